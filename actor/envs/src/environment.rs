@@ -1,0 +1,68 @@
+//! What a world is: many copies of one game, stepped together, written straight into the caller's buffers.
+//! It does not stack, enlarge or convert frames, and it keeps no statistics; those live where they are used.
+
+use crate::EnvError;
+
+/// The shape of one frame, channels last: `height` x `width` x `channels` bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FrameShape {
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// Bytes a pixel.
+    pub channels: usize,
+}
+
+impl FrameShape {
+    /// Bytes in one frame.
+    pub const fn bytes(&self) -> usize {
+        self.height * self.width * self.channels
+    }
+}
+
+/// What one step ended, if anything.
+///
+/// The frame after a step whose end is not `Running` is the first of another episode or level.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+#[repr(u8)]
+pub enum StepEnd {
+    /// Nothing: the next frame follows from this one.
+    #[default]
+    Running = 0,
+    /// The level was completed and the next one began; the return goes on.
+    LevelChange = 1,
+    /// The episode was cut off by its step limit.
+    TimedOut = 2,
+    /// The episode ended.
+    Terminal = 3,
+}
+
+/// Copies of one game, stepped together.
+///
+/// Deterministic: the same construction arguments and actions give the same frames, rewards and ends.
+/// A copy that ends resets by itself, so its next frame is the first of another episode (as in gym3 and Procgen).
+pub trait Environment: Send {
+    /// The shape of one frame.
+    fn frame_shape(&self) -> FrameShape;
+
+    /// Number of actions; valid ones are `0..num_actions`.
+    fn num_actions(&self) -> usize;
+
+    /// Number of copies, N.
+    fn num_envs(&self) -> usize;
+
+    /// Writes the current frames [N, H, W, C]; the ones in which the next actions are taken.
+    fn observe(&mut self, frames: &mut [u8]);
+
+    /// Takes `actions` [N] and writes what they earned, `rewards` [N], and what they ended, `ends` [N].
+    ///
+    /// # Errors
+    /// An action out of range, or a fault of the engine. After an error the world must not be stepped again.
+    fn step(
+        &mut self,
+        actions: &[u8],
+        rewards: &mut [f32],
+        ends: &mut [StepEnd],
+    ) -> Result<(), EnvError>;
+}

@@ -1,0 +1,194 @@
+//! The newest few frames of each copy, as one image with more channels.
+//! It keeps no history beyond the stack, and it does not enlarge or convert pixels.
+
+use crate::{EnvError, FrameShape};
+
+/// Most frames in a stack; more are rejected.
+const STACK_MAX: usize = 64;
+
+/// For each of N copies the newest `stack` frames, [N, H, W, C * stack].
+///
+/// A pixel's channels are those of the oldest frame first: [oldest C, ..., newest C]. At the first frame of an episode or
+/// level every slot holds that frame, so a stack never reaches across an end.
+pub struct FrameStack {
+    frame: FrameShape,
+    stack: usize,
+    num_envs: usize,
+    stacked: Vec<u8>,
+}
+
+impl FrameStack {
+    /// An empty (all 0) stack of `stack` frames of `shape` for `num_envs` copies; the first push of a copy must be `first`.
+    ///
+    /// # Errors
+    /// A stack of 0 or above 64 frames.
+    pub fn new(shape: FrameShape, stack: usize, num_envs: usize) -> Result<Self, EnvError> {
+        if !(1..=STACK_MAX).contains(&stack) {
+            return Err(EnvError::Config(format!(
+                "a frame stack holds 1 to {STACK_MAX} frames, got {stack}"
+            )));
+        }
+        Ok(Self {
+            frame: shape,
+            stack,
+            num_envs,
+            stacked: vec![0; shape.bytes() * stack * num_envs],
+        })
+    }
+
+    /// The shape of one stacked observation: [H, W, C * stack].
+    pub fn shape(&self) -> FrameShape {
+        FrameShape {
+            channels: self.frame.channels * self.stack,
+            ..self.frame
+        }
+    }
+
+    /// Takes the current `frames` [N, H, W, C]; `first` [N] says which are the first of an episode or level.
+    ///
+    /// # Panics
+    /// If a slice has the wrong length: both come from the caller's own buffers.
+    pub fn push(&mut self, frames: &[u8], first: &[bool]) {
+        assert_eq!(
+            frames.len(),
+            self.frame.bytes() * self.num_envs,
+            "frames must be [N, H, W, C]"
+        );
+        assert_eq!(first.len(), self.num_envs, "first must be [N]");
+        if self.stack == 1 {
+            self.stacked.copy_from_slice(frames);
+            return;
+        }
+        let channels = self.frame.channels;
+        let deep = channels * self.stack;
+        let copies = self
+            .stacked
+            .chunks_exact_mut(self.frame.bytes() * self.stack);
+        for ((stacked, frame), &first) in copies
+            .zip(frames.chunks_exact(self.frame.bytes()))
+            .zip(first)
+        {
+            let pixels = frame.chunks_exact(channels);
+            if first {
+                for (out, pixel) in stacked.chunks_exact_mut(channels * self.stack).zip(pixels) {
+                    out.chunks_exact_mut(channels)
+                        .for_each(|slot| slot.copy_from_slice(pixel));
+                }
+            } else {
+                // One move shifts every pixel; what spills into a pixel's last slot is overwritten right after.
+                stacked.copy_within(channels.., 0);
+                for (out, pixel) in stacked.chunks_exact_mut(deep).zip(pixels) {
+                    out[deep - channels..].copy_from_slice(pixel);
+                }
+            }
+        }
+    }
+
+    /// The stacked observations [N, H, W, C * stack].
+    pub fn stacked(&self) -> &[u8] {
+        &self.stacked
+    }
+
+    /// Copies the stacked observations into `out` [N, H, W, C * stack].
+    ///
+    /// # Panics
+    /// If `out` has another length.
+    pub fn write(&self, out: &mut [u8]) {
+        out.copy_from_slice(&self.stacked);
+    }
+
+    /// `push`, then `write`.
+    ///
+    /// # Panics
+    /// As these two.
+    pub fn push_into(&mut self, frames: &[u8], first: &[bool], out: &mut [u8]) {
+        self.push(frames, first);
+        self.write(out);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// The stack of copy `env` at time `t`, from the whole history: slot j is the frame `stack - 1 - j` back, but no
+    /// further than the last first frame.
+    fn reference(
+        history: &[(Vec<u8>, Vec<bool>)],
+        t: usize,
+        env: usize,
+        shape: FrameShape,
+        stack: usize,
+    ) -> Vec<u8> {
+        let start = (0..=t).rev().find(|&i| history[i].1[env]).unwrap();
+        let mut out = vec![];
+        for pixel in 0..shape.height * shape.width {
+            for back in (0..stack).rev() {
+                let frame = &history[t.saturating_sub(back).max(start)].0;
+                let at = env * shape.bytes() + pixel * shape.channels;
+                out.extend_from_slice(&frame[at..at + shape.channels]);
+            }
+        }
+        out
+    }
+
+    proptest! {
+        #[test]
+        fn equals_the_slow_reference(
+            height in 1usize..4, width in 1usize..4, channels in 1usize..4, stack in 1usize..6, num_envs in 1usize..4,
+            seed in any::<u64>(), steps in 1usize..20,
+        ) {
+            use rand::{Rng, SeedableRng};
+            let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+            let shape = FrameShape { height, width, channels };
+            let mut frames = FrameStack::new(shape, stack, num_envs).unwrap();
+            let mut history = vec![];
+            for t in 0..steps {
+                let frame: Vec<u8> = (0..shape.bytes() * num_envs).map(|_| rng.random()).collect();
+                let first: Vec<bool> = (0..num_envs).map(|_| t == 0 || rng.random_bool(0.2)).collect();
+                let mut out = vec![0; shape.bytes() * stack * num_envs];
+                frames.push_into(&frame, &first, &mut out);
+                history.push((frame, first));
+                let expected: Vec<u8> =
+                    (0..num_envs).flat_map(|env| reference(&history, t, env, shape, stack)).collect();
+                prop_assert_eq!(&out, &expected);
+                prop_assert_eq!(frames.stacked(), &expected[..]);
+            }
+        }
+    }
+
+    #[test]
+    fn oldest_channels_come_first() {
+        let shape = FrameShape {
+            height: 1,
+            width: 2,
+            channels: 2,
+        };
+        let mut frames = FrameStack::new(shape, 2, 1).unwrap();
+        frames.push(&[1, 2, 3, 4], &[true]);
+        assert_eq!(frames.stacked(), [1, 2, 1, 2, 3, 4, 3, 4]);
+        frames.push(&[5, 6, 7, 8], &[false]);
+        assert_eq!(frames.stacked(), [1, 2, 5, 6, 3, 4, 7, 8]);
+        assert_eq!(
+            frames.shape(),
+            FrameShape {
+                height: 1,
+                width: 2,
+                channels: 4
+            }
+        );
+    }
+
+    #[test]
+    fn a_stack_of_none_is_an_error() {
+        let shape = FrameShape {
+            height: 1,
+            width: 1,
+            channels: 1,
+        };
+        assert!(FrameStack::new(shape, 0, 1).is_err());
+        assert!(FrameStack::new(shape, 65, 1).is_err());
+    }
+}

@@ -1,0 +1,189 @@
+//! The Ising lattice against exact enumeration, and its books against a recount.
+
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use super::lattice::*;
+
+/// Exact law over all 2^(H * W) states: (probability of each, mean E, mean |m|). Bit i is the spin of site i.
+fn enumerate(
+    height: usize,
+    width: usize,
+    temperature: f64,
+    boundary: Boundary,
+) -> (Vec<f64>, f64, f64) {
+    let sites = height * width;
+    let energy_and_m = |state: usize| {
+        let s = |i: usize| if state >> i & 1 == 1 { 1i64 } else { -1 };
+        let mut energy = 0;
+        for row in 0..height {
+            for column in 0..width {
+                let here = s(row * width + column);
+                if row + 1 < height || boundary == Boundary::Periodic {
+                    energy -= here * s((row + 1) % height * width + column);
+                }
+                if column + 1 < width || boundary == Boundary::Periodic {
+                    energy -= here * s(row * width + (column + 1) % width);
+                }
+            }
+        }
+        (energy as f64, (0..sites).map(s).sum::<i64>().abs() as f64)
+    };
+    let weights: Vec<f64> = (0..1 << sites)
+        .map(|x| (-energy_and_m(x).0 / temperature).exp())
+        .collect();
+    let z: f64 = weights.iter().sum();
+    let p: Vec<f64> = weights.iter().map(|w| w / z).collect();
+    let mean = |f: &dyn Fn(usize) -> f64| p.iter().enumerate().map(|(x, p)| p * f(x)).sum();
+    let (e, m) = (mean(&|x| energy_and_m(x).0), mean(&|x| energy_and_m(x).1));
+    (p, e, m)
+}
+
+/// Mean of `samples` within 5 standard errors of `exact`, the error from 100 batch means.
+fn assert_mean(samples: &[f64], exact: f64, what: &str) {
+    let batches: Vec<f64> = samples
+        .chunks(samples.len() / 100)
+        .map(|b| b.iter().sum::<f64>() / b.len() as f64)
+        .collect();
+    let mean = batches.iter().sum::<f64>() / batches.len() as f64;
+    let variance =
+        batches.iter().map(|b| (b - mean).powi(2)).sum::<f64>() / (batches.len() - 1) as f64;
+    let error = (variance / batches.len() as f64).sqrt();
+    assert!(
+        (mean - exact).abs() < 5.0 * error,
+        "{what}: sampled {mean} +- {error}, exact {exact}"
+    );
+}
+
+fn assert_samples_law(
+    height: usize,
+    width: usize,
+    temperature: f64,
+    boundary: Boundary,
+    by_sweep: bool,
+) {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let mut lattice = IsingLattice::random(height, width, temperature, boundary, &mut rng).unwrap();
+    let (p, mean_energy, mean_m) = enumerate(height, width, temperature, boundary);
+    let samples = 60_000;
+    let (mut counts, mut energies, mut ms) = (vec![0u32; p.len()], vec![], vec![]);
+    for sample in 0..samples + 100 {
+        // 10 sweeps apart the states are near enough to independent for the chi-square below.
+        for _ in 0..10 {
+            match by_sweep {
+                true => lattice.sweep(&mut rng),
+                false => drop(lattice.attempt_flips(height * width, &mut rng)),
+            }
+        }
+        if sample >= 100 {
+            let state = lattice
+                .spins()
+                .iter()
+                .rev()
+                .fold(0, |x, &s| x << 1 | usize::from(s == 1));
+            counts[state] += 1;
+            energies.push(lattice.energy() as f64);
+            ms.push(lattice.magnetisation().abs() as f64);
+        }
+    }
+    lattice.check_valid();
+    assert_mean(&energies, mean_energy, "mean energy");
+    assert_mean(&ms, mean_m, "mean |m|");
+    // States with fewer than 5 expected visits share one bin.
+    let (mut chi, mut bins, mut rest) = (0.0, 0, (0.0, 0.0));
+    for (count, p) in counts.iter().zip(&p) {
+        let (seen, expected) = (f64::from(*count), p * f64::from(samples));
+        if expected >= 5.0 {
+            chi += (seen - expected).powi(2) / expected;
+            bins += 1;
+        } else {
+            rest = (rest.0 + seen, rest.1 + expected);
+        }
+    }
+    if rest.1 >= 5.0 {
+        chi += (rest.0 - rest.1).powi(2) / rest.1;
+        bins += 1;
+    }
+    let dof = f64::from(bins - 1);
+    assert!(
+        chi < dof + 5.0 * (2.0 * dof).sqrt(),
+        "chi-square {chi} on {dof} degrees of freedom"
+    );
+}
+
+#[test]
+fn sweeps_sample_the_boltzmann_law_3x3_periodic() {
+    assert_samples_law(3, 3, 4.0, Boundary::Periodic, true);
+}
+
+#[test]
+fn sweeps_sample_the_boltzmann_law_3x4_free() {
+    assert_samples_law(3, 4, 2.5, Boundary::Free, true);
+}
+
+#[test]
+fn random_proposals_sample_the_boltzmann_law() {
+    assert_samples_law(3, 3, 4.0, Boundary::Periodic, false);
+    assert_samples_law(3, 4, 2.5, Boundary::Free, false);
+}
+
+#[test]
+fn energy_and_magnetisation_follow_every_step() {
+    let mut rng = ChaCha8Rng::seed_from_u64(2);
+    for boundary in [Boundary::Free, Boundary::Periodic] {
+        let mut lattice = IsingLattice::random(7, 5, 2.0, boundary, &mut rng).unwrap();
+        for _ in 0..50 {
+            lattice.sweep(&mut rng);
+            lattice.check_valid();
+            lattice.attempt_flips(3, &mut rng);
+            lattice.check_valid();
+        }
+    }
+}
+
+#[test]
+fn ground_state_has_one_unit_of_energy_a_bond() {
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    for (boundary, bonds) in [
+        (Boundary::Free, 3 * 3 + 2 * 4),
+        (Boundary::Periodic, 2 * 12),
+    ] {
+        let mut lattice = IsingLattice::random(3, 4, 0.1, boundary, &mut rng).unwrap();
+        lattice.attempt_flips(100_000, &mut rng);
+        assert_eq!(
+            (lattice.energy(), lattice.magnetisation().abs()),
+            (-bonds, 12)
+        );
+    }
+}
+
+#[test]
+fn absent_sites_stay_absent_and_bind_nobody() {
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    // Two columns apart: 2 bonds in each, none between them.
+    let present = [true, false, true].repeat(3);
+    let mut lattice = IsingLattice::masked(3, 3, &present, 0.1, Boundary::Free, &mut rng).unwrap();
+    lattice.attempt_flips(100_000, &mut rng);
+    lattice.check_valid();
+    assert_eq!(lattice.energy(), -4);
+    assert!(
+        lattice
+            .spins()
+            .iter()
+            .zip(&present)
+            .all(|(s, p)| (*s != 0) == *p)
+    );
+}
+
+#[test]
+fn unusable_settings_are_errors() {
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    for temperature in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+        assert!(IsingLattice::random(3, 3, temperature, Boundary::Free, &mut rng).is_err());
+    }
+    assert!(IsingLattice::random(0, 3, 1.0, Boundary::Free, &mut rng).is_err());
+    assert!(IsingLattice::random(2, 3, 1.0, Boundary::Periodic, &mut rng).is_err());
+    assert!(IsingLattice::random(usize::MAX, usize::MAX, 1.0, Boundary::Free, &mut rng).is_err());
+    assert!(IsingLattice::masked(3, 3, &[true; 4], 1.0, Boundary::Free, &mut rng).is_err());
+    assert!(IsingLattice::masked(3, 3, &[false; 9], 1.0, Boundary::Free, &mut rng).is_err());
+}

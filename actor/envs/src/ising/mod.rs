@@ -1,0 +1,11 @@
+//! The Ising model: a Metropolis sampler on a small lattice, and the world made of one in a field of noise.
+//! It measures no mutual information and draws no score maps; the Ising experiment does.
+
+mod lattice;
+#[cfg(test)]
+mod lattice_tests;
+mod world;
+
+pub(crate) use lattice::check_temperature;
+pub use lattice::{Boundary, IsingLattice};
+pub use world::{IsingConfig, IsingWorld};

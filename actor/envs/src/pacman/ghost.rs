@@ -1,0 +1,262 @@
+//! How a ghost moves: wander, follow or avoid, changed over by chance, with the odd random move.
+//! It decides nothing about contacts; every ghost sees the agent where it was before the step.
+
+use rand::Rng;
+
+use super::maze::{DIRECTIONS, Direction, Maze, Place};
+
+/// What a ghost is at. Which one the situation asks for: `wanted`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Mode {
+    /// Go on at random, turning back only where there is no other way.
+    Wander,
+    /// Take the shortest way to the agent.
+    Follow,
+    /// Take the move that ends furthest from the agent.
+    Avoid,
+}
+
+/// How much of a ghost's behaviour is chance.
+#[derive(Clone, Copy)]
+pub(crate) struct Chance {
+    /// Probability of a random move instead of the mode's, at each step.
+    pub(crate) epsilon: f64,
+    /// Probability of changing over to the wanted mode, at each step in which it is another.
+    pub(crate) switch_probability: f64,
+}
+
+/// One ghost.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Ghost {
+    pub(crate) place: Place,
+    /// The last move's direction; `None` before the first.
+    pub(crate) heading: Option<Direction>,
+    pub(crate) mode: Mode,
+}
+
+impl Ghost {
+    /// A ghost at its start, wandering.
+    pub(crate) fn at(place: Place) -> Self {
+        Self {
+            place,
+            heading: None,
+            mode: Mode::Wander,
+        }
+    }
+
+    /// One step: perhaps a change of mode, then one move.
+    pub(crate) fn step(
+        &mut self,
+        maze: &Maze,
+        agent: Place,
+        boosted: bool,
+        chance: Chance,
+        rng: &mut impl Rng,
+    ) {
+        let wanted = wanted(maze.in_sight(self.place, agent), boosted);
+        if wanted != self.mode && rng.random::<f64>() < chance.switch_probability {
+            self.mode = wanted;
+        }
+        let direction = if rng.random::<f64>() < chance.epsilon {
+            Some(draw(maze.open(self.place), rng))
+        } else {
+            match self.mode {
+                Mode::Wander => Some(self.wander(maze, rng)),
+                Mode::Follow if self.place == agent => None,
+                Mode::Follow => self.best(maze, |place| -i32::from(maze.distance(place, agent))),
+                Mode::Avoid => self.best(maze, |place| maze.distance(place, agent).into()),
+            }
+        };
+        if let Some(direction) = direction {
+            self.place = maze.next(self.place, direction);
+            self.heading = Some(direction);
+        }
+    }
+
+    fn wander(&self, maze: &Maze, rng: &mut impl Rng) -> Direction {
+        let open = maze.open(self.place);
+        let onward = self
+            .heading
+            .map_or(open, |heading| open & !(1 << (heading ^ 1)));
+        draw(if onward == 0 { open } else { onward }, rng)
+    }
+
+    /// The open direction of the highest score, the first of equals in the order up, down, left, right.
+    fn best(&self, maze: &Maze, score: impl Fn(Place) -> i32) -> Option<Direction> {
+        (0..DIRECTIONS as Direction)
+            .rev()
+            .filter(|d| maze.open(self.place) >> d & 1 == 1)
+            .max_by_key(|&d| score(maze.next(self.place, d)))
+    }
+}
+
+/// The paper's three behaviours: out of sight wander; in sight follow, or avoid an agent with a boost.
+fn wanted(visible: bool, boosted: bool) -> Mode {
+    match (visible, boosted) {
+        (false, _) => Mode::Wander,
+        (true, false) => Mode::Follow,
+        (true, true) => Mode::Avoid,
+    }
+}
+
+/// A uniform draw among the directions whose bit is set in `open`, which must not be 0.
+fn draw(open: u8, rng: &mut impl Rng) -> Direction {
+    let mut left = open;
+    for _ in 0..rng.random_range(0..open.count_ones()) {
+        left &= left - 1;
+    }
+    left.trailing_zeros() as Direction
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    const CERTAIN: Chance = Chance {
+        epsilon: 0.0,
+        switch_probability: 1.0,
+    };
+
+    #[test]
+    fn followers_close_in_and_avoiders_do_not() {
+        let maze = Maze::new();
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let places = maze.items().len() as u16;
+        for place in 0..places {
+            for agent in (0..places).filter(|&agent| agent != place && maze.in_sight(place, agent))
+            {
+                let (mut follower, mut avoider) = (Ghost::at(place), Ghost::at(place));
+                follower.step(&maze, agent, false, CERTAIN, &mut rng);
+                avoider.step(&maze, agent, true, CERTAIN, &mut rng);
+                assert_eq!((follower.mode, avoider.mode), (Mode::Follow, Mode::Avoid));
+                assert_eq!(
+                    maze.distance(follower.place, agent),
+                    maze.distance(place, agent) - 1
+                );
+                let furthest = (0..4).map(|d| maze.next(place, d)).filter(|&p| p != place);
+                let furthest = furthest.map(|p| maze.distance(p, agent)).max().unwrap();
+                assert_eq!(maze.distance(avoider.place, agent), furthest);
+            }
+        }
+    }
+
+    #[test]
+    fn a_follower_that_lost_sight_goes_on_until_it_changes_over() {
+        let maze = Maze::new();
+        let mut rng = ChaCha8Rng::seed_from_u64(2);
+        let mut ghost = Ghost {
+            mode: Mode::Follow,
+            ..Ghost::at(maze.ghost_starts()[2])
+        };
+        let agent = 0;
+        assert!(!maze.in_sight(ghost.place, agent));
+        for _ in 0..maze.distance(ghost.place, agent) {
+            ghost.step(
+                &maze,
+                agent,
+                false,
+                Chance {
+                    switch_probability: 0.0,
+                    ..CERTAIN
+                },
+                &mut rng,
+            );
+        }
+        assert_eq!((ghost.place, ghost.mode), (agent, Mode::Follow));
+    }
+
+    #[test]
+    fn modes_change_over_with_the_given_probability() {
+        let maze = Maze::new();
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let start = Ghost::at(maze.agent_start());
+        let (trials, p) = (20_000, 0.3);
+        let changed = (0..trials)
+            .filter(|_| {
+                let mut ghost = start;
+                ghost.step(
+                    &maze,
+                    start.place,
+                    false,
+                    Chance {
+                        switch_probability: p,
+                        ..CERTAIN
+                    },
+                    &mut rng,
+                );
+                ghost.mode == Mode::Follow
+            })
+            .count() as f64;
+        let deviation = (f64::from(trials) * p * (1.0 - p)).sqrt();
+        assert!(
+            (changed - f64::from(trials) * p).abs() < 4.0 * deviation,
+            "{changed} of {trials}"
+        );
+    }
+
+    /// At epsilon 1 every open direction is equally likely, even back, whatever the mode.
+    #[test]
+    fn random_moves_are_uniform() {
+        let maze = Maze::new();
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        let crossing = (0..maze.items().len() as u16)
+            .find(|&p| maze.open(p) == 0b1111)
+            .unwrap();
+        let mut counts = [0i32; 4];
+        for _ in 0..40_000 {
+            let mut ghost = Ghost {
+                mode: Mode::Follow,
+                heading: Some(1),
+                ..Ghost::at(crossing)
+            };
+            ghost.step(
+                &maze,
+                0,
+                false,
+                Chance {
+                    epsilon: 1.0,
+                    switch_probability: 0.0,
+                },
+                &mut rng,
+            );
+            counts[usize::from(ghost.heading.unwrap())] += 1;
+        }
+        let chi: f64 = counts
+            .iter()
+            .map(|c| f64::from(c - 10_000).powi(2) / 10_000.0)
+            .sum();
+        assert!(
+            chi < 16.3,
+            "chi-square {chi} on 3 degrees of freedom, p = 0.001 at 16.3"
+        );
+    }
+
+    #[test]
+    fn wanderers_turn_back_only_in_dead_ends() {
+        let maze = Maze::new();
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let never = Chance {
+            epsilon: 0.0,
+            switch_probability: 0.0,
+        };
+        let mut ghost = Ghost::at(maze.ghost_starts()[1]);
+        let mut visited = std::collections::BTreeSet::new();
+        for _ in 0..20_000 {
+            let before = ghost;
+            ghost.step(&maze, before.place, false, never, &mut rng);
+            visited.insert(ghost.place);
+            let back = before
+                .heading
+                .is_some_and(|heading| ghost.heading == Some(heading ^ 1));
+            assert!(!back || maze.open(before.place).count_ones() == 1);
+        }
+        assert_eq!(
+            visited.len(),
+            maze.items().len(),
+            "a wanderer gets everywhere"
+        );
+    }
+}

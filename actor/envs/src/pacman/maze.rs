@@ -1,0 +1,295 @@
+//! The maze of Ms. PacMan: where walls, food and starts are, what sees what, and how far it is.
+//! It knows nothing of what moves in it. The layout was drawn for this project; it is not the arcade's.
+
+/// Rows of the maze, one pixel each.
+pub(crate) const HEIGHT: usize = 21;
+/// Columns of the maze, one pixel each.
+pub(crate) const WIDTH: usize = 19;
+/// Ghosts, each with a start of its own.
+pub(crate) const GHOSTS: usize = 4;
+/// Ways out of a cell: up, down, left, right.
+pub(crate) const DIRECTIONS: usize = 4;
+
+/// `#` wall, `.` pellet, `o` boost, `@` the agent's start, `1`-`4` the ghosts' starts. Row 9 is a tunnel.
+const LAYOUT: [&[u8; WIDTH]; HEIGHT] = [
+    b"###################",
+    b"#o....#.....#....o#",
+    b"#.###.#.###.#.###.#",
+    b"#...#.........#...#",
+    b"###.#.###.###.#.###",
+    b"#.......#.#.......#",
+    b"#.###.#.#.#.#.###.#",
+    b"#.###.........###.#",
+    b"#.###.###1###.###.#",
+    b"......##234##......",
+    b"###.#.#######.#.###",
+    b"#...#.........#...#",
+    b"#.#.###.###.###.#.#",
+    b"#.#.............#.#",
+    b"#.###.###.###.###.#",
+    b"#.....#..@..#.....#",
+    b"###.#.#.###.#.#.###",
+    b"#o..#.........#..o#",
+    b"#.#####.###.#####.#",
+    b"#.................#",
+    b"###################",
+];
+
+/// A way out of a cell; `direction ^ 1` is its opposite.
+pub(crate) type Direction = u8;
+
+/// An open cell, by its number in row order: 0..places.
+pub(crate) type Place = u16;
+
+/// What lies in an open cell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Item {
+    Nothing,
+    Pellet,
+    Boost,
+}
+
+/// The maze, with everything about it that a step looks up.
+pub(crate) struct Maze {
+    /// Open cell -> pixel, in row order.
+    pixels: Vec<u16>,
+    /// Open cell and direction -> the open cell there, or the same one where a wall is.
+    next: Vec<[Place; DIRECTIONS]>,
+    /// Open cell -> bit d is set where direction d is open.
+    open: Vec<u8>,
+    /// Open cell -> number of its unbroken run of open cells in its row, and in its column.
+    runs: Vec<(u16, u16)>,
+    /// [places, places]: moves on the shortest way.
+    distances: Vec<u8>,
+    items: Vec<Item>,
+    pellets: u32,
+    agent_start: Place,
+    ghost_starts: [Place; GHOSTS],
+}
+
+impl Maze {
+    pub(crate) fn new() -> Self {
+        let cell = |pixel: usize| LAYOUT[pixel / WIDTH][pixel % WIDTH];
+        let pixels: Vec<u16> = (0..(HEIGHT * WIDTH) as u16)
+            .filter(|&p| cell(p.into()) != b'#')
+            .collect();
+        let place = |pixel: usize| {
+            pixels
+                .iter()
+                .position(|&p| usize::from(p) == pixel)
+                .map(|p| p as Place)
+        };
+        let start = |mark: u8| {
+            let pixel = (0..HEIGHT * WIDTH)
+                .find(|&pixel| cell(pixel) == mark)
+                .expect("the layout marks every start");
+            place(pixel).expect("a start is an open cell")
+        };
+        let next: Vec<[Place; DIRECTIONS]> = (0..pixels.len())
+            .map(|from| {
+                beside(pixels[from].into()).map(|pixel| place(pixel).unwrap_or(from as Place))
+            })
+            .collect();
+        let open = |from: usize| {
+            (0..DIRECTIONS)
+                .map(|d| u8::from(usize::from(next[from][d]) != from) << d)
+                .sum()
+        };
+        let items: Vec<Item> = pixels
+            .iter()
+            .map(|&pixel| match cell(pixel.into()) {
+                b'.' => Item::Pellet,
+                b'o' => Item::Boost,
+                _ => Item::Nothing,
+            })
+            .collect();
+        Self {
+            open: (0..pixels.len()).map(open).collect(),
+            runs: pixels.iter().map(|&pixel| runs(pixel.into())).collect(),
+            distances: (0..pixels.len())
+                .flat_map(|from| distances_from(from, &next))
+                .collect(),
+            pellets: items.iter().filter(|&&item| item == Item::Pellet).count() as u32,
+            items,
+            agent_start: start(b'@'),
+            ghost_starts: [b'1', b'2', b'3', b'4'].map(start),
+            next,
+            pixels,
+        }
+    }
+
+    /// The pixel of an open cell, row * 19 + column.
+    pub(crate) fn pixel(&self, place: Place) -> usize {
+        self.pixels[usize::from(place)].into()
+    }
+
+    /// Where one move leads; a wall leaves the mover where it is.
+    pub(crate) fn next(&self, place: Place, direction: Direction) -> Place {
+        self.next[usize::from(place)][usize::from(direction)]
+    }
+
+    /// The ways out of a cell: bit d for direction d. Never 0.
+    pub(crate) fn open(&self, place: Place) -> u8 {
+        self.open[usize::from(place)]
+    }
+
+    /// Whether the two are in one row or column with no wall between. The tunnel cannot be looked through.
+    pub(crate) fn in_sight(&self, a: Place, b: Place) -> bool {
+        let (a, b) = (self.runs[usize::from(a)], self.runs[usize::from(b)]);
+        a.0 == b.0 || a.1 == b.1
+    }
+
+    /// Moves on the shortest way from one open cell to another.
+    pub(crate) fn distance(&self, a: Place, b: Place) -> u8 {
+        self.distances[usize::from(a) * self.pixels.len() + usize::from(b)]
+    }
+
+    /// What lies in each open cell at the start of an episode.
+    pub(crate) fn items(&self) -> &[Item] {
+        &self.items
+    }
+
+    /// Pellets at the start of an episode.
+    pub(crate) fn pellets(&self) -> u32 {
+        self.pellets
+    }
+
+    pub(crate) fn agent_start(&self) -> Place {
+        self.agent_start
+    }
+
+    pub(crate) fn ghost_starts(&self) -> [Place; GHOSTS] {
+        self.ghost_starts
+    }
+
+    /// [H * W]: whether each pixel is wall.
+    pub(crate) fn walls(&self) -> Vec<bool> {
+        LAYOUT
+            .iter()
+            .flat_map(|row| row.map(|c| c == b'#'))
+            .collect()
+    }
+}
+
+/// The pixels up, down, left and right of one, around the rim.
+fn beside(pixel: usize) -> [usize; DIRECTIONS] {
+    let (row, column) = (pixel / WIDTH, pixel % WIDTH);
+    let at = |row: usize, column: usize| row % HEIGHT * WIDTH + column % WIDTH;
+    [
+        at(row + HEIGHT - 1, column),
+        at(row + 1, column),
+        at(row, column + WIDTH - 1),
+        at(row, column + 1),
+    ]
+}
+
+/// The pixel in which the run of open cells through `pixel` begins: along its row, and along its column.
+fn runs(pixel: usize) -> (u16, u16) {
+    let (row, column) = (pixel / WIDTH, pixel % WIDTH);
+    let left = (0..column)
+        .rev()
+        .take_while(|&c| LAYOUT[row][c] != b'#')
+        .last()
+        .unwrap_or(column);
+    let top = (0..row)
+        .rev()
+        .take_while(|&r| LAYOUT[r][column] != b'#')
+        .last()
+        .unwrap_or(row);
+    ((row * WIDTH + left) as u16, (top * WIDTH + column) as u16)
+}
+
+/// Breadth-first moves from one open cell to each; `u8::MAX` where none leads.
+fn distances_from(from: usize, next: &[[Place; DIRECTIONS]]) -> Vec<u8> {
+    let mut distances = vec![u8::MAX; next.len()];
+    distances[from] = 0;
+    let mut queue = std::collections::VecDeque::from([from]);
+    while let Some(here) = queue.pop_front() {
+        for there in next[here].map(usize::from) {
+            if distances[there] == u8::MAX {
+                distances[there] = distances[here] + 1;
+                queue.push_back(there);
+            }
+        }
+    }
+    distances
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_open_cell_is_reachable_and_the_food_is_counted() {
+        let maze = Maze::new();
+        let places = maze.items().len();
+        assert!((0..places as u16).all(|place| maze.distance(maze.agent_start(), place) < u8::MAX));
+        assert_eq!(places, 196);
+        assert_eq!(maze.pellets(), 187);
+        assert_eq!(
+            maze.items()
+                .iter()
+                .filter(|&&item| item == Item::Boost)
+                .count(),
+            4
+        );
+        assert_eq!(maze.walls().iter().filter(|&&wall| !wall).count(), places);
+    }
+
+    #[test]
+    fn walls_and_food_mirror_left_and_right() {
+        for row in LAYOUT {
+            for column in 0..WIDTH {
+                let symmetric = |c: u8| if c.is_ascii_digit() { b' ' } else { c };
+                assert_eq!(symmetric(row[column]), symmetric(row[WIDTH - 1 - column]));
+            }
+        }
+    }
+
+    #[test]
+    fn only_the_house_has_dead_ends_and_only_the_tunnel_leaves_the_rim() {
+        let maze = Maze::new();
+        let house = maze.ghost_starts();
+        for place in 0..maze.items().len() as u16 {
+            assert!(
+                maze.open(place).count_ones() >= 2 || house.contains(&place),
+                "pixel {}",
+                maze.pixel(place)
+            );
+            for direction in 0..4 {
+                let there = maze.next(place, direction);
+                assert!(
+                    there == place || maze.next(there, direction ^ 1) == place,
+                    "moves can be undone"
+                );
+                let (a, b) = (maze.pixel(place), maze.pixel(there));
+                assert!(
+                    a.abs_diff(b) <= WIDTH && (a / WIDTH == b / WIDTH || a % WIDTH == b % WIDTH)
+                );
+                let around = a / WIDTH == b / WIDTH && a.abs_diff(b) > 1;
+                assert!(
+                    !around || a / WIDTH == 9,
+                    "a second tunnel in row {}",
+                    a / WIDTH
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn sight_is_a_straight_line_without_walls() {
+        let maze = Maze::new();
+        let at = |row: usize, column: usize| {
+            (0..maze.items().len() as u16)
+                .find(|&p| maze.pixel(p) == row * WIDTH + column)
+                .unwrap()
+        };
+        assert!(maze.in_sight(at(19, 1), at(19, 17)));
+        assert!(maze.in_sight(at(1, 5), at(11, 5)));
+        assert!(!maze.in_sight(at(1, 5), at(1, 7)), "a wall between");
+        assert!(!maze.in_sight(at(1, 1), at(3, 3)), "neither row nor column");
+        assert!(!maze.in_sight(at(9, 0), at(9, 18)), "through the tunnel");
+        assert_eq!(maze.distance(at(9, 0), at(9, 18)), 1);
+        assert_eq!(maze.distance(at(19, 1), at(19, 17)), 16);
+    }
+}

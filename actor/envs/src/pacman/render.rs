@@ -1,0 +1,102 @@
+//! How Ms. PacMan looks: one pixel a cell, [21, 19, 3] RGB.
+//! It does not enlarge frames; what a frame cannot show (a ghost's mode, the boost's remaining steps) stays hidden.
+
+use super::maze::{GHOSTS, HEIGHT, Item, Maze, Place, WIDTH};
+
+/// Bytes a pixel.
+pub(crate) const CHANNELS: usize = 3;
+/// Bytes a frame.
+pub(crate) const FRAME_BYTES: usize = HEIGHT * WIDTH * CHANNELS;
+
+/// An RGB colour.
+pub(crate) type Colour = [u8; CHANNELS];
+
+pub(crate) const WALL: Colour = [33, 33, 160];
+pub(crate) const FLOOR: Colour = [0, 0, 0];
+pub(crate) const PELLET: Colour = [120, 90, 60];
+pub(crate) const BOOST: Colour = [255, 255, 255];
+pub(crate) const AGENT: Colour = [255, 255, 0];
+/// The agent while a boost lasts: paler, so that the frame tells whether it is invincible.
+pub(crate) const AGENT_BOOSTED: Colour = [255, 255, 150];
+/// Red, cyan, orange, green.
+pub(crate) const GHOST: [Colour; GHOSTS] = [[255, 0, 0], [0, 255, 255], [255, 128, 0], [0, 255, 0]];
+/// A wall whose Ising spin is +1; one with spin -1 stays as it is.
+pub(crate) const FUCHSIA: Colour = [255, 0, 255];
+
+/// Paints walls, floor and all the food into `frame` [21, 19, 3].
+pub(crate) fn background(maze: &Maze, frame: &mut [u8]) {
+    for (pixel, wall) in maze.walls().into_iter().enumerate() {
+        paint(frame, pixel, if wall { WALL } else { FLOOR });
+    }
+    for (place, item) in maze.items().iter().enumerate() {
+        let colour = match item {
+            Item::Nothing => FLOOR,
+            Item::Pellet => PELLET,
+            Item::Boost => BOOST,
+        };
+        paint(frame, maze.pixel(place as Place), colour);
+    }
+}
+
+/// Paints the floor where food was eaten.
+pub(crate) fn erase(maze: &Maze, place: Place, frame: &mut [u8]) {
+    paint(frame, maze.pixel(place), FLOOR);
+}
+
+/// Paints the walls by their spins [21 * 19]: fuchsia +1, wall -1; 0 (open cells) is left alone.
+pub(crate) fn overlay(spins: &[i8], frame: &mut [u8]) {
+    for (pixel, &spin) in frame.chunks_exact_mut(CHANNELS).zip(spins) {
+        match spin {
+            1 => pixel.copy_from_slice(&FUCHSIA),
+            -1 => pixel.copy_from_slice(&WALL),
+            _ => {}
+        }
+    }
+}
+
+/// Paints what moves: the ghosts, the first on top, and the agent over them.
+pub(crate) fn actors(
+    maze: &Maze,
+    ghosts: [Place; GHOSTS],
+    agent: Place,
+    boosted: bool,
+    frame: &mut [u8],
+) {
+    for (place, colour) in ghosts.into_iter().zip(GHOST).rev() {
+        paint(frame, maze.pixel(place), colour);
+    }
+    paint(
+        frame,
+        maze.pixel(agent),
+        if boosted { AGENT_BOOSTED } else { AGENT },
+    );
+}
+
+fn paint(frame: &mut [u8], pixel: usize, colour: Colour) {
+    frame[pixel * CHANNELS..][..CHANNELS].copy_from_slice(&colour);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn colours_are_distinct() {
+        let mut colours = vec![WALL, FLOOR, PELLET, BOOST, AGENT, AGENT_BOOSTED, FUCHSIA];
+        colours.extend(GHOST);
+        let count = colours.len();
+        colours.sort_unstable();
+        colours.dedup();
+        assert_eq!(colours.len(), count);
+    }
+
+    #[test]
+    fn the_agent_is_over_the_ghosts_and_the_first_ghost_over_the_rest() {
+        let maze = Maze::new();
+        let mut frame = vec![0; FRAME_BYTES];
+        background(&maze, &mut frame);
+        actors(&maze, [5, 5, 7, 7], 7, false, &mut frame);
+        let at = |place| frame[maze.pixel(place) * CHANNELS..][..CHANNELS].to_vec();
+        assert_eq!((at(5), at(7)), (GHOST[0].to_vec(), AGENT.to_vec()));
+    }
+}

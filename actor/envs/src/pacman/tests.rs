@@ -1,0 +1,503 @@
+//! The rules of Ms. PacMan, checked on games put into chosen situations.
+
+use rand::{Rng, SeedableRng};
+
+use super::ghost::Mode;
+use super::maze::WIDTH;
+use super::*;
+
+fn config() -> PacmanConfig {
+    PacmanConfig {
+        epsilon: 0.1,
+        switch_probability: 0.5,
+        lethal: [true; 4],
+        lethal_schedule: None,
+        boost_steps: 10,
+        step_limit: 500,
+        reward_pellet: 1.0,
+        reward_boost: 5.0,
+        reward_ghost: 20.0,
+        reward_death: -100.0,
+        reward_cleared: 1000.0,
+        ising: None,
+    }
+}
+
+/// Ghosts that keep to the mode they are put into.
+fn steady(config: &PacmanConfig) -> PacmanConfig {
+    PacmanConfig {
+        epsilon: 0.0,
+        switch_probability: 0.0,
+        ..config.clone()
+    }
+}
+
+fn at(world: &PacmanWorld, row: usize, column: usize) -> Place {
+    let places = world.maze.items().len() as u16;
+    (0..places)
+        .find(|&p| world.maze.pixel(p) == row * WIDTH + column)
+        .unwrap()
+}
+
+fn step(world: &mut PacmanWorld, action: u8) -> (f32, StepEnd) {
+    let (mut reward, mut end) = ([0.0], [StepEnd::Running]);
+    world.step(&[action], &mut reward, &mut end).unwrap();
+    (reward[0], end[0])
+}
+
+fn frame(world: &mut PacmanWorld) -> Vec<u8> {
+    let mut frames = vec![0; world.num_envs() * render::FRAME_BYTES];
+    world.observe(&mut frames);
+    frames
+}
+
+/// The bottom corridor, agent in column 9 and ghost 0 `apart` to the right, sure to come closer; the rest far away.
+fn duel(config: &PacmanConfig, apart: usize) -> PacmanWorld {
+    let mut world = PacmanWorld::new(&steady(config), 1, 0).unwrap();
+    let (agent, hunter, far) = (
+        at(&world, 19, 9),
+        at(&world, 19, 9 + apart),
+        at(&world, 1, 1),
+    );
+    let game = &mut world.copies[0];
+    game.agent = agent;
+    game.ghosts = [hunter, far, far, far].map(Ghost::at);
+    game.ghosts[0].mode = Mode::Follow;
+    world
+}
+
+/// Frames, rewards and ends of `steps` random steps.
+fn play(
+    world: &mut PacmanWorld,
+    steps: usize,
+    seed: u64,
+) -> (Vec<Vec<u8>>, Vec<f32>, Vec<StepEnd>) {
+    let n = world.num_envs();
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let (mut frames, mut all_rewards, mut all_ends) = (vec![], vec![], vec![]);
+    for _ in 0..steps {
+        frames.push(frame(world));
+        // The same action in every copy, so that a copy's play does not depend on how many there are.
+        let actions = vec![rng.random_range(0..5); n];
+        let (mut rewards, mut ends) = (vec![0.0; n], vec![StepEnd::Running; n]);
+        world.step(&actions, &mut rewards, &mut ends).unwrap();
+        all_rewards.extend(rewards);
+        all_ends.extend(ends);
+    }
+    (frames, all_rewards, all_ends)
+}
+
+#[test]
+fn a_copy_depends_on_seed_and_index_only() {
+    let (one, rewards, ends) = play(&mut PacmanWorld::new(&config(), 1, 3).unwrap(), 2_000, 1);
+    let (again, same_rewards, same_ends) =
+        play(&mut PacmanWorld::new(&config(), 1, 3).unwrap(), 2_000, 1);
+    assert_eq!((&one, &rewards, &ends), (&again, &same_rewards, &same_ends));
+    let (three, ..) = play(&mut PacmanWorld::new(&config(), 3, 3).unwrap(), 2_000, 1);
+    let (other, ..) = play(&mut PacmanWorld::new(&config(), 1, 4).unwrap(), 2_000, 1);
+    let bytes = render::FRAME_BYTES;
+    assert!(one.iter().zip(&three).all(|(a, b)| a[..] == b[..bytes]));
+    assert!(
+        three.iter().any(|f| f[..bytes] != f[bytes..2 * bytes]),
+        "copies differ"
+    );
+    assert_ne!(one, other, "seeds differ");
+    assert!(ends.contains(&StepEnd::Terminal), "some episode ended");
+}
+
+#[test]
+fn the_first_frame_shows_everything() {
+    let mut world = PacmanWorld::new(&config(), 1, 0).unwrap();
+    let frame = frame(&mut world);
+    let count = |colour: render::Colour| frame.chunks_exact(3).filter(|&p| p == colour).count();
+    assert_eq!(
+        (
+            count(render::AGENT),
+            count(render::PELLET),
+            count(render::BOOST)
+        ),
+        (1, 187, 4)
+    );
+    assert_eq!(render::GHOST.map(count), [1; 4]);
+    assert_eq!(count(render::WALL), 21 * 19 - 196);
+}
+
+#[test]
+fn a_wall_stops_the_agent_and_a_no_op_keeps_it() {
+    let mut world = duel(
+        &PacmanConfig {
+            lethal: [false; 4],
+            ..config()
+        },
+        3,
+    );
+    let before = world.copies[0].agent;
+    for action in [0, 2] {
+        step(&mut world, action);
+        assert_eq!(world.copies[0].agent, before);
+    }
+    step(&mut world, 3);
+    assert_eq!(world.copies[0].agent, at(&world, 19, 8));
+}
+
+#[test]
+fn food_is_eaten_once() {
+    let mut world = duel(
+        &PacmanConfig {
+            lethal: [false; 4],
+            ..config()
+        },
+        3,
+    );
+    assert_eq!(step(&mut world, 3).0, 1.0);
+    assert_eq!(world.copies[0].pellets_left, 186);
+    assert_eq!(
+        step(&mut world, 4).0,
+        1.0,
+        "the pellet on which the agent was put"
+    );
+    assert_eq!(step(&mut world, 3).0, 0.0);
+    let pixel = world.maze.pixel(at(&world, 19, 9));
+    assert_eq!(world.copies[0].background[pixel * 3..][..3], render::FLOOR);
+}
+
+#[test]
+fn contact_with_a_lethal_ghost_ends_the_episode() {
+    // Ghost 1 apart, agent waits: the ghost steps onto it.
+    assert_eq!(
+        step(&mut duel(&config(), 1), 0),
+        (1.0 - 100.0, StepEnd::Terminal)
+    );
+    // 1 apart, agent walks at it: they change places, which counts.
+    assert_eq!(
+        step(&mut duel(&config(), 1), 4),
+        (1.0 - 100.0, StepEnd::Terminal)
+    );
+    // 2 apart, both go to the middle.
+    assert_eq!(
+        step(&mut duel(&config(), 2), 4),
+        (1.0 - 100.0, StepEnd::Terminal)
+    );
+    // 1 apart, agent flees: the ghost is where the agent was, and no contact.
+    assert_eq!(step(&mut duel(&config(), 1), 3), (1.0, StepEnd::Running));
+}
+
+#[test]
+fn the_game_starts_again_after_an_end() {
+    let mut world = duel(&config(), 1);
+    let start = frame(&mut PacmanWorld::new(&config(), 1, 0).unwrap());
+    assert_ne!(frame(&mut world), start);
+    assert_eq!(step(&mut world, 0).1, StepEnd::Terminal);
+    assert_eq!(frame(&mut world), start);
+    assert_eq!(
+        (world.copies[0].pellets_left, world.copies[0].episode_step),
+        (187, 0)
+    );
+}
+
+#[test]
+fn contact_with_a_harmless_ghost_is_nothing() {
+    let mut world = duel(
+        &PacmanConfig {
+            lethal: [false, true, true, true],
+            ..config()
+        },
+        1,
+    );
+    assert_eq!(step(&mut world, 0), (1.0, StepEnd::Running));
+    assert_eq!(world.copies[0].ghosts[0].place, world.copies[0].agent);
+    assert_eq!(
+        step(&mut world, 0),
+        (0.0, StepEnd::Running),
+        "it stays, and still does nothing"
+    );
+}
+
+#[test]
+fn a_boosted_agent_destroys_ghosts_and_only_lethal_ones_pay() {
+    for (lethal, reward) in [([true; 4], 1.0 + 20.0), ([false, true, true, true], 1.0)] {
+        let mut world = duel(&PacmanConfig { lethal, ..config() }, 1);
+        world.copies[0].boost_left = 5;
+        assert_eq!(step(&mut world, 0), (reward, StepEnd::Running));
+        let home = Ghost::at(world.maze.ghost_starts()[0]);
+        assert_eq!(
+            world.copies[0].ghosts[0], home,
+            "back at its start, wandering"
+        );
+    }
+}
+
+#[test]
+fn a_boost_protects_in_its_own_step_and_the_next_ten() {
+    let mut world = duel(&config(), 1);
+    let (boost, beside) = (at(&world, 1, 1), at(&world, 1, 2));
+    let away = at(&world, 19, 9);
+    world.copies[0].agent = beside;
+    world.copies[0].ghosts = [boost, away, away, away].map(Ghost::at);
+    world.copies[0].ghosts[0].mode = Mode::Follow;
+    assert_eq!(
+        step(&mut world, 3),
+        (5.0 + 20.0, StepEnd::Running),
+        "protected while taking it"
+    );
+    for protected in 1..=11 {
+        let pixel = world.maze.pixel(boost) * 3;
+        let colour = if protected <= 10 {
+            render::AGENT_BOOSTED
+        } else {
+            render::AGENT
+        };
+        assert_eq!(frame(&mut world)[pixel..][..3], colour);
+        world.copies[0].ghosts[0] = Ghost {
+            mode: Mode::Follow,
+            ..Ghost::at(beside)
+        };
+        let expected = if protected <= 10 {
+            (20.0, StepEnd::Running)
+        } else {
+            (-100.0, StepEnd::Terminal)
+        };
+        assert_eq!(
+            step(&mut world, 0),
+            expected,
+            "step {protected} after the boost"
+        );
+    }
+}
+
+#[test]
+fn the_last_pellet_ends_the_episode_before_any_contact() {
+    let mut world = duel(&config(), 1);
+    world.copies[0].items.fill(Item::Nothing);
+    let last = at(&world, 19, 10);
+    world.copies[0].items[usize::from(last)] = Item::Pellet;
+    world.copies[0].pellets_left = 1;
+    assert_eq!(step(&mut world, 4), (1.0 + 1000.0, StepEnd::Terminal));
+}
+
+#[test]
+fn a_whole_game_can_be_cleared() {
+    let config = PacmanConfig {
+        lethal: [false; 4],
+        step_limit: 5_000,
+        ..config()
+    };
+    let mut world = PacmanWorld::new(&config, 1, 5).unwrap();
+    let mut total = 0.0;
+    for steps in 1.. {
+        let game = &world.copies[0];
+        let target = (0..game.items.len() as u16)
+            .filter(|&p| game.items[usize::from(p)] != Item::Nothing)
+            .min_by_key(|&p| world.maze.distance(game.agent, p))
+            .unwrap();
+        let action = (1..5)
+            .find(|&a| {
+                let there = world.maze.next(game.agent, a - 1);
+                world.maze.distance(there, target) < world.maze.distance(game.agent, target)
+            })
+            .unwrap();
+        let (reward, end) = step(&mut world, action);
+        total += reward;
+        if end != StepEnd::Running {
+            assert_eq!(end, StepEnd::Terminal);
+            assert!(steps < 400, "nearest-food play took {steps} steps");
+            break;
+        }
+    }
+    // No lethal ghost, so none pays; boosts may be left when the last pellet goes.
+    assert!((1187.0..=1207.0).contains(&total), "{total}");
+}
+
+#[test]
+fn episodes_are_cut_off_at_the_step_limit() {
+    let config = PacmanConfig {
+        step_limit: 7,
+        lethal: [false; 4],
+        ..config()
+    };
+    let (_, _, ends) = play(&mut PacmanWorld::new(&config, 1, 6).unwrap(), 21, 1);
+    let cut: Vec<usize> = (0..21).filter(|&i| ends[i] == StepEnd::TimedOut).collect();
+    assert_eq!(cut, [6, 13, 20]);
+    assert_eq!(
+        ends.iter().filter(|&&end| end == StepEnd::Running).count(),
+        18
+    );
+}
+
+#[test]
+fn the_lethal_ghost_changes_by_the_schedule() {
+    let schedule = LethalSchedule {
+        episodes_per_task: 2,
+        order: vec![0, 2, 3],
+    };
+    let config = PacmanConfig {
+        step_limit: 1,
+        lethal_schedule: Some(schedule),
+        ..config()
+    };
+    let mut world = PacmanWorld::new(&config, 1, 7).unwrap();
+    for ghost in [0, 0, 2, 2, 3, 3, 0, 0] {
+        let lethal = world.lethal(0).unwrap();
+        assert_eq!(lethal, std::array::from_fn(|g| g == ghost));
+        assert_eq!(step(&mut world, 0).1, StepEnd::TimedOut);
+    }
+    assert_eq!(world.lethal(1), None);
+}
+
+#[test]
+fn the_overlay_changes_walls_only_and_starts_afresh_in_each_episode() {
+    let overlay = IsingOverlay {
+        temperature: 0.4,
+        sweeps_per_step: 1,
+    };
+    let noisy = PacmanConfig {
+        ising: Some(overlay),
+        step_limit: 40,
+        ..config()
+    };
+    let plain = PacmanConfig {
+        ising: None,
+        ..noisy.clone()
+    };
+    let (seen, rewards, ends) = play(&mut PacmanWorld::new(&noisy, 1, 8).unwrap(), 400, 2);
+    let (bare, bare_rewards, _) = play(&mut PacmanWorld::new(&plain, 1, 8).unwrap(), 400, 2);
+    assert_eq!(rewards, bare_rewards);
+    let mut starts = vec![];
+    for (t, (a, b)) in seen.iter().zip(&bare).enumerate() {
+        let mut fuchsia = 0;
+        for (a, b) in a.chunks_exact(3).zip(b.chunks_exact(3)) {
+            if b == render::WALL {
+                assert!(a == render::WALL || a == render::FUCHSIA);
+                fuchsia += i32::from(a == render::FUCHSIA);
+            } else {
+                assert_eq!(a, b);
+            }
+        }
+        if t == 0 || ends[t - 1] != StepEnd::Running {
+            assert!(
+                (60..140).contains(&fuchsia),
+                "half of 203 walls, more or less: {fuchsia}"
+            );
+            starts.push(a);
+        }
+    }
+    assert!(
+        starts.windows(2).all(|pair| pair[0] != pair[1]),
+        "each start is another draw"
+    );
+}
+
+#[test]
+fn unusable_settings_and_actions_are_errors() {
+    let schedule = |episodes_per_task, order: &[u8]| {
+        Some(LethalSchedule {
+            episodes_per_task,
+            order: order.to_vec(),
+        })
+    };
+    let overlay = |temperature, sweeps_per_step| {
+        Some(IsingOverlay {
+            temperature,
+            sweeps_per_step,
+        })
+    };
+    for bad in [
+        PacmanConfig {
+            epsilon: 1.1,
+            ..config()
+        },
+        PacmanConfig {
+            epsilon: f64::NAN,
+            ..config()
+        },
+        PacmanConfig {
+            switch_probability: -0.1,
+            ..config()
+        },
+        PacmanConfig {
+            step_limit: 0,
+            ..config()
+        },
+        PacmanConfig {
+            reward_ghost: f32::INFINITY,
+            ..config()
+        },
+        PacmanConfig {
+            lethal_schedule: schedule(0, &[0]),
+            ..config()
+        },
+        PacmanConfig {
+            lethal_schedule: schedule(1, &[]),
+            ..config()
+        },
+        PacmanConfig {
+            lethal_schedule: schedule(1, &[4]),
+            ..config()
+        },
+        PacmanConfig {
+            ising: overlay(0.0, 1),
+            ..config()
+        },
+        PacmanConfig {
+            ising: overlay(0.4, 0),
+            ..config()
+        },
+    ] {
+        let error = PacmanWorld::new(&bad, 1, 0)
+            .err()
+            .expect("rejected")
+            .to_string();
+        assert!(
+            error.contains("must") || error.contains("0 to 3"),
+            "{error}"
+        );
+    }
+    assert!(PacmanWorld::new(&config(), 0, 0).is_err());
+    let mut world = PacmanWorld::new(&config(), 1, 0).unwrap();
+    let error = world
+        .step(&[5], &mut [0.0], &mut [StepEnd::Running])
+        .unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "action 5 of copy 0 is out of range: this world has 5 actions"
+    );
+}
+
+/// The returns of 1000 episodes of uniformly random actions, mean and its standard error.
+///
+/// These are the reference numbers for a uniform policy in Ms. PacMan; run with `--nocapture` to read them.
+#[test]
+fn a_uniform_policy_earns_its_reference_return() {
+    let paid = PacmanConfig {
+        epsilon: 0.0,
+        switch_probability: 0.25,
+        reward_pellet: 0.1,
+        reward_boost: 0.1,
+        reward_ghost: 0.5,
+        reward_death: -1.0,
+        reward_cleared: 1.0,
+        ..config()
+    };
+    for (lethal, reference) in [([true; 4], 0.04), ([true, false, false, false], 1.01)] {
+        let config = PacmanConfig {
+            lethal,
+            ..paid.clone()
+        };
+        let mut world = PacmanWorld::new(&config, 1, 1).unwrap();
+        let mut rng = ChaCha8Rng::seed_from_u64(2);
+        let (mut returns, mut total, mut steps) = (vec![], 0.0, 0);
+        while returns.len() < 1000 {
+            let (reward, end) = step(&mut world, rng.random_range(0..5));
+            (total, steps) = (total + f64::from(reward), steps + 1);
+            if end != StepEnd::Running {
+                returns.push(std::mem::take(&mut total));
+            }
+        }
+        let mean = returns.iter().sum::<f64>() / 1000.0;
+        let variance = returns.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / 999.0;
+        let error = (variance / 1000.0).sqrt();
+        let length = f64::from(steps) / 1000.0;
+        println!("lethal {lethal:?}: {mean:.3} +- {error:.3}, {length:.1} env steps an episode");
+        assert!((mean - reference).abs() < 5.0 * error);
+    }
+}

@@ -1,0 +1,160 @@
+//! The engine's C interface (libenv version 1), type for type.
+//! Nothing here is safe to use by itself; `vec_game` is where the rules of the calls are kept.
+//!
+//! Source: `gym3/libenv.h` of gym3 0.3.3 and `procgen/src/vecgame.cpp` of procgen 0.10.7.
+
+use std::ffi::{c_char, c_void};
+use std::mem::{offset_of, size_of};
+
+pub(crate) const NAME_BYTES: usize = 128;
+pub(crate) const DIMENSIONS_MAX: usize = 16;
+pub(crate) const LIBENV_VERSION: i32 = 1;
+
+pub(crate) const DTYPE_UINT8: u32 = 1;
+pub(crate) const DTYPE_INT32: u32 = 2;
+pub(crate) const DTYPE_FLOAT32: u32 = 3;
+
+pub(crate) const SPACE_OBSERVATION: u32 = 1;
+pub(crate) const SPACE_ACTION: u32 = 2;
+pub(crate) const SPACE_INFO: u32 = 3;
+
+/// A bound of a tensor's values; the tensor's dtype says which field holds it.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub(crate) union LibenvValue {
+    pub(crate) uint8: u8,
+    pub(crate) int32: i32,
+    pub(crate) float32: f32,
+}
+
+/// One tensor of a space. The engine leaves the bytes after the name's NUL and the shape past `ndim` unset.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub(crate) struct LibenvTensortype {
+    pub(crate) name: [c_char; NAME_BYTES],
+    pub(crate) scalar_type: u32,
+    pub(crate) dtype: u32,
+    pub(crate) shape: [i32; DIMENSIONS_MAX],
+    pub(crate) ndim: i32,
+    pub(crate) low: LibenvValue,
+    pub(crate) high: LibenvValue,
+}
+
+/// One setting: `count` values of `dtype` at `data`.
+#[repr(C)]
+pub(crate) struct LibenvOption {
+    pub(crate) name: [c_char; NAME_BYTES],
+    pub(crate) dtype: u32,
+    pub(crate) count: i32,
+    pub(crate) data: *mut c_void,
+}
+
+/// The settings; passed by value.
+#[repr(C)]
+pub(crate) struct LibenvOptions {
+    pub(crate) items: *mut LibenvOption,
+    pub(crate) count: i32,
+}
+
+/// Where the engine reads and writes. Pointer arrays are indexed by `tensor * num_envs + env`.
+#[repr(C)]
+pub(crate) struct LibenvBuffers {
+    pub(crate) ob: *mut *mut c_void,
+    pub(crate) rew: *mut f32,
+    pub(crate) first: *mut u8,
+    pub(crate) info: *mut *mut c_void,
+    pub(crate) ac: *mut *mut c_void,
+}
+
+const _: () = {
+    assert!(size_of::<LibenvValue>() == 4);
+    assert!(size_of::<LibenvTensortype>() == 212);
+    assert!(offset_of!(LibenvTensortype, scalar_type) == 128);
+    assert!(offset_of!(LibenvTensortype, dtype) == 132);
+    assert!(offset_of!(LibenvTensortype, shape) == 136);
+    assert!(offset_of!(LibenvTensortype, ndim) == 200);
+    assert!(offset_of!(LibenvTensortype, low) == 204);
+    assert!(offset_of!(LibenvTensortype, high) == 208);
+    assert!(size_of::<LibenvOption>() == 144);
+    assert!(offset_of!(LibenvOption, dtype) == 128);
+    assert!(offset_of!(LibenvOption, count) == 132);
+    assert!(offset_of!(LibenvOption, data) == 136);
+    assert!(size_of::<LibenvOptions>() == 16);
+    assert!(offset_of!(LibenvOptions, count) == 8);
+    assert!(size_of::<LibenvBuffers>() == 40);
+    assert!(offset_of!(LibenvBuffers, info) == 24);
+};
+
+pub(crate) type Handle = *mut c_void;
+pub(crate) type Version = unsafe extern "C" fn() -> i32;
+pub(crate) type Make = unsafe extern "C" fn(i32, LibenvOptions) -> Handle;
+pub(crate) type GetTensortypes = unsafe extern "C" fn(Handle, u32, *mut LibenvTensortype) -> i32;
+pub(crate) type SetBuffers = unsafe extern "C" fn(Handle, *mut LibenvBuffers);
+pub(crate) type Unit = unsafe extern "C" fn(Handle);
+pub(crate) type GetState = unsafe extern "C" fn(Handle, i32, *mut c_char, i32) -> i32;
+pub(crate) type SetState = unsafe extern "C" fn(Handle, i32, *mut c_char, i32);
+
+/// A name in the engine's fixed, NUL-terminated form. Panics on names that do not fit; ours are constants.
+pub(crate) fn name(text: &str) -> [c_char; NAME_BYTES] {
+    assert!(
+        text.len() < NAME_BYTES && text.is_ascii(),
+        "\"{text}\" does not fit in an option's name"
+    );
+    let mut name = [0; NAME_BYTES];
+    for (to, from) in name.iter_mut().zip(text.bytes()) {
+        *to = from as c_char;
+    }
+    name
+}
+
+impl LibenvTensortype {
+    /// An all-zero value for the engine to write over.
+    pub(crate) fn zeroed() -> LibenvTensortype {
+        let zero = LibenvValue { int32: 0 };
+        let (name, shape) = ([0; NAME_BYTES], [0; DIMENSIONS_MAX]);
+        LibenvTensortype {
+            name,
+            scalar_type: 0,
+            dtype: 0,
+            shape,
+            ndim: 0,
+            low: zero,
+            high: zero,
+        }
+    }
+
+    /// The name up to its NUL, with anything that is not ASCII replaced.
+    pub(crate) fn name(&self) -> String {
+        let bytes = self
+            .name
+            .iter()
+            .map(|&byte| byte as u8)
+            .take_while(|&byte| byte != 0);
+        bytes
+            .map(|byte| {
+                if byte.is_ascii() {
+                    char::from(byte)
+                } else {
+                    '?'
+                }
+            })
+            .collect()
+    }
+
+    /// The shape's used part.
+    pub(crate) fn shape(&self) -> &[i32] {
+        let ndim = usize::try_from(self.ndim).unwrap_or(0).min(DIMENSIONS_MAX);
+        &self.shape[..ndim]
+    }
+
+    /// Name, dtype and shape in one line, for messages.
+    pub(crate) fn describe(&self) -> String {
+        let dtype = match self.dtype {
+            DTYPE_UINT8 => "uint8".to_owned(),
+            DTYPE_INT32 => "int32".to_owned(),
+            DTYPE_FLOAT32 => "float32".to_owned(),
+            other => format!("dtype {other}"),
+        };
+        format!("{} {dtype} {:?}", self.name(), self.shape())
+    }
+}

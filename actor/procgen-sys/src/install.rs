@@ -1,0 +1,350 @@
+//! Puts the engine into the cache folder and knows whether it lies there whole.
+//! It does not load it, and fetches nothing with `DRIML_OFFLINE=1`.
+//!
+//! Layout: `<cache>/procgen-0.10.7/{libenv.so, assets/, LICENSE, installed.txt}`. `installed.txt` is written last and
+//! names the library's hash and the number and bytes of the pictures, so that a damaged folder is recognised.
+//! A folder is made beside its place and renamed into it, one process at a time, so that all that race succeed.
+
+use std::fs::{self, File, TryLockError};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use crate::WITHOUT_ENGINE;
+use crate::cache::Cache;
+use crate::library::{self, LoadError};
+use crate::wheel::{self, LIBENV_SHA256, VERSION, WHEEL_NAME, WHEEL_SHA256};
+
+/// How long to wait for another process that fetches or installs; then this one does it for itself.
+const WAIT_MAX: Duration = Duration::from_secs(120);
+
+/// The unpacked engine.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Engine {
+    root: PathBuf,
+}
+
+/// Why the engine is not there and could not be put there.
+#[derive(Debug, thiserror::Error)]
+pub enum InstallError {
+    /// The engine cannot run on this machine at all.
+    #[error(transparent)]
+    Machine(#[from] LoadError),
+    /// No variable says where the cache folder is.
+    #[error(
+        "procgen's engine has no cache folder: set DRIML_CACHE, XDG_CACHE_HOME or HOME {WITHOUT_ENGINE}"
+    )]
+    NoCacheFolder,
+    /// The engine was never installed.
+    #[error("procgen's engine is not installed in {root}: {to_install} {WITHOUT_ENGINE}", to_install = to_install(.root))]
+    Missing {
+        /// Where it would lie.
+        root: PathBuf,
+    },
+    /// The engine was installed, but something of it is gone or changed.
+    #[error("procgen's engine in {root} is damaged ({reason}): {to_install} {WITHOUT_ENGINE}", to_install = to_install(.root))]
+    Damaged {
+        /// Where it lies.
+        root: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// It would have to be fetched, which `DRIML_OFFLINE=1` forbids.
+    #[error("DRIML_OFFLINE=1 forbids fetching procgen's engine, and {reason}: {to_install} {WITHOUT_ENGINE}", to_install = to_install(.root))]
+    Offline {
+        /// Where it would lie.
+        root: PathBuf,
+        /// What is wrong with what lies there.
+        reason: String,
+    },
+    /// There is no pip to fetch it with.
+    #[error(
+        "fetching procgen's engine: none of `pip`, `pip3` and `python3 -m pip` works here; install pip \
+         (`apt-get install python3-pip`, `dnf install python3-pip`) {WITHOUT_ENGINE}"
+    )]
+    NoPip,
+    /// pip ran and failed.
+    #[error(
+        "fetching procgen's engine: `{pip} download` failed ({status}); is the network reachable? It said:\n  \
+         {output}\n{WITHOUT_ENGINE}"
+    )]
+    PipFailed {
+        /// The pip that ran.
+        pip: String,
+        /// How it ended.
+        status: String,
+        /// The last lines it printed.
+        output: String,
+    },
+    /// The wheel is not the pinned one.
+    #[error(
+        "{path} is not the wheel this was written for: its SHA-256 is {actual}, expected {expected}; \
+         delete it and check which package index pip uses {WITHOUT_ENGINE}"
+    )]
+    WrongHash {
+        /// The wheel.
+        path: PathBuf,
+        /// The pinned hash.
+        expected: String,
+        /// The file's hash.
+        actual: String,
+    },
+    /// The wheel cannot be unpacked.
+    #[error("unpacking {path}: {reason}; delete it and fetch it again {WITHOUT_ENGINE}")]
+    BadWheel {
+        /// The wheel.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The file system refused something.
+    #[error("installing procgen's engine: {doing} {path}: {source} {WITHOUT_ENGINE}")]
+    Io {
+        /// What was being done.
+        doing: &'static str,
+        /// With which file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+}
+
+impl InstallError {
+    pub(crate) fn io(doing: &'static str, path: &Path, source: io::Error) -> InstallError {
+        InstallError::Io {
+            doing,
+            path: path.to_owned(),
+            source,
+        }
+    }
+}
+
+/// How to get the engine into `root`, with and without a network.
+fn to_install(root: &Path) -> String {
+    let cache = root.parent().unwrap_or(root);
+    let command = wheel::download_command(cache);
+    format!(
+        "run with network access and without DRIML_OFFLINE, or fetch the wheel where there is a network with `{command}` and put it into {}",
+        cache.display()
+    )
+}
+
+impl Engine {
+    /// The engine in the cache folder, if it lies there whole.
+    ///
+    /// # Errors
+    /// Not installed, damaged, or a machine that cannot run it.
+    pub fn locate() -> Result<Engine, InstallError> {
+        Engine::locate_in(&Cache::from_env()?)
+    }
+
+    /// The engine in the cache folder; fetched with pip if it is missing or damaged.
+    ///
+    /// A wheel that already lies in the cache folder under its published name is used instead of fetching.
+    /// `progress` is told what is being done, a line at a time; nothing when all is there.
+    ///
+    /// # Errors
+    /// No pip, no network, a wrong hash, a full disk, `DRIML_OFFLINE=1`, or a machine that cannot run it.
+    pub fn install(progress: &mut dyn FnMut(&str)) -> Result<Engine, InstallError> {
+        Engine::install_in(&Cache::from_env()?, progress, wheel::fetch)
+    }
+
+    /// Unpacks a wheel that the user has fetched; what lay in the cache folder is replaced unless it is whole.
+    ///
+    /// # Errors
+    /// A wrong hash, an unreadable file, a full disk, or a machine that cannot run it.
+    pub fn install_from_wheel(wheel: &Path) -> Result<Engine, InstallError> {
+        library::check_machine()?;
+        Engine::unpack_into(&Cache::from_env()?, wheel, WHEEL_SHA256, LIBENV_SHA256)
+    }
+
+    /// The folder that holds everything.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// The engine's library.
+    pub fn library(&self) -> PathBuf {
+        self.root.join("libenv.so")
+    }
+
+    /// The folder of the pictures.
+    pub fn assets(&self) -> PathBuf {
+        self.root.join("assets")
+    }
+
+    fn root_in(cache: &Cache) -> PathBuf {
+        cache.folder.join(format!("procgen-{VERSION}"))
+    }
+
+    fn locate_in(cache: &Cache) -> Result<Engine, InstallError> {
+        library::check_machine()?;
+        Engine::whole(Engine::root_in(cache), LIBENV_SHA256)
+    }
+
+    fn install_in(
+        cache: &Cache,
+        progress: &mut dyn FnMut(&str),
+        fetch: impl Fn(&Path) -> Result<PathBuf, InstallError>,
+    ) -> Result<Engine, InstallError> {
+        let reason = match Engine::locate_in(cache) {
+            Ok(engine) => return Ok(engine),
+            Err(InstallError::Missing { .. }) => "it is not installed".to_owned(),
+            Err(InstallError::Damaged { reason, .. }) => {
+                format!("the installed one is damaged ({reason})")
+            }
+            Err(other) => return Err(other),
+        };
+        let root = Engine::root_in(cache);
+        let provided = cache.folder.join(WHEEL_NAME);
+        if provided.is_file() {
+            progress(&format!(
+                "procgen's engine: unpacking {} into {}",
+                provided.display(),
+                root.display()
+            ));
+            return Engine::unpack_into(cache, &provided, WHEEL_SHA256, LIBENV_SHA256);
+        }
+        if cache.offline {
+            return Err(InstallError::Offline { root, reason });
+        }
+        fs::create_dir_all(&cache.folder)
+            .map_err(|error| InstallError::io("making", &cache.folder, error))?;
+        let _turn = wait_for_turn(cache, "fetch.lock", WAIT_MAX);
+        if let Ok(engine) = Engine::locate_in(cache) {
+            return Ok(engine);
+        }
+        progress(&format!(
+            "procgen's engine: {reason}; fetching version {VERSION} with pip (36 MB)"
+        ));
+        let folder = tempfile::Builder::new()
+            .prefix("fetch-")
+            .tempdir_in(&cache.folder);
+        let folder =
+            folder.map_err(|error| InstallError::io("making a folder in", &cache.folder, error))?;
+        let wheel = fetch(folder.path())?;
+        progress(&format!(
+            "procgen's engine: unpacking into {}",
+            root.display()
+        ));
+        Engine::unpack_into(cache, &wheel, WHEEL_SHA256, LIBENV_SHA256)
+    }
+
+    /// Checks and unpacks the wheel beside its place, then renames it into it.
+    fn unpack_into(
+        cache: &Cache,
+        wheel: &Path,
+        wheel_hash: &str,
+        library_hash: &str,
+    ) -> Result<Engine, InstallError> {
+        wheel::check_hash(wheel, wheel_hash)?;
+        fs::create_dir_all(&cache.folder)
+            .map_err(|error| InstallError::io("making", &cache.folder, error))?;
+        let folder = tempfile::Builder::new()
+            .prefix("unpack-")
+            .tempdir_in(&cache.folder);
+        let folder =
+            folder.map_err(|error| InstallError::io("making a folder in", &cache.folder, error))?;
+        let fresh = folder.path().join("fresh");
+        fs::create_dir(&fresh).map_err(|error| InstallError::io("making", &fresh, error))?;
+        wheel::unpack(wheel, &fresh)?;
+        let marker = marker(&fresh)?;
+        fs::write(fresh.join("installed.txt"), marker)
+            .map_err(|error| InstallError::io("writing", &fresh, error))?;
+
+        let root = Engine::root_in(cache);
+        let _turn = wait_for_turn(cache, "install.lock", WAIT_MAX);
+        if let Ok(engine) = Engine::whole(root.clone(), library_hash) {
+            return Ok(engine);
+        }
+        if root.exists() {
+            // What is moved into the temporary folder goes with it.
+            fs::rename(&root, folder.path().join("damaged"))
+                .map_err(|error| InstallError::io("moving away the damaged", &root, error))?;
+        }
+        match fs::rename(&fresh, &root) {
+            Ok(()) => Engine::whole(root, library_hash),
+            // Where files cannot be locked, somebody may have been faster: theirs is as good, if it is whole.
+            Err(error) => Engine::whole(root.clone(), library_hash)
+                .map_err(|_| InstallError::io("renaming into place", &root, error)),
+        }
+    }
+
+    /// The engine in `root`, if nothing of it is missing or changed.
+    fn whole(root: PathBuf, library_hash: &str) -> Result<Engine, InstallError> {
+        if !root.exists() {
+            return Err(InstallError::Missing { root });
+        }
+        let damaged = |reason: &str| InstallError::Damaged {
+            root: root.clone(),
+            reason: reason.to_owned(),
+        };
+        let expected = fs::read_to_string(root.join("installed.txt"));
+        let expected = expected.map_err(|_| damaged("installed.txt cannot be read"))?;
+        let actual = marker(&root).map_err(|error| match error {
+            InstallError::Io { path, source, .. } => {
+                damaged(&format!("{}: {source}", path.display()))
+            }
+            other => other,
+        })?;
+        if !actual.contains(library_hash) {
+            return Err(damaged("libenv.so has another SHA-256 than the pinned one"));
+        }
+        if expected != actual {
+            return Err(damaged("pictures are missing or changed"));
+        }
+        Ok(Engine { root })
+    }
+}
+
+/// Lets one process at a time do something, by locking a file; the turn ends when what this gives is dropped.
+///
+/// `None` when the file cannot be locked or the limit has passed: then two may do the same at once, which wastes
+/// time, and at worst one of them reports an error.
+fn wait_for_turn(cache: &Cache, name: &str, limit: Duration) -> Option<File> {
+    let file = File::create(cache.folder.join(name)).ok()?;
+    let started = Instant::now();
+    loop {
+        match file.try_lock() {
+            Ok(()) => return Some(file),
+            Err(TryLockError::WouldBlock) if started.elapsed() < limit => {
+                std::thread::sleep(Duration::from_millis(50));
+            }
+            Err(_) => return None,
+        }
+    }
+}
+
+/// What `installed.txt` says of the folder `root`.
+fn marker(root: &Path) -> Result<String, InstallError> {
+    let library = root.join("libenv.so");
+    let hash =
+        wheel::sha256(&library).map_err(|error| InstallError::io("reading", &library, error))?;
+    let assets = root.join("assets");
+    let (files, bytes) =
+        count(&assets).map_err(|error| InstallError::io("reading", &assets, error))?;
+    Ok(format!(
+        "procgen {VERSION}\nlibenv.so sha256 {hash}\nassets {files} files {bytes} bytes\n"
+    ))
+}
+
+/// Files and bytes below a folder.
+fn count(folder: &Path) -> io::Result<(u64, u64)> {
+    let (mut files, mut bytes) = (0, 0);
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        let data = entry.metadata()?;
+        if data.is_dir() {
+            let (more_files, more_bytes) = count(&entry.path())?;
+            files += more_files;
+            bytes += more_bytes;
+        } else {
+            files += 1;
+            bytes += data.len();
+        }
+    }
+    Ok((files, bytes))
+}
+
+#[cfg(test)]
+mod tests;

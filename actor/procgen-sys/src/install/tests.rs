@@ -1,0 +1,199 @@
+//! Installing without a network: made-up wheels, races, damage, messages.
+//! The real wheel is unpacked in `tests/engine.rs`.
+
+use std::io::Write;
+
+use super::*;
+
+fn cache(folder: &Path, offline: bool) -> Cache {
+    Cache {
+        folder: folder.join("cache"),
+        offline,
+    }
+}
+
+/// A wheel with a made-up library, its hash and the library's.
+fn made_up(folder: &Path) -> (PathBuf, String, String) {
+    let path = folder.join("made-up.whl");
+    let mut writer = zip::ZipWriter::new(File::create(&path).unwrap());
+    for name in [
+        "procgen/data/prebuilt/libenv.so",
+        "procgen/data/assets/a.png",
+        "procgen/data/assets/b/c.png",
+    ] {
+        writer
+            .start_file(name, zip::write::SimpleFileOptions::default())
+            .unwrap();
+        writer.write_all(name.as_bytes()).unwrap();
+    }
+    writer.finish().unwrap();
+    let hash = wheel::sha256(&path).unwrap();
+    let library = folder.join("library");
+    fs::write(&library, "procgen/data/prebuilt/libenv.so").unwrap();
+    (path, hash, wheel::sha256(&library).unwrap())
+}
+
+/// Names of what lies in the cache folder, sorted.
+fn left(cache: &Cache) -> Vec<String> {
+    let entries = fs::read_dir(&cache.folder).unwrap();
+    let name = |entry: io::Result<fs::DirEntry>| entry.unwrap().file_name().into_string().unwrap();
+    let mut names: Vec<String> = entries.map(name).collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn damage_is_recognised_and_repaired() {
+    let folder = tempfile::tempdir().unwrap();
+    let cache = cache(folder.path(), true);
+    let (wheel, hash, library) = made_up(folder.path());
+    let install = || Engine::unpack_into(&cache, &wheel, &hash, &library);
+    let reason = |root: &Path| {
+        Engine::whole(root.to_owned(), &library)
+            .unwrap_err()
+            .to_string()
+    };
+
+    let root = install().unwrap().root;
+    assert_eq!(
+        Engine::whole(root.clone(), &library).unwrap().library(),
+        root.join("libenv.so")
+    );
+    fs::write(root.join("libenv.so"), "other").unwrap();
+    assert!(
+        reason(&root).contains("another SHA-256"),
+        "{}",
+        reason(&root)
+    );
+    install().unwrap();
+    fs::remove_file(root.join("assets/b/c.png")).unwrap();
+    assert!(
+        reason(&root).contains("pictures are missing"),
+        "{}",
+        reason(&root)
+    );
+    install().unwrap();
+    fs::remove_file(root.join("installed.txt")).unwrap();
+    assert!(reason(&root).contains("installed.txt"), "{}", reason(&root));
+    install().unwrap();
+    assert_eq!(
+        fs::read(root.join("assets/b/c.png")).unwrap(),
+        b"procgen/data/assets/b/c.png"
+    );
+    assert_eq!(
+        left(&cache),
+        ["install.lock", "procgen-0.10.7"],
+        "nothing temporary is left"
+    );
+}
+
+#[test]
+fn installers_that_race_all_succeed() {
+    let folder = tempfile::tempdir().unwrap();
+    let cache = cache(folder.path(), true);
+    let (wheel, hash, library) = made_up(folder.path());
+    for damaged in [false, true] {
+        if damaged {
+            fs::remove_file(Engine::root_in(&cache).join("installed.txt")).unwrap();
+        }
+        std::thread::scope(|scope| {
+            let install = || Engine::unpack_into(&cache, &wheel, &hash, &library).unwrap();
+            let threads: Vec<_> = (0..8).map(|_| scope.spawn(install)).collect();
+            for thread in threads {
+                let engine = thread.join().unwrap();
+                Engine::whole(engine.root, &library).unwrap();
+            }
+        });
+        assert_eq!(
+            left(&cache),
+            ["install.lock", "procgen-0.10.7"],
+            "nothing temporary is left"
+        );
+    }
+}
+
+#[test]
+fn offline_says_what_to_do_and_fetches_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let cache = cache(folder.path(), true);
+    let fetch = |_: &Path| -> Result<PathBuf, InstallError> { panic!("fetched") };
+    let error = Engine::install_in(&cache, &mut |line| panic!("{line}"), fetch)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.starts_with(
+            "DRIML_OFFLINE=1 forbids fetching procgen's engine, and it is not installed"
+        ),
+        "{error}"
+    );
+    assert!(
+        error.contains("pip download procgen==0.10.7 --no-deps"),
+        "{error}"
+    );
+    assert!(error.ends_with(WITHOUT_ENGINE), "{error}");
+    assert!(
+        Engine::locate_in(&cache)
+            .unwrap_err()
+            .to_string()
+            .contains("not installed")
+    );
+}
+
+#[test]
+fn a_provided_wheel_is_used_and_its_hash_checked() {
+    let folder = tempfile::tempdir().unwrap();
+    let cache = cache(folder.path(), true);
+    fs::create_dir_all(&cache.folder).unwrap();
+    let (wheel, hash, _) = made_up(folder.path());
+    fs::copy(wheel, cache.folder.join(WHEEL_NAME)).unwrap();
+    let fetch = |_: &Path| -> Result<PathBuf, InstallError> { panic!("fetched") };
+    let mut lines = Vec::new();
+    let error =
+        Engine::install_in(&cache, &mut |line| lines.push(line.to_owned()), fetch).unwrap_err();
+    assert!(
+        matches!(&error, InstallError::WrongHash { actual, .. } if *actual == hash),
+        "{error}"
+    );
+    assert!(
+        error.to_string().contains(WHEEL_SHA256) && error.to_string().ends_with(WITHOUT_ENGINE),
+        "{error}"
+    );
+    assert_eq!(lines.len(), 1);
+}
+
+#[test]
+fn what_pip_said_is_passed_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let cache = cache(folder.path(), false);
+    let fetch = |_: &Path| {
+        let (pip, status) = ("pip".to_owned(), "exit status: 1".to_owned());
+        Err(InstallError::PipFailed {
+            pip,
+            status,
+            output: "ERROR: no route".to_owned(),
+        })
+    };
+    let error = Engine::install_in(&cache, &mut |_| {}, fetch)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.contains("is the network reachable?") && error.contains("ERROR: no route"),
+        "{error}"
+    );
+    for error in [InstallError::NoPip, InstallError::NoCacheFolder] {
+        assert!(error.to_string().ends_with(WITHOUT_ENGINE), "{error}");
+    }
+    assert_eq!(left(&cache), ["fetch.lock"], "nothing temporary is left");
+}
+
+#[test]
+fn one_process_fetches_and_the_others_wait_for_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let cache = cache(folder.path(), false);
+    fs::create_dir_all(&cache.folder).unwrap();
+    let turn = wait_for_turn(&cache, "a.lock", Duration::ZERO);
+    assert!(turn.is_some());
+    assert!(wait_for_turn(&cache, "a.lock", Duration::from_millis(120)).is_none());
+    drop(turn);
+    assert!(wait_for_turn(&cache, "a.lock", Duration::ZERO).is_some());
+}

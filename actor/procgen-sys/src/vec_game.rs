@@ -1,0 +1,349 @@
+//! Copies of one game, stepped together: the safe face of the engine.
+//! It passes the engine's flags on as they are and does not say what they mean for episodes.
+
+use std::ffi::c_void;
+
+use crate::ProcgenError;
+use crate::ffi::{self, DTYPE_INT32, DTYPE_UINT8, Handle, LibenvBuffers, LibenvTensortype};
+use crate::game::Game;
+use crate::install::{Engine, InstallError};
+use crate::library::{self, Api};
+use crate::options::{Options, RawOptions};
+use crate::pinned::Pinned;
+
+/// Rows and columns of a frame.
+pub const FRAME_SIDE: usize = 64;
+
+/// Bytes of a frame: 64 x 64 pixels, red, green and blue.
+pub const FRAME_BYTES: usize = FRAME_SIDE * FRAME_SIDE * 3;
+
+/// Number of actions; valid ones are `0..15`.
+pub const NUM_ACTIONS: usize = 15;
+
+/// The action that takes the game's no-op and then ends the episode, whatever happened.
+pub const RESET: i32 = -1;
+
+/// Bytes set aside for a state at first; grown when states come near it. The engine ends the process if one does not
+/// fit; states seen are below 100 kB.
+const STATE_BYTES: usize = 1 << 20;
+
+/// A copy's complete state, as the engine wrote it. Only the engine makes one, because it trusts what it reads back.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct State {
+    game: Game,
+    bytes: Vec<u8>,
+}
+
+impl State {
+    /// The engine's bytes.
+    pub fn bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+}
+
+/// N copies of one game. One thread at a time may use it; different ones may be used by different threads.
+pub struct VecGame {
+    api: &'static Api,
+    handle: Handle,
+    game: Game,
+    num_envs: usize,
+    state_bytes: usize,
+    // The engine keeps the addresses of all of these until `close`, which `Drop` calls before they go.
+    frames: Pinned<u8>,
+    rewards: Pinned<f32>,
+    first: Pinned<u8>,
+    prev_level_seed: Pinned<i32>,
+    prev_level_complete: Pinned<u8>,
+    level_seed: Pinned<i32>,
+    actions: Pinned<i32>,
+}
+
+// SAFETY: the engine ties a handle to no thread; it asks only that one thread at a time uses it (gym3's `libenv.h`),
+// which `&mut self` ensures. Its own threads touch the buffers only between `act` and `observe`, inside `act` here.
+unsafe impl Send for VecGame {}
+
+impl VecGame {
+    /// Makes the copies and resets them. The first one in a process reads all pictures (1 to 3 s).
+    ///
+    /// # Errors
+    /// Settings that the engine does not take, a library that cannot be loaded, or one that is not version 0.10.7.
+    pub fn new(engine: &Engine, options: &Options) -> Result<VecGame, ProcgenError> {
+        options.validate()?;
+        let api = library::load(&engine.library())?;
+        let assets = engine.assets();
+        // The engine reads files by joining strings and ends the process when one is missing.
+        if !assets.is_dir() {
+            let reason = "the folder of pictures is gone".to_owned();
+            return Err(InstallError::Damaged {
+                root: engine.root().to_owned(),
+                reason,
+            }
+            .into());
+        }
+        let resource_root = assets
+            .to_str()
+            .map(|path| format!("{path}/"))
+            .ok_or_else(|| {
+                ProcgenError::Unexpected(format!(
+                    "its path {} is not UTF-8; set DRIML_CACHE to another",
+                    assets.display()
+                ))
+            })?;
+        let n = options.num_envs;
+        let num_envs = i32::try_from(n).expect("validated to be small");
+        let mut raw = RawOptions::new(options, &resource_root);
+        // SAFETY: the settings were validated, are laid out as the engine reads them, and live until after the call.
+        let handle = unsafe { (api.make)(num_envs, raw.as_libenv()) };
+        if handle.is_null() {
+            return Err(ProcgenError::Unexpected("it made no game".to_owned()));
+        }
+        drop(raw);
+        let game = VecGame {
+            api,
+            handle,
+            game: options.game,
+            num_envs: n,
+            state_bytes: STATE_BYTES,
+            frames: Pinned::new(0, n * FRAME_BYTES),
+            rewards: Pinned::new(0.0, n),
+            first: Pinned::new(0, n),
+            prev_level_seed: Pinned::new(0, n),
+            prev_level_complete: Pinned::new(0, n),
+            level_seed: Pinned::new(0, n),
+            actions: Pinned::new(0, n),
+        };
+        game.check_types()?;
+        game.set_buffers();
+        Ok(game)
+    }
+
+    /// The game.
+    pub fn game(&self) -> Game {
+        self.game
+    }
+
+    /// Number of copies, N.
+    pub fn num_envs(&self) -> usize {
+        self.num_envs
+    }
+
+    /// The current frames [N, 64, 64, 3].
+    pub fn frames(&self) -> &[u8] {
+        // SAFETY: the engine writes only inside `act` and `set_state`, which take `&mut self`; so for all below.
+        unsafe { self.frames.as_slice() }
+    }
+
+    /// What the last actions earned [N]; 0 before the first.
+    pub fn rewards(&self) -> &[f32] {
+        // SAFETY: as in `frames`.
+        unsafe { self.rewards.as_slice() }
+    }
+
+    /// 1 where the current frame is the first of an episode [N].
+    pub fn first(&self) -> &[u8] {
+        // SAFETY: as in `frames`.
+        unsafe { self.first.as_slice() }
+    }
+
+    /// The level in which the last actions were taken [N].
+    pub fn prev_level_seed(&self) -> &[i32] {
+        // SAFETY: as in `frames`.
+        unsafe { self.prev_level_seed.as_slice() }
+    }
+
+    /// 1 where the last action completed its level [N].
+    pub fn prev_level_complete(&self) -> &[u8] {
+        // SAFETY: as in `frames`.
+        unsafe { self.prev_level_complete.as_slice() }
+    }
+
+    /// The level that the current frame shows [N].
+    pub fn level_seed(&self) -> &[i32] {
+        // SAFETY: as in `frames`.
+        unsafe { self.level_seed.as_slice() }
+    }
+
+    /// Takes one action in every copy, each in `0..15` or `RESET`, and waits for what comes of it.
+    ///
+    /// # Errors
+    /// Not N actions, or one out of range; nothing was stepped.
+    pub fn act(&mut self, actions: &[i32]) -> Result<(), ProcgenError> {
+        if actions.len() != self.num_envs {
+            let text = format!(
+                "{} actions for {} copies of {}",
+                actions.len(),
+                self.num_envs,
+                self.game
+            );
+            return Err(ProcgenError::Action(text));
+        }
+        let valid = RESET..NUM_ACTIONS as i32;
+        if let Some(env) = actions.iter().position(|action| !valid.contains(action)) {
+            let text = format!(
+                "action {} for copy {env} of {}; 0 to 14 exist",
+                actions[env], self.game
+            );
+            return Err(ProcgenError::Action(text));
+        }
+        // SAFETY: `act` below is the only call during which the engine reads the actions.
+        unsafe { self.actions.as_mut_slice() }.copy_from_slice(actions);
+        // SAFETY: the handle is open, the buffers are set, and no reference into them is alive thanks to `&mut self`.
+        // `observe` returns once every copy is stepped, so that nothing is written after this.
+        unsafe {
+            (self.api.act)(self.handle);
+            (self.api.observe)(self.handle);
+        }
+        Ok(())
+    }
+
+    /// The complete state of copy `env`: its level, its generators, everything.
+    ///
+    /// # Errors
+    /// No such copy.
+    pub fn state(&mut self, env: usize) -> Result<State, ProcgenError> {
+        let index = self.index(env)?;
+        let mut bytes = vec![0_u8; self.state_bytes];
+        // The engine may write 4 bytes past the length it is told (`write_string` forgets its own prefix).
+        let len =
+            i32::try_from(self.state_bytes - 8).expect("doubled from 1 MiB with a limit below");
+        // SAFETY: the handle is open, `index` is one of its copies, and `bytes` is longer than `len`.
+        let used =
+            unsafe { (self.api.get_state)(self.handle, index, bytes.as_mut_ptr().cast(), len) };
+        let used = usize::try_from(used)
+            .ok()
+            .filter(|used| *used < bytes.len());
+        let used = used.ok_or_else(|| {
+            ProcgenError::Unexpected("it wrote a state of an impossible size".to_owned())
+        })?;
+        if used > self.state_bytes / 2 && self.state_bytes < 1 << 28 {
+            self.state_bytes *= 2;
+        }
+        bytes.truncate(used);
+        bytes.shrink_to_fit();
+        Ok(State {
+            game: self.game,
+            bytes,
+        })
+    }
+
+    /// Puts copy `env` into a state of the same game; its frame, reward and flags become those of that state.
+    ///
+    /// # Errors
+    /// No such copy, or a state of another game.
+    pub fn set_state(&mut self, env: usize, state: &State) -> Result<(), ProcgenError> {
+        let index = self.index(env)?;
+        if state.game != self.game {
+            return Err(ProcgenError::State(format!(
+                "a state of {} for a copy of {}",
+                state.game, self.game
+            )));
+        }
+        let len = i32::try_from(state.bytes.len()).expect("the engine gave its length as an i32");
+        // SAFETY: the handle is open, its buffers are set, `index` is one of its copies, and the bytes are what the
+        // engine wrote for this game. It only reads them; the pointer is `*mut` for want of `const` in its header.
+        unsafe {
+            (self.api.set_state)(
+                self.handle,
+                index,
+                state.bytes.as_ptr().cast_mut().cast(),
+                len,
+            )
+        };
+        Ok(())
+    }
+
+    fn index(&self, env: usize) -> Result<i32, ProcgenError> {
+        if env >= self.num_envs {
+            return Err(ProcgenError::State(format!(
+                "copy {env} of {} copies of {}",
+                self.num_envs, self.game
+            )));
+        }
+        Ok(i32::try_from(env).expect("below num_envs, which is small"))
+    }
+
+    /// The buffers above are right only for exactly these tensors.
+    fn check_types(&self) -> Result<(), ProcgenError> {
+        let side = FRAME_SIDE as i32;
+        self.check_space(
+            "observations",
+            ffi::SPACE_OBSERVATION,
+            &[("rgb", DTYPE_UINT8, &[side, side, 3])],
+        )?;
+        self.check_space(
+            "actions",
+            ffi::SPACE_ACTION,
+            &[("action", DTYPE_INT32, &[])],
+        )?;
+        let infos: [(&str, u32, &[i32]); 3] = [
+            ("prev_level_seed", DTYPE_INT32, &[]),
+            ("prev_level_complete", DTYPE_UINT8, &[]),
+            ("level_seed", DTYPE_INT32, &[]),
+        ];
+        self.check_space("infos", ffi::SPACE_INFO, &infos)
+    }
+
+    fn check_space(
+        &self,
+        what: &str,
+        space: u32,
+        expected: &[(&str, u32, &[i32])],
+    ) -> Result<(), ProcgenError> {
+        // SAFETY: the handle is open; with a null pointer the engine only counts.
+        let count = unsafe { (self.api.get_tensortypes)(self.handle, space, std::ptr::null_mut()) };
+        if count != expected.len() as i32 {
+            return Err(ProcgenError::Unexpected(format!(
+                "{count} {what}, not {}",
+                expected.len()
+            )));
+        }
+        let mut types = vec![LibenvTensortype::zeroed(); expected.len()];
+        // SAFETY: the engine writes as many types as it just counted, and there is room for them.
+        unsafe { (self.api.get_tensortypes)(self.handle, space, types.as_mut_ptr()) };
+        let agrees = |(found, (name, dtype, shape)): (&LibenvTensortype, &(&str, u32, &[i32]))| {
+            found.name() == *name && found.dtype == *dtype && found.shape() == *shape
+        };
+        if types.iter().zip(expected).all(agrees) {
+            return Ok(());
+        }
+        let found: Vec<String> = types.iter().map(LibenvTensortype::describe).collect();
+        Err(ProcgenError::Unexpected(format!(
+            "its {what} are {}",
+            found.join(", ")
+        )))
+    }
+
+    /// Tells the engine where to read and write, which also does the first reset. Once only.
+    fn set_buffers(&self) {
+        let each = |address: &dyn Fn(usize) -> *mut c_void| {
+            (0..self.num_envs).map(address).collect::<Vec<_>>()
+        };
+        let mut ob = each(&|env| self.frames.address(env * FRAME_BYTES).cast());
+        let mut ac = each(&|env| self.actions.address(env).cast());
+        // In the order of the tensors that `check_types` has seen.
+        let mut info = each(&|env| self.prev_level_seed.address(env).cast());
+        info.extend(each(&|env| self.prev_level_complete.address(env).cast()));
+        info.extend(each(&|env| self.level_seed.address(env).cast()));
+        let mut buffers = LibenvBuffers {
+            ob: ob.as_mut_ptr(),
+            rew: self.rewards.address(0),
+            first: self.first.address(0),
+            info: info.as_mut_ptr(),
+            ac: ac.as_mut_ptr(),
+        };
+        // SAFETY: every address lies in memory that `self` keeps in place until the handle is closed, with the sizes
+        // that `check_types` has confirmed; the engine copies the pointer arrays. No reference into the buffers is
+        // alive, and `observe` returns once the first frames are written.
+        unsafe {
+            (self.api.set_buffers)(self.handle, &raw mut buffers);
+            (self.api.observe)(self.handle);
+        }
+    }
+}
+
+impl Drop for VecGame {
+    fn drop(&mut self) {
+        // SAFETY: the handle is open and not used again; the engine joins its threads before this returns.
+        unsafe { (self.api.close)(self.handle) };
+    }
+}

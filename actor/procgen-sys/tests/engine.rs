@@ -1,0 +1,347 @@
+//! What the real engine does, call by call: these are the facts that `driml-envs` builds its worlds on.
+//! The engine is fetched into the cache folder once; with `DRIML_OFFLINE=1` every test here is skipped.
+#![allow(clippy::unwrap_used)]
+
+use std::sync::OnceLock;
+
+use procgen_sys::{DistributionMode, Engine, Game, NUM_ACTIONS, Options, RESET, State, VecGame};
+
+/// The installed engine, or a line that says the test was skipped.
+fn engine(test: &str) -> Option<&'static Engine> {
+    static ENGINE: OnceLock<Engine> = OnceLock::new();
+    if std::env::var_os("DRIML_OFFLINE").is_some_and(|value| value == "1") {
+        println!("skipped: {test} (DRIML_OFFLINE=1)");
+        return None;
+    }
+    Some(ENGINE.get_or_init(|| Engine::install(&mut |line| println!("{line}")).unwrap()))
+}
+
+fn options(game: Game) -> Options {
+    Options {
+        game,
+        num_envs: 4,
+        num_levels: 500,
+        start_level: 0,
+        rand_seed: 7,
+        num_threads: 0,
+        distribution_mode: DistributionMode::Easy,
+        use_sequential_levels: false,
+        paint_vel_info: true,
+        use_backgrounds: true,
+        center_agent: true,
+        restrict_themes: false,
+    }
+}
+
+/// The actions of step `t`: a fixed pseudo-random sequence (Knuth's multiplicative hash).
+fn actions(t: usize, num_envs: usize) -> Vec<i32> {
+    let draw = |env: usize| ((t * 64 + env + 1) as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40;
+    (0..num_envs)
+        .map(|env| (draw(env) % NUM_ACTIONS as u64) as i32)
+        .collect()
+}
+
+/// Everything that can be seen after a step.
+fn seen(game: &VecGame) -> (Vec<u8>, Vec<f32>, Vec<u8>, Vec<i32>) {
+    (
+        game.frames().to_vec(),
+        game.rewards().to_vec(),
+        game.first().to_vec(),
+        game.level_seed().to_vec(),
+    )
+}
+
+#[test]
+fn every_game_steps() {
+    let Some(engine) = engine("every_game_steps") else {
+        return;
+    };
+    for game in Game::ALL {
+        let mut envs = VecGame::new(engine, &options(game)).unwrap();
+        assert_eq!(
+            envs.first(),
+            [1; 4],
+            "{game}: the first frame is a first one"
+        );
+        assert_eq!(envs.rewards(), [0.0; 4], "{game}");
+        assert!(
+            envs.level_seed()
+                .iter()
+                .all(|level| (0..500).contains(level)),
+            "{game}"
+        );
+        let start = envs.frames().to_vec();
+        for t in 0..50 {
+            envs.act(&actions(t, 4)).unwrap();
+        }
+        assert_ne!(envs.frames(), start, "{game}: nothing moved in 50 steps");
+    }
+}
+
+#[test]
+fn the_same_seed_gives_the_same_frames_on_any_number_of_threads() {
+    let Some(engine) = engine("the_same_seed_gives_the_same_frames_on_any_number_of_threads")
+    else {
+        return;
+    };
+    let run = |num_threads: usize, rand_seed: i32| -> Vec<_> {
+        let options = Options {
+            num_threads,
+            rand_seed,
+            ..options(Game::Starpilot)
+        };
+        let mut envs = VecGame::new(engine, &options).unwrap();
+        let mut tape = vec![seen(&envs)];
+        for t in 0..100 {
+            envs.act(&actions(t, 4)).unwrap();
+            tape.push(seen(&envs));
+        }
+        tape
+    };
+    let tape = run(0, 7);
+    assert!(tape == run(0, 7));
+    assert!(tape == run(2, 7));
+    assert!(tape != run(0, 8));
+}
+
+#[test]
+fn wrong_actions_are_refused_and_step_nothing() {
+    let Some(engine) = engine("wrong_actions_are_refused_and_step_nothing") else {
+        return;
+    };
+    let mut envs = VecGame::new(engine, &options(Game::Coinrun)).unwrap();
+    let before = envs.state(0).unwrap();
+    let error = envs.act(&[0, 0, 15, 0]).unwrap_err().to_string();
+    assert!(error.contains("action 15 for copy 2 of coinrun"), "{error}");
+    let error = envs.act(&[0, 0, 0, -2]).unwrap_err().to_string();
+    assert!(error.contains("action -2 for copy 3"), "{error}");
+    let error = envs.act(&[0; 3]).unwrap_err().to_string();
+    assert!(error.contains("3 actions for 4 copies"), "{error}");
+    assert_eq!(envs.state(0).unwrap(), before);
+}
+
+#[test]
+fn settings_that_would_end_the_process_are_errors() {
+    let Some(engine) = engine("settings_that_would_end_the_process_are_errors") else {
+        return;
+    };
+    let refused = |options: Options| VecGame::new(engine, &options).err().unwrap().to_string();
+    let text = refused(Options {
+        distribution_mode: DistributionMode::Memory,
+        ..options(Game::Bigfish)
+    });
+    assert!(
+        text.contains("bigfish has no distribution mode \"memory\""),
+        "{text}"
+    );
+    assert!(
+        refused(Options {
+            num_envs: 0,
+            ..options(Game::Bigfish)
+        })
+        .contains("0 copies")
+    );
+    assert!(
+        refused(Options {
+            start_level: -1,
+            ..options(Game::Bigfish)
+        })
+        .contains("start_level = -1")
+    );
+}
+
+#[test]
+fn a_state_put_back_repeats_the_trajectory_in_any_copy() {
+    let Some(engine) = engine("a_state_put_back_repeats_the_trajectory_in_any_copy") else {
+        return;
+    };
+    for game in Game::ALL {
+        let mut envs = VecGame::new(engine, &options(game)).unwrap();
+        let mut other = VecGame::new(
+            engine,
+            &Options {
+                num_envs: 1,
+                rand_seed: 99,
+                ..options(game)
+            },
+        )
+        .unwrap();
+        for t in 0..20 {
+            envs.act(&actions(t, 4)).unwrap();
+        }
+        let state = envs.state(2).unwrap();
+        assert!(!state.bytes().is_empty());
+        other.set_state(0, &state).unwrap();
+        let size = other.frames().len();
+        for t in 20..60 {
+            assert!(
+                other.frames() == &envs.frames()[2 * size..3 * size],
+                "{game}, step {t}"
+            );
+            assert_eq!(
+                other.level_seed()[0],
+                envs.level_seed()[2],
+                "{game}, step {t}"
+            );
+            assert_eq!(other.first()[0], envs.first()[2], "{game}, step {t}");
+            let actions = actions(t, 4);
+            envs.act(&actions).unwrap();
+            other.act(&actions[2..3]).unwrap();
+        }
+    }
+    let mut coinrun = VecGame::new(engine, &options(Game::Coinrun)).unwrap();
+    let mut maze = VecGame::new(engine, &options(Game::Maze)).unwrap();
+    let state = maze.state(0).unwrap();
+    assert!(
+        coinrun
+            .set_state(0, &state)
+            .unwrap_err()
+            .to_string()
+            .contains("a state of maze")
+    );
+    assert!(
+        coinrun
+            .state(4)
+            .unwrap_err()
+            .to_string()
+            .contains("copy 4 of 4")
+    );
+}
+
+#[test]
+fn the_reset_action_ends_the_episode_and_draws_a_level_of_the_set() {
+    let Some(engine) = engine("the_reset_action_ends_the_episode_and_draws_a_level_of_the_set")
+    else {
+        return;
+    };
+    let options = Options {
+        num_levels: 3,
+        start_level: 40,
+        ..options(Game::Maze)
+    };
+    let mut envs = VecGame::new(engine, &options).unwrap();
+    let mut drawn = std::collections::BTreeSet::new();
+    for _ in 0..30 {
+        envs.act(&[RESET, 4, 4, RESET]).unwrap();
+        assert_eq!(envs.first(), [1, 0, 0, 1]);
+        drawn.insert(envs.level_seed()[0]);
+    }
+    assert_eq!(drawn.into_iter().collect::<Vec<_>>(), [40, 41, 42]);
+}
+
+/// `first` stays 0, the level's number goes up by 997, and so leaves a set of 500 levels at once.
+#[test]
+fn sequential_levels_leave_their_set_without_a_flag() {
+    let Some(engine) = engine("sequential_levels_leave_their_set_without_a_flag") else {
+        return;
+    };
+    for game in [Game::Leaper, Game::Jumper, Game::Maze] {
+        let options = Options {
+            num_envs: 16,
+            use_sequential_levels: true,
+            ..options(game)
+        };
+        let mut envs = VecGame::new(engine, &options).unwrap();
+        let mut completed = 0;
+        for t in 0..1000 {
+            let before = envs.level_seed().to_vec();
+            envs.act(&actions(t, 16)).unwrap();
+            for (env, before) in before.into_iter().enumerate() {
+                let (first, level) = (envs.first()[env], envs.level_seed()[env]);
+                if envs.prev_level_complete()[env] == 1 {
+                    completed += 1;
+                    assert_eq!((first, level), (0, before + 997), "{game}, step {t}");
+                    assert_eq!(envs.prev_level_seed()[env], before, "{game}, step {t}");
+                } else if first == 0 {
+                    assert_eq!(level, before, "{game}, step {t}");
+                } else {
+                    assert!((0..500).contains(&level), "{game}, step {t}");
+                }
+            }
+        }
+        assert!(completed > 0, "{game}: no level was completed");
+    }
+}
+
+/// `timeout` and `cur_time` in a state: after version and name come 17 numbers, two generators (a flag and a text
+/// each), 5 numbers, `timeout`, 8 numbers and `cur_time`. Source: `Game::serialize` in `procgen/src/game.cpp`.
+fn time_limit_and_time(state: &State) -> (i32, i32) {
+    struct Reader<'a>(&'a [u8]);
+    impl Reader<'_> {
+        fn int(&mut self) -> i32 {
+            let (int, rest) = self.0.split_first_chunk().unwrap();
+            self.0 = rest;
+            i32::from_le_bytes(*int)
+        }
+        fn ints(&mut self, count: usize) {
+            for _ in 0..count {
+                self.int();
+            }
+        }
+        fn text(&mut self) {
+            let len = usize::try_from(self.int()).unwrap();
+            self.0 = &self.0[len..];
+        }
+    }
+    let mut reader = Reader(state.bytes());
+    reader.ints(1);
+    reader.text();
+    reader.ints(17);
+    for _ in 0..2 {
+        reader.ints(1);
+        reader.text();
+    }
+    // Reward, done, complete; then action.
+    reader.ints(4);
+    let limit = reader.int();
+    reader.ints(8);
+    (limit, reader.int())
+}
+
+/// The limits that `Game::time_limit_steps` promises are the engine's, in every mode of every game.
+#[test]
+fn time_limits_are_the_engines() {
+    let Some(engine) = engine("time_limits_are_the_engines") else {
+        return;
+    };
+    use DistributionMode::{Easy, Extreme, Hard, Memory};
+    for game in Game::ALL {
+        for mode in [Easy, Hard, Extreme, Memory]
+            .into_iter()
+            .filter(|mode| game.has(*mode))
+        {
+            let options = Options {
+                num_envs: 1,
+                distribution_mode: mode,
+                ..options(game)
+            };
+            let mut envs = VecGame::new(engine, &options).unwrap();
+            let limit = i32::try_from(game.time_limit_steps(mode)).unwrap();
+            assert_eq!(
+                time_limit_and_time(&envs.state(0).unwrap()),
+                (limit, 0),
+                "{game} {mode}"
+            );
+            envs.act(&[4]).unwrap();
+            assert_eq!(
+                time_limit_and_time(&envs.state(0).unwrap()),
+                (limit, 1),
+                "{game} {mode}"
+            );
+        }
+    }
+}
+
+/// In a maze, standing still ends the episode with the step whose number is the limit, without completing the level.
+#[test]
+fn a_time_limit_ends_the_episode_with_the_step_of_its_number() {
+    let Some(engine) = engine("a_time_limit_ends_the_episode_with_the_step_of_its_number") else {
+        return;
+    };
+    let mut envs = VecGame::new(engine, &options(Game::Maze)).unwrap();
+    for step in 1..=1000 {
+        envs.act(&[4; 4]).unwrap();
+        assert_eq!(envs.first(), [u8::from(step % 500 == 0); 4], "step {step}");
+        assert_eq!(envs.prev_level_complete(), [0; 4], "step {step}");
+    }
+}

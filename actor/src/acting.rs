@@ -1,0 +1,79 @@
+//! The acting loop: a policy in a world, one step of all copies at a time.
+//! It does not send, count or stop; recording, delivery and limits consume what it yields.
+
+use driml_envs::{EnvError, Environment, FrameStack, StepEnd};
+use rand_chacha::ChaCha8Rng;
+
+use crate::policy::Policy;
+
+/// One step of every copy.
+#[derive(Debug)]
+pub struct Step<'a> {
+    /// Frames [N, frame bytes] in which the actions were taken, unstacked.
+    pub frames: &'a [u8],
+    /// Actions [N].
+    pub actions: &'a [u8],
+    /// Rewards [N] that they earned.
+    pub rewards: &'a [f32],
+    /// What they ended [N].
+    pub ends: &'a [StepEnd],
+}
+
+/// A world in motion.
+pub struct Acting {
+    world: Box<dyn Environment>,
+    stack: FrameStack,
+    rng: ChaCha8Rng,
+    frames: Vec<u8>,
+    states: Vec<u8>,
+    actions: Vec<u8>,
+    rewards: Vec<f32>,
+    ends: Vec<StepEnd>,
+    first: Vec<bool>,
+}
+
+impl Acting {
+    /// Starts `world` with stacks of `frame_stack` frames; `rng` is for exploration alone.
+    ///
+    /// # Errors
+    /// A stack of no frames.
+    pub fn new(
+        world: Box<dyn Environment>,
+        frame_stack: usize,
+        rng: ChaCha8Rng,
+    ) -> Result<Self, EnvError> {
+        let (envs, shape) = (world.num_envs(), world.frame_shape());
+        Ok(Self {
+            stack: FrameStack::new(shape, frame_stack, envs)?,
+            rng,
+            frames: vec![0; envs * shape.bytes()],
+            states: vec![0; envs * shape.bytes() * frame_stack],
+            actions: vec![0; envs],
+            rewards: vec![0.0; envs],
+            ends: vec![StepEnd::Running; envs],
+            first: vec![true; envs],
+            world,
+        })
+    }
+
+    /// Lets `policy` act once in every copy.
+    ///
+    /// # Errors
+    /// The policy or the world failed; the world must not be stepped again.
+    pub fn step(&mut self, policy: &mut dyn Policy, epsilon: f64) -> anyhow::Result<Step<'_>> {
+        self.world.observe(&mut self.frames);
+        self.stack.push(&self.frames, &self.first);
+        self.stack.write(&mut self.states);
+        policy.act(&self.states, epsilon, &mut self.rng, &mut self.actions)?;
+        self.world.step(&self.actions, &mut self.rewards, &mut self.ends)?;
+        for (first, end) in self.first.iter_mut().zip(&self.ends) {
+            *first = *end != StepEnd::Running;
+        }
+        Ok(Step {
+            frames: &self.frames,
+            actions: &self.actions,
+            rewards: &self.rewards,
+            ends: &self.ends,
+        })
+    }
+}

@@ -1,0 +1,114 @@
+//! The actor's settings, and what it takes from the run's other tables.
+//! It fills in no number: presets do, with their sources.
+
+use driml_protocol::{RunSpec, config::Settings};
+use serde::{Deserialize, Serialize};
+
+/// The `[actor]` table.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Copies of the world in one actor process, stepped together.
+    pub envs: u32,
+    /// Steps of every copy in one chunk: how often an actor sends, and takes newer weights.
+    pub steps_per_chunk: u32,
+    /// Chunks waiting to be acknowledged; at this many the actor stops stepping until one is.
+    pub chunks_in_flight_max: u32,
+    /// Threads that step the copies; 0 steps them in the acting thread.
+    pub world_threads: u32,
+    /// Probability of a random action at the run's first frame.
+    pub epsilon_start: f64,
+    /// Probability of a random action from `epsilon_decay_frames` on.
+    pub epsilon_end: f64,
+    /// Frames of the whole run, all actors together, over which epsilon falls linearly.
+    pub epsilon_decay_frames: u64,
+    /// How long one try to deliver a chunk may take, milliseconds; then it is tried again.
+    pub ack_timeout_ms: u64,
+    /// How long the replay server or learner may be out of reach, milliseconds, before the actor gives up.
+    pub unreachable_max_ms: u64,
+}
+
+/// The `[input]` table: the size at which the network sees a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct InputSize {
+    /// Rows after enlargement.
+    pub height: u32,
+    /// Columns after enlargement.
+    pub width: u32,
+}
+
+/// Everything an actor needs to know of a run.
+#[derive(Clone, Debug)]
+pub struct ActorSettings {
+    /// What all parts agree on.
+    pub spec: RunSpec,
+    /// The world.
+    pub world: driml_envs::WorldConfig,
+    /// The size at which the network sees it.
+    pub input: InputSize,
+    /// The network.
+    pub model: driml_model::ModelConfig,
+    /// The actor's own.
+    pub actor: Config,
+}
+
+impl ActorSettings {
+    /// Reads the tables from a run's resolved settings.
+    ///
+    /// # Errors
+    /// A table that is missing or does not fit, or values that cannot work.
+    pub fn from_toml(text: &str) -> anyhow::Result<Self> {
+        let settings = Settings::parse(text)?;
+        let this = Self {
+            spec: settings.table("run")?,
+            world: settings.table("world")?,
+            input: settings.table("input")?,
+            model: settings.table("model")?,
+            actor: settings.table("actor")?,
+        };
+        this.spec.validate()?;
+        this.model.validate()?;
+        this.actor.validate()?;
+        Ok(this)
+    }
+}
+
+/// Why the actor's settings cannot work.
+#[derive(Debug, thiserror::Error, PartialEq)]
+#[error("actor.{key} = {value} cannot work: {why}")]
+pub struct ConfigError {
+    key: &'static str,
+    value: String,
+    why: &'static str,
+}
+
+impl Config {
+    /// Checks every field's range.
+    ///
+    /// # Errors
+    /// The first field that cannot work, and why.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let bad = |key, value: String, why| Err(ConfigError { key, value, why });
+        if !(1..=4096).contains(&self.envs) {
+            return bad("envs", self.envs.to_string(), "an actor steps 1 to 4096 copies");
+        }
+        if !(1..=4096).contains(&self.steps_per_chunk) {
+            return bad("steps_per_chunk", self.steps_per_chunk.to_string(), "a chunk has 1 to 4096 steps");
+        }
+        if !(1..=64).contains(&self.chunks_in_flight_max) {
+            return bad("chunks_in_flight_max", self.chunks_in_flight_max.to_string(), "1 to 64 chunks may wait");
+        }
+        for (key, epsilon) in [("epsilon_start", self.epsilon_start), ("epsilon_end", self.epsilon_end)] {
+            if !(0.0..=1.0).contains(&epsilon) {
+                return bad(key, epsilon.to_string(), "a probability lies between 0 and 1");
+            }
+        }
+        for (key, ms) in [("ack_timeout_ms", self.ack_timeout_ms), ("unreachable_max_ms", self.unreachable_max_ms)] {
+            if !(100..=86_400_000).contains(&ms) {
+                return bad(key, ms.to_string(), "a wait lasts 100 ms to one day");
+            }
+        }
+        Ok(())
+    }
+}

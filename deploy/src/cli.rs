@@ -1,0 +1,188 @@
+//! The command line: commands, flags and their help.
+//! It reads words only; what they mean together is for `config` and the commands.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+
+/// Deep Reinforcement and InfoMax Learning: actors, a replay server and a learner.
+#[derive(Debug, Parser)]
+#[command(name = "driml", version, max_term_width = 100)]
+pub(crate) struct Cli {
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Train on this machine: start all parts, show how it goes, leave a run folder
+    Local(LocalArgs),
+    /// One actor of a run whose replay server is reached at ENDPOINT
+    Actor(ActorArgs),
+    /// The replay server of a run; the other parts connect to it and take its settings
+    ReplayServer(ReplayServerArgs),
+    /// The learner of a run whose replay server is reached at ENDPOINT
+    Learner(LearnerArgs),
+    /// Play whole episodes with a run's newest weights, beside a random policy
+    Evaluate(EvaluateArgs),
+    /// Check the learner's arithmetic against updates computed elsewhere in float64
+    Parity(ParityArgs),
+    /// List the presets
+    Presets,
+    /// Procgen's engine
+    #[command(subcommand)]
+    Procgen(ProcgenCommand),
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ProcgenCommand {
+    /// Fetch the engine into the cache folder (DRIML_CACHE, or the user's own)
+    Install,
+}
+
+/// What to train, and with which settings.
+#[derive(Clone, Debug, Args)]
+pub(crate) struct RunFlags {
+    /// World: procgen:GAME, mspacman, chain or ising [default: procgen:bigfish]
+    #[arg(long, value_name = "WORLD")]
+    pub(crate) env: Option<String>,
+    /// Agent: c51, driml-fix, driml-ada or driml-randk [default: driml-ada]
+    #[arg(long, value_name = "AGENT")]
+    pub(crate) agent: Option<String>,
+    /// Named settings; `driml presets` lists them [default: paper]
+    #[arg(long, value_name = "NAME")]
+    pub(crate) preset: Option<String>,
+    /// Resolved settings of another run, its config.toml, instead of world, agent and preset
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["preset", "env", "agent"])]
+    pub(crate) config: Option<PathBuf>,
+    /// Actor processes [default: by cores]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub(crate) actors: Option<u32>,
+    /// Copies of the world in each actor [default: 16]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub(crate) envs: Option<u32>,
+    /// Frames of the whole run; it ends when they are in and their updates done
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=i64::MAX as u64))]
+    pub(crate) frames: Option<u64>,
+    /// Seed of every generator of the run
+    #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=i64::MAX as u64))]
+    pub(crate) seed: Option<u64>,
+    /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub(crate) sets: Vec<String>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct LocalArgs {
+    #[command(flatten)]
+    pub(crate) run: RunFlags,
+    /// Where settings, metrics, checkpoints, logs and summary go [default: runs/WORLD-AGENT-seedS-TIME]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) run_dir: Option<PathBuf>,
+    /// All parts in one process in a fixed order: the same seed gives the same weights
+    #[arg(long, conflicts_with = "listen")]
+    pub(crate) lockstep: bool,
+    /// Endpoint on which the parts meet [default: a unix socket in a fresh folder]
+    #[arg(long, value_name = "ENDPOINT")]
+    pub(crate) listen: Option<String>,
+}
+
+/// How a part reaches the run.
+#[derive(Debug, Args)]
+pub(crate) struct JoinFlags {
+    /// Prefix of the run's keys
+    #[arg(long, value_name = "NS", default_value = NAMESPACE)]
+    pub(crate) namespace: String,
+    /// End when the process that started this one ends
+    #[arg(long, hide = true)]
+    pub(crate) exit_with_parent: bool,
+}
+
+/// The prefix of a run's keys unless it is told otherwise.
+pub(crate) const NAMESPACE: &str = "driml";
+
+#[derive(Debug, Args)]
+pub(crate) struct ActorArgs {
+    /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; may be given several times
+    #[arg(long, value_name = "ENDPOINT", required = true)]
+    pub(crate) connect: Vec<String>,
+    /// Which actor this is; unique in the run
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) id: u32,
+    /// Copies of the world [default: as the run's settings say]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub(crate) envs: Option<u32>,
+    #[command(flatten)]
+    pub(crate) join: JoinFlags,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct LearnerArgs {
+    /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; may be given several times
+    #[arg(long, value_name = "ENDPOINT", required = true)]
+    pub(crate) connect: Vec<String>,
+    /// Where checkpoints go: DIR/checkpoints
+    #[arg(long, value_name = "DIR")]
+    pub(crate) run_dir: PathBuf,
+    #[command(flatten)]
+    pub(crate) join: JoinFlags,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ReplayServerArgs {
+    /// Endpoint to listen on, such as tcp/0.0.0.0:7447; may be given several times
+    #[arg(long, value_name = "ENDPOINT", required = true)]
+    pub(crate) listen: Vec<String>,
+    /// Router to connect to as well
+    #[arg(long, value_name = "ENDPOINT")]
+    pub(crate) connect: Vec<String>,
+    #[command(flatten)]
+    pub(crate) run: RunFlags,
+    #[command(flatten)]
+    pub(crate) join: JoinFlags,
+}
+
+/// Which levels to play.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Levels {
+    /// Those trained on
+    Train,
+    /// Others of the same game (Procgen)
+    Unseen,
+}
+
+#[derive(Debug, Args)]
+#[allow(dead_code, reason = "read by `evaluate`")]
+pub(crate) struct EvaluateArgs {
+    /// Folder of the run
+    #[arg(long, value_name = "DIR")]
+    pub(crate) run: PathBuf,
+    /// Whole episodes to play
+    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub(crate) episodes: u32,
+    /// Which levels to play
+    #[arg(long, value_enum, default_value_t = Levels::Train)]
+    pub(crate) levels: Levels,
+    /// Seed of the worlds and of exploration
+    #[arg(long, value_name = "S", default_value_t = 0)]
+    pub(crate) seed: u64,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ParityArgs {
+    /// Case files (safetensors)
+    #[arg(value_name = "FILE", required = true)]
+    pub(crate) files: Vec<PathBuf>,
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+}

@@ -1,0 +1,151 @@
+//! The settings that follow from others: filled in, checked when read back, refused when set by hand.
+//! It decides nothing of its own.
+
+use driml_envs::{WorldConfig, WorldName};
+use driml_learner::LearnerSettings;
+use toml::{Table, Value};
+
+use crate::{
+    error::{Usage, usage},
+    overrides::inline,
+    presets,
+};
+
+/// What follows, and from what.
+const FOLLOWS: [(&str, &str); 13] = [
+    ("run.world", "is chosen by --env"),
+    ("run.agent", "is chosen by --agent"),
+    ("run.frame_height", "follows from the world"),
+    ("run.frame_width", "follows from the world"),
+    ("run.frame_channels", "follows from the world"),
+    ("run.num_actions", "follows from the world"),
+    ("world.kind", "is chosen by --env"),
+    ("world.game", "is chosen by --env"),
+    ("model.height", "follows from input.height"),
+    ("model.width", "follows from input.width"),
+    ("model.channels", "follows from the world and run.frame_stack"),
+    ("model.num_actions", "follows from the world"),
+    ("model.dim", "follows from learner.update.lambda"),
+];
+
+/// Writes the names that everything else follows from.
+pub(crate) fn name(table: &mut Table, world: &str, agent: &str) {
+    put(table, "run.world", Value::String(world.into()));
+    put(table, "run.agent", Value::String(agent.into()));
+}
+
+/// Refuses a `--set` of something that follows from something else.
+///
+/// # Errors
+/// Says what to set instead.
+pub(crate) fn refuse(path: &str) -> Result<(), Usage> {
+    let follows = FOLLOWS.iter().find(|(known, _)| {
+        path == *known || path.strip_prefix(known).is_some_and(|rest| rest.starts_with('.'))
+    });
+    match follows {
+        Some((known, how)) => Err(usage!("{known} cannot be set by hand: it {how}")),
+        None => Ok(()),
+    }
+}
+
+/// Fills in what follows.
+///
+/// # Errors
+/// A table from which something follows and that cannot be read.
+pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
+    let world: WorldName = text(table, "run.world")?.parse().map_err(|e| usage!("run.world: {e}"))?;
+    put(table, "world.kind", Value::String(presets::family(world)));
+    if let WorldName::Procgen(game) = world {
+        put(table, "world.game", Value::String(game.name().into()));
+    }
+    let config: WorldConfig = part(table, "world")?;
+    let update: LearnerSettings = part(table, "learner.update")?;
+    let shape = driml_envs::frame_shape(&config);
+    let (num_actions, stack) = (driml_envs::num_actions(&config), whole(table, "run.frame_stack")?);
+    let dim = update.lambda.dim_parts(num_actions > 1);
+    let size = |value: usize| Value::Integer(value as i64);
+    let dim = Value::try_from(dim).map_err(|e| usage!("the DIM heads as TOML: {e}"))?;
+    for (path, value) in [
+        ("run.frame_height", size(shape.height)),
+        ("run.frame_width", size(shape.width)),
+        ("run.frame_channels", size(shape.channels)),
+        ("run.num_actions", size(num_actions)),
+        ("model.height", Value::Integer(whole(table, "input.height")?)),
+        ("model.width", Value::Integer(whole(table, "input.width")?)),
+        ("model.channels", Value::Integer(stack.saturating_mul(shape.channels as i64))),
+        ("model.num_actions", size(num_actions)),
+        ("model.dim", dim),
+    ] {
+        put(table, path, value);
+    }
+    visible_actions(table, world, num_actions);
+    Ok(())
+}
+
+/// Fills in what each action amounts to in the world, where that is asked for and not given.
+fn visible_actions(table: &mut Table, world: WorldName, num_actions: usize) {
+    let asked = find(table, "learner.affinity.alphabet").and_then(Value::as_str) == Some("visible");
+    if asked && find(table, "learner.affinity.visible").is_none() {
+        let map: Vec<u8> = match world {
+            WorldName::Procgen(game) => driml_envs::visible_actions(game).into(),
+            // In the other worlds every action does something of its own; each has fewer than 256.
+            _ => (0..num_actions).map(|action| action as u8).collect(),
+        };
+        let map = map.into_iter().map(|action| Value::Integer(action.into())).collect();
+        put(table, "learner.affinity.visible", Value::Array(map));
+    }
+}
+
+/// Checks that what a file says of what follows is what follows.
+///
+/// # Errors
+/// The first value at odds, and what it follows from.
+pub(crate) fn check(read: &Table) -> Result<(), Usage> {
+    let mut right = read.clone();
+    derive(&mut right)?;
+    for (path, how) in FOLLOWS {
+        if let (Some(was), Some(is)) = (find(read, path), find(&right, path))
+            && was != is
+        {
+            return Err(usage!("{path} = {}, but it {how} and is {}; correct the one or the other", inline(was), inline(is)));
+        }
+    }
+    Ok(())
+}
+
+fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
+    let (first, rest) = path.split_once('.').unwrap_or((path, ""));
+    let value = table.get(first)?;
+    if rest.is_empty() { Some(value) } else { find(value.as_table()?, rest) }
+}
+
+/// Writes a value, making the tables on the way; what is no table on the way stays, for its reader to refuse.
+fn put(table: &mut Table, path: &str, value: Value) {
+    match path.split_once('.') {
+        None => {
+            table.insert(path.into(), value);
+        }
+        Some((first, rest)) => {
+            let inner = table.entry(first).or_insert_with(|| Value::Table(Table::new()));
+            if let Some(inner) = inner.as_table_mut() {
+                put(inner, rest, value);
+            }
+        }
+    }
+}
+
+fn text(table: &Table, path: &str) -> Result<String, Usage> {
+    let value = find(table, path).and_then(Value::as_str);
+    value.map(str::to_owned).ok_or_else(|| usage!("the settings lack {path}, a word: use a config.toml that driml wrote"))
+}
+
+fn whole(table: &Table, path: &str) -> Result<i64, Usage> {
+    let value = find(table, path).and_then(Value::as_integer);
+    value.ok_or_else(|| usage!("the settings lack {path}, a whole number: use a config.toml that driml wrote"))
+}
+
+fn part<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
+    let value = find(table, path)
+        .ok_or_else(|| usage!("the settings have no [{path}] table: use a config.toml that driml wrote"))?;
+    value.clone().try_into().map_err(|e: toml::de::Error| usage!("in the settings' [{path}] table: {}", e.message()))
+}

@@ -1,0 +1,172 @@
+//! The composition root: the command line, a run's settings, the launcher and the run folder.
+//! It computes nothing that is learned; actors, replay server and learner are crates of their own.
+
+#![cfg_attr(test, allow(clippy::unwrap_used))]
+
+mod child;
+mod cli;
+mod config;
+mod derived;
+mod display;
+mod error;
+mod evaluate;
+mod interrupts;
+mod local;
+mod lockstep;
+mod machine;
+mod overrides;
+mod plan;
+mod presets;
+mod processes;
+mod record;
+mod statuses;
+
+use std::{
+    io::{IsTerminal, Write},
+    process::ExitCode,
+};
+
+use anyhow::Context;
+use clap::Parser;
+use driml_protocol::{Keys, Shutdown};
+use tracing_subscriber::EnvFilter;
+
+use crate::{
+    cli::{Cli, Command, JoinFlags, ParityArgs, ProcgenCommand, ReplayServerArgs},
+    error::{Interrupted, Usage, usage},
+};
+
+/// Exit code of a call or configuration that cannot work (`EX_USAGE`).
+const EXIT_USAGE: u8 = 64;
+/// Exit code after Ctrl-C, as shells have it.
+const EXIT_INTERRUPTED: u8 = 130;
+
+/// Runs the program: 0 when all went well, 64 for a call that cannot work, 130 when interrupted, 1 for all else.
+pub fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(e) => {
+            // Nothing is left to be done if the terminal is gone.
+            let _ = e.print();
+            return if e.use_stderr() { ExitCode::from(EXIT_USAGE) } else { ExitCode::SUCCESS };
+        }
+    };
+    log_to_stderr();
+    match run(cli.command) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) if e.is::<Interrupted>() => ExitCode::from(EXIT_INTERRUPTED),
+        Err(e) => {
+            eprintln!("error: {e:#}");
+            if e.is::<Usage>() { ExitCode::from(EXIT_USAGE) } else { ExitCode::FAILURE }
+        }
+    }
+}
+
+/// `DRIML_LOG` says what is logged, in the form of `RUST_LOG`.
+fn log_to_stderr() {
+    let filter = EnvFilter::try_from_env("DRIML_LOG").unwrap_or_else(|_| EnvFilter::new("warn,driml=info"));
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal())
+        .init();
+}
+
+fn run(command: Command) -> anyhow::Result<()> {
+    match command {
+        Command::Local(args) => local::run(args),
+        Command::Actor(args) => {
+            check_endpoints(&args.connect)?;
+            let shutdown = join(&args.join)?;
+            let (connect, namespace) = (args.connect, args.join.namespace);
+            driml_actor::run(driml_actor::RunArgs { connect, namespace, actor: args.id, envs: args.envs }, &shutdown)
+        }
+        Command::Learner(args) => {
+            check_endpoints(&args.connect)?;
+            let shutdown = join(&args.join)?;
+            let (connect, namespace) = (args.connect, args.join.namespace);
+            driml_learner::run(driml_learner::RunArgs { connect, namespace, run_dir: args.run_dir }, &shutdown)
+        }
+        Command::ReplayServer(args) => replay_server(args),
+        Command::Evaluate(args) => evaluate::run(&args),
+        Command::Parity(args) => parity(&args),
+        Command::Presets => print(&presets::describe()),
+        Command::Procgen(ProcgenCommand::Install) => {
+            let engine = procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
+            print(&format!("procgen's engine is in {}\n", engine.root().display()))
+        }
+    }
+}
+
+fn replay_server(args: ReplayServerArgs) -> anyhow::Result<()> {
+    check_endpoints(&args.listen)?;
+    check_endpoints(&args.connect)?;
+    let (config, _) = local::resolve(&args.run, &machine::Machine::this())?;
+    let shutdown = join(&args.join)?;
+    for note in &config.notes {
+        tracing::warn!("{note}");
+    }
+    let run = driml_replay_server::RunArgs {
+        listen: args.listen,
+        connect: args.connect,
+        namespace: args.join.namespace,
+        config_toml: config.to_toml(),
+    };
+    driml_replay_server::run(run, &shutdown)
+}
+
+fn parity(args: &ParityArgs) -> anyhow::Result<()> {
+    let mut failed = 0;
+    for file in &args.files {
+        let report = driml_learner::parity::check_file(file)?;
+        print(&report.to_string())?;
+        failed += usize::from(!report.passed());
+    }
+    anyhow::ensure!(failed == 0, "{failed} of {} files are out of tolerance", args.files.len());
+    Ok(())
+}
+
+/// Checks how a part reaches the run, and starts to listen for signals.
+fn join(flags: &JoinFlags) -> anyhow::Result<Shutdown> {
+    Keys::new(&flags.namespace).map_err(Usage)?;
+    Shutdown::on_signals(flags.exit_with_parent).context("listening for signals")
+}
+
+/// Refuses what zenoh could not open.
+fn check_endpoints(endpoints: &[String]) -> Result<(), Usage> {
+    let good = |endpoint: &str| match endpoint.split_once('/') {
+        Some(("tcp" | "tls", address)) => address.rsplit_once(':').is_some_and(|(host, _)| !host.is_empty()),
+        Some(("unixsock-stream", path)) => !path.is_empty(),
+        _ => false,
+    };
+    match endpoints.iter().find(|endpoint| !good(endpoint)) {
+        Some(endpoint) => Err(usage!(
+            "{endpoint:?} is no endpoint: take tcp/HOST:PORT, tls/HOST:PORT or unixsock-stream/PATH"
+        )),
+        None => Ok(()),
+    }
+}
+
+/// Writes to stdout; a reader that has gone away is no error.
+fn print(text: &str) -> anyhow::Result<()> {
+    let mut out = std::io::stdout().lock();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(e).context("writing to stdout"),
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn endpoints_that_zenoh_cannot_open_are_refused() {
+        for good in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tls/host:1", "unixsock-stream//tmp/driml.sock"] {
+            assert!(check_endpoints(&[good.into()]).is_ok(), "{good}");
+        }
+        for bad in ["", "localhost:7447", "tcp/localhost", "tcp/:1", "udp/1.2.3.4:5", "unixsock-stream/"] {
+            assert!(check_endpoints(&[bad.into()]).is_err(), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,107 @@
+//! `driml local`: settings, plan, engine, run folder, and then the parts, as processes or in lockstep.
+//! Starting and ending processes is for `processes`.
+
+use std::{
+    path::PathBuf,
+    time::{SystemTime, UNIX_EPOCH},
+};
+
+use driml_envs::{WorldConfig, WorldName};
+use driml_protocol::RunSpec;
+
+use crate::{
+    check_endpoints,
+    cli::{LocalArgs, RunFlags},
+    config::{self, Flags, RunConfig, Source},
+    error::{Usage, usage},
+    lockstep,
+    machine::Machine,
+    plan, presets, print, processes, record,
+};
+
+const ENV: &str = "procgen:bigfish";
+const AGENT: &str = "driml-ada";
+
+/// Trains on this machine.
+///
+/// # Errors
+/// Settings that cannot work, a run folder in use, an engine that cannot be had, a part that failed, an interrupt.
+pub(crate) fn run(args: LocalArgs) -> anyhow::Result<()> {
+    let machine = Machine::this();
+    let (config, from) = resolve(&args.run, &machine)?;
+    check_endpoints(args.listen.as_slice())?;
+    let run_dir = args.run_dir.unwrap_or_else(|| default_run_dir(&config.run));
+    record::check_free(&run_dir)?;
+    print(&plan::describe(&config, &from, &run_dir, args.lockstep, &machine))?;
+    if matches!(config.world, WorldConfig::Procgen(_)) {
+        procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
+    }
+    if args.lockstep {
+        lockstep::run(&config, &run_dir)
+    } else {
+        processes::run(&config, &run_dir, args.listen)
+    }
+}
+
+/// The settings that the flags ask for, and where they come from.
+///
+/// # Errors
+/// Flags or a file that cannot work.
+pub(crate) fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String), Usage> {
+    let flags = Flags {
+        actors: args.actors,
+        envs: args.envs,
+        frames: args.frames,
+        seed: args.seed,
+        sets: args.sets.clone(),
+    };
+    let (source, from) = match &args.config {
+        Some(path) => {
+            let name = path.display().to_string();
+            let text = std::fs::read_to_string(path).map_err(|e| usage!("reading the settings {name}: {e}"))?;
+            (Source::File(name.clone(), text), name)
+        }
+        None => {
+            let world: WorldName =
+                args.env.as_deref().unwrap_or(ENV).parse().map_err(|e| usage!("--env: {e}"))?;
+            let agent = presets::agent(args.agent.as_deref().unwrap_or(AGENT))?;
+            let preset = presets::preset(args.preset.as_deref().unwrap_or(presets::PRESETS[0].name))?;
+            (Source::Layers(preset, world, agent.name), format!("preset {}", preset.name))
+        }
+    };
+    Ok((config::resolve(&source, &flags, machine)?, from))
+}
+
+fn default_run_dir(run: &RunSpec) -> PathBuf {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
+    let world = run.world.replace(':', "-");
+    PathBuf::from("runs").join(format!("{world}-{}-seed{}-{}", run.agent, run.seed, timestamp(since)))
+}
+
+/// `20260131-235959` in UTC, from seconds since 1970.
+///
+/// Source: Howard Hinnant's `civil_from_days`, for days since 1970 that are not negative.
+fn timestamp(seconds: u64) -> String {
+    let (days, second) = (seconds / 86_400 + 719_468, seconds % 86_400);
+    let (era, day_of_era) = (days / 146_097, days % 146_097);
+    let year_of_era = (day_of_era - day_of_era / 1_460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let march_month = (5 * day_of_year + 2) / 153;
+    let day = day_of_year - (153 * march_month + 2) / 5 + 1;
+    let month = if march_month < 10 { march_month + 3 } else { march_month - 9 };
+    let year = year_of_era + era * 400 + u64::from(month <= 2);
+    format!("{year:04}{month:02}{day:02}-{:02}{:02}{:02}", second / 3600, second % 3600 / 60, second % 60)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn timestamps_are_the_calendars() {
+        assert_eq!(timestamp(0), "19700101-000000");
+        assert_eq!(timestamp(951_782_399), "20000228-235959");
+        assert_eq!(timestamp(951_782_400), "20000229-000000");
+        assert_eq!(timestamp(1_767_225_599), "20251231-235959");
+    }
+}

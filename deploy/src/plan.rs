@@ -1,0 +1,181 @@
+//! What a run will do and about how long it takes, for a person to read before it starts.
+//! It decides nothing, and its time is an estimate from the network's arithmetic, not a promise.
+
+use std::{path::Path, time::Duration};
+
+use driml_model::ModelConfig;
+
+use crate::{
+    config::{RunConfig, replay_bytes_each},
+    display::duration,
+    machine::Machine,
+};
+
+/// Arithmetic that a core sustains over a whole run, learner and actors together, in GFLOP/s.
+///
+/// Basis: about half of what a core of a 2-core AMD EPYC machine does in a plain matrix product (90 GFLOP/s).
+const GFLOPS_PER_CORE: f64 = 40.0;
+
+/// Multiplications and additions, each counted as one, of one row through parts of the network.
+struct RowFlops {
+    /// Torso up to f3.
+    local: f64,
+    /// From f3 to f4.
+    global: f64,
+    /// C51 head.
+    head: f64,
+    /// DIM heads that exist, at every location where they are applied.
+    dim: f64,
+}
+
+fn row_flops(model: &ModelConfig) -> RowFlops {
+    let mut flops = RowFlops { local: 0.0, global: 0.0, head: 0.0, dim: 0.0 };
+    let (mut height, mut width) = (model.height, model.width);
+    let mut channels = model.channels;
+    for layer in &model.conv {
+        height = (height - layer.kernel) / layer.stride + 1;
+        width = (width - layer.kernel) / layer.stride + 1;
+        flops.local += 2.0 * (height * width * layer.out * channels * layer.kernel * layer.kernel) as f64;
+        channels = layer.out;
+    }
+    for (name, shape) in model.parameter_shapes() {
+        if shape.len() != 2 {
+            continue;
+        }
+        let product = 2.0 * shape.iter().product::<usize>() as f64;
+        match name.as_str() {
+            "torso.fc.weight" => flops.global += product,
+            "head.weight" => flops.head += product,
+            local if local.starts_with("dim.psi3") || local.starts_with("dim.phi3") => {
+                flops.dim += product * (height * width) as f64;
+            }
+            _ => flops.dim += product,
+        }
+    }
+    flops
+}
+
+/// About how long the run takes on `cores` cores.
+///
+/// An update passes s_t forward and backward (3 times the forward arithmetic), s_{t+n} forward, and with DIM s_{t+k}
+/// forward and backward; the InfoNCE scores come on top: locations * rows^2 * rkhs. A frame is one forward pass.
+pub(crate) fn estimate(config: &RunConfig, cores: u32) -> Duration {
+    let (model, rows) = (&config.model, f64::from(config.learner.batch_rows));
+    let RowFlops { local, global, head, dim } = row_flops(model);
+    let forward = local + global + head;
+    let lambda = config.learner.update.lambda.wanted();
+    let with_dim = lambda.contains(&true);
+    let (height, width, _) = model.local_shape();
+    let locations = if lambda[..3].contains(&true) { (height * width) as f64 } else { 1.0 };
+    let scores = if with_dim { 6.0 * locations * rows * rows * model.rkhs as f64 } else { 0.0 };
+    let second_pass = if with_dim { 3.0 * (local + global) } else { 0.0 };
+    let update = rows * (4.0 * forward + second_pass + 3.0 * dim) + scores;
+    let flops = config.updates() as f64 * update + config.frames() as f64 * forward;
+    let seconds = flops / (GFLOPS_PER_CORE * 1e9 * f64::from(cores.max(1)));
+    Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX)
+}
+
+/// The plan, one fact a line.
+pub(crate) fn describe(config: &RunConfig, from: &str, run_dir: &Path, lockstep: bool, machine: &Machine) -> String {
+    let RunConfig { run, actor, replay, learner, local, .. } = config;
+    let bytes = config.frames().min(replay.capacity_transitions) * replay_bytes_each(run);
+    let processes = if lockstep {
+        "one, all parts in lockstep".into()
+    } else {
+        let actors = if local.actors == 1 { "actor" } else { "actors" };
+        format!(
+            "replay server; learner with {} threads; {} {actors} with {} copies of the world each",
+            local.learner_threads, local.actors, actor.envs
+        )
+    };
+    let lines = [
+        ("trains", format!("{} on {}, seed {}, from {from}", run.agent, run.world, run.seed)),
+        (
+            "frames",
+            format!(
+                "{} in all, with {} updates of {} rows (replay ratio {})",
+                config.frames(),
+                config.updates(),
+                learner.batch_rows,
+                replay.replay_ratio
+            ),
+        ),
+        ("processes", processes),
+        (
+            "replay",
+            format!(
+                "the newest {} transitions, up to {:.1} GiB of memory",
+                replay.capacity_transitions.min(config.frames()),
+                bytes as f64 / f64::from(1 << 30)
+            ),
+        ),
+        ("run folder", run_dir.display().to_string()),
+        ("time", format!("about {} (coarse: from the network's arithmetic)", about(estimate(config, machine.cores)))),
+    ];
+    let mut text: String = lines.iter().map(|(name, fact)| format!("{name:<12}{fact}\n")).collect();
+    for note in &config.notes {
+        text.push_str(&format!("{:<12}{note}\n", "note"));
+    }
+    text
+}
+
+/// A time that pretends to no more precision than an estimate has.
+fn about(time: Duration) -> String {
+    match time.as_secs() {
+        0..60 => "a minute".into(),
+        seconds @ 60..7200 => format!("{} min", seconds.div_ceil(60)),
+        seconds => duration(Duration::from_secs(seconds.div_ceil(3600) * 3600)).replace(" 0 min", "").replace(" 0 h", ""),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use expect_test::expect;
+
+    use super::*;
+    use crate::{
+        config::{Flags, Source, resolve},
+        presets::PRESETS,
+    };
+
+    const MACHINE: Machine = Machine { cores: 2, memory_bytes: 16 << 30 };
+
+    fn config(world: &str, agent: &'static str) -> RunConfig {
+        let source = Source::Layers(&PRESETS[0], world.parse().unwrap(), agent);
+        resolve(&source, &Flags::default(), &MACHINE).unwrap()
+    }
+
+    #[test]
+    fn the_plan_says_what_will_be_done() {
+        let config = config("procgen:bigfish", "driml-fix");
+        let plan = describe(&config, "preset paper", Path::new("runs/x"), false, &MACHINE);
+        // The time depends on a measured constant.
+        let plan: String = plan.lines().filter(|line| !line.starts_with("time")).map(|line| format!("{line}\n")).collect();
+        expect![].assert_eq(&plan);
+    }
+
+    #[test]
+    fn the_arithmetic_is_that_of_the_network() {
+        // Mnih et al.'s network on 84 x 84 x 4: 20x20, 9x9, 7x7 maps.
+        let mut model = config("mspacman", "c51").model;
+        model.channels = 4;
+        let flops = row_flops(&model);
+        let conv = 20 * 20 * 32 * 4 * 64 + 9 * 9 * 64 * 32 * 16 + 7 * 7 * 64 * 64 * 9;
+        assert_eq!(flops.local, 2.0 * f64::from(conv));
+        assert_eq!(flops.global, 2.0 * 3136.0 * 512.0);
+        assert_eq!(flops.dim, 0.0);
+    }
+
+    #[test]
+    fn more_cores_and_less_to_learn_take_less_time() {
+        let (ada, c51) = (config("procgen:bigfish", "driml-ada"), config("procgen:bigfish", "c51"));
+        assert!(estimate(&ada, 4) < estimate(&ada, 2));
+        assert!(estimate(&c51, 2) < estimate(&ada, 2));
+    }
+
+    #[test]
+    fn estimates_are_not_precise() {
+        let texts = [5, 600, 7_300, 90_000, 86_400].map(|seconds| about(Duration::from_secs(seconds)));
+        assert_eq!(texts, ["a minute", "10 min", "3 h", "1 d 1 h", "1 d"]);
+    }
+}

@@ -1,0 +1,251 @@
+//! The menu of presets: TOML layers that lie in `presets/`, built into the program and laid over one another.
+//! It checks no value: `config` does, once everything is in place.
+
+use driml_envs::WorldName;
+use serde::Deserialize;
+use toml::{Table, Value};
+
+use crate::error::{Usage, nearest, usage};
+
+/// One file of `presets/`.
+struct Layer {
+    name: &'static str,
+    text: &'static str,
+}
+
+macro_rules! layer {
+    ($path:literal) => {
+        Layer { name: $path, text: include_str!(concat!("../presets/", $path, ".toml")) }
+    };
+}
+
+const BASE: Layer = layer!("base");
+
+/// A way to run any agent in a world.
+pub(crate) struct Preset {
+    /// As `--preset` takes it.
+    pub(crate) name: &'static str,
+    /// One line for `driml presets`.
+    pub(crate) about: &'static str,
+    /// Laid over base, world and agent.
+    layers: &'static [Layer],
+    /// The worlds it is made for; none means all.
+    families: &'static [&'static str],
+}
+
+/// Every preset, the default first.
+pub(crate) const PRESETS: [Preset; 4] = [
+    Preset {
+        name: "paper",
+        about: "as the paper's authors ran it, at the world's own frame size (the default)",
+        layers: &[],
+        families: &[],
+    },
+    Preset {
+        name: "paper-observation",
+        about: "`paper` with Procgen's frame enlarged to the paper's 104 x 80: 2.3 times the arithmetic",
+        layers: &[layer!("variant/paper-observation")],
+        families: &["procgen"],
+    },
+    Preset {
+        name: "split",
+        about: "`paper` with 500 Procgen levels in random order to train on, and unseen ones to test on",
+        layers: &[layer!("variant/split")],
+        families: &["procgen"],
+    },
+    Preset {
+        name: "smoke",
+        about: "a tiny network, batch and replay: shows within a minute that all parts work together",
+        layers: &[layer!("variant/smoke")],
+        families: &[],
+    },
+];
+
+/// An agent.
+pub(crate) struct Agent {
+    /// As `--agent` takes it.
+    pub(crate) name: &'static str,
+    layer: Layer,
+}
+
+/// Every agent.
+pub(crate) const AGENTS: [Agent; 4] = [
+    Agent { name: "c51", layer: layer!("agent/c51") },
+    Agent { name: "driml-fix", layer: layer!("agent/driml-fix") },
+    Agent { name: "driml-ada", layer: layer!("agent/driml-ada") },
+    Agent { name: "driml-randk", layer: layer!("agent/driml-randk") },
+];
+
+fn world_layer(world: WorldName) -> Layer {
+    match world {
+        WorldName::Procgen(_) => layer!("world/procgen"),
+        WorldName::MsPacman => layer!("world/mspacman"),
+        WorldName::Chain => layer!("world/chain"),
+        WorldName::Ising => layer!("world/ising"),
+    }
+}
+
+/// The kind of a world, as `world.kind` has it: its name without the game.
+pub(crate) fn family(world: WorldName) -> String {
+    let name = world.to_string();
+    name.split_once(':').map_or(name.as_str(), |(family, _)| family).to_owned()
+}
+
+/// Finds an agent by name.
+///
+/// # Errors
+/// Says which agents there are.
+pub(crate) fn agent(name: &str) -> Result<&'static Agent, Usage> {
+    AGENTS.iter().find(|agent| agent.name == name).ok_or_else(|| {
+        let names = AGENTS.map(|agent| agent.name);
+        usage!("there is no agent {name:?}{}; --agent takes {}", nearest(name, names), names.join(", "))
+    })
+}
+
+/// Finds a preset by name.
+///
+/// # Errors
+/// Says which presets there are.
+pub(crate) fn preset(name: &str) -> Result<&'static Preset, Usage> {
+    PRESETS.iter().find(|preset| preset.name == name).ok_or_else(|| {
+        let names = PRESETS.map(|preset| preset.name);
+        usage!(
+            "there is no preset {name:?}{}; --preset takes {} (`driml presets` describes them)",
+            nearest(name, names),
+            names.join(", ")
+        )
+    })
+}
+
+/// Lays base, world, agent and preset over one another, in this order: a later one wins.
+///
+/// # Errors
+/// A preset that is not made for the world.
+pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result<Table, Usage> {
+    if !preset.families.is_empty() && !preset.families.contains(&family(world).as_str()) {
+        return Err(usage!(
+            "preset {:?} is for {} only, not for {world}; take --preset paper",
+            preset.name,
+            preset.families.join(", ")
+        ));
+    }
+    let mut table = Table::new();
+    let world_layer = world_layer(world);
+    for layer in [&BASE, &world_layer, &agent.layer].into_iter().chain(preset.layers) {
+        lay(&mut table, layer, &world.to_string());
+    }
+    Ok(table)
+}
+
+/// Lays one file over `table`: first what holds everywhere, then each `[[only]]` block that names `world`.
+fn lay(table: &mut Table, layer: &Layer, world: &str) {
+    let (everywhere, blocks) = layer.read();
+    merge(table, everywhere);
+    for block in blocks.into_iter().filter(|block| block.worlds.iter().any(|name| name == world)) {
+        merge(table, block.set);
+    }
+}
+
+/// What a person should know of an agent in a world before it starts.
+pub(crate) fn notes(name: &str, world: &str) -> Vec<String> {
+    let blocks = agent(name).map(|agent| agent.layer.read().1).unwrap_or_default();
+    let here = blocks.into_iter().filter(|block| block.worlds.iter().any(|name| name == world));
+    here.filter_map(|block| block.note).collect()
+}
+
+/// An `[[only]]` block of a layer.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Only {
+    /// The worlds in which it holds.
+    worlds: Vec<String>,
+    /// What it sets.
+    #[serde(default)]
+    set: Table,
+    /// What a person should know before the run starts.
+    note: Option<String>,
+}
+
+impl Layer {
+    /// What holds in every world, and the blocks that hold in some.
+    fn read(&self) -> (Table, Vec<Only>) {
+        let built_in = "presets are built in, and a test reads each of them";
+        let mut everywhere: Table = self.text.parse().expect(built_in);
+        let blocks = everywhere.remove("only").map(|blocks| blocks.try_into().expect(built_in));
+        (everywhere, blocks.unwrap_or_default())
+    }
+}
+
+/// Lays `upper` over `lower`, table by table; anything else is replaced.
+fn merge(lower: &mut Table, upper: Table) {
+    for (key, value) in upper {
+        match (lower.get_mut(&key), value) {
+            (Some(Value::Table(lower)), Value::Table(upper)) => merge(lower, upper),
+            (_, value) => {
+                lower.insert(key, value);
+            }
+        }
+    }
+}
+
+/// What `driml presets` prints.
+pub(crate) fn describe() -> String {
+    let width = PRESETS.iter().map(|preset| preset.name.len()).max().unwrap_or(0);
+    let lines = PRESETS.iter().map(|preset| format!("{:width$}  {}\n", preset.name, preset.about));
+    lines.collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn later_layers_win_key_by_key() {
+        let mut lower: Table = "[a]\nx = 1\ny = 2\n[b]\nz = [1, 2]".parse().unwrap();
+        merge(&mut lower, "[a]\ny = 3\n[b]\nz = [4]".parse().unwrap());
+        assert_eq!(lower, "[a]\nx = 1\ny = 3\n[b]\nz = [4]".parse::<Table>().unwrap());
+    }
+
+    fn all_layers() -> Vec<Layer> {
+        let agents = AGENTS.into_iter().map(|agent| agent.layer);
+        let worlds = WorldName::all().map(world_layer);
+        let variants = PRESETS.into_iter().flat_map(|preset| preset.layers);
+        let variants = variants.map(|layer| Layer { name: layer.name, text: layer.text });
+        agents.chain(worlds).chain(variants).chain([BASE]).collect()
+    }
+
+    #[test]
+    fn every_only_block_names_worlds_that_exist() {
+        let worlds: BTreeSet<_> = WorldName::all().map(|world| world.to_string()).collect();
+        for layer in all_layers() {
+            for block in layer.read().1 {
+                for world in block.worlds {
+                    assert!(worlds.contains(&world), "{world} in {}", layer.name);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn every_layer_says_what_it_is_for() {
+        for layer in all_layers() {
+            assert!(layer.text.starts_with("# "), "{}", layer.name);
+        }
+    }
+
+    #[test]
+    fn driml_fix_looks_as_far_ahead_as_the_paper_says() {
+        let k = |world: &str| {
+            let table = layers(&PRESETS[0], world.parse().unwrap(), agent("driml-fix").unwrap()).unwrap();
+            table["run"]["horizon"]["k"].as_integer().unwrap()
+        };
+        let five: Vec<_> = WorldName::all().map(|world| world.to_string()).filter(|world| k(world) == 5).collect();
+        expect_test::expect![[
+            r#"procgen:bigfish procgen:chaser procgen:climber procgen:fruitbot procgen:jumper procgen:maze procgen:miner procgen:plunder"#
+        ]]
+        .assert_eq(&five.join(" "));
+        assert_eq!(k("mspacman"), 1);
+    }
+}

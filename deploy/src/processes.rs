@@ -1,0 +1,302 @@
+//! The launcher: starts the parts as processes, watches them to the end of the run, and ends them in order.
+//! Each part is a `child`; what they say is for `statuses`, what is shown and kept for `display` and `record`.
+
+use std::{
+    path::Path,
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context, bail};
+use driml_protocol::{
+    Keys,
+    session::{self, Endpoints},
+};
+
+use crate::{
+    child::Part,
+    cli::NAMESPACE,
+    config::RunConfig,
+    display::{Display, Screen, duration},
+    error::{Interrupted, Usage},
+    interrupts::Interrupts,
+    print,
+    record::{Outcome, Recorder, Summary},
+    statuses::Statuses,
+};
+
+/// How often the parts are asked how they are.
+const POLL: Duration = Duration::from_secs(1);
+/// How long the replay server may take to listen.
+const LISTEN_MAX: Duration = Duration::from_secs(30);
+/// How long a part may leave questions unanswered, from its start too, before the run is given up.
+const SILENCE_MAX: Duration = Duration::from_secs(120);
+/// How long a run may make no progress before it is given up.
+const STALL_MAX: Duration = Duration::from_secs(600);
+/// How long actors may take to deliver what they have, once they are not needed or told to stop.
+const ACTORS_DRAIN_MAX: Duration = Duration::from_secs(60);
+/// How long the learner may take to save, once it is told to stop.
+const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
+/// How long the replay server may take to end, once it is told to stop.
+const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
+/// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
+const PART_THREADS: u32 = 1;
+
+/// Trains with one process for each part, and leaves `run_dir`.
+///
+/// # Errors
+/// A part that failed or went silent, a file system that refuses; [`Interrupted`] if a person ended the run.
+pub(crate) fn run(config: &RunConfig, run_dir: &Path, listen: Option<String>) -> anyhow::Result<()> {
+    let interrupts = Interrupts::listen().context("listening for signals")?;
+    let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
+    let names: Vec<_> = ["replay-server".into(), "learner".into()].into_iter().chain(actors).collect();
+    let mut recorder = Recorder::create(run_dir, &config.to_toml(), &names)?;
+    // A unix socket's path must be short, so it lies beside other temporary files and not in the run folder.
+    let meeting = tempfile::Builder::new().prefix("driml-").tempdir().context("making a folder for the socket")?;
+    let endpoint =
+        listen.unwrap_or_else(|| format!("unixsock-stream/{}", meeting.path().join("driml.sock").display()));
+    let screen = Screen::new(config.frames());
+    let display = Display::new(screen.clone(), config.frames(), config.updates());
+    let mut launch = Launch { config, run_dir, endpoint, screen, display, interrupts, parts: Vec::new(), statuses: None };
+
+    let ran = launch.start_and_watch(&mut recorder);
+    let ended = launch.end(&ran);
+    launch.screen.clear();
+    let outcome = match (&ran, &ended) {
+        (Ok(Outcome::Finished), Ok(())) => Outcome::Finished,
+        (Ok(Outcome::Interrupted), Ok(())) => Outcome::Interrupted,
+        _ => Outcome::Failed,
+    };
+    let summary = launch.conclude(&mut recorder, outcome)?;
+    ran.and(ended)?;
+    print(&describe(&summary, run_dir))?;
+    if outcome == Outcome::Interrupted { Err(Interrupted.into()) } else { Ok(()) }
+}
+
+/// A run's processes and what is known of them.
+struct Launch<'a> {
+    config: &'a RunConfig,
+    run_dir: &'a Path,
+    endpoint: String,
+    screen: Screen,
+    display: Display,
+    interrupts: Interrupts,
+    /// Replay server, learner, actors, in this order, as far as they were started.
+    parts: Vec<Part>,
+    statuses: Option<Statuses>,
+}
+
+/// Places in `Launch::parts`.
+const REPLAY: usize = 0;
+const LEARNER: usize = 1;
+const FIRST_ACTOR: usize = 2;
+
+impl Launch<'_> {
+    fn start_and_watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
+        let logs = self.run_dir.join("logs");
+        std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
+        let config = recorder.config_path().display().to_string();
+        let part = |words: &[&str]| words.iter().map(|&word| word.to_owned()).collect::<Vec<_>>();
+        let exit = "--exit-with-parent";
+        let args = part(&["replay-server", "--listen", &self.endpoint, "--config", &config, exit]);
+        self.parts.push(Part::start("replay-server", &args, PART_THREADS, &logs, &self.screen)?);
+        let Some(session) = self.connect()? else { return Ok(Outcome::Interrupted) };
+        let keys = Keys::new(NAMESPACE).map_err(Usage)?;
+        self.statuses = Some(Statuses::new(session, keys, self.config.run.hash()));
+
+        let folder = self.run_dir.display().to_string();
+        let args = part(&["learner", "--connect", &self.endpoint, "--run-dir", &folder, exit]);
+        self.parts.push(Part::start("learner", &args, self.config.local.learner_threads, &logs, &self.screen)?);
+        for id in 0..self.config.local.actors {
+            let args = part(&["actor", "--connect", &self.endpoint, "--id", &id.to_string(), exit]);
+            self.parts.push(Part::start(&format!("actor-{id}"), &args, PART_THREADS, &logs, &self.screen)?);
+        }
+        self.watch(recorder)
+    }
+
+    /// A session to the replay server as soon as it listens; none if a person was faster.
+    fn connect(&mut self) -> anyhow::Result<Option<zenoh::Session>> {
+        let endpoints = Endpoints { listen: Vec::new(), connect: vec![self.endpoint.clone()] };
+        let deadline = Instant::now() + LISTEN_MAX;
+        loop {
+            // Opening may take seconds of its own, in which the replay server may end: so it is not waited for here.
+            let endpoints = endpoints.clone();
+            let (tell, told) = std::sync::mpsc::channel();
+            std::thread::spawn(move || drop(tell.send(session::open(&endpoints))));
+            let opened = loop {
+                self.check_alive()?;
+                if self.interrupts.count() > 0 {
+                    return Ok(None);
+                }
+                match told.recv_timeout(Duration::from_millis(50)) {
+                    Ok(opened) => break opened,
+                    Err(_) if Instant::now() > deadline => {
+                        bail!("the replay server does not listen on {} after {}", self.endpoint, duration(LISTEN_MAX))
+                    }
+                    Err(_) => {}
+                }
+            };
+            match opened {
+                Ok(session) => return Ok(Some(session)),
+                Err(e) if Instant::now() > deadline => return Err(e).context("reaching the replay server"),
+                Err(e) => tracing::debug!("the replay server does not listen yet: {e}"),
+            }
+        }
+    }
+
+    /// Asks, shows and records once a second until the run is over.
+    fn watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
+        let mut heard = [Instant::now(); 2];
+        let mut progress = (Instant::now(), (0, 0));
+        loop {
+            if self.interrupts.wait_timeout(POLL) > 0 {
+                return Ok(Outcome::Interrupted);
+            }
+            self.check_alive()?;
+            let statuses = self.statuses.as_mut().expect("it was set before the run is watched");
+            for (heard, (name, answer)) in heard
+                .iter_mut()
+                .zip([("replay server", statuses.ask_replay()), ("learner", statuses.ask_learner())])
+            {
+                match answer {
+                    Ok(()) => *heard = Instant::now(),
+                    Err(e) if heard.elapsed() > SILENCE_MAX => {
+                        return Err(e.context(format!("the {name} has not answered for {}", duration(heard.elapsed()))));
+                    }
+                    Err(e) => tracing::debug!("the {name} did not answer: {e:#}"),
+                }
+            }
+            let (replay, learner) = (statuses.replay.clone(), statuses.learner.clone());
+            let rss: Vec<_> = self.parts.iter_mut().map(Part::rss_mib).collect();
+            recorder.record(&replay, &learner, &rss)?;
+            self.display.show(&replay, &learner);
+            if replay.finished && learner.finished {
+                return Ok(Outcome::Finished);
+            }
+            let counts = (replay.transitions_inserted, learner.updates);
+            if counts != progress.1 {
+                progress = (Instant::now(), counts);
+            } else if progress.0.elapsed() > STALL_MAX {
+                bail!(
+                    "no frame and no update for {}, at {} frames and {} updates ({}): see {}",
+                    duration(STALL_MAX),
+                    counts.0,
+                    counts.1,
+                    replay.waiting,
+                    self.run_dir.join("logs").display()
+                );
+            }
+        }
+    }
+
+    /// Whether all parts are as they should be: running, or actors that are not needed any more.
+    fn check_alive(&mut self) -> anyhow::Result<()> {
+        for (at, part) in self.parts.iter_mut().enumerate() {
+            if let Some(status) = part.end()
+                && !(at >= FIRST_ACTOR && status.success())
+            {
+                bail!("{}", part.obituary());
+            }
+        }
+        Ok(())
+    }
+
+    /// Ends all parts: actors first, so that what they have is stored; the learner saves; the replay server is last, so
+    /// that it can be asked for the final counts. A second interrupt ends everything at once.
+    fn end(&mut self, ran: &anyhow::Result<Outcome>) -> anyhow::Result<()> {
+        if matches!(ran, Ok(Outcome::Interrupted)) {
+            self.screen.line("stopping: actors deliver what they have, the learner saves (Ctrl-C again ends at once)");
+        }
+        // The interrupt that led here is the first.
+        let allowed = self.interrupts.count().min(1);
+        let interrupts = self.interrupts.clone();
+        let hurry = move || interrupts.count() > allowed;
+        let finished = matches!(ran, Ok(Outcome::Finished));
+        let mut late = Vec::new();
+        let last = self.parts.len();
+        // When the run is finished, actors hear it from the replay server and end by themselves.
+        late.extend(self.stop(FIRST_ACTOR.min(last)..last, !finished, ACTORS_DRAIN_MAX, &hurry));
+        self.ask_all();
+        late.extend(self.stop(LEARNER.min(last)..FIRST_ACTOR.min(last), true, LEARNER_DRAIN_MAX, &hurry));
+        if let Some(statuses) = &mut self.statuses
+            && let Err(e) = statuses.ask_replay()
+        {
+            tracing::debug!("the replay server's last word: {e:#}");
+        }
+        late.extend(self.stop(REPLAY..LEARNER.min(last), true, REPLAY_DRAIN_MAX, &hurry));
+        if hurry() {
+            bail!("ended at once by a second interrupt: what was not saved is lost");
+        }
+        if ran.is_ok() && !late.is_empty() {
+            bail!("at the end of the run, {}", late.join("; "));
+        }
+        Ok(())
+    }
+
+    fn ask_all(&mut self) {
+        if let Some(statuses) = &mut self.statuses {
+            for answer in [statuses.ask_replay(), statuses.ask_learner()] {
+                if let Err(e) = answer {
+                    tracing::debug!("a last question: {e:#}");
+                }
+            }
+        }
+    }
+
+    /// Waits for some parts to end, asking them first if `ask`; says which did not end well in time. None is left.
+    fn stop(
+        &mut self,
+        which: std::ops::Range<usize>,
+        ask: bool,
+        drain_max: Duration,
+        hurry: &impl Fn() -> bool,
+    ) -> Vec<String> {
+        let parts = &mut self.parts[which];
+        if ask {
+            parts.iter_mut().for_each(Part::ask_to_stop);
+        }
+        let deadline = Instant::now() + drain_max;
+        let mut late = Vec::new();
+        for part in parts {
+            match part.wait_until(deadline, hurry) {
+                Some(status) if status.success() => {}
+                Some(_) => late.push(part.obituary()),
+                None => {
+                    if !hurry() {
+                        late.push(format!("{} did not end within {} and was killed", part.name, duration(drain_max)));
+                    }
+                    part.kill();
+                    part.wait_until(Instant::now() + REPLAY_DRAIN_MAX, || false);
+                }
+            }
+        }
+        late
+    }
+
+    fn conclude(&mut self, recorder: &mut Recorder, outcome: Outcome) -> anyhow::Result<Summary> {
+        let statuses = self.statuses.take();
+        let (replay, learner) = statuses.as_ref().map(|it| (it.replay.clone(), it.learner.clone())).unwrap_or_default();
+        if let Some(statuses) = statuses {
+            statuses.close();
+        }
+        recorder.record(&replay, &learner, &[])?;
+        recorder.finish(outcome, &self.config.run, &replay, &learner)
+    }
+}
+
+/// What a person reads at the end.
+fn describe(summary: &Summary, run_dir: &Path) -> String {
+    let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
+    let how = if summary.outcome == Outcome::Finished { "finished" } else { "interrupted" };
+    format!(
+        "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, mean return {} over the last of {} episodes\n{}\n",
+        summary.frames,
+        summary.updates,
+        duration(Duration::from_secs_f64(summary.wall_seconds)),
+        summary.frames_per_second,
+        summary.updates_per_second,
+        number(summary.replay_ratio),
+        number(summary.mean_return),
+        summary.episodes,
+        run_dir.display()
+    )
+}

@@ -1,0 +1,348 @@
+//! The run folder: `config.toml`, `metrics.csv`, `summary.json`, `logs/`; the learner adds `checkpoints/`.
+//! It reads no status from anywhere: whoever runs the parts hands them over.
+
+use std::{
+    fs::{self, File},
+    io::Write,
+    path::{Path, PathBuf},
+    time::Instant,
+};
+
+use anyhow::Context;
+use driml_protocol::{LearnerStatus, ReplayStatus};
+use serde::Serialize;
+
+use crate::{
+    display::{PAIRS, Rates},
+    error::{Usage, usage},
+};
+
+/// How a run ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum Outcome {
+    /// All frames are in, their updates done and the last checkpoint written.
+    Finished,
+    /// A person ended it; what was done is saved.
+    Interrupted,
+    /// A part failed.
+    Failed,
+}
+
+/// `summary.json`.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub(crate) struct Summary {
+    /// How the run ended.
+    pub(crate) outcome: Outcome,
+    /// The world.
+    pub(crate) world: String,
+    /// The agent.
+    pub(crate) agent: String,
+    /// The seed.
+    pub(crate) seed: u64,
+    /// Frames that trained: transitions stored.
+    pub(crate) frames: u64,
+    /// Updates done.
+    pub(crate) updates: u64,
+    /// Transitions stored.
+    pub(crate) transitions_inserted: u64,
+    /// Transitions that actors produced and that never arrived.
+    pub(crate) transitions_lost: u64,
+    /// Transitions stored twice.
+    pub(crate) transitions_duplicated: u64,
+    /// Rows served to the learner.
+    pub(crate) rows_sampled: u64,
+    /// Rows per transition, both counted from the end of the warm-up.
+    pub(crate) replay_ratio: Option<f64>,
+    /// Episodes that ended.
+    pub(crate) episodes: u64,
+    /// Mean undiscounted return of the last 100 episodes.
+    pub(crate) mean_return: Option<f64>,
+    /// From the start of the first part to the end of the run.
+    pub(crate) wall_seconds: f64,
+    /// Frames over wall seconds.
+    pub(crate) frames_per_second: f64,
+    /// Updates over wall seconds.
+    pub(crate) updates_per_second: f64,
+    /// Mean k of all positives served.
+    pub(crate) mean_k: Option<f64>,
+    /// How often each k was served; index 0 counts rows without a positive.
+    pub(crate) k_histogram: Vec<u64>,
+    /// Version of the last weights.
+    pub(crate) weights_version: u64,
+    /// SHA-256 of the last weights, hexadecimal.
+    pub(crate) weights_sha256: String,
+    /// Chunks recognised as a retry of a stored one.
+    pub(crate) chunks_retried: u64,
+    /// Messages refused as malformed or foreign.
+    pub(crate) messages_refused: u64,
+    /// Highest resident memory of each process, MiB.
+    pub(crate) rss_mib_max: serde_json::Map<String, serde_json::Value>,
+}
+
+/// Writes a run folder.
+#[derive(Debug)]
+pub(crate) struct Recorder {
+    folder: PathBuf,
+    metrics: csv::Writer<File>,
+    processes: Vec<String>,
+    rss_max: Vec<Option<f64>>,
+    started: Instant,
+    rates: Rates,
+}
+
+/// Refuses a folder in which something lies.
+///
+/// # Errors
+/// Says what to do.
+pub(crate) fn check_free(folder: &Path) -> Result<(), Usage> {
+    let taken = match fs::read_dir(folder) {
+        Ok(mut entries) => entries.next().is_some(),
+        Err(_) => folder.exists(),
+    };
+    if taken {
+        return Err(usage!(
+            "the run folder {} exists and is not empty: choose another --run-dir, or remove it",
+            folder.display()
+        ));
+    }
+    Ok(())
+}
+
+impl Recorder {
+    /// Makes the folder and writes the settings; the clock starts. `processes` are those whose memory is recorded.
+    ///
+    /// # Errors
+    /// A folder in which something lies, or a file system that refuses.
+    pub(crate) fn create(folder: &Path, config_toml: &str, processes: &[String]) -> anyhow::Result<Self> {
+        check_free(folder)?;
+        fs::create_dir_all(folder).with_context(|| format!("making the run folder {}", folder.display()))?;
+        let head = "# The resolved settings of this run; `driml local --config` with this file repeats it.\n\n";
+        write_whole(&folder.join("config.toml"), format!("{head}{config_toml}").as_bytes())?;
+        let path = folder.join("metrics.csv");
+        let metrics = csv::Writer::from_path(&path).with_context(|| format!("making {}", path.display()))?;
+        let mut this = Self {
+            folder: folder.to_owned(),
+            metrics,
+            processes: processes.to_vec(),
+            rss_max: vec![None; processes.len()],
+            started: Instant::now(),
+            rates: Rates::default(),
+        };
+        this.write_header()?;
+        Ok(this)
+    }
+
+    /// The settings' file, for parts that read it.
+    pub(crate) fn config_path(&self) -> PathBuf {
+        self.folder.join("config.toml")
+    }
+
+    fn write_header(&mut self) -> anyhow::Result<()> {
+        let counts = [
+            "seconds", "frames", "updates", "frames_per_second", "updates_per_second", "replay_ratio", "episodes",
+            "mean_return", "c51_kl",
+        ];
+        let rest = ["total_loss", "grad_norm", "q_mean", "mean_k", "mean_age", "weights_version", "affinity_version", "actors", "waiting"];
+        let dim = PAIRS.map(|pair| format!("dim_{pair}"));
+        let rss: Vec<_> = self.processes.iter().map(|name| format!("rss_mib_{}", name.replace('-', "_"))).collect();
+        let counts = counts.map(String::from);
+        let rest = rest.map(String::from);
+        self.metrics.write_record(counts.iter().chain(&dim).chain(&rest).chain(&rss)).context("writing metrics.csv")
+    }
+
+    /// Adds a row of metrics. `rss_mib` is in the order of the processes given at the start; none for one that ended.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(crate) fn record(
+        &mut self,
+        replay: &ReplayStatus,
+        learner: &LearnerStatus,
+        rss_mib: &[Option<f64>],
+    ) -> anyhow::Result<()> {
+        self.rates.add(Instant::now(), replay.transitions_inserted, learner.updates);
+        for (max, now) in self.rss_max.iter_mut().zip(rss_mib) {
+            *max = now.map_or(*max, |now| Some(max.map_or(now, |max: f64| max.max(now))));
+        }
+        let (frames_rate, updates_rate) = self.rates.per_second();
+        let some = |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.6}"));
+        // What has not been computed is left empty: a 0 would look like a loss.
+        let computed = |value: f64| some((learner.updates > 0).then_some(value));
+        let mut row = vec![
+            format!("{:.3}", self.started.elapsed().as_secs_f64()),
+            replay.transitions_inserted.to_string(),
+            learner.updates.to_string(),
+            format!("{frames_rate:.2}"),
+            format!("{updates_rate:.3}"),
+            some(replay.replay_ratio()),
+            replay.episodes.to_string(),
+            some(replay.mean_return),
+            computed(learner.c51_kl.into()),
+        ];
+        row.extend(learner.dim.map(|loss| some(loss.map(f64::from))));
+        row.extend([
+            computed(learner.total.into()),
+            computed(learner.grad_norm),
+            computed(learner.q_mean.into()),
+            some(replay.mean_k()),
+            format!("{:.1}", replay.mean_age),
+            learner.weights_version.to_string(),
+            replay.affinity_version.to_string(),
+            replay.actors.to_string(),
+            replay.waiting.to_string(),
+        ]);
+        let rss = (0..self.processes.len()).map(|i| rss_mib.get(i).copied().flatten());
+        row.extend(rss.map(|mib| mib.map_or(String::new(), |mib| format!("{mib:.1}"))));
+        self.metrics.write_record(&row).context("writing metrics.csv")?;
+        self.metrics.flush().context("writing metrics.csv")
+    }
+
+    /// Writes `summary.json`, whole or not at all, and returns it.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(crate) fn finish(
+        &mut self,
+        outcome: Outcome,
+        run: &driml_protocol::RunSpec,
+        replay: &ReplayStatus,
+        learner: &LearnerStatus,
+    ) -> anyhow::Result<Summary> {
+        let wall_seconds = self.started.elapsed().as_secs_f64();
+        let rss = self.processes.iter().zip(&self.rss_max);
+        let summary = Summary {
+            outcome,
+            world: run.world.clone(),
+            agent: run.agent.clone(),
+            seed: run.seed,
+            frames: replay.transitions_inserted,
+            updates: learner.updates,
+            transitions_inserted: replay.transitions_inserted,
+            transitions_lost: replay.transitions_lost,
+            transitions_duplicated: replay.transitions_duplicated,
+            rows_sampled: replay.rows_sampled,
+            replay_ratio: replay.replay_ratio(),
+            episodes: replay.episodes,
+            mean_return: replay.mean_return,
+            wall_seconds,
+            frames_per_second: replay.transitions_inserted as f64 / wall_seconds,
+            updates_per_second: learner.updates as f64 / wall_seconds,
+            mean_k: replay.mean_k(),
+            k_histogram: replay.k_histogram.clone(),
+            weights_version: learner.weights_version,
+            weights_sha256: learner.weights_sha256.clone(),
+            chunks_retried: replay.chunks_retried,
+            messages_refused: replay.messages_refused,
+            rss_mib_max: rss.map(|(name, mib)| (name.clone(), mib.map(f64::round).into())).collect(),
+        };
+        let mut text = serde_json::to_vec_pretty(&summary).context("writing summary.json")?;
+        text.push(b'\n');
+        write_whole(&self.folder.join("summary.json"), &text)?;
+        Ok(summary)
+    }
+}
+
+/// Writes a file beside its place and renames it into it.
+fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let doing = || format!("writing {}", path.display());
+    let folder = path.parent().unwrap_or(Path::new("."));
+    let mut file = tempfile::NamedTempFile::new_in(folder).with_context(doing)?;
+    file.write_all(bytes).with_context(doing)?;
+    file.as_file().sync_all().with_context(doing)?;
+    make_readable(file.as_file()).with_context(doing)?;
+    file.persist(path).map_err(|e| e.error).with_context(doing)?;
+    Ok(())
+}
+
+/// Temporary files are private by default; these are for whoever may look into the folder.
+fn make_readable(file: &File) -> std::io::Result<()> {
+    use std::os::unix::fs::PermissionsExt;
+    file.set_permissions(fs::Permissions::from_mode(0o644))
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_protocol::{Horizon, RunSpec, TimeoutRule, Waiting};
+    use expect_test::expect;
+
+    use super::*;
+
+    fn spec() -> RunSpec {
+        RunSpec {
+            world: "chain".into(),
+            agent: "driml-ada".into(),
+            seed: 3,
+            frame_height: 12,
+            frame_width: 12,
+            frame_channels: 1,
+            frame_stack: 1,
+            num_actions: 3,
+            n_step: 7,
+            gamma: 0.99,
+            horizon: Horizon::Nhg { k_max: 5 },
+            timeout: TimeoutRule::Terminal,
+        }
+    }
+
+    fn statuses() -> (ReplayStatus, LearnerStatus) {
+        let replay = ReplayStatus {
+            transitions_inserted: 2_000,
+            warmup_transitions: 1_000,
+            rows_sampled: 8_000,
+            episodes: 7,
+            mean_return: Some(0.5),
+            k_histogram: vec![2, 1, 1],
+            waiting: Waiting::Finished,
+            ..ReplayStatus::default()
+        };
+        let learner = LearnerStatus {
+            updates: 31,
+            dim: [None, None, None, Some(2.0)],
+            weights_version: 4,
+            weights_sha256: "abcd".into(),
+            finished: true,
+            ..LearnerStatus::default()
+        };
+        (replay, learner)
+    }
+
+    #[test]
+    fn a_run_leaves_settings_metrics_and_a_summary() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = folder.path().join("run");
+        let mut recorder = Recorder::create(&run, "[run]\n", &["replay-server".into(), "actor-0".into()]).unwrap();
+        let (replay, learner) = statuses();
+        recorder.record(&ReplayStatus::default(), &LearnerStatus::default(), &[]).unwrap();
+        recorder.record(&replay, &learner, &[Some(12.34), None]).unwrap();
+        let summary = recorder.finish(Outcome::Finished, &spec(), &replay, &learner).unwrap();
+        assert_eq!((summary.frames, summary.replay_ratio, summary.mean_k), (2_000, Some(8.0), Some(1.5)));
+
+        let csv = fs::read_to_string(run.join("metrics.csv")).unwrap();
+        let columns: Vec<_> = csv.lines().map(|line| line.split(',').count()).collect();
+        assert_eq!(columns, [24, 24, 24], "{csv}");
+        expect!["seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,c51_kl,dim_3t3,dim_3t4,dim_4t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,mean_age,weights_version,affinity_version,actors,waiting,rss_mib_replay_server,rss_mib_actor_0"]
+            .assert_eq(csv.lines().next().unwrap());
+
+        let json: serde_json::Value = serde_json::from_slice(&fs::read(run.join("summary.json")).unwrap()).unwrap();
+        for key in [
+            "frames", "updates", "transitions_inserted", "transitions_lost", "transitions_duplicated", "rows_sampled",
+            "replay_ratio", "episodes", "mean_return", "wall_seconds", "frames_per_second", "updates_per_second",
+            "mean_k", "weights_version", "weights_sha256",
+        ] {
+            assert!(!json[key].is_null(), "{key}");
+        }
+        assert_eq!(json["outcome"], "finished");
+        assert_eq!(json["rss_mib_max"]["replay-server"], 12.0);
+    }
+
+    #[test]
+    fn a_folder_in_use_is_refused_and_an_empty_one_is_not() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(check_free(folder.path()).is_ok());
+        fs::write(folder.path().join("x"), "").unwrap();
+        let said = check_free(folder.path()).unwrap_err().to_string();
+        assert!(said.contains("exists and is not empty: choose another --run-dir"), "{said}");
+        assert!(check_free(&folder.path().join("x")).is_err());
+    }
+}

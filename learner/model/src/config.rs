@@ -1,0 +1,214 @@
+//! Everything that fixes the network's shapes, and the names and shapes of its parameters.
+//! It holds no training setting, and no number has a default: each comes from a preset.
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::{ModelError, Result};
+
+/// Largest size of any one dimension; a configuration beyond it is rejected.
+const DIMENSION_MAX: usize = 1 << 16;
+/// Largest number of scalars in one parameter; a configuration beyond it is rejected.
+const PARAMETER_LEN_MAX: usize = 1 << 28;
+/// Actions and their number fit one byte; a configuration beyond it is rejected.
+const ACTIONS_MAX: usize = 255;
+
+/// Everything that fixes the network's shapes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelConfig {
+    /// Height of the network's input in pixels.
+    pub height: usize,
+    /// Width of the network's input in pixels.
+    pub width: usize,
+    /// Channels of the network's input, after frames were stacked.
+    pub channels: usize,
+    /// Number of actions, 1 to 255.
+    pub num_actions: usize,
+    /// Atoms of each return distribution, at least 2.
+    pub atoms: usize,
+    /// Return at the first atom.
+    pub v_min: f32,
+    /// Return at the last atom.
+    pub v_max: f32,
+    /// The convolutions, first to last, each followed by ReLU; at least one. The last one's output is f3.
+    pub conv: Vec<ConvLayer>,
+    /// Width of the fully connected layer f4.
+    pub hidden: usize,
+    /// Width of the space in which DIM scores are dot products, and of its heads' hidden layers.
+    pub rkhs: usize,
+    /// Width of the embedded action.
+    pub action_embed: usize,
+    /// Which DIM heads exist.
+    pub dim: DimParts,
+}
+
+/// One convolution: square kernel, no padding, then ReLU.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ConvLayer {
+    /// Output channels.
+    pub out: usize,
+    /// Side of the square kernel in pixels.
+    pub kernel: usize,
+    /// Step between two windows in pixels, the same in both directions.
+    pub stride: usize,
+}
+
+/// Which DIM heads exist. Nothing is built that no lambda needs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DimParts {
+    /// Psi over the locations of f3(s_t).
+    pub psi3: bool,
+    /// Phi over the locations of f3(s_{t+k}).
+    pub phi3: bool,
+    /// Psi over f4(s_t).
+    pub psi4: bool,
+    /// Phi over f4(s_{t+k}).
+    pub phi4: bool,
+    /// Whether Psi sees the embedded action; without a Psi it builds nothing.
+    pub action: bool,
+}
+
+impl DimParts {
+    /// No DIM head at all: the C51 agent, target networks and actors.
+    pub const NONE: Self = Self { psi3: false, phi3: false, psi4: false, phi4: false, action: false };
+
+    /// Whether the action embedding exists: Psi is conditioned on the action, and there is a Psi.
+    pub fn embeds_action(&self) -> bool {
+        self.action && (self.psi3 || self.psi4)
+    }
+}
+
+impl ModelConfig {
+    /// Checks that such a network can exist.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] names the field: a size of 0 or above 65,536, a kernel larger than its input, a parameter
+    /// of more than 2^28 scalars, more than 255 actions, fewer than 2 atoms, `v_min` not below `v_max`, no convolution.
+    pub fn validate(&self) -> Result<()> {
+        let fail = |what: String| Err(ModelError::Config(what));
+        let sizes = [
+            ("height", self.height),
+            ("width", self.width),
+            ("channels", self.channels),
+            ("num_actions", self.num_actions),
+            ("atoms", self.atoms),
+            ("hidden", self.hidden),
+            ("rkhs", self.rkhs),
+            ("action_embed", self.action_embed),
+        ];
+        for (name, size) in sizes {
+            if size == 0 || size > DIMENSION_MAX {
+                return fail(format!("{name} is {size}, must be 1 to {DIMENSION_MAX}"));
+            }
+        }
+        if self.num_actions > ACTIONS_MAX {
+            return fail(format!("num_actions is {}, must be 1 to {ACTIONS_MAX}", self.num_actions));
+        }
+        if self.atoms < 2 {
+            return fail(format!("atoms is {}, must be at least 2", self.atoms));
+        }
+        if !(self.v_min.is_finite() && self.v_max.is_finite() && self.v_min < self.v_max) {
+            return fail(format!("v_min {} must be below v_max {}, both finite", self.v_min, self.v_max));
+        }
+        if self.conv.is_empty() {
+            return fail("conv is empty, at least one convolution is needed".to_owned());
+        }
+        let (mut height, mut width) = (self.height, self.width);
+        for (index, layer) in self.conv.iter().enumerate() {
+            for (name, size) in [("out", layer.out), ("kernel", layer.kernel), ("stride", layer.stride)] {
+                if size == 0 || size > DIMENSION_MAX {
+                    return fail(format!("conv[{index}].{name} is {size}, must be 1 to {DIMENSION_MAX}"));
+                }
+            }
+            if layer.kernel > height || layer.kernel > width {
+                return fail(format!("conv[{index}].kernel {} exceeds its input {height}x{width}", layer.kernel));
+            }
+            (height, width) = (layer.output_side(height), layer.output_side(width));
+        }
+        for (name, shape) in self.parameter_shapes() {
+            let len = shape.iter().try_fold(1usize, |len, &size| len.checked_mul(size));
+            if len.is_none_or(|len| len > PARAMETER_LEN_MAX) {
+                return fail(format!("{name} would have shape {shape:?}, more than {PARAMETER_LEN_MAX} scalars"));
+            }
+        }
+        Ok(())
+    }
+
+    /// The same network without its DIM heads: what target networks and actors hold.
+    pub fn without_dim(&self) -> Self {
+        Self { dim: DimParts::NONE, ..self.clone() }
+    }
+
+    /// Shape of f3: height, width, channels of the last convolution's output. Meaningful for a valid configuration.
+    pub fn local_shape(&self) -> (usize, usize, usize) {
+        self.conv.iter().fold((self.height, self.width, self.channels), |(height, width, _), layer| {
+            (layer.output_side(height), layer.output_side(width), layer.out)
+        })
+    }
+
+    /// Bytes of one input frame: height * width * channels.
+    pub fn frame_len(&self) -> usize {
+        self.height * self.width * self.channels
+    }
+
+    /// The atoms z_i = v_min + i (v_max - v_min) / (atoms - 1).
+    pub fn atoms_support(&self) -> Vec<f32> {
+        let (v_min, v_max) = (f64::from(self.v_min), f64::from(self.v_max));
+        let step = (v_max - v_min) / (self.atoms - 1) as f64;
+        (0..self.atoms).map(|i| (v_min + i as f64 * step) as f32).collect()
+    }
+
+    /// Names and PyTorch shapes of all parameters: torso first, then head, then the DIM heads that exist.
+    ///
+    /// Linear weights are [out, in], convolutions [out, in, k, k], biases [out]. The order is the order in which initial
+    /// weights are drawn, so the torso's and the head's do not depend on which DIM heads exist.
+    pub fn parameter_shapes(&self) -> Vec<(String, Vec<usize>)> {
+        let mut shapes = Vec::new();
+        let mut layer = |name: &str, weight: Vec<usize>, bias: bool| {
+            let out = weight[0];
+            shapes.push((format!("{name}.weight"), weight));
+            if bias {
+                shapes.push((format!("{name}.bias"), vec![out]));
+            }
+        };
+
+        let mut channels_in = self.channels;
+        for (index, conv) in self.conv.iter().enumerate() {
+            layer(&format!("torso.conv{}", index + 1), vec![conv.out, channels_in, conv.kernel, conv.kernel], true);
+            channels_in = conv.out;
+        }
+        let (local_height, local_width, local_channels) = self.local_shape();
+        let flat = local_height.saturating_mul(local_width).saturating_mul(local_channels);
+        layer("torso.fc", vec![self.hidden, flat], true);
+        layer("head", vec![self.num_actions.saturating_mul(self.atoms), self.hidden], true);
+
+        let mut block = |name: &str, input: usize, hidden: usize, skip_bias: bool| {
+            layer(&format!("{name}.hidden"), vec![hidden, input], true);
+            layer(&format!("{name}.out"), vec![hidden, hidden], true);
+            layer(&format!("{name}.skip"), vec![hidden, input], skip_bias);
+        };
+        let embed = if self.dim.embeds_action() { self.action_embed } else { 0 };
+        if self.dim.embeds_action() {
+            block("dim.action", self.num_actions, self.action_embed, true);
+        }
+        let heads = [
+            (self.dim.psi3, "dim.psi3", local_channels + embed),
+            (self.dim.phi3, "dim.phi3", local_channels),
+            (self.dim.psi4, "dim.psi4", self.hidden + embed),
+            (self.dim.phi4, "dim.phi4", self.hidden),
+        ];
+        for (_, name, input) in heads.into_iter().filter(|&(exists, _, _)| exists) {
+            block(name, input, self.rkhs, false);
+        }
+        shapes
+    }
+}
+
+impl ConvLayer {
+    /// Side of the output map for an input of this side; 1 where the kernel would not fit.
+    fn output_side(&self, input: usize) -> usize {
+        input.saturating_sub(self.kernel) / self.stride.max(1) + 1
+    }
+}

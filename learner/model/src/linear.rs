@@ -1,0 +1,256 @@
+//! The fully connected layer as a candle operation with gradients, with optional ReLU, and ReLU by itself.
+//! It knows no network; it runs on the CPU only.
+//!
+//! candle's own path is a matrix product and a broadcast addition, whose backward pass sums the bias on a single thread,
+//! and its ReLU passes a gradient at exactly 0, which PyTorch's does not.
+
+use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use rayon::prelude::*;
+
+use crate::conv::cpu;
+use crate::gemm::{Matrix, Output, Threads, multiply};
+
+/// Rows that one task sums. Fixed, so that sums are taken in the same order whatever the number of threads.
+const TASK_ROWS: usize = 256;
+/// Scalars that one task of an elementwise pass takes.
+const TASK_LEN: usize = 1 << 15;
+
+/// y = x w^T + b, differentiable in all arguments.
+///
+/// `x` [..., in]; `w` [out, in]; `b` [out], or [groups..., out] where each entry serves an equal share of consecutive
+/// rows of `x`. Result [..., out]. All f32. With as many groups as rows this is x w^T + b for a whole tensor b, which
+/// saves the separate addition. Results and gradients have the same bits whatever the number of threads.
+///
+/// # Errors
+/// Shapes that do not match, or other types.
+pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor) -> Result<Tensor> {
+    apply(x, w, b, false)
+}
+
+/// relu(x w^T + b): [`linear`] with the ReLU fused. Where the result is 0 the gradient is 0, as in PyTorch.
+///
+/// # Errors
+/// Shapes that do not match, or other types.
+pub fn linear_relu(x: &Tensor, w: &Tensor, b: &Tensor) -> Result<Tensor> {
+    apply(x, w, b, true)
+}
+
+/// max(x, 0), whose gradient at exactly 0 is 0, as in PyTorch.
+///
+/// # Errors
+/// Another type than f32.
+pub fn relu(x: &Tensor) -> Result<Tensor> {
+    x.contiguous()?.apply_op1(Relu)
+}
+
+fn apply(x: &Tensor, w: &Tensor, b: &Tensor, relu: bool) -> Result<Tensor> {
+    let (inputs, outputs) = (x.dims().last().copied().unwrap_or(0), w.dims().first().copied().unwrap_or(0));
+    let fits = w.dims() == [outputs, inputs] && b.dims().last() == Some(&outputs) && inputs * outputs > 0;
+    let (rows, groups) = (x.elem_count() / inputs.max(1), b.elem_count() / outputs.max(1));
+    if !fits || groups == 0 || rows % groups != 0 {
+        bail!("linear layer of x {:?} with weight {:?} and bias {:?}", x.shape(), w.shape(), b.shape());
+    }
+    let op = Linear { rows, inputs, outputs, groups, relu };
+    x.contiguous()?.apply_op3(&w.contiguous()?, &b.contiguous()?, op)
+}
+
+#[derive(Clone, Copy)]
+struct Linear {
+    rows: usize,
+    inputs: usize,
+    outputs: usize,
+    groups: usize,
+    relu: bool,
+}
+
+impl CustomOp3 for Linear {
+    fn name(&self) -> &'static str {
+        "linear"
+    }
+
+    fn cpu_fwd(
+        &self,
+        x: &CpuStorage,
+        x_layout: &Layout,
+        w: &CpuStorage,
+        w_layout: &Layout,
+        b: &CpuStorage,
+        b_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let x = Matrix::new(floats(x, x_layout)?, self.rows, self.inputs);
+        let w = Matrix::new(floats(w, w_layout)?, self.outputs, self.inputs);
+        let b = floats(b, b_layout)?;
+        let group_len = self.rows / self.groups * self.outputs;
+        let mut y = vec![0.0; self.rows * self.outputs];
+        y.par_chunks_mut(self.task_len()).enumerate().for_each(|(task, y)| {
+            let first = task * self.task_len();
+            for (row, y) in y.chunks_exact_mut(self.outputs).enumerate() {
+                let group = (first + row * self.outputs) / group_len;
+                y.copy_from_slice(&b[group * self.outputs..][..self.outputs]);
+            }
+        });
+        multiply(&mut y, Output::Add, x, w.transposed(), Threads::Pool);
+        if self.relu {
+            y.par_chunks_mut(TASK_LEN).for_each(relu_in_place);
+        }
+        let mut dims = x_layout.dims().to_vec();
+        if let Some(last) = dims.last_mut() {
+            *last = self.outputs;
+        }
+        Ok((CpuStorage::F32(y), dims.into()))
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        w: &Tensor,
+        b: &Tensor,
+        y: &Tensor,
+        grad_y: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let grad_y = if self.relu { masked(&y.detach(), &grad_y.detach())? } else { grad_y.detach().contiguous()? };
+        let (x_storage, x_layout) = x.storage_and_layout();
+        let (w_storage, w_layout) = w.storage_and_layout();
+        let (grad_storage, grad_layout) = grad_y.storage_and_layout();
+        let grad_values = floats(cpu(&grad_storage)?, grad_layout)?;
+        let grad = Matrix::new(grad_values, self.rows, self.outputs);
+        let device = w.device();
+
+        let grad_x = x.track_op().then(|| -> Result<Tensor> {
+            let w = Matrix::new(floats(cpu(&w_storage)?, w_layout)?, self.outputs, self.inputs);
+            let mut grad_x = vec![0.0; self.rows * self.inputs];
+            multiply(&mut grad_x, Output::Replace, grad, w, Threads::Pool);
+            Tensor::from_vec(grad_x, x.shape(), device)
+        });
+        let grad_w = w.track_op().then(|| -> Result<Tensor> {
+            let x = Matrix::new(floats(cpu(&x_storage)?, x_layout)?, self.rows, self.inputs);
+            let mut grad_w = vec![0.0; self.outputs * self.inputs];
+            multiply(&mut grad_w, Output::Replace, grad.transposed(), x, Threads::Pool);
+            Tensor::from_vec(grad_w, w.shape(), device)
+        });
+        let grad_b = b.track_op().then(|| -> Result<Tensor> {
+            if self.groups == self.rows {
+                return grad_y.reshape(b.shape());
+            }
+            Tensor::from_vec(self.group_sums(grad_values), b.shape(), device)
+        });
+        Ok((grad_x.transpose()?, grad_w.transpose()?, grad_b.transpose()?))
+    }
+}
+
+impl Linear {
+    /// Scalars of a task's whole rows.
+    fn task_len(&self) -> usize {
+        (TASK_LEN / self.outputs).max(1) * self.outputs
+    }
+
+    /// Sums of each group's rows: [rows, outputs] to [groups, outputs].
+    fn group_sums(&self, grad: &[f32]) -> Vec<f32> {
+        let outputs = self.outputs;
+        if self.groups > 1 {
+            let mut sums = vec![0.0; self.groups * outputs];
+            sums.par_chunks_mut(outputs)
+                .zip(grad.par_chunks(self.rows / self.groups * outputs))
+                .for_each(|(sum, rows)| add_rows(sum, rows));
+            return sums;
+        }
+        let parts = grad.par_chunks(TASK_ROWS * outputs).map(|rows| {
+            let mut sum = vec![0.0; outputs];
+            add_rows(&mut sum, rows);
+            sum
+        });
+        add_in_order(parts.collect(), outputs)
+    }
+}
+
+fn add_rows(sum: &mut [f32], rows: &[f32]) {
+    for row in rows.chunks_exact(sum.len()) {
+        for (sum, value) in sum.iter_mut().zip(row) {
+            *sum += value;
+        }
+    }
+}
+
+/// Sum of equally long vectors, first to last; `len` zeros if there are none.
+pub(crate) fn add_in_order(parts: Vec<Vec<f32>>, len: usize) -> Vec<f32> {
+    let mut parts = parts.into_iter();
+    let mut sum = parts.next().unwrap_or_else(|| vec![0.0; len]);
+    for part in parts {
+        for (sum, value) in sum.iter_mut().zip(part) {
+            *sum += value;
+        }
+    }
+    sum
+}
+
+/// One layer on the calling thread: `y` [rows, outputs] = x w + b, with `w` given as a matrix [inputs, outputs].
+pub(crate) fn forward(x: Matrix<'_>, w: Matrix<'_>, b: &[f32], y: &mut [f32]) {
+    for row in y.chunks_exact_mut(w.cols()) {
+        row.copy_from_slice(b);
+    }
+    multiply(y, Output::Add, x, w, Threads::Caller);
+}
+
+pub(crate) fn relu_in_place(values: &mut [f32]) {
+    for value in values {
+        *value = relu_of(*value);
+    }
+}
+
+/// max(value, 0); unlike `f32::max` it keeps NaN, so that a diverged network shows.
+#[inline]
+pub(crate) fn relu_of(value: f32) -> f32 {
+    if value < 0.0 { 0.0 } else { value }
+}
+
+/// The gradient at ReLU's input, from its output `y` and the gradient there.
+#[inline]
+pub(crate) fn relu_gradient(y: f32, grad: f32) -> f32 {
+    if y <= 0.0 { 0.0 } else { grad }
+}
+
+/// `grad` where `y` is above 0, else 0.
+fn masked(y: &Tensor, grad: &Tensor) -> Result<Tensor> {
+    let grad = grad.contiguous()?;
+    let (y_storage, y_layout) = y.storage_and_layout();
+    let (grad_storage, grad_layout) = grad.storage_and_layout();
+    let y_values = floats(cpu(&y_storage)?, y_layout)?;
+    let grad_values = floats(cpu(&grad_storage)?, grad_layout)?;
+    let mut result = vec![0.0; y_values.len()];
+    result
+        .par_chunks_mut(TASK_LEN)
+        .zip(y_values.par_chunks(TASK_LEN))
+        .zip(grad_values.par_chunks(TASK_LEN))
+        .for_each(|((result, y), grad)| {
+            for ((result, &y), &grad) in result.iter_mut().zip(y).zip(grad) {
+                *result = relu_gradient(y, grad);
+            }
+        });
+    Tensor::from_vec(result, y.shape(), y.device())
+}
+
+struct Relu;
+
+impl CustomOp1 for Relu {
+    fn name(&self) -> &'static str {
+        "relu"
+    }
+
+    fn cpu_fwd(&self, x: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
+        let mut y = floats(x, layout)?.to_vec();
+        y.par_chunks_mut(TASK_LEN).for_each(relu_in_place);
+        Ok((CpuStorage::F32(y), layout.shape().clone()))
+    }
+
+    fn bwd(&self, _x: &Tensor, y: &Tensor, grad_y: &Tensor) -> Result<Option<Tensor>> {
+        Ok(Some(masked(&y.detach(), &grad_y.detach())?))
+    }
+}
+
+/// The scalars of a contiguous f32 storage.
+pub(crate) fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
+    match layout.contiguous_offsets() {
+        Some((start, end)) => Ok(&storage.as_slice::<f32>()?[start..end]),
+        None => bail!("a tensor of shape {:?} must be contiguous", layout.shape()),
+    }
+}

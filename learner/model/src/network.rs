@@ -1,0 +1,138 @@
+//! The whole network with gradients, as the learner sees it.
+//! It owns no weights (it shares `Parameters`' storage) and computes no loss.
+
+use candle_core::{DType, Tensor};
+
+use crate::c51_head::C51Head;
+use crate::config::ModelConfig;
+use crate::dim_head::{ActionEmbedding, Head};
+use crate::error::{ModelError, Result};
+use crate::torso::Torso;
+use crate::weights::Parameters;
+
+/// What the torso makes of a batch of frames.
+#[derive(Clone, Debug)]
+pub struct Features {
+    /// The last convolution's output after ReLU, [B, h, w, c], channels last.
+    pub f3: Tensor,
+    /// The fully connected layer's output before its ReLU, [B, hidden].
+    pub f4: Tensor,
+}
+
+/// Torso, C51 head and the DIM heads that the configuration has.
+///
+/// It shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes this network.
+pub struct Network {
+    input: [usize; 3],
+    torso: Torso,
+    head: C51Head,
+    action: Option<ActionEmbedding>,
+    psi3: Option<Head>,
+    phi3: Option<Head>,
+    psi4: Option<Head>,
+    phi4: Option<Head>,
+}
+
+impl Network {
+    /// The network of `config` on `parameters`, which may hold more than it needs (a target network's configuration
+    /// with the online network's parameters).
+    ///
+    /// # Errors
+    /// An invalid configuration, or a parameter that is missing.
+    pub fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
+        config.validate()?;
+        let channels = config.local_shape().2;
+        let head = |exists: bool, name: &str, features: usize| {
+            exists.then(|| Head::new(name, features, parameters)).transpose()
+        };
+        let action = config.dim.embeds_action().then(|| ActionEmbedding::new(config, parameters)).transpose()?;
+        Ok(Self {
+            input: [config.height, config.width, config.channels],
+            torso: Torso::new(config, parameters)?,
+            head: C51Head::new(config, parameters)?,
+            action,
+            psi3: head(config.dim.psi3, "dim.psi3", channels)?,
+            phi3: head(config.dim.phi3, "dim.phi3", channels)?,
+            psi4: head(config.dim.psi4, "dim.psi4", config.hidden)?,
+            phi4: head(config.dim.phi4, "dim.phi4", config.hidden)?,
+        })
+    }
+
+    /// f3 and f4 of `frames` [B, H, W, C] u8, which are scaled by 1/255.
+    ///
+    /// # Errors
+    /// Frames of another type or size.
+    pub fn features(&self, frames: &Tensor) -> Result<Features> {
+        if frames.dtype() != DType::U8 || frames.dims().get(1..) != Some(&self.input[..]) {
+            let (dtype, shape, input) = (frames.dtype(), frames.shape(), self.input);
+            return Err(ModelError::Input(format!("frames {shape:?} of type {dtype:?}, wanted u8 [B, {input:?}]")));
+        }
+        let (f3, f4) = self.torso.features(frames)?;
+        Ok(Features { f3, f4 })
+    }
+
+    /// Logits [B, A, atoms] of `f4` [B, hidden] as [`Features`] has it, before its ReLU.
+    ///
+    /// # Errors
+    /// Another shape.
+    pub fn logits(&self, f4: &Tensor) -> Result<Tensor> {
+        self.head.logits(f4)
+    }
+
+    /// Expected returns [B, A] of `logits` [B, A, atoms]. No gradient flows through them.
+    ///
+    /// # Errors
+    /// Another shape.
+    pub fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
+        self.head.q_values(logits)
+    }
+
+    /// Psi_3 [B, h * w, rkhs] of `f3` [B, h, w, c] and `actions` [B] (integers; ignored if Psi does not see the action).
+    ///
+    /// # Errors
+    /// Other shapes, an action out of range, or no such head.
+    pub fn psi3(&self, f3: &Tensor, actions: &Tensor) -> Result<Tensor> {
+        let head = self.psi3.as_ref().ok_or(ModelError::NoHead("psi3"))?;
+        by_location(head.forward(f3, self.embedded(actions)?.as_ref())?)
+    }
+
+    /// Phi_3 [B, h * w, rkhs] of `f3` [B, h, w, c].
+    ///
+    /// # Errors
+    /// Another shape, or no such head.
+    pub fn phi3(&self, f3: &Tensor) -> Result<Tensor> {
+        by_location(self.phi3.as_ref().ok_or(ModelError::NoHead("phi3"))?.forward(f3, None)?)
+    }
+
+    /// Psi_4 [B, rkhs] of `f4` [B, hidden] and `actions` [B] (integers; ignored if Psi does not see the action).
+    ///
+    /// # Errors
+    /// Other shapes, an action out of range, or no such head.
+    pub fn psi4(&self, f4: &Tensor, actions: &Tensor) -> Result<Tensor> {
+        let head = self.psi4.as_ref().ok_or(ModelError::NoHead("psi4"))?;
+        head.forward(f4, self.embedded(actions)?.as_ref())
+    }
+
+    /// Phi_4 [B, rkhs] of `f4` [B, hidden].
+    ///
+    /// # Errors
+    /// Another shape, or no such head.
+    pub fn phi4(&self, f4: &Tensor) -> Result<Tensor> {
+        self.phi4.as_ref().ok_or(ModelError::NoHead("phi4"))?.forward(f4, None)
+    }
+
+    fn embedded(&self, actions: &Tensor) -> Result<Option<Tensor>> {
+        self.action.as_ref().map(|action| action.forward(actions)).transpose()
+    }
+}
+
+/// [B, h, w, rkhs] as [B, h * w, rkhs].
+fn by_location(maps: Tensor) -> Result<Tensor> {
+    Ok(maps.flatten(1, 2)?)
+}
+
+impl std::fmt::Debug for Network {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Network").finish_non_exhaustive()
+    }
+}

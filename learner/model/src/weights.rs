@@ -1,0 +1,192 @@
+//! Named parameters: made from a seed, read from and written to safetensors, all checked.
+//! It knows nothing of versions, files or networks between processes.
+
+use std::collections::{BTreeMap, HashMap};
+
+use candle_core::{DType, Device, Tensor, Var};
+use rand_chacha::ChaCha8Rng;
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+
+use crate::config::ModelConfig;
+use crate::error::{ModelError, Result};
+use crate::init::{RELU_GAIN, orthogonal};
+
+/// Parameters by name, as candle variables with PyTorch's names and shapes.
+///
+/// A clone shares the variables' storage; [`Parameters::copy`] does not.
+#[derive(Clone, Debug)]
+pub struct Parameters(BTreeMap<String, Var>);
+
+impl Parameters {
+    /// Initial parameters: orthogonal weights with gain sqrt(2), convolutions flattened to [out, in * k * k]; biases 0.
+    ///
+    /// Drawn in the order of [`ModelConfig::parameter_shapes`].
+    ///
+    /// # Errors
+    /// An invalid configuration.
+    pub fn init(config: &ModelConfig, rng: &mut ChaCha8Rng, device: &Device) -> Result<Self> {
+        config.validate()?;
+        let mut vars = BTreeMap::new();
+        for (name, shape) in config.parameter_shapes() {
+            let len: usize = shape.iter().product();
+            let values = match shape.as_slice() {
+                [_] => vec![0.0; len],
+                [rows, ..] => orthogonal(*rows, len / rows, RELU_GAIN, rng),
+                [] => unreachable!("parameters are vectors, matrices or kernels"),
+            };
+            vars.insert(name, Var::from_vec(values, shape, device)?);
+        }
+        Ok(Self(vars))
+    }
+
+    /// Parameters from tensors, which are copied.
+    ///
+    /// # Errors
+    /// [`ModelError::Parameter`] for the first parameter that is missing, unknown, not f32, of another shape or not
+    /// finite; an invalid configuration.
+    pub fn from_tensors(config: &ModelConfig, mut tensors: HashMap<String, Tensor>, device: &Device) -> Result<Self> {
+        config.validate()?;
+        let mut vars = BTreeMap::new();
+        for (name, shape) in config.parameter_shapes() {
+            let tensor = tensors.remove(&name).ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
+            if tensor.dtype() != DType::F32 {
+                return Err(ModelError::parameter(&name, format!("has type {:?}, wanted F32", tensor.dtype())));
+            }
+            check_shape(&name, tensor.dims(), &shape)?;
+            let values = tensor.flatten_all()?.to_vec1::<f32>()?;
+            check_finite(&name, &values)?;
+            vars.insert(name, Var::from_vec(values, shape, device)?);
+        }
+        match tensors.keys().min() {
+            Some(name) => Err(ModelError::parameter(name, "is not part of this network")),
+            None => Ok(Self(vars)),
+        }
+    }
+
+    /// Parameters from the bytes of a safetensors file that holds exactly this configuration's.
+    ///
+    /// # Errors
+    /// Bytes that are not safetensors; otherwise as [`Parameters::from_tensors`].
+    pub fn load_safetensors(config: &ModelConfig, bytes: &[u8], device: &Device) -> Result<Self> {
+        let mut vars = BTreeMap::new();
+        for (name, (shape, values)) in decode(config, bytes, |_| false)? {
+            vars.insert(name, Var::from_vec(values, shape, device)?);
+        }
+        Ok(Self(vars))
+    }
+
+    /// The parameters whose name passes `filter`, as a safetensors file. Equal parameters give equal bytes.
+    ///
+    /// # Errors
+    /// A failure to read a variable or to serialise.
+    pub fn to_safetensors(&self, filter: impl Fn(&str) -> bool) -> Result<Vec<u8>> {
+        let mut tensors = Vec::new();
+        for (name, var) in self.iter().filter(|(name, _)| filter(name)) {
+            let values = var.flatten_all()?.to_vec1::<f32>()?;
+            let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+            tensors.push((name, var.dims().to_vec(), bytes));
+        }
+        let mut views = Vec::with_capacity(tensors.len());
+        for (name, shape, bytes) in &tensors {
+            views.push((*name, TensorView::new(Dtype::F32, shape.clone(), bytes)?));
+        }
+        Ok(safetensors::serialize(views, None)?)
+    }
+
+    /// The parameter of this name, for example `torso.conv1.weight`.
+    pub fn get(&self, name: &str) -> Option<&Var> {
+        self.0.get(name)
+    }
+
+    /// All parameters in the order of their names.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &Var)> {
+        self.0.iter().map(|(name, var)| (name.as_str(), var))
+    }
+
+    /// Number of parameters (tensors, not scalars).
+    pub fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    /// Whether there is no parameter.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// A deep copy, which shares nothing with this one.
+    ///
+    /// # Errors
+    /// A failure to copy a variable.
+    pub fn copy(&self) -> Result<Self> {
+        self.copy_where(|_| true)
+    }
+
+    /// A deep copy without the DIM heads: what [`ModelConfig::without_dim`] describes, for a target network.
+    ///
+    /// # Errors
+    /// A failure to copy a variable.
+    pub fn without_dim(&self) -> Result<Self> {
+        self.copy_where(|name| !is_dim(name))
+    }
+
+    fn copy_where(&self, filter: impl Fn(&str) -> bool) -> Result<Self> {
+        let mut vars = BTreeMap::new();
+        for (name, var) in self.iter().filter(|(name, _)| filter(name)) {
+            vars.insert(name.to_owned(), Var::from_tensor(&var.as_detached_tensor().copy()?)?);
+        }
+        Ok(Self(vars))
+    }
+
+    /// The variable `layer.part` as a tensor that shares its storage and its gradient.
+    pub(crate) fn tensor(&self, layer: &str, part: &str) -> Result<Tensor> {
+        let name = format!("{layer}.{part}");
+        let var = self.get(&name).ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
+        Ok(var.as_tensor().clone())
+    }
+}
+
+/// Whether a parameter belongs to the DIM heads.
+pub(crate) fn is_dim(name: &str) -> bool {
+    name.starts_with("dim.")
+}
+
+/// Shapes and values of this configuration's parameters in a safetensors file; names that pass `ignore` may be there too.
+pub(crate) fn decode(
+    config: &ModelConfig,
+    bytes: &[u8],
+    ignore: impl Fn(&str) -> bool,
+) -> Result<BTreeMap<String, (Vec<usize>, Vec<f32>)>> {
+    config.validate()?;
+    let file = SafeTensors::deserialize(bytes)?;
+    let mut found: BTreeMap<&str, TensorView<'_>> = file.iter().collect();
+    let mut parameters = BTreeMap::new();
+    for (name, shape) in config.parameter_shapes() {
+        let view = found.remove(name.as_str()).ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
+        if view.dtype() != Dtype::F32 {
+            return Err(ModelError::parameter(&name, format!("has type {:?}, wanted F32", view.dtype())));
+        }
+        check_shape(&name, view.shape(), &shape)?;
+        let (scalars, _) = view.data().as_chunks::<4>();
+        let values: Vec<f32> = scalars.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+        check_finite(&name, &values)?;
+        parameters.insert(name, (shape, values));
+    }
+    match found.keys().find(|name| !ignore(name)) {
+        Some(name) => Err(ModelError::parameter(name, "is not part of this network")),
+        None => Ok(parameters),
+    }
+}
+
+fn check_shape(name: &str, found: &[usize], wanted: &[usize]) -> Result<()> {
+    if found == wanted {
+        return Ok(());
+    }
+    Err(ModelError::parameter(name, format!("has shape {found:?}, wanted {wanted:?}")))
+}
+
+fn check_finite(name: &str, values: &[f32]) -> Result<()> {
+    match values.iter().position(|value| !value.is_finite()) {
+        Some(index) => Err(ModelError::parameter(name, format!("is {} at index {index}", values[index]))),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,122 @@
+//! The alphabet of A: which raw actions count as one visible action.
+//! It does not know games; the tables come from presets.
+
+use serde::{Deserialize, Serialize};
+
+use super::AffinityError;
+
+/// A map from raw to visible actions, and the visible ones numbered without gaps.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Alphabet {
+    /// Dense index of each raw action's visible action [n], below `len`.
+    index: Vec<u8>,
+    /// Visible actions, m.
+    len: usize,
+}
+
+impl Alphabet {
+    /// The alphabet of a table raw -> visible.
+    ///
+    /// # Errors
+    /// A table that is empty, longer than 255, or maps to an action that does not stand for itself.
+    pub fn new(map: &[u8]) -> Result<Self, AffinityError> {
+        if map.is_empty() || map.len() > 255 {
+            return Err(AffinityError(format!(
+                "an alphabet of {} actions",
+                map.len()
+            )));
+        }
+        for (raw, &visible) in map.iter().enumerate() {
+            if map.get(usize::from(visible)) != Some(&visible) {
+                return Err(AffinityError(format!(
+                    "action {raw} amounts to {visible}, which does not stand for itself"
+                )));
+            }
+        }
+        let mut visible = map.to_vec();
+        visible.sort_unstable();
+        visible.dedup();
+        // At most 255 of them, so an index fits a byte.
+        let index = map
+            .iter()
+            .map(|v| visible.partition_point(|known| known < v) as u8)
+            .collect();
+        Ok(Self {
+            index,
+            len: visible.len(),
+        })
+    }
+
+    /// The alphabet in which each of `num_actions` actions stands for itself.
+    ///
+    /// # Errors
+    /// None or more than 255 actions.
+    pub fn raw(num_actions: usize) -> Result<Self, AffinityError> {
+        let map: Vec<u8> = (0..num_actions.min(256))
+            .map(|action| action as u8)
+            .collect();
+        Self::new(&map)
+    }
+
+    /// Visible actions, m.
+    #[allow(clippy::len_without_is_empty)] // Never empty.
+    pub const fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Raw actions, n.
+    pub fn num_actions(&self) -> usize {
+        self.index.len()
+    }
+
+    /// Pairs of raw actions as pairs of dense indices.
+    pub(super) fn map_pairs(&self, pairs: &[(u8, u8)]) -> Result<Vec<(u8, u8)>, AffinityError> {
+        let index = |action: u8| {
+            let unknown =
+                || AffinityError(format!("action {action}; there are {}", self.index.len()));
+            self.index
+                .get(usize::from(action))
+                .copied()
+                .ok_or_else(unknown)
+        };
+        pairs
+            .iter()
+            .map(|&(i, j)| Ok((index(i)?, index(j)?)))
+            .collect()
+    }
+
+    /// A matrix [m, m] by dense indices as one [n, n] by raw actions.
+    pub(super) fn expand(&self, matrix: &[f64]) -> Vec<f32> {
+        let entry = |&i: &u8, &j: &u8| matrix[usize::from(i) * self.len + usize::from(j)] as f32;
+        self.index
+            .iter()
+            .flat_map(|i| self.index.iter().map(move |j| entry(i, j)))
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_visible_actions_are_numbered_without_gaps() {
+        let alphabet = Alphabet::new(&[1, 1, 2, 4, 4]).unwrap();
+        assert_eq!((alphabet.len(), alphabet.num_actions()), (3, 5));
+        assert_eq!(
+            alphabet.map_pairs(&[(0, 2), (3, 1)]).unwrap(),
+            [(0, 1), (2, 0)]
+        );
+        let expanded = alphabet.expand(&[0.0, 1.0, 2.0, 10.0, 11.0, 12.0, 20.0, 21.0, 22.0]);
+        assert_eq!(expanded[..5], [0.0, 0.0, 1.0, 2.0, 2.0]);
+        assert_eq!(expanded[20..], [20.0, 20.0, 21.0, 22.0, 22.0]);
+    }
+
+    #[test]
+    fn a_table_must_lead_to_actions_that_stand_for_themselves() {
+        assert!(Alphabet::new(&[]).is_err());
+        assert!(Alphabet::new(&[0, 2, 0]).is_err());
+        assert!(Alphabet::new(&[0, 9]).is_err());
+        assert!(Alphabet::raw(256).is_err());
+    }
+}

@@ -1,0 +1,279 @@
+//! Affinity as the paper learns it: a small network on action pairs, trained with the Jensen-Shannon bound.
+//! It has no tensors: there are at most 255^2 distinct inputs, so loops over the pairs' counts are all it takes.
+
+use rand::{Rng, seq::SliceRandom};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::{AffinityError, Alphabet, bits, row_softmax};
+
+/// The estimator's numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LearnedSettings {
+    /// Hidden units, at least 1.
+    pub hidden: usize,
+    /// Adam's learning rate, above 0.
+    pub lr: f64,
+    /// Adam's decay of the first moment, in [0, 1).
+    pub beta1: f64,
+    /// Adam's decay of the second moment, in [0, 1).
+    pub beta2: f64,
+    /// Adam's addend outside the root, above 0.
+    pub eps: f64,
+    /// Share of the old A that each update keeps, in [0, 1): A <- keep * A + (1 - keep) * row softmax of q.
+    pub keep: f64,
+}
+
+/// q(i, j) = out . relu(w_from[i] + w_to[j] + b) + c on one-hot pairs, its Adam, and the smoothed A.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LearnedAffinity {
+    alphabet: Alphabet,
+    settings: LearnedSettings,
+    /// w_from [m, hidden], w_to [m, hidden], b [hidden], out [hidden], c [1], one after the other.
+    #[serde(with = "bits")]
+    parameters: Vec<f64>,
+    #[serde(with = "bits")]
+    first_moments: Vec<f64>,
+    #[serde(with = "bits")]
+    second_moments: Vec<f64>,
+    updates: u64,
+    /// [m, m] by dense visible indices.
+    #[serde(with = "bits")]
+    smoothed: Vec<f64>,
+    /// [n, n] by raw actions.
+    #[serde(with = "bits")]
+    matrix: Vec<f32>,
+}
+
+impl LearnedAffinity {
+    /// A network drawn from `rng` with q = 0 everywhere: A is uniform over the alphabet.
+    ///
+    /// # Errors
+    /// A setting out of its range.
+    pub fn new(
+        alphabet: Alphabet,
+        settings: LearnedSettings,
+        rng: &mut ChaCha8Rng,
+    ) -> Result<Self, AffinityError> {
+        let LearnedSettings {
+            hidden,
+            lr,
+            beta1,
+            beta2,
+            eps,
+            keep,
+        } = settings;
+        let share = |x: f64| (0.0..1.0).contains(&x);
+        let fine = hidden > 0
+            && lr > 0.0
+            && lr.is_finite()
+            && eps > 0.0
+            && eps.is_finite()
+            && [beta1, beta2, keep].into_iter().all(share);
+        if !fine {
+            return Err(AffinityError(format!(
+                "settings out of range: {settings:?}"
+            )));
+        }
+        let m = alphabet.len();
+        let mut parameters = vec![0.0; (2 * m + 2) * hidden + 1];
+        // The first layer as PyTorch draws it, U(+-1/sqrt(inputs)); the last one stays 0, so that q starts at 0.
+        let bound = 1.0 / ((2 * m) as f64).sqrt();
+        let first_layer = (2 * m + 1) * hidden;
+        parameters[..first_layer]
+            .iter_mut()
+            .for_each(|p| *p = rng.random_range(-bound..bound));
+        let zeros = vec![0.0; parameters.len()];
+        let smoothed = vec![1.0 / m as f64; m * m];
+        Ok(Self {
+            matrix: alphabet.expand(&smoothed),
+            first_moments: zeros.clone(),
+            second_moments: zeros,
+            updates: 0,
+            alphabet,
+            settings,
+            parameters,
+            smoothed,
+        })
+    }
+
+    pub(super) const fn alphabet(&self) -> &Alphabet {
+        &self.alphabet
+    }
+
+    pub(super) fn matrix(&self) -> &[f32] {
+        &self.matrix
+    }
+
+    /// One Adam step up the bound `E_joint[-softplus(-q)] - E_marginal[softplus(q)]`, whose optimum is the log ratio
+    /// `ln p(i, j) / (p(i) p(j))`. Joint: the batch's pairs. Marginal: their second halves shuffled by `rng`.
+    /// Then A moves towards the new row softmax. Source: Mazoure et al. 2020, section 4; Hjelm et al. 2019, equation 4.
+    pub(super) fn observe(
+        &mut self,
+        pairs: &[(u8, u8)],
+        rng: &mut ChaCha8Rng,
+    ) -> Result<(), AffinityError> {
+        let pairs = self.alphabet.map_pairs(pairs)?;
+        if pairs.is_empty() {
+            return Ok(());
+        }
+        let mut shuffled: Vec<u8> = pairs.iter().map(|&(_, j)| j).collect();
+        shuffled.shuffle(rng);
+        let m = self.alphabet.len();
+        let q = self.q();
+        let each = 1.0 / pairs.len() as f64;
+        // Derivative of the loss (the bound, negated) by q.
+        let mut by_q = vec![0.0; m * m];
+        for (&(i, j), &other) in pairs.iter().zip(&shuffled) {
+            let joint = usize::from(i) * m + usize::from(j);
+            let marginal = usize::from(i) * m + usize::from(other);
+            by_q[joint] -= each * sigmoid(-q[joint]);
+            by_q[marginal] += each * sigmoid(q[marginal]);
+        }
+        let gradient = self.gradient(&by_q);
+        self.step(&gradient);
+        let keep = self.settings.keep;
+        let new = row_softmax(&self.q(), m);
+        for (old, new) in self.smoothed.iter_mut().zip(new) {
+            *old = keep * *old + (1.0 - keep) * new;
+        }
+        self.matrix = self.alphabet.expand(&self.smoothed);
+        Ok(())
+    }
+
+    /// Offsets of w_to, b, out and c.
+    const fn offsets(&self) -> [usize; 4] {
+        let (m, hidden) = (self.alphabet.len(), self.settings.hidden);
+        [
+            m * hidden,
+            2 * m * hidden,
+            (2 * m + 1) * hidden,
+            (2 * m + 2) * hidden,
+        ]
+    }
+
+    /// Hidden unit `h` of the pair (i, j) before its ReLU.
+    fn unit(&self, i: usize, j: usize, h: usize) -> f64 {
+        let ([to, b, ..], hidden) = (self.offsets(), self.settings.hidden);
+        let p = &self.parameters;
+        p[i * hidden + h] + p[to + j * hidden + h] + p[b + h]
+    }
+
+    /// q [m, m].
+    fn q(&self) -> Vec<f64> {
+        let (m, [_, _, out, c]) = (self.alphabet.len(), self.offsets());
+        let weights = &self.parameters[out..c];
+        let q = |i: usize, j: usize| {
+            let units = weights
+                .iter()
+                .enumerate()
+                .map(|(h, w)| w * self.unit(i, j, h).max(0.0));
+            units.sum::<f64>() + self.parameters[c]
+        };
+        (0..m * m).map(|at| q(at / m, at % m)).collect()
+    }
+
+    /// Derivative by the parameters, given that by q.
+    fn gradient(&self, by_q: &[f64]) -> Vec<f64> {
+        let (m, hidden, [to, b, out, c]) =
+            (self.alphabet.len(), self.settings.hidden, self.offsets());
+        let mut gradient = vec![0.0; self.parameters.len()];
+        for (at, &slope) in by_q.iter().enumerate().filter(|(_, slope)| **slope != 0.0) {
+            let (i, j) = (at / m, at % m);
+            gradient[c] += slope;
+            for h in 0..hidden {
+                let unit = self.unit(i, j, h);
+                if unit > 0.0 {
+                    gradient[out + h] += slope * unit;
+                    let by_unit = slope * self.parameters[out + h];
+                    gradient[i * hidden + h] += by_unit;
+                    gradient[to + j * hidden + h] += by_unit;
+                    gradient[b + h] += by_unit;
+                }
+            }
+        }
+        gradient
+    }
+
+    /// One step of Adam.
+    fn step(&mut self, gradient: &[f64]) {
+        let LearnedSettings {
+            lr,
+            beta1,
+            beta2,
+            eps,
+            ..
+        } = self.settings;
+        self.updates += 1;
+        let t = i32::try_from(self.updates).unwrap_or(i32::MAX);
+        let (rest1, rest2) = (1.0 - beta1.powi(t), 1.0 - beta2.powi(t));
+        let moments = self.first_moments.iter_mut().zip(&mut self.second_moments);
+        for ((p, &g), (m, v)) in self.parameters.iter_mut().zip(gradient).zip(moments) {
+            *m = beta1 * *m + (1.0 - beta1) * g;
+            *v = beta2 * *v + (1.0 - beta2) * g * g;
+            *p -= lr * (*m / rest1) / ((*v / rest2).sqrt() + eps);
+        }
+    }
+}
+
+fn sigmoid(x: f64) -> f64 {
+    1.0 / (1.0 + (-x).exp())
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+
+    use super::*;
+
+    const SETTINGS: LearnedSettings = LearnedSettings {
+        hidden: 5,
+        lr: 1e-3,
+        beta1: 0.9,
+        beta2: 0.999,
+        eps: 1e-8,
+        keep: 0.9,
+    };
+
+    #[test]
+    fn the_gradient_is_the_slope() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let mut learned =
+            LearnedAffinity::new(Alphabet::raw(3).unwrap(), SETTINGS, &mut rng).unwrap();
+        learned
+            .parameters
+            .iter_mut()
+            .for_each(|p| *p = rng.random_range(-1.0..1.0));
+        let by_q: Vec<f64> = (0..9).map(|i| f64::from(i) - 4.5).collect();
+        let gradient = learned.gradient(&by_q);
+        for (at, slope) in gradient.iter().enumerate() {
+            let value = |by: f64| {
+                let mut moved = learned.clone();
+                moved.parameters[at] += by;
+                moved.q().iter().zip(&by_q).map(|(q, g)| q * g).sum::<f64>()
+            };
+            let measured = (value(1e-6) - value(-1e-6)) / 2e-6;
+            assert!(
+                (measured - slope).abs() < 1e-6,
+                "parameter {at}: {measured} and {slope}"
+            );
+        }
+    }
+
+    #[test]
+    fn it_starts_uniform_and_comes_back_from_text_as_it_was() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let mut learned =
+            LearnedAffinity::new(Alphabet::new(&[1, 1, 2]).unwrap(), SETTINGS, &mut rng).unwrap();
+        assert_eq!(learned.matrix(), [0.5; 9]);
+        learned
+            .observe(&[(0, 1), (2, 2), (1, 2)], &mut rng)
+            .unwrap();
+        let text = serde_json::to_string(&learned).unwrap();
+        assert_eq!(
+            serde_json::from_str::<LearnedAffinity>(&text).unwrap(),
+            learned
+        );
+    }
+}

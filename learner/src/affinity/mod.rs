@@ -1,0 +1,187 @@
+//! Action affinity: how likely action j follows action i, against how likely j is at all, as a matrix A for the sampler.
+//! It does not draw k (the replay server does) and does not send A.
+
+pub mod alphabet;
+mod bits;
+pub mod exact;
+pub mod learned;
+
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+pub use alphabet::Alphabet;
+pub use exact::{ExactAffinity, ExactSettings};
+pub use learned::{LearnedAffinity, LearnedSettings};
+
+/// A way to estimate A from the pairs (a_t, a_{t+1}) of the learner's batches; its whole state can be saved.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "estimator", rename_all = "kebab-case")]
+pub enum AffinityEstimator {
+    /// The paper's: a small network trained with the Jensen-Shannon bound.
+    Learned(LearnedAffinity),
+    /// Closed form from decayed pair counts.
+    Exact(ExactAffinity),
+}
+
+/// A fault in settings or pairs.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("action affinity: {0}")]
+pub struct AffinityError(String);
+
+impl AffinityEstimator {
+    /// Learns from one batch's pairs of raw actions, none of which crosses an episode's end. No pairs: no change.
+    ///
+    /// # Errors
+    /// An action that the alphabet does not have: nothing has then changed.
+    pub fn observe(
+        &mut self,
+        pairs: &[(u8, u8)],
+        rng: &mut ChaCha8Rng,
+    ) -> Result<(), AffinityError> {
+        match self {
+            Self::Learned(learned) => learned.observe(pairs, rng),
+            Self::Exact(exact) => exact.observe(pairs),
+        }
+    }
+
+    /// A by raw actions [n, n], `matrix[i * n + j] = A[visible(i), visible(j)]`: looked up without the alphabet.
+    /// Over one representative of each visible action a row sums to 1.
+    pub fn matrix(&self) -> &[f32] {
+        match self {
+            Self::Learned(learned) => learned.matrix(),
+            Self::Exact(exact) => exact.matrix(),
+        }
+    }
+
+    /// Raw actions n, the side of the matrix.
+    pub fn num_actions(&self) -> usize {
+        match self {
+            Self::Learned(learned) => learned.alphabet().num_actions(),
+            Self::Exact(exact) => exact.alphabet().num_actions(),
+        }
+    }
+}
+
+/// Row-wise softmax of `q` [m, m].
+fn row_softmax(q: &[f64], m: usize) -> Vec<f64> {
+    let mut matrix = Vec::with_capacity(q.len());
+    for row in q.chunks_exact(m) {
+        let max = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let sum: f64 = row.iter().map(|q| (q - max).exp()).sum();
+        matrix.extend(row.iter().map(|q| (q - max).exp() / sum));
+    }
+    matrix
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{Rng, SeedableRng};
+
+    use super::*;
+
+    /// A Markov source of actions with four raw actions, of which 3 looks like 1.
+    const MAP: [u8; 4] = [0, 1, 2, 1];
+    const TRANSITIONS: [[f64; 4]; 4] = [
+        [0.7, 0.1, 0.1, 0.1],
+        [0.2, 0.2, 0.5, 0.1],
+        [0.3, 0.3, 0.3, 0.1],
+        [0.2, 0.3, 0.4, 0.1],
+    ];
+
+    fn walk(action: &mut usize, count: usize, rng: &mut ChaCha8Rng) -> Vec<(u8, u8)> {
+        let mut step = || {
+            let from = *action;
+            let mut left = rng.random::<f64>();
+            let next = (0..4).find(|&j| {
+                left -= TRANSITIONS[from][j];
+                left < 0.0
+            });
+            *action = next.unwrap_or(3);
+            (from as u8, *action as u8)
+        };
+        (0..count).map(|_| step()).collect()
+    }
+
+    /// A of the source itself, by raw actions: softmax over visible j of ln p(j | i) / p(j).
+    fn true_matrix() -> Vec<f32> {
+        let mut stationary = [0.25f64; 4];
+        for _ in 0..200 {
+            let next = |j: usize| (0..4).map(|i| stationary[i] * TRANSITIONS[i][j]).sum();
+            stationary = [next(0), next(1), next(2), next(3)];
+        }
+        let mut joint = [[0f64; 3]; 3];
+        for i in 0..4 {
+            for j in 0..4 {
+                joint[usize::from(MAP[i])][usize::from(MAP[j])] +=
+                    stationary[i] * TRANSITIONS[i][j];
+            }
+        }
+        let p = |j: usize| joint.iter().map(|row| row[j]).sum::<f64>();
+        let ratio = |i: usize, j: usize| joint[i][j] / joint[i].iter().sum::<f64>() / p(j);
+        let entry = |i: usize, j: usize| ratio(i, j) / (0..3).map(|j| ratio(i, j)).sum::<f64>();
+        let raw = |i: usize, j: usize| entry(usize::from(MAP[i]), usize::from(MAP[j])) as f32;
+        (0..16).map(|at| raw(at / 4, at % 4)).collect()
+    }
+
+    fn largest_error(a: &[f32], b: &[f32]) -> f32 {
+        a.iter()
+            .zip(b)
+            .map(|(a, b)| (a - b).abs())
+            .fold(0.0, f32::max)
+    }
+
+    #[test]
+    fn both_ways_find_the_source_s_own_ratios() {
+        for seed in 0..3 {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let alphabet = Alphabet::new(&MAP).unwrap();
+            let exact = ExactSettings {
+                decay: 0.9995,
+                smoothing: 1.0,
+            };
+            let learned = LearnedSettings {
+                hidden: 32,
+                lr: 2e-3,
+                beta1: 0.9,
+                beta2: 0.999,
+                eps: 1e-8,
+                keep: 0.99,
+            };
+            let mut exact =
+                AffinityEstimator::Exact(ExactAffinity::new(alphabet.clone(), exact).unwrap());
+            let mut learned = AffinityEstimator::Learned(
+                LearnedAffinity::new(alphabet, learned, &mut rng).unwrap(),
+            );
+            let mut action = 0;
+            for _ in 0..4000 {
+                let pairs = walk(&mut action, 256, &mut rng);
+                exact.observe(&pairs, &mut rng).unwrap();
+                learned.observe(&pairs, &mut rng).unwrap();
+            }
+            let truth = true_matrix();
+            let (e, l) = (
+                largest_error(exact.matrix(), &truth),
+                largest_error(learned.matrix(), &truth),
+            );
+            assert!(e < 0.005, "seed {seed}: exact is off by {e}");
+            assert!(l < 0.03, "seed {seed}: learned is off by {l}");
+            assert!(largest_error(learned.matrix(), exact.matrix()) < 0.03);
+        }
+    }
+
+    #[test]
+    fn an_unknown_action_is_an_error_and_no_pairs_change_nothing() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let settings = ExactSettings {
+            decay: 0.999,
+            smoothing: 1.0,
+        };
+        let exact = ExactAffinity::new(Alphabet::raw(3).unwrap(), settings).unwrap();
+        let mut exact = AffinityEstimator::Exact(exact);
+        let before = exact.clone();
+        assert!(exact.observe(&[(0, 1), (1, 3)], &mut rng).is_err());
+        exact.observe(&[], &mut rng).unwrap();
+        assert_eq!(exact, before);
+        assert!(largest_error(exact.matrix(), &[1.0 / 3.0; 9]) < 1e-6);
+    }
+}

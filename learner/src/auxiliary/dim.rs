@@ -1,0 +1,291 @@
+//! Deep InfoMax: InfoNCE between features of (s_t, a_t) and of s_{t+k}, for up to four pairs of levels.
+//! It holds no parameters (the model does) and does not mask beyond `positive_valid`.
+
+use candle_core::Tensor;
+use driml_model::{DimParts, Features, Network};
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    loss::info_nce::{Scores, info_nce_loss},
+    update::UpdateError,
+};
+
+/// The pairs NtM in the order of every array of four here: features N of (s_t, a_t) against features M of s_{t+k}.
+pub const PAIRS: [&str; 4] = ["3t3", "3t4", "4t3", "4t4"];
+
+/// Weight of each pair's loss in the total, 0 or above; a pair at 0 is not computed.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Lambda {
+    /// Local against local.
+    #[serde(rename = "3t3")]
+    pub l3t3: f64,
+    /// Local against global.
+    #[serde(rename = "3t4")]
+    pub l3t4: f64,
+    /// Global against local.
+    #[serde(rename = "4t3")]
+    pub l4t3: f64,
+    /// Global against global.
+    #[serde(rename = "4t4")]
+    pub l4t4: f64,
+}
+
+impl Lambda {
+    /// In the order of [`PAIRS`].
+    pub const fn values(&self) -> [f64; 4] {
+        [self.l3t3, self.l3t4, self.l4t3, self.l4t4]
+    }
+
+    /// The pairs with a weight above 0.
+    pub fn wanted(&self) -> [bool; 4] {
+        self.values().map(|lambda| lambda > 0.0)
+    }
+
+    /// The heads that the pairs with a weight above 0 need; `action` says whether psi is given a_t.
+    pub fn dim_parts(&self, action: bool) -> DimParts {
+        let [local_local, local_global, global_local, global_global] = self.wanted();
+        let psi3 = local_local || local_global;
+        let psi4 = global_local || global_global;
+        DimParts {
+            psi3,
+            phi3: local_local || global_local,
+            psi4,
+            phi4: local_global || global_global,
+            action: action && (psi3 || psi4),
+        }
+    }
+
+    /// Checks the ranges.
+    ///
+    /// # Errors
+    /// The first weight that is negative or not finite.
+    pub fn validate(&self) -> Result<(), UpdateError> {
+        for (name, value) in PAIRS.iter().zip(self.values()) {
+            if !(value >= 0.0 && value.is_finite()) {
+                return Err(UpdateError::Settings(format!("lambda.{name} is {value}")));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The DIM objective's settings.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Dim {
+    /// Weights of the pairs.
+    pub lambda: Lambda,
+    /// Bound c of the scores' soft clip `c * tanh(x / c)`.
+    pub tanh_clip: f64,
+}
+
+impl Dim {
+    /// Losses of the pairs with a weight above 0, each a scalar, before their weights.
+    ///
+    /// `features_t` of s_t, `features_k` of s_{t+k}, `action` [B], `valid` [B]: a row with 0 is neither anchor nor
+    /// candidate. Source: Mazoure et al. 2020, section 4; InfoNCE, scale and clip are `loss::info_nce`'s.
+    ///
+    /// # Errors
+    /// A head that such a pair needs and `network` lacks.
+    pub fn losses(
+        &self,
+        network: &Network,
+        features_t: &Features,
+        features_k: &Features,
+        action: &Tensor,
+        valid: &[u8],
+    ) -> Result<[Option<Tensor>; 4], UpdateError> {
+        let mut losses = [const { None }; 4];
+        let dots = dots(
+            network,
+            features_t,
+            features_k,
+            action,
+            self.lambda.wanted(),
+        )?;
+        for (loss, dots) in losses.iter_mut().zip(dots) {
+            if let Some(Dots { dots, rkhs }) = dots {
+                *loss = Some(info_nce_loss(&dots, valid, self.scores(rkhs))?);
+            }
+        }
+        Ok(losses)
+    }
+
+    /// How dot products of vectors of `rkhs` numbers become scores.
+    pub fn scores(&self, rkhs: usize) -> Scores {
+        Scores {
+            scale: 1.0 / (rkhs as f64).sqrt(),
+            tanh_clip: self.tanh_clip,
+        }
+    }
+}
+
+/// Dot products of every anchor with every candidate.
+#[derive(Debug)]
+pub struct Dots {
+    /// [L, B, B]: location, anchor, candidate; L = 1 where both features are global.
+    pub dots: Tensor,
+    /// Numbers in each vector.
+    pub rkhs: usize,
+}
+
+/// Dot products for the `wanted` pairs, in the order of [`PAIRS`].
+///
+/// Local features meet local ones at the same location; a global feature meets every location.
+///
+/// # Errors
+/// A head that a wanted pair needs and `network` lacks.
+pub fn dots(
+    network: &Network,
+    features_t: &Features,
+    features_k: &Features,
+    action: &Tensor,
+    wanted: [bool; 4],
+) -> Result<[Option<Dots>; 4], UpdateError> {
+    let [local_local, local_global, global_local, global_global] = wanted;
+    let psi3 = when(local_local || local_global, || {
+        network.psi3(&features_t.f3, action)
+    })?;
+    let phi3 = when(local_local || global_local, || network.phi3(&features_k.f3))?;
+    let psi4 = when(global_local || global_global, || {
+        network.psi4(&features_t.f4, action)
+    })?;
+    let phi4 = when(local_global || global_global, || {
+        network.phi4(&features_k.f4)
+    })?;
+    let pair = |wanted: bool, psi: &Option<Tensor>, phi: &Option<Tensor>, multiply: Multiply| {
+        let both = psi.as_ref().zip(phi.as_ref()).filter(|_| wanted);
+        both.map(|(psi, phi)| {
+            multiply(psi, phi).map(|dots| Dots {
+                dots,
+                rkhs: psi.dims()[psi.rank() - 1],
+            })
+        })
+        .transpose()
+    };
+    Ok([
+        pair(local_local, &psi3, &phi3, local_local_dots)?,
+        pair(local_global, &psi3, &phi4, local_global_dots)?,
+        pair(global_local, &psi4, &phi3, global_local_dots)?,
+        pair(global_global, &psi4, &phi4, global_global_dots)?,
+    ])
+}
+
+/// Dot products [L, B, B] of anchors and candidates.
+type Multiply = fn(&Tensor, &Tensor) -> candle_core::Result<Tensor>;
+
+fn when<E>(wanted: bool, make: impl FnOnce() -> Result<Tensor, E>) -> Result<Option<Tensor>, E> {
+    if wanted { make().map(Some) } else { Ok(None) }
+}
+
+/// `psi` [B, L, R], `phi` [B, L, R].
+fn local_local_dots(psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
+    psi.transpose(0, 1)?.matmul(&phi.permute((1, 2, 0))?)
+}
+
+/// `psi` [B, L, R], `phi` [B, R].
+fn local_global_dots(psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
+    let (rows, locations, rkhs) = psi.dims3()?;
+    let dots = psi.reshape((rows * locations, rkhs))?.matmul(&phi.t()?)?;
+    dots.reshape((rows, locations, rows))?
+        .transpose(0, 1)?
+        .contiguous()
+}
+
+/// `psi` [B, R], `phi` [B, L, R].
+fn global_local_dots(psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
+    let (rows, locations, rkhs) = phi.dims3()?;
+    let dots = phi.reshape((rows * locations, rkhs))?.matmul(&psi.t()?)?;
+    dots.reshape((rows, locations, rows))?
+        .permute((1, 2, 0))?
+        .contiguous()
+}
+
+/// `psi` [B, R], `phi` [B, R].
+fn global_global_dots(psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
+    psi.matmul(&phi.t()?)?.unsqueeze(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::Device;
+
+    use super::*;
+
+    fn ramp(shape: &[usize], by: f32) -> Tensor {
+        let count = shape.iter().product::<usize>();
+        let values: Vec<f32> = (0..count)
+            .map(|i| ((i * 7 % 11) as f32 - 5.0) * by)
+            .collect();
+        Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
+    }
+
+    /// [L, B, B] by its definition: `psi` and `phi` give the vector of a row at a location.
+    fn plain(
+        psi: impl Fn(usize, usize) -> Vec<f32>,
+        phi: impl Fn(usize, usize) -> Vec<f32>,
+    ) -> Vec<f32> {
+        let mut dots = Vec::new();
+        for l in 0..2 {
+            for i in 0..3 {
+                for j in 0..3 {
+                    dots.push(psi(i, l).iter().zip(phi(j, l)).map(|(a, b)| a * b).sum());
+                }
+            }
+        }
+        dots
+    }
+
+    #[test]
+    fn every_pair_of_levels_meets_as_it_should() -> candle_core::Result<()> {
+        let (psi3, phi3) = (ramp(&[3, 2, 4], 1.0), ramp(&[3, 2, 4], -2.0));
+        let (psi4, phi4) = (ramp(&[3, 4], 3.0), ramp(&[3, 4], -1.0));
+        let local = |t: &Tensor| t.to_vec3::<f32>().unwrap();
+        let global = |t: &Tensor| t.to_vec2::<f32>().unwrap();
+        let (p3, q3, p4, q4) = (local(&psi3), local(&phi3), global(&psi4), global(&phi4));
+        let got = |t: Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let (l, g) = (
+            |v: &Vec<Vec<Vec<f32>>>, i: usize, at: usize| v[i][at].clone(),
+            |v: &Vec<Vec<f32>>, i: usize| v[i].clone(),
+        );
+        assert_eq!(
+            got(local_local_dots(&psi3, &phi3)?),
+            plain(|i, at| l(&p3, i, at), |j, at| l(&q3, j, at))
+        );
+        assert_eq!(
+            got(local_global_dots(&psi3, &phi4)?),
+            plain(|i, at| l(&p3, i, at), |j, _| g(&q4, j))
+        );
+        assert_eq!(
+            got(global_local_dots(&psi4, &phi3)?),
+            plain(|i, _| g(&p4, i), |j, at| l(&q3, j, at))
+        );
+        let once = plain(|i, _| g(&p4, i), |j, _| g(&q4, j))[..9].to_vec();
+        assert_eq!(got(global_global_dots(&psi4, &phi4)?), once);
+        Ok(())
+    }
+
+    #[test]
+    fn only_the_heads_of_weighted_pairs_are_needed() {
+        let lambda = |l3t3, l3t4, l4t3, l4t4| Lambda {
+            l3t3,
+            l3t4,
+            l4t3,
+            l4t4,
+        };
+        let parts = |lambda: Lambda| {
+            let p = lambda.dim_parts(true);
+            [p.psi3, p.phi3, p.psi4, p.phi4, p.action]
+        };
+        assert_eq!(parts(lambda(0.0, 0.0, 0.0, 0.0)), [false; 5]);
+        assert_eq!(
+            parts(lambda(0.0, 0.0, 0.0, 1.0)),
+            [false, false, true, true, true]
+        );
+        assert_eq!(
+            parts(lambda(0.0, 0.5, 0.0, 0.0)),
+            [true, false, false, true, true]
+        );
+        assert_eq!(parts(lambda(1.0, 0.0, 0.0, 1.0)), [true; 5]);
+    }
+}

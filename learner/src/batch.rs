@@ -1,0 +1,97 @@
+//! A batch as one update reads it: borrowed planes, checked before anything is computed.
+//! It does not travel (the protocol's batch does) and is not sampled here.
+
+use driml_model::ModelConfig;
+
+use crate::update::UpdateError;
+
+/// Stands in `next_action` where a row has none: its transition ended the episode or the level.
+pub const NO_ACTION: u8 = 255;
+
+/// Rows (s_t, a_t, a_{t+1}, n-step return, discount, s_{t+k}, s_{t+n}), plane by plane; B rows each.
+#[derive(Clone, Copy, Debug)]
+pub struct Batch<'a> {
+    /// Rows, B, at least 1.
+    pub rows: usize,
+    /// s_t [B, H, W, C].
+    pub frames_t: &'a [u8],
+    /// s_{t+k} [B, H, W, C]; `None` where the agent has no use for it.
+    pub frames_k: Option<&'a [u8]>,
+    /// s_{t+n} [B, H, W, C].
+    pub frames_n: &'a [u8],
+    /// a_t [B].
+    pub action: &'a [u8],
+    /// a_{t+1} [B], or [`NO_ACTION`].
+    pub next_action: &'a [u8],
+    /// Sum of gamma^i r_{t+i} over i < n, stopped at the episode's end [B], in units of return.
+    pub n_step_return: &'a [f32],
+    /// gamma^n, or 0 where the episode ended within the n steps [B], in [0, 1].
+    pub bootstrap_discount: &'a [f32],
+    /// 0 where the row has no positive [B].
+    pub positive_valid: &'a [u8],
+}
+
+impl Batch<'_> {
+    /// Checks lengths against `model`, actions, returns and discounts.
+    ///
+    /// # Errors
+    /// [`UpdateError::Batch`] with the first fault found.
+    pub fn validate(&self, model: &ModelConfig, needs_positives: bool) -> Result<(), UpdateError> {
+        let fault = |what: String| Err(UpdateError::Batch(what));
+        let rows = self.rows;
+        if rows == 0 {
+            return fault("it has no rows".to_owned());
+        }
+        let state_bytes = model.height * model.width * model.channels;
+        let frames_k = match self.frames_k {
+            Some(frames) => frames.len(),
+            None if needs_positives => {
+                return fault("it has no positives, which DIM needs".to_owned());
+            }
+            None => rows * state_bytes,
+        };
+        for (name, length, row_length) in [
+            ("frames_t", self.frames_t.len(), state_bytes),
+            ("frames_k", frames_k, state_bytes),
+            ("frames_n", self.frames_n.len(), state_bytes),
+            ("action", self.action.len(), 1),
+            ("next_action", self.next_action.len(), 1),
+            ("n_step_return", self.n_step_return.len(), 1),
+            ("bootstrap_discount", self.bootstrap_discount.len(), 1),
+            ("positive_valid", self.positive_valid.len(), 1),
+        ] {
+            if length != rows * row_length {
+                return fault(format!(
+                    "{name} has {length} values, not {rows} rows of {row_length}"
+                ));
+            }
+        }
+        let known = |action: u8| usize::from(action) < model.num_actions;
+        for row in 0..rows {
+            let (action, next) = (self.action[row], self.next_action[row]);
+            if !known(action) || !(known(next) || next == NO_ACTION) {
+                let count = model.num_actions;
+                return fault(format!(
+                    "row {row} has actions {action}, {next}; there are {count}"
+                ));
+            }
+            let (reward, discount) = (self.n_step_return[row], self.bootstrap_discount[row]);
+            if !reward.is_finite() || !(0.0..=1.0).contains(&discount) {
+                return fault(format!(
+                    "row {row} has return {reward} and discount {discount}"
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// The pairs (a_t, a_{t+1}) of the rows that have both.
+    pub fn action_pairs(&self) -> Vec<(u8, u8)> {
+        let pairs = self
+            .action
+            .iter()
+            .copied()
+            .zip(self.next_action.iter().copied());
+        pairs.filter(|&(_, next)| next != NO_ACTION).collect()
+    }
+}

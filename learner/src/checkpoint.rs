@@ -1,0 +1,364 @@
+//! Checkpoints: all of a learner's state in one folder, from which a run resumes bit for bit.
+//! It does not decide when to save, and never falls back to an older checkpoint by itself.
+
+use std::{
+    collections::BTreeMap,
+    fs::{self, File},
+    io::{self, Write},
+    path::{Path, PathBuf},
+};
+
+use candle_core::Device;
+use driml_model::{ModelConfig, Parameters};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::{
+    affinity::AffinityEstimator,
+    update::{Learner, LearnerSettings, UpdateError},
+};
+
+const FORMAT: u32 = 1;
+const PREFIX: &str = "checkpoint-";
+const ONLINE: &str = "online.safetensors";
+const TARGET: &str = "target.safetensors";
+const OPTIMIZER: &str = "optimizer.safetensors";
+const STATE: &str = "state.json";
+const STATE_SUM: &str = "state.json.sha256";
+
+/// Why a checkpoint was not written or not read.
+#[derive(Debug, thiserror::Error)]
+pub enum CheckpointError {
+    /// The file system refused.
+    #[error("cannot {what} {path}: {source}")]
+    Io {
+        /// What was being done.
+        what: &'static str,
+        /// To what.
+        path: PathBuf,
+        /// The reason.
+        source: io::Error,
+    },
+    /// A file is not what was written.
+    #[error(
+        "{file} is damaged: {why}. To resume from the checkpoint before it, remove the folder it is in; \
+         to begin anew, remove all checkpoint-* folders beside it"
+    )]
+    Damaged {
+        /// The file.
+        file: PathBuf,
+        /// What is wrong with it.
+        why: String,
+    },
+    /// The checkpoint is another run's.
+    #[error(
+        "{folder} belongs to a run with specification {found}, this run's is {expected}: \
+         resume with the settings it was made with, or choose another folder"
+    )]
+    OtherRun {
+        /// The checkpoint.
+        folder: PathBuf,
+        /// Hash of the run that wrote it.
+        found: String,
+        /// Hash of this run.
+        expected: String,
+    },
+    /// The state does not fit the network or the settings.
+    #[error("checkpoint: {0}")]
+    Update(#[from] UpdateError),
+    /// The number of checkpoints to keep is 0.
+    #[error("at least one checkpoint must be kept")]
+    KeepNone,
+}
+
+/// What a checkpoint holds, borrowed for saving.
+#[derive(Clone, Copy, Debug)]
+pub struct RunState<'a> {
+    /// Networks, optimiser, count of updates.
+    pub learner: &'a Learner,
+    /// The affinity estimate, if the run has one.
+    pub affinity: Option<&'a AffinityEstimator>,
+    /// The learner's generator.
+    pub rng: &'a ChaCha8Rng,
+    /// Hash of the run's specification.
+    pub run_spec_hash: u64,
+}
+
+/// What a checkpoint gave.
+#[derive(Debug)]
+pub struct Restored {
+    /// Networks, optimiser, count of updates.
+    pub learner: Learner,
+    /// The affinity estimate, if the run had one.
+    pub affinity: Option<AffinityEstimator>,
+    /// The learner's generator.
+    pub rng: ChaCha8Rng,
+}
+
+/// `state.json`.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct StateFile {
+    format: u32,
+    run_spec_hash: String,
+    updates: u64,
+    adam_step: u64,
+    rng: ChaCha8Rng,
+    affinity: Option<AffinityEstimator>,
+    /// SHA-256 of the tensor files, by name.
+    sha256: BTreeMap<String, String>,
+}
+
+/// Writes `folder/checkpoint-<updates>` and removes all but the newest `keep` checkpoints.
+///
+/// Every file is written aside, flushed to disk and renamed; so is the folder: a crash at any moment leaves the older
+/// checkpoints whole and at most a `.tmp` folder, which the next save of that name replaces.
+///
+/// # Errors
+/// A failing file system; nothing older has then been removed.
+pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf, CheckpointError> {
+    if keep == 0 {
+        return Err(CheckpointError::KeepNone);
+    }
+    let learner = state.learner;
+    let name = format!("{PREFIX}{:012}", learner.updates());
+    let (path, aside) = (folder.join(&name), folder.join(format!("{name}.tmp")));
+    remove_if_there(&aside)?;
+    fs::create_dir_all(&aside).map_err(io_error("create", &aside))?;
+
+    let everything = |parameters: &Parameters| {
+        parameters
+            .to_safetensors(|_| true)
+            .map_err(UpdateError::from)
+    };
+    let moments = learner.adam.to_tensors()?;
+    let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from);
+    let mut sha256 = BTreeMap::new();
+    for (name, bytes) in [
+        (ONLINE, everything(learner.online())?),
+        (TARGET, everything(learner.target())?),
+        (OPTIMIZER, moments.map_err(UpdateError::from)?),
+    ] {
+        write_durably(&aside.join(name), &bytes)?;
+        sha256.insert(name.to_owned(), sha256_of(&bytes));
+    }
+    let file = StateFile {
+        format: FORMAT,
+        run_spec_hash: hex_of(state.run_spec_hash),
+        updates: learner.updates(),
+        adam_step: learner.adam.step_count(),
+        rng: state.rng.clone(),
+        affinity: state.affinity.cloned(),
+        sha256,
+    };
+    let text = serde_json::to_vec_pretty(&file).map_err(|why| CheckpointError::Io {
+        what: "encode",
+        path: aside.join(STATE),
+        source: why.into(),
+    })?;
+    write_durably(&aside.join(STATE), &text)?;
+    // As `sha256sum --check` reads it.
+    write_durably(
+        &aside.join(STATE_SUM),
+        format!("{}  {STATE}\n", sha256_of(&text)).as_bytes(),
+    )?;
+    sync(&aside)?;
+
+    // A checkpoint of the same update, as at a stop right after a periodic save, gives way only once this one is whole.
+    let older = folder.join(format!("{name}.replaced.tmp"));
+    remove_if_there(&older)?;
+    if path.exists() {
+        fs::rename(&path, &older).map_err(io_error("move", &path))?;
+    }
+    fs::rename(&aside, &path).map_err(io_error("move", &aside))?;
+    sync(folder)?;
+    remove_if_there(&older)?;
+
+    let all = list(folder)?;
+    for (_, old) in &all[..all.len().saturating_sub(keep)] {
+        fs::remove_dir_all(old).map_err(io_error("remove", old))?;
+    }
+    Ok(path)
+}
+
+/// The checkpoints in `folder`, oldest first, as (updates, path). A folder that does not exist has none.
+///
+/// # Errors
+/// A folder that cannot be read.
+pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
+    let entries = match fs::read_dir(folder) {
+        Ok(entries) => entries,
+        Err(why) if why.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(why) => return Err(io_error("read", folder)(why)),
+    };
+    let mut all = Vec::new();
+    for entry in entries {
+        let path = entry.map_err(io_error("read", folder))?.path();
+        let name = path
+            .file_name()
+            .and_then(|name| name.to_str())
+            .unwrap_or_default();
+        let Some(rest) = name.strip_prefix(PREFIX) else {
+            continue;
+        };
+        match rest.parse::<u64>() {
+            Ok(updates) => all.push((updates, path)),
+            Err(_) => {
+                tracing::warn!(path = %path.display(), "left from an unfinished save; not a checkpoint")
+            }
+        }
+    }
+    all.sort();
+    Ok(all)
+}
+
+/// Loads the newest checkpoint in `folder`; `None` if there is none. A damaged one is an error, not skipped.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_latest(
+    folder: &Path,
+    model: &ModelConfig,
+    settings: &LearnerSettings,
+    run_spec_hash: u64,
+) -> Result<Option<Restored>, CheckpointError> {
+    match list(folder)?.last() {
+        Some((_, path)) => load(path, model, settings, run_spec_hash).map(Some),
+        None => Ok(None),
+    }
+}
+
+/// Loads one checkpoint.
+///
+/// # Errors
+/// A file that is missing or is not what was written, a run of another specification, a network of other sizes.
+pub fn load(
+    path: &Path,
+    model: &ModelConfig,
+    settings: &LearnerSettings,
+    run_spec_hash: u64,
+) -> Result<Restored, CheckpointError> {
+    let text = read(&path.join(STATE))?;
+    let sum = read(&path.join(STATE_SUM))?;
+    if !sum.starts_with(sha256_of(&text).as_bytes()) {
+        return Err(damaged(
+            path,
+            STATE,
+            format!("its SHA-256 is not the one in {STATE_SUM}"),
+        ));
+    }
+    let state: StateFile =
+        serde_json::from_slice(&text).map_err(|why| damaged(path, STATE, why.to_string()))?;
+    if state.format != FORMAT {
+        return Err(damaged(
+            path,
+            STATE,
+            format!("its format is {}, not {FORMAT}", state.format),
+        ));
+    }
+    let expected = hex_of(run_spec_hash);
+    if state.run_spec_hash != expected {
+        let (folder, found) = (path.to_owned(), state.run_spec_hash);
+        return Err(CheckpointError::OtherRun {
+            folder,
+            found,
+            expected,
+        });
+    }
+    let tensors = |name: &str| {
+        let bytes = read(&path.join(name))?;
+        if state.sha256.get(name) == Some(&sha256_of(&bytes)) {
+            Ok(bytes)
+        } else {
+            let length = bytes.len();
+            Err(damaged(
+                path,
+                name,
+                format!("the SHA-256 of its {length} bytes is not the one in {STATE}"),
+            ))
+        }
+    };
+    let parameters = |model: &ModelConfig, name: &str| {
+        let loaded = Parameters::load_safetensors(model, &tensors(name)?, &Device::Cpu);
+        loaded.map_err(|why| damaged(path, name, why.to_string()))
+    };
+    let online = parameters(model, ONLINE)?;
+    let target = parameters(&model.without_dim(), TARGET)?;
+    let moments = candle_core::safetensors::load_buffer(&tensors(OPTIMIZER)?, &Device::Cpu)
+        .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
+    let mut learner = Learner::from_parameters(model.clone(), settings.clone(), online, target)?;
+    learner
+        .restore_progress(state.updates, state.adam_step, moments)
+        .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
+    Ok(Restored {
+        learner,
+        affinity: state.affinity,
+        rng: state.rng,
+    })
+}
+
+fn io_error<'a>(
+    what: &'static str,
+    path: &'a Path,
+) -> impl FnOnce(io::Error) -> CheckpointError + 'a {
+    move |source| CheckpointError::Io {
+        what,
+        path: path.to_owned(),
+        source,
+    }
+}
+
+fn damaged(folder: &Path, file: &str, why: String) -> CheckpointError {
+    CheckpointError::Damaged {
+        file: folder.join(file),
+        why,
+    }
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, CheckpointError> {
+    fs::read(path).map_err(|why| match why.kind() {
+        io::ErrorKind::NotFound => CheckpointError::Damaged {
+            file: path.to_owned(),
+            why: "it is missing".to_owned(),
+        },
+        _ => io_error("read", path)(why),
+    })
+}
+
+/// Writes a file aside, flushes it to disk and gives it its name.
+fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
+    let mut aside = path.as_os_str().to_owned();
+    aside.push(".tmp");
+    let aside = PathBuf::from(aside);
+    let mut file = File::create(&aside).map_err(io_error("create", &aside))?;
+    file.write_all(bytes)
+        .and_then(|()| file.sync_all())
+        .map_err(io_error("write", &aside))?;
+    fs::rename(&aside, path).map_err(io_error("move", &aside))
+}
+
+/// Flushes a folder's own entries to disk.
+fn sync(folder: &Path) -> Result<(), CheckpointError> {
+    File::open(folder)
+        .and_then(|folder| folder.sync_all())
+        .map_err(io_error("flush", folder))
+}
+
+fn remove_if_there(folder: &Path) -> Result<(), CheckpointError> {
+    match fs::remove_dir_all(folder) {
+        Err(why) if why.kind() != io::ErrorKind::NotFound => Err(io_error("remove", folder)(why)),
+        _ => Ok(()),
+    }
+}
+
+fn sha256_of(bytes: &[u8]) -> String {
+    Sha256::digest(bytes)
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect()
+}
+
+fn hex_of(hash: u64) -> String {
+    format!("{hash:016x}")
+}

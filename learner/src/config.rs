@@ -1,0 +1,204 @@
+//! The learner's settings, and what it takes from the run's other tables.
+//! It fills in no number: presets do, with their sources.
+
+use driml_model::ModelConfig;
+use driml_protocol::{RunSpec, config::Settings};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    affinity::{
+        AffinityError, AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity,
+        LearnedSettings,
+    },
+    update::LearnerSettings,
+};
+
+/// The `[learner]` table.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Rows of one update, B.
+    pub batch_rows: u32,
+    /// Batches asked for ahead of the one being learned from.
+    pub batches_in_flight: u32,
+    /// Updates from one version of the weights to the next.
+    pub publish_period_updates: u64,
+    /// Updates from one checkpoint to the next.
+    pub checkpoint_period_updates: u64,
+    /// Checkpoints kept; older ones are removed.
+    pub checkpoints_kept: u32,
+    /// Losses, optimiser and target network.
+    pub update: LearnerSettings,
+    /// Action affinity.
+    pub affinity: AffinityConfig,
+}
+
+/// How A is estimated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum EstimatorKind {
+    /// Not at all.
+    None,
+    /// By a small network (the paper).
+    Learned,
+    /// In closed form from counts.
+    Exact,
+}
+
+/// Which actions A tells apart.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum AlphabetKind {
+    /// All that the world takes.
+    Raw,
+    /// Those that differ in what they do.
+    Visible,
+}
+
+/// The `[learner.affinity]` table; an estimator that is not chosen needs no numbers.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AffinityConfig {
+    /// How A is estimated.
+    pub estimator: EstimatorKind,
+    /// Which actions A tells apart.
+    pub alphabet: Option<AlphabetKind>,
+    /// For each raw action the one that it amounts to; needed for the alphabet `visible`.
+    pub visible: Option<Vec<u8>>,
+    /// Numbers of the learned estimate.
+    pub learned: Option<LearnedSettings>,
+    /// Numbers of the exact estimate.
+    pub exact: Option<ExactSettings>,
+}
+
+impl AffinityConfig {
+    /// The estimator that the settings ask for, with its weights drawn from `rng`.
+    ///
+    /// # Errors
+    /// A number or table that is missing or out of range.
+    pub fn estimator(
+        &self,
+        num_actions: usize,
+        rng: &mut ChaCha8Rng,
+    ) -> Result<Option<AffinityEstimator>, ConfigError> {
+        let missing = |key| ConfigError {
+            key,
+            value: "(missing)".into(),
+            why: "the chosen estimator needs it: start from a preset".into(),
+        };
+        let bad = |e: AffinityError| ConfigError {
+            key: "affinity",
+            value: format!("{:?}", self.estimator),
+            why: e.to_string(),
+        };
+        if self.estimator == EstimatorKind::None {
+            return Ok(None);
+        }
+        let alphabet = match self.alphabet.ok_or_else(|| missing("affinity.alphabet"))? {
+            AlphabetKind::Raw => Alphabet::raw(num_actions),
+            AlphabetKind::Visible => {
+                Alphabet::new(self.visible.as_ref().ok_or_else(|| missing("affinity.visible"))?)
+            }
+        }
+        .map_err(bad)?;
+        if alphabet.num_actions() != num_actions {
+            return Err(ConfigError {
+                key: "affinity.visible",
+                value: format!("{} actions", alphabet.num_actions()),
+                why: format!("the world has {num_actions}"),
+            });
+        }
+        let estimator = match self.estimator {
+            EstimatorKind::Exact => {
+                let settings = self.exact.ok_or_else(|| missing("affinity.exact"))?;
+                AffinityEstimator::Exact(ExactAffinity::new(alphabet, settings).map_err(bad)?)
+            }
+            _ => {
+                let settings = self.learned.ok_or_else(|| missing("affinity.learned"))?;
+                AffinityEstimator::Learned(
+                    LearnedAffinity::new(alphabet, settings, rng).map_err(bad)?,
+                )
+            }
+        };
+        Ok(Some(estimator))
+    }
+}
+
+/// Why the learner's settings cannot work.
+#[derive(Debug, thiserror::Error, PartialEq)]
+#[error("learner.{key} = {value} cannot work: {why}")]
+pub struct ConfigError {
+    key: &'static str,
+    value: String,
+    why: String,
+}
+
+impl Config {
+    /// Checks every field's range but those of `update`, which checks itself.
+    ///
+    /// # Errors
+    /// The first field that cannot work, and why.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        for (key, value, max) in [
+            ("batch_rows", u64::from(self.batch_rows), 65_536),
+            ("batches_in_flight", u64::from(self.batches_in_flight), 64),
+            ("publish_period_updates", self.publish_period_updates, u64::MAX),
+            ("checkpoint_period_updates", self.checkpoint_period_updates, u64::MAX),
+            ("checkpoints_kept", u64::from(self.checkpoints_kept), 1_000_000),
+        ] {
+            if value == 0 || value > max {
+                let why = format!("it must lie between 1 and {max}");
+                return Err(ConfigError { key, value: value.to_string(), why });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The size at which the network sees a frame: the `[input]` table.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct InputSize {
+    height: usize,
+    width: usize,
+}
+
+/// Everything a learner needs to know of a run.
+#[derive(Clone, Debug)]
+pub struct LearnerPart {
+    /// What all parts agree on.
+    pub spec: RunSpec,
+    /// The network.
+    pub model: ModelConfig,
+    /// The learner's own.
+    pub learner: Config,
+}
+
+impl LearnerPart {
+    /// Reads the tables from a run's resolved settings.
+    ///
+    /// # Errors
+    /// A table that is missing or does not fit, or values that cannot work.
+    pub fn from_toml(text: &str) -> anyhow::Result<Self> {
+        let settings = Settings::parse(text)?;
+        let this = Self {
+            spec: settings.table("run")?,
+            model: settings.table("model")?,
+            learner: settings.table("learner")?,
+        };
+        let input: InputSize = settings.table("input")?;
+        this.spec.validate()?;
+        this.model.validate()?;
+        this.learner.validate()?;
+        this.learner.update.validate()?;
+        let states = (this.spec.frame_channels * this.spec.frame_stack) as usize;
+        anyhow::ensure!(
+            (this.model.height, this.model.width, this.model.channels)
+                == (input.height, input.width, states)
+                && this.model.num_actions == this.spec.num_actions as usize,
+            "the [model] table's sizes do not follow from [run] and [input]: write the settings anew with `driml local`"
+        );
+        Ok(this)
+    }
+}

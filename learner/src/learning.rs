@@ -1,0 +1,156 @@
+//! A learner's work without its network connections: batch in, report out, weights and affinity on demand.
+//! The processes and the lockstep mode run this same code; it neither asks for batches nor sends anything.
+
+use std::path::Path;
+
+use driml_model::Enlarge;
+use driml_protocol::{AffinityUpdate, Batch as WireBatch, WeightsHeader};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::{
+    affinity::AffinityEstimator,
+    batch::Batch,
+    checkpoint::{self, RunState},
+    config::LearnerPart,
+    update::{Learner, UpdateReport},
+};
+
+/// Weights as they travel: what they say of themselves, and a safetensors file.
+pub type Weights = (WeightsHeader, Vec<u8>);
+
+/// Everything that a learner changes while it learns.
+pub struct Learning {
+    part: LearnerPart,
+    spec_hash: u64,
+    learner: Learner,
+    affinity: Option<AffinityEstimator>,
+    rng: ChaCha8Rng,
+    enlarge: Option<Enlarge>,
+    weights_version: u64,
+}
+
+impl Learning {
+    /// A learner at its start, all generators derived from the run's seed.
+    ///
+    /// # Errors
+    /// Settings that cannot work.
+    pub fn new(part: LearnerPart) -> anyhow::Result<Self> {
+        let spec = &part.spec;
+        let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
+        let mut rng = ChaCha8Rng::from_seed(spec.seed_for("learner", 0));
+        let learner = Learner::new(part.model.clone(), part.learner.update.clone(), &mut init)?;
+        let affinity = part.learner.affinity.estimator(part.model.num_actions, &mut rng)?;
+        let from = (spec.frame_height as usize, spec.frame_width as usize);
+        let to = (part.model.height, part.model.width);
+        let enlarge = (from != to).then(|| Enlarge::new(from, to, part.model.channels)).transpose()?;
+        Ok(Self {
+            spec_hash: spec.hash(),
+            learner,
+            affinity,
+            rng,
+            enlarge,
+            weights_version: 0,
+            part,
+        })
+    }
+
+    /// Hash of the run spec.
+    pub const fn spec_hash(&self) -> u64 {
+        self.spec_hash
+    }
+
+    /// Updates taken.
+    pub const fn updates(&self) -> u64 {
+        self.learner.updates()
+    }
+
+    /// Learns from one batch: the network, then the affinity.
+    ///
+    /// # Errors
+    /// A batch that does not fit, or arithmetic that left the finite numbers; the learner is then as it was.
+    pub fn update(&mut self, batch: &WireBatch) -> anyhow::Result<UpdateReport> {
+        let enlarged = |states: &[u8]| match &self.enlarge {
+            None => None,
+            Some(enlarge) => {
+                let count = states.len() / enlarge.input_bytes();
+                let mut out = vec![0; count * enlarge.output_bytes()];
+                enlarge.apply(states, &mut out);
+                Some(out)
+            }
+        };
+        let states = [batch.frames_t(), batch.frames_k(), batch.frames_n()];
+        let larger = states.map(enlarged);
+        let frames = |i: usize| larger[i].as_deref().unwrap_or(states[i]);
+        let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
+        let without_positives;
+        let positive_valid = if batch.positives() > 0 {
+            batch.positive_valid()
+        } else {
+            without_positives = vec![0; batch.rows()];
+            &without_positives
+        };
+        let batch = Batch {
+            rows: batch.rows(),
+            frames_t: frames(0),
+            frames_k: (batch.positives() > 0).then(|| frames(1)),
+            frames_n: frames(2),
+            action: batch.actions(),
+            next_action: batch.next_actions(),
+            n_step_return: &returns,
+            bootstrap_discount: &discounts,
+            positive_valid,
+        };
+        let report = self.learner.update(&batch)?;
+        if let Some(affinity) = &mut self.affinity {
+            affinity.observe(&batch.action_pairs(), &mut self.rng)?;
+        }
+        Ok(report)
+    }
+
+    /// The affinity matrix after the last update, if this agent has one.
+    pub fn affinity_update(&self) -> Option<AffinityUpdate> {
+        self.affinity.as_ref().map(|affinity| AffinityUpdate {
+            version: self.learner.updates(),
+            num_actions: affinity.num_actions() as u32,
+            matrix: affinity.matrix().to_vec(),
+        })
+    }
+
+    /// Whether the actors are due newer weights after this many updates.
+    pub const fn publication_is_due(&self) -> bool {
+        self.learner.updates().is_multiple_of(self.part.learner.publish_period_updates)
+    }
+
+    /// Whether a checkpoint is due after this many updates.
+    pub const fn checkpoint_is_due(&self) -> bool {
+        self.learner.updates().is_multiple_of(self.part.learner.checkpoint_period_updates)
+    }
+
+    /// The present weights as a new version.
+    ///
+    /// # Errors
+    /// The tensor library failed.
+    pub fn next_weights(&mut self) -> anyhow::Result<Weights> {
+        let safetensors = self.learner.weights()?;
+        self.weights_version += 1;
+        let header = WeightsHeader::new(self.weights_version, self.updates(), &safetensors);
+        Ok((header, safetensors))
+    }
+
+    /// Writes a checkpoint into `folder`.
+    ///
+    /// # Errors
+    /// The file system refused; older checkpoints are untouched.
+    pub fn save(&self, folder: &Path) -> anyhow::Result<()> {
+        let state = RunState {
+            learner: &self.learner,
+            affinity: self.affinity.as_ref(),
+            rng: &self.rng,
+            run_spec_hash: self.spec_hash,
+        };
+        let path = checkpoint::save(folder, &state, self.part.learner.checkpoints_kept as usize)?;
+        tracing::info!("saved {}", path.display());
+        Ok(())
+    }
+}

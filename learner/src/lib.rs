@@ -1,0 +1,30 @@
+//! The learner's library: losses, optimiser, one update, affinity, checkpoints and the parity check.
+//! The arithmetic here knows no network connection, no replay and no world.
+
+#![cfg_attr(test, allow(clippy::unwrap_used))]
+
+pub mod affinity;
+pub mod auxiliary;
+pub mod batch;
+mod batch_source;
+pub mod checkpoint;
+mod config;
+mod learning;
+pub mod loss;
+pub mod optim;
+pub mod parity;
+mod publish;
+mod run;
+pub mod target;
+pub mod update;
+
+pub use affinity::{
+    AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
+};
+pub use auxiliary::dim::Lambda;
+pub use batch::{Batch, NO_ACTION};
+pub use config::{AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart};
+pub use learning::{Learning, Weights};
+pub use optim::AdamSettings;
+pub use run::{RunArgs, run};
+pub use update::{Learner, LearnerSettings, UpdateError, UpdateReport};

@@ -1,0 +1,157 @@
+//! The C51 projection: one Bellman step of a return distribution, put back onto the atoms.
+//! It does not choose the action, and it does not check for NaN: its callers do.
+
+/// Moves return distributions one Bellman step and back onto the atoms.
+///
+/// With atoms `z_i = v_min + i * (v_max - v_min) / (N - 1)`, atom i of a row moves to
+/// `b = (clamp(reward + discount * z_i, v_min, v_max) - v_min) / (z_1 - z_0)` atoms, and its probability is split
+/// between `floor(b)` and the next atom in proportion to nearness; where `b` is an atom that atom gets all of it.
+///
+/// `probs` [B, N], rows sum to 1; `reward` [B], in units of return; `discount` [B], 0 where the episode ended.
+/// `out` [B, N] is overwritten; its rows sum to what the rows of `probs` sum to. Positions are computed in f64.
+/// Source: Bellemare et al. 2017, algorithm 1.
+///
+/// # Panics
+/// If the lengths disagree, or `v_min < v_max` does not hold, or N < 2: the caller has checked its batch by then.
+pub fn project(
+    probs: &[f32],
+    reward: &[f32],
+    discount: &[f32],
+    v_min: f32,
+    v_max: f32,
+    out: &mut [f32],
+) {
+    let rows = reward.len();
+    assert!(
+        rows > 0 && discount.len() == rows,
+        "one reward and one discount a row"
+    );
+    let atoms = probs.len() / rows;
+    assert!(
+        atoms >= 2 && probs.len() == rows * atoms,
+        "two atoms or more, whole rows"
+    );
+    assert_eq!(probs.len(), out.len(), "the result has the shape of probs");
+    assert!(v_min < v_max, "a support from {v_min} to {v_max}");
+
+    let (v_min, v_max) = (f64::from(v_min), f64::from(v_max));
+    let last = (atoms - 1) as f64;
+    let spacing = (v_max - v_min) / last;
+    let mut row_out = vec![0f64; atoms];
+    let rows_in = probs.chunks_exact(atoms).zip(reward.iter().zip(discount));
+    for ((row_in, (&reward, &discount)), out) in rows_in.zip(out.chunks_exact_mut(atoms)) {
+        let (reward, discount) = (f64::from(reward), f64::from(discount));
+        row_out.fill(0.0);
+        for (i, &p) in row_in.iter().enumerate() {
+            let moved = reward + discount * (v_min + i as f64 * spacing);
+            // A position on an atom must not lose its mass to rounding beyond the last one.
+            let b = ((moved.clamp(v_min, v_max) - v_min) / spacing).clamp(0.0, last);
+            let low = b.floor();
+            let (index, above) = (low as usize, b - low);
+            row_out[index] += f64::from(p) * (1.0 - above);
+            if above > 0.0 {
+                row_out[index + 1] += f64::from(p) * above;
+            }
+        }
+        for (out, &p) in out.iter_mut().zip(&row_out) {
+            *out = p as f32;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const ATOMS: usize = 51;
+
+    fn projected(probs: &[f32], reward: f32, discount: f32) -> Vec<f32> {
+        let mut out = vec![f32::NAN; probs.len()];
+        project(probs, &[reward], &[discount], -10.0, 10.0, &mut out);
+        out
+    }
+
+    fn mean(probs: &[f32]) -> f64 {
+        let spacing = 20.0 / (probs.len() - 1) as f64;
+        probs
+            .iter()
+            .enumerate()
+            .map(|(i, &p)| f64::from(p) * (-10.0 + i as f64 * spacing))
+            .sum()
+    }
+
+    fn one_hot(at: usize) -> Vec<f32> {
+        (0..ATOMS).map(|i| f32::from(u8::from(i == at))).collect()
+    }
+
+    fn distribution() -> impl Strategy<Value = Vec<f32>> {
+        prop::collection::vec(0.0f64..1.0, ATOMS).prop_map(|weights| {
+            let sum: f64 = weights.iter().sum::<f64>() + 1e-9;
+            weights
+                .iter()
+                .map(|w| ((w + 1e-9 / ATOMS as f64) / sum) as f32)
+                .collect()
+        })
+    }
+
+    proptest! {
+        #[test]
+        fn rows_keep_their_mass(
+            probs in distribution(),
+            reward in prop_oneof![-30.0f32..30.0, Just(-1e30f32), Just(1e30f32)],
+            discount in 0.0f32..=1.0,
+        ) {
+            let out = projected(&probs, reward, discount);
+            let (before, after): (f64, f64) =
+                (probs.iter().map(|&p| f64::from(p)).sum(), out.iter().map(|&p| f64::from(p)).sum());
+            prop_assert!((before - after).abs() < 1e-6);
+            prop_assert!(out.iter().all(|p| (0.0..=1.0 + 1e-6).contains(p)));
+        }
+
+        #[test]
+        fn the_mean_moves_by_the_bellman_step_inside_the_support(
+            probs in distribution(),
+            discount in 0.0f32..=0.9,
+            share in -1.0f32..1.0,
+        ) {
+            // Every moved atom stays in [-10, 10].
+            let reward = share * 10.0 * (1.0 - discount);
+            let out = projected(&probs, reward, discount);
+            let sum: f64 = probs.iter().map(|&p| f64::from(p)).sum();
+            let expected = f64::from(reward) * sum + f64::from(discount) * mean(&probs);
+            prop_assert!((mean(&out) - expected).abs() < 1e-5);
+        }
+
+        #[test]
+        fn a_return_on_an_atom_takes_all_the_mass(probs in distribution(), at in 0usize..ATOMS) {
+            let out = projected(&probs, -10.0 + 0.4 * at as f32, 0.0);
+            prop_assert!((out[at] - 1.0).abs() < 1e-5, "{} at {at}", out[at]);
+        }
+    }
+
+    #[test]
+    fn whole_steps_of_one_atom_shift_the_distribution() {
+        // 21 atoms on [-10, 10] are one unit apart, so that a reward of 2 is exact.
+        let probs: Vec<f32> = (0..21).map(|i| if i < 4 { 0.25 } else { 0.0 }).collect();
+        let out = projected(&probs, 2.0, 1.0);
+        let expected: Vec<f32> = (0..21)
+            .map(|i| if (2..6).contains(&i) { 0.25 } else { 0.0 })
+            .collect();
+        assert_eq!(out, expected);
+    }
+
+    #[test]
+    fn returns_beyond_the_support_are_clamped_to_its_ends() {
+        assert_eq!(projected(&one_hot(20), 1e30, 0.0), one_hot(ATOMS - 1));
+        assert_eq!(projected(&one_hot(20), -1e30, 0.99), one_hot(0));
+        assert_eq!(projected(&one_hot(ATOMS - 1), 5.0, 1.0), one_hot(ATOMS - 1));
+    }
+
+    #[test]
+    fn a_return_between_two_atoms_is_split_by_nearness() {
+        let out = projected(&one_hot(7), 0.1, 0.0);
+        assert!((out[25] - 0.75).abs() < 1e-6 && (out[26] - 0.25).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,342 @@
+//! A parity case as its file gives it: settings, inputs, parameters and expectations, all checked.
+//! It computes nothing.
+
+use std::{
+    cell::RefCell,
+    collections::{BTreeMap, BTreeSet, HashMap},
+    io,
+    path::PathBuf,
+};
+
+use candle_core::{DType, Device, Tensor};
+use driml_model::{ConvLayer, DimParts, ModelConfig};
+use safetensors::SafeTensors;
+use serde::Deserialize;
+
+use crate::{
+    auxiliary::dim::Lambda,
+    batch::{Batch, NO_ACTION},
+    optim::AdamSettings,
+    update::{LearnerSettings, UpdateError},
+};
+
+/// Why a case could not be checked.
+#[derive(Debug, thiserror::Error)]
+pub enum ParityError {
+    /// The file could not be read.
+    #[error("cannot read {file}: {source}")]
+    Read {
+        /// The case.
+        file: PathBuf,
+        /// The reason.
+        source: io::Error,
+    },
+    /// The file was read, but cannot be checked.
+    #[error("{file}: {why}")]
+    InFile {
+        /// The case.
+        file: PathBuf,
+        /// The reason.
+        why: Box<ParityError>,
+    },
+    /// Not a safetensors file, or not all of one.
+    #[error("not a whole safetensors file: {0}")]
+    Format(String),
+    /// The metadata key `config` is missing or says nothing usable.
+    #[error("metadata key `config`: {0}")]
+    Config(String),
+    /// A tensor is missing, or is not what it must be.
+    #[error("tensor {name}: {why}")]
+    Tensor {
+        /// Its name in the file.
+        name: String,
+        /// What is wrong with it.
+        why: String,
+    },
+    /// The update refused the case.
+    #[error(transparent)]
+    Update(#[from] UpdateError),
+    /// The model refused the case's parameters.
+    #[error(transparent)]
+    Model(#[from] driml_model::ModelError),
+    /// The tensor library refused.
+    #[error(transparent)]
+    Candle(#[from] candle_core::Error),
+}
+
+/// The metadata's `config`.
+#[derive(Debug, Deserialize)]
+struct Config {
+    obs: Observation,
+    actions: usize,
+    atoms: usize,
+    v_min: f32,
+    v_max: f32,
+    double_dqn: bool,
+    lambda: Lambda,
+    tanh_clip: f64,
+    max_grad_norm: f64,
+    adam: AdamSettings,
+    model: Sizes,
+}
+
+#[derive(Debug, Deserialize)]
+struct Observation {
+    height: usize,
+    width: usize,
+    channels: usize,
+}
+
+#[derive(Debug, Deserialize)]
+struct Sizes {
+    conv: Vec<(usize, usize, usize)>,
+    hidden: usize,
+    rkhs: usize,
+    action_embed: usize,
+}
+
+/// One case.
+pub(super) struct Case {
+    config: Config,
+    pub(super) settings: LearnerSettings,
+    pub(super) rows: usize,
+    frames: [Vec<u8>; 3],
+    action: Vec<u8>,
+    next_action: Vec<u8>,
+    n_step_return: Vec<f32>,
+    bootstrap_discount: Vec<f32>,
+    positive_valid: Vec<u8>,
+    tensors: BTreeMap<String, Tensor>,
+    /// Expectations that were asked for.
+    used: RefCell<BTreeSet<String>>,
+}
+
+/// Every head of the DIM objective.
+pub(super) const fn all_parts() -> DimParts {
+    DimParts {
+        psi3: true,
+        phi3: true,
+        psi4: true,
+        phi4: true,
+        action: true,
+    }
+}
+
+impl Case {
+    pub(super) fn parse(bytes: &[u8]) -> Result<Self, ParityError> {
+        let format = |why: String| ParityError::Format(why);
+        let (_, header) =
+            SafeTensors::read_metadata(bytes).map_err(|why| format(why.to_string()))?;
+        let text = header
+            .metadata()
+            .as_ref()
+            .and_then(|metadata| metadata.get("config"));
+        let text = text.ok_or_else(|| ParityError::Config("it is missing".to_owned()))?;
+        let config: Config =
+            serde_json::from_str(text).map_err(|why| ParityError::Config(why.to_string()))?;
+        let tensors: BTreeMap<String, Tensor> =
+            candle_core::safetensors::load_buffer(bytes, &Device::Cpu)
+                .map_err(|why| format(why.to_string()))?
+                .into_iter()
+                .collect();
+        let settings = LearnerSettings {
+            double_dqn: config.double_dqn,
+            lambda: config.lambda,
+            tanh_clip: config.tanh_clip,
+            max_grad_norm: config.max_grad_norm,
+            adam: config.adam,
+            // One update: the target network does not move.
+            target_period_updates: u64::MAX,
+            target_tau: 1.0,
+        };
+        let mut case = Self {
+            rows: 0,
+            frames: Default::default(),
+            action: Vec::new(),
+            next_action: Vec::new(),
+            n_step_return: Vec::new(),
+            bootstrap_discount: Vec::new(),
+            positive_valid: Vec::new(),
+            used: RefCell::default(),
+            config,
+            settings,
+            tensors,
+        };
+        case.read_inputs()?;
+        Ok(case)
+    }
+
+    fn read_inputs(&mut self) -> Result<(), ParityError> {
+        let Observation {
+            height,
+            width,
+            channels,
+        } = self.config.obs;
+        self.rows = self.tensor("input.action")?.elem_count();
+        let rows = self.rows;
+        for (at, name) in ["input.frames_t", "input.frames_k", "input.frames_n"]
+            .into_iter()
+            .enumerate()
+        {
+            let frames = self.input(name, DType::U8, &[rows, height, width, channels])?;
+            self.frames[at] = frames.flatten_all()?.to_vec1()?;
+        }
+        let actions: Vec<i64> = self.input("input.action", DType::I64, &[rows])?.to_vec1()?;
+        let action = |action: i64| {
+            u8::try_from(action)
+                .ok()
+                .filter(|&action| action != NO_ACTION)
+        };
+        let narrowed: Option<Vec<u8>> = actions.iter().map(|&a| action(a)).collect();
+        self.action = narrowed.ok_or_else(|| ParityError::Tensor {
+            name: "input.action".to_owned(),
+            why: format!("its actions {actions:?} are not all in 0..255"),
+        })?;
+        self.next_action = vec![NO_ACTION; rows];
+        self.n_step_return = self
+            .input("input.n_step_return", DType::F32, &[rows])?
+            .to_vec1()?;
+        self.bootstrap_discount = self
+            .input("input.bootstrap_discount", DType::F32, &[rows])?
+            .to_vec1()?;
+        self.positive_valid = self
+            .input("input.positive_valid", DType::U8, &[rows])?
+            .to_vec1()?;
+        Ok(())
+    }
+
+    pub(super) fn model(&self, dim: DimParts) -> ModelConfig {
+        let Config {
+            obs,
+            actions,
+            atoms,
+            v_min,
+            v_max,
+            model,
+            ..
+        } = &self.config;
+        let conv = |&(out, kernel, stride): &(usize, usize, usize)| ConvLayer {
+            out,
+            kernel,
+            stride,
+        };
+        ModelConfig {
+            height: obs.height,
+            width: obs.width,
+            channels: obs.channels,
+            num_actions: *actions,
+            atoms: *atoms,
+            v_min: *v_min,
+            v_max: *v_max,
+            conv: model.conv.iter().map(conv).collect(),
+            hidden: model.hidden,
+            rkhs: model.rkhs,
+            action_embed: model.action_embed,
+            dim,
+        }
+    }
+
+    pub(super) fn batch(&self) -> Batch<'_> {
+        let [frames_t, frames_k, frames_n] = &self.frames;
+        Batch {
+            rows: self.rows,
+            frames_t,
+            frames_k: Some(frames_k),
+            frames_n,
+            action: &self.action,
+            next_action: &self.next_action,
+            n_step_return: &self.n_step_return,
+            bootstrap_discount: &self.bootstrap_discount,
+            positive_valid: &self.positive_valid,
+        }
+    }
+
+    /// The online parameters, without their prefix.
+    pub(super) fn online(&self) -> impl Iterator<Item = (&str, &Tensor)> {
+        self.tensors
+            .iter()
+            .filter_map(|(name, tensor)| Some((name.strip_prefix("online.")?, tensor)))
+    }
+
+    /// The parameters under `prefix` that `model` builds: heads that no lambda uses are left out.
+    pub(super) fn parameters(&self, prefix: &str, model: &ModelConfig) -> HashMap<String, Tensor> {
+        let DimParts {
+            psi3,
+            phi3,
+            psi4,
+            phi4,
+            action,
+        } = model.dim;
+        let unused = |name: &str| {
+            [
+                ("psi3", psi3),
+                ("phi3", phi3),
+                ("psi4", psi4),
+                ("phi4", phi4),
+                ("action", action),
+            ]
+            .iter()
+            .any(|(part, built)| !built && name.starts_with(&format!("dim.{part}.")))
+        };
+        let named = self
+            .tensors
+            .iter()
+            .filter_map(|(name, t)| Some((name.strip_prefix(prefix)?, t)));
+        named
+            .filter(|(name, _)| !unused(name))
+            .map(|(name, t)| (name.to_owned(), t.clone()))
+            .collect()
+    }
+
+    /// The values of `expect.<name>`, as f64.
+    pub(super) fn expected(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>, ParityError> {
+        let name = format!("expect.{name}");
+        let tensor = self.tensor(&name)?;
+        if tensor.dims() != shape {
+            let why = format!("its shape is {:?}, not {shape:?}", tensor.dims());
+            return Err(ParityError::Tensor { name, why });
+        }
+        let values = tensor.to_dtype(DType::F64)?.flatten_all()?.to_vec1()?;
+        self.used.borrow_mut().insert(name);
+        Ok(values)
+    }
+
+    /// An expectation that nothing was compared with must not pass as met.
+    pub(super) fn check_all_expectations_used(&self) -> Result<(), ParityError> {
+        let used = self.used.borrow();
+        match self
+            .tensors
+            .keys()
+            .find(|name| name.starts_with("expect.") && !used.contains(*name))
+        {
+            None => Ok(()),
+            Some(name) => Err(ParityError::Tensor {
+                name: name.clone(),
+                why: "this expectation is not known here".to_owned(),
+            }),
+        }
+    }
+
+    fn tensor(&self, name: &str) -> Result<&Tensor, ParityError> {
+        let missing = || ParityError::Tensor {
+            name: name.to_owned(),
+            why: "it is missing".to_owned(),
+        };
+        self.tensors.get(name).ok_or_else(missing)
+    }
+
+    fn input(&self, name: &str, dtype: DType, shape: &[usize]) -> Result<&Tensor, ParityError> {
+        let tensor = self.tensor(name)?;
+        if tensor.dtype() != dtype || tensor.dims() != shape {
+            return Err(ParityError::Tensor {
+                name: name.to_owned(),
+                why: format!(
+                    "it is {:?} {:?}, not {dtype:?} {shape:?}",
+                    tensor.dtype(),
+                    tensor.dims()
+                ),
+            });
+        }
+        Ok(tensor)
+    }
+}

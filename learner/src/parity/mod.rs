@@ -1,0 +1,309 @@
+//! The parity check: the learner's own update on a case computed elsewhere in float64, compared tensor by tensor.
+//! It has no arithmetic of its own beyond the comparison, and does not print.
+
+mod case;
+
+use std::{
+    fmt,
+    path::{Path, PathBuf},
+};
+
+use candle_core::{Device, Tensor};
+use driml_model::{Network, Parameters};
+
+pub use case::ParityError;
+use case::{Case, all_parts};
+
+use crate::{
+    auxiliary::dim::{self, Dim, Dots, PAIRS},
+    loss::info_nce::info_nce_loss,
+    update::Learner,
+};
+
+/// Values of s_t, in units of return, as a share of the support's width.
+const Q_VALUES: f64 = 1e-5;
+/// Probabilities.
+const PROJECTION: f64 = 5e-6;
+/// Losses, relative; the second where scores saturate; the third absolute.
+const LOSS: (f64, f64, f64) = (1e-5, 1e-4, 1e-6);
+/// Gradients: share of the tensor's own 2-norm, and of the global one.
+const GRADIENT: (f64, f64) = (1e-4, 1e-6);
+/// Parameters after the step.
+const UPDATED: f64 = 4e-6;
+
+/// One tensor group's comparison.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ParityLine {
+    /// The group; for groups of several tensors, with the tensor that is nearest to its tolerance.
+    pub name: String,
+    /// Largest error found.
+    pub error: f64,
+    /// Largest error allowed.
+    pub tolerance: f64,
+}
+
+impl ParityLine {
+    /// Whether the error is within the tolerance; NaN is not.
+    pub fn ok(&self) -> bool {
+        self.error <= self.tolerance
+    }
+}
+
+/// A case's comparison.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ParityReport {
+    /// The case.
+    pub file: PathBuf,
+    /// One line a tensor group.
+    pub lines: Vec<ParityLine>,
+}
+
+impl ParityReport {
+    /// Whether everything is within tolerance.
+    pub fn passed(&self) -> bool {
+        self.lines.iter().all(ParityLine::ok)
+    }
+}
+
+impl fmt::Display for ParityReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{}", self.file.display())?;
+        for line in &self.lines {
+            let verdict = if line.ok() { "ok" } else { "FAILED" };
+            let ParityLine {
+                name,
+                error,
+                tolerance,
+            } = line;
+            writeln!(
+                f,
+                "  {name:<48} error {error:9.2e}  tolerance {tolerance:9.2e}  {verdict}"
+            )?;
+        }
+        Ok(())
+    }
+}
+
+/// Runs one update on a case file and compares every tensor it expects.
+///
+/// # Errors
+/// A file that cannot be read, is not a case, or lacks a tensor. Values out of tolerance are no error: see the report.
+pub fn check_file(path: impl AsRef<Path>) -> Result<ParityReport, ParityError> {
+    let path = path.as_ref();
+    let bytes = std::fs::read(path).map_err(|source| ParityError::Read {
+        file: path.to_owned(),
+        source,
+    })?;
+    let in_file = |why: ParityError| ParityError::InFile {
+        file: path.to_owned(),
+        why: Box::new(why),
+    };
+    let lines = Case::parse(&bytes)
+        .and_then(|case| check(&case))
+        .map_err(in_file)?;
+    Ok(ParityReport {
+        file: path.to_owned(),
+        lines,
+    })
+}
+
+fn check(case: &Case) -> Result<Vec<ParityLine>, ParityError> {
+    let model = case.model(case.settings.lambda.dim_parts(true));
+    let online =
+        Parameters::from_tensors(&model, case.parameters("online.", &model), &Device::Cpu)?;
+    let acting = model.without_dim();
+    let target =
+        Parameters::from_tensors(&acting, case.parameters("target.", &acting), &Device::Cpu)?;
+    let mut learner =
+        Learner::from_parameters(model.clone(), case.settings.clone(), online, target)?;
+
+    let mut lines = Vec::new();
+    let pairs = dim_losses(case)?;
+    let evaluation = learner.evaluate(&case.batch())?;
+
+    let width = f64::from(model.v_max - model.v_min);
+    let (rows, num_actions, atoms) = (case.rows, model.num_actions, model.atoms);
+    let expected = case.expected("q_values_t", &[rows, num_actions])?;
+    lines.push(line(
+        "q_values_t",
+        largest(&widened(&evaluation.q_values_t), &expected),
+        Q_VALUES * width,
+    ));
+    let expected = case.expected("next_action", &[rows])?;
+    let chosen: Vec<f64> = evaluation
+        .next_greedy_action
+        .iter()
+        .map(|&action| f64::from(action))
+        .collect();
+    lines.push(line("next_action", largest(&chosen, &expected), 0.0));
+    let expected = case.expected("target_projection", &[rows, atoms])?;
+    lines.push(line(
+        "target_projection",
+        largest(&widened(&evaluation.target_projection), &expected),
+        PROJECTION,
+    ));
+
+    let mut loss_line = |name: &str, got: f32, saturated: bool| -> Result<(), ParityError> {
+        let expected = case.expected(name, &[1])?[0];
+        let relative = if saturated { LOSS.1 } else { LOSS.0 };
+        let tolerance = (relative * expected.abs()).max(LOSS.2);
+        lines.push(line(name, (f64::from(got) - expected).abs(), tolerance));
+        Ok(())
+    };
+    loss_line("loss.c51_kl", evaluation.c51_kl, false)?;
+    let mut total_saturates = false;
+    for (i, (forward_only, saturates)) in pairs.into_iter().enumerate() {
+        // A pair of weight 0 is not in the update; its loss comes from the forward pass alone.
+        let got = evaluation.dim[i].unwrap_or(forward_only);
+        loss_line(&format!("loss.dim.{}", PAIRS[i]), got, saturates)?;
+        total_saturates |= saturates && evaluation.dim[i].is_some();
+    }
+    loss_line("loss.total", evaluation.total, total_saturates)?;
+
+    let global_norm = case.expected("grad_norm", &[1])?[0];
+    let mut worst = Worst::default();
+    for (name, tensor) in case.online() {
+        let expected = case.expected(&format!("grad.{name}"), tensor.dims())?;
+        let got = match evaluation.gradients.get(name) {
+            Some(gradient) => values(gradient)?,
+            None => vec![0.0; expected.len()],
+        };
+        let difference = norm(
+            got.iter()
+                .zip(&expected)
+                .map(|(got, expected)| got - expected),
+        );
+        let tolerance = GRADIENT.0 * norm(expected.iter().copied()) + GRADIENT.1 * global_norm;
+        worst.add("grad", name, difference, tolerance);
+    }
+    lines.extend(worst.lines);
+    let got = learner.apply(&evaluation.gradients)?;
+    lines.push(line(
+        "grad_norm",
+        (got - global_norm).abs(),
+        GRADIENT.0 * global_norm,
+    ));
+
+    let mut worst = Worst::default();
+    for (name, tensor) in case.online() {
+        let expected = case.expected(&format!("updated.{name}"), tensor.dims())?;
+        // What no lambda uses is not built, so it stays as the file gives it.
+        let got = values(
+            learner
+                .online()
+                .get(name)
+                .map_or(tensor, |var| var.as_tensor()),
+        )?;
+        worst.add("updated", name, largest(&got, &expected), UPDATED);
+    }
+    lines.extend(worst.lines);
+    case.check_all_expectations_used()?;
+    Ok(lines)
+}
+
+/// The four DIM losses, forward only and untouched by lambda, and whether the scores of each saturate.
+fn dim_losses(case: &Case) -> Result<[(f32, bool); 4], ParityError> {
+    let model = case.model(all_parts());
+    let parameters =
+        Parameters::from_tensors(&model, case.parameters("online.", &model), &Device::Cpu)?;
+    let network = Network::new(&model, &parameters)?;
+    let batch = case.batch();
+    let frames = |frames: &[u8]| -> Result<Tensor, ParityError> {
+        let shape = (case.rows, model.height, model.width, model.channels);
+        Ok(Tensor::from_slice(frames, shape, &Device::Cpu)?)
+    };
+    let features_t = network.features(&frames(batch.frames_t)?)?;
+    let features_k = network.features(&frames(batch.frames_k.unwrap_or_default())?)?;
+    let action = Tensor::from_slice(batch.action, case.rows, &Device::Cpu)?;
+    let all = dim::dots(&network, &features_t, &features_k, &action, [true; 4])?;
+    let objective = Dim {
+        lambda: case.settings.lambda,
+        tanh_clip: case.settings.tanh_clip,
+    };
+    let mut losses = [(0.0, false); 4];
+    for (loss, dots) in losses.iter_mut().zip(all) {
+        if let Some(Dots { dots, rkhs }) = dots {
+            let scores = objective.scores(rkhs);
+            let largest = values(&dots)?
+                .iter()
+                .fold(0.0, |largest: f64, dot| largest.max(dot.abs()));
+            // Past c the slope of the clip is below 0.42.
+            let saturates = largest * scores.scale > scores.tanh_clip;
+            *loss = (
+                info_nce_loss(&dots, batch.positive_valid, scores)?.to_scalar()?,
+                saturates,
+            );
+        }
+    }
+    Ok(losses)
+}
+
+fn line(name: &str, error: f64, tolerance: f64) -> ParityLine {
+    ParityLine {
+        name: name.to_owned(),
+        error,
+        tolerance,
+    }
+}
+
+/// Lines of parameter groups (`torso`, `head`, `dim.psi3`, ..): of each, the tensor nearest to its tolerance.
+#[derive(Default)]
+struct Worst {
+    lines: Vec<ParityLine>,
+    groups: Vec<String>,
+}
+
+impl Worst {
+    fn add(&mut self, what: &str, name: &str, error: f64, tolerance: f64) {
+        let parts = if name.starts_with("dim.") { 2 } else { 1 };
+        let group = name.split('.').take(parts).collect::<Vec<_>>().join(".");
+        let new = line(&format!("{what}.{name}"), error, tolerance);
+        match self.groups.iter().position(|known| *known == group) {
+            None => {
+                self.groups.push(group);
+                self.lines.push(new);
+            }
+            Some(at) => {
+                let old = &self.lines[at];
+                // A NaN, once there, stays.
+                let nearer = error * old.tolerance > old.error * tolerance;
+                if !old.error.is_nan() && (nearer || error.is_nan()) {
+                    self.lines[at] = new;
+                }
+            }
+        }
+    }
+}
+
+fn values(tensor: &Tensor) -> Result<Vec<f64>, ParityError> {
+    Ok(tensor
+        .to_dtype(candle_core::DType::F64)?
+        .flatten_all()?
+        .to_vec1()?)
+}
+
+fn widened(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|&value| f64::from(value)).collect()
+}
+
+fn norm(values: impl Iterator<Item = f64>) -> f64 {
+    values.map(|value| value * value).sum::<f64>().sqrt()
+}
+
+/// Largest absolute difference; NaN if any is.
+fn largest(got: &[f64], expected: &[f64]) -> f64 {
+    if got.len() != expected.len() {
+        return f64::INFINITY;
+    }
+    let differences = got
+        .iter()
+        .zip(expected)
+        .map(|(got, expected)| (got - expected).abs());
+    differences.fold(0.0, |largest, d| {
+        if d.is_nan() || d > largest {
+            d
+        } else {
+            largest
+        }
+    })
+}

@@ -1,0 +1,159 @@
+//! What the learner tells others: its newest weights on demand, that they are new, its affinity, its own status.
+//! It computes none of it.
+
+use std::{
+    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
+    time::Duration,
+};
+
+use driml_protocol::{
+    AffinityUpdate, Keys, Kind, LearnerStatus, Shutdown, WeightsVersion, codec, session,
+};
+use zenoh::{
+    Session, Wait,
+    bytes::ZBytes,
+    pubsub::Publisher,
+    qos::{CongestionControl, Priority},
+    query::Queryable,
+};
+
+use crate::learning::Weights;
+
+/// One delivery of the affinity matrix.
+const AFFINITY_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// The learner's outlets; dropping it closes them.
+pub(crate) struct Outlets {
+    weights: Arc<Mutex<Option<(Vec<u8>, Vec<u8>)>>>,
+    status: Arc<Mutex<LearnerStatus>>,
+    affinity: Arc<Newest>,
+    version: Publisher<'static>,
+    spec_hash: u64,
+    _queryables: [Queryable<()>; 2],
+}
+
+/// A slot that keeps the newest affinity until it is sent.
+#[derive(Default)]
+struct Newest {
+    slot: Mutex<Option<AffinityUpdate>>,
+    filled: Condvar,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Outlets {
+    /// Declares everything that others may ask, and starts the affinity's own thread.
+    pub(crate) fn open(
+        session: &Session,
+        keys: &Keys,
+        spec_hash: u64,
+        shutdown: &Shutdown,
+    ) -> anyhow::Result<Self> {
+        let failed = |e: zenoh::Error| anyhow::anyhow!("declaring what the learner answers: {e}");
+        let weights: Arc<Mutex<Option<(Vec<u8>, Vec<u8>)>>> = Arc::default();
+        let held = weights.clone();
+        let weights_queryable = session
+            .declare_queryable(keys.weights())
+            .callback(move |query| {
+                // An actor that comes before the first weights hears nothing and asks again.
+                if let Some((head, planes)) = lock(&held).clone() {
+                    session::answer(&query, session::join_pieces([head, planes]));
+                }
+            })
+            .wait()
+            .map_err(failed)?;
+        let status: Arc<Mutex<LearnerStatus>> = Arc::default();
+        let held = status.clone();
+        let status_queryable = session
+            .declare_queryable(keys.learner_status())
+            .callback(move |query| {
+                match codec::encode(Kind::LearnerStatus, spec_hash, &*lock(&held), &[]) {
+                    Ok(bytes) => session::answer(&query, bytes.into()),
+                    Err(e) => tracing::warn!("the learner's status was not sent: {e}"),
+                }
+            })
+            .wait()
+            .map_err(failed)?;
+        // An announcement that is dropped under congestion is made good by the next, or by the actors' own look.
+        let version = session
+            .declare_publisher(keys.weights_version())
+            .congestion_control(CongestionControl::Drop)
+            .priority(Priority::InteractiveHigh)
+            .wait()
+            .map_err(failed)?;
+        let affinity = Arc::new(Newest::default());
+        let sender = AffinitySender {
+            session: session.clone(),
+            key: keys.affinity(),
+            spec_hash,
+            newest: affinity.clone(),
+            shutdown: shutdown.clone(),
+        };
+        std::thread::Builder::new().name("affinity".into()).spawn(move || sender.run())?;
+        let _queryables = [weights_queryable, status_queryable];
+        Ok(Self { weights, status, affinity, version, spec_hash, _queryables })
+    }
+
+    /// Makes `weights` the ones that actors get, and announces them.
+    pub(crate) fn publish(&self, (header, safetensors): Weights) -> anyhow::Result<()> {
+        let head = codec::seal(Kind::Weights, self.spec_hash, &header, &safetensors)?;
+        *lock(&self.weights) = Some((head, safetensors));
+        let announced = WeightsVersion { version: header.version };
+        let bytes = codec::encode(Kind::WeightsVersion, self.spec_hash, &announced, &[])?;
+        if let Err(e) = self.version.put(bytes).wait() {
+            tracing::warn!("weights {} were not announced: {e}", header.version);
+        }
+        let mut status = lock(&self.status);
+        status.weights_version = header.version;
+        status.weights_sha256 = header.sha256_hex();
+        Ok(())
+    }
+
+    /// Hands over the newest affinity; one that was not sent yet is replaced.
+    pub(crate) fn send_affinity(&self, update: AffinityUpdate) {
+        *lock(&self.affinity.slot) = Some(update);
+        self.affinity.filled.notify_one();
+    }
+
+    /// Changes the status that others see.
+    pub(crate) fn with_status(&self, change: impl FnOnce(&mut LearnerStatus)) {
+        change(&mut lock(&self.status));
+    }
+}
+
+struct AffinitySender {
+    session: Session,
+    key: String,
+    spec_hash: u64,
+    newest: Arc<Newest>,
+    shutdown: Shutdown,
+}
+
+impl AffinitySender {
+    fn run(self) {
+        while !self.shutdown.is_set() {
+            let slot = lock(&self.newest.slot);
+            let (mut slot, _) = self
+                .newest
+                .filled
+                .wait_timeout_while(slot, Duration::from_millis(200), |slot| slot.is_none())
+                .unwrap_or_else(PoisonError::into_inner);
+            let Some(update) = slot.take() else { continue };
+            drop(slot);
+            if let Err(e) = self.send(&update) {
+                tracing::warn!("affinity {} did not arrive, the next one will: {e:#}", update.version);
+            }
+        }
+    }
+
+    fn send(&self, update: &AffinityUpdate) -> anyhow::Result<()> {
+        let bytes = codec::encode(Kind::Affinity, self.spec_hash, update, &[])?;
+        let payload = ZBytes::from(bytes);
+        let answer =
+            session::ask(&self.session, &self.key, payload, Priority::DataHigh, AFFINITY_TIMEOUT)?;
+        codec::decode::<()>(&answer, Kind::Done, Some(self.spec_hash))?;
+        Ok(())
+    }
+}

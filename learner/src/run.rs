@@ -1,0 +1,97 @@
+//! One learner process: join, learn from batch after batch, publish, save, until told to stop.
+//! The learning itself is `learning`, which knows no network.
+
+use std::{
+    path::PathBuf,
+    time::{Duration, Instant},
+};
+
+use anyhow::Context;
+use driml_protocol::{
+    Keys, Shutdown,
+    session::{self, Endpoints},
+};
+use zenoh::Wait;
+
+use crate::{
+    batch_source::{BatchSource, Next},
+    config::LearnerPart,
+    learning::Learning,
+    publish::Outlets,
+};
+
+/// How often a waiting learner looks whether it should stop.
+const TICK: Duration = Duration::from_millis(200);
+
+/// What a learner is told at its start; everything else comes from the replay server.
+#[derive(Clone, Debug)]
+pub struct RunArgs {
+    /// Endpoints of the replay server.
+    pub connect: Vec<String>,
+    /// Prefix of the run's keys.
+    pub namespace: String,
+    /// Where checkpoints go: `RUN_DIR/checkpoints`.
+    pub run_dir: PathBuf,
+}
+
+/// Runs the learner until `shutdown`. When the run has no more batches it saves, and stays to answer questions.
+///
+/// # Errors
+/// Nobody to join, settings that cannot work, an update that failed, a disk that refuses.
+pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
+    let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
+    let session = session::open(&Endpoints { listen: Vec::new(), connect: args.connect })?;
+    let hello = session::join(&session, &keys, shutdown)?;
+    let part = LearnerPart::from_toml(&hello.config_toml)
+        .context("the settings that the replay server sent")?;
+    let (rows, in_flight) = (part.learner.batch_rows, part.learner.batches_in_flight);
+    let mut learning = Learning::new(part)?;
+    let folder = args.run_dir.join("checkpoints");
+    let spec_hash = learning.spec_hash();
+    let outlets = Outlets::open(&session, &keys, spec_hash, shutdown)?;
+    outlets.publish(learning.next_weights()?)?;
+    let mut batches = BatchSource::start(&session, &keys, spec_hash, rows, in_flight, shutdown)?;
+    tracing::info!("learning from batches of {rows} rows, run {spec_hash:016x}");
+
+    let mut waiting_since = Instant::now();
+    while !shutdown.is_set() {
+        let batch = match batches.next(TICK)? {
+            Next::Batch(batch) => batch,
+            Next::NotYet => continue,
+            Next::Finished => break,
+        };
+        let started = Instant::now();
+        let report = learning.update(&batch)?;
+        if let Some(affinity) = learning.affinity_update() {
+            outlets.send_affinity(affinity);
+        }
+        if learning.publication_is_due() {
+            outlets.publish(learning.next_weights()?)?;
+        }
+        let ended = Instant::now();
+        outlets.with_status(|status| {
+            status.updates = learning.updates();
+            status.c51_kl = report.c51_kl;
+            status.dim = report.dim;
+            status.total = report.total;
+            status.grad_norm = report.grad_norm;
+            status.q_mean = report.q_mean;
+            status.waiting_s += (started - waiting_since).as_secs_f64();
+            status.computing_s += (ended - started).as_secs_f64();
+        });
+        waiting_since = ended;
+        if learning.checkpoint_is_due() {
+            learning.save(&folder)?;
+        }
+    }
+    if !learning.publication_is_due() {
+        outlets.publish(learning.next_weights()?)?;
+    }
+    if !learning.checkpoint_is_due() || learning.updates() == 0 {
+        learning.save(&folder)?;
+    }
+    outlets.with_status(|status| status.finished = true);
+    tracing::info!("finished after {} updates", learning.updates());
+    shutdown.wait();
+    session.close().wait().map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+}

@@ -1,0 +1,101 @@
+//! The target network: a slow copy of the online network's torso and head.
+//! It decides neither when it follows (`update` does) nor what is computed with it.
+
+use std::collections::HashMap;
+
+use candle_core::{CpuStorage, Device, InplaceOp2, Layout, bail};
+use driml_model::{ModelConfig, Parameters};
+
+use crate::{
+    optim::{slice, slice_mut},
+    update::UpdateError,
+};
+
+/// Names of the parameters that only the auxiliary loss uses begin so.
+pub const AUXILIARY_PREFIX: &str = "dim.";
+
+/// A deep copy of the acting part of `online`.
+///
+/// # Errors
+/// A parameter that is missing.
+pub fn copy_of(model: &ModelConfig, online: &Parameters) -> Result<Parameters, UpdateError> {
+    let mut tensors = HashMap::new();
+    for (name, var) in online
+        .iter()
+        .filter(|(name, _)| !name.starts_with(AUXILIARY_PREFIX))
+    {
+        tensors.insert(name.to_owned(), var.copy()?);
+    }
+    Ok(Parameters::from_tensors(
+        &model.without_dim(),
+        tensors,
+        &Device::Cpu,
+    )?)
+}
+
+/// Moves `target` towards `online`, in place: `target <- tau * online + (1 - tau) * target`.
+///
+/// `tau` in (0, 1]; at 1 the copy is exact.
+///
+/// # Errors
+/// A parameter of the target that the online network lacks.
+pub fn follow(target: &Parameters, online: &Parameters, tau: f64) -> Result<(), UpdateError> {
+    for (name, var) in target.iter() {
+        let Some(source) = online.get(name) else {
+            return Err(UpdateError::State(format!(
+                "the online network has no {name}"
+            )));
+        };
+        var.inplace_op2(source, &Follow { tau: tau as f32 })?;
+    }
+    Ok(())
+}
+
+struct Follow {
+    tau: f32,
+}
+
+impl InplaceOp2 for Follow {
+    fn name(&self) -> &'static str {
+        "follow"
+    }
+
+    fn cpu_fwd(
+        &self,
+        target: &mut CpuStorage,
+        l1: &Layout,
+        online: &CpuStorage,
+        l2: &Layout,
+    ) -> candle_core::Result<()> {
+        let (target, online) = (slice_mut(target, l1)?, slice(online, l2)?);
+        if target.len() != online.len() {
+            bail!(
+                "a target of {} values follows {}",
+                target.len(),
+                online.len()
+            );
+        }
+        let keep = 1.0 - self.tau;
+        for (target, &online) in target.iter_mut().zip(online) {
+            *target = self.tau * online + keep * *target;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::{Result, Var};
+
+    use super::*;
+
+    #[test]
+    fn it_moves_by_tau() -> Result<()> {
+        let target = Var::new(&[1.0f32, -2.0], &Device::Cpu)?;
+        let online = Var::new(&[3.0f32, 2.0], &Device::Cpu)?;
+        target.inplace_op2(&online, &Follow { tau: 0.75 })?;
+        assert_eq!(target.to_vec1::<f32>()?, [2.5, 1.0]);
+        assert_eq!(online.to_vec1::<f32>()?, [3.0, 2.0]);
+        Ok(())
+    }
+}

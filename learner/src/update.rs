@@ -1,0 +1,439 @@
+//! One update: C51 plus the auxiliary objective, clipped, through Adam; then the target network's turn.
+//! It does not fetch batches, publish weights or keep checkpoints, and knows no process but its own.
+
+use std::collections::HashMap;
+
+use candle_core::{Device, Tensor};
+use driml_model::{DimParts, ModelConfig, Network, Parameters};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    auxiliary::{
+        Auxiliary,
+        dim::{Dim, Lambda, PAIRS},
+    },
+    batch::Batch,
+    loss::{
+        c51::{kl_loss, softmax},
+        projection::project,
+    },
+    optim::{Adam, AdamSettings, Gradients, clip_factor},
+    target,
+};
+
+/// Everything that one update depends on beside the network's sizes. No field has a default.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LearnerSettings {
+    /// Choose the action in s_{t+n} by the online network instead of the target network.
+    pub double_dqn: bool,
+    /// Weights of the DIM losses; all 0 for an agent without DIM.
+    pub lambda: Lambda,
+    /// Bound c of the DIM scores' soft clip `c * tanh(x / c)`, above 0.
+    pub tanh_clip: f64,
+    /// Global 2-norm to which gradients are clipped, above 0.
+    pub max_grad_norm: f64,
+    /// The optimiser's numbers.
+    pub adam: AdamSettings,
+    /// The target network moves once in so many updates, at least 1.
+    pub target_period_updates: u64,
+    /// Share of the online network in a move of the target network, in (0, 1].
+    pub target_tau: f64,
+}
+
+impl LearnerSettings {
+    /// Checks the ranges.
+    ///
+    /// # Errors
+    /// The first setting out of its range, with its value.
+    pub fn validate(&self) -> Result<(), UpdateError> {
+        let above_0 = |x: f64| x > 0.0 && x.is_finite();
+        for (name, value, fine) in [
+            ("tanh_clip", self.tanh_clip, above_0(self.tanh_clip)),
+            (
+                "max_grad_norm",
+                self.max_grad_norm,
+                above_0(self.max_grad_norm),
+            ),
+            (
+                "target_tau",
+                self.target_tau,
+                above_0(self.target_tau) && self.target_tau <= 1.0,
+            ),
+            ("target_period_updates", 0.0, self.target_period_updates > 0),
+        ] {
+            if !fine {
+                return Err(UpdateError::Settings(format!("{name} is {value}")));
+            }
+        }
+        self.lambda.validate()?;
+        self.adam.validate()
+    }
+
+    /// The auxiliary objective that the weights ask for.
+    pub fn auxiliary(&self) -> Auxiliary {
+        if self.lambda.wanted().contains(&true) {
+            Auxiliary::Dim(Dim {
+                lambda: self.lambda,
+                tanh_clip: self.tanh_clip,
+            })
+        } else {
+            Auxiliary::None
+        }
+    }
+}
+
+/// Why an update, or the making of a learner, did not happen. Parameters are then as they were before.
+#[derive(Debug, thiserror::Error)]
+pub enum UpdateError {
+    /// The batch is not one of this network's, or holds values that no world gives.
+    #[error("this batch cannot be learned from: {0}")]
+    Batch(String),
+    /// A setting out of its range.
+    #[error("bad learner setting: {0}")]
+    Settings(String),
+    /// State that does not fit the network, as from another run's checkpoint.
+    #[error("learner state does not fit: {0}")]
+    State(String),
+    /// The arithmetic left the finite numbers.
+    #[error("{what} is not finite; the update is not taken")]
+    NonFinite {
+        /// The first quantity in which it showed.
+        what: String,
+    },
+    /// The model refused.
+    #[error(transparent)]
+    Model(#[from] driml_model::ModelError),
+    /// The tensor library refused.
+    #[error(transparent)]
+    Tensor(#[from] candle_core::Error),
+}
+
+/// What one update did, for a person to watch.
+#[derive(Clone, Debug, PartialEq)]
+pub struct UpdateReport {
+    /// Mean KL divergence of the prediction from the projected target, in nats.
+    pub c51_kl: f32,
+    /// DIM losses in nats, in the order of [`PAIRS`]; `None` for pairs of weight 0.
+    pub dim: [Option<f32>; 4],
+    /// `c51_kl + sum of lambda * dim`.
+    pub total: f32,
+    /// Global 2-norm of the gradients before clipping.
+    pub grad_norm: f64,
+    /// Mean over rows of the taken action's value, in units of return.
+    pub q_mean: f32,
+}
+
+/// The losses of a batch and all that led to them, before any step is taken.
+#[derive(Debug)]
+pub struct Evaluation {
+    /// Mean KL divergence, in nats.
+    pub c51_kl: f32,
+    /// DIM losses in nats, in the order of [`PAIRS`]; `None` for pairs of weight 0.
+    pub dim: [Option<f32>; 4],
+    /// `c51_kl + sum of lambda * dim`.
+    pub total: f32,
+    /// Online values of s_t [B, A].
+    pub q_values_t: Vec<f32>,
+    /// Greedy action in s_{t+n} [B].
+    pub next_greedy_action: Vec<u8>,
+    /// Projected target distributions [B, N].
+    pub target_projection: Vec<f32>,
+    /// Gradients of the total, before clipping.
+    pub gradients: Gradients,
+}
+
+/// The learner: online and target network, optimiser, count of updates.
+#[derive(Debug)]
+pub struct Learner {
+    model: ModelConfig,
+    settings: LearnerSettings,
+    auxiliary: Auxiliary,
+    pub(crate) online: Parameters,
+    pub(crate) target: Parameters,
+    online_network: Network,
+    target_network: Network,
+    pub(crate) adam: Adam,
+    pub(crate) updates: u64,
+}
+
+impl Learner {
+    /// A learner with initial weights drawn from `rng`; the target network is a copy.
+    ///
+    /// # Errors
+    /// Settings out of their ranges, or a model whose heads are not those that the lambdas use.
+    pub fn new(
+        model: ModelConfig,
+        settings: LearnerSettings,
+        rng: &mut ChaCha8Rng,
+    ) -> Result<Self, UpdateError> {
+        let online = Parameters::init(&model, rng, &Device::Cpu)?;
+        let target = target::copy_of(&model, &online)?;
+        Self::from_parameters(model, settings, online, target)
+    }
+
+    /// A learner with given weights, before its first update.
+    ///
+    /// # Errors
+    /// As [`Learner::new`], and parameters that do not fit the model.
+    pub fn from_parameters(
+        model: ModelConfig,
+        settings: LearnerSettings,
+        online: Parameters,
+        target: Parameters,
+    ) -> Result<Self, UpdateError> {
+        settings.validate()?;
+        let built = DimParts {
+            action: model.dim.embeds_action(),
+            ..model.dim
+        };
+        let needed = settings.lambda.dim_parts(built.action);
+        if needed != built {
+            return Err(UpdateError::Settings(format!(
+                "the lambdas use {needed:?}, the model builds {built:?}"
+            )));
+        }
+        Ok(Self {
+            online_network: Network::new(&model, &online)?,
+            target_network: Network::new(&model.without_dim(), &target)?,
+            adam: Adam::new(settings.adam, &online),
+            auxiliary: settings.auxiliary(),
+            updates: 0,
+            model,
+            settings,
+            online,
+            target,
+        })
+    }
+
+    /// The network's sizes.
+    pub const fn model(&self) -> &ModelConfig {
+        &self.model
+    }
+
+    /// The settings.
+    pub const fn settings(&self) -> &LearnerSettings {
+        &self.settings
+    }
+
+    /// Updates taken since the run began, those before a restart included.
+    pub const fn updates(&self) -> u64 {
+        self.updates
+    }
+
+    /// The online network's parameters.
+    pub const fn online(&self) -> &Parameters {
+        &self.online
+    }
+
+    /// The target network's parameters.
+    pub const fn target(&self) -> &Parameters {
+        &self.target
+    }
+
+    /// What actors need, torso and head, as safetensors bytes.
+    ///
+    /// # Errors
+    /// A failing serialisation.
+    pub fn weights(&self) -> Result<Vec<u8>, UpdateError> {
+        Ok(self
+            .online
+            .to_safetensors(|name| !name.starts_with(target::AUXILIARY_PREFIX))?)
+    }
+
+    /// Learns from one batch.
+    ///
+    /// # Errors
+    /// A batch that does not fit, or losses or gradients that are not finite: nothing has then changed.
+    pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
+        let evaluation = self.evaluate(batch)?;
+        let grad_norm = self.apply(&evaluation.gradients)?;
+        let num_actions = self.model.num_actions;
+        let taken = evaluation
+            .q_values_t
+            .chunks_exact(num_actions)
+            .zip(batch.action);
+        let q_sum: f32 = taken.map(|(q, &action)| q[usize::from(action)]).sum();
+        Ok(UpdateReport {
+            c51_kl: evaluation.c51_kl,
+            dim: evaluation.dim,
+            total: evaluation.total,
+            grad_norm,
+            q_mean: q_sum / batch.rows as f32,
+        })
+    }
+
+    /// Losses and gradients of one batch at the present parameters.
+    ///
+    /// # Errors
+    /// A batch that does not fit, or losses that are not finite.
+    pub fn evaluate(&self, batch: &Batch<'_>) -> Result<Evaluation, UpdateError> {
+        batch.validate(&self.model, self.auxiliary.needs_positives())?;
+        let (next_greedy_action, target_projection) = self.make_target(batch)?;
+
+        let features_t = self
+            .online_network
+            .features(&self.frames(batch.rows, batch.frames_t)?)?;
+        let logits = self.online_network.logits(&features_t.f4)?;
+        let q_values_t = flat(&self.online_network.q_values(&logits.detach())?)?;
+        let kl = kl_loss(&logits, batch.action, target_projection.clone())?;
+        let c51_kl = finite("the C51 loss", &kl)?;
+
+        let mut total = kl;
+        let mut dim = [None; 4];
+        if let (Auxiliary::Dim(objective), Some(frames_k)) = (&self.auxiliary, batch.frames_k) {
+            let features_k = self
+                .online_network
+                .features(&self.frames(batch.rows, frames_k)?)?;
+            let losses = objective.losses(
+                &self.online_network,
+                &features_t,
+                &features_k,
+                &Tensor::from_slice(batch.action, batch.rows, &Device::Cpu)?,
+                batch.positive_valid,
+            )?;
+            for (i, (loss, lambda)) in losses.iter().zip(objective.lambda.values()).enumerate() {
+                if let Some(loss) = loss {
+                    dim[i] = Some(finite(PAIRS[i], loss)?);
+                    total = (total + loss.affine(lambda, 0.0)?)?;
+                }
+            }
+        }
+        let total_value = finite("the total loss", &total)?;
+        let gradients = Gradients::take(&self.online, total.backward()?)?;
+        Ok(Evaluation {
+            c51_kl,
+            dim,
+            total: total_value,
+            q_values_t,
+            next_greedy_action,
+            target_projection,
+            gradients,
+        })
+    }
+
+    /// Clips `gradients` and takes one step with them; moves the target network when it is its turn.
+    /// Returns their global norm before clipping.
+    ///
+    /// # Errors
+    /// Gradients that are not finite: nothing has then changed.
+    pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
+        let norm = gradients.norm()?;
+        self.adam.step(
+            &self.online,
+            gradients,
+            clip_factor(norm, self.settings.max_grad_norm),
+        )?;
+        self.updates += 1;
+        if self
+            .updates
+            .is_multiple_of(self.settings.target_period_updates)
+        {
+            target::follow(&self.target, &self.online, self.settings.target_tau)?;
+        }
+        Ok(norm)
+    }
+
+    /// Greedy actions in s_{t+n} [B] and their distributions one Bellman step earlier [B, N], without a graph.
+    fn make_target(&self, batch: &Batch<'_>) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
+        let ModelConfig {
+            num_actions,
+            atoms,
+            v_min,
+            v_max,
+            ..
+        } = self.model;
+        let frames_n = self.frames(batch.rows, batch.frames_n)?;
+        let target_logits = distribution(&self.target_network, &frames_n)?;
+        let next_q_values = if self.settings.double_dqn {
+            self.online_network
+                .q_values(&distribution(&self.online_network, &frames_n)?)?
+        } else {
+            self.target_network.q_values(&target_logits)?
+        };
+        let next_greedy: Vec<u8> = flat(&next_q_values)?
+            .chunks_exact(num_actions)
+            .map(greedy)
+            .collect();
+
+        let logits = flat(&target_logits)?;
+        let mut probs = vec![0f32; batch.rows * atoms];
+        for (row, (probs, &action)) in probs.chunks_exact_mut(atoms).zip(&next_greedy).enumerate() {
+            let at = (row * num_actions + usize::from(action)) * atoms;
+            softmax(&logits[at..at + atoms], probs);
+        }
+        if !probs.iter().all(|p| p.is_finite()) {
+            return Err(UpdateError::NonFinite {
+                what: "the target network's distribution".to_owned(),
+            });
+        }
+        let mut projected = vec![0f32; probs.len()];
+        project(
+            &probs,
+            batch.n_step_return,
+            batch.bootstrap_discount,
+            v_min,
+            v_max,
+            &mut projected,
+        );
+        Ok((next_greedy, projected))
+    }
+
+    fn frames(&self, rows: usize, frames: &[u8]) -> Result<Tensor, UpdateError> {
+        let ModelConfig {
+            height,
+            width,
+            channels,
+            ..
+        } = self.model;
+        Ok(Tensor::from_slice(
+            frames,
+            (rows, height, width, channels),
+            &Device::Cpu,
+        )?)
+    }
+
+    /// Puts back a state that [`Learner::online`], [`Learner::target`] and [`Adam`] had after `updates` updates.
+    pub(crate) fn restore_progress(
+        &mut self,
+        updates: u64,
+        adam_step: u64,
+        moments: HashMap<String, Tensor>,
+    ) -> Result<(), UpdateError> {
+        self.adam.restore(adam_step, moments)?;
+        self.updates = updates;
+        Ok(())
+    }
+}
+
+/// Logits [B, A, N] of `frames`, cut off from any graph.
+fn distribution(network: &Network, frames: &Tensor) -> Result<Tensor, UpdateError> {
+    Ok(network.logits(&network.features(frames)?.f4)?.detach())
+}
+
+fn flat(tensor: &Tensor) -> Result<Vec<f32>, UpdateError> {
+    Ok(tensor.flatten_all()?.to_vec1()?)
+}
+
+/// Index of the first largest value.
+fn greedy(values: &[f32]) -> u8 {
+    let mut best = 0;
+    for (i, value) in values.iter().enumerate() {
+        if *value > values[best] {
+            best = i;
+        }
+    }
+    u8::try_from(best).expect("a model has at most 255 actions")
+}
+
+fn finite(what: &str, loss: &Tensor) -> Result<f32, UpdateError> {
+    let value = loss.to_scalar::<f32>()?;
+    if value.is_finite() {
+        Ok(value)
+    } else {
+        Err(UpdateError::NonFinite {
+            what: what.to_owned(),
+        })
+    }
+}

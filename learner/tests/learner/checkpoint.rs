@@ -1,0 +1,202 @@
+//! Checkpoints: bit-exact resumption, and damage that is reported instead of skipped.
+//! Crashes are made up by what they leave on disk.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
+
+use driml_learner::{
+    AffinityEstimator, Alphabet, LearnedAffinity, LearnedSettings, Learner,
+    checkpoint::{CheckpointError, RunState, list, load_latest, save},
+};
+use driml_model::Parameters;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::made_up::{ACTIONS, ALL_DIM, Rows, learner, model, settings};
+
+const SPEC: u64 = 0x0123_4567_89ab_cdef;
+
+/// A folder of this test's own, removed at its end.
+struct Folder(PathBuf);
+
+impl Folder {
+    fn new(name: &str) -> Self {
+        let path =
+            std::env::temp_dir().join(format!("driml-checkpoint-{name}-{}", std::process::id()));
+        let _ = fs::remove_dir_all(&path);
+        Self(path)
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+struct Run {
+    learner: Learner,
+    affinity: AffinityEstimator,
+    rng: ChaCha8Rng,
+}
+
+impl Run {
+    fn new() -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(99);
+        let settings = LearnedSettings {
+            hidden: 8,
+            lr: 1e-3,
+            beta1: 0.9,
+            beta2: 0.999,
+            eps: 1e-8,
+            keep: 0.9,
+        };
+        let affinity =
+            LearnedAffinity::new(Alphabet::raw(ACTIONS).unwrap(), settings, &mut rng).unwrap();
+        Self {
+            learner: learner(ALL_DIM, 1),
+            affinity: AffinityEstimator::Learned(affinity),
+            rng,
+        }
+    }
+
+    fn updates(&mut self, count: u64) {
+        for _ in 0..count {
+            let rows = Rows::random(6, self.learner.updates());
+            self.learner.update(&rows.batch()).unwrap();
+            self.affinity
+                .observe(&rows.batch().action_pairs(), &mut self.rng)
+                .unwrap();
+        }
+    }
+
+    fn save(&self, folder: &Path, keep: usize) -> PathBuf {
+        let Self {
+            learner,
+            affinity,
+            rng,
+        } = self;
+        let state = RunState {
+            learner,
+            affinity: Some(affinity),
+            rng,
+            run_spec_hash: SPEC,
+        };
+        save(folder, &state, keep).unwrap()
+    }
+
+    fn resume(folder: &Path) -> Self {
+        let restored = load(folder).unwrap().expect("a checkpoint");
+        let affinity = restored.affinity.expect("an estimate");
+        Self {
+            learner: restored.learner,
+            affinity,
+            rng: restored.rng,
+        }
+    }
+
+    fn bytes(&self) -> [Vec<u8>; 2] {
+        let all = |parameters: &Parameters| parameters.to_safetensors(|_| true).unwrap();
+        [all(self.learner.online()), all(self.learner.target())]
+    }
+}
+
+fn load(folder: &Path) -> Result<Option<driml_learner::checkpoint::Restored>, CheckpointError> {
+    load_latest(folder, &model(ALL_DIM), &settings(ALL_DIM), SPEC)
+}
+
+#[test]
+fn a_resumed_run_is_the_same_run_bit_for_bit() {
+    let folder = Folder::new("resume");
+    let mut straight = Run::new();
+    straight.updates(8);
+
+    let mut first_half = Run::new();
+    first_half.updates(4);
+    first_half.save(&folder.0, 2);
+    drop(first_half);
+    let mut resumed = Run::resume(&folder.0);
+    assert_eq!(resumed.learner.updates(), 4);
+    resumed.updates(4);
+
+    assert!(straight.bytes() == resumed.bytes(), "the networks differ");
+    assert_eq!(straight.affinity, resumed.affinity);
+    assert_eq!(straight.rng, resumed.rng);
+    // The optimiser's state, through its file.
+    let (a, b) = (Folder::new("straight"), Folder::new("resumed"));
+    let optimizer = |path: PathBuf| fs::read(path.join("optimizer.safetensors")).unwrap();
+    assert!(
+        optimizer(straight.save(&a.0, 1)) == optimizer(resumed.save(&b.0, 1)),
+        "the moments differ"
+    );
+}
+
+#[test]
+fn the_newest_are_kept_and_an_unfinished_save_is_no_checkpoint() {
+    let folder = Folder::new("keep");
+    assert!(
+        load(&folder.0).unwrap().is_none(),
+        "no folder, no checkpoint"
+    );
+    let mut run = Run::new();
+    for _ in 0..3 {
+        run.updates(1);
+        run.save(&folder.0, 2);
+    }
+    run.save(&folder.0, 2);
+    fs::create_dir(folder.0.join("checkpoint-000000000009.tmp")).unwrap();
+    let kept: Vec<u64> = list(&folder.0)
+        .unwrap()
+        .iter()
+        .map(|(updates, _)| *updates)
+        .collect();
+    assert_eq!(kept, [2, 3]);
+    assert_eq!(load(&folder.0).unwrap().unwrap().learner.updates(), 3);
+}
+
+#[test]
+fn every_kind_of_damage_is_reported_with_its_file() {
+    let folder = Folder::new("damage");
+    let mut run = Run::new();
+    run.updates(1);
+    let path = run.save(&folder.0, 1);
+    for name in [
+        "online.safetensors",
+        "target.safetensors",
+        "optimizer.safetensors",
+        "state.json",
+        "state.json.sha256",
+    ] {
+        let file = path.join(name);
+        let whole = fs::read(&file).unwrap();
+        let reported = || {
+            let error = load(&folder.0).expect_err(name);
+            assert!(matches!(error, CheckpointError::Damaged { .. }), "{error}");
+            let text = error.to_string();
+            assert!(text.contains(name) && text.contains("remove"), "{text}");
+        };
+        fs::write(&file, &whole[..whole.len() / 2]).unwrap();
+        reported();
+        let mut flipped = whole.clone();
+        flipped[whole.len() / 2] ^= 1;
+        fs::write(&file, &flipped).unwrap();
+        if name != "state.json.sha256" || whole.len() / 2 < 64 {
+            reported();
+        }
+        fs::remove_file(&file).unwrap();
+        reported();
+        fs::write(&file, &whole).unwrap();
+    }
+    assert!(load(&folder.0).unwrap().is_some());
+}
+
+#[test]
+fn another_run_s_checkpoint_is_refused() {
+    let folder = Folder::new("other");
+    Run::new().save(&folder.0, 1);
+    let error = load_latest(&folder.0, &model(ALL_DIM), &settings(ALL_DIM), SPEC + 1)
+        .expect_err("another run");
+    assert!(matches!(error, CheckpointError::OtherRun { .. }), "{error}");
+}

@@ -1,0 +1,130 @@
+//! Small networks, settings and batches for these tests.
+//! Nothing here is measured or asserted.
+
+use driml_learner::{AdamSettings, Batch, Lambda, Learner, LearnerSettings, NO_ACTION};
+use driml_model::{ConvLayer, ModelConfig};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+pub(crate) const ACTIONS: usize = 4;
+pub(crate) const NO_DIM: Lambda = Lambda {
+    l3t3: 0.0,
+    l3t4: 0.0,
+    l4t3: 0.0,
+    l4t4: 0.0,
+};
+pub(crate) const ALL_DIM: Lambda = Lambda {
+    l3t3: 1.0,
+    l3t4: 0.5,
+    l4t3: 0.25,
+    l4t4: 2.0,
+};
+
+pub(crate) fn model(lambda: Lambda) -> ModelConfig {
+    ModelConfig {
+        height: 20,
+        width: 24,
+        channels: 2,
+        num_actions: ACTIONS,
+        atoms: 21,
+        v_min: -5.0,
+        v_max: 5.0,
+        conv: vec![
+            ConvLayer {
+                out: 5,
+                kernel: 8,
+                stride: 4,
+            },
+            ConvLayer {
+                out: 6,
+                kernel: 3,
+                stride: 1,
+            },
+        ],
+        hidden: 16,
+        rkhs: 12,
+        action_embed: 7,
+        dim: lambda.dim_parts(true),
+    }
+}
+
+pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
+    LearnerSettings {
+        double_dqn: false,
+        lambda,
+        tanh_clip: 20.0,
+        max_grad_norm: 10.0,
+        adam: AdamSettings {
+            lr: 1e-3,
+            beta1: 0.9,
+            beta2: 0.999,
+            eps: 1e-5,
+        },
+        target_period_updates: 3,
+        target_tau: 0.95,
+    }
+}
+
+pub(crate) fn learner(lambda: Lambda, seed: u64) -> Learner {
+    Learner::new(
+        model(lambda),
+        settings(lambda),
+        &mut ChaCha8Rng::seed_from_u64(seed),
+    )
+    .unwrap()
+}
+
+/// A batch that owns its planes.
+#[derive(Clone)]
+pub(crate) struct Rows {
+    pub(crate) frames: [Vec<u8>; 3],
+    pub(crate) action: Vec<u8>,
+    pub(crate) next_action: Vec<u8>,
+    pub(crate) n_step_return: Vec<f32>,
+    pub(crate) bootstrap_discount: Vec<f32>,
+    pub(crate) positive_valid: Vec<u8>,
+}
+
+impl Rows {
+    pub(crate) fn random(rows: usize, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut frames = || {
+            (0..rows * 20 * 24 * 2)
+                .map(|_| rng.random())
+                .collect::<Vec<u8>>()
+        };
+        let frames = [frames(), frames(), frames()];
+        let mut draw = |below: u8| {
+            (0..rows)
+                .map(|_| rng.random_range(0..below))
+                .collect::<Vec<u8>>()
+        };
+        let action = draw(ACTIONS as u8);
+        let mut next_action = draw(ACTIONS as u8);
+        next_action[0] = NO_ACTION;
+        Self {
+            frames,
+            action,
+            next_action,
+            n_step_return: (0..rows).map(|_| rng.random_range(-3.0..3.0)).collect(),
+            bootstrap_discount: (0..rows)
+                .map(|row| if row == 0 { 0.0 } else { 0.93 })
+                .collect(),
+            positive_valid: (0..rows).map(|row| u8::from(row != 0)).collect(),
+        }
+    }
+
+    pub(crate) fn batch(&self) -> Batch<'_> {
+        Batch {
+            rows: self.action.len(),
+            frames_t: &self.frames[0],
+            frames_k: Some(&self.frames[1]),
+            frames_n: &self.frames[2],
+            action: &self.action,
+            next_action: &self.next_action,
+            n_step_return: &self.n_step_return,
+            bootstrap_discount: &self.bootstrap_discount,
+            positive_valid: &self.positive_valid,
+        }
+    }
+}

@@ -1,0 +1,6 @@
+//! The learner as its process uses it: updates on made-up batches, and checkpoints.
+//! The arithmetic's oracle is in `parity`; here is what must hold for any batch.
+
+mod checkpoint;
+mod made_up;
+mod update;

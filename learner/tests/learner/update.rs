@@ -1,0 +1,327 @@
+//! What holds for every update: slopes, zeros, finiteness, and errors that change nothing.
+//! It compares with no outside numbers.
+
+use std::collections::HashMap;
+
+use candle_core::{Device, Tensor};
+use driml_learner::{Learner, UpdateError};
+use driml_model::Parameters;
+
+use crate::made_up::{ALL_DIM, NO_DIM, Rows, learner, model, settings};
+
+type Values = HashMap<String, Vec<f32>>;
+
+fn values(parameters: &Parameters) -> Values {
+    let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    parameters
+        .iter()
+        .map(|(name, var)| (name.to_owned(), flat(var)))
+        .collect()
+}
+
+/// `learner` with its online parameters changed.
+fn changed(learner: &Learner, change: impl Fn(&str, &mut [f32])) -> Learner {
+    let tensors = |parameters: &Parameters, change: &dyn Fn(&str, &mut [f32])| {
+        let mut tensors = HashMap::new();
+        for (name, var) in parameters.iter() {
+            let mut values: Vec<f32> = var.flatten_all().unwrap().to_vec1().unwrap();
+            change(name, &mut values);
+            tensors.insert(
+                name.to_owned(),
+                Tensor::from_vec(values, var.dims(), &Device::Cpu).unwrap(),
+            );
+        }
+        tensors
+    };
+    let device = Device::Cpu;
+    let model = learner.model();
+    let online =
+        Parameters::from_tensors(model, tensors(learner.online(), &change), &device).unwrap();
+    let acting = model.without_dim();
+    let target =
+        Parameters::from_tensors(&acting, tensors(learner.target(), &|_, _| ()), &device).unwrap();
+    Learner::from_parameters(model.clone(), learner.settings().clone(), online, target).unwrap()
+}
+
+#[test]
+fn the_gradient_is_the_slope_of_the_total_in_every_part() {
+    let (learner, rows) = (learner(ALL_DIM, 1), Rows::random(9, 2));
+    let evaluation = learner.evaluate(&rows.batch()).unwrap();
+    for part in [
+        "torso.conv1",
+        "torso.conv2",
+        "torso.fc",
+        "head",
+        "dim.action",
+        "dim.psi3",
+        "dim.phi3",
+        "dim.psi4",
+        "dim.phi4",
+    ] {
+        let mut direction = Values::new();
+        for (name, _) in learner
+            .online()
+            .iter()
+            .filter(|(name, _)| name.starts_with(part))
+        {
+            let gradient = evaluation
+                .gradients
+                .get(name)
+                .expect("every part is in the total");
+            direction.insert(
+                name.to_owned(),
+                gradient.flatten_all().unwrap().to_vec1().unwrap(),
+            );
+        }
+        let square = |values: &Vec<f32>| values.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>();
+        let norm = direction.values().map(square).sum::<f64>().sqrt();
+        assert!(norm > 1e-5, "{part} has a gradient of {norm}");
+        let step = 2e-3;
+        let total = |by: f64| {
+            let moved = changed(&learner, |name, values| {
+                if let Some(gradient) = direction.get(name) {
+                    values
+                        .iter_mut()
+                        .zip(gradient)
+                        .for_each(|(v, g)| *v += (by * f64::from(*g) / norm) as f32);
+                }
+            });
+            f64::from(moved.evaluate(&rows.batch()).unwrap().total)
+        };
+        let slope = (total(step) - total(-step)) / (2.0 * step);
+        assert!(
+            (slope - norm).abs() < 0.02 * norm + 1e-3,
+            "{part}: slope {slope}, gradient {norm}"
+        );
+    }
+}
+
+#[test]
+fn repeated_updates_on_one_batch_bring_the_losses_down() {
+    let (mut learner, rows) = (learner(ALL_DIM, 3), Rows::random(16, 4));
+    let first = learner.update(&rows.batch()).unwrap();
+    let last = (0..60)
+        .map(|_| learner.update(&rows.batch()).unwrap())
+        .last()
+        .unwrap();
+    assert!(
+        last.total < 0.7 * first.total,
+        "{} to {}",
+        first.total,
+        last.total
+    );
+    assert_eq!(learner.updates(), 61);
+}
+
+#[test]
+fn without_dim_no_positives_are_needed_and_no_heads_are_built() {
+    let (mut learner, rows) = (learner(NO_DIM, 5), Rows::random(6, 6));
+    assert!(
+        learner
+            .online()
+            .iter()
+            .all(|(name, _)| !name.starts_with("dim."))
+    );
+    let mut batch = rows.batch();
+    batch.frames_k = None;
+    let report = learner.update(&batch).unwrap();
+    assert_eq!(report.dim, [None; 4]);
+    assert_eq!(report.total, report.c51_kl);
+}
+
+#[test]
+fn one_valid_positive_or_none_gives_dim_losses_of_zero() {
+    for valid in 0..2 {
+        let mut rows = Rows::random(7, 7);
+        rows.positive_valid = (0..7).map(|row| u8::from(row < valid)).collect();
+        let with_dim = learner(ALL_DIM, 8);
+        let evaluation = with_dim.evaluate(&rows.batch()).unwrap();
+        assert_eq!(evaluation.dim, [Some(0.0); 4]);
+        assert_eq!(evaluation.total, evaluation.c51_kl);
+        for (name, _) in with_dim
+            .online()
+            .iter()
+            .filter(|(name, _)| name.starts_with("dim."))
+        {
+            let gradient = evaluation
+                .gradients
+                .get(name)
+                .map(|g| g.flatten_all().unwrap().to_vec1::<f32>().unwrap());
+            assert!(
+                gradient.is_none_or(|g| g.iter().all(|&g| g == 0.0)),
+                "{name}"
+            );
+        }
+    }
+}
+
+#[test]
+fn an_all_terminal_batch_ignores_what_comes_after() {
+    let mut rows = Rows::random(6, 9);
+    rows.bootstrap_discount.fill(0.0);
+    let learner = learner(NO_DIM, 10);
+    let first = learner.evaluate(&rows.batch()).unwrap();
+    rows.frames[2].fill(0);
+    let second = learner.evaluate(&rows.batch()).unwrap();
+    let close = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-6;
+    assert!(
+        first
+            .target_projection
+            .iter()
+            .zip(&second.target_projection)
+            .all(close)
+    );
+    let sum: f32 = first.target_projection.iter().sum();
+    assert!((sum - 6.0).abs() < 1e-5);
+}
+
+#[test]
+fn rows_without_a_positive_are_out_of_dim_altogether() {
+    let mut rows = Rows::random(8, 11);
+    rows.positive_valid = vec![1, 0, 1, 1, 0, 1, 1, 1];
+    let learner = learner(ALL_DIM, 12);
+    let before = learner.evaluate(&rows.batch()).unwrap();
+    let row_bytes = rows.frames[1].len() / 8;
+    for row in [1, 4] {
+        rows.frames[1][row * row_bytes..(row + 1) * row_bytes].fill(200);
+    }
+    let after = learner.evaluate(&rows.batch()).unwrap();
+    assert_eq!(before.dim, after.dim);
+}
+
+#[test]
+fn saturated_scores_and_extreme_returns_stay_finite() {
+    let mut rows = Rows::random(6, 13);
+    rows.n_step_return
+        .copy_from_slice(&[1e30, -1e30, 5.0, -5.0, 0.0, 1e-30]);
+    let mut learner = changed(&learner(ALL_DIM, 14), |name, values| {
+        if name.starts_with("dim.") {
+            values.iter_mut().for_each(|v| *v *= 30.0);
+        }
+        if name.starts_with("head") {
+            values.iter_mut().for_each(|v| *v *= 300.0);
+        }
+    });
+    for _ in 0..5 {
+        let report = learner.update(&rows.batch()).unwrap();
+        assert!(report.total.is_finite() && report.grad_norm.is_finite());
+    }
+    assert!(
+        values(learner.online())
+            .values()
+            .flatten()
+            .all(|v| v.is_finite())
+    );
+}
+
+#[test]
+fn double_dqn_chooses_by_the_online_network() {
+    let rows = Rows::random(12, 15);
+    let mut settings = settings(NO_DIM);
+    let mut chosen = Vec::new();
+    for double_dqn in [false, true] {
+        settings.double_dqn = double_dqn;
+        let mut rng = rand_chacha::rand_core::SeedableRng::seed_from_u64(16);
+        let learner = Learner::new(model(NO_DIM), settings.clone(), &mut rng).unwrap();
+        // The online network alone turns to action 2.
+        let learner = changed(&learner, |name, values| {
+            if name == "head.bias" {
+                values[2 * 21 + 20] += 50.0;
+            }
+        });
+        chosen.push(learner.evaluate(&rows.batch()).unwrap().next_greedy_action);
+    }
+    assert!(chosen[0].iter().any(|&action| action != 2));
+    assert_eq!(chosen[1], [2; 12]);
+}
+
+#[test]
+fn the_target_network_follows_once_a_period() {
+    let (mut learner, rows) = (learner(NO_DIM, 17), Rows::random(4, 18));
+    let start = values(learner.target());
+    for _ in 0..2 {
+        learner.update(&rows.batch()).unwrap();
+        assert_eq!(values(learner.target()), start);
+    }
+    learner.update(&rows.batch()).unwrap();
+    let (online, target) = (values(learner.online()), values(learner.target()));
+    for (name, values) in &target {
+        for (i, value) in values.iter().enumerate() {
+            let expected = 0.95 * online[name][i] + 0.05 * start[name][i];
+            assert!((value - expected).abs() < 1e-6, "{name}[{i}]");
+        }
+    }
+}
+
+#[test]
+fn a_bad_batch_is_an_error_that_changes_nothing() {
+    let mut learner = learner(ALL_DIM, 19);
+    let before = values(learner.online());
+    let good = Rows::random(5, 20);
+    let mut refused = |change: fn(&mut Rows), said: &str| {
+        let mut rows = good.clone();
+        change(&mut rows);
+        let error = learner.update(&rows.batch()).expect_err(said);
+        assert!(
+            matches!(error, UpdateError::Batch(_)) && error.to_string().contains(said),
+            "{error}"
+        );
+    };
+    refused(|rows| rows.action[3] = 4, "row 3");
+    refused(|rows| rows.next_action[2] = 17, "row 2");
+    refused(|rows| rows.n_step_return[1] = f32::NAN, "row 1");
+    refused(|rows| rows.n_step_return[1] = f32::INFINITY, "row 1");
+    refused(|rows| rows.bootstrap_discount[1] = 1.5, "row 1");
+    refused(|rows| rows.frames[0].truncate(7), "frames_t");
+    refused(|rows| rows.frames[1].truncate(7), "frames_k");
+    refused(|rows| rows.positive_valid.clear(), "positive_valid");
+    let mut batch = good.batch();
+    batch.frames_k = None;
+    assert!(learner.update(&batch).is_err());
+    batch.rows = 0;
+    assert!(learner.update(&batch).is_err());
+    assert_eq!(values(learner.online()), before);
+    assert_eq!(learner.updates(), 0);
+}
+
+#[test]
+fn arithmetic_that_is_not_finite_is_an_error_that_changes_nothing() {
+    let rows = Rows::random(5, 21);
+    for poisoned in [
+        "torso.conv1.weight",
+        "head.bias",
+        "dim.psi3.out.weight",
+        "dim.phi4.hidden.bias",
+    ] {
+        let mut learner = learner(ALL_DIM, 22);
+        let var = learner.online().get(poisoned).unwrap();
+        let mut values: Vec<f32> = var.flatten_all().unwrap().to_vec1().unwrap();
+        values[0] = f32::NAN;
+        var.set(&Tensor::from_vec(values, var.dims(), &Device::Cpu).unwrap())
+            .unwrap();
+        let error = learner.update(&rows.batch()).expect_err(poisoned);
+        assert!(
+            matches!(error, UpdateError::NonFinite { .. }),
+            "{poisoned}: {error}"
+        );
+        assert_eq!(learner.updates(), 0);
+    }
+}
+
+#[test]
+fn a_model_whose_heads_the_lambdas_do_not_use_is_refused() {
+    let mut rng = rand_chacha::rand_core::SeedableRng::seed_from_u64(23);
+    let error = Learner::new(model(ALL_DIM), settings(NO_DIM), &mut rng).expect_err("unused heads");
+    assert!(matches!(error, UpdateError::Settings(_)), "{error}");
+}
+
+#[test]
+fn actors_get_torso_and_head_and_nothing_else() {
+    let learner = learner(ALL_DIM, 24);
+    let bytes = learner.weights().unwrap();
+    let acting = learner.model().without_dim();
+    let loaded = Parameters::load_safetensors(&acting, &bytes, &Device::Cpu).unwrap();
+    let mut expected = values(learner.online());
+    expected.retain(|name, _| !name.starts_with("dim."));
+    assert_eq!(values(&loaded), expected);
+}

@@ -1,0 +1,239 @@
+//! The bytes of a message: a fixed prefix, a bincode header, then raw planes that serde never touches.
+//! It does not know what a message means, and it is the only file that calls bincode.
+//!
+//! | bytes | field |
+//! | --- | --- |
+//! | 0..4 | magic `DRML` |
+//! | 4..6 | protocol version, little-endian as everything here |
+//! | 6..8 | kind |
+//! | 8..16 | run spec's hash |
+//! | 16..20 | header's length |
+//! | 20..28 | planes' length |
+//! | 28..32 | CRC-32 of bytes 0..28, the header and the planes |
+//! | 32.. | header, then planes |
+
+use serde::{Serialize, de::DeserializeOwned};
+
+use crate::PROTOCOL_VERSION;
+
+const MAGIC: [u8; 4] = *b"DRML";
+/// Length of the fixed prefix, bytes.
+pub const PREFIX_BYTES: usize = 32;
+/// Longest header, bytes; a longer one is refused by both sides.
+pub const HEADER_BYTES_MAX: usize = 1 << 20;
+/// Longest planes, bytes; longer ones are refused by both sides.
+pub const PLANES_BYTES_MAX: usize = 1 << 29;
+
+/// What a message is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u16)]
+pub enum Kind {
+    /// Transitions, actor to replay server.
+    Chunk = 1,
+    /// The answer to a chunk.
+    InsertReply = 2,
+    /// A request for a batch, learner to replay server.
+    BatchRequest = 3,
+    /// A batch, or why there is none yet.
+    BatchReply = 4,
+    /// The action-affinity matrix, learner to replay server.
+    Affinity = 5,
+    /// Network weights, learner to actors.
+    Weights = 6,
+    /// "Newer weights exist", learner to actors.
+    WeightsVersion = 7,
+    /// An actor's last word.
+    Goodbye = 8,
+    /// The replay server's account of itself.
+    ReplayStatus = 9,
+    /// The learner's account of itself.
+    LearnerStatus = 10,
+    /// What a joining part needs to know.
+    Hello = 11,
+    /// "Understood"; carries nothing.
+    Done = 12,
+}
+
+/// Why bytes were refused. None of these is ever a panic.
+#[derive(Debug, thiserror::Error, PartialEq, Eq)]
+pub enum CodecError {
+    /// Fewer or more bytes than the prefix promises.
+    #[error("the message has {have} bytes, not the {need} that it needs: it was cut off or padded on the way")]
+    Length {
+        /// Bytes at hand.
+        have: usize,
+        /// Bytes expected.
+        need: usize,
+    },
+    /// Not one of our messages.
+    #[error("the message does not start with DRML: the sender is not part of DRIML, or the bytes were damaged")]
+    Magic,
+    /// Another protocol version.
+    #[error("the sender speaks protocol version {theirs}, this part version {ours}: run the same build of driml everywhere")]
+    Version {
+        /// The sender's.
+        theirs: u16,
+        /// Ours.
+        ours: u16,
+    },
+    /// Another kind than this place takes.
+    #[error("a message of kind {theirs} came where kind {ours} is expected")]
+    Kind {
+        /// The sender's.
+        theirs: u16,
+        /// Ours.
+        ours: u16,
+    },
+    /// Another run.
+    #[error(
+        "the message belongs to run spec {theirs:016x}, this part runs {ours:016x}: start every part with the same settings, or let actors and learner fetch them with --connect"
+    )]
+    RunSpec {
+        /// The sender's hash.
+        theirs: u64,
+        /// Ours.
+        ours: u64,
+    },
+    /// Damaged bytes.
+    #[error("the message's checksum is wrong: it was damaged on the way")]
+    Checksum,
+    /// A header that does not decode, or is inconsistent with its planes.
+    #[error("the message's header makes no sense: {0}")]
+    Header(String),
+    /// Larger than a message may be.
+    #[error("the message has {have} bytes, more than the {max} allowed: use smaller chunks or batches")]
+    TooLarge {
+        /// Bytes at hand.
+        have: usize,
+        /// The limit.
+        max: usize,
+    },
+}
+
+/// Encodes `header` with bincode, refusing more than [`HEADER_BYTES_MAX`].
+fn encode_header<H: Serialize>(header: &H) -> Result<Vec<u8>, CodecError> {
+    let bytes = bincode::serde::encode_to_vec(header, bincode::config::standard())
+        .map_err(|e| CodecError::Header(e.to_string()))?;
+    if bytes.len() > HEADER_BYTES_MAX {
+        return Err(CodecError::TooLarge { have: bytes.len(), max: HEADER_BYTES_MAX });
+    }
+    Ok(bytes)
+}
+
+/// The bincode bytes of a value, for hashing and for small files of our own.
+pub(crate) fn canonical_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
+    encode_header(value)
+}
+
+/// Prefix and header of a message; the wire carries these bytes followed by `planes`, which are not copied.
+///
+/// # Errors
+/// A header or planes over their limits.
+pub fn seal<H: Serialize>(
+    kind: Kind,
+    spec_hash: u64,
+    header: &H,
+    planes: &[u8],
+) -> Result<Vec<u8>, CodecError> {
+    if planes.len() > PLANES_BYTES_MAX {
+        return Err(CodecError::TooLarge { have: planes.len(), max: PLANES_BYTES_MAX });
+    }
+    let header = encode_header(header)?;
+    let mut out = Vec::with_capacity(PREFIX_BYTES + header.len());
+    out.extend_from_slice(&MAGIC);
+    out.extend_from_slice(&PROTOCOL_VERSION.to_le_bytes());
+    out.extend_from_slice(&(kind as u16).to_le_bytes());
+    out.extend_from_slice(&spec_hash.to_le_bytes());
+    out.extend_from_slice(&(header.len() as u32).to_le_bytes());
+    out.extend_from_slice(&(planes.len() as u64).to_le_bytes());
+    let checksum = checksum(&out, &header, planes);
+    out.extend_from_slice(&checksum.to_le_bytes());
+    out.extend_from_slice(&header);
+    Ok(out)
+}
+
+/// A whole message in one piece, for small ones and for tests.
+///
+/// # Errors
+/// As [`seal`].
+pub fn encode<H: Serialize>(
+    kind: Kind,
+    spec_hash: u64,
+    header: &H,
+    planes: &[u8],
+) -> Result<Vec<u8>, CodecError> {
+    let mut out = seal(kind, spec_hash, header, planes)?;
+    out.extend_from_slice(planes);
+    Ok(out)
+}
+
+/// Checks a message and gives its header and planes.
+///
+/// `spec_hash` is the hash that this part runs, or `None` where any run is welcome (a part that joins to learn it).
+///
+/// # Errors
+/// Anything that is not a whole, undamaged message of this kind, version and run.
+pub fn decode<H: DeserializeOwned>(
+    bytes: &[u8],
+    kind: Kind,
+    spec_hash: Option<u64>,
+) -> Result<(H, &[u8]), CodecError> {
+    let prefix: &[u8; PREFIX_BYTES] =
+        bytes.first_chunk().ok_or(CodecError::Length { have: bytes.len(), need: PREFIX_BYTES })?;
+    if prefix[0..4] != MAGIC {
+        return Err(CodecError::Magic);
+    }
+    let version = u16::from_le_bytes([prefix[4], prefix[5]]);
+    if version != PROTOCOL_VERSION {
+        return Err(CodecError::Version { theirs: version, ours: PROTOCOL_VERSION });
+    }
+    let header_len = le_u32(&prefix[16..20]) as usize;
+    let planes_len = usize::try_from(le_u64(&prefix[20..28])).unwrap_or(usize::MAX);
+    if header_len > HEADER_BYTES_MAX {
+        return Err(CodecError::TooLarge { have: header_len, max: HEADER_BYTES_MAX });
+    }
+    if planes_len > PLANES_BYTES_MAX {
+        return Err(CodecError::TooLarge { have: planes_len, max: PLANES_BYTES_MAX });
+    }
+    let need = PREFIX_BYTES + header_len + planes_len;
+    if bytes.len() != need {
+        return Err(CodecError::Length { have: bytes.len(), need });
+    }
+    let (header, planes) = bytes[PREFIX_BYTES..].split_at(header_len);
+    if checksum(&prefix[..28], header, planes) != le_u32(&prefix[28..32]) {
+        return Err(CodecError::Checksum);
+    }
+    let their_kind = u16::from_le_bytes([prefix[6], prefix[7]]);
+    if their_kind != kind as u16 {
+        return Err(CodecError::Kind { theirs: their_kind, ours: kind as u16 });
+    }
+    let theirs = le_u64(&prefix[8..16]);
+    if let Some(ours) = spec_hash
+        && ours != theirs
+    {
+        return Err(CodecError::RunSpec { theirs, ours });
+    }
+    let config = bincode::config::standard().with_limit::<HEADER_BYTES_MAX>();
+    let (value, used) = bincode::serde::decode_from_slice(header, config)
+        .map_err(|e| CodecError::Header(e.to_string()))?;
+    if used != header.len() {
+        return Err(CodecError::Header(format!("{} bytes after its end", header.len() - used)));
+    }
+    Ok((value, planes))
+}
+
+fn checksum(prefix: &[u8], header: &[u8], planes: &[u8]) -> u32 {
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(prefix);
+    hasher.update(header);
+    hasher.update(planes);
+    hasher.finalize()
+}
+
+fn le_u32(bytes: &[u8]) -> u32 {
+    u32::from_le_bytes(bytes.try_into().expect("the caller slices four bytes"))
+}
+
+fn le_u64(bytes: &[u8]) -> u64 {
+    u64::from_le_bytes(bytes.try_into().expect("the caller slices eight bytes"))
+}

@@ -1,0 +1,48 @@
+//! How a part finds its own tables in the run's resolved settings.
+//! It does not know what the tables hold: each part has a Config of its own.
+
+use serde::de::DeserializeOwned;
+
+/// Why settings were refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// Not TOML.
+    #[error("the settings are not valid TOML: {0}")]
+    Syntax(String),
+    /// A table is missing.
+    #[error("the settings have no [{0}] table: use a config.toml that driml wrote, or a preset")]
+    Missing(&'static str),
+    /// A table does not fit.
+    #[error("in the settings' [{table}] table: {why}")]
+    Table {
+        /// Which.
+        table: &'static str,
+        /// What is wrong.
+        why: String,
+    },
+}
+
+/// The resolved settings of a run, one table a part.
+#[derive(Clone, Debug)]
+pub struct Settings(toml::Table);
+
+impl Settings {
+    /// Parses TOML.
+    ///
+    /// # Errors
+    /// Text that is not TOML.
+    pub fn parse(text: &str) -> Result<Self, ConfigError> {
+        let table = text.parse::<toml::Table>().map_err(|e| ConfigError::Syntax(e.to_string()))?;
+        Ok(Self(table))
+    }
+
+    /// Reads one table; unknown keys, missing keys and wrong types are refused by the type.
+    ///
+    /// # Errors
+    /// No such table, or one that does not fit `T`.
+    pub fn table<T: DeserializeOwned>(&self, name: &'static str) -> Result<T, ConfigError> {
+        let value = self.0.get(name).ok_or(ConfigError::Missing(name))?;
+        let why = |e: toml::de::Error| ConfigError::Table { table: name, why: e.message().to_owned() };
+        value.clone().try_into().map_err(why)
+    }
+}

@@ -1,0 +1,31 @@
+//! Everything that crosses a process boundary: the run spec, the messages, their bytes, and where they travel.
+//! It holds no algorithm and no state; `README.md` beside this crate is the table of what is sent where.
+
+#![cfg_attr(test, allow(clippy::unwrap_used))]
+
+pub mod affinity;
+pub mod batch;
+pub mod codec;
+pub mod config;
+pub mod control;
+pub mod keys;
+pub mod metric;
+pub mod run_spec;
+pub mod session;
+pub mod shutdown;
+pub mod transition;
+pub mod weights;
+
+pub use affinity::AffinityUpdate;
+pub use batch::{Batch, BatchHeader, BatchReply, BatchRequest, NO_ACTION};
+pub use codec::{CodecError, Kind};
+pub use control::{Goodbye, Hello};
+pub use keys::Keys;
+pub use metric::{LearnerStatus, ReplayStatus, Waiting};
+pub use shutdown::Shutdown;
+pub use run_spec::{Horizon, RunSpec, TimeoutRule};
+pub use transition::{Chunk, ChunkHeader, End, InsertReply};
+pub use weights::{WeightsHeader, WeightsVersion};
+
+/// The version of every message in this crate; parts of different versions refuse each other.
+pub const PROTOCOL_VERSION: u16 = 1;

@@ -1,0 +1,160 @@
+//! What every part of one run must agree on, and its hash, which is in every message.
+//! It holds no setting that only one part uses.
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::{PROTOCOL_VERSION, codec};
+
+/// How far ahead a positive lies: the rule by which the replay server draws k.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "rule", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Horizon {
+    /// No positive is served: the agent has no DIM loss.
+    None,
+    /// k, or the steps left in the episode if fewer.
+    Fixed {
+        /// Environment steps ahead, at least 1.
+        k: u32,
+    },
+    /// Uniform on 1..=k_max (or the steps left).
+    Uniform {
+        /// Environment steps ahead, at least 1.
+        k_max: u32,
+    },
+    /// Non-homogeneous geometric along the stored actions, at most k_max (or the steps left). SPEC: DRIML-ada.
+    Nhg {
+        /// Environment steps ahead, at least 1.
+        k_max: u32,
+    },
+}
+
+impl Horizon {
+    /// Positives a row carries: frames s_{t+k} served beside s_t.
+    pub const fn positives(&self) -> usize {
+        match self {
+            Self::None => 0,
+            Self::Fixed { .. } | Self::Uniform { .. } | Self::Nhg { .. } => 1,
+        }
+    }
+
+    /// The largest k that can be drawn, environment steps; 0 where none is.
+    pub const fn k_max(&self) -> u32 {
+        match *self {
+            Self::None => 0,
+            Self::Fixed { k } => k,
+            Self::Uniform { k_max } | Self::Nhg { k_max } => k_max,
+        }
+    }
+}
+
+/// What a time-out means for the return.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum TimeoutRule {
+    /// As the end of the episode: nothing follows (the paper).
+    Terminal,
+    /// Bootstrap from the last frame before it, over the fewer steps that remain.
+    Bootstrap,
+}
+
+/// What every part of one run must agree on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunSpec {
+    /// The world, as `--env` takes it.
+    pub world: String,
+    /// The agent, as `--agent` takes it.
+    pub agent: String,
+    /// The run's seed; every generator of every part is derived from it.
+    pub seed: u64,
+    /// Rows of a frame as the world gives it.
+    pub frame_height: u32,
+    /// Columns of a frame as the world gives it.
+    pub frame_width: u32,
+    /// Bytes a pixel of a frame as the world gives it.
+    pub frame_channels: u32,
+    /// Frames that make one state, oldest first along the channels.
+    pub frame_stack: u32,
+    /// Actions of the world; valid ones are `0..num_actions`.
+    pub num_actions: u32,
+    /// Environment steps in the return.
+    pub n_step: u32,
+    /// Discount a step, 0 to 1.
+    pub gamma: f64,
+    /// The rule for k.
+    pub horizon: Horizon,
+    /// What a time-out means for the return.
+    pub timeout: TimeoutRule,
+}
+
+/// Why a run spec cannot work.
+#[derive(Debug, thiserror::Error, PartialEq)]
+#[error("run.{key} = {value} cannot work: {why}")]
+pub struct RunSpecError {
+    key: &'static str,
+    value: String,
+    why: &'static str,
+}
+
+impl RunSpec {
+    /// Bytes of one frame as the world gives it.
+    pub const fn frame_bytes(&self) -> usize {
+        self.frame_height as usize * self.frame_width as usize * self.frame_channels as usize
+    }
+
+    /// Bytes of one state: `frame_stack` frames.
+    pub const fn state_bytes(&self) -> usize {
+        self.frame_bytes() * self.frame_stack as usize
+    }
+
+    /// The hash that is in every message of this run: the first 8 bytes of the SHA-256 of version and fields.
+    pub fn hash(&self) -> u64 {
+        let bytes = codec::canonical_bytes(&(PROTOCOL_VERSION, self))
+            .expect("a run spec is a few short fields, far below the limit");
+        let digest = Sha256::digest(&bytes);
+        u64::from_le_bytes(digest[..8].try_into().expect("SHA-256 has 32 bytes"))
+    }
+
+    /// The seed of one generator of one part: SHA-256 of the run's seed, the part's name and `index`.
+    pub fn seed_for(&self, part: &str, index: u64) -> [u8; 32] {
+        let mut hasher = Sha256::new();
+        hasher.update(self.seed.to_le_bytes());
+        hasher.update(index.to_le_bytes());
+        hasher.update(part.as_bytes());
+        hasher.finalize().into()
+    }
+
+    /// Checks every field's range.
+    ///
+    /// # Errors
+    /// The first field that cannot work, and why.
+    pub fn validate(&self) -> Result<(), RunSpecError> {
+        let bad = |key, value: String, why| Err(RunSpecError { key, value, why });
+        let sides = [
+            ("frame_height", self.frame_height, 4096),
+            ("frame_width", self.frame_width, 4096),
+            ("frame_channels", self.frame_channels, 16),
+            ("frame_stack", self.frame_stack, 16),
+        ];
+        for (key, value, max) in sides {
+            if value == 0 || value > max {
+                return bad(key, value.to_string(), "it must be at least 1 and of a sensible size");
+            }
+        }
+        if self.num_actions == 0 || self.num_actions > 255 {
+            return bad("num_actions", self.num_actions.to_string(), "a world has 1 to 255 actions");
+        }
+        if self.n_step == 0 || self.n_step > 1000 {
+            return bad("n_step", self.n_step.to_string(), "a return spans 1 to 1000 steps");
+        }
+        if !(0.0..=1.0).contains(&self.gamma) {
+            return bad("gamma", self.gamma.to_string(), "a discount lies between 0 and 1");
+        }
+        let k_max = self.horizon.k_max();
+        if self.horizon != Horizon::None && (k_max == 0 || k_max > 1000) {
+            return bad("horizon", k_max.to_string(), "k lies between 1 and 1000");
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,142 @@
+//! What can be set about the replay server, and the checks that keep a run from stalling.
+//! It does not hold the rules of the return or of k: those are the run spec's, shared by every part.
+
+use driml_protocol::{
+    codec::PLANES_BYTES_MAX,
+    run_spec::{RunSpec, RunSpecError},
+};
+use serde::{Deserialize, Serialize};
+
+/// The replay server's settings.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Transitions held; the oldest are overwritten beyond it. Memory: one frame and 32 bytes each, taken as they come.
+    pub capacity_transitions: u64,
+    /// Rows sampled per transition inserted after the warm-up. More trains longer on each transition.
+    pub replay_ratio: f64,
+    /// Transitions stored before the replay ratio starts to count and the first row is sampled.
+    pub warmup_transitions: u64,
+    /// Transitions that inserts may run ahead of sampling, after the warm-up, before they have to wait.
+    pub slack_transitions: u64,
+    /// Transitions of the whole run, warm-up included: once that many are stored, no more are taken. None runs on.
+    pub transitions_max: Option<u64>,
+}
+
+/// Why settings were refused.
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum ConfigError {
+    /// One key's value cannot work.
+    #[error("{key} = {value} cannot work: {why}")]
+    Key {
+        /// The key, with its table.
+        key: &'static str,
+        /// Its value.
+        value: String,
+        /// What is wrong and what to do.
+        why: String,
+    },
+    /// The run spec cannot work.
+    #[error(transparent)]
+    RunSpec(#[from] RunSpecError),
+}
+
+/// Environment steps that must follow an anchor in its stream, unless its episode ends before: max(n_step, k_max).
+pub const fn reach(spec: &RunSpec) -> u32 {
+    let k_max = spec.horizon.k_max();
+    if spec.n_step > k_max {
+        spec.n_step
+    } else {
+        k_max
+    }
+}
+
+impl Config {
+    /// Checks every value, alone and against `batch_rows`, the rows of the learner's batches.
+    ///
+    /// The run cannot stall if slack_transitions * replay_ratio >= batch_rows: inserts then wait only while a whole batch
+    /// may be sampled.
+    ///
+    /// # Errors
+    /// The first key that cannot work, its value and what to do.
+    pub fn validate(&self, spec: &RunSpec, batch_rows: u32) -> Result<(), ConfigError> {
+        spec.validate()?;
+        let bad = |key, value: String, why: String| Err(ConfigError::Key { key, value, why });
+        let ratio = self.replay_ratio;
+        if !(ratio.is_finite() && ratio > 0.0) {
+            return bad(
+                "replay.replay_ratio",
+                ratio.to_string(),
+                "rows per transition must be a number above 0".into(),
+            );
+        }
+        let rows_max = rows_max(spec);
+        if batch_rows == 0 || batch_rows > rows_max {
+            let why = format!("a batch of this run has 1 to {rows_max} rows");
+            return bad("learner.batch_rows", batch_rows.to_string(), why);
+        }
+        let window = u64::from(reach(spec)) + u64::from(spec.frame_stack);
+        if self.capacity_transitions < window {
+            let why = format!(
+                "one sample spans {window} transitions (the longer of n_step and k_max, and the frame stack); hold at least that many for each copy of the world"
+            );
+            return bad(
+                "replay.capacity_transitions",
+                self.capacity_transitions.to_string(),
+                why,
+            );
+        }
+        if self
+            .capacity_transitions
+            .checked_mul(spec.frame_bytes() as u64)
+            .is_none_or(|b| b > isize::MAX as u64)
+        {
+            let why = "this many frames exceed any machine's address space; hold fewer".into();
+            return bad(
+                "replay.capacity_transitions",
+                self.capacity_transitions.to_string(),
+                why,
+            );
+        }
+        if self.warmup_transitions > self.capacity_transitions {
+            let why = format!(
+                "the first of them would be overwritten before any is sampled; use at most capacity_transitions = {}",
+                self.capacity_transitions
+            );
+            return bad(
+                "replay.warmup_transitions",
+                self.warmup_transitions.to_string(),
+                why,
+            );
+        }
+        if (self.slack_transitions as f64) * ratio < f64::from(batch_rows) {
+            let least = (f64::from(batch_rows) / ratio).ceil();
+            let why = format!(
+                "actors and learner would wait for each other; use at least batch rows / replay_ratio = {batch_rows} / {ratio} = {least}"
+            );
+            return bad(
+                "replay.slack_transitions",
+                self.slack_transitions.to_string(),
+                why,
+            );
+        }
+        if let Some(max) = self.transitions_max {
+            let batch = (f64::from(batch_rows) / ratio).ceil();
+            let least = self.warmup_transitions as f64 + batch;
+            if (max as f64) < least {
+                let why = format!(
+                    "the run would end before its first batch; use at least warmup_transitions + batch rows / replay_ratio = {least}"
+                );
+                return bad("replay.transitions_max", max.to_string(), why);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Most rows of one batch of this run, so that it stays below the codec's limit; larger requests are refused.
+pub fn rows_max(spec: &RunSpec) -> u32 {
+    let positives = spec.horizon.positives();
+    let row = spec.state_bytes() * (2 + positives) + 10 + 2 * positives;
+    u32::try_from(PLANES_BYTES_MAX / row).unwrap_or(u32::MAX)
+}

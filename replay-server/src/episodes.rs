@@ -1,0 +1,140 @@
+//! Walks along stored episodes: which transitions can be an anchor, the steps that follow it, and stacked frames.
+//! It does not draw anchors and computes no returns.
+
+use driml_protocol::{End, RunSpec, TimeoutRule};
+
+use crate::{
+    config,
+    ring::{Previous, Ring, Step},
+};
+
+/// An anchor t and what follows it: s_t, .., s_{t+m}, where m is the reach or the episode ends at s_{t+m}. Never empty.
+#[derive(Default)]
+pub(crate) struct Window {
+    steps: Vec<(u64, Step)>,
+}
+
+impl Window {
+    /// Index of s_{t+i} in the ring; i must not pass the end of the window.
+    pub(crate) fn index(&self, i: usize) -> u64 {
+        self.steps[i].0
+    }
+
+    /// Step t+i; i must not pass the end of the window.
+    pub(crate) fn step(&self, i: usize) -> &Step {
+        &self.steps[i].1
+    }
+
+    /// Steps t, t+1, .. to the end of the window.
+    pub(crate) fn steps(&self) -> impl Iterator<Item = &Step> {
+        self.steps.iter().map(|(_, step)| step)
+    }
+}
+
+/// What a transition needs around it to be an anchor, and how its states are put together.
+pub(crate) struct Episodes {
+    reach: usize,
+    frame_stack: usize,
+    pixel_bytes: usize,
+    timeout: TimeoutRule,
+}
+
+impl Episodes {
+    pub(crate) fn new(spec: &RunSpec) -> Self {
+        Self {
+            reach: config::reach(spec) as usize,
+            frame_stack: spec.frame_stack as usize,
+            pixel_bytes: spec.frame_channels as usize,
+            timeout: spec.timeout,
+        }
+    }
+
+    /// Whether the held transition `t` can be an anchor; if so, `window` is its window.
+    ///
+    /// It can if its stack's frames are held and `reach` steps follow it or its episode ends before. With
+    /// `TimeoutRule::Bootstrap` a timed-out transition has no return at all, so it cannot.
+    pub(crate) fn walk(&self, ring: &Ring, t: u64, window: &mut Window) -> bool {
+        window.steps.clear();
+        let mut index = t;
+        loop {
+            let step = *ring.step(index);
+            window.steps.push((index, step));
+            if step.end.is_episode_end() || window.steps.len() > self.reach {
+                break;
+            }
+            match step.next() {
+                Some(next) => index = next,
+                None => return false,
+            }
+        }
+        let timed_out =
+            window.step(0).end == End::TimedOut && self.timeout == TimeoutRule::Bootstrap;
+        !timed_out && self.stack_is_held(ring, t)
+    }
+
+    fn stack_is_held(&self, ring: &Ring, t: u64) -> bool {
+        let mut index = t;
+        for _ in 1..self.frame_stack {
+            match ring.previous(index) {
+                Previous::Start => return true,
+                Previous::Held(previous) => index = previous,
+                Previous::Gone => return false,
+            }
+        }
+        true
+    }
+
+    /// Writes the state at `index` into `out` [H, W, C * stack], a pixel's oldest channels first.
+    ///
+    /// At the start of a level its first frame fills the slots of the frames before it. The stack must be held, which it is
+    /// for every state of a window: it reaches back to the anchor's stack at most.
+    pub(crate) fn write_state(&self, ring: &Ring, index: u64, out: &mut [u8]) {
+        if self.frame_stack == 1 {
+            out.copy_from_slice(ring.frame(index));
+            return;
+        }
+        let mut index = index;
+        for slot in (0..self.frame_stack).rev() {
+            interleave(
+                ring.frame(index),
+                out,
+                slot,
+                self.frame_stack,
+                self.pixel_bytes,
+            );
+            if slot > 0 {
+                match ring.previous(index) {
+                    Previous::Start => {}
+                    Previous::Held(previous) => index = previous,
+                    Previous::Gone => {
+                        unreachable!("the stack of {index} was checked with its anchor")
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Writes `frame` [pixels, C] into the channels of `slot` of `out` [pixels, stack, C].
+fn interleave(frame: &[u8], out: &mut [u8], slot: usize, stack: usize, pixel_bytes: usize) {
+    fn pixels<const C: usize>(frame: &[u8], out: &mut [u8], slot: usize, stack: usize) {
+        let to = out
+            .as_chunks_mut::<C>()
+            .0
+            .iter_mut()
+            .skip(slot)
+            .step_by(stack);
+        to.zip(frame.as_chunks::<C>().0)
+            .for_each(|(to, from)| *to = *from);
+    }
+    match pixel_bytes {
+        1 => pixels::<1>(frame, out, slot, stack),
+        3 => pixels::<3>(frame, out, slot, stack),
+        4 => pixels::<4>(frame, out, slot, stack),
+        _ => {
+            let to = out.chunks_exact_mut(pixel_bytes).skip(slot).step_by(stack);
+            to.zip(frame.chunks_exact(pixel_bytes))
+                .for_each(|(to, from)| to.copy_from_slice(from));
+        }
+    }
+}

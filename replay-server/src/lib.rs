@@ -1,0 +1,22 @@
+//! The replay server: keeps transitions exactly once, holds the replay ratio, and serves batches with k drawn as they are made.
+//! It knows bytes and integers, never tensors, and it does not know what a frame shows.
+
+#![cfg_attr(test, allow(clippy::unwrap_used))]
+
+pub mod config;
+pub mod horizon;
+pub mod rate_limiter;
+pub mod replay;
+
+mod actors;
+mod anchors;
+mod assemble;
+mod episodes;
+mod ring;
+mod service;
+mod statistics;
+
+pub use actors::{ACTORS_MAX, STREAMS_MAX};
+pub use config::{Config, ConfigError};
+pub use replay::{Replay, Unready};
+pub use service::{RunArgs, run};

@@ -1,0 +1,120 @@
+//! Holds the replay ratio: it says which side is ahead and has to wait.
+//! It does not wait itself, keep time or know what is stored.
+
+use driml_protocol::Waiting;
+
+/// Counts transitions in and rows out, and keeps rows / transitions after the warm-up at the replay ratio.
+///
+/// Its one quantity is the credit, in rows: replay ratio * transitions after the warm-up - rows sampled. A batch of B rows
+/// needs a credit of B; inserts wait while the credit is above slack * replay ratio. With slack * replay ratio >= B at least
+/// one side can always go on. Source: the rate limiter of Reverb (Cassirer et al. 2021), with the ratio counted exactly.
+#[derive(Clone, Debug)]
+pub struct RateLimiter {
+    replay_ratio: f64,
+    warmup_transitions: u64,
+    slack_transitions: u64,
+    transitions_max: Option<u64>,
+    inserted: u64,
+    rows_sampled: u64,
+    /// Where the present ratio began to count: transitions after the warm-up, and the rows allowed by then.
+    since: (u64, f64),
+}
+
+impl RateLimiter {
+    /// Nothing stored, nothing sampled. The arguments are those of `Config`, validated there.
+    pub fn new(
+        replay_ratio: f64,
+        warmup_transitions: u64,
+        slack_transitions: u64,
+        transitions_max: Option<u64>,
+    ) -> Self {
+        Self {
+            replay_ratio,
+            warmup_transitions,
+            slack_transitions,
+            transitions_max,
+            inserted: 0,
+            rows_sampled: 0,
+            since: (0, 0.0),
+        }
+    }
+
+    fn after_warmup(&self) -> u64 {
+        self.inserted.saturating_sub(self.warmup_transitions)
+    }
+
+    /// Rows allowed so far, whether sampled or not.
+    fn rows_allowed(&self) -> f64 {
+        let (since, rows) = self.since;
+        rows + self.replay_ratio * (self.after_warmup() - since) as f64
+    }
+
+    fn credit(&self) -> f64 {
+        self.rows_allowed() - self.rows_sampled as f64
+    }
+
+    /// Whether a chunk may be stored now; chunks are stored whole, so inserts may overshoot by one chunk.
+    pub fn may_insert(&self) -> bool {
+        !self.all_in() && self.credit() <= self.slack_transitions as f64 * self.replay_ratio
+    }
+
+    /// Whether `rows` rows may be sampled now.
+    pub fn may_sample(&self, rows: u32) -> bool {
+        self.inserted >= self.warmup_transitions && f64::from(rows) <= self.credit()
+    }
+
+    /// Whether all transitions of the run are in.
+    pub fn all_in(&self) -> bool {
+        self.transitions_max.is_some_and(|max| self.inserted >= max)
+    }
+
+    /// Whether all transitions are in and no further batch of `rows` is allowed.
+    pub fn finished(&self, rows: u32) -> bool {
+        self.all_in() && !self.may_sample(rows)
+    }
+
+    /// Most rows that can ever be asked for at once; for more, both sides could wait for each other.
+    pub fn rows_max(&self) -> u32 {
+        (self.slack_transitions as f64 * self.replay_ratio) as u32
+    }
+
+    /// Counts `transitions` stored.
+    pub fn inserted(&mut self, transitions: u64) {
+        self.inserted += transitions;
+    }
+
+    /// Counts `rows` sampled.
+    pub fn sampled(&mut self, rows: u32) {
+        debug_assert!(self.may_sample(rows), "{rows} rows beyond the replay ratio");
+        self.rows_sampled += u64::from(rows);
+    }
+
+    /// Rows sampled since the start.
+    pub const fn rows_sampled(&self) -> u64 {
+        self.rows_sampled
+    }
+
+    /// Changes the replay ratio from now on; rows allowed before stay allowed. The caller has validated it.
+    pub fn set_replay_ratio(&mut self, replay_ratio: f64) {
+        self.since = (self.after_warmup(), self.rows_allowed());
+        self.replay_ratio = replay_ratio;
+    }
+
+    /// Who waits, for batches of `rows`.
+    pub fn waiting(&self, rows: u32) -> Waiting {
+        if self.finished(rows) {
+            Waiting::Finished
+        } else if self.inserted < self.warmup_transitions {
+            Waiting::WarmUp {
+                have: self.inserted,
+                need: self.warmup_transitions,
+            }
+        } else if !self.may_sample(rows) {
+            Waiting::LearnerWaitsForActors
+        } else if !self.may_insert() && !self.all_in() {
+            Waiting::ActorsWaitForLearner
+        } else {
+            Waiting::Nobody
+        }
+    }
+}

@@ -1,0 +1,392 @@
+//! The replay server's core: chunks in, batches out, and its account of itself.
+//! It does no I/O, keeps no time and starts no thread: the service around it does.
+
+use driml_protocol::{
+    AffinityUpdate, Batch, BatchHeader, BatchReply, Chunk, CodecError, Goodbye, InsertReply,
+    ReplayStatus, RunSpec, Waiting,
+};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::{
+    actors::{Actors, Difference, Verdict},
+    anchors::Anchors,
+    assemble::Assembler,
+    config::{self, Config, ConfigError},
+    episodes::{Episodes, Window},
+    horizon::Affinity,
+    rate_limiter::RateLimiter,
+    ring::{Link, Ring, Step},
+    statistics::Statistics,
+};
+
+/// The replay server's own stream of the run's seed, so that no other part draws the same numbers.
+const RNG_STREAM: u64 = u64::from_be_bytes(*b"replay-1");
+
+/// Why there is no batch.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Unready {
+    /// Not yet: who waits for what.
+    Wait(Waiting),
+    /// Never again: all transitions are in and sampled.
+    Finished,
+    /// Never: the reason, for a person.
+    Refused {
+        /// The reason.
+        why: String,
+    },
+}
+
+impl From<Unready> for BatchReply {
+    fn from(unready: Unready) -> Self {
+        match unready {
+            Unready::Wait(waiting) => Self::Wait(waiting),
+            Unready::Finished => Self::Finished,
+            Unready::Refused { why } => Self::Refused { why },
+        }
+    }
+}
+
+/// Everything the replay server knows.
+pub struct Replay {
+    spec: RunSpec,
+    config: Config,
+    batch_rows: u32,
+    ring: Ring,
+    actors: Actors,
+    limiter: RateLimiter,
+    episodes: Episodes,
+    anchors: Anchors,
+    window: Window,
+    assembler: Assembler,
+    affinity: Affinity,
+    rng: ChaCha8Rng,
+    statistics: Statistics,
+    /// The learner found no anchor: one chunk may pass the limiter, or both sides would wait for each other.
+    starving: bool,
+}
+
+impl Replay {
+    /// An empty replay for batches of `batch_rows` rows; its draws follow from `spec.seed` and the order of calls.
+    ///
+    /// # Errors
+    /// Settings that cannot work, or more memory than the system grants.
+    pub fn new(spec: &RunSpec, config: &Config, batch_rows: u32) -> Result<Self, ConfigError> {
+        config.validate(spec, batch_rows)?;
+        let ring = Ring::new(config.capacity_transitions, spec.frame_bytes()).map_err(|bytes| {
+            let why =
+                format!("the system does not grant the {bytes} bytes that this takes; hold fewer");
+            ConfigError::Key {
+                key: "replay.capacity_transitions",
+                value: config.capacity_transitions.to_string(),
+                why,
+            }
+        })?;
+        let mut rng = ChaCha8Rng::seed_from_u64(spec.seed);
+        rng.set_stream(RNG_STREAM);
+        Ok(Self {
+            spec: spec.clone(),
+            config: config.clone(),
+            batch_rows,
+            ring,
+            actors: Actors::default(),
+            limiter: RateLimiter::new(
+                config.replay_ratio,
+                config.warmup_transitions,
+                config.slack_transitions,
+                config.transitions_max,
+            ),
+            episodes: Episodes::new(spec),
+            anchors: Anchors::default(),
+            window: Window::default(),
+            assembler: Assembler::new(spec),
+            affinity: Affinity::uniform(spec.num_actions),
+            rng,
+            statistics: Statistics::new(spec.horizon.k_max(), spec.num_actions),
+            starving: false,
+        })
+    }
+
+    /// Stores a chunk, whole, or says why not.
+    ///
+    /// A retry is answered `Stored` whatever the limiter says; a chunk that is not next is never stored.
+    pub fn insert(&mut self, chunk: &Chunk) -> InsertReply {
+        let verdict = match self.unfit(chunk) {
+            Some(why) => Verdict::Refused(why),
+            None => self.actors.judge(&chunk.header),
+        };
+        let inserted_total = self.ring.inserted();
+        match verdict {
+            Verdict::Refused(why) => {
+                tracing::warn!("refused a chunk of actor {}: {why}", chunk.header.actor);
+                self.statistics.messages_refused += 1;
+                InsertReply::Refused { why }
+            }
+            Verdict::Retried => {
+                self.statistics.chunks_retried += 1;
+                InsertReply::Stored { inserted_total }
+            }
+            _ if self.limiter.all_in() => InsertReply::Finished { inserted_total },
+            Verdict::OutOfOrder { expected } => InsertReply::OutOfOrder { expected },
+            Verdict::Next if !self.limiter.may_insert() && !self.starving => {
+                InsertReply::Wait { inserted_total }
+            }
+            Verdict::Next => {
+                self.store(chunk);
+                InsertReply::Stored {
+                    inserted_total: self.ring.inserted(),
+                }
+            }
+        }
+    }
+
+    fn unfit(&self, chunk: &Chunk) -> Option<String> {
+        let header = &chunk.header;
+        let frame_bytes = self.spec.frame_bytes();
+        if header.frame_bytes as usize != frame_bytes {
+            return Some(format!(
+                "frames of {} bytes; this run has {frame_bytes}",
+                header.frame_bytes
+            ));
+        }
+        let transitions = header.transitions() as u64;
+        if transitions == 0 || transitions > self.ring.capacity() {
+            let capacity = self.ring.capacity();
+            return Some(format!(
+                "{transitions} transitions in one chunk; the replay holds {capacity}: use 1 to that many"
+            ));
+        }
+        if header.sequence == u64::MAX || header.first_transition.checked_add(transitions).is_none()
+        {
+            return Some(format!(
+                "counts that no run reaches: chunk {}, transition {}",
+                header.sequence, header.first_transition
+            ));
+        }
+        let action = chunk
+            .actions()
+            .iter()
+            .find(|&&a| u32::from(a) >= self.spec.num_actions)?;
+        Some(format!(
+            "action {action}; this run has {}",
+            self.spec.num_actions
+        ))
+    }
+
+    fn store(&mut self, chunk: &Chunk) {
+        let header = chunk.header;
+        let (streams, difference) = self.actors.accept(&header);
+        let (steps, frame_bytes) = (header.steps as usize, header.frame_bytes as usize);
+        for (number, stream) in streams.iter_mut().enumerate() {
+            for row in number * steps..(number + 1) * steps {
+                let (action, reward, end) =
+                    (chunk.actions()[row], chunk.reward(row), chunk.end(row));
+                let frame = &chunk.frames()[row * frame_bytes..][..frame_bytes];
+                let step = Step::new(action, reward, end, header.weights_version);
+                let index = self.ring.push(frame, step, stream.link);
+                stream.link = Link::following(index, end);
+                self.statistics.action_histogram[usize::from(action)] += 1;
+                stream.episode_return = stream.episode_return.map(|sum| sum + f64::from(reward));
+                if end.is_episode_end() {
+                    self.statistics
+                        .episode_ended(stream.episode_return.replace(0.0));
+                }
+            }
+        }
+        self.limiter.inserted(header.transitions() as u64);
+        self.starving = false;
+        self.count(header.actor, difference);
+    }
+
+    fn count(&mut self, actor: u32, Difference { lost, duplicated }: Difference) {
+        if lost > 0 || duplicated > 0 {
+            tracing::warn!(
+                "actor {actor}: {lost} transitions lost, {duplicated} stored twice, by its own count"
+            );
+        }
+        let Statistics {
+            transitions_lost,
+            transitions_duplicated,
+            ..
+        } = &mut self.statistics;
+        *transitions_lost = transitions_lost.saturating_add(lost);
+        *transitions_duplicated = transitions_duplicated.saturating_add(duplicated);
+    }
+
+    /// A batch of `rows` rows, anchors uniform over the valid ones and drawn with replacement, or why there is none.
+    ///
+    /// # Errors
+    /// The limiter or the lack of any valid anchor asks to wait; the run is over; `rows` can never be served.
+    pub fn sample(&mut self, rows: u32) -> Result<Batch, Unready> {
+        let rows_max = config::rows_max(&self.spec).min(self.limiter.rows_max());
+        if rows == 0 || rows > rows_max {
+            self.statistics.messages_refused += 1;
+            let why = format!(
+                "a batch of {rows} rows; this run serves 1 to {rows_max}: change the batch size, or raise slack_transitions"
+            );
+            return Err(Unready::Refused { why });
+        }
+        if self.limiter.finished(rows) {
+            return Err(Unready::Finished);
+        }
+        if !self.limiter.may_sample(rows) {
+            return Err(Unready::Wait(self.limiter.waiting(rows)));
+        }
+        let mut batch = Batch::zeroed(BatchHeader {
+            rows,
+            positives: self.spec.horizon.positives() as u32,
+            state_bytes: self.spec.state_bytes() as u32,
+            inserted_total: self.ring.inserted(),
+            mean_age: 0.0,
+            weights_versions: (0, u64::MAX),
+        });
+        let mut header = batch.header;
+        let mut age_total = 0;
+        let mut rows_mut = batch.rows_mut();
+        for row in 0..rows as usize {
+            if !self
+                .anchors
+                .draw(&self.ring, &self.episodes, &mut self.rng, &mut self.window)
+            {
+                return Err(self.no_anchor());
+            }
+            let parts = (&self.ring, &self.episodes, &self.affinity);
+            let k =
+                self.assembler
+                    .write_row(parts, &self.window, &mut self.rng, (&mut rows_mut, row));
+            self.statistics.k_histogram[k as usize] += 1;
+            age_total += self.ring.inserted() - 1 - self.window.index(0);
+            let version = self.window.step(0).weights_version;
+            let (newest, oldest) = header.weights_versions;
+            header.weights_versions = (newest.max(version), oldest.min(version));
+        }
+        header.mean_age = age_total as f64 / f64::from(rows);
+        batch.header = header;
+        self.statistics.mean_age = header.mean_age;
+        self.limiter.sampled(rows);
+        self.starving = false;
+        Ok(batch)
+    }
+
+    fn no_anchor(&mut self) -> Unready {
+        if self.limiter.all_in() {
+            let why = format!(
+                "none of the {} transitions held can be sampled, and no more will come: every copy of the world needs n_step or k_max consecutive ones; raise capacity_transitions or transitions_max, or use fewer copies",
+                self.ring.inserted() - self.ring.oldest()
+            );
+            return Unready::Refused { why };
+        }
+        self.starving = true;
+        Unready::Wait(Waiting::LearnerWaitsForActors)
+    }
+
+    /// Takes a newer affinity matrix; one that is not newer is ignored.
+    ///
+    /// # Errors
+    /// A matrix of another size, or with an entry that is no probability; it counts as a refused message.
+    pub fn set_affinity(&mut self, update: &AffinityUpdate) -> Result<(), CodecError> {
+        self.affinity
+            .update(update)
+            .inspect_err(|_| self.note_refused_message())
+    }
+
+    /// Takes an actor's last word; what it produced and is not stored counts as lost, the reverse as stored twice.
+    pub fn goodbye(&mut self, goodbye: &Goodbye) {
+        let difference = self.actors.goodbye(goodbye);
+        self.count(goodbye.actor, difference);
+    }
+
+    /// Changes the replay ratio from now on; what was allowed before stays allowed.
+    ///
+    /// # Errors
+    /// A ratio that [`Config::validate`] refuses.
+    pub fn set_replay_ratio(&mut self, replay_ratio: f64) -> Result<(), ConfigError> {
+        let config = Config {
+            replay_ratio,
+            transitions_max: None,
+            ..self.config.clone()
+        };
+        config.validate(&self.spec, self.batch_rows)?;
+        self.config.replay_ratio = replay_ratio;
+        self.limiter.set_replay_ratio(replay_ratio);
+        Ok(())
+    }
+
+    /// Counts a message that could not be read.
+    pub fn note_refused_message(&mut self) {
+        self.statistics.messages_refused += 1;
+    }
+
+    /// Counts `seconds` that a request for a batch waited at the limiter.
+    pub fn note_learner_waited(&mut self, seconds: f64) {
+        self.statistics.learner_waited_s += seconds;
+    }
+
+    /// Counts `seconds` that a chunk waited at the limiter.
+    pub fn note_actors_waited(&mut self, seconds: f64) {
+        self.statistics.actors_waited_s += seconds;
+    }
+
+    /// Sets how many actors are connected.
+    pub fn set_actors(&mut self, actors: u32) {
+        self.statistics.actors = actors;
+    }
+
+    /// Transitions stored since the start.
+    pub fn inserted_total(&self) -> u64 {
+        self.ring.inserted()
+    }
+
+    /// Who waits for whom now, for batches of the size that the replay was made for.
+    pub fn waiting(&self) -> Waiting {
+        match self.limiter.waiting(self.batch_rows) {
+            Waiting::ActorsWaitForLearner | Waiting::Nobody if self.starving => {
+                Waiting::LearnerWaitsForActors
+            }
+            waiting => waiting,
+        }
+    }
+
+    /// The account of itself.
+    pub fn status(&self) -> ReplayStatus {
+        let statistics = &self.statistics;
+        ReplayStatus {
+            transitions_inserted: self.ring.inserted(),
+            transitions_held: self.ring.inserted() - self.ring.oldest(),
+            transitions_lost: statistics.transitions_lost,
+            transitions_duplicated: statistics.transitions_duplicated,
+            chunks_retried: statistics.chunks_retried,
+            messages_refused: statistics.messages_refused,
+            rows_sampled: self.limiter.rows_sampled(),
+            warmup_transitions: self.config.warmup_transitions,
+            episodes: statistics.episodes,
+            mean_return: statistics.mean_return(),
+            k_histogram: statistics.k_histogram.clone(),
+            mean_age: statistics.mean_age,
+            action_histogram: statistics.action_histogram.clone(),
+            waiting: self.waiting(),
+            learner_waited_s: statistics.learner_waited_s,
+            actors_waited_s: statistics.actors_waited_s,
+            actors: statistics.actors,
+            affinity_version: self.affinity.version(),
+            finished: self.limiter.all_in(),
+        }
+    }
+
+    /// Checks the ring and the counts; panics at the first that is wrong. Slow: for tests.
+    pub fn check_valid(&self) {
+        self.ring.check_valid();
+        let stored: u64 = self.statistics.action_histogram.iter().sum();
+        assert_eq!(
+            stored,
+            self.ring.inserted(),
+            "every transition stored has one action"
+        );
+        let served: u64 = self.statistics.k_histogram.iter().sum();
+        assert_eq!(
+            served,
+            self.limiter.rows_sampled(),
+            "every row served has one k"
+        );
+    }
+}

@@ -1,0 +1,52 @@
+//! Counters over what was stored and served: episodes, returns, actions, k and ages.
+//! It decides nothing.
+
+use std::collections::VecDeque;
+
+/// Episodes whose returns enter the mean.
+const RETURNS_MAX: usize = 100;
+
+/// What the status reports beside the ring's and the limiter's own counts.
+#[derive(Default)]
+pub(crate) struct Statistics {
+    pub(crate) transitions_lost: u64,
+    pub(crate) transitions_duplicated: u64,
+    pub(crate) chunks_retried: u64,
+    pub(crate) messages_refused: u64,
+    pub(crate) episodes: u64,
+    returns: VecDeque<f64>,
+    pub(crate) k_histogram: Vec<u64>,
+    pub(crate) mean_age: f64,
+    pub(crate) action_histogram: Vec<u64>,
+    pub(crate) learner_waited_s: f64,
+    pub(crate) actors_waited_s: f64,
+    pub(crate) actors: u32,
+}
+
+impl Statistics {
+    /// Zeros, for k in 0..=`k_max` and actions below `num_actions`.
+    pub(crate) fn new(k_max: u32, num_actions: u32) -> Self {
+        Self {
+            k_histogram: vec![0; k_max as usize + 1],
+            action_histogram: vec![0; num_actions as usize],
+            ..Self::default()
+        }
+    }
+
+    /// Counts an episode that ended, with its undiscounted return if all of it was seen.
+    pub(crate) fn episode_ended(&mut self, episode_return: Option<f64>) {
+        self.episodes += 1;
+        if let Some(episode_return) = episode_return {
+            if self.returns.len() == RETURNS_MAX {
+                self.returns.pop_front();
+            }
+            self.returns.push_back(episode_return);
+        }
+    }
+
+    /// Mean return of the last [`RETURNS_MAX`] episodes; none before the first.
+    pub(crate) fn mean_return(&self) -> Option<f64> {
+        let sum: f64 = self.returns.iter().sum();
+        (!self.returns.is_empty()).then(|| sum / self.returns.len() as f64)
+    }
+}

@@ -1,0 +1,151 @@
+//! Every valid anchor is equally likely, where they are many and where they are few.
+//! It does not check what the rows hold.
+
+use std::collections::HashMap;
+
+use driml_protocol::{ChunkHeader, Horizon, InsertReply, Waiting};
+use driml_replay_server::{Config, Replay, Unready};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::{
+    history::{History, identity, spec, unlimited},
+    law::ChiSquare,
+};
+
+struct Setup {
+    replay: Replay,
+    history: History,
+    rng: ChaCha8Rng,
+}
+
+impl Setup {
+    fn new(config: &Config, frame_stack: u32) -> Self {
+        let spec = spec(3, frame_stack, 4, Horizon::Uniform { k_max: 3 });
+        Self {
+            replay: Replay::new(&spec, config, 64).unwrap(),
+            history: History::new(&spec, config.capacity_transitions),
+            rng: ChaCha8Rng::seed_from_u64(3),
+        }
+    }
+
+    fn insert(&mut self, actor: u32, sequence: u64, streams: u32, steps: u32) -> InsertReply {
+        let chunk = self.history.next_chunk(
+            ChunkHeader {
+                actor,
+                epoch: 1,
+                sequence,
+                first_transition: sequence * u64::from(streams * steps),
+                weights_version: 0,
+                streams,
+                steps,
+                frame_bytes: self.history.spec.frame_bytes() as u32,
+            },
+            0,
+            &mut self.rng,
+        );
+        self.replay.insert(&chunk)
+    }
+
+    fn check_uniform(&mut self, what: &str) {
+        let anchors = self.history.valid_anchors();
+        let mut counts: HashMap<_, u64> = anchors.iter().map(|&anchor| (anchor, 0)).collect();
+        let bytes = self.history.spec.state_bytes();
+        for _ in 0..anchors.len() * 2 {
+            let batch = self.replay.sample(64).unwrap();
+            for state in batch.frames_t().chunks(bytes) {
+                *counts
+                    .get_mut(&identity(&self.history.spec, state))
+                    .unwrap() += 1;
+            }
+        }
+        let counts: Vec<u64> = counts.into_values().collect();
+        let mut chi = ChiSquare::default();
+        chi.add(&counts, &vec![1.0 / counts.len() as f64; counts.len()]);
+        chi.check(what);
+    }
+}
+
+#[test]
+fn many_anchors_are_equally_likely() {
+    for frame_stack in [1, 4] {
+        let mut setup = Setup::new(&unlimited(200), frame_stack);
+        for sequence in 0..30 {
+            setup.insert(0, sequence, 2, 5);
+            setup.insert(1, sequence, 1, 3);
+        }
+        assert!(setup.history.valid_anchors().len() > 100);
+        setup.check_uniform("anchors by rejection");
+    }
+}
+
+#[test]
+fn few_anchors_are_equally_likely() {
+    let mut setup = Setup::new(&unlimited(2000), 1);
+    setup.insert(0, 0, 1, 20);
+    // Streams of one step each: next to none of them can be an anchor.
+    setup.insert(1, 0, 900, 1);
+    setup.insert(2, 0, 900, 1);
+    let share = setup.history.valid_anchors().len() as f64 / setup.history.inserted as f64;
+    assert!((0.005..0.2).contains(&share), "{share}");
+    setup.check_uniform("anchors by listing");
+}
+
+/// Nothing ends and no stream is long enough: both sides would wait for each other, were actors not let on.
+#[test]
+fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
+    let config = Config {
+        capacity_transitions: 10_000,
+        replay_ratio: 64.0,
+        warmup_transitions: 0,
+        slack_transitions: 1,
+        transitions_max: Some(60),
+    };
+    let spec = spec(3, 1, 4, Horizon::None);
+    let mut replay = Replay::new(&spec, &config, 64).unwrap();
+    let mut header = ChunkHeader {
+        actor: 0,
+        epoch: 1,
+        sequence: 0,
+        first_transition: 0,
+        weights_version: 0,
+        streams: 20,
+        steps: 1,
+        frame_bytes: spec.frame_bytes() as u32,
+    };
+    for stored in [20, 40, 60] {
+        let chunk = driml_protocol::Chunk::zeroed(header);
+        assert_eq!(
+            replay.insert(&chunk),
+            InsertReply::Stored {
+                inserted_total: stored
+            }
+        );
+        header.sequence += 1;
+        header.first_transition += 20;
+        let chunk = driml_protocol::Chunk::zeroed(header);
+        if stored < 60 {
+            assert_eq!(
+                replay.insert(&chunk),
+                InsertReply::Wait {
+                    inserted_total: stored
+                }
+            );
+            assert_eq!(
+                replay.sample(64),
+                Err(Unready::Wait(Waiting::LearnerWaitsForActors))
+            );
+            assert_eq!(replay.waiting(), Waiting::LearnerWaitsForActors);
+        } else {
+            assert_eq!(
+                replay.insert(&chunk),
+                InsertReply::Finished {
+                    inserted_total: stored
+                }
+            );
+            let answer = replay.sample(64);
+            assert!(matches!(answer, Err(Unready::Refused { .. })), "{answer:?}");
+        }
+        replay.check_valid();
+    }
+}

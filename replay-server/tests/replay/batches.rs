@@ -1,0 +1,214 @@
+//! Batches against the reference, through wrap-around, restarts, losses, retries and strays.
+//! It does not test how often each row or k comes: `anchors` and `horizon` do.
+
+use std::collections::HashMap;
+
+use driml_protocol::{Batch, ChunkHeader, Goodbye, Horizon, InsertReply, TimeoutRule, Waiting};
+use driml_replay_server::{Replay, Unready};
+use proptest::prelude::*;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::history::{History, identity, spec, unlimited};
+
+/// Checks every row of `batch` against the reference.
+fn check_batch(batch: &Batch, history: &History) {
+    let spec = &history.spec;
+    let (rows, bytes) = (batch.rows(), spec.state_bytes());
+    let state = |plane: &[u8], row: usize| plane[row * bytes..(row + 1) * bytes].to_vec();
+    let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
+    let (mut ages, mut versions) = (0, (0, u64::MAX));
+    for row in 0..rows {
+        let (key, t) = identity(spec, &state(batch.frames_t(), row));
+        assert!(
+            history.is_valid(key, t),
+            "{key:?} step {t} is no valid anchor"
+        );
+        let want = history.row(key, t);
+        let context = format!("{key:?} step {t}: {want:?}");
+        let record = &history.streams[&key][t];
+        assert_eq!(
+            state(batch.frames_t(), row),
+            history.state(key, t),
+            "{context}"
+        );
+        assert_eq!(batch.actions()[row], want.action, "{context}");
+        assert_eq!(batch.next_actions()[row], want.next_action, "{context}");
+        assert!(
+            (f64::from(returns[row]) - want.n_step_return).abs() < 1e-5,
+            "{context}: {}",
+            returns[row]
+        );
+        assert!(
+            (f64::from(discounts[row]) - want.discount).abs() < 1e-6,
+            "{context}: {}",
+            discounts[row]
+        );
+        let frame_n = want
+            .bootstrap
+            .map_or(vec![0; bytes], |i| history.state(key, t + i));
+        assert_eq!(state(batch.frames_n(), row), frame_n, "{context}");
+        if batch.positives() == 1 {
+            let k = usize::from(batch.ks()[row]);
+            let right = match (spec.horizon, want.steps_left) {
+                (_, left) if left == 0 => k == 0,
+                (Horizon::Fixed { .. }, left) => k == left,
+                (_, left) => (1..=left).contains(&k),
+            };
+            assert!(right, "{context}: k = {k}");
+            assert_eq!(batch.positive_valid()[row], u8::from(k > 0), "{context}");
+            let frame_k = if k == 0 {
+                vec![0; bytes]
+            } else {
+                history.state(key, t + k)
+            };
+            assert_eq!(state(batch.frames_k(), row), frame_k, "{context}: k = {k}");
+        }
+        ages += history.inserted - 1 - record.index;
+        versions = (
+            record.weights_version.max(versions.0),
+            record.weights_version.min(versions.1),
+        );
+    }
+    assert_eq!(batch.header.mean_age, ages as f64 / rows as f64);
+    assert_eq!(batch.header.weights_versions, versions);
+    assert_eq!(batch.header.inserted_total, history.inserted);
+}
+
+/// What an actor knows of itself.
+struct Actor {
+    next: ChunkHeader,
+    part: u8,
+}
+
+fn horizons() -> impl Strategy<Value = Horizon> {
+    prop_oneof![
+        Just(Horizon::None),
+        (1u32..7).prop_map(|k| Horizon::Fixed { k }),
+        (1u32..7).prop_map(|k_max| Horizon::Uniform { k_max }),
+        (1u32..7).prop_map(|k_max| Horizon::Nhg { k_max }),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 96, ..ProptestConfig::default() })]
+
+    #[test]
+    fn every_row_equals_the_reference(
+        seed in any::<u64>(),
+        stack in prop_oneof![Just(1u32), Just(4), 2u32..4],
+        channels in 1u32..6,
+        n_step in 1u32..8,
+        horizon in horizons(),
+        bootstrap in any::<bool>(),
+        capacity in 24u64..160,
+        (actors, streams) in (1u32..4, 1u32..4),
+    ) {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut spec = spec(channels, stack, n_step, horizon);
+        if bootstrap {
+            spec.timeout = TimeoutRule::Bootstrap;
+        }
+        let mut replay = Replay::new(&spec, &unlimited(capacity), 8).unwrap();
+        let mut history = History::new(&spec, capacity);
+        let mut known: HashMap<u32, Actor> = HashMap::new();
+        let (mut lost, mut retried, mut refused, mut rows_sampled) = (0, 0, 0, 0);
+        for _ in 0..150 {
+            let number = rng.random_range(0..actors);
+            let fresh = |epoch| Actor {
+                next: ChunkHeader {
+                    actor: number, epoch, sequence: 0, first_transition: 0, weights_version: 0,
+                    streams, steps: 1, frame_bytes: spec.frame_bytes() as u32,
+                },
+                part: 0,
+            };
+            let actor = known.entry(number).or_insert_with(|| fresh(1));
+            match rng.random_range(0..20) {
+                // The actor dies and starts anew; a straggler of its former life is refused.
+                0 => {
+                    let old = actor.next;
+                    *actor = fresh(old.epoch + 1);
+                    let chunk = history.next_chunk(actor.next, 0, &mut rng);
+                    let stored = InsertReply::Stored { inserted_total: history.inserted };
+                    prop_assert_eq!(replay.insert(&chunk), stored);
+                    actor.next.sequence = 1;
+                    actor.next.first_transition = u64::from(streams);
+                    if old.sequence > 0 {
+                        let stray = driml_protocol::Chunk::zeroed(old);
+                        let answer = replay.insert(&stray);
+                        prop_assert!(matches!(answer, InsertReply::Refused { .. }), "{:?}", answer);
+                        refused += 1;
+                    }
+                }
+                // Transitions get lost before the next chunk.
+                1 => {
+                    let count = rng.random_range(1..9);
+                    if actor.next.sequence > 0 && actor.part < 200 {
+                        actor.next.first_transition += count;
+                        actor.part += 1;
+                        lost += count;
+                        let chunk = history.next_chunk(actor.next, actor.part, &mut rng);
+                        let stored = InsertReply::Stored { inserted_total: history.inserted };
+                        prop_assert_eq!(replay.insert(&chunk), stored);
+                        actor.next.sequence += 1;
+                        actor.next.first_transition += chunk.header.transitions() as u64;
+                    }
+                }
+                // A retry of a stored chunk.
+                2 if actor.next.sequence > 0 => {
+                    let sequence = rng.random_range(0..actor.next.sequence);
+                    let chunk = driml_protocol::Chunk::zeroed(ChunkHeader { sequence, ..actor.next });
+                    let stored = InsertReply::Stored { inserted_total: history.inserted };
+                    prop_assert_eq!(replay.insert(&chunk), stored);
+                    retried += 1;
+                }
+                // A chunk that is ahead of its time.
+                3 => {
+                    let sequence = actor.next.sequence + rng.random_range(1..4);
+                    let chunk = driml_protocol::Chunk::zeroed(ChunkHeader { sequence, ..actor.next });
+                    let expected = InsertReply::OutOfOrder { expected: actor.next.sequence };
+                    prop_assert_eq!(replay.insert(&chunk), expected);
+                }
+                4..12 => {
+                    actor.next.steps = rng.random_range(1..6);
+                    actor.next.weights_version += rng.random_range(0..2);
+                    let chunk = history.next_chunk(actor.next, actor.part, &mut rng);
+                    let stored = InsertReply::Stored { inserted_total: history.inserted };
+                    prop_assert_eq!(replay.insert(&chunk), stored);
+                    actor.next.sequence += 1;
+                    actor.next.first_transition += chunk.header.transitions() as u64;
+                    actor.next.steps = 1;
+                }
+                _ if history.inserted == 0 => {}
+                _ => match replay.sample(8) {
+                    Ok(batch) => {
+                        check_batch(&batch, &history);
+                        rows_sampled += 8;
+                    }
+                    Err(unready) => {
+                        prop_assert_eq!(unready, Unready::Wait(Waiting::LearnerWaitsForActors));
+                        prop_assert!(history.valid_anchors().is_empty());
+                    }
+                },
+            }
+            replay.check_valid();
+        }
+        for (&actor, Actor { next, .. }) in &known {
+            if next.sequence > 0 {
+                replay.goodbye(&Goodbye { actor, epoch: next.epoch, produced: next.first_transition });
+            }
+        }
+        let status = replay.status();
+        let (episodes, mean_return) = history.episodes();
+        prop_assert_eq!(status.transitions_inserted, history.inserted);
+        prop_assert_eq!(status.transitions_held, history.inserted.min(capacity));
+        prop_assert_eq!((status.transitions_lost, status.transitions_duplicated), (lost, 0));
+        prop_assert_eq!((status.chunks_retried, status.messages_refused), (retried, refused));
+        prop_assert_eq!((status.episodes, status.rows_sampled), (episodes, rows_sampled));
+        let same = match (status.mean_return, mean_return) {
+            (Some(have), Some(want)) => (have - want).abs() < 1e-9,
+            (have, want) => have == want,
+        };
+        prop_assert!(same, "{:?} is not {:?}", status.mean_return, mean_return);
+    }
+}

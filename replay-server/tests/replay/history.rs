@@ -1,0 +1,275 @@
+//! The slow, obvious reference: everything that was ever stored, stream by stream, and what a row of it must hold.
+//! It knows nothing of rings, links or windows.
+
+use std::collections::BTreeMap;
+
+use driml_protocol::{Chunk, ChunkHeader, End, Horizon, NO_ACTION, RunSpec, TimeoutRule};
+use driml_replay_server::Config;
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+/// One transition, where it was stored and which weights chose its action.
+#[derive(Clone, Debug)]
+pub(crate) struct Record {
+    pub(crate) index: u64,
+    pub(crate) action: u8,
+    pub(crate) reward: f32,
+    pub(crate) end: End,
+    pub(crate) weights_version: u64,
+}
+
+/// (actor, epoch, stream, part): a part ends where transitions were lost.
+pub(crate) type StreamKey = (u8, u8, u8, u8);
+
+/// Everything that was stored.
+pub(crate) struct History {
+    pub(crate) spec: RunSpec,
+    pub(crate) capacity: u64,
+    pub(crate) inserted: u64,
+    pub(crate) streams: BTreeMap<StreamKey, Vec<Record>>,
+}
+
+/// What a row must hold; k is not determined, only how far it may go.
+#[derive(Debug, PartialEq)]
+pub(crate) struct Row {
+    pub(crate) action: u8,
+    pub(crate) next_action: u8,
+    pub(crate) n_step_return: f64,
+    pub(crate) discount: f64,
+    pub(crate) bootstrap: Option<usize>,
+    pub(crate) steps_left: usize,
+}
+
+pub(crate) fn spec(
+    frame_channels: u32,
+    frame_stack: u32,
+    n_step: u32,
+    horizon: Horizon,
+) -> RunSpec {
+    RunSpec {
+        world: "test".into(),
+        agent: "test".into(),
+        seed: 7,
+        frame_height: 4,
+        frame_width: 3,
+        frame_channels,
+        frame_stack,
+        num_actions: 5,
+        n_step,
+        gamma: 0.9,
+        horizon,
+        timeout: TimeoutRule::Terminal,
+    }
+}
+
+/// Settings under which nobody ever waits.
+pub(crate) fn unlimited(capacity_transitions: u64) -> Config {
+    Config {
+        capacity_transitions,
+        replay_ratio: 1e6,
+        warmup_transitions: 0,
+        slack_transitions: 1 << 40,
+        transitions_max: None,
+    }
+}
+
+/// A frame that says which one it is: its identity, then bytes that depend on the identity and their place.
+pub(crate) fn frame(spec: &RunSpec, key: StreamKey, step: usize) -> Vec<u8> {
+    let id = [key.0, key.1, key.2, key.3, step as u8, (step >> 8) as u8];
+    let hash = id.iter().fold(17u32, |hash, &b| {
+        hash.wrapping_mul(31).wrapping_add(u32::from(b))
+    });
+    let fill = |at: usize| (hash.wrapping_mul(at as u32 + 1) >> 7) as u8;
+    (0..spec.frame_bytes())
+        .map(|at| id.get(at).copied().unwrap_or_else(|| fill(at)))
+        .collect()
+}
+
+/// The identity of the newest frame of a state.
+pub(crate) fn identity(spec: &RunSpec, state: &[u8]) -> (StreamKey, usize) {
+    let (channels, stack) = (spec.frame_channels as usize, spec.frame_stack as usize);
+    let newest: Vec<u8> = state
+        .chunks(channels * stack)
+        .flat_map(|pixel| &pixel[channels * (stack - 1)..])
+        .copied()
+        .collect();
+    let id = &newest[..6];
+    (
+        (id[0], id[1], id[2], id[3]),
+        usize::from(id[4]) + 256 * usize::from(id[5]),
+    )
+}
+
+impl History {
+    pub(crate) fn new(spec: &RunSpec, capacity: u64) -> Self {
+        Self {
+            spec: spec.clone(),
+            capacity,
+            inserted: 0,
+            streams: BTreeMap::new(),
+        }
+    }
+
+    pub(crate) fn oldest(&self) -> u64 {
+        self.inserted.saturating_sub(self.capacity)
+    }
+
+    /// Makes the next chunk of an epoch, `part` of it, and writes it down as if stored.
+    pub(crate) fn next_chunk(
+        &mut self,
+        header: ChunkHeader,
+        part: u8,
+        rng: &mut ChaCha8Rng,
+    ) -> Chunk {
+        let mut chunk = Chunk::zeroed(header);
+        for stream in 0..header.streams {
+            let key = (header.actor as u8, header.epoch as u8, stream as u8, part);
+            let records = self.streams.entry(key).or_default();
+            for step in 0..header.steps {
+                let row = (stream * header.steps + step) as usize;
+                let end = match rng.random_range(0..20) {
+                    0 => End::Terminal,
+                    1 => End::TimedOut,
+                    2 => End::LevelChange,
+                    _ => End::Running,
+                };
+                let record = Record {
+                    index: self.inserted,
+                    action: rng.random_range(0..self.spec.num_actions as u8),
+                    reward: rng.random_range(-3.0..3.0),
+                    end,
+                    weights_version: header.weights_version,
+                };
+                chunk.set(row, record.action, record.reward, end);
+                chunk
+                    .frame_mut(row)
+                    .copy_from_slice(&frame(&self.spec, key, records.len()));
+                records.push(record);
+                self.inserted += 1;
+            }
+        }
+        chunk
+    }
+
+    /// The first step of the level that step `t` belongs to.
+    fn level_start(records: &[Record], t: usize) -> usize {
+        (0..t)
+            .rev()
+            .find(|&i| records[i].end != End::Running)
+            .map_or(0, |i| i + 1)
+    }
+
+    /// The steps whose frames make the state of step `t`, oldest first.
+    fn stack_steps(&self, key: StreamKey, t: usize) -> Vec<usize> {
+        let start = Self::level_start(&self.streams[&key], t);
+        let stack = self.spec.frame_stack as usize;
+        (0..stack)
+            .rev()
+            .map(|back| t.saturating_sub(back).max(start))
+            .collect()
+    }
+
+    /// s_t.
+    pub(crate) fn state(&self, key: StreamKey, t: usize) -> Vec<u8> {
+        let channels = self.spec.frame_channels as usize;
+        let frames: Vec<_> = self
+            .stack_steps(key, t)
+            .into_iter()
+            .map(|step| frame(&self.spec, key, step))
+            .collect();
+        let pixels = 0..self.spec.frame_bytes() / channels;
+        pixels
+            .flat_map(|p| {
+                frames
+                    .iter()
+                    .flat_map(move |f| &f[p * channels..(p + 1) * channels])
+            })
+            .copied()
+            .collect()
+    }
+
+    /// Whether step `t` can be an anchor.
+    pub(crate) fn is_valid(&self, key: StreamKey, t: usize) -> bool {
+        let records = &self.streams[&key];
+        let held = |step: &usize| records[*step].index >= self.oldest();
+        let timed_out =
+            records[t].end == End::TimedOut && self.spec.timeout == TimeoutRule::Bootstrap;
+        if !held(&t) || timed_out || !self.stack_steps(key, t).iter().all(held) {
+            return false;
+        }
+        // After a loss nobody knows what came before the part's first step.
+        let reaches_into_the_lost = t + 1 < self.spec.frame_stack as usize;
+        if key.3 > 0 && reaches_into_the_lost && Self::level_start(records, t) == 0 {
+            return false;
+        }
+        let reach = self.spec.n_step.max(self.spec.horizon.k_max()) as usize;
+        let ends = records[t..]
+            .iter()
+            .take(reach)
+            .any(|record| record.end.is_episode_end());
+        ends || t + reach < records.len()
+    }
+
+    /// Every valid anchor.
+    pub(crate) fn valid_anchors(&self) -> Vec<(StreamKey, usize)> {
+        let all = self
+            .streams
+            .iter()
+            .flat_map(|(&key, records)| (0..records.len()).map(move |t| (key, t)));
+        all.filter(|&(key, t)| self.is_valid(key, t)).collect()
+    }
+
+    /// What the row of anchor `t` must hold.
+    pub(crate) fn row(&self, key: StreamKey, t: usize) -> Row {
+        let records = &self.streams[&key];
+        let n = self.spec.n_step as usize;
+        let (mut sum, mut bootstrap) = (0.0, Some(n));
+        for i in 0..n {
+            let Record { reward, end, .. } = records[t + i];
+            if end == End::TimedOut && self.spec.timeout == TimeoutRule::Bootstrap {
+                bootstrap = Some(i);
+                break;
+            }
+            sum += self.spec.gamma.powi(i as i32) * f64::from(reward);
+            if end.is_episode_end() {
+                bootstrap = None;
+                break;
+            }
+        }
+        let in_level = records[t..]
+            .iter()
+            .take_while(|record| record.end == End::Running)
+            .count();
+        Row {
+            action: records[t].action,
+            next_action: if records[t].end == End::Running {
+                records[t + 1].action
+            } else {
+                NO_ACTION
+            },
+            n_step_return: sum,
+            discount: bootstrap.map_or(0.0, |i| self.spec.gamma.powi(i as i32)),
+            bootstrap,
+            steps_left: in_level.min(self.spec.horizon.k_max() as usize),
+        }
+    }
+
+    /// Episodes that ended, and the mean return of the last 100 of those that were seen whole.
+    pub(crate) fn episodes(&self) -> (u64, Option<f64>) {
+        let mut ended: Vec<(u64, Option<f64>)> = vec![];
+        for (key, records) in &self.streams {
+            let mut sum = (key.3 == 0).then_some(0.0);
+            for record in records {
+                sum = sum.map(|sum| sum + f64::from(record.reward));
+                if record.end.is_episode_end() {
+                    ended.push((record.index, sum.replace(0.0)));
+                }
+            }
+        }
+        ended.sort_by_key(|&(index, _)| index);
+        let whole: Vec<f64> = ended.iter().filter_map(|&(_, sum)| sum).collect();
+        let last = &whole[whole.len().saturating_sub(100)..];
+        let mean = (!last.is_empty()).then(|| last.iter().sum::<f64>() / last.len() as f64);
+        (ended.len() as u64, mean)
+    }
+}

@@ -1,0 +1,12 @@
+//! Tests of the replay server's core as its service uses it: messages in, batches out.
+//! They open no socket and start no thread.
+#![allow(clippy::unwrap_used)]
+
+mod anchors;
+mod batches;
+mod config;
+mod exactly_once;
+mod history;
+mod horizon;
+mod law;
+mod rate_limiter;
