@@ -67,13 +67,31 @@ impl Part {
         let tail = Arc::new(Mutex::new(VecDeque::new()));
         let file = Arc::new(Mutex::new(file));
         let (out, err) = (child.stdout.take(), child.stderr.take());
-        let pipes: [Option<Box<dyn Read + Send>>; 2] =
-            [out.map(|pipe| Box::new(pipe) as _), err.map(|pipe| Box::new(pipe) as _)];
-        let mut part = Self { name: name.into(), log, child, end: None, tail, pumps: Vec::new() };
+        let pipes: [Option<Box<dyn Read + Send>>; 2] = [
+            out.map(|pipe| Box::new(pipe) as _),
+            err.map(|pipe| Box::new(pipe) as _),
+        ];
+        let mut part = Self {
+            name: name.into(),
+            log,
+            child,
+            end: None,
+            tail,
+            pumps: Vec::new(),
+        };
         for pipe in pipes.into_iter().flatten() {
-            let pump = Pump { name: name.into(), file: file.clone(), tail: part.tail.clone(), screen: screen.clone() };
+            let pump = Pump {
+                name: name.into(),
+                file: file.clone(),
+                tail: part.tail.clone(),
+                screen: screen.clone(),
+            };
             let thread = std::thread::Builder::new().name(format!("log of {name}"));
-            part.pumps.push(thread.spawn(move || pump.run(pipe)).context("starting a thread")?);
+            part.pumps.push(
+                thread
+                    .spawn(move || pump.run(pipe))
+                    .context("starting a thread")?,
+            );
         }
         Ok(part)
     }
@@ -113,7 +131,11 @@ impl Part {
     }
 
     /// Waits for its end until `deadline`, or until `hurry` says that there is no time for that.
-    pub(crate) fn wait_until(&mut self, deadline: Instant, hurry: impl Fn() -> bool) -> Option<ExitStatus> {
+    pub(crate) fn wait_until(
+        &mut self,
+        deadline: Instant,
+        hurry: impl Fn() -> bool,
+    ) -> Option<ExitStatus> {
         while self.end().is_none() && Instant::now() < deadline && !hurry() {
             std::thread::sleep(POLL);
         }
@@ -146,9 +168,16 @@ impl Part {
                 (None, None) => "ended".into(),
             },
         };
-        let tail = self.tail.lock().expect("no thread panics while holding the lines");
+        let tail = self
+            .tail
+            .lock()
+            .expect("no thread panics while holding the lines");
         let lines: String = tail.iter().map(|line| format!("\n  {line}")).collect();
-        let last = if lines.is_empty() { String::new() } else { format!("; its last lines:{lines}") };
+        let last = if lines.is_empty() {
+            String::new()
+        } else {
+            format!("; its last lines:{lines}")
+        };
         format!("{} {how} (log: {}){last}", self.name, self.log.display())
     }
 }
@@ -162,7 +191,9 @@ impl Drop for Part {
 
 /// Resident memory in MiB from `/proc/PID/status`.
 pub(crate) fn rss_mib(status: &str) -> Option<f64> {
-    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
+    let line = status
+        .lines()
+        .find_map(|line| line.strip_prefix("VmRSS:"))?;
     let kib: f64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
     Some(kib / 1024.0)
 }
@@ -202,7 +233,9 @@ impl Pump {
 /// Whether a log line is a warning or worse: the level is the second word, after the time.
 fn matters(line: &str) -> bool {
     let level = line.split_whitespace().nth(1);
-    matches!(level, Some("WARN" | "ERROR")) || line.starts_with("error:") || line.contains("panicked at")
+    matches!(level, Some("WARN" | "ERROR"))
+        || line.starts_with("error:")
+        || line.contains("panicked at")
 }
 
 #[cfg(test)]
@@ -211,11 +244,15 @@ mod tests {
 
     #[test]
     fn warnings_and_worse_reach_the_screen() {
-        assert!(matters("2026-01-01T00:00:00.1Z  WARN driml_actor: weights were refused"));
+        assert!(matters(
+            "2026-01-01T00:00:00.1Z  WARN driml_actor: weights were refused"
+        ));
         assert!(matters("2026-01-01T00:00:00.1Z ERROR driml_actor: gone"));
         assert!(matters("error: nobody answers"));
         assert!(matters("thread 'main' panicked at src/lib.rs:1:1:"));
-        assert!(!matters("2026-01-01T00:00:00.1Z  INFO driml_actor: ERROR is a word here"));
+        assert!(!matters(
+            "2026-01-01T00:00:00.1Z  INFO driml_actor: ERROR is a word here"
+        ));
         assert!(!matters(""));
     }
 

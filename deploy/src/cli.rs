@@ -152,7 +152,6 @@ pub(crate) enum Levels {
 }
 
 #[derive(Debug, Args)]
-#[allow(dead_code, reason = "read by `evaluate`")]
 pub(crate) struct EvaluateArgs {
     /// Folder of the run
     #[arg(long, value_name = "DIR")]

@@ -23,7 +23,10 @@ const FOLLOWS: [(&str, &str); 13] = [
     ("world.game", "is chosen by --env"),
     ("model.height", "follows from input.height"),
     ("model.width", "follows from input.width"),
-    ("model.channels", "follows from the world and run.frame_stack"),
+    (
+        "model.channels",
+        "follows from the world and run.frame_stack",
+    ),
     ("model.num_actions", "follows from the world"),
     ("model.dim", "follows from learner.update.lambda"),
 ];
@@ -40,7 +43,10 @@ pub(crate) fn name(table: &mut Table, world: &str, agent: &str) {
 /// Says what to set instead.
 pub(crate) fn refuse(path: &str) -> Result<(), Usage> {
     let follows = FOLLOWS.iter().find(|(known, _)| {
-        path == *known || path.strip_prefix(known).is_some_and(|rest| rest.starts_with('.'))
+        path == *known
+            || path
+                .strip_prefix(known)
+                .is_some_and(|rest| rest.starts_with('.'))
     });
     match follows {
         Some((known, how)) => Err(usage!("{known} cannot be set by hand: it {how}")),
@@ -53,7 +59,9 @@ pub(crate) fn refuse(path: &str) -> Result<(), Usage> {
 /// # Errors
 /// A table from which something follows and that cannot be read.
 pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
-    let world: WorldName = text(table, "run.world")?.parse().map_err(|e| usage!("run.world: {e}"))?;
+    let world: WorldName = text(table, "run.world")?
+        .parse()
+        .map_err(|e| usage!("run.world: {e}"))?;
     put(table, "world.kind", Value::String(presets::family(world)));
     if let WorldName::Procgen(game) = world {
         put(table, "world.game", Value::String(game.name().into()));
@@ -61,7 +69,10 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     let config: WorldConfig = part(table, "world")?;
     let update: LearnerSettings = part(table, "learner.update")?;
     let shape = driml_envs::frame_shape(&config);
-    let (num_actions, stack) = (driml_envs::num_actions(&config), whole(table, "run.frame_stack")?);
+    let (num_actions, stack) = (
+        driml_envs::num_actions(&config),
+        whole(table, "run.frame_stack")?,
+    );
     let dim = update.lambda.dim_parts(num_actions > 1);
     let size = |value: usize| Value::Integer(value as i64);
     let dim = Value::try_from(dim).map_err(|e| usage!("the DIM heads as TOML: {e}"))?;
@@ -70,9 +81,15 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         ("run.frame_width", size(shape.width)),
         ("run.frame_channels", size(shape.channels)),
         ("run.num_actions", size(num_actions)),
-        ("model.height", Value::Integer(whole(table, "input.height")?)),
+        (
+            "model.height",
+            Value::Integer(whole(table, "input.height")?),
+        ),
         ("model.width", Value::Integer(whole(table, "input.width")?)),
-        ("model.channels", Value::Integer(stack.saturating_mul(shape.channels as i64))),
+        (
+            "model.channels",
+            Value::Integer(stack.saturating_mul(shape.channels as i64)),
+        ),
         ("model.num_actions", size(num_actions)),
         ("model.dim", dim),
     ] {
@@ -91,7 +108,10 @@ fn visible_actions(table: &mut Table, world: WorldName, num_actions: usize) {
             // In the other worlds every action does something of its own; each has fewer than 256.
             _ => (0..num_actions).map(|action| action as u8).collect(),
         };
-        let map = map.into_iter().map(|action| Value::Integer(action.into())).collect();
+        let map = map
+            .into_iter()
+            .map(|action| Value::Integer(action.into()))
+            .collect();
         put(table, "learner.affinity.visible", Value::Array(map));
     }
 }
@@ -107,7 +127,11 @@ pub(crate) fn check(read: &Table) -> Result<(), Usage> {
         if let (Some(was), Some(is)) = (find(read, path), find(&right, path))
             && was != is
         {
-            return Err(usage!("{path} = {}, but it {how} and is {}; correct the one or the other", inline(was), inline(is)));
+            return Err(usage!(
+                "{path} = {}, but it {how} and is {}; correct the one or the other",
+                inline(was),
+                inline(is)
+            ));
         }
     }
     Ok(())
@@ -116,7 +140,11 @@ pub(crate) fn check(read: &Table) -> Result<(), Usage> {
 fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     let (first, rest) = path.split_once('.').unwrap_or((path, ""));
     let value = table.get(first)?;
-    if rest.is_empty() { Some(value) } else { find(value.as_table()?, rest) }
+    if rest.is_empty() {
+        Some(value)
+    } else {
+        find(value.as_table()?, rest)
+    }
 }
 
 /// Writes a value, making the tables on the way; what is no table on the way stays, for its reader to refuse.
@@ -126,7 +154,9 @@ fn put(table: &mut Table, path: &str, value: Value) {
             table.insert(path.into(), value);
         }
         Some((first, rest)) => {
-            let inner = table.entry(first).or_insert_with(|| Value::Table(Table::new()));
+            let inner = table
+                .entry(first)
+                .or_insert_with(|| Value::Table(Table::new()));
             if let Some(inner) = inner.as_table_mut() {
                 put(inner, rest, value);
             }
@@ -136,16 +166,24 @@ fn put(table: &mut Table, path: &str, value: Value) {
 
 fn text(table: &Table, path: &str) -> Result<String, Usage> {
     let value = find(table, path).and_then(Value::as_str);
-    value.map(str::to_owned).ok_or_else(|| usage!("the settings lack {path}, a word: use a config.toml that driml wrote"))
+    value.map(str::to_owned).ok_or_else(|| {
+        usage!("the settings lack {path}, a word: use a config.toml that driml wrote")
+    })
 }
 
 fn whole(table: &Table, path: &str) -> Result<i64, Usage> {
     let value = find(table, path).and_then(Value::as_integer);
-    value.ok_or_else(|| usage!("the settings lack {path}, a whole number: use a config.toml that driml wrote"))
+    value.ok_or_else(|| {
+        usage!("the settings lack {path}, a whole number: use a config.toml that driml wrote")
+    })
 }
 
 fn part<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
-    let value = find(table, path)
-        .ok_or_else(|| usage!("the settings have no [{path}] table: use a config.toml that driml wrote"))?;
-    value.clone().try_into().map_err(|e: toml::de::Error| usage!("in the settings' [{path}] table: {}", e.message()))
+    let value = find(table, path).ok_or_else(|| {
+        usage!("the settings have no [{path}] table: use a config.toml that driml wrote")
+    })?;
+    value
+        .clone()
+        .try_into()
+        .map_err(|e: toml::de::Error| usage!("in the settings' [{path}] table: {}", e.message()))
 }

@@ -70,12 +70,17 @@ impl Rates {
 
     /// Frames a second and updates a second; 0 before the second sample.
     pub(crate) fn per_second(&self) -> (f64, f64) {
-        let (Some(first), Some(last)) = (self.samples.front(), self.samples.back()) else { return (0.0, 0.0) };
+        let (Some(first), Some(last)) = (self.samples.front(), self.samples.back()) else {
+            return (0.0, 0.0);
+        };
         let seconds = (last.0 - first.0).as_secs_f64();
         if seconds <= 0.0 {
             return (0.0, 0.0);
         }
-        (last.1.saturating_sub(first.1) as f64 / seconds, last.2.saturating_sub(first.2) as f64 / seconds)
+        (
+            last.1.saturating_sub(first.1) as f64 / seconds,
+            last.2.saturating_sub(first.2) as f64 / seconds,
+        )
     }
 }
 
@@ -92,13 +97,22 @@ pub(crate) struct Display {
 impl Display {
     /// A view of a run of so many frames and updates.
     pub(crate) fn new(screen: Screen, frames_max: u64, updates_max: u64) -> Self {
-        Self { screen, frames_max, updates_max, rates: Rates::default(), plain_next: Instant::now() + PLAIN_PERIOD }
+        let mut rates = Rates::default();
+        rates.add(Instant::now(), 0, 0);
+        Self {
+            screen,
+            frames_max,
+            updates_max,
+            rates,
+            plain_next: Instant::now() + PLAIN_PERIOD,
+        }
     }
 
     /// Shows the state of the run.
     pub(crate) fn show(&mut self, replay: &ReplayStatus, learner: &LearnerStatus) {
         let now = Instant::now();
-        self.rates.add(now, replay.transitions_inserted, learner.updates);
+        self.rates
+            .add(now, replay.transitions_inserted, learner.updates);
         let parts = self.text(replay, learner);
         match &self.screen.bar {
             Some(bar) => {
@@ -115,12 +129,25 @@ impl Display {
 
     fn text(&self, replay: &ReplayStatus, learner: &LearnerStatus) -> [String; 2] {
         let (frames_rate, updates_rate) = self.rates.per_second();
-        let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |value| format!("{value:.digits$}"));
-        let dim = PAIRS.iter().zip(learner.dim).filter_map(|(pair, loss)| Some(format!("  DIM {pair} {:.3}", loss?)));
-        let k = replay.mean_k().map_or(String::new(), |k| format!("  mean k {k:.2}"));
+        let number = |value: Option<f64>, digits: usize| {
+            value.map_or("-".into(), |value| format!("{value:.digits$}"))
+        };
+        let dim = PAIRS
+            .iter()
+            .zip(learner.dim)
+            .filter_map(|(pair, loss)| Some(format!("  DIM {pair} {:.3}", loss?)));
+        let k = replay
+            .mean_k()
+            .map_or(String::new(), |k| format!("  mean k {k:.2}"));
         let left = time_left(
-            (self.frames_max.saturating_sub(replay.transitions_inserted), frames_rate),
-            (self.updates_max.saturating_sub(learner.updates), updates_rate),
+            (
+                self.frames_max.saturating_sub(replay.transitions_inserted),
+                frames_rate,
+            ),
+            (
+                self.updates_max.saturating_sub(learner.updates),
+                updates_rate,
+            ),
         );
         [
             format!(
@@ -186,11 +213,18 @@ mod tests {
             waiting: Waiting::ActorsWaitForLearner,
             ..ReplayStatus::default()
         };
-        let learner =
-            LearnerStatus { updates: 1000, c51_kl: 0.1234, dim: [None, None, None, Some(4.0)], ..LearnerStatus::default() };
+        let learner = LearnerStatus {
+            updates: 1000,
+            c51_kl: 0.1234,
+            dim: [None, None, None, Some(4.0)],
+            ..LearnerStatus::default()
+        };
         let start = Instant::now();
+        display.rates = Rates::default();
         display.rates.add(start, 31_400, 950);
-        display.rates.add(start + Duration::from_secs(10), 33_000, 1000);
+        display
+            .rates
+            .add(start + Duration::from_secs(10), 33_000, 1000);
         expect![[r#"
             frames 33000/200000 (160/s)  updates 1000/6218 (5.0/s)  replay ratio 8.00
             return 1.23 (45 episodes)  C51 0.123  DIM 4t4 4.000  mean k 2.25  actors wait for learner  17 min 23 s left"#]]
@@ -198,7 +232,11 @@ mod tests {
         expect![[r#"
             frames 0/200000 (160/s)  updates 0/6218 (5.0/s)  replay ratio -
             return - (0 episodes)  C51 0.000  nobody waits  20 min 50 s left"#]]
-        .assert_eq(&display.text(&ReplayStatus::default(), &LearnerStatus::default()).join("\n"));
+        .assert_eq(
+            &display
+                .text(&ReplayStatus::default(), &LearnerStatus::default())
+                .join("\n"),
+        );
     }
 
     #[test]
@@ -206,7 +244,11 @@ mod tests {
         let (mut rates, start) = (Rates::default(), Instant::now());
         assert_eq!(rates.per_second(), (0.0, 0.0));
         for second in 0..100 {
-            rates.add(start + Duration::from_secs(second), if second < 50 { 0 } else { (second - 50) * 10 }, 0);
+            rates.add(
+                start + Duration::from_secs(second),
+                if second < 50 { 0 } else { (second - 50) * 10 },
+                0,
+            );
         }
         assert_eq!(rates.per_second().0, 10.0);
         assert!(rates.samples.len() <= 22);

@@ -22,14 +22,17 @@ pub(crate) struct Interrupted;
 /// ` (did you mean "..."?)` with the candidate most like `name`, or nothing if none is near.
 pub(crate) fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> String {
     let distance = |candidate: &str| edit_distance(name, candidate);
-    match candidates.into_iter().min_by_key(|candidate| distance(candidate)) {
+    match candidates
+        .into_iter()
+        .min_by_key(|candidate| distance(candidate))
+    {
         Some(best) if distance(best) <= 1 + name.len() / 4 => format!(" (did you mean {best:?}?)"),
         _ => String::new(),
     }
 }
 
 /// Characters to insert, delete or replace to make `b` of `a` (Levenshtein).
-fn edit_distance(a: &str, b: &str) -> usize {
+pub(crate) fn edit_distance(a: &str, b: &str) -> usize {
     let b: Vec<char> = b.chars().collect();
     let mut row: Vec<usize> = (0..=b.len()).collect();
     for (i, x) in a.chars().enumerate() {
@@ -52,7 +55,10 @@ mod tests {
     fn near_names_are_offered_and_far_ones_are_not() {
         assert_eq!(edit_distance("kitten", "sitting"), 3);
         assert_eq!(edit_distance("", "abc"), 3);
-        assert_eq!(nearest("drimlada", ["c51", "driml-ada"]), " (did you mean \"driml-ada\"?)");
+        assert_eq!(
+            nearest("drimlada", ["c51", "driml-ada"]),
+            " (did you mean \"driml-ada\"?)"
+        );
         assert_eq!(nearest("zzz", ["c51", "driml-ada"]), "");
         assert_eq!(nearest("zzz", []), "");
     }

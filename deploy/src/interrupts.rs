@@ -21,42 +21,65 @@ impl Interrupts {
     /// The operating system gave no thread, runtime or signal handler.
     pub(crate) fn listen() -> std::io::Result<Self> {
         let this = Self::default();
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()?;
         let (mut interrupt, mut terminate, mut hangup) = {
             let _inside = runtime.enter();
-            (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?, signal(SignalKind::hangup())?)
+            (
+                signal(SignalKind::interrupt())?,
+                signal(SignalKind::terminate())?,
+                signal(SignalKind::hangup())?,
+            )
         };
         let counted = this.clone();
-        std::thread::Builder::new().name("interrupts".into()).spawn(move || {
-            runtime.block_on(async {
-                loop {
-                    tokio::select! {
-                        _ = interrupt.recv() => {}
-                        _ = terminate.recv() => {}
-                        _ = hangup.recv() => {}
+        std::thread::Builder::new()
+            .name("interrupts".into())
+            .spawn(move || {
+                runtime.block_on(async {
+                    loop {
+                        tokio::select! {
+                            _ = interrupt.recv() => {}
+                            _ = terminate.recv() => {}
+                            _ = hangup.recv() => {}
+                        }
+                        counted.add();
                     }
-                    counted.add();
-                }
-            });
-        })?;
+                });
+            })?;
         Ok(this)
     }
 
     fn add(&self) {
-        *self.state.0.lock().expect("no thread panics while holding the count") += 1;
+        *self
+            .state
+            .0
+            .lock()
+            .expect("no thread panics while holding the count") += 1;
         self.state.1.notify_all();
     }
 
     /// How many there were.
     pub(crate) fn count(&self) -> u32 {
-        *self.state.0.lock().expect("no thread panics while holding the count")
+        *self
+            .state
+            .0
+            .lock()
+            .expect("no thread panics while holding the count")
     }
 
     /// Sleeps for `timeout`, or until there is one more; returns how many there were.
     pub(crate) fn wait_timeout(&self, timeout: Duration) -> u32 {
-        let count = self.state.0.lock().expect("no thread panics while holding the count");
+        let count = self
+            .state
+            .0
+            .lock()
+            .expect("no thread panics while holding the count");
         let before = *count;
-        let waited = self.state.1.wait_timeout_while(count, timeout, |count| *count == before);
+        let waited = self
+            .state
+            .1
+            .wait_timeout_while(count, timeout, |count| *count == before);
         *waited.expect("no thread panics while holding the count").0
     }
 }

@@ -48,7 +48,11 @@ pub fn main() -> ExitCode {
         Err(e) => {
             // Nothing is left to be done if the terminal is gone.
             let _ = e.print();
-            return if e.use_stderr() { ExitCode::from(EXIT_USAGE) } else { ExitCode::SUCCESS };
+            return if e.use_stderr() {
+                ExitCode::from(EXIT_USAGE)
+            } else {
+                ExitCode::SUCCESS
+            };
         }
     };
     log_to_stderr();
@@ -57,14 +61,20 @@ pub fn main() -> ExitCode {
         Err(e) if e.is::<Interrupted>() => ExitCode::from(EXIT_INTERRUPTED),
         Err(e) => {
             eprintln!("error: {e:#}");
-            if e.is::<Usage>() { ExitCode::from(EXIT_USAGE) } else { ExitCode::FAILURE }
+            if e.is::<Usage>() {
+                ExitCode::from(EXIT_USAGE)
+            } else {
+                ExitCode::FAILURE
+            }
         }
     }
 }
 
-/// `DRIML_LOG` says what is logged, in the form of `RUST_LOG`.
+/// `DRIML_LOG` says what is logged, in the form of `RUST_LOG`. zenoh warns of each try to reach a part that is not there
+/// yet or any more, which is ours to judge: so only its errors are logged.
 fn log_to_stderr() {
-    let filter = EnvFilter::try_from_env("DRIML_LOG").unwrap_or_else(|_| EnvFilter::new("warn,driml=info"));
+    let filter = EnvFilter::try_from_env("DRIML_LOG")
+        .unwrap_or_else(|_| EnvFilter::new("warn,driml=info,zenoh=error"));
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
@@ -79,13 +89,28 @@ fn run(command: Command) -> anyhow::Result<()> {
             check_endpoints(&args.connect)?;
             let shutdown = join(&args.join)?;
             let (connect, namespace) = (args.connect, args.join.namespace);
-            driml_actor::run(driml_actor::RunArgs { connect, namespace, actor: args.id, envs: args.envs }, &shutdown)
+            driml_actor::run(
+                driml_actor::RunArgs {
+                    connect,
+                    namespace,
+                    actor: args.id,
+                    envs: args.envs,
+                },
+                &shutdown,
+            )
         }
         Command::Learner(args) => {
             check_endpoints(&args.connect)?;
             let shutdown = join(&args.join)?;
             let (connect, namespace) = (args.connect, args.join.namespace);
-            driml_learner::run(driml_learner::RunArgs { connect, namespace, run_dir: args.run_dir }, &shutdown)
+            driml_learner::run(
+                driml_learner::RunArgs {
+                    connect,
+                    namespace,
+                    run_dir: args.run_dir,
+                },
+                &shutdown,
+            )
         }
         Command::ReplayServer(args) => replay_server(args),
         Command::Evaluate(args) => evaluate::run(&args),
@@ -93,7 +118,10 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Presets => print(&presets::describe()),
         Command::Procgen(ProcgenCommand::Install) => {
             let engine = procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
-            print(&format!("procgen's engine is in {}\n", engine.root().display()))
+            print(&format!(
+                "procgen's engine is in {}\n",
+                engine.root().display()
+            ))
         }
     }
 }
@@ -122,7 +150,11 @@ fn parity(args: &ParityArgs) -> anyhow::Result<()> {
         print(&report.to_string())?;
         failed += usize::from(!report.passed());
     }
-    anyhow::ensure!(failed == 0, "{failed} of {} files are out of tolerance", args.files.len());
+    anyhow::ensure!(
+        failed == 0,
+        "{failed} of {} files are out of tolerance",
+        args.files.len()
+    );
     Ok(())
 }
 
@@ -135,7 +167,9 @@ fn join(flags: &JoinFlags) -> anyhow::Result<Shutdown> {
 /// Refuses what zenoh could not open.
 fn check_endpoints(endpoints: &[String]) -> Result<(), Usage> {
     let good = |endpoint: &str| match endpoint.split_once('/') {
-        Some(("tcp" | "tls", address)) => address.rsplit_once(':').is_some_and(|(host, _)| !host.is_empty()),
+        Some(("tcp" | "tls", address)) => address
+            .rsplit_once(':')
+            .is_some_and(|(host, _)| !host.is_empty()),
         Some(("unixsock-stream", path)) => !path.is_empty(),
         _ => false,
     };
@@ -162,10 +196,22 @@ mod tests {
 
     #[test]
     fn endpoints_that_zenoh_cannot_open_are_refused() {
-        for good in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tls/host:1", "unixsock-stream//tmp/driml.sock"] {
+        for good in [
+            "tcp/127.0.0.1:7447",
+            "tcp/[::1]:7447",
+            "tls/host:1",
+            "unixsock-stream//tmp/driml.sock",
+        ] {
             assert!(check_endpoints(&[good.into()]).is_ok(), "{good}");
         }
-        for bad in ["", "localhost:7447", "tcp/localhost", "tcp/:1", "udp/1.2.3.4:5", "unixsock-stream/"] {
+        for bad in [
+            "",
+            "localhost:7447",
+            "tcp/localhost",
+            "tcp/:1",
+            "udp/1.2.3.4:5",
+            "unixsock-stream/",
+        ] {
             assert!(check_endpoints(&[bad.into()]).is_err(), "{bad}");
         }
     }

@@ -32,7 +32,13 @@ pub(crate) fn run(args: LocalArgs) -> anyhow::Result<()> {
     check_endpoints(args.listen.as_slice())?;
     let run_dir = args.run_dir.unwrap_or_else(|| default_run_dir(&config.run));
     record::check_free(&run_dir)?;
-    print(&plan::describe(&config, &from, &run_dir, args.lockstep, &machine))?;
+    print(&plan::describe(
+        &config,
+        &from,
+        &run_dir,
+        args.lockstep,
+        &machine,
+    ))?;
     if matches!(config.world, WorldConfig::Procgen(_)) {
         procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
     }
@@ -58,24 +64,40 @@ pub(crate) fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, 
     let (source, from) = match &args.config {
         Some(path) => {
             let name = path.display().to_string();
-            let text = std::fs::read_to_string(path).map_err(|e| usage!("reading the settings {name}: {e}"))?;
+            let text = std::fs::read_to_string(path)
+                .map_err(|e| usage!("reading the settings {name}: {e}"))?;
             (Source::File(name.clone(), text), name)
         }
         None => {
-            let world: WorldName =
-                args.env.as_deref().unwrap_or(ENV).parse().map_err(|e| usage!("--env: {e}"))?;
+            let world: WorldName = args
+                .env
+                .as_deref()
+                .unwrap_or(ENV)
+                .parse()
+                .map_err(|e| usage!("--env: {e}"))?;
             let agent = presets::agent(args.agent.as_deref().unwrap_or(AGENT))?;
-            let preset = presets::preset(args.preset.as_deref().unwrap_or(presets::PRESETS[0].name))?;
-            (Source::Layers(preset, world, agent.name), format!("preset {}", preset.name))
+            let preset =
+                presets::preset(args.preset.as_deref().unwrap_or(presets::PRESETS[0].name))?;
+            (
+                Source::Layers(preset, world, agent.name),
+                format!("preset {}", preset.name),
+            )
         }
     };
     Ok((config::resolve(&source, &flags, machine)?, from))
 }
 
 fn default_run_dir(run: &RunSpec) -> PathBuf {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
+    let since = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .map_or(0, |since| since.as_secs());
     let world = run.world.replace(':', "-");
-    PathBuf::from("runs").join(format!("{world}-{}-seed{}-{}", run.agent, run.seed, timestamp(since)))
+    PathBuf::from("runs").join(format!(
+        "{world}-{}-seed{}-{}",
+        run.agent,
+        run.seed,
+        timestamp(since)
+    ))
 }
 
 /// `20260131-235959` in UTC, from seconds since 1970.
@@ -84,13 +106,23 @@ fn default_run_dir(run: &RunSpec) -> PathBuf {
 fn timestamp(seconds: u64) -> String {
     let (days, second) = (seconds / 86_400 + 719_468, seconds % 86_400);
     let (era, day_of_era) = (days / 146_097, days % 146_097);
-    let year_of_era = (day_of_era - day_of_era / 1_460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let year_of_era =
+        (day_of_era - day_of_era / 1_460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
     let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
     let march_month = (5 * day_of_year + 2) / 153;
     let day = day_of_year - (153 * march_month + 2) / 5 + 1;
-    let month = if march_month < 10 { march_month + 3 } else { march_month - 9 };
+    let month = if march_month < 10 {
+        march_month + 3
+    } else {
+        march_month - 9
+    };
     let year = year_of_era + era * 400 + u64::from(month <= 2);
-    format!("{year:04}{month:02}{day:02}-{:02}{:02}{:02}", second / 3600, second % 3600 / 60, second % 60)
+    format!(
+        "{year:04}{month:02}{day:02}-{:02}{:02}{:02}",
+        second / 3600,
+        second % 3600 / 60,
+        second % 60
+    )
 }
 
 #[cfg(test)]

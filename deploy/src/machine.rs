@@ -24,7 +24,10 @@ impl Machine {
     pub(crate) fn this() -> Self {
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get() as u32);
         let memory_bytes = free_memory_bytes().unwrap_or(4 << 30);
-        Self { cores, memory_bytes }
+        Self {
+            cores,
+            memory_bytes,
+        }
     }
 
     /// Actor processes. Few: one actor feeds several learners' worth of cores, as an update takes 32 steps only.
@@ -68,7 +71,9 @@ fn free_memory_bytes() -> Option<u64> {
 }
 
 fn meminfo_available(text: &str) -> Option<u64> {
-    let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    let line = text
+        .lines()
+        .find_map(|line| line.strip_prefix("MemAvailable:"))?;
     let kib: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
     Some(kib * 1024)
 }
@@ -79,7 +84,8 @@ mod tests {
 
     #[test]
     fn available_memory_is_read_from_the_kernels_table() {
-        let text = "MemTotal:       24600000 kB\nMemFree:        1000 kB\nMemAvailable:    2000 kB\n";
+        let text =
+            "MemTotal:       24600000 kB\nMemFree:        1000 kB\nMemAvailable:    2000 kB\n";
         assert_eq!(meminfo_available(text), Some(2000 * 1024));
         assert_eq!(meminfo_available("MemTotal: 1 kB"), None);
     }
@@ -87,7 +93,10 @@ mod tests {
     #[test]
     fn every_machine_gets_at_least_one_of_each() {
         for cores in [0, 1, 2, 8, 300] {
-            let machine = Machine { cores, memory_bytes: 1 << 30 };
+            let machine = Machine {
+                cores,
+                memory_bytes: 1 << 30,
+            };
             assert!(machine.actors() >= 1 && machine.actors() <= 4);
         }
         assert!(Machine::this().cores >= 1);

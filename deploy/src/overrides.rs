@@ -3,7 +3,7 @@
 
 use toml::{Table, Value};
 
-use crate::error::{Usage, nearest, usage};
+use crate::error::{Usage, edit_distance, nearest, usage};
 
 /// A parsed `--set`.
 #[derive(Clone, Debug, PartialEq)]
@@ -21,18 +21,26 @@ impl Override {
     /// No `=`, or no path of at least a table and a key.
     pub(crate) fn parse(text: &str) -> Result<Self, Usage> {
         let form = "--set takes table.key=value, such as learner.update.adam.lr=1e-4";
-        let (path, value) = text.split_once('=').ok_or_else(|| usage!("--set {text:?} has no '='; {form}"))?;
+        let (path, value) = text
+            .split_once('=')
+            .ok_or_else(|| usage!("--set {text:?} has no '='; {form}"))?;
         let (path, value) = (path.trim(), value.trim());
         if path.split('.').any(|key| key.trim().is_empty()) {
             return Err(usage!("--set {text:?} has no key before '='; {form}"));
         }
         let read = format!("value = {value}").parse::<Table>().ok();
         // A line break could bring in a second key.
-        let value = match read.and_then(|mut table| (table.len() == 1).then(|| table.remove("value"))).flatten() {
+        let value = match read
+            .and_then(|mut table| (table.len() == 1).then(|| table.remove("value")))
+            .flatten()
+        {
             Some(value) => value,
             None => Value::String(value.to_owned()),
         };
-        Ok(Self { path: path.to_owned(), value })
+        Ok(Self {
+            path: path.to_owned(),
+            value,
+        })
     }
 
     /// Puts the value into `table`; returns whether the key was not there before.
@@ -43,10 +51,17 @@ impl Override {
     /// A path that leads nowhere, or a value of another type than the one it replaces.
     pub(crate) fn apply(&self, table: &mut Table) -> Result<bool, Usage> {
         let unknown = self.unknown(table);
-        let (tables, key) = self.path.rsplit_once('.').ok_or_else(|| self.unknown(table))?;
+        let (tables, key) = self
+            .path
+            .rsplit_once('.')
+            .ok_or_else(|| self.unknown(table))?;
         let mut inner = table;
         for name in tables.split('.') {
-            inner = inner.get_mut(name).and_then(Value::as_table_mut).ok_or(()).map_err(|()| unknown.clone())?;
+            inner = inner
+                .get_mut(name)
+                .and_then(Value::as_table_mut)
+                .ok_or(())
+                .map_err(|()| unknown.clone())?;
         }
         let value = match inner.get(key) {
             Some(old) => self.as_type_of(old)?,
@@ -84,18 +99,25 @@ impl Override {
                 None => break,
             }
         }
+        // The same key in another table is what is meant most often.
         let paths = leaves(table);
-        let last = self.path.rsplit('.').next().unwrap_or(&self.path);
-        let tail_first = |path: &&String| path.rsplit('.').next() != Some(last);
-        let mut candidates: Vec<_> = paths.iter().collect();
-        candidates.sort_by_key(tail_first);
-        let near = match candidates.first() {
-            Some(path) if !tail_first(path) => format!(" (did you mean {path:?}?)"),
-            _ => nearest(&self.path, paths.iter().map(String::as_str)),
+        let key = |path: &str| path.rsplit('.').next().map(str::to_owned);
+        let elsewhere = paths.iter().filter(|path| key(path) == key(&self.path));
+        let near = match elsewhere.min_by_key(|path| edit_distance(&self.path, path)) {
+            Some(path) => format!(" (did you mean {path:?}?)"),
+            None => nearest(&self.path, paths.iter().map(String::as_str)),
         };
         let keys: Vec<_> = known.keys().map(String::as_str).collect();
-        let place = if at.is_empty() { "the settings have the tables".into() } else { format!("[{}] has", at.join(".")) };
-        usage!("there is no setting {:?}{near}; {place} {}", self.path, keys.join(", "))
+        let place = if at.is_empty() {
+            "the settings have the tables".into()
+        } else {
+            format!("[{}] has", at.join("."))
+        };
+        usage!(
+            "there is no setting {:?}{near}; {place} {}",
+            self.path,
+            keys.join(", ")
+        )
     }
 }
 
@@ -104,7 +126,11 @@ fn leaves(table: &Table) -> Vec<String> {
     let mut paths = Vec::new();
     for (key, value) in table {
         match value {
-            Value::Table(inner) => paths.extend(leaves(inner).into_iter().map(|path| format!("{key}.{path}"))),
+            Value::Table(inner) => paths.extend(
+                leaves(inner)
+                    .into_iter()
+                    .map(|path| format!("{key}.{path}")),
+            ),
             _ => paths.push(key.clone()),
         }
     }
@@ -146,16 +172,30 @@ mod tests {
 
     fn set(text: &str) -> Result<(Table, bool), String> {
         let mut table = settings();
-        let new = Override::parse(text).and_then(|it| it.apply(&mut table)).map_err(|e| e.to_string())?;
+        let new = Override::parse(text)
+            .and_then(|it| it.apply(&mut table))
+            .map_err(|e| e.to_string())?;
         Ok((table, new))
     }
 
     #[test]
     fn values_take_the_type_of_what_they_replace() {
-        assert_eq!(set("learner.update.adam.lr=1e-4").unwrap().0["learner"]["update"]["adam"]["lr"], Value::Float(1e-4));
-        assert_eq!(set("run.gamma=1").unwrap().0["run"]["gamma"], Value::Float(1.0));
-        assert_eq!(set("run.timeout=bootstrap").unwrap().0["run"]["timeout"], Value::String("bootstrap".into()));
-        assert_eq!(set("run.timeout = \"bootstrap\"").unwrap().0["run"]["timeout"].as_str(), Some("bootstrap"));
+        assert_eq!(
+            set("learner.update.adam.lr=1e-4").unwrap().0["learner"]["update"]["adam"]["lr"],
+            Value::Float(1e-4)
+        );
+        assert_eq!(
+            set("run.gamma=1").unwrap().0["run"]["gamma"],
+            Value::Float(1.0)
+        );
+        assert_eq!(
+            set("run.timeout=bootstrap").unwrap().0["run"]["timeout"],
+            Value::String("bootstrap".into())
+        );
+        assert_eq!(
+            set("run.timeout = \"bootstrap\"").unwrap().0["run"]["timeout"].as_str(),
+            Some("bootstrap")
+        );
         let (table, new) = set("run.horizon={rule=\"uniform\",k_max=3}").unwrap();
         assert_eq!((table["run"]["horizon"].get("k"), new), (None, false));
         assert!(set("run.other=3").unwrap().1);
@@ -168,8 +208,10 @@ mod tests {
             .assert_eq(&said("run.seed"));
         expect![[r#"--set "=3" has no key before '='; --set takes table.key=value, such as learner.update.adam.lr=1e-4"#]]
             .assert_eq(&said("=3"));
-        expect![[r#"--set run.seed=many: the value is a whole number, and many is a word"#]].assert_eq(&said("run.seed=many"));
-        expect![[r#"--set run.seed=1.5: the value is a whole number, and 1.5 is a number"#]].assert_eq(&said("run.seed=1.5"));
+        expect![[r#"--set run.seed=many: the value is a whole number, and many is a word"#]]
+            .assert_eq(&said("run.seed=many"));
+        expect![[r#"--set run.seed=1.5: the value is a whole number, and 1.5 is a number"#]]
+            .assert_eq(&said("run.seed=1.5"));
         expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has batch_rows, update"#]]
             .assert_eq(&said("learner.adam.lr=1"));
         expect![[r#"there is no setting "seed" (did you mean "run.seed"?); the settings have the tables learner, run"#]]

@@ -29,13 +29,19 @@ struct RowFlops {
 }
 
 fn row_flops(model: &ModelConfig) -> RowFlops {
-    let mut flops = RowFlops { local: 0.0, global: 0.0, head: 0.0, dim: 0.0 };
+    let mut flops = RowFlops {
+        local: 0.0,
+        global: 0.0,
+        head: 0.0,
+        dim: 0.0,
+    };
     let (mut height, mut width) = (model.height, model.width);
     let mut channels = model.channels;
     for layer in &model.conv {
         height = (height - layer.kernel) / layer.stride + 1;
         width = (width - layer.kernel) / layer.stride + 1;
-        flops.local += 2.0 * (height * width * layer.out * channels * layer.kernel * layer.kernel) as f64;
+        flops.local +=
+            2.0 * (height * width * layer.out * channels * layer.kernel * layer.kernel) as f64;
         channels = layer.out;
     }
     for (name, shape) in model.parameter_shapes() {
@@ -61,14 +67,31 @@ fn row_flops(model: &ModelConfig) -> RowFlops {
 /// forward and backward; the InfoNCE scores come on top: locations * rows^2 * rkhs. A frame is one forward pass.
 pub(crate) fn estimate(config: &RunConfig, cores: u32) -> Duration {
     let (model, rows) = (&config.model, f64::from(config.learner.batch_rows));
-    let RowFlops { local, global, head, dim } = row_flops(model);
+    let RowFlops {
+        local,
+        global,
+        head,
+        dim,
+    } = row_flops(model);
     let forward = local + global + head;
     let lambda = config.learner.update.lambda.wanted();
     let with_dim = lambda.contains(&true);
     let (height, width, _) = model.local_shape();
-    let locations = if lambda[..3].contains(&true) { (height * width) as f64 } else { 1.0 };
-    let scores = if with_dim { 6.0 * locations * rows * rows * model.rkhs as f64 } else { 0.0 };
-    let second_pass = if with_dim { 3.0 * (local + global) } else { 0.0 };
+    let locations = if lambda[..3].contains(&true) {
+        (height * width) as f64
+    } else {
+        1.0
+    };
+    let scores = if with_dim {
+        6.0 * locations * rows * rows * model.rkhs as f64
+    } else {
+        0.0
+    };
+    let second_pass = if with_dim {
+        3.0 * (local + global)
+    } else {
+        0.0
+    };
     let update = rows * (4.0 * forward + second_pass + 3.0 * dim) + scores;
     let flops = config.updates() as f64 * update + config.frames() as f64 * forward;
     let seconds = flops / (GFLOPS_PER_CORE * 1e9 * f64::from(cores.max(1)));
@@ -76,8 +99,21 @@ pub(crate) fn estimate(config: &RunConfig, cores: u32) -> Duration {
 }
 
 /// The plan, one fact a line.
-pub(crate) fn describe(config: &RunConfig, from: &str, run_dir: &Path, lockstep: bool, machine: &Machine) -> String {
-    let RunConfig { run, actor, replay, learner, local, .. } = config;
+pub(crate) fn describe(
+    config: &RunConfig,
+    from: &str,
+    run_dir: &Path,
+    lockstep: bool,
+    machine: &Machine,
+) -> String {
+    let RunConfig {
+        run,
+        actor,
+        replay,
+        learner,
+        local,
+        ..
+    } = config;
     let bytes = config.frames().min(replay.capacity_transitions) * replay_bytes_each(run);
     let processes = if lockstep {
         "one, all parts in lockstep".into()
@@ -89,7 +125,13 @@ pub(crate) fn describe(config: &RunConfig, from: &str, run_dir: &Path, lockstep:
         )
     };
     let lines = [
-        ("trains", format!("{} on {}, seed {}, from {from}", run.agent, run.world, run.seed)),
+        (
+            "trains",
+            format!(
+                "{} on {}, seed {}, from {from}",
+                run.agent, run.world, run.seed
+            ),
+        ),
         (
             "frames",
             format!(
@@ -110,9 +152,18 @@ pub(crate) fn describe(config: &RunConfig, from: &str, run_dir: &Path, lockstep:
             ),
         ),
         ("run folder", run_dir.display().to_string()),
-        ("time", format!("about {} (coarse: from the network's arithmetic)", about(estimate(config, machine.cores)))),
+        (
+            "time",
+            format!(
+                "about {} (coarse: from the network's arithmetic)",
+                about(estimate(config, machine.cores))
+            ),
+        ),
     ];
-    let mut text: String = lines.iter().map(|(name, fact)| format!("{name:<12}{fact}\n")).collect();
+    let mut text: String = lines
+        .iter()
+        .map(|(name, fact)| format!("{name:<12}{fact}\n"))
+        .collect();
     for note in &config.notes {
         text.push_str(&format!("{:<12}{note}\n", "note"));
     }
@@ -124,7 +175,9 @@ fn about(time: Duration) -> String {
     match time.as_secs() {
         0..60 => "a minute".into(),
         seconds @ 60..7200 => format!("{} min", seconds.div_ceil(60)),
-        seconds => duration(Duration::from_secs(seconds.div_ceil(3600) * 3600)).replace(" 0 min", "").replace(" 0 h", ""),
+        seconds => duration(Duration::from_secs(seconds.div_ceil(3600) * 3600))
+            .replace(" 0 min", "")
+            .replace(" 0 h", ""),
     }
 }
 
@@ -138,7 +191,10 @@ mod tests {
         presets::PRESETS,
     };
 
-    const MACHINE: Machine = Machine { cores: 2, memory_bytes: 16 << 30 };
+    const MACHINE: Machine = Machine {
+        cores: 2,
+        memory_bytes: 16 << 30,
+    };
 
     fn config(world: &str, agent: &'static str) -> RunConfig {
         let source = Source::Layers(&PRESETS[0], world.parse().unwrap(), agent);
@@ -148,10 +204,27 @@ mod tests {
     #[test]
     fn the_plan_says_what_will_be_done() {
         let config = config("procgen:bigfish", "driml-fix");
-        let plan = describe(&config, "preset paper", Path::new("runs/x"), false, &MACHINE);
+        let plan = describe(
+            &config,
+            "preset paper",
+            Path::new("runs/x"),
+            false,
+            &MACHINE,
+        );
         // The time depends on a measured constant.
-        let plan: String = plan.lines().filter(|line| !line.starts_with("time")).map(|line| format!("{line}\n")).collect();
-        expect![].assert_eq(&plan);
+        let plan: String = plan
+            .lines()
+            .filter(|line| !line.starts_with("time"))
+            .map(|line| format!("{line}\n"))
+            .collect();
+        expect![[r#"
+            trains      driml-fix on procgen:bigfish, seed 1, from preset paper
+            frames      200000 in all, with 6218 updates of 256 rows (replay ratio 8)
+            processes   replay server; learner with 2 threads; 1 actor with 16 copies of the world each
+            replay      the newest 200000 transitions, up to 2.3 GiB of memory
+            run folder  runs/x
+            note        the paper's driml-fix augments the DIM inputs on this game; this build does not augment, so expect other numbers
+        "#]].assert_eq(&plan);
     }
 
     #[test]
@@ -168,14 +241,18 @@ mod tests {
 
     #[test]
     fn more_cores_and_less_to_learn_take_less_time() {
-        let (ada, c51) = (config("procgen:bigfish", "driml-ada"), config("procgen:bigfish", "c51"));
+        let (ada, c51) = (
+            config("procgen:bigfish", "driml-ada"),
+            config("procgen:bigfish", "c51"),
+        );
         assert!(estimate(&ada, 4) < estimate(&ada, 2));
         assert!(estimate(&c51, 2) < estimate(&ada, 2));
     }
 
     #[test]
     fn estimates_are_not_precise() {
-        let texts = [5, 600, 7_300, 90_000, 86_400].map(|seconds| about(Duration::from_secs(seconds)));
+        let texts =
+            [5, 600, 7_300, 90_000, 86_400].map(|seconds| about(Duration::from_secs(seconds)));
         assert_eq!(texts, ["a minute", "10 min", "3 h", "1 d 1 h", "1 d"]);
     }
 }

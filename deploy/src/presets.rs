@@ -8,6 +8,7 @@ use toml::{Table, Value};
 use crate::error::{Usage, nearest, usage};
 
 /// One file of `presets/`.
+#[derive(Clone, Copy, Debug)]
 struct Layer {
     name: &'static str,
     text: &'static str,
@@ -15,13 +16,17 @@ struct Layer {
 
 macro_rules! layer {
     ($path:literal) => {
-        Layer { name: $path, text: include_str!(concat!("../presets/", $path, ".toml")) }
+        Layer {
+            name: $path,
+            text: include_str!(concat!("../presets/", $path, ".toml")),
+        }
     };
 }
 
 const BASE: Layer = layer!("base");
 
 /// A way to run any agent in a world.
+#[derive(Clone, Debug)]
 pub(crate) struct Preset {
     /// As `--preset` takes it.
     pub(crate) name: &'static str,
@@ -62,6 +67,7 @@ pub(crate) const PRESETS: [Preset; 4] = [
 ];
 
 /// An agent.
+#[derive(Clone, Debug)]
 pub(crate) struct Agent {
     /// As `--agent` takes it.
     pub(crate) name: &'static str,
@@ -70,10 +76,22 @@ pub(crate) struct Agent {
 
 /// Every agent.
 pub(crate) const AGENTS: [Agent; 4] = [
-    Agent { name: "c51", layer: layer!("agent/c51") },
-    Agent { name: "driml-fix", layer: layer!("agent/driml-fix") },
-    Agent { name: "driml-ada", layer: layer!("agent/driml-ada") },
-    Agent { name: "driml-randk", layer: layer!("agent/driml-randk") },
+    Agent {
+        name: "c51",
+        layer: layer!("agent/c51"),
+    },
+    Agent {
+        name: "driml-fix",
+        layer: layer!("agent/driml-fix"),
+    },
+    Agent {
+        name: "driml-ada",
+        layer: layer!("agent/driml-ada"),
+    },
+    Agent {
+        name: "driml-randk",
+        layer: layer!("agent/driml-randk"),
+    },
 ];
 
 fn world_layer(world: WorldName) -> Layer {
@@ -88,7 +106,9 @@ fn world_layer(world: WorldName) -> Layer {
 /// The kind of a world, as `world.kind` has it: its name without the game.
 pub(crate) fn family(world: WorldName) -> String {
     let name = world.to_string();
-    name.split_once(':').map_or(name.as_str(), |(family, _)| family).to_owned()
+    name.split_once(':')
+        .map_or(name.as_str(), |(family, _)| family)
+        .to_owned()
 }
 
 /// Finds an agent by name.
@@ -96,10 +116,17 @@ pub(crate) fn family(world: WorldName) -> String {
 /// # Errors
 /// Says which agents there are.
 pub(crate) fn agent(name: &str) -> Result<&'static Agent, Usage> {
-    AGENTS.iter().find(|agent| agent.name == name).ok_or_else(|| {
-        let names = AGENTS.map(|agent| agent.name);
-        usage!("there is no agent {name:?}{}; --agent takes {}", nearest(name, names), names.join(", "))
-    })
+    AGENTS
+        .iter()
+        .find(|agent| agent.name == name)
+        .ok_or_else(|| {
+            let names = AGENTS.map(|agent| agent.name);
+            usage!(
+                "there is no agent {name:?}{}; --agent takes {}",
+                nearest(name, names),
+                names.join(", ")
+            )
+        })
 }
 
 /// Finds a preset by name.
@@ -107,14 +134,17 @@ pub(crate) fn agent(name: &str) -> Result<&'static Agent, Usage> {
 /// # Errors
 /// Says which presets there are.
 pub(crate) fn preset(name: &str) -> Result<&'static Preset, Usage> {
-    PRESETS.iter().find(|preset| preset.name == name).ok_or_else(|| {
-        let names = PRESETS.map(|preset| preset.name);
-        usage!(
-            "there is no preset {name:?}{}; --preset takes {} (`driml presets` describes them)",
-            nearest(name, names),
-            names.join(", ")
-        )
-    })
+    PRESETS
+        .iter()
+        .find(|preset| preset.name == name)
+        .ok_or_else(|| {
+            let names = PRESETS.map(|preset| preset.name);
+            usage!(
+                "there is no preset {name:?}{}; --preset takes {} (`driml presets` describes them)",
+                nearest(name, names),
+                names.join(", ")
+            )
+        })
 }
 
 /// Lays base, world, agent and preset over one another, in this order: a later one wins.
@@ -131,7 +161,10 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
     }
     let mut table = Table::new();
     let world_layer = world_layer(world);
-    for layer in [&BASE, &world_layer, &agent.layer].into_iter().chain(preset.layers) {
+    for layer in [&BASE, &world_layer, &agent.layer]
+        .into_iter()
+        .chain(preset.layers)
+    {
         lay(&mut table, layer, &world.to_string());
     }
     Ok(table)
@@ -141,15 +174,22 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
 fn lay(table: &mut Table, layer: &Layer, world: &str) {
     let (everywhere, blocks) = layer.read();
     merge(table, everywhere);
-    for block in blocks.into_iter().filter(|block| block.worlds.iter().any(|name| name == world)) {
+    for block in blocks
+        .into_iter()
+        .filter(|block| block.worlds.iter().any(|name| name == world))
+    {
         merge(table, block.set);
     }
 }
 
 /// What a person should know of an agent in a world before it starts.
 pub(crate) fn notes(name: &str, world: &str) -> Vec<String> {
-    let blocks = agent(name).map(|agent| agent.layer.read().1).unwrap_or_default();
-    let here = blocks.into_iter().filter(|block| block.worlds.iter().any(|name| name == world));
+    let blocks = agent(name)
+        .map(|agent| agent.layer.read().1)
+        .unwrap_or_default();
+    let here = blocks
+        .into_iter()
+        .filter(|block| block.worlds.iter().any(|name| name == world));
     here.filter_map(|block| block.note).collect()
 }
 
@@ -169,9 +209,16 @@ struct Only {
 impl Layer {
     /// What holds in every world, and the blocks that hold in some.
     fn read(&self) -> (Table, Vec<Only>) {
-        let built_in = "presets are built in, and a test reads each of them";
-        let mut everywhere: Table = self.text.parse().expect(built_in);
-        let blocks = everywhere.remove("only").map(|blocks| blocks.try_into().expect(built_in));
+        let bad = |e| -> ! {
+            panic!(
+                "presets/{}.toml is built in, and a test reads it: {e}",
+                self.name
+            )
+        };
+        let mut everywhere: Table = self.text.parse().unwrap_or_else(|e| bad(e));
+        let blocks = everywhere
+            .remove("only")
+            .map(|blocks| blocks.try_into().unwrap_or_else(|e| bad(e)));
         (everywhere, blocks.unwrap_or_default())
     }
 }
@@ -190,8 +237,14 @@ fn merge(lower: &mut Table, upper: Table) {
 
 /// What `driml presets` prints.
 pub(crate) fn describe() -> String {
-    let width = PRESETS.iter().map(|preset| preset.name.len()).max().unwrap_or(0);
-    let lines = PRESETS.iter().map(|preset| format!("{:width$}  {}\n", preset.name, preset.about));
+    let width = PRESETS
+        .iter()
+        .map(|preset| preset.name.len())
+        .max()
+        .unwrap_or(0);
+    let lines = PRESETS
+        .iter()
+        .map(|preset| format!("{:width$}  {}\n", preset.name, preset.about));
     lines.collect()
 }
 
@@ -205,14 +258,20 @@ mod tests {
     fn later_layers_win_key_by_key() {
         let mut lower: Table = "[a]\nx = 1\ny = 2\n[b]\nz = [1, 2]".parse().unwrap();
         merge(&mut lower, "[a]\ny = 3\n[b]\nz = [4]".parse().unwrap());
-        assert_eq!(lower, "[a]\nx = 1\ny = 3\n[b]\nz = [4]".parse::<Table>().unwrap());
+        assert_eq!(
+            lower,
+            "[a]\nx = 1\ny = 3\n[b]\nz = [4]".parse::<Table>().unwrap()
+        );
     }
 
     fn all_layers() -> Vec<Layer> {
         let agents = AGENTS.into_iter().map(|agent| agent.layer);
         let worlds = WorldName::all().map(world_layer);
         let variants = PRESETS.into_iter().flat_map(|preset| preset.layers);
-        let variants = variants.map(|layer| Layer { name: layer.name, text: layer.text });
+        let variants = variants.map(|layer| Layer {
+            name: layer.name,
+            text: layer.text,
+        });
         agents.chain(worlds).chain(variants).chain([BASE]).collect()
     }
 
@@ -238,10 +297,18 @@ mod tests {
     #[test]
     fn driml_fix_looks_as_far_ahead_as_the_paper_says() {
         let k = |world: &str| {
-            let table = layers(&PRESETS[0], world.parse().unwrap(), agent("driml-fix").unwrap()).unwrap();
+            let table = layers(
+                &PRESETS[0],
+                world.parse().unwrap(),
+                agent("driml-fix").unwrap(),
+            )
+            .unwrap();
             table["run"]["horizon"]["k"].as_integer().unwrap()
         };
-        let five: Vec<_> = WorldName::all().map(|world| world.to_string()).filter(|world| k(world) == 5).collect();
+        let five: Vec<_> = WorldName::all()
+            .map(|world| world.to_string())
+            .filter(|world| k(world) == 5)
+            .collect();
         expect_test::expect![[
             r#"procgen:bigfish procgen:chaser procgen:climber procgen:fruitbot procgen:jumper procgen:maze procgen:miner procgen:plunder"#
         ]]

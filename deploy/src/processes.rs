@@ -34,6 +34,8 @@ const SILENCE_MAX: Duration = Duration::from_secs(120);
 const STALL_MAX: Duration = Duration::from_secs(600);
 /// How long actors may take to deliver what they have, once they are not needed or told to stop.
 const ACTORS_DRAIN_MAX: Duration = Duration::from_secs(60);
+/// How long actors may take to end once another part has failed.
+const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
 /// How long the learner may take to save, once it is told to stop.
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 /// How long the replay server may take to end, once it is told to stop.
@@ -45,18 +47,41 @@ const PART_THREADS: u32 = 1;
 ///
 /// # Errors
 /// A part that failed or went silent, a file system that refuses; [`Interrupted`] if a person ended the run.
-pub(crate) fn run(config: &RunConfig, run_dir: &Path, listen: Option<String>) -> anyhow::Result<()> {
+pub(crate) fn run(
+    config: &RunConfig,
+    run_dir: &Path,
+    listen: Option<String>,
+) -> anyhow::Result<()> {
     let interrupts = Interrupts::listen().context("listening for signals")?;
     let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
-    let names: Vec<_> = ["replay-server".into(), "learner".into()].into_iter().chain(actors).collect();
+    let names: Vec<_> = ["replay-server".into(), "learner".into()]
+        .into_iter()
+        .chain(actors)
+        .collect();
     let mut recorder = Recorder::create(run_dir, &config.to_toml(), &names)?;
     // A unix socket's path must be short, so it lies beside other temporary files and not in the run folder.
-    let meeting = tempfile::Builder::new().prefix("driml-").tempdir().context("making a folder for the socket")?;
-    let endpoint =
-        listen.unwrap_or_else(|| format!("unixsock-stream/{}", meeting.path().join("driml.sock").display()));
+    let meeting = tempfile::Builder::new()
+        .prefix("driml-")
+        .tempdir()
+        .context("making a folder for the socket")?;
+    let endpoint = listen.unwrap_or_else(|| {
+        format!(
+            "unixsock-stream/{}",
+            meeting.path().join("driml.sock").display()
+        )
+    });
     let screen = Screen::new(config.frames());
     let display = Display::new(screen.clone(), config.frames(), config.updates());
-    let mut launch = Launch { config, run_dir, endpoint, screen, display, interrupts, parts: Vec::new(), statuses: None };
+    let mut launch = Launch {
+        config,
+        run_dir,
+        endpoint,
+        screen,
+        display,
+        interrupts,
+        parts: Vec::new(),
+        statuses: None,
+    };
 
     let ran = launch.start_and_watch(&mut recorder);
     let ended = launch.end(&ran);
@@ -69,7 +94,11 @@ pub(crate) fn run(config: &RunConfig, run_dir: &Path, listen: Option<String>) ->
     let summary = launch.conclude(&mut recorder, outcome)?;
     ran.and(ended)?;
     print(&describe(&summary, run_dir))?;
-    if outcome == Outcome::Interrupted { Err(Interrupted.into()) } else { Ok(()) }
+    if outcome == Outcome::Interrupted {
+        Err(Interrupted.into())
+    } else {
+        Ok(())
+    }
 }
 
 /// A run's processes and what is known of them.
@@ -95,27 +124,76 @@ impl Launch<'_> {
         let logs = self.run_dir.join("logs");
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
         let config = recorder.config_path().display().to_string();
-        let part = |words: &[&str]| words.iter().map(|&word| word.to_owned()).collect::<Vec<_>>();
+        let part = |words: &[&str]| {
+            words
+                .iter()
+                .map(|&word| word.to_owned())
+                .collect::<Vec<_>>()
+        };
         let exit = "--exit-with-parent";
-        let args = part(&["replay-server", "--listen", &self.endpoint, "--config", &config, exit]);
-        self.parts.push(Part::start("replay-server", &args, PART_THREADS, &logs, &self.screen)?);
-        let Some(session) = self.connect()? else { return Ok(Outcome::Interrupted) };
+        let args = part(&[
+            "replay-server",
+            "--listen",
+            &self.endpoint,
+            "--config",
+            &config,
+            exit,
+        ]);
+        self.parts.push(Part::start(
+            "replay-server",
+            &args,
+            PART_THREADS,
+            &logs,
+            &self.screen,
+        )?);
+        let Some(session) = self.connect()? else {
+            return Ok(Outcome::Interrupted);
+        };
         let keys = Keys::new(NAMESPACE).map_err(Usage)?;
         self.statuses = Some(Statuses::new(session, keys, self.config.run.hash()));
 
         let folder = self.run_dir.display().to_string();
-        let args = part(&["learner", "--connect", &self.endpoint, "--run-dir", &folder, exit]);
-        self.parts.push(Part::start("learner", &args, self.config.local.learner_threads, &logs, &self.screen)?);
+        let args = part(&[
+            "learner",
+            "--connect",
+            &self.endpoint,
+            "--run-dir",
+            &folder,
+            exit,
+        ]);
+        self.parts.push(Part::start(
+            "learner",
+            &args,
+            self.config.local.learner_threads,
+            &logs,
+            &self.screen,
+        )?);
         for id in 0..self.config.local.actors {
-            let args = part(&["actor", "--connect", &self.endpoint, "--id", &id.to_string(), exit]);
-            self.parts.push(Part::start(&format!("actor-{id}"), &args, PART_THREADS, &logs, &self.screen)?);
+            let args = part(&[
+                "actor",
+                "--connect",
+                &self.endpoint,
+                "--id",
+                &id.to_string(),
+                exit,
+            ]);
+            self.parts.push(Part::start(
+                &format!("actor-{id}"),
+                &args,
+                PART_THREADS,
+                &logs,
+                &self.screen,
+            )?);
         }
         self.watch(recorder)
     }
 
     /// A session to the replay server as soon as it listens; none if a person was faster.
     fn connect(&mut self) -> anyhow::Result<Option<zenoh::Session>> {
-        let endpoints = Endpoints { listen: Vec::new(), connect: vec![self.endpoint.clone()] };
+        let endpoints = Endpoints {
+            listen: Vec::new(),
+            connect: vec![self.endpoint.clone()],
+        };
         let deadline = Instant::now() + LISTEN_MAX;
         loop {
             // Opening may take seconds of its own, in which the replay server may end: so it is not waited for here.
@@ -130,14 +208,20 @@ impl Launch<'_> {
                 match told.recv_timeout(Duration::from_millis(50)) {
                     Ok(opened) => break opened,
                     Err(_) if Instant::now() > deadline => {
-                        bail!("the replay server does not listen on {} after {}", self.endpoint, duration(LISTEN_MAX))
+                        bail!(
+                            "the replay server does not listen on {} after {}",
+                            self.endpoint,
+                            duration(LISTEN_MAX)
+                        )
                     }
                     Err(_) => {}
                 }
             };
             match opened {
                 Ok(session) => return Ok(Some(session)),
-                Err(e) if Instant::now() > deadline => return Err(e).context("reaching the replay server"),
+                Err(e) if Instant::now() > deadline => {
+                    return Err(e).context("reaching the replay server");
+                }
                 Err(e) => tracing::debug!("the replay server does not listen yet: {e}"),
             }
         }
@@ -152,15 +236,21 @@ impl Launch<'_> {
                 return Ok(Outcome::Interrupted);
             }
             self.check_alive()?;
-            let statuses = self.statuses.as_mut().expect("it was set before the run is watched");
-            for (heard, (name, answer)) in heard
-                .iter_mut()
-                .zip([("replay server", statuses.ask_replay()), ("learner", statuses.ask_learner())])
-            {
+            let statuses = self
+                .statuses
+                .as_mut()
+                .expect("it was set before the run is watched");
+            for (heard, (name, answer)) in heard.iter_mut().zip([
+                ("replay server", statuses.ask_replay()),
+                ("learner", statuses.ask_learner()),
+            ]) {
                 match answer {
                     Ok(()) => *heard = Instant::now(),
                     Err(e) if heard.elapsed() > SILENCE_MAX => {
-                        return Err(e.context(format!("the {name} has not answered for {}", duration(heard.elapsed()))));
+                        return Err(e.context(format!(
+                            "the {name} has not answered for {}",
+                            duration(heard.elapsed())
+                        )));
                     }
                     Err(e) => tracing::debug!("the {name} did not answer: {e:#}"),
                 }
@@ -211,20 +301,41 @@ impl Launch<'_> {
         let interrupts = self.interrupts.clone();
         let hurry = move || interrupts.count() > allowed;
         let finished = matches!(ran, Ok(Outcome::Finished));
+        // Once a part has failed, what the actors still have will hardly be learned from.
+        let actors_max = if ran.is_ok() {
+            ACTORS_DRAIN_MAX
+        } else {
+            FAILED_DRAIN_MAX
+        };
         let mut late = Vec::new();
         let last = self.parts.len();
         // When the run is finished, actors hear it from the replay server and end by themselves.
-        late.extend(self.stop(FIRST_ACTOR.min(last)..last, !finished, ACTORS_DRAIN_MAX, &hurry));
+        let actors = self.stop(FIRST_ACTOR.min(last)..last, !finished, actors_max, &hurry);
+        if finished {
+            late.extend(actors);
+        } else {
+            // What an actor could not deliver is in the count of lost transitions; all that was learned is still saved.
+            actors
+                .iter()
+                .for_each(|actor| self.screen.line(&format!("while stopping, {actor}")));
+        }
         self.ask_all();
-        late.extend(self.stop(LEARNER.min(last)..FIRST_ACTOR.min(last), true, LEARNER_DRAIN_MAX, &hurry));
-        if let Some(statuses) = &mut self.statuses
-            && let Err(e) = statuses.ask_replay()
-        {
-            tracing::debug!("the replay server's last word: {e:#}");
+        late.extend(self.stop(
+            LEARNER.min(last)..FIRST_ACTOR.min(last),
+            true,
+            LEARNER_DRAIN_MAX,
+            &hurry,
+        ));
+        if let Some(statuses) = &mut self.statuses {
+            if let Err(e) = statuses.ask_replay() {
+                tracing::debug!("the replay server's last word: {e:#}");
+            }
+            // Before its router goes away, so that it does not try to reach it again.
+            statuses.close();
         }
         late.extend(self.stop(REPLAY..LEARNER.min(last), true, REPLAY_DRAIN_MAX, &hurry));
         if hurry() {
-            bail!("ended at once by a second interrupt: what was not saved is lost");
+            bail!("ended at once by an interrupt: what was not saved is lost");
         }
         if ran.is_ok() && !late.is_empty() {
             bail!("at the end of the run, {}", late.join("; "));
@@ -262,7 +373,11 @@ impl Launch<'_> {
                 Some(_) => late.push(part.obituary()),
                 None => {
                     if !hurry() {
-                        late.push(format!("{} did not end within {} and was killed", part.name, duration(drain_max)));
+                        late.push(format!(
+                            "{} did not end within {} and was killed",
+                            part.name,
+                            duration(drain_max)
+                        ));
                     }
                     part.kill();
                     part.wait_until(Instant::now() + REPLAY_DRAIN_MAX, || false);
@@ -273,20 +388,24 @@ impl Launch<'_> {
     }
 
     fn conclude(&mut self, recorder: &mut Recorder, outcome: Outcome) -> anyhow::Result<Summary> {
-        let statuses = self.statuses.take();
-        let (replay, learner) = statuses.as_ref().map(|it| (it.replay.clone(), it.learner.clone())).unwrap_or_default();
-        if let Some(statuses) = statuses {
-            statuses.close();
-        }
+        let (replay, learner) = self
+            .statuses
+            .as_ref()
+            .map(|it| (it.replay.clone(), it.learner.clone()))
+            .unwrap_or_default();
         recorder.record(&replay, &learner, &[])?;
         recorder.finish(outcome, &self.config.run, &replay, &learner)
     }
 }
 
 /// What a person reads at the end.
-fn describe(summary: &Summary, run_dir: &Path) -> String {
+pub(crate) fn describe(summary: &Summary, run_dir: &Path) -> String {
     let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
-    let how = if summary.outcome == Outcome::Finished { "finished" } else { "interrupted" };
+    let how = if summary.outcome == Outcome::Finished {
+        "finished"
+    } else {
+        "interrupted"
+    };
     format!(
         "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, mean return {} over the last of {} episodes\n{}\n",
         summary.frames,

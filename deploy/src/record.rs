@@ -114,13 +114,22 @@ impl Recorder {
     ///
     /// # Errors
     /// A folder in which something lies, or a file system that refuses.
-    pub(crate) fn create(folder: &Path, config_toml: &str, processes: &[String]) -> anyhow::Result<Self> {
+    pub(crate) fn create(
+        folder: &Path,
+        config_toml: &str,
+        processes: &[String],
+    ) -> anyhow::Result<Self> {
         check_free(folder)?;
-        fs::create_dir_all(folder).with_context(|| format!("making the run folder {}", folder.display()))?;
+        fs::create_dir_all(folder)
+            .with_context(|| format!("making the run folder {}", folder.display()))?;
         let head = "# The resolved settings of this run; `driml local --config` with this file repeats it.\n\n";
-        write_whole(&folder.join("config.toml"), format!("{head}{config_toml}").as_bytes())?;
+        write_whole(
+            &folder.join("config.toml"),
+            format!("{head}{config_toml}").as_bytes(),
+        )?;
         let path = folder.join("metrics.csv");
-        let metrics = csv::Writer::from_path(&path).with_context(|| format!("making {}", path.display()))?;
+        let metrics =
+            csv::Writer::from_path(&path).with_context(|| format!("making {}", path.display()))?;
         let mut this = Self {
             folder: folder.to_owned(),
             metrics,
@@ -129,6 +138,7 @@ impl Recorder {
             started: Instant::now(),
             rates: Rates::default(),
         };
+        this.rates.add(this.started, 0, 0);
         this.write_header()?;
         Ok(this)
     }
@@ -140,15 +150,38 @@ impl Recorder {
 
     fn write_header(&mut self) -> anyhow::Result<()> {
         let counts = [
-            "seconds", "frames", "updates", "frames_per_second", "updates_per_second", "replay_ratio", "episodes",
-            "mean_return", "c51_kl",
+            "seconds",
+            "frames",
+            "updates",
+            "frames_per_second",
+            "updates_per_second",
+            "replay_ratio",
+            "episodes",
+            "mean_return",
+            "c51_kl",
         ];
-        let rest = ["total_loss", "grad_norm", "q_mean", "mean_k", "mean_age", "weights_version", "affinity_version", "actors", "waiting"];
+        let rest = [
+            "total_loss",
+            "grad_norm",
+            "q_mean",
+            "mean_k",
+            "mean_age",
+            "weights_version",
+            "affinity_version",
+            "actors",
+            "waiting",
+        ];
         let dim = PAIRS.map(|pair| format!("dim_{pair}"));
-        let rss: Vec<_> = self.processes.iter().map(|name| format!("rss_mib_{}", name.replace('-', "_"))).collect();
+        let rss: Vec<_> = self
+            .processes
+            .iter()
+            .map(|name| format!("rss_mib_{}", name.replace('-', "_")))
+            .collect();
         let counts = counts.map(String::from);
         let rest = rest.map(String::from);
-        self.metrics.write_record(counts.iter().chain(&dim).chain(&rest).chain(&rss)).context("writing metrics.csv")
+        self.metrics
+            .write_record(counts.iter().chain(&dim).chain(&rest).chain(&rss))
+            .context("writing metrics.csv")
     }
 
     /// Adds a row of metrics. `rss_mib` is in the order of the processes given at the start; none for one that ended.
@@ -161,7 +194,8 @@ impl Recorder {
         learner: &LearnerStatus,
         rss_mib: &[Option<f64>],
     ) -> anyhow::Result<()> {
-        self.rates.add(Instant::now(), replay.transitions_inserted, learner.updates);
+        self.rates
+            .add(Instant::now(), replay.transitions_inserted, learner.updates);
         for (max, now) in self.rss_max.iter_mut().zip(rss_mib) {
             *max = now.map_or(*max, |now| Some(max.map_or(now, |max: f64| max.max(now))));
         }
@@ -194,7 +228,9 @@ impl Recorder {
         ]);
         let rss = (0..self.processes.len()).map(|i| rss_mib.get(i).copied().flatten());
         row.extend(rss.map(|mib| mib.map_or(String::new(), |mib| format!("{mib:.1}"))));
-        self.metrics.write_record(&row).context("writing metrics.csv")?;
+        self.metrics
+            .write_record(&row)
+            .context("writing metrics.csv")?;
         self.metrics.flush().context("writing metrics.csv")
     }
 
@@ -234,7 +270,9 @@ impl Recorder {
             weights_sha256: learner.weights_sha256.clone(),
             chunks_retried: replay.chunks_retried,
             messages_refused: replay.messages_refused,
-            rss_mib_max: rss.map(|(name, mib)| (name.clone(), mib.map(f64::round).into())).collect(),
+            rss_mib_max: rss
+                .map(|(name, mib)| (name.clone(), mib.map(f64::round).into()))
+                .collect(),
         };
         let mut text = serde_json::to_vec_pretty(&summary).context("writing summary.json")?;
         text.push(b'\n');
@@ -251,7 +289,9 @@ fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     file.write_all(bytes).with_context(doing)?;
     file.as_file().sync_all().with_context(doing)?;
     make_readable(file.as_file()).with_context(doing)?;
-    file.persist(path).map_err(|e| e.error).with_context(doing)?;
+    file.persist(path)
+        .map_err(|e| e.error)
+        .with_context(doing)?;
     Ok(())
 }
 
@@ -311,12 +351,22 @@ mod tests {
     fn a_run_leaves_settings_metrics_and_a_summary() {
         let folder = tempfile::tempdir().unwrap();
         let run = folder.path().join("run");
-        let mut recorder = Recorder::create(&run, "[run]\n", &["replay-server".into(), "actor-0".into()]).unwrap();
+        let mut recorder =
+            Recorder::create(&run, "[run]\n", &["replay-server".into(), "actor-0".into()]).unwrap();
         let (replay, learner) = statuses();
-        recorder.record(&ReplayStatus::default(), &LearnerStatus::default(), &[]).unwrap();
-        recorder.record(&replay, &learner, &[Some(12.34), None]).unwrap();
-        let summary = recorder.finish(Outcome::Finished, &spec(), &replay, &learner).unwrap();
-        assert_eq!((summary.frames, summary.replay_ratio, summary.mean_k), (2_000, Some(8.0), Some(1.5)));
+        recorder
+            .record(&ReplayStatus::default(), &LearnerStatus::default(), &[])
+            .unwrap();
+        recorder
+            .record(&replay, &learner, &[Some(12.34), None])
+            .unwrap();
+        let summary = recorder
+            .finish(Outcome::Finished, &spec(), &replay, &learner)
+            .unwrap();
+        assert_eq!(
+            (summary.frames, summary.replay_ratio, summary.mean_k),
+            (2_000, Some(8.0), Some(1.5))
+        );
 
         let csv = fs::read_to_string(run.join("metrics.csv")).unwrap();
         let columns: Vec<_> = csv.lines().map(|line| line.split(',').count()).collect();
@@ -324,11 +374,24 @@ mod tests {
         expect!["seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,c51_kl,dim_3t3,dim_3t4,dim_4t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,mean_age,weights_version,affinity_version,actors,waiting,rss_mib_replay_server,rss_mib_actor_0"]
             .assert_eq(csv.lines().next().unwrap());
 
-        let json: serde_json::Value = serde_json::from_slice(&fs::read(run.join("summary.json")).unwrap()).unwrap();
+        let json: serde_json::Value =
+            serde_json::from_slice(&fs::read(run.join("summary.json")).unwrap()).unwrap();
         for key in [
-            "frames", "updates", "transitions_inserted", "transitions_lost", "transitions_duplicated", "rows_sampled",
-            "replay_ratio", "episodes", "mean_return", "wall_seconds", "frames_per_second", "updates_per_second",
-            "mean_k", "weights_version", "weights_sha256",
+            "frames",
+            "updates",
+            "transitions_inserted",
+            "transitions_lost",
+            "transitions_duplicated",
+            "rows_sampled",
+            "replay_ratio",
+            "episodes",
+            "mean_return",
+            "wall_seconds",
+            "frames_per_second",
+            "updates_per_second",
+            "mean_k",
+            "weights_version",
+            "weights_sha256",
         ] {
             assert!(!json[key].is_null(), "{key}");
         }
@@ -342,7 +405,10 @@ mod tests {
         assert!(check_free(folder.path()).is_ok());
         fs::write(folder.path().join("x"), "").unwrap();
         let said = check_free(folder.path()).unwrap_err().to_string();
-        assert!(said.contains("exists and is not empty: choose another --run-dir"), "{said}");
+        assert!(
+            said.contains("exists and is not empty: choose another --run-dir"),
+            "{said}"
+        );
         assert!(check_free(&folder.path().join("x")).is_err());
     }
 }

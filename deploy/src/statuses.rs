@@ -28,7 +28,13 @@ pub(crate) struct Statuses {
 impl Statuses {
     /// A client over an open session.
     pub(crate) fn new(session: Session, keys: Keys, spec_hash: u64) -> Self {
-        Self { session, keys, spec_hash, replay: ReplayStatus::default(), learner: LearnerStatus::default() }
+        Self {
+            session,
+            keys,
+            spec_hash,
+            replay: ReplayStatus::default(),
+            learner: LearnerStatus::default(),
+        }
     }
 
     /// Asks the replay server.
@@ -52,14 +58,20 @@ impl Statuses {
     }
 
     fn ask<T: DeserializeOwned>(&self, key: &str, kind: Kind) -> anyhow::Result<T> {
-        let reply: Result<Vec<u8>, SessionError> =
-            session::ask(&self.session, key, ZBytes::new(), Priority::InteractiveHigh, ANSWER_MAX);
-        let (status, _) = codec::decode(&reply?, kind, Some(self.spec_hash)).with_context(|| key.to_owned())?;
+        let reply: Result<Vec<u8>, SessionError> = session::ask(
+            &self.session,
+            key,
+            ZBytes::new(),
+            Priority::InteractiveHigh,
+            ANSWER_MAX,
+        );
+        let (status, _) =
+            codec::decode(&reply?, kind, Some(self.spec_hash)).with_context(|| key.to_owned())?;
         Ok(status)
     }
 
-    /// Leaves the run.
-    pub(crate) fn close(self) {
+    /// Leaves the run; the last answers stay.
+    pub(crate) fn close(&self) {
         if let Err(e) = self.session.close().wait() {
             tracing::debug!("closing the session: {e}");
         }

@@ -15,13 +15,21 @@ fn driml(args: &[&str]) -> Output {
 }
 
 fn driml_in(folder: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_driml")).args(args).current_dir(folder).env_remove("DRIML_LOG").output().unwrap()
+    Command::new(env!("CARGO_BIN_EXE_driml"))
+        .args(args)
+        .current_dir(folder)
+        .env_remove("DRIML_LOG")
+        .output()
+        .unwrap()
 }
 
 /// Exit code and stderr.
 fn said(args: &[&str]) -> (i32, String) {
     let output = driml(args);
-    (output.status.code().unwrap(), String::from_utf8(output.stderr).unwrap())
+    (
+        output.status.code().unwrap(),
+        String::from_utf8(output.stderr).unwrap(),
+    )
 }
 
 fn usage(args: &[&str]) -> String {
@@ -32,22 +40,58 @@ fn usage(args: &[&str]) -> String {
 
 #[test]
 fn names_that_nothing_has() {
-    expect![].assert_eq(&usage(&["local", "--env", "procgen:bigfihs"]));
-    expect![].assert_eq(&usage(&["local", "--env", "pong"]));
-    expect![].assert_eq(&usage(&["local", "--agent", "driml"]));
-    expect![].assert_eq(&usage(&["local", "--preset", "papper"]));
-    expect![].assert_eq(&usage(&["local", "--preset", "split", "--env", "mspacman"]));
-    expect![].assert_eq(&usage(&["local", "--set", "learner.lr=1"]));
+    expect![[r#"
+        error: --env: no world is named "procgen:bigfihs"; did you mean "procgen:bigfish"? (the worlds: procgen:GAME, mspacman, ising, chain; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
+    "#]].assert_eq(&usage(&["local", "--env", "procgen:bigfihs"]));
+    expect![[r#"
+        error: --env: no world is named "pong"; did you mean "ising"? (the worlds: procgen:GAME, mspacman, ising, chain; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
+    "#]].assert_eq(&usage(&["local", "--env", "pong"]));
+    expect![[r#"
+        error: there is no agent "driml"; --agent takes c51, driml-fix, driml-ada, driml-randk
+    "#]]
+    .assert_eq(&usage(&["local", "--agent", "driml"]));
+    expect![[r#"
+        error: there is no preset "papper" (did you mean "paper"?); --preset takes paper, paper-observation, split, smoke (`driml presets` describes them)
+    "#]].assert_eq(&usage(&["local", "--preset", "papper"]));
+    expect![[r#"
+        error: preset "split" is for procgen only, not for mspacman; take --preset paper
+    "#]]
+    .assert_eq(&usage(&["local", "--preset", "split", "--env", "mspacman"]));
+    expect![[r#"
+        error: there is no setting "learner.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_rows, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, update
+    "#]].assert_eq(&usage(&["local", "--set", "learner.lr=1"]));
 }
 
 #[test]
 fn values_that_cannot_work() {
-    expect![].assert_eq(&usage(&["local", "--set", "run.gamma=2"]));
-    expect![].assert_eq(&usage(&["local", "--set", "learner.batch_rows=many"]));
-    expect![].assert_eq(&usage(&["local", "--env", "chain", "--frames", "10"]));
-    expect![].assert_eq(&usage(&["local", "--listen", "localhost"]));
-    expect![].assert_eq(&usage(&["actor", "--connect", "tcp/localhost:1", "--namespace", "a b"]));
-    expect![].assert_eq(&usage(&["local", "--config", "no-such.toml"]));
+    expect![[r#"
+        error: run.gamma = 2 cannot work: a discount lies between 0 and 1
+    "#]]
+    .assert_eq(&usage(&["local", "--set", "run.gamma=2"]));
+    expect![[r#"
+        error: --set learner.batch_rows=many: the value is a whole number, and many is a word
+    "#]]
+    .assert_eq(&usage(&["local", "--set", "learner.batch_rows=many"]));
+    expect![[r#"
+        error: 10 frames are no more than the warm-up of 500: ask for more --frames, or --set replay.warmup_transitions=1
+    "#]].assert_eq(&usage(&["local", "--env", "chain", "--frames", "10"]));
+    expect![[r#"
+        error: "localhost" is no endpoint: take tcp/HOST:PORT, tls/HOST:PORT or unixsock-stream/PATH
+    "#]]
+    .assert_eq(&usage(&["local", "--listen", "localhost"]));
+    expect![[r#"
+        error: namespace "a b" cannot be used: take letters, digits, '-' and '_', in parts separated by single '/'
+    "#]].assert_eq(&usage(&[
+        "actor",
+        "--connect",
+        "tcp/localhost:1",
+        "--namespace",
+        "a b",
+    ]));
+    expect![[r#"
+        error: reading the settings no-such.toml: No such file or directory (os error 2)
+    "#]]
+    .assert_eq(&usage(&["local", "--config", "no-such.toml"]));
 }
 
 #[test]
@@ -65,10 +109,18 @@ fn clap_s_own_refusals_are_usage_too() {
     ] {
         usage(args);
     }
-    for args in [&["--help"][..], &["--version"], &["local", "--help"], &["presets"]] {
+    for args in [
+        &["--help"][..],
+        &["--version"],
+        &["local", "--help"],
+        &["presets"],
+    ] {
         let output = driml(args);
         assert_eq!(output.status.code(), Some(0), "{args:?}");
-        assert!(!output.stdout.is_empty() && output.stderr.is_empty(), "{args:?}");
+        assert!(
+            !output.stdout.is_empty() && output.stderr.is_empty(),
+            "{args:?}"
+        );
     }
 }
 
@@ -77,20 +129,41 @@ fn a_run_folder_in_use_is_not_touched() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::create_dir(folder.path().join("run")).unwrap();
     std::fs::write(folder.path().join("run/metrics.csv"), "old").unwrap();
-    let output = driml_in(folder.path(), &["local", "--env", "chain", "--run-dir", "run"]);
+    let output = driml_in(
+        folder.path(),
+        &["local", "--env", "chain", "--run-dir", "run"],
+    );
     assert_eq!(output.status.code(), Some(64));
-    expect![].assert_eq(&String::from_utf8(output.stderr).unwrap());
-    assert_eq!(std::fs::read_to_string(folder.path().join("run/metrics.csv")).unwrap(), "old");
-    assert_eq!(std::fs::read_dir(folder.path().join("run")).unwrap().count(), 1);
+    expect![[r#"
+        error: the run folder run exists and is not empty: choose another --run-dir, or remove it
+    "#]]
+    .assert_eq(&String::from_utf8(output.stderr).unwrap());
+    assert_eq!(
+        std::fs::read_to_string(folder.path().join("run/metrics.csv")).unwrap(),
+        "old"
+    );
+    assert_eq!(
+        std::fs::read_dir(folder.path().join("run"))
+            .unwrap()
+            .count(),
+        1
+    );
 }
 
 #[test]
 fn a_config_file_at_odds_with_itself() {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("config.toml"), "[run]\nworld = \"chain\"\n").unwrap();
+    std::fs::write(
+        folder.path().join("config.toml"),
+        "[run]\nworld = \"chain\"\n",
+    )
+    .unwrap();
     let output = driml_in(folder.path(), &["local", "--config", "config.toml"]);
     assert_eq!(output.status.code(), Some(64));
-    expect![].assert_eq(&String::from_utf8(output.stderr).unwrap());
+    expect![[r#"
+        error: config.toml: in the settings' [world] table: missing field `cells`
+    "#]]
+    .assert_eq(&String::from_utf8(output.stderr).unwrap());
 }
 
 #[test]
@@ -105,14 +178,22 @@ fn parity_files_that_are_none() {
         assert_eq!(output.status.code(), Some(1));
         String::from_utf8(output.stderr).unwrap()
     };
-    expect![].assert_eq(&in_folder(&["parity", "cut.safetensors"]));
-    expect![].assert_eq(&in_folder(&["parity", "none.safetensors"]));
+    expect![[r#"
+        error: cut.safetensors: not a whole safetensors file: invalid header length
+    "#]]
+    .assert_eq(&in_folder(&["parity", "cut.safetensors"]));
+    expect![[r#"
+        error: cannot read none.safetensors: No such file or directory (os error 2): No such file or directory (os error 2)
+    "#]].assert_eq(&in_folder(&["parity", "none.safetensors"]));
 }
 
 #[test]
 fn nobody_to_join_is_a_failure_at_run_time() {
     let folder = tempfile::tempdir().unwrap();
-    let endpoint = format!("unixsock-stream/{}", folder.path().join("nobody.sock").display());
+    let endpoint = format!(
+        "unixsock-stream/{}",
+        folder.path().join("nobody.sock").display()
+    );
     let (code, text) = said(&["actor", "--connect", &endpoint]);
     assert_eq!(code, 1, "{text}");
     assert!(text.contains("error: "), "{text}");

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use driml_model::Enlarge;
-use driml_protocol::{AffinityUpdate, Batch as WireBatch, WeightsHeader};
+use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, WeightsHeader};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -108,6 +108,16 @@ impl Learning {
         Ok(report)
     }
 
+    /// Writes into `status` what the last update gave.
+    pub fn note(&self, report: &UpdateReport, status: &mut LearnerStatus) {
+        status.updates = self.updates();
+        status.c51_kl = report.c51_kl;
+        status.dim = report.dim;
+        status.total = report.total;
+        status.grad_norm = report.grad_norm;
+        status.q_mean = report.q_mean;
+    }
+
     /// The affinity matrix after the last update, if this agent has one.
     pub fn affinity_update(&self) -> Option<AffinityUpdate> {
         self.affinity.as_ref().map(|affinity| AffinityUpdate {
@@ -124,7 +134,7 @@ impl Learning {
 
     /// Whether a checkpoint is due after this many updates.
     pub const fn checkpoint_is_due(&self) -> bool {
-        self.learner.updates().is_multiple_of(self.part.learner.checkpoint_period_updates)
+        self.updates() > 0 && self.updates().is_multiple_of(self.part.learner.checkpoint_period_updates)
     }
 
     /// The present weights as a new version.

@@ -70,12 +70,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         }
         let ended = Instant::now();
         outlets.with_status(|status| {
-            status.updates = learning.updates();
-            status.c51_kl = report.c51_kl;
-            status.dim = report.dim;
-            status.total = report.total;
-            status.grad_norm = report.grad_norm;
-            status.q_mean = report.q_mean;
+            learning.note(&report, status);
             status.waiting_s += (started - waiting_since).as_secs_f64();
             status.computing_s += (ended - started).as_secs_f64();
         });

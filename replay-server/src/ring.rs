@@ -238,3 +238,64 @@ impl Ring {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use rand::{Rng, SeedableRng};
+
+    use super::*;
+
+    proptest! {
+        /// Against a plain list of all that was ever pushed, in which every relation is searched for.
+        #[test]
+        fn equals_a_plain_list(seed in any::<u64>(), capacity in 1u64..40, streams in 1usize..4) {
+            struct Pushed { stream: usize, frame: [u8; 2], reward: f32, end: End, cut: bool }
+            let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+            let mut ring = Ring::new(capacity, 2).unwrap();
+            let mut list: Vec<Pushed> = vec![];
+            for index in 0..120u64 {
+                let stream = rng.random_range(0..streams);
+                let ends = [End::Running, End::Running, End::LevelChange, End::TimedOut, End::Terminal];
+                let end = ends[rng.random_range(0..ends.len())];
+                let last = list.iter().rposition(|pushed| pushed.stream == stream);
+                let cut = rng.random_bool(0.1);
+                let link = match last {
+                    _ if cut => Link::Lost,
+                    Some(last) => Link::following(last as u64, list[last].end),
+                    None => Link::EpisodeStart,
+                };
+                let frame = rng.random::<[u8; 2]>();
+                let reward = rng.random();
+                prop_assert_eq!(ring.push(&frame, Step::new(3, reward, end, index), link), index);
+                list.push(Pushed { stream, frame, reward, end, cut });
+                ring.check_valid();
+                prop_assert_eq!(ring.oldest(), (index + 1).saturating_sub(capacity));
+                for i in ring.oldest()..=index {
+                    let pushed = &list[i as usize];
+                    prop_assert_eq!(ring.frame(i), pushed.frame);
+                    let step = ring.step(i);
+                    prop_assert_eq!((step.reward, step.end, step.weights_version), (pushed.reward, pushed.end, i));
+                    let of_stream = |pushed: &&Pushed| pushed.stream == list[i as usize].stream;
+                    let after = list.iter().skip(i as usize + 1).find(of_stream);
+                    let follows = after.is_some_and(|next| !pushed.end.is_episode_end() && !next.cut);
+                    let next = list.iter().skip(i as usize + 1).position(|p| p.stream == pushed.stream);
+                    prop_assert_eq!(step.next(), follows.then(|| i + 1 + next.unwrap() as u64));
+                    let before = list[..i as usize].iter().rposition(|p| p.stream == pushed.stream);
+                    let previous = match before {
+                        _ if pushed.cut => Previous::Gone,
+                        Some(at) if list[at].end == End::Running && (at as u64) < ring.oldest() => Previous::Gone,
+                        Some(at) if list[at].end == End::Running => Previous::Held(at as u64),
+                        _ => Previous::Start,
+                    };
+                    prop_assert_eq!(ring.previous(i), previous);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn memory_that_is_not_there_is_an_error() {
+        assert_eq!(Ring::new(1 << 50, 1 << 12).err(), Some(1 << 62));
+    }
+}

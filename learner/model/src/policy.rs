@@ -1,61 +1,210 @@
-//! The network as actors run it: states in, best actions out.
-//! It has no DIM heads and no exploration.
+//! The network as an actor uses it: frames to expected returns and greedy actions, without a graph.
+//! It does not explore, and it holds no DIM head.
+//!
+//! It runs the same kernels as `Network`. The batch is split over the rayon pool once, not layer by layer, so that a
+//! task's maps stay in its core's cache.
 
-use candle_core::{Device, Tensor};
+use rayon::prelude::*;
 
-use crate::{ModelConfig, ModelError, Network, Parameters};
+use crate::c51_head::expected_returns;
+use crate::config::ModelConfig;
+use crate::error::{ModelError, Result};
+use crate::gemm::Matrix;
+use crate::im2col::{ConvScratch, ConvShape, Images, forward, grown};
+use crate::linear::{self, relu_in_place};
+use crate::weights::{decode, is_dim};
 
-/// Torso and C51 head, ready to run.
+/// Frames that go through the network together on one thread.
+const TILE_FRAMES: usize = 32;
+
+/// Torso and C51 head for inference.
 pub struct PolicyNetwork {
     config: ModelConfig,
-    network: Network,
-}
-
-fn load(config: &ModelConfig, safetensors: &[u8]) -> Result<Network, ModelError> {
-    let parameters = Parameters::load_safetensors(config, safetensors, &Device::Cpu)?;
-    Network::new(config, &parameters)
+    support: Vec<f32>,
+    weights: PolicyWeights,
+    /// One a task.
+    scratch: Vec<Scratch>,
+    values: Vec<f32>,
 }
 
 impl PolicyNetwork {
-    /// A network with the weights of a safetensors file.
+    /// The network of `config` with the weights of a safetensors file; DIM parameters in it are ignored.
     ///
     /// # Errors
-    /// Sizes that cannot work, or weights that do not fit them.
-    pub fn new(config: &ModelConfig, safetensors: &[u8]) -> Result<Self, ModelError> {
+    /// An invalid configuration, bytes that are not safetensors, or a parameter that is missing, unknown, of another type
+    /// or shape, or not finite.
+    pub fn new(config: &ModelConfig, safetensors: &[u8]) -> Result<Self> {
         let config = config.without_dim();
-        Ok(Self { network: load(&config, safetensors)?, config })
+        let weights = PolicyWeights::decode(&config, safetensors)?;
+        Ok(Self { support: config.atoms_support(), config, weights, scratch: Vec::new(), values: Vec::new() })
     }
 
-    /// Replaces the weights; on an error the old ones stay.
+    /// Replaces the weights. On an error the old ones stay.
     ///
     /// # Errors
-    /// Weights that do not fit the model.
-    pub fn load(&mut self, safetensors: &[u8]) -> Result<(), ModelError> {
-        self.network = load(&self.config, safetensors)?;
+    /// As for [`PolicyNetwork::new`].
+    pub fn load(&mut self, safetensors: &[u8]) -> Result<()> {
+        self.weights = PolicyWeights::decode(&self.config, safetensors)?;
         Ok(())
     }
 
-    /// Writes the best action of each state: `states` [B, H, W, C], `actions` [B]. Of equal ones the first.
+    /// Expected returns `values` [B, A] of `frames` [B, H, W, C].
     ///
     /// # Errors
-    /// States of another size.
-    pub fn greedy_actions(&mut self, states: &[u8], actions: &mut [u8]) -> Result<(), ModelError> {
-        let q = self.q_values(states, actions.len())?;
-        for (action, q) in actions.iter_mut().zip(q.chunks_exact(self.config.num_actions)) {
-            let best = q.iter().enumerate().fold(0, |best, (i, value)| if *value > q[best] { i } else { best });
-            *action = best as u8;
+    /// [`ModelError::Input`] if the lengths do not match; [`ModelError::NotFinite`] if a value is not finite.
+    pub fn q_values(&mut self, frames: &[u8], values: &mut [f32]) -> Result<()> {
+        let (frame_len, actions) = (self.config.frame_len(), self.config.num_actions);
+        let batch = values.len() / actions;
+        if values.len() != batch * actions || frames.len() != batch * frame_len {
+            let (bytes, count) = (frames.len(), values.len());
+            return Err(ModelError::Input(format!(
+                "{bytes} bytes of frames of {frame_len} for {count} values of {actions} actions"
+            )));
         }
-        Ok(())
+        let tasks = rayon::current_num_threads().min(batch);
+        if self.scratch.len() < tasks {
+            self.scratch.resize_with(tasks, Scratch::default);
+        }
+        let (weights, support) = (&self.weights, &self.support);
+        if tasks <= 1 {
+            if let Some(scratch) = self.scratch.first_mut() {
+                weights.q_values(support, frames, values, scratch);
+            }
+        } else {
+            let share = batch.div_ceil(tasks);
+            let values = values.par_chunks_mut(share * actions);
+            let frames = frames.par_chunks(share * frame_len);
+            values.zip(frames).zip(&mut self.scratch).for_each(|((values, frames), scratch)| {
+                weights.q_values(support, frames, values, scratch);
+            });
+        }
+        match values.iter().position(|value| !value.is_finite()) {
+            Some(index) => Err(ModelError::NotFinite { row: index / actions }),
+            None => Ok(()),
+        }
     }
 
-    /// Expected returns [B, A] of `states` [B, H, W, C].
+    /// Writes the action of largest expected return, the lowest on a tie, for each of `frames` [B, H, W, C] to
+    /// `actions` [B].
     ///
     /// # Errors
-    /// States of another size.
-    pub fn q_values(&mut self, states: &[u8], batch: usize) -> Result<Vec<f32>, ModelError> {
-        let ModelConfig { height, width, channels, .. } = self.config;
-        let frames = Tensor::from_slice(states, (batch, height, width, channels), &Device::Cpu)?;
-        let logits = self.network.logits(&self.network.features(&frames)?.f4)?;
-        Ok(self.network.q_values(&logits)?.flatten_all()?.to_vec1()?)
+    /// As for [`PolicyNetwork::q_values`].
+    pub fn greedy_actions(&mut self, frames: &[u8], actions: &mut [u8]) -> Result<()> {
+        let count = self.config.num_actions;
+        let mut values = std::mem::take(&mut self.values);
+        values.resize(actions.len() * count, 0.0);
+        let result = self.q_values(frames, &mut values);
+        if result.is_ok() {
+            for (action, values) in actions.iter_mut().zip(values.chunks_exact(count)) {
+                let better = |best: usize, next: usize| if values[next] > values[best] { next } else { best };
+                let best = (1..count).fold(0, better);
+                *action = u8::try_from(best).expect("a valid configuration has at most 255 actions");
+            }
+        }
+        self.values = values;
+        result
     }
+}
+
+/// Weights as the kernels want them.
+struct PolicyWeights {
+    convolutions: Vec<Convolution>,
+    fc: Dense,
+    head: Dense,
+}
+
+struct Convolution {
+    shape: ConvShape,
+    packed: Vec<f32>,
+    bias: Vec<f32>,
+}
+
+/// A fully connected layer with its weight as [in, out].
+struct Dense {
+    weight: Vec<f32>,
+    bias: Vec<f32>,
+}
+
+/// Buffers that one task keeps between calls.
+#[derive(Default)]
+struct Scratch {
+    conv: ConvScratch,
+    maps: Vec<f32>,
+    next_maps: Vec<f32>,
+    hidden: Vec<f32>,
+    logits: Vec<f32>,
+}
+
+impl PolicyWeights {
+    fn decode(config: &ModelConfig, safetensors: &[u8]) -> Result<Self> {
+        let mut parameters = decode(config, safetensors, is_dim)?;
+        let mut take = |name: &str| {
+            let (_, values) = parameters.remove(name).expect("decode returns every parameter of the configuration");
+            values
+        };
+        let (mut height, mut width, mut channels_in) = (config.height, config.width, config.channels);
+        let mut convolutions = Vec::with_capacity(config.conv.len());
+        for (index, layer) in config.conv.iter().enumerate() {
+            let (channels_out, kernel, stride) = (layer.out, layer.kernel, layer.stride);
+            let shape = ConvShape { height, width, channels_in, channels_out, kernel, stride };
+            let packed = shape.pack_weight(&take(&format!("torso.conv{}.weight", index + 1)));
+            let bias = take(&format!("torso.conv{}.bias", index + 1));
+            convolutions.push(Convolution { shape, packed, bias });
+            (height, width, channels_in) = (shape.out_height(), shape.out_width(), channels_out);
+        }
+        // The inputs in our maps' order, row, column, channel, instead of PyTorch's channel, row, column.
+        let column = |input: usize| input % channels_in * height * width + input / channels_in;
+        let fc_weight = transposed(&take("torso.fc.weight"), config.hidden, column);
+        let fc = Dense { weight: fc_weight, bias: take("torso.fc.bias") };
+        let head_weight = transposed(&take("head.weight"), config.num_actions * config.atoms, |input| input);
+        let head = Dense { weight: head_weight, bias: take("head.bias") };
+        Ok(Self { convolutions, fc, head })
+    }
+
+    fn q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32], scratch: &mut Scratch) {
+        let frame_len = self.convolutions.first().map_or(1, |first| first.shape.image_len());
+        let actions = self.head.bias.len() / support.len();
+        let tiles = frames.chunks(TILE_FRAMES * frame_len).zip(values.chunks_mut(TILE_FRAMES * actions));
+        for (frames, values) in tiles {
+            self.tile_q_values(support, frames, values, scratch);
+        }
+    }
+
+    fn tile_q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32], scratch: &mut Scratch) {
+        let Scratch { conv, maps, next_maps, hidden, logits } = scratch;
+        let batch = values.len() * support.len() / self.head.bias.len();
+        for (index, Convolution { shape, packed, bias }) in self.convolutions.iter().enumerate() {
+            let images = match index {
+                0 => Images::Bytes(frames),
+                _ => Images::Floats(&maps[..batch * shape.image_len()]),
+            };
+            forward(shape, images, packed, bias, grown(next_maps, batch * shape.map_len()), conv);
+            std::mem::swap(maps, next_maps);
+        }
+        let flat = self.fc.weight.len() / self.fc.bias.len();
+        let hidden = self.fc.forward(&maps[..batch * flat], batch, hidden);
+        relu_in_place(hidden);
+        let logits = self.head.forward(hidden, batch, logits);
+        expected_returns(logits, support, values);
+    }
+}
+
+impl Dense {
+    fn forward<'a>(&self, x: &[f32], batch: usize, y: &'a mut Vec<f32>) -> &'a mut [f32] {
+        let outputs = self.bias.len();
+        let inputs = self.weight.len() / outputs;
+        let y = grown(y, batch * outputs);
+        linear::forward(Matrix::new(x, batch, inputs), Matrix::new(&self.weight, inputs, outputs), &self.bias, y);
+        y
+    }
+}
+
+/// A weight [out, in] as [in, out], whose input i is column `column(i)` of the original.
+fn transposed(weight: &[f32], outputs: usize, column: impl Fn(usize) -> usize) -> Vec<f32> {
+    let inputs = weight.len() / outputs;
+    let mut result = Vec::with_capacity(weight.len());
+    for input in 0..inputs {
+        result.extend((0..outputs).map(|output| weight[output * inputs + column(input)]));
+    }
+    result
 }

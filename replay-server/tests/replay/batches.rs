@@ -51,7 +51,7 @@ fn check_batch(batch: &Batch, history: &History) {
         if batch.positives() == 1 {
             let k = usize::from(batch.ks()[row]);
             let right = match (spec.horizon, want.steps_left) {
-                (_, left) if left == 0 => k == 0,
+                (_, 0) => k == 0,
                 (Horizon::Fixed { .. }, left) => k == left,
                 (_, left) => (1..=left).contains(&k),
             };

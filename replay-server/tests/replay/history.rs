@@ -26,6 +26,8 @@ pub(crate) struct History {
     pub(crate) spec: RunSpec,
     pub(crate) capacity: u64,
     pub(crate) inserted: u64,
+    /// Whether episodes and levels ever end.
+    pub(crate) ends: bool,
     pub(crate) streams: BTreeMap<StreamKey, Vec<Record>>,
 }
 
@@ -106,6 +108,7 @@ impl History {
             spec: spec.clone(),
             capacity,
             inserted: 0,
+            ends: true,
             streams: BTreeMap::new(),
         }
     }
@@ -128,6 +131,7 @@ impl History {
             for step in 0..header.steps {
                 let row = (stream * header.steps + step) as usize;
                 let end = match rng.random_range(0..20) {
+                    _ if !self.ends => End::Running,
                     0 => End::Terminal,
                     1 => End::TimedOut,
                     2 => End::LevelChange,
