@@ -112,13 +112,13 @@ impl Courier {
         let mut produced = 0;
         let mut unwanted = 0;
         let mut outcome = Ok(());
-        for chunk in chunks {
+        for mut chunk in chunks {
             let transitions = chunk.header.transitions() as u64;
             produced += transitions;
             last = Some((chunk.header.actor, chunk.header.epoch));
             // After a failure the rest is only counted, so that the goodbye tells the truth.
             if outcome.is_ok() {
-                match self.deliver(&chunk) {
+                match self.deliver(&mut chunk) {
                     Ok(true) => {}
                     Ok(false) => unwanted += transitions,
                     Err(e) => {
@@ -135,8 +135,7 @@ impl Courier {
     }
 
     /// Whether the chunk was stored; `false` if it is no longer wanted.
-    fn deliver(&self, chunk: &Chunk) -> anyhow::Result<bool> {
-        let (head, planes) = chunk.seal(self.spec_hash)?;
+    fn deliver(&self, chunk: &mut Chunk) -> anyhow::Result<bool> {
         let mut answered = Instant::now();
         let mut draining_since = None;
         loop {
@@ -145,8 +144,10 @@ impl Courier {
                 if since.elapsed() > DRAIN_MAX {
                     bail!("chunk {} was not stored within {DRAIN_MAX:?} of the end", chunk.header.sequence);
                 }
+                chunk.header.leaving = true;
             }
-            match self.ask(&self.keys.ingest(), Kind::InsertReply, session::join_pieces([head.clone(), planes.to_vec()])) {
+            let (head, planes) = chunk.seal(self.spec_hash)?;
+            match self.ask(&self.keys.ingest(), Kind::InsertReply, session::join_pieces([head, planes.to_vec()])) {
                 Ok(InsertReply::Stored { inserted_total }) => {
                     self.answers.inserted_total.store(inserted_total, Ordering::Relaxed);
                     return Ok(true);

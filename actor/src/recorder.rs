@@ -30,7 +30,7 @@ impl Recorder {
             epoch,
             sequence: 0,
             first_transition: 0,
-            weights_version: 0,
+            weights_version: 0, leaving: false,
             streams,
             steps,
             frame_bytes,

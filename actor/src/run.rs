@@ -40,7 +40,7 @@ pub struct RunArgs {
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let session = session::open(&Endpoints { listen: Vec::new(), connect: args.connect })?;
-    let hello = session::join(&session, &keys, shutdown)?;
+    let Some(hello) = session::join(&session, &keys, shutdown)? else { return Ok(()) };
     let mut settings = ActorSettings::from_toml(&hello.config_toml)
         .context("the settings that the replay server sent")?;
     if let Some(envs) = args.envs {
@@ -48,8 +48,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         settings.actor.validate()?;
     }
     let spec_hash = settings.spec.hash();
-    let (header, weights) =
+    let first =
         weight_watch::first_weights(&session, &keys, spec_hash, WEIGHTS_WAIT_MAX, shutdown)?;
+    let Some((header, weights)) = first else { return Ok(()) };
     let limits = DeliveryLimits {
         chunks_in_flight_max: settings.actor.chunks_in_flight_max as usize,
         ack_timeout: Duration::from_millis(settings.actor.ack_timeout_ms),

@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use driml_protocol::{Keys, Kind, Shutdown, WeightsHeader, WeightsVersion, codec, session};
 use zenoh::{Session, Wait, bytes::ZBytes, handlers::RingChannel, qos::Priority};
 
@@ -37,21 +37,21 @@ impl Newest {
     }
 }
 
-/// Pulls the first weights, waiting until the learner has some.
+/// Pulls the first weights, waiting until the learner has some; `None` if told to stop before.
 ///
 /// # Errors
-/// No learner within `wait_max`, or a stop.
+/// No learner within `wait_max`.
 pub(crate) fn first_weights(
     session: &Session,
     keys: &Keys,
     spec_hash: u64,
     wait_max: Duration,
     shutdown: &Shutdown,
-) -> anyhow::Result<Weights> {
+) -> anyhow::Result<Option<Weights>> {
     let started = Instant::now();
     loop {
         match pull(session, keys, spec_hash) {
-            Ok(weights) => return Ok(weights),
+            Ok(weights) => return Ok(Some(weights)),
             Err(e) if started.elapsed() > wait_max => {
                 return Err(e).context(format!(
                     "no weights within {wait_max:?}: is the learner running and connected to the same replay server?"
@@ -60,7 +60,7 @@ pub(crate) fn first_weights(
             Err(e) => tracing::debug!("no weights yet: {e:#}"),
         }
         if shutdown.wait_timeout(Duration::from_millis(200)) {
-            bail!("told to stop before the first weights came");
+            return Ok(None);
         }
     }
 }

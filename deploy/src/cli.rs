@@ -27,6 +27,8 @@ pub(crate) enum Command {
     Evaluate(EvaluateArgs),
     /// Check the learner's arithmetic against updates computed elsewhere in float64
     Parity(ParityArgs),
+    /// Draw a column of several runs' metrics over their frames
+    Plot(PlotArgs),
     /// List the presets
     Presets,
     /// Procgen's engine
@@ -165,6 +167,19 @@ pub(crate) struct EvaluateArgs {
     /// Seed of the worlds and of exploration
     #[arg(long, value_name = "S", default_value_t = 0)]
     pub(crate) seed: u64,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct PlotArgs {
+    /// Folders of runs
+    #[arg(value_name = "RUN", required = true)]
+    pub(crate) runs: Vec<PathBuf>,
+    /// Column of metrics.csv
+    #[arg(long, default_value = "mean_return")]
+    pub(crate) column: String,
+    /// Picture to write (SVG)
+    #[arg(long, value_name = "FILE", default_value = "plot.svg")]
+    pub(crate) out: PathBuf,
 }
 
 #[derive(Debug, Args)]

@@ -3,10 +3,13 @@
 
 use std::{
     sync::{Arc, Condvar, Mutex},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use tokio::signal::unix::{SignalKind, signal};
+
+/// Signals closer together are one wish: tools such as `timeout` signal the process and its group.
+const ONE_WISH: Duration = Duration::from_millis(300);
 
 /// A shared count of interrupts.
 #[derive(Clone, Debug, Default)]
@@ -37,13 +40,17 @@ impl Interrupts {
             .name("interrupts".into())
             .spawn(move || {
                 runtime.block_on(async {
+                    let mut last: Option<Instant> = None;
                     loop {
                         tokio::select! {
                             _ = interrupt.recv() => {}
                             _ = terminate.recv() => {}
                             _ = hangup.recv() => {}
                         }
-                        counted.add();
+                        if last.is_none_or(|last| last.elapsed() > ONE_WISH) {
+                            counted.add();
+                        }
+                        last = Some(Instant::now());
                     }
                 });
             })?;

@@ -16,6 +16,7 @@ mod lockstep;
 mod machine;
 mod overrides;
 mod plan;
+mod plot;
 mod presets;
 mod processes;
 mod record;
@@ -115,6 +116,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::ReplayServer(args) => replay_server(args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Parity(args) => parity(&args),
+        Command::Plot(args) => plot::run(&args),
         Command::Presets => print(&presets::describe()),
         Command::Procgen(ProcgenCommand::Install) => {
             let engine = procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;

@@ -146,9 +146,9 @@ pub(crate) fn describe(
         (
             "replay",
             format!(
-                "the newest {} transitions, up to {:.1} GiB of memory",
+                "the newest {} transitions, up to {} of memory",
                 replay.capacity_transitions.min(config.frames()),
-                bytes as f64 / f64::from(1 << 30)
+                size(bytes)
             ),
         ),
         ("run folder", run_dir.display().to_string()),
@@ -168,6 +168,14 @@ pub(crate) fn describe(
         text.push_str(&format!("{:<12}{note}\n", "note"));
     }
     text
+}
+
+/// Bytes for a person.
+fn size(bytes: u64) -> String {
+    match bytes >> 20 {
+        mib @ 0..1024 => format!("{} MiB", mib + 1),
+        mib => format!("{:.1} GiB", mib as f64 / 1024.0),
+    }
 }
 
 /// A time that pretends to no more precision than an estimate has.

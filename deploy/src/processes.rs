@@ -40,6 +40,8 @@ const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 /// How long the replay server may take to end, once it is told to stop.
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
+/// How often a learner that saves is asked whether it is done.
+const DRAIN_POLL: Duration = Duration::from_millis(100);
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
 const PART_THREADS: u32 = 1;
 
@@ -319,7 +321,7 @@ impl Launch<'_> {
                 .iter()
                 .for_each(|actor| self.screen.line(&format!("while stopping, {actor}")));
         }
-        self.ask_all();
+        self.hear_the_learner_out(&hurry);
         late.extend(self.stop(
             LEARNER.min(last)..FIRST_ACTOR.min(last),
             true,
@@ -343,13 +345,21 @@ impl Launch<'_> {
         Ok(())
     }
 
-    fn ask_all(&mut self) {
-        if let Some(statuses) = &mut self.statuses {
-            for answer in [statuses.ask_replay(), statuses.ask_learner()] {
-                if let Err(e) = answer {
-                    tracing::debug!("a last question: {e:#}");
-                }
+    /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
+    fn hear_the_learner_out(&mut self, hurry: &impl Fn() -> bool) {
+        let Some(learner) = self.parts.get_mut(LEARNER) else { return };
+        learner.ask_to_stop();
+        let deadline = Instant::now() + LEARNER_DRAIN_MAX;
+        let Some(statuses) = &mut self.statuses else { return };
+        while Instant::now() < deadline && !hurry() {
+            if let Err(e) = statuses.ask_learner() {
+                tracing::debug!("a last question: {e:#}");
+                return;
             }
+            if statuses.learner.finished {
+                return;
+            }
+            std::thread::sleep(DRAIN_POLL);
         }
     }
 

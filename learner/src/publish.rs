@@ -2,8 +2,11 @@
 //! It computes none of it.
 
 use std::{
-    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
-    time::Duration,
+    sync::{
+        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::{Duration, Instant},
 };
 
 use driml_protocol::{
@@ -26,6 +29,7 @@ const AFFINITY_TIMEOUT: Duration = Duration::from_secs(5);
 pub(crate) struct Outlets {
     weights: Arc<Mutex<Option<(Vec<u8>, Vec<u8>)>>>,
     status: Arc<Mutex<LearnerStatus>>,
+    heard: Arc<AtomicBool>,
     affinity: Arc<Newest>,
     version: Publisher<'static>,
     spec_hash: u64,
@@ -65,12 +69,17 @@ impl Outlets {
             .wait()
             .map_err(failed)?;
         let status: Arc<Mutex<LearnerStatus>> = Arc::default();
-        let held = status.clone();
+        let heard: Arc<AtomicBool> = Arc::default();
+        let (held, told) = (status.clone(), heard.clone());
         let status_queryable = session
             .declare_queryable(keys.learner_status())
             .callback(move |query| {
-                match codec::encode(Kind::LearnerStatus, spec_hash, &*lock(&held), &[]) {
-                    Ok(bytes) => session::answer(&query, bytes.into()),
+                let status = lock(&held).clone();
+                match codec::encode(Kind::LearnerStatus, spec_hash, &status, &[]) {
+                    Ok(bytes) => {
+                        session::answer(&query, bytes.into());
+                        told.store(status.finished, Ordering::Relaxed);
+                    }
                     Err(e) => tracing::warn!("the learner's status was not sent: {e}"),
                 }
             })
@@ -93,7 +102,7 @@ impl Outlets {
         };
         std::thread::Builder::new().name("affinity".into()).spawn(move || sender.run())?;
         let _queryables = [weights_queryable, status_queryable];
-        Ok(Self { weights, status, affinity, version, spec_hash, _queryables })
+        Ok(Self { weights, status, heard, affinity, version, spec_hash, _queryables })
     }
 
     /// Makes `weights` the ones that actors get, and announces them.
@@ -115,6 +124,14 @@ impl Outlets {
     pub(crate) fn send_affinity(&self, update: AffinityUpdate) {
         *lock(&self.affinity.slot) = Some(update);
         self.affinity.filled.notify_one();
+    }
+
+    /// Waits until somebody has asked for the status since the learner finished, or for `wait_max`.
+    pub(crate) fn wait_until_heard(&self, wait_max: Duration) {
+        let started = Instant::now();
+        while !self.heard.load(Ordering::Relaxed) && started.elapsed() < wait_max {
+            std::thread::sleep(Duration::from_millis(20));
+        }
     }
 
     /// Changes the status that others see.

@@ -2,7 +2,7 @@
 //! The learning itself is `learning`, which knows no network.
 
 use std::{
-    path::PathBuf,
+    path::{Path, PathBuf},
     time::{Duration, Instant},
 };
 
@@ -20,6 +20,8 @@ use crate::{
     publish::Outlets,
 };
 
+/// How long a learner that was told to stop stays to be asked for its last status.
+const LAST_WORD_MAX: Duration = Duration::from_secs(3);
 /// How often a waiting learner looks whether it should stop.
 const TICK: Duration = Duration::from_millis(200);
 
@@ -41,11 +43,12 @@ pub struct RunArgs {
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let session = session::open(&Endpoints { listen: Vec::new(), connect: args.connect })?;
-    let hello = session::join(&session, &keys, shutdown)?;
+    let Some(hello) = session::join(&session, &keys, shutdown)? else { return Ok(()) };
     let part = LearnerPart::from_toml(&hello.config_toml)
         .context("the settings that the replay server sent")?;
     let (rows, in_flight) = (part.learner.batch_rows, part.learner.batches_in_flight);
     let mut learning = Learning::new(part)?;
+    keep_settings(&args.run_dir, &hello.config_toml)?;
     let folder = args.run_dir.join("checkpoints");
     let spec_hash = learning.spec_hash();
     let outlets = Outlets::open(&session, &keys, spec_hash, shutdown)?;
@@ -88,5 +91,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     outlets.with_status(|status| status.finished = true);
     tracing::info!("finished after {} updates", learning.updates());
     shutdown.wait();
+    outlets.wait_until_heard(LAST_WORD_MAX);
     session.close().wait().map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+}
+
+/// Leaves the run's settings beside the checkpoints, for `driml evaluate`; a file that is there is the launcher's.
+fn keep_settings(run_dir: &Path, config_toml: &str) -> anyhow::Result<()> {
+    let path = run_dir.join("config.toml");
+    if path.exists() {
+        return Ok(());
+    }
+    std::fs::create_dir_all(run_dir)
+        .and_then(|()| std::fs::write(&path, config_toml))
+        .with_context(|| format!("writing {}", path.display()))
 }

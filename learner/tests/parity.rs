@@ -1,6 +1,8 @@
 //! The project's update against updates computed elsewhere in float64, and the check against broken files.
 //! It makes no cases of its own; `learner` does.
 
+#![allow(clippy::unwrap_used)]
+
 use std::{fs, path::PathBuf};
 
 use driml_learner::parity::{ParityReport, check_file};

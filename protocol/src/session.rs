@@ -63,9 +63,6 @@ pub enum JoinError {
         /// The last try's error.
         last: SessionError,
     },
-    /// Told to stop while waiting.
-    #[error("told to stop before a replay server answered")]
-    Stopped,
     /// An answer that cannot be read.
     #[error("the replay server's greeting: {0}")]
     Codec(#[from] CodecError),
@@ -165,20 +162,20 @@ pub fn answer(query: &Query, payload: ZBytes) {
     }
 }
 
-/// Asks the replay server for the run's settings, waiting for it if it is not there yet.
+/// Asks the replay server for the run's settings, waiting for it if it is not there yet; `None` if told to stop before.
 ///
 /// # Errors
-/// Nobody there within a minute, another protocol version, or a stop.
-pub fn join(session: &Session, keys: &Keys, shutdown: &Shutdown) -> Result<Hello, JoinError> {
+/// Nobody there within a minute, or another protocol version.
+pub fn join(session: &Session, keys: &Keys, shutdown: &Shutdown) -> Result<Option<Hello>, JoinError> {
     let started = Instant::now();
     loop {
         match ask(session, &keys.hello(), ZBytes::new(), Priority::Data, JOIN_TRY) {
-            Ok(bytes) => return Ok(codec::decode(&bytes, Kind::Hello, None)?.0),
+            Ok(bytes) => return Ok(Some(codec::decode(&bytes, Kind::Hello, None)?.0)),
             Err(last) if started.elapsed() > JOIN_MAX => return Err(JoinError::Nobody { last }),
             Err(e) => tracing::debug!("no replay server yet: {e}"),
         }
         if shutdown.wait_timeout(Duration::from_millis(200)) {
-            return Err(JoinError::Stopped);
+            return Ok(None);
         }
     }
 }

@@ -50,6 +50,8 @@ pub struct ChunkHeader {
     pub first_transition: u64,
     /// The weights that chose every action of this chunk; 0 before the first.
     pub weights_version: u64,
+    /// The actor was told to stop and sends what it has left: the rate limiter lets it pass.
+    pub leaving: bool,
     /// Copies of the world, each a stream of its own.
     pub streams: u32,
     /// Consecutive steps of each stream in this chunk.

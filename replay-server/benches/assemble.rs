@@ -41,6 +41,7 @@ fn chunk(sequence: u64) -> Chunk {
         sequence,
         first_transition: sequence * u64::from(STREAMS * STEPS),
         weights_version: 1,
+        leaving: false,
         streams: STREAMS,
         steps: STEPS,
         frame_bytes: 64 * 64 * 3,

@@ -1,1 +1,55 @@
-//! driml-tests
+//! A whole system under test: a folder, processes, a client, and a deadline on each wait.
+//! It knows nothing of any one test, sleeps only between two looks at a condition, and leaves no process behind.
+
+#![allow(
+    clippy::unwrap_used,
+    reason = "a harness fails by panicking in the test that uses it"
+)]
+
+mod client;
+mod process;
+mod run_folder;
+mod system;
+
+pub use client::Client;
+pub use process::{Ended, Process};
+pub use run_folder::RunFolder;
+pub use system::{Survivor, TestSystem};
+
+use std::{
+    io::Write,
+    thread,
+    time::{Duration, Instant},
+};
+
+/// How long any one wait may take. Far more than a busy machine of two cores needs, and short of a CI job's limit.
+pub const DEADLINE: Duration = Duration::from_secs(180);
+/// Between two looks at a condition.
+const LOOK_AGAIN: Duration = Duration::from_millis(10);
+
+/// Waits until `look` gives something.
+///
+/// # Panics
+/// At the [`DEADLINE`], saying what was waited for.
+pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
+    let started = Instant::now();
+    loop {
+        if let Some(seen) = look() {
+            return seen;
+        }
+        assert!(started.elapsed() < DEADLINE, "waited {DEADLINE:?} for: {what}");
+        thread::sleep(LOOK_AGAIN);
+    }
+}
+
+/// Whether `test`, which needs Procgen's engine, is to be skipped; a line on stderr then names it.
+///
+/// The line does not go through `eprintln!`, whose output the test runner keeps to itself when a test passes.
+pub fn skipped_offline(test: &str) -> bool {
+    let offline = std::env::var_os("DRIML_OFFLINE").is_some_and(|value| !value.is_empty() && value != "0");
+    if offline {
+        let line = format!("skipped: {test} (DRIML_OFFLINE=1)\n");
+        std::io::stderr().write_all(line.as_bytes()).expect("stderr is there while tests run");
+    }
+    offline
+}

@@ -1,6 +1,8 @@
 //! The learner as its process uses it: updates on made-up batches, and checkpoints.
 //! The arithmetic's oracle is in `parity`; here is what must hold for any batch.
 
+#![allow(clippy::unwrap_used)]
+
 mod checkpoint;
 mod made_up;
 mod update;

@@ -117,7 +117,7 @@ proptest! {
             let number = rng.random_range(0..actors);
             let fresh = |epoch| Actor {
                 next: ChunkHeader {
-                    actor: number, epoch, sequence: 0, first_transition: 0, weights_version: 0,
+                    actor: number, epoch, sequence: 0, first_transition: 0, weights_version: 0, leaving: false,
                     streams, steps: 1, frame_bytes: spec.frame_bytes() as u32,
                 },
                 part: 0,

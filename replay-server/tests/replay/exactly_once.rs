@@ -21,7 +21,7 @@ fn header(actor: u32, epoch: u64, sequence: u64, first_transition: u64) -> Chunk
         epoch,
         sequence,
         first_transition,
-        weights_version: 0,
+        weights_version: 0, leaving: false,
         streams: 2,
         steps: 3,
         frame_bytes: small_spec().frame_bytes() as u32,

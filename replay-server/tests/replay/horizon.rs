@@ -194,7 +194,7 @@ fn the_k_served_follow_the_law() {
             epoch: 1,
             sequence,
             first_transition: sequence * 10,
-            weights_version: 0,
+            weights_version: 0, leaving: false,
             streams: 2,
             steps: 5,
             frame_bytes: spec.frame_bytes() as u32,

@@ -1,1 +1,11 @@
-//! Tests.
+//! Tests of the network from outside: kernels against stock candle operations, the parity cases, weights, the policy.
+//! They know nothing of losses; the learner's tests check the gradients of those.
+#![allow(clippy::unwrap_used, missing_docs)]
+
+mod conv;
+mod linear;
+mod network;
+mod parity;
+mod policy;
+mod support;
+mod weights;

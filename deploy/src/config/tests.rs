@@ -1,0 +1,232 @@
+//! Presets, flags, `--set` and files: what they resolve to, and what is said of those that cannot work.
+//! The texts of single `--set`s are tested beside `overrides`.
+
+use expect_test::expect;
+
+use super::*;
+use crate::presets::{AGENTS, PRESETS};
+
+const MACHINE: Machine = Machine {
+    cores: 2,
+    memory_bytes: 16 << 30,
+};
+
+fn source(preset: &str, world: &str, agent: &str) -> Source {
+    let agent = presets::agent(agent).unwrap();
+    Source::Layers(
+        presets::preset(preset).unwrap(),
+        world.parse().unwrap(),
+        agent.name,
+    )
+}
+
+fn sets(sets: &[&str]) -> Flags {
+    Flags {
+        sets: sets.iter().map(|&set| set.into()).collect(),
+        ..Flags::default()
+    }
+}
+
+fn with(world: &str, agent: &str, set: &[&str]) -> Result<RunConfig, String> {
+    resolve(&source("paper", world, agent), &sets(set), &MACHINE).map_err(|e| e.to_string())
+}
+
+#[test]
+fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
+    let mut resolved = 0;
+    for preset in &PRESETS {
+        for world in WorldName::all() {
+            for agent in &AGENTS {
+                let source = Source::Layers(preset, world, agent.name);
+                let config = match resolve(&source, &Flags::default(), &MACHINE) {
+                    Err(e) if e.0.contains("take --preset paper") => continue,
+                    other => other
+                        .unwrap_or_else(|e| panic!("{} {world} {}: {e}", preset.name, agent.name)),
+                };
+                let text = config.to_toml();
+                let file = Source::File("config.toml".into(), text.clone());
+                let again = resolve(&file, &Flags::default(), &MACHINE).unwrap();
+                assert_eq!(again.run.hash(), config.run.hash());
+                assert_eq!(again.to_toml(), text);
+                assert_eq!(
+                    RunConfig::parse("config.toml", &text).unwrap().to_toml(),
+                    text
+                );
+                driml_actor::ActorSettings::from_toml(&text).unwrap();
+                resolved += 1;
+            }
+        }
+    }
+    // Two presets are for all 19 worlds, two for Procgen's 16 games.
+    assert_eq!(resolved, (2 * 19 + 2 * 16) * 4);
+}
+
+#[test]
+fn the_default_run_is_the_papers() {
+    let config = with("procgen:bigfish", "driml-ada", &[]).unwrap();
+    expect![[r#"
+        [actor]
+        ack_timeout_ms = 10000
+        chunks_in_flight_max = 4
+        envs = 16
+        epsilon_decay_frames = 100000
+        epsilon_end = 0.01
+        epsilon_start = 0.1
+        steps_per_chunk = 16
+        unreachable_max_ms = 60000
+        world_threads = 0
+    "#]]
+    .assert_eq(&format!(
+        "[actor]\n{}",
+        config.table["actor"].as_table().unwrap()
+    ));
+    assert_eq!(config.model.dim.psi4, config.model.dim.phi4);
+    assert_eq!(
+        (config.model.dim.psi3, config.model.dim.action),
+        (false, true)
+    );
+    // 199_000 transitions after the warm-up at 8 rows each, in batches of 256.
+    assert_eq!(config.updates(), 6_218);
+}
+
+#[test]
+fn what_nobody_uses_is_not_there() {
+    let config = with("mspacman", "c51", &[]).unwrap();
+    assert_eq!(config.run.horizon, Horizon::None);
+    assert_eq!(config.model.dim, driml_model::DimParts::NONE);
+    assert_eq!(config.learner.affinity.learned, None);
+    // Nothing to tell apart in a world with a single action.
+    assert!(!with("ising", "driml-fix", &[]).unwrap().model.dim.action);
+}
+
+#[test]
+fn settings_that_cannot_work_are_answered_with_what_to_do() {
+    let said = |agent: &str, set: &str| with("procgen:bigfish", agent, &[set]).unwrap_err();
+    expect![[r#"there is no setting "learner.update.adam.learning_rate"; [learner.update.adam] has beta1, beta2, eps, lr"#]].assert_eq(&said("driml-ada", "learner.update.adam.learning_rate=1"));
+    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_rows, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
+    expect![[r#"there is no setting "world.num_level" (did you mean "world.num_levels"?); [world] has center_agent, distribution_mode, num_levels, paint_vel_info, restrict_themes, start_level, use_backgrounds, use_sequential_levels"#]].assert_eq(&said("driml-ada", "world.num_level=5"));
+    expect!["model.height cannot be set by hand: it follows from input.height"]
+        .assert_eq(&said("driml-ada", "model.height=84"));
+    expect!["model.dim cannot be set by hand: it follows from learner.update.lambda"]
+        .assert_eq(&said("driml-ada", "model.dim.psi3=true"));
+    expect!["run.gamma = 1.5 cannot work: a discount lies between 0 and 1"]
+        .assert_eq(&said("driml-ada", "run.gamma=1.5"));
+    expect!["run.horizon = 0 cannot work: k lies between 1 and 1000"]
+        .assert_eq(&said("driml-ada", "run.horizon={rule=\"fixed\",k=0}"));
+    expect!["in the settings' [run] table: unknown variant `always`, expected one of `none`, `fixed`, `uniform`, `nhg`"].assert_eq(&said("driml-ada", "run.horizon.rule=always"));
+    expect![[r#"run.horizon draws positives, but all of learner.update.lambda are 0: --set 'run.horizon={rule="none"}', or set a lambda above 0"#]].assert_eq(&said("driml-ada", "learner.update.lambda.4t4=0"));
+    expect![[r#"learner.update.lambda asks for DIM, but run.horizon draws no positive: set all four lambdas to 0, or --set 'run.horizon={rule="fixed",k=1}'"#]].assert_eq(&said("c51", "learner.update.lambda.4t4=1"));
+    expect!["run.horizon follows the action affinity, which nobody estimates: --set learner.affinity.estimator=learned"].assert_eq(&said("driml-ada", "learner.affinity.estimator=none"));
+    expect!["learner.affinity.alphabet = (missing) cannot work: the chosen estimator needs it: start from a preset"].assert_eq(&said("driml-fix", "learner.affinity.estimator=exact"));
+    expect!["replay.replay_ratio = 0 cannot work: rows per transition must be a number above 0"]
+        .assert_eq(&said("driml-ada", "replay.replay_ratio=0"));
+    expect!["500 frames are no more than the warm-up of 1000: ask for more --frames, or --set replay.warmup_transitions=50"].assert_eq(&said("driml-ada", "replay.transitions_max=500"));
+    expect!["in the settings' [world] table: invalid value: integer `-1`, expected u32"]
+        .assert_eq(&said("driml-ada", "world.num_levels=-1"));
+    expect!["learner.update cannot work: bad learner setting: adam.lr is 0"]
+        .assert_eq(&said("driml-ada", "learner.update.adam.lr=0"));
+    expect!["replay.capacity_transitions = 100000000000 needs 1147389.4 GiB, and 16.0 GiB are free: --set replay.capacity_transitions=697234"].assert_eq(&said(
+        "driml-ada",
+        "replay.capacity_transitions=100000000000",
+    ));
+}
+
+#[test]
+fn optional_settings_can_be_set_though_no_preset_has_them() {
+    let ising = "world.ising={temperature=0.4,sweeps_per_step=1}";
+    let config = with("mspacman", "c51", &[ising]).unwrap();
+    assert!(matches!(config.world, WorldConfig::MsPacman(world) if world.ising.is_some()));
+    let map = with(
+        "procgen:maze",
+        "driml-ada",
+        &["learner.affinity.alphabet=visible"],
+    )
+    .unwrap();
+    assert_eq!(map.learner.affinity.visible.unwrap()[..3], [1, 1, 1]);
+}
+
+#[test]
+fn a_file_at_odds_with_itself_is_refused() {
+    let text = with("mspacman", "c51", &[]).unwrap().to_toml();
+    let said = |text: String| {
+        resolve(
+            &Source::File("x.toml".into(), text),
+            &Flags::default(),
+            &MACHINE,
+        )
+        .unwrap_err()
+        .to_string()
+    };
+    expect!["x.toml: run.num_actions = 6, but it follows from the world and is 5; correct the one or the other"].assert_eq(&said(text.replace("num_actions = 5", "num_actions = 6")));
+    expect![
+        "x.toml: the settings lack input.height, a whole number: use a config.toml that driml wrote"
+    ]
+    .assert_eq(&said(text.replace("[input]", "[inputs]")));
+    expect!["x.toml: in the settings' [world] table: unknown field `boost_steps`, expected one of `cells`, `height`, `width`, `step_limit`, `reward_left`, `reward_right`"].assert_eq(&said(
+        text.replace("world = \"mspacman\"", "world = \"chain\""),
+    ));
+    expect![
+        "x.toml is not TOML: unquoted keys cannot be empty, expected letters, numbers, `-`, `_`"
+    ]
+    .assert_eq(&said("= 3".into()));
+    expect!["x.toml: the settings lack run.world, a word: use a config.toml that driml wrote"]
+        .assert_eq(&said(String::new()));
+    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `chunks_in_flight_max`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
+}
+
+#[test]
+fn flags_come_before_set_and_both_before_the_machine() {
+    let flags = Flags {
+        frames: Some(7_000),
+        seed: Some(5),
+        actors: Some(3),
+        envs: Some(2),
+        sets: vec!["run.seed=6".into()],
+    };
+    let config = resolve(&source("paper", "chain", "c51"), &flags, &MACHINE).unwrap();
+    assert_eq!(
+        (
+            config.frames(),
+            config.run.seed,
+            config.local.actors,
+            config.actor.envs
+        ),
+        (7_000, 6, 3, 2)
+    );
+}
+
+#[test]
+fn the_replay_fits_the_memory_and_says_so() {
+    let flags = Flags {
+        frames: Some(50_000_000),
+        ..Flags::default()
+    };
+    let small = Machine {
+        cores: 2,
+        memory_bytes: 8 << 30,
+    };
+    let config = resolve(
+        &source("paper", "procgen:bigfish", "driml-fix"),
+        &flags,
+        &small,
+    )
+    .unwrap();
+    expect![[r#"
+        the paper's driml-fix augments the DIM inputs on this game; this build does not augment, so expect other numbers
+        the replay holds the newest 348617 transitions instead of 1000000: 8.0 GiB of memory are free, and half is taken"#]].assert_eq(&config.notes.join("\n"));
+    assert!(config.replay.capacity_transitions < 400_000);
+    let large = Machine {
+        cores: 2,
+        memory_bytes: 64 << 30,
+    };
+    let config = resolve(
+        &source("paper", "procgen:heist", "driml-fix"),
+        &flags,
+        &large,
+    )
+    .unwrap();
+    assert_eq!(
+        (config.replay.capacity_transitions, config.notes.len()),
+        (1_000_000, 0)
+    );
+}

@@ -1,0 +1,182 @@
+//! The whole network: the DIM heads against their plain formula, determinism, and errors for what does not fit.
+//! Values against another framework are in `parity`.
+
+use candle_core::{DType, Device, Result, Tensor};
+use driml_model::{DimParts, ModelConfig, ModelError, Network, Parameters};
+
+use crate::support::{assert_close, bits, frames, parameters, rng, small};
+
+/// out(relu(hidden(x))) + skip(x) by candle's operations, x [rows, in].
+fn stock_block(parameters: &Parameters, name: &str, x: &Tensor) -> Result<Tensor> {
+    let layer = |part: &str, x: &Tensor| {
+        let y = x.matmul(&parameters.get(&format!("{name}.{part}.weight")).unwrap().t()?)?;
+        match parameters.get(&format!("{name}.{part}.bias")) {
+            Some(bias) => y.broadcast_add(bias),
+            None => Ok(y),
+        }
+    };
+    layer("out", &layer("hidden", x)?.relu()?)? + layer("skip", x)?
+}
+
+/// Initial biases are 0; tests want them to matter.
+fn with_biases(config: &ModelConfig) -> Parameters {
+    let (parameters, rng) = (parameters(config, 7), &mut rng(8));
+    for (name, var) in parameters.iter().filter(|(name, _)| name.ends_with(".bias")) {
+        let values = crate::support::floats(var.dims(), rng);
+        var.set(&values).unwrap_or_else(|error| panic!("{name}: {error}"));
+    }
+    parameters
+}
+
+#[test]
+fn the_dim_heads_follow_their_formula_with_gradients() -> Result<()> {
+    for action in [true, false] {
+        let mut config = small();
+        config.dim.action = action;
+        let parameters = with_biases(&config);
+        let network = Network::new(&config, &parameters).unwrap();
+        let features = network.features(&frames(&config, 6, &mut rng(1))).unwrap();
+        let (f3, f4) = (features.f3.detach(), features.f4.detach());
+        let (h, w, c) = config.local_shape();
+        assert_eq!(f3.dims(), [6, h, w, c]);
+        let indices = [0u32, 4, 2, 2, 1, 3];
+        let actions = Tensor::new(&indices, &Device::Cpu)?;
+
+        let flat = f3.reshape((6 * h * w, c))?;
+        let (mut local, mut global) = (flat.clone(), f4.clone());
+        if action {
+            let one_hot = Tensor::eye(5, DType::F32, &Device::Cpu)?.index_select(&actions, 0)?;
+            let embedded = stock_block(&parameters, "dim.action", &one_hot)?;
+            let tiled = embedded.unsqueeze(1)?.repeat((1, h * w, 1))?.reshape((6 * h * w, ()))?;
+            local = Tensor::cat(&[&flat, &tiled], 1)?;
+            global = Tensor::cat(&[&f4, &embedded], 1)?;
+        }
+        let by_location = |x: Tensor| x.reshape((6, h * w, config.rkhs));
+        let pairs = [
+            ("psi3", network.psi3(&f3, &actions), by_location(stock_block(&parameters, "dim.psi3", &local)?)?),
+            ("phi3", network.phi3(&f3), by_location(stock_block(&parameters, "dim.phi3", &flat)?)?),
+            ("psi4", network.psi4(&f4, &actions), stock_block(&parameters, "dim.psi4", &global)?),
+            ("phi4", network.phi4(&f4), stock_block(&parameters, "dim.phi4", &f4)?),
+        ];
+        for (name, found, wanted) in pairs {
+            let found = found.unwrap();
+            assert_close(name, &found, &wanted, 1e-6);
+            let (found, wanted) = (found.sqr()?.sum_all()?.backward()?, wanted.sqr()?.sum_all()?.backward()?);
+            for (parameter, var) in parameters.iter() {
+                match (found.get(var), wanted.get(var)) {
+                    (None, None) => {}
+                    (Some(found), Some(wanted)) => assert_close(parameter, found, wanted, 3e-6),
+                    _ => panic!("{name}: only one way has a gradient for {parameter}"),
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
+    let config = small();
+    let parameters = with_biases(&config);
+    let network = Network::new(&config, &parameters).unwrap();
+    let batch = frames(&config, 61, &mut rng(2));
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let features = network.features(&batch).unwrap();
+            let logits = network.logits(&features.f4).unwrap();
+            let phi3 = network.phi3(&features.f3).unwrap();
+            let loss = (logits.sqr().unwrap().sum_all().unwrap() + phi3.sqr().unwrap().sum_all().unwrap()).unwrap();
+            let grads = loss.backward().unwrap();
+            let grads = parameters.iter().filter_map(|(_, var)| grads.get(var).map(bits)).collect::<Vec<_>>();
+            (bits(&logits), grads)
+        })
+    };
+    let one = run(1);
+    assert_eq!(one.1.len(), 8 + 2 + 5, "torso, head, phi3");
+    for threads in [2, 3] {
+        assert!(run(threads) == one, "{threads} threads");
+    }
+}
+
+#[test]
+fn a_network_follows_its_parameters() -> Result<()> {
+    let config = small();
+    let (parameters, batch) = (parameters(&config, 1), frames(&config, 3, &mut rng(3)));
+    let network = Network::new(&config, &parameters).unwrap();
+    let before = bits(&network.features(&batch).unwrap().f4);
+    let bias = parameters.get("torso.fc.bias").unwrap();
+    bias.set(&(bias.as_tensor() + 1.0)?)?;
+    assert_ne!(before, bits(&network.features(&batch).unwrap().f4));
+    Ok(())
+}
+
+#[test]
+fn q_values_are_expectations_over_the_atoms() -> Result<()> {
+    let config = small();
+    let network = Network::new(&config, &parameters(&config, 1)).unwrap();
+    let logits = crate::support::floats(&[3, 5, 11], &mut rng(4));
+    let support = Tensor::from_vec(config.atoms_support(), 11, &Device::Cpu)?;
+    assert_eq!(config.atoms_support()[0], -2.0);
+    assert_eq!(config.atoms_support()[10], 3.0);
+    let wanted = candle_nn::ops::softmax(&logits, 2)?.broadcast_mul(&support)?.sum(2)?;
+    assert_close("values", &network.q_values(&logits).unwrap(), &wanted, 1e-6);
+    Ok(())
+}
+
+#[test]
+fn heads_that_are_left_out_are_not_there() {
+    let config = ModelConfig { dim: DimParts { psi3: false, phi4: false, ..small().dim }, ..small() };
+    let parameters = parameters(&config, 1);
+    assert!(parameters.iter().all(|(name, _)| !name.starts_with("dim.psi3") && !name.starts_with("dim.phi4")));
+    let network = Network::new(&config, &parameters).unwrap();
+    let features = network.features(&frames(&config, 2, &mut rng(5))).unwrap();
+    let actions = Tensor::zeros(2, DType::I64, &Device::Cpu).unwrap();
+    assert!(matches!(network.psi3(&features.f3, &actions), Err(ModelError::NoHead("psi3"))));
+    assert!(matches!(network.phi4(&features.f4), Err(ModelError::NoHead("phi4"))));
+    assert!(network.psi4(&features.f4, &actions).is_ok());
+
+    let without_psi = ModelConfig { dim: DimParts { psi3: false, psi4: false, ..small().dim }, ..small() };
+    assert!(without_psi.parameter_shapes().iter().all(|(name, _)| !name.starts_with("dim.action")));
+}
+
+#[test]
+fn inputs_that_do_not_fit_are_errors() {
+    let config = small();
+    let network = Network::new(&config, &parameters(&config, 1)).unwrap();
+    let batch = frames(&config, 2, &mut rng(6));
+    let features = network.features(&batch).unwrap();
+    assert!(network.features(&batch.to_dtype(DType::F32).unwrap()).is_err());
+    assert!(network.features(&batch.narrow(1, 0, 35).unwrap()).is_err());
+    assert!(network.features(&batch.get(0).unwrap()).is_err());
+    for wrong in [5i64, -1] {
+        let actions = Tensor::new(&[0, wrong], &Device::Cpu).unwrap();
+        assert!(matches!(network.psi4(&features.f4, &actions), Err(ModelError::Input(_))));
+    }
+    let actions = Tensor::new(&[0i64, 1, 2], &Device::Cpu).unwrap();
+    assert!(network.psi4(&features.f4, &actions).is_err(), "three actions for two rows");
+    assert!(network.logits(&features.f4.narrow(1, 0, 5).unwrap()).is_err());
+}
+
+#[test]
+fn configurations_that_cannot_work_are_errors() {
+    let fails = |change: fn(&mut ModelConfig)| {
+        let mut config = small();
+        change(&mut config);
+        assert!(matches!(config.validate(), Err(ModelError::Config(_))), "{config:?}");
+        assert!(Parameters::init(&config, &mut rng(1), &Device::Cpu).is_err());
+    };
+    assert!(small().validate().is_ok());
+    fails(|config| config.height = 0);
+    fails(|config| config.height = 11);
+    fails(|config| config.channels = usize::MAX);
+    fails(|config| config.num_actions = 256);
+    fails(|config| config.atoms = 1);
+    fails(|config| config.v_max = config.v_min);
+    fails(|config| config.v_min = f32::NAN);
+    fails(|config| config.conv.clear());
+    fails(|config| config.conv[1].kernel = 9);
+    fails(|config| config.conv[0].stride = 0);
+    fails(|config| config.conv[2].out = 0);
+    fails(|config| (config.hidden, config.rkhs) = (65_536, 65_536));
+}

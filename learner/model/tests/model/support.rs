@@ -1,0 +1,83 @@
+//! What several tests need: random tensors, comparisons, a small network.
+//! No test lives here.
+
+use candle_core::{DType, Device, Result, Tensor, Var};
+use driml_model::{ConvLayer, DimParts, ModelConfig, Parameters};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{RngCore, SeedableRng};
+
+pub(crate) fn rng(seed: u64) -> ChaCha8Rng {
+    ChaCha8Rng::seed_from_u64(seed)
+}
+
+/// Uniform on [-1, 1).
+pub(crate) fn uniform(rng: &mut ChaCha8Rng) -> f32 {
+    (rng.next_u32() >> 8) as f32 / (1 << 23) as f32 - 1.0
+}
+
+pub(crate) fn floats(shape: &[usize], rng: &mut ChaCha8Rng) -> Tensor {
+    let values: Vec<f32> = (0..shape.iter().product()).map(|_| uniform(rng)).collect();
+    Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
+}
+
+pub(crate) fn variable(shape: &[usize], rng: &mut ChaCha8Rng) -> Var {
+    Var::from_tensor(&floats(shape, rng)).unwrap()
+}
+
+pub(crate) fn bytes(len: usize, rng: &mut ChaCha8Rng) -> Vec<u8> {
+    (0..len).map(|_| rng.next_u32() as u8).collect()
+}
+
+pub(crate) fn frames(config: &ModelConfig, batch: usize, rng: &mut ChaCha8Rng) -> Tensor {
+    let shape = (batch, config.height, config.width, config.channels);
+    Tensor::from_vec(bytes(batch * config.frame_len(), rng), shape, &Device::Cpu).unwrap()
+}
+
+pub(crate) fn double(tensor: &Tensor) -> Result<Tensor> {
+    tensor.to_dtype(DType::F64)
+}
+
+pub(crate) fn values(tensor: &Tensor) -> Vec<f64> {
+    double(tensor).unwrap().flatten_all().unwrap().to_vec1().unwrap()
+}
+
+pub(crate) fn bits(tensor: &Tensor) -> Vec<u32> {
+    let values: Vec<f32> = tensor.flatten_all().unwrap().to_vec1().unwrap();
+    values.iter().map(|value| value.to_bits()).collect()
+}
+
+/// Asserts equal shapes, and a difference whose 2-norm is at most `tolerance` of the wanted tensor's.
+#[track_caller]
+pub(crate) fn assert_close(what: &str, found: &Tensor, wanted: &Tensor, tolerance: f64) {
+    assert_eq!(found.dims(), wanted.dims(), "{what}");
+    let (found, wanted) = (values(found), values(wanted));
+    let norm = wanted.iter().map(|value| value * value).sum::<f64>().sqrt();
+    let error = found.iter().zip(&wanted).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
+    assert!(error <= tolerance * norm, "{what}: error {error}, norm {norm}");
+}
+
+/// A small network with all heads; its sizes are no multiples of anything.
+pub(crate) fn small() -> ModelConfig {
+    ModelConfig {
+        height: 36,
+        width: 44,
+        channels: 3,
+        num_actions: 5,
+        atoms: 11,
+        v_min: -2.0,
+        v_max: 3.0,
+        conv: vec![
+            ConvLayer { out: 5, kernel: 8, stride: 4 },
+            ConvLayer { out: 7, kernel: 3, stride: 2 },
+            ConvLayer { out: 6, kernel: 2, stride: 1 },
+        ],
+        hidden: 19,
+        rkhs: 13,
+        action_embed: 9,
+        dim: DimParts { psi3: true, phi3: true, psi4: true, phi4: true, action: true },
+    }
+}
+
+pub(crate) fn parameters(config: &ModelConfig, seed: u64) -> Parameters {
+    Parameters::init(config, &mut rng(seed), &Device::Cpu).unwrap()
+}

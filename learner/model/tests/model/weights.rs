@@ -1,0 +1,147 @@
+//! Parameters: round trips, and an error instead of a panic for every kind of broken file.
+//! Orthogonality of the initial weights is tested where they are made.
+
+use std::collections::HashMap;
+
+use candle_core::{DType, Device, Tensor};
+use driml_model::{ModelConfig, ModelError, Parameters, PolicyNetwork};
+
+use crate::support::{bits, bytes, parameters, rng, small};
+
+fn tensors(parameters: &Parameters) -> HashMap<String, Tensor> {
+    parameters.iter().map(|(name, var)| (name.to_owned(), var.as_tensor().clone())).collect()
+}
+
+fn all_bits(parameters: &Parameters) -> Vec<(String, Vec<u32>)> {
+    parameters.iter().map(|(name, var)| (name.to_owned(), bits(var))).collect()
+}
+
+#[test]
+fn the_seed_decides_the_weights() {
+    let config = small();
+    let first = parameters(&config, 5);
+    assert_eq!(all_bits(&first), all_bits(&parameters(&config, 5)));
+    assert_ne!(all_bits(&first), all_bits(&parameters(&config, 6)));
+    for (name, var) in first.iter() {
+        let zero = bits(var).iter().all(|&bits| bits == 0);
+        assert_eq!(zero, name.ends_with(".bias"), "{name}");
+    }
+    let acting = parameters(&config.without_dim(), 5);
+    assert_eq!(all_bits(&acting), all_bits(&first.without_dim().unwrap()), "heads do not change the torso's weights");
+}
+
+#[test]
+fn names_and_shapes_are_the_configuration_s() {
+    let config = small();
+    let parameters = parameters(&config, 1);
+    let shapes = config.parameter_shapes();
+    assert_eq!(shapes.len(), parameters.len());
+    for (name, shape) in shapes {
+        assert_eq!(parameters.get(&name).unwrap().dims(), shape, "{name}");
+    }
+    assert_eq!(parameters.get("torso.conv1.weight").unwrap().dims(), [5, 3, 8, 8]);
+    assert_eq!(parameters.get("dim.psi4.hidden.weight").unwrap().dims(), [13, 19 + 9]);
+    assert!(parameters.get("dim.psi4.skip.bias").is_none());
+    assert!(parameters.get("dim.action.skip.bias").is_some());
+}
+
+#[test]
+fn safetensors_go_round() {
+    let config = small();
+    let written = parameters(&config, 1);
+    let file = written.to_safetensors(|_| true).unwrap();
+    assert_eq!(file, written.copy().unwrap().to_safetensors(|_| true).unwrap(), "equal parameters give equal bytes");
+    let read = Parameters::load_safetensors(&config, &file, &Device::Cpu).unwrap();
+    assert_eq!(all_bits(&read), all_bits(&written));
+
+    let acting = written.to_safetensors(|name| !name.starts_with("dim.")).unwrap();
+    let read = Parameters::load_safetensors(&config.without_dim(), &acting, &Device::Cpu).unwrap();
+    assert_eq!(all_bits(&read), all_bits(&written.without_dim().unwrap()));
+}
+
+#[test]
+fn copies_share_nothing_and_clones_share_all() {
+    let original = parameters(&small(), 1);
+    let (copy, clone) = (original.copy().unwrap(), original.clone());
+    let var = original.get("head.bias").unwrap();
+    var.set(&var.ones_like().unwrap()).unwrap();
+    assert_ne!(bits(copy.get("head.bias").unwrap()), bits(var));
+    assert_eq!(bits(clone.get("head.bias").unwrap()), bits(var));
+}
+
+#[test]
+fn tensors_that_do_not_fit_are_named() {
+    let config = small();
+    let good = tensors(&parameters(&config, 1));
+    let problem = |change: &dyn Fn(&mut HashMap<String, Tensor>)| {
+        let mut tensors = good.clone();
+        change(&mut tensors);
+        match Parameters::from_tensors(&config, tensors, &Device::Cpu) {
+            Err(ModelError::Parameter { name, problem }) => format!("{name} {problem}"),
+            other => panic!("{other:?}"),
+        }
+    };
+    let insert = |name: &str, tensor: Tensor| {
+        let name = name.to_owned();
+        move |tensors: &mut HashMap<String, Tensor>| {
+            tensors.insert(name.clone(), tensor.clone());
+        }
+    };
+    let nan = Tensor::new(&[f32::NAN; 19], &Device::Cpu).unwrap();
+    let transposed = good["head.weight"].t().unwrap();
+    let double = good["head.bias"].to_dtype(DType::F64).unwrap();
+    assert_eq!(problem(&|tensors| drop(tensors.remove("torso.fc.bias"))), "torso.fc.bias is missing");
+    assert_eq!(problem(&insert("dim.extra", nan.clone())), "dim.extra is not part of this network");
+    assert_eq!(problem(&insert("torso.fc.bias", nan)), "torso.fc.bias is NaN at index 0");
+    assert_eq!(problem(&insert("head.weight", transposed)), "head.weight has shape [19, 55], wanted [55, 19]");
+    assert_eq!(problem(&insert("head.bias", double)), "head.bias has type F64, wanted F32");
+}
+
+/// Loads the file both ways; both must fail and leave the policy as it was.
+fn assert_rejected(config: &ModelConfig, file: &[u8], what: &str) {
+    assert!(Parameters::load_safetensors(config, file, &Device::Cpu).is_err(), "{what}");
+    let good = parameters(config, 1).to_safetensors(|_| true).unwrap();
+    let mut policy = PolicyNetwork::new(config, &good).unwrap();
+    let frames = bytes(2 * config.frame_len(), &mut rng(1));
+    let (mut before, mut after) = ([0.0; 10], [0.0; 10]);
+    policy.q_values(&frames, &mut before).unwrap();
+    assert!(policy.load(file).is_err(), "{what}");
+    policy.q_values(&frames, &mut after).unwrap();
+    assert_eq!(before, after, "{what}");
+}
+
+#[test]
+fn broken_files_are_errors() {
+    let config = small().without_dim();
+    let file = parameters(&config, 2).to_safetensors(|_| true).unwrap();
+    for len in [0, 1, 7, 8, 9, 100, file.len() / 2, file.len() - 4, file.len() - 1] {
+        assert_rejected(&config, &file[..len], &format!("cut to {len} bytes"));
+    }
+    assert_rejected(&config, &[&file[..], &[0; 4]].concat(), "four bytes too many");
+    assert_rejected(&config, &[0xff; 64], "a header length beyond all memory");
+
+    let missing = parameters(&config, 2).to_safetensors(|name| name != "head.bias").unwrap();
+    assert_rejected(&config, &missing, "a parameter missing");
+    let other = ModelConfig { hidden: 20, ..config.clone() };
+    assert_rejected(&config, &parameters(&other, 2).to_safetensors(|_| true).unwrap(), "another width");
+
+    let mut not_finite = file.clone();
+    let last = not_finite.len() - 4;
+    not_finite[last..].copy_from_slice(&f32::INFINITY.to_le_bytes());
+    assert_rejected(&config, &not_finite, "an infinite weight");
+}
+
+#[test]
+fn corrupted_headers_never_panic() {
+    let config = small().without_dim();
+    let file = parameters(&config, 2).to_safetensors(|_| true).unwrap();
+    let header = 8 + usize::try_from(u64::from_le_bytes(file[..8].try_into().unwrap())).unwrap();
+    for at in 0..header {
+        for flip in [1u8, 0x10, 0x80] {
+            let mut broken = file.clone();
+            broken[at] ^= flip;
+            // A flipped bit may turn a space into nothing that matters; it must only never panic.
+            drop(Parameters::load_safetensors(&config, &broken, &Device::Cpu));
+        }
+    }
+}

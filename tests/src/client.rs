@@ -1,0 +1,109 @@
+//! A client of a run over zenoh, as any part is one: asks, and sends whatever a test wants.
+//! It takes no part in the run and keeps nothing.
+
+use std::time::{Duration, Instant};
+
+use driml_protocol::{
+    Chunk, InsertReply, Keys, Kind, LearnerStatus, ReplayStatus, RunSpec, Shutdown, codec,
+    config::Settings,
+    session::{self, Endpoints, SessionError},
+};
+use serde::de::DeserializeOwned;
+use zenoh::{Session, Wait, qos::Priority};
+
+use crate::wait_for;
+
+/// The prefix of a run's keys unless a part is told otherwise.
+const NAMESPACE: &str = "driml";
+/// One answer.
+const ANSWER_MAX: Duration = Duration::from_secs(20);
+
+/// An open session and what the replay server said of its run.
+#[derive(Debug)]
+pub struct Client {
+    /// The session, for whatever else a test wants to do with it.
+    pub session: Session,
+    /// The run's keys.
+    pub keys: Keys,
+    /// What all parts of the run agree on.
+    pub spec: RunSpec,
+    /// The run's resolved settings.
+    pub config_toml: String,
+}
+
+impl Client {
+    pub(crate) fn join(endpoint: &str, deadline: Instant) -> Self {
+        let endpoints = Endpoints { listen: Vec::new(), connect: vec![endpoint.to_owned()] };
+        // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
+        let session = loop {
+            match session::open(&endpoints) {
+                Ok(session) => break session,
+                Err(e) => assert!(Instant::now() < deadline, "{e}"),
+            }
+        };
+        let keys = Keys::new(NAMESPACE).unwrap();
+        let hello = session::join(&session, &keys, &Shutdown::default()).unwrap();
+        let spec = Settings::parse(&hello.config_toml).unwrap().table("run").unwrap();
+        Self { session, keys, spec, config_toml: hello.config_toml }
+    }
+
+    /// Sends bytes and gives the bytes of the answer.
+    ///
+    /// # Errors
+    /// Nobody answered.
+    pub fn ask(&self, key: &str, payload: Vec<u8>) -> Result<Vec<u8>, SessionError> {
+        session::ask(&self.session, key, payload.into(), Priority::Data, ANSWER_MAX)
+    }
+
+    fn ask_for<T: DeserializeOwned>(&self, key: &str, kind: Kind, payload: Vec<u8>) -> Option<T> {
+        let answer = self.ask(key, payload).ok()?;
+        Some(codec::decode(&answer, kind, Some(self.spec.hash())).unwrap().0)
+    }
+
+    /// The replay server's status; none if it did not answer.
+    pub fn replay(&self) -> Option<ReplayStatus> {
+        self.ask_for(&self.keys.replay_status(), Kind::ReplayStatus, Vec::new())
+    }
+
+    /// The learner's status; none if it is not there.
+    pub fn learner(&self) -> Option<LearnerStatus> {
+        self.ask_for(&self.keys.learner_status(), Kind::LearnerStatus, Vec::new())
+    }
+
+    /// Waits until the replay server's status is as wanted, and gives it.
+    pub fn wait_for_replay(&self, what: &str, wanted: impl Fn(&ReplayStatus) -> bool) -> ReplayStatus {
+        wait_for(what, || self.replay().filter(&wanted))
+    }
+
+    /// Waits until the learner's status is as wanted, and gives it.
+    pub fn wait_for_learner(&self, what: &str, wanted: impl Fn(&LearnerStatus) -> bool) -> LearnerStatus {
+        wait_for(what, || self.learner().filter(&wanted))
+    }
+
+    /// Sends a chunk as an actor would.
+    pub fn insert(&self, chunk: &Chunk) -> InsertReply {
+        self.insert_bytes(sealed(chunk, self.spec.hash()))
+    }
+
+    /// Sends bytes to the place where chunks go.
+    ///
+    /// # Panics
+    /// If nobody answers, or not in the run's own words.
+    pub fn insert_bytes(&self, bytes: Vec<u8>) -> InsertReply {
+        self.ask_for(&self.keys.ingest(), Kind::InsertReply, bytes).expect("chunks are always answered")
+    }
+}
+
+/// A chunk's bytes as a part of the run with this hash would send them.
+fn sealed(chunk: &Chunk, spec_hash: u64) -> Vec<u8> {
+    let (mut bytes, planes) = chunk.seal(spec_hash).unwrap();
+    bytes.extend_from_slice(planes);
+    bytes
+}
+
+impl Drop for Client {
+    fn drop(&mut self) {
+        // Its router may be gone already, which is no fault of the test's.
+        let _ = self.session.close().wait();
+    }
+}

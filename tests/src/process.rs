@@ -1,0 +1,171 @@
+//! One process: its output as it comes, signals to it, and its end within the deadline.
+//! It does not know what the process is.
+
+use std::{
+    io::{BufRead, BufReader, Read},
+    os::unix::process::ExitStatusExt,
+    process::{Child, Command, Stdio},
+    sync::{Arc, Mutex, PoisonError},
+    thread::{self, JoinHandle},
+};
+
+use nix::{
+    sys::signal::{Signal, kill},
+    unistd::Pid,
+};
+
+use crate::wait_for;
+
+/// A started process. Dropping it kills it.
+#[derive(Debug)]
+pub struct Process {
+    name: String,
+    child: Child,
+    stdout: Output,
+    stderr: Output,
+}
+
+/// How a process ended, and all it said.
+#[derive(Clone, Debug)]
+pub struct Ended {
+    /// Its exit code; none if a signal ended it.
+    pub code: Option<i32>,
+    /// The signal that ended it.
+    pub signal: Option<i32>,
+    /// All of its standard output.
+    pub stdout: String,
+    /// All of its standard error.
+    pub stderr: String,
+}
+
+/// What was read from one pipe so far, and the thread that reads on.
+#[derive(Debug)]
+struct Output {
+    text: Arc<Mutex<String>>,
+    reader: JoinHandle<()>,
+}
+
+impl Output {
+    fn read(pipe: impl Read + Send + 'static) -> Self {
+        let text = Arc::<Mutex<String>>::default();
+        let sink = text.clone();
+        let reader = thread::spawn(move || {
+            for line in BufReader::new(pipe).split(b'\n') {
+                let Ok(line) = line else { return };
+                let mut sink = sink.lock().unwrap_or_else(PoisonError::into_inner);
+                sink.push_str(&String::from_utf8_lossy(&line));
+                sink.push('\n');
+            }
+        });
+        Self { text, reader }
+    }
+
+    fn so_far(&self) -> String {
+        self.text.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+impl Process {
+    pub(crate) fn start(name: String, mut command: Command) -> Self {
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap_or_else(|e| panic!("starting {command:?}: {e}"));
+        let stdout = Output::read(child.stdout.take().expect("it is piped"));
+        let stderr = Output::read(child.stderr.take().expect("it is piped"));
+        Self { name, child, stdout, stderr }
+    }
+
+    /// Sends a signal. It has not been waited for, so its number is still its own.
+    pub fn signal(&self, signal: Signal) {
+        kill(Pid::from_raw(self.child.id() as i32), signal).unwrap();
+    }
+
+    /// Standard error so far.
+    pub fn stderr(&self) -> String {
+        self.stderr.so_far()
+    }
+
+    /// Waits until standard error holds `words`.
+    ///
+    /// # Panics
+    /// At the deadline, or when the process has ended without them.
+    pub fn wait_for_stderr(&mut self, words: &str) {
+        wait_for(&format!("{}: {words:?} on stderr", self.name), || {
+            // In this order: what it said just before its end is not missed.
+            let ended = self.child.try_wait().unwrap().is_some() && self.stderr.reader.is_finished();
+            let said = self.stderr.so_far();
+            let found = said.contains(words);
+            assert!(found || !ended, "{} ended without saying {words:?}:\n{said}", self.name);
+            found.then_some(())
+        });
+    }
+
+    /// Whether it is still running.
+    pub fn is_running(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_none()
+    }
+
+    /// Waits for its end.
+    ///
+    /// # Panics
+    /// At the deadline; the process is then killed.
+    pub fn wait(mut self) -> Ended {
+        let what = format!("the end of {}", self.name);
+        let status = wait_for(&what, || self.child.try_wait().unwrap());
+        // Its pipes close with it, as no child of its own holds them.
+        wait_for(&format!("the last output of {}", self.name), || {
+            (self.stdout.reader.is_finished() && self.stderr.reader.is_finished()).then_some(())
+        });
+        Ended {
+            code: status.code(),
+            signal: status.signal(),
+            stdout: self.stdout.so_far(),
+            stderr: self.stderr.so_far(),
+        }
+    }
+
+    /// Asks it to stop and waits for its end.
+    pub fn stop(self) -> Ended {
+        self.signal(Signal::SIGTERM);
+        self.wait()
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        if thread::panicking() {
+            // The test runner shows this beside the failure.
+            println!("--- {}\n{}{}", self.name, self.stdout.so_far(), self.stderr.so_far());
+        }
+    }
+}
+
+impl Ended {
+    /// Checks the exit code.
+    ///
+    /// # Panics
+    /// On any other code, with all that the process said; and if it panicked itself.
+    #[track_caller]
+    pub fn expect_code(self, code: i32) -> Self {
+        assert!(
+            self.code == Some(code) && !self.stderr.contains("panicked"),
+            "exit code {:?}, signal {:?}, wanted code {code}\n{}{}",
+            self.code,
+            self.signal,
+            self.stdout,
+            self.stderr
+        );
+        self
+    }
+
+    /// Checks that standard error holds `words`.
+    ///
+    /// # Panics
+    /// If it does not, with what it holds.
+    #[track_caller]
+    pub fn expect_said(self, words: &str) -> Self {
+        assert!(self.stderr.contains(words), "wanted {words:?} on stderr, found:\n{}", self.stderr);
+        self
+    }
+}

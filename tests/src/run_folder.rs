@@ -1,0 +1,157 @@
+//! What a run left behind: summary, metrics, checkpoints, logs.
+//! It reads and checks what every run promises; what one run should have reached is for its test.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
+
+use safetensors::SafeTensors;
+use serde::Deserialize;
+use sha2::{Digest, Sha256};
+
+/// The counts of `summary.json` that every run has.
+#[derive(Clone, Debug, Deserialize)]
+#[allow(missing_docs, reason = "the names are those of the file, which the launcher documents")]
+pub struct Summary {
+    pub outcome: String,
+    pub frames: u64,
+    pub updates: u64,
+    pub transitions_inserted: u64,
+    pub transitions_lost: u64,
+    pub transitions_duplicated: u64,
+    pub rows_sampled: u64,
+    pub replay_ratio: Option<f64>,
+    pub episodes: u64,
+    pub mean_return: Option<f64>,
+    pub wall_seconds: f64,
+    pub frames_per_second: f64,
+    pub updates_per_second: f64,
+    pub mean_k: Option<f64>,
+    pub k_histogram: Vec<u64>,
+    pub weights_version: u64,
+    pub weights_sha256: String,
+    pub chunks_retried: u64,
+    pub messages_refused: u64,
+}
+
+/// A run's folder.
+#[derive(Clone, Debug)]
+pub struct RunFolder {
+    path: PathBuf,
+}
+
+impl RunFolder {
+    pub(crate) const fn new(path: PathBuf) -> Self {
+        Self { path }
+    }
+
+    /// Where it lies.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    fn text(&self, name: &str) -> String {
+        let path = self.path.join(name);
+        fs::read_to_string(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+    }
+
+    /// The resolved settings.
+    pub fn config(&self) -> toml::Table {
+        self.text("config.toml").parse().unwrap()
+    }
+
+    /// One whole number of the settings, by its dotted path.
+    pub fn setting(&self, path: &str) -> f64 {
+        let config = toml::Value::Table(self.config());
+        let value = path.split('.').fold(&config, |table, key| &table[key]);
+        value.as_float().unwrap_or_else(|| value.as_integer().unwrap() as f64)
+    }
+
+    /// `summary.json`.
+    pub fn summary(&self) -> Summary {
+        serde_json::from_str(&self.text("summary.json")).unwrap()
+    }
+
+    /// `metrics.csv`: its header and its rows.
+    pub fn metrics(&self) -> (Vec<String>, Vec<Vec<String>>) {
+        let text = self.text("metrics.csv");
+        let mut rows = text.lines().map(|line| line.split(',').map(str::to_owned).collect());
+        let header = rows.next().unwrap();
+        (header, rows.collect())
+    }
+
+    /// A part's log.
+    pub fn log(&self, part: &str) -> String {
+        self.text(&format!("logs/{part}.log"))
+    }
+
+    /// The checkpoints, oldest first.
+    pub fn checkpoints(&self) -> Vec<PathBuf> {
+        let entries = fs::read_dir(self.path.join("checkpoints")).unwrap();
+        let mut paths: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
+        paths.sort();
+        assert!(paths.iter().all(|path| path.extension().is_none()), "left from an unfinished save: {paths:?}");
+        paths
+    }
+
+    /// SHA-256 of the newest checkpoint's weights as actors get them: torso and head alone, as a safetensors file.
+    ///
+    /// Computed from the file's own tensors, by the safetensors library alone.
+    pub fn checkpoint_sha256(&self) -> String {
+        let path = self.checkpoints().pop().expect("there is a checkpoint").join("online.safetensors");
+        let bytes = fs::read(path).unwrap();
+        let tensors = SafeTensors::deserialize(&bytes).unwrap();
+        let published = tensors.iter().filter(|(name, _)| !name.starts_with("dim."));
+        let file = safetensors::serialize(published, None).unwrap();
+        Sha256::digest(file).iter().map(|byte| format!("{byte:02x}")).collect()
+    }
+
+    /// Checks what holds of every run that ended in order, and gives its summary.
+    ///
+    /// # Panics
+    /// At the first thing that does not hold.
+    #[track_caller]
+    pub fn check(&self, outcome: &str) -> Summary {
+        let summary = self.summary();
+        let said = format!("{summary:#?}");
+        assert_eq!(summary.outcome, outcome, "{said}");
+        assert_eq!((summary.transitions_lost, summary.transitions_duplicated), (0, 0), "{said}");
+        assert_eq!(summary.messages_refused, 0, "{said}");
+        assert_eq!(summary.frames, summary.transitions_inserted, "{said}");
+        assert_eq!(summary.k_histogram.iter().sum::<u64>(), summary.rows_sampled, "{said}");
+        assert!(summary.wall_seconds > 0.0 && summary.frames_per_second > 0.0, "{said}");
+
+        let (header, rows) = self.metrics();
+        assert!(rows.iter().all(|row| row.len() == header.len()), "{header:?}\n{rows:?}");
+        let column = |name: &str| header.iter().position(|it| it == name).unwrap_or_else(|| panic!("no column {name}"));
+        let last = rows.last().expect("there is a row");
+        assert_eq!(last[column("frames")], summary.frames.to_string());
+        assert_eq!(last[column("updates")], summary.updates.to_string());
+
+        assert_eq!(self.checkpoint_sha256(), summary.weights_sha256, "of the newest checkpoint and of the last weights");
+        let kept = self.checkpoints().len();
+        assert!((1..=self.setting("learner.checkpoints_kept") as usize).contains(&kept), "{kept} checkpoints");
+        summary
+    }
+
+    /// Checks, beyond [`Self::check`], what holds of a run that went to its end.
+    ///
+    /// # Panics
+    /// At the first thing that does not hold.
+    #[track_caller]
+    pub fn check_finished(&self) -> Summary {
+        let summary = self.check("finished");
+        let said = format!("{summary:#?}");
+        let rows = self.setting("learner.batch_rows") as u64;
+        let (warmup, ratio) = (self.setting("replay.warmup_transitions") as u64, self.setting("replay.replay_ratio"));
+        assert!(summary.frames >= self.setting("replay.transitions_max") as u64, "{said}");
+        assert_eq!(summary.rows_sampled, summary.updates * rows, "{said}");
+        let allowed = ratio * (summary.frames - warmup) as f64 / rows as f64;
+        assert_eq!(summary.updates, allowed as u64, "{said}");
+        let publications = summary.updates / self.setting("learner.publish_period_updates") as u64;
+        // One set of weights before the first update, one for what came after the last publication.
+        assert!((publications + 1..=publications + 2).contains(&summary.weights_version), "{said}");
+        summary
+    }
+}

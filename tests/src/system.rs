@@ -1,0 +1,152 @@
+//! One system: its folder, its mark, and every process that carries the mark.
+//! It starts processes and finds them; what they say is for `process` and `client`.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::Command,
+    sync::atomic::{AtomicU32, Ordering},
+    time::Instant,
+};
+
+use nix::{
+    sys::signal::{Signal, kill},
+    unistd::Pid,
+};
+
+use crate::{Client, DEADLINE, Ended, Process, RunFolder, wait_for};
+
+/// The variable that marks each process of a system. Children inherit it, so that those of a killed launcher are found too.
+const MARK: &str = "DRIML_TEST_SYSTEM";
+
+/// A folder and the processes that were started in it. Dropping it kills those that are left.
+#[derive(Debug)]
+pub struct TestSystem {
+    program: PathBuf,
+    folder: tempfile::TempDir,
+    mark: String,
+}
+
+/// A process of a system that is still there.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Survivor {
+    /// Its number.
+    pub pid: i32,
+    /// Its arguments after the program's name.
+    pub args: Vec<String>,
+}
+
+impl TestSystem {
+    /// A system of its own, in a fresh folder; `program` is the binary under test.
+    pub fn new(program: &str) -> Self {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
+        // Not in the target folder: a unix socket's path must be short.
+        let folder = tempfile::Builder::new().prefix("driml-test-").tempdir().unwrap();
+        let program = program.into();
+        Self { program, folder, mark: format!("{}-{count}", std::process::id()) }
+    }
+
+    /// A path in the system's folder.
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// A run folder in the system's folder, whether or not it is there yet.
+    pub fn run_folder(&self, name: &str) -> RunFolder {
+        RunFolder::new(self.path(name))
+    }
+
+    /// The endpoint at which this system's parts meet: a unix socket, so that no port can be taken.
+    pub fn endpoint(&self) -> String {
+        format!("unixsock-stream/{}", self.path("s").display())
+    }
+
+    /// Starts the program in the system's folder. Arguments are as in a shell, split at blanks.
+    pub fn start(&self, args: &str) -> Process {
+        let args: Vec<_> = args.split_whitespace().collect();
+        let mut command = Command::new(&self.program);
+        command
+            .args(&args)
+            .current_dir(self.folder.path())
+            .env(MARK, &self.mark)
+            .env_remove("DRIML_LOG");
+        Process::start(args.join(" "), command)
+    }
+
+    /// Runs the program to its end.
+    pub fn run(&self, args: &str) -> Ended {
+        self.start(args).wait()
+    }
+
+    /// Starts a part that would wait for signals for ever; it ends with this test, however that ends.
+    pub fn start_part(&self, args: &str) -> Process {
+        self.start(&format!("{args} --exit-with-parent"))
+    }
+
+    /// Starts a replay server on this system's endpoint, with the settings that `flags` ask for.
+    pub fn start_replay_server(&self, flags: &str) -> Process {
+        self.start_part(&format!("replay-server --listen {} {flags}", self.endpoint()))
+    }
+
+    /// Starts a learner whose checkpoints go into the run folder `run_dir`.
+    pub fn start_learner(&self, run_dir: &str) -> Process {
+        self.start_part(&format!("learner --connect {} --run-dir {run_dir}", self.endpoint()))
+    }
+
+    /// Starts an actor.
+    pub fn start_actor(&self, id: u32) -> Process {
+        self.start_part(&format!("actor --connect {} --id {id}", self.endpoint()))
+    }
+
+    /// A client of the run at this system's endpoint, once its replay server answers.
+    pub fn connect(&self) -> Client {
+        Client::join(&self.endpoint(), Instant::now() + DEADLINE)
+    }
+
+    /// Every process of this system that still runs, children of ended ones included.
+    pub fn survivors(&self) -> Vec<Survivor> {
+        let mark = format!("{MARK}={}", self.mark);
+        let processes = fs::read_dir("/proc").unwrap().flatten();
+        let carries_mark = |folder: &Path| {
+            let variables = fs::read(folder.join("environ")).unwrap_or_default();
+            variables.split(|&byte| byte == 0).any(|variable| variable == mark.as_bytes())
+        };
+        let survivor = |entry: fs::DirEntry| {
+            let pid = entry.file_name().to_str()?.parse().ok()?;
+            // One that has ended and was not waited for has no environment any more.
+            carries_mark(&entry.path()).then_some(())?;
+            let words = fs::read(entry.path().join("cmdline")).unwrap_or_default();
+            let words = words.split(|&byte| byte == 0).skip(1).filter(|word| !word.is_empty());
+            let args = words.map(|word| String::from_utf8_lossy(word).into_owned()).collect();
+            Some(Survivor { pid, args })
+        };
+        processes.filter_map(survivor).collect()
+    }
+
+    /// The process that runs `part` (`learner`, `actor`, `replay-server`), once it is there.
+    pub fn find_part(&self, part: &str) -> Survivor {
+        let is_part = |it: &Survivor| it.args.first().is_some_and(|first| first == part);
+        wait_for(&format!("a process {part}"), || self.survivors().into_iter().find(is_part))
+    }
+}
+
+impl Survivor {
+    /// Sends a signal; a process that has ended meanwhile is no error.
+    pub fn signal(&self, signal: Signal) {
+        let _ = kill(Pid::from_raw(self.pid), signal);
+    }
+}
+
+impl Drop for TestSystem {
+    fn drop(&mut self) {
+        // A child that a dying launcher started while the list was made is in the next list.
+        for _ in 0..10 {
+            let left = self.survivors();
+            if left.is_empty() {
+                return;
+            }
+            left.iter().for_each(|it| it.signal(Signal::SIGKILL));
+        }
+    }
+}

@@ -1,0 +1,76 @@
+//! Runs that end before their time: Ctrl-C, a part that dies, a launcher that dies. No process is ever left.
+//! What a dead part's successor may do is in `by_hand`.
+
+use driml_tests::{Process, TestSystem, wait_for};
+use nix::sys::signal::Signal;
+
+use crate::{LONG, system};
+
+/// A launched run that has learned something.
+fn launched(system: &TestSystem) -> Process {
+    let process = system.start(&format!("local --agent driml-ada {LONG} --listen {} --run-dir run", system.endpoint()));
+    let client = system.connect();
+    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    process
+}
+
+#[test]
+fn an_interrupt_saves_and_ends_all_parts() {
+    let system = system();
+    let process = launched(&system);
+    process.signal(Signal::SIGINT);
+    let ended = process.wait().expect_code(130).expect_said("stopping: actors deliver what they have");
+    assert_eq!(system.survivors(), []);
+    assert!(ended.stdout.contains("interrupted: "), "{}", ended.stdout);
+    let summary = system.run_folder("run").check("interrupted");
+    assert!(summary.updates > 100, "{summary:#?}");
+}
+
+#[test]
+fn a_second_interrupt_ends_at_once() {
+    let system = system();
+    let mut process = launched(&system);
+    // A learner that does not answer any more, for which the first interrupt would wait for minutes.
+    system.find_part("learner").signal(Signal::SIGSTOP);
+    process.signal(Signal::SIGINT);
+    process.wait_for_stderr("Ctrl-C again ends at once");
+    process.signal(Signal::SIGINT);
+    process.wait().expect_code(1).expect_said("ended at once by an interrupt: what was not saved is lost");
+    assert_eq!(system.survivors(), []);
+    assert_eq!(system.run_folder("run").summary().outcome, "failed");
+}
+
+/// Kills one part of a run; the launcher must say which, and end the others.
+fn dies(part: &str, name: &str) {
+    let system = system();
+    let process = launched(&system);
+    system.find_part(part).signal(Signal::SIGKILL);
+    process.wait().expect_code(1).expect_said(&format!("error: {name} was ended by signal 9 SIGKILL (log: "));
+    assert_eq!(system.survivors(), []);
+    assert_eq!(system.run_folder("run").summary().outcome, "failed");
+}
+
+#[test]
+fn a_dead_learner_ends_the_run() {
+    dies("learner", "learner");
+}
+
+#[test]
+fn a_dead_actor_ends_the_run() {
+    dies("actor", "actor-0");
+}
+
+#[test]
+fn a_dead_replay_server_ends_the_run() {
+    dies("replay-server", "replay-server");
+}
+
+#[test]
+fn parts_end_with_their_launcher() {
+    let system = system();
+    let process = launched(&system);
+    process.signal(Signal::SIGKILL);
+    process.wait();
+    wait_for("the end of all parts", || system.survivors().is_empty().then_some(()));
+    assert!(!system.run_folder("run").checkpoints().is_empty(), "the learner saved");
+}

@@ -1,0 +1,73 @@
+//! `driml local` with a process for each part: what a run leaves behind, in every world that needs nothing installed.
+//! How runs end badly is in `failures`.
+
+use crate::{SHORT, system};
+
+#[test]
+fn c51_leaves_a_whole_run_folder() {
+    let system = system();
+    let ended = system.run(&format!("local --agent c51 {SHORT} --run-dir run")).expect_code(0);
+    let run = system.run_folder("run");
+    let summary = run.check_finished();
+    // Chosen so that chunks and batches fit without a remainder; the promise is within 1%.
+    assert_eq!(summary.replay_ratio, Some(8.0));
+    assert_eq!((summary.frames, summary.updates), (1280, 540));
+    assert!(summary.episodes > 0 && summary.mean_return.is_some());
+    assert_eq!(summary.mean_k, None, "c51 draws no positive");
+
+    let (header, rows) = run.metrics();
+    for name in ["seconds", "frames", "replay_ratio", "c51_kl", "dim_4t4", "waiting", "rss_mib_learner", "rss_mib_actor_0"] {
+        assert!(header.iter().any(|it| it == name), "{name} is not in {header:?}");
+    }
+    assert!(!rows.is_empty());
+    for part in ["replay-server", "learner", "actor-0"] {
+        let log = run.log(part);
+        assert!(log.contains("INFO") && !log.contains("panicked"), "{part}:\n{log}");
+    }
+    assert!(ended.stdout.contains("trains      c51 on chain, seed 1"), "{}", ended.stdout);
+    assert!(ended.stdout.contains("finished: 1280 frames and 540 updates"), "{}", ended.stdout);
+    assert_eq!(system.survivors(), []);
+}
+
+#[test]
+fn driml_ada_with_two_actors_over_tcp() {
+    let system = system();
+    // Port 0 cannot work here, as nobody could tell the parts which one it became; so the sockets are the launcher's own.
+    system.run(&format!("local --agent driml-ada {SHORT} --actors 2 --run-dir run")).expect_code(0);
+    let run = system.run_folder("run");
+    let summary = run.check_finished();
+    assert_eq!(summary.replay_ratio, Some(8.0));
+    let mean_k = summary.mean_k.expect("driml-ada draws positives");
+    assert!(1.0 < mean_k && mean_k < 5.0, "{mean_k}");
+    for part in ["actor-0", "actor-1"] {
+        let log = run.log(part);
+        assert!(log.contains("leaves: ") && !log.contains("leaves: 0 "), "{log}");
+    }
+    // The replay server says whose affinity it used; the learner sends one after each update.
+    let (header, rows) = run.metrics();
+    let affinity = header.iter().position(|it| it == "affinity_version").unwrap();
+    assert_ne!(rows.last().unwrap()[affinity], "0", "the learner's affinity reached the replay server");
+}
+
+#[test]
+fn mspacman_with_stacked_and_enlarged_frames() {
+    let system = system();
+    system
+        .run("local --env mspacman --agent driml-fix --preset smoke --frames 320 --run-dir run")
+        .expect_code(0);
+    let summary = system.run_folder("run").check_finished();
+    assert_eq!(summary.updates, 7);
+    assert_eq!(summary.mean_k, Some(1.0), "driml-fix serves k = 1 here");
+}
+
+#[test]
+fn the_settings_that_a_run_leaves_repeat_it() {
+    let system = system();
+    system.run(&format!("local --agent driml-randk {SHORT} --seed 5 --run-dir a")).expect_code(0);
+    system.run("local --config a/config.toml --run-dir b").expect_code(0);
+    let (a, b) = (system.run_folder("a"), system.run_folder("b"));
+    assert_eq!(a.config(), b.config());
+    // Processes race, so the weights differ; the counts do not.
+    let (a, b) = (a.check_finished(), b.check_finished());
+    assert_eq!((a.frames, a.updates, a.rows_sampled), (b.frames, b.updates, b.rows_sampled));
+}

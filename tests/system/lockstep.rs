@@ -1,0 +1,62 @@
+//! `driml local --lockstep`: the same seed gives the same weights, and an agent learns what can be learned.
+//! It starts one process only.
+
+use driml_envs::{ChainConfig, optimal_return};
+use driml_tests::{Summary, TestSystem};
+
+use crate::{SHORT, system};
+
+fn run(system: &TestSystem, flags: &str, name: &str) -> Summary {
+    system.run(&format!("local --lockstep {flags} --run-dir {name}")).expect_code(0);
+    system.run_folder(name).check_finished()
+}
+
+#[test]
+fn the_seed_decides_the_weights() {
+    let system = system();
+    let flags = format!("{SHORT} --agent driml-ada --actors 2 --envs 3");
+    let first = run(&system, &format!("{flags} --seed 3"), "first");
+    let same = run(&system, &format!("{flags} --seed 3"), "same");
+    let other = run(&system, &format!("{flags} --seed 4"), "other");
+    assert_eq!(first.weights_sha256, same.weights_sha256);
+    assert_eq!((first.k_histogram, first.episodes), (same.k_histogram, same.episodes));
+    assert_ne!(first.weights_sha256, other.weights_sha256);
+    // And so do the settings that the first run left.
+    let again = run(&system, "--config first/config.toml", "again");
+    assert_eq!(first.weights_sha256, again.weights_sha256);
+}
+
+#[test]
+fn every_agent_runs_in_every_world_that_needs_nothing() {
+    let system = system();
+    for world in ["chain", "mspacman", "ising"] {
+        for agent in ["c51", "driml-fix", "driml-ada", "driml-randk"] {
+            let flags = format!("--env {world} --agent {agent} --preset smoke --frames 256");
+            let summary = run(&system, &flags, &format!("{world}-{agent}"));
+            assert_eq!(summary.mean_k.is_some(), agent != "c51", "{world} {agent}");
+        }
+    }
+}
+
+#[test]
+fn c51_learns_the_chain_and_evaluation_shows_it() {
+    let system = system();
+    let summary = run(&system, "--env chain --agent c51", "run");
+    let folder = system.run_folder("run");
+    let mut world = folder.config()["world"].as_table().unwrap().clone();
+    world.remove("kind");
+    let world: ChainConfig = world.try_into().unwrap();
+    let wanted = 0.9 * optimal_return(&world);
+    let while_training = summary.mean_return.unwrap();
+    assert!(while_training >= wanted, "the last 100 episodes, with exploration: {while_training} of {wanted}");
+
+    let ended = system.run("evaluate --run run --episodes 40").expect_code(0);
+    let mean = |policy: &str| -> f64 {
+        let line = ended.stdout.lines().find(|line| line.starts_with(policy)).expect("each policy has a line");
+        line.split_once("mean return").unwrap().1.split(',').next().unwrap().trim().parse().unwrap()
+    };
+    let (learned, random) = (mean("c51"), mean("random"));
+    assert!(learned >= wanted, "greedy: {learned} of {wanted}");
+    // A random walk reaches the far end in one of seven episodes.
+    assert!(random < 0.6 * wanted, "random: {random}");
+}

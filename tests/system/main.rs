@@ -1,0 +1,30 @@
+//! End-to-end tests: the program under test as its users run it, and the rules of the repository.
+//! What one crate promises is tested in that crate; here only what takes several of them.
+
+#![allow(clippy::unwrap_used, reason = "these are tests")]
+
+mod bad_messages;
+mod bad_weights;
+mod by_hand;
+mod evaluate;
+mod failures;
+mod local;
+mod lockstep;
+mod parity;
+mod procgen;
+mod repo_rules;
+
+use driml_tests::TestSystem;
+
+/// A fresh system of the program that cargo has built for this test.
+fn system() -> TestSystem {
+    TestSystem::new(env!("CARGO_BIN_EXE_driml-under-test"))
+}
+
+/// A run on the chain that takes about a second: 540 updates of 16 rows, replay ratio 8.
+///
+/// 1280 frames are whole chunks of one or two actors (4 copies x 8 steps), and (1280 - 200) * 8 / 16 is whole.
+const SHORT: &str = "--env chain --preset smoke --frames 1280 --set replay.replay_ratio=8";
+
+/// A run on the chain that nobody waits for: it is ended from outside, long before its last frame.
+const LONG: &str = "--env chain --preset smoke --frames 100000000 --set replay.replay_ratio=8";

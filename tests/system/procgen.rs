@@ -1,0 +1,22 @@
+//! Real Procgen through all processes. The engine is fetched into the cache folder once, as `driml local` does.
+//! With `DRIML_OFFLINE=1` each test here is skipped and says so; what each game does is tested beside the worlds.
+
+use driml_tests::skipped_offline;
+
+use crate::system;
+
+#[test]
+fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
+    if skipped_offline("procgen::bigfish_trains_and_is_evaluated_on_unseen_levels") {
+        return;
+    }
+    let system = system();
+    system
+        .run("local --env procgen:bigfish --agent driml-ada --preset smoke --frames 608 --actors 2 --run-dir run")
+        .expect_code(0);
+    let summary = system.run_folder("run").check_finished();
+    assert_eq!((summary.frames, summary.updates), (608, 25));
+    assert!(summary.mean_k.is_some());
+    let ended = system.run("evaluate --run run --episodes 2 --levels unseen").expect_code(0);
+    assert!(ended.stdout.starts_with("procgen:bigfish on unseen levels, 2 episodes each"), "{}", ended.stdout);
+}
