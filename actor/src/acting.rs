@@ -65,7 +65,8 @@ impl Acting {
         self.stack.push(&self.frames, &self.first);
         self.stack.write(&mut self.states);
         policy.act(&self.states, epsilon, &mut self.rng, &mut self.actions)?;
-        self.world.step(&self.actions, &mut self.rewards, &mut self.ends)?;
+        self.world
+            .step(&self.actions, &mut self.rewards, &mut self.ends)?;
         for (first, end) in self.first.iter_mut().zip(&self.ends) {
             *first = *end != StepEnd::Running;
         }

@@ -43,9 +43,18 @@ impl Collector {
         )
         .with_context(|| format!("making the world {}", spec.world))?;
         let shape = world.frame_shape();
-        let promised = (spec.frame_height, spec.frame_width, spec.frame_channels, spec.num_actions);
-        let given =
-            (shape.height as u32, shape.width as u32, shape.channels as u32, world.num_actions() as u32);
+        let promised = (
+            spec.frame_height,
+            spec.frame_width,
+            spec.frame_channels,
+            spec.num_actions,
+        );
+        let given = (
+            shape.height as u32,
+            shape.width as u32,
+            shape.channels as u32,
+            world.num_actions() as u32,
+        );
         anyhow::ensure!(
             promised == given,
             "the world {} gives (height, width, channels, actions) {given:?}, the run spec promises {promised:?}: \
@@ -93,7 +102,10 @@ impl Collector {
         let epsilon = schedule::epsilon(&self.settings.actor, frames);
         loop {
             let step = self.acting.step(&mut self.policy, epsilon)?;
-            if let Some(chunk) = self.recorder.record(step.frames, step.actions, step.rewards, step.ends) {
+            if let Some(chunk) =
+                self.recorder
+                    .record(step.frames, step.actions, step.rewards, step.ends)
+            {
                 return Ok(chunk);
             }
         }

@@ -91,20 +91,42 @@ impl Config {
     pub fn validate(&self) -> Result<(), ConfigError> {
         let bad = |key, value: String, why| Err(ConfigError { key, value, why });
         if !(1..=4096).contains(&self.envs) {
-            return bad("envs", self.envs.to_string(), "an actor steps 1 to 4096 copies");
+            return bad(
+                "envs",
+                self.envs.to_string(),
+                "an actor steps 1 to 4096 copies",
+            );
         }
         if !(1..=4096).contains(&self.steps_per_chunk) {
-            return bad("steps_per_chunk", self.steps_per_chunk.to_string(), "a chunk has 1 to 4096 steps");
+            return bad(
+                "steps_per_chunk",
+                self.steps_per_chunk.to_string(),
+                "a chunk has 1 to 4096 steps",
+            );
         }
         if !(1..=64).contains(&self.chunks_in_flight_max) {
-            return bad("chunks_in_flight_max", self.chunks_in_flight_max.to_string(), "1 to 64 chunks may wait");
+            return bad(
+                "chunks_in_flight_max",
+                self.chunks_in_flight_max.to_string(),
+                "1 to 64 chunks may wait",
+            );
         }
-        for (key, epsilon) in [("epsilon_start", self.epsilon_start), ("epsilon_end", self.epsilon_end)] {
+        for (key, epsilon) in [
+            ("epsilon_start", self.epsilon_start),
+            ("epsilon_end", self.epsilon_end),
+        ] {
             if !(0.0..=1.0).contains(&epsilon) {
-                return bad(key, epsilon.to_string(), "a probability lies between 0 and 1");
+                return bad(
+                    key,
+                    epsilon.to_string(),
+                    "a probability lies between 0 and 1",
+                );
             }
         }
-        for (key, ms) in [("ack_timeout_ms", self.ack_timeout_ms), ("unreachable_max_ms", self.unreachable_max_ms)] {
+        for (key, ms) in [
+            ("ack_timeout_ms", self.ack_timeout_ms),
+            ("unreachable_max_ms", self.unreachable_max_ms),
+        ] {
             if !(100..=86_400_000).contains(&ms) {
                 return bad(key, ms.to_string(), "a wait lasts 100 ms to one day");
             }

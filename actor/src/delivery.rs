@@ -13,8 +13,7 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Chunk, Goodbye, InsertReply, Keys, Kind, Shutdown,
-    codec,
+    Chunk, Goodbye, InsertReply, Keys, Kind, Shutdown, codec,
     session::{self, SessionError},
 };
 use zenoh::{Session, qos::Priority};
@@ -63,13 +62,27 @@ impl Delivery {
         shutdown: Shutdown,
     ) -> std::io::Result<Self> {
         let answers = Arc::new(Answers::default());
-        answers.inserted_total.store(inserted_total, Ordering::Relaxed);
+        answers
+            .inserted_total
+            .store(inserted_total, Ordering::Relaxed);
         // One chunk is on its way, the others wait in the channel.
         let (queue, chunks) = mpsc::sync_channel(limits.chunks_in_flight_max.saturating_sub(1));
-        let courier = Courier { session, keys, spec_hash, limits, shutdown, answers: answers.clone() };
-        let thread =
-            std::thread::Builder::new().name("delivery".into()).spawn(move || courier.run(&chunks))?;
-        Ok(Self { queue, answers, thread })
+        let courier = Courier {
+            session,
+            keys,
+            spec_hash,
+            limits,
+            shutdown,
+            answers: answers.clone(),
+        };
+        let thread = std::thread::Builder::new()
+            .name("delivery".into())
+            .spawn(move || courier.run(&chunks))?;
+        Ok(Self {
+            queue,
+            answers,
+            thread,
+        })
     }
 
     /// Transitions that the run has stored, as of the last answer.
@@ -93,7 +106,9 @@ impl Delivery {
     /// A chunk that could not be delivered.
     pub(crate) fn finish(self) -> anyhow::Result<u64> {
         drop(self.queue);
-        self.thread.join().map_err(|_| anyhow::anyhow!("the delivery thread panicked"))?
+        self.thread
+            .join()
+            .map_err(|_| anyhow::anyhow!("the delivery thread panicked"))?
     }
 }
 
@@ -129,7 +144,11 @@ impl Courier {
             }
         }
         if let Some((actor, epoch)) = last {
-            self.say_goodbye(Goodbye { actor, epoch, produced: produced - unwanted });
+            self.say_goodbye(Goodbye {
+                actor,
+                epoch,
+                produced: produced - unwanted,
+            });
         }
         outcome.map(|()| unwanted)
     }
@@ -142,23 +161,36 @@ impl Courier {
             if self.shutdown.is_set() {
                 let since = *draining_since.get_or_insert_with(Instant::now);
                 if since.elapsed() > DRAIN_MAX {
-                    bail!("chunk {} was not stored within {DRAIN_MAX:?} of the end", chunk.header.sequence);
+                    bail!(
+                        "chunk {} was not stored within {DRAIN_MAX:?} of the end",
+                        chunk.header.sequence
+                    );
                 }
                 chunk.header.leaving = true;
             }
             let (head, planes) = chunk.seal(self.spec_hash)?;
-            match self.ask(&self.keys.ingest(), Kind::InsertReply, session::join_pieces([head, planes.to_vec()])) {
+            match self.ask(
+                &self.keys.ingest(),
+                Kind::InsertReply,
+                session::join_pieces([head, planes.to_vec()]),
+            ) {
                 Ok(InsertReply::Stored { inserted_total }) => {
-                    self.answers.inserted_total.store(inserted_total, Ordering::Relaxed);
+                    self.answers
+                        .inserted_total
+                        .store(inserted_total, Ordering::Relaxed);
                     return Ok(true);
                 }
                 Ok(InsertReply::Finished { inserted_total }) => {
-                    self.answers.inserted_total.store(inserted_total, Ordering::Relaxed);
+                    self.answers
+                        .inserted_total
+                        .store(inserted_total, Ordering::Relaxed);
                     self.answers.finished.store(true, Ordering::Relaxed);
                     return Ok(false);
                 }
                 Ok(InsertReply::Wait { inserted_total }) => {
-                    self.answers.inserted_total.store(inserted_total, Ordering::Relaxed);
+                    self.answers
+                        .inserted_total
+                        .store(inserted_total, Ordering::Relaxed);
                     answered = Instant::now();
                 }
                 // This side sends one chunk at a time, so a gap cannot be filled: the replay server forgot this epoch.
@@ -166,7 +198,9 @@ impl Courier {
                     "the replay server expects chunk {expected}, this actor is at {}: it was restarted; start the actor again",
                     chunk.header.sequence
                 ),
-                Ok(InsertReply::Refused { why }) => bail!("the replay server refused a chunk: {why}"),
+                Ok(InsertReply::Refused { why }) => {
+                    bail!("the replay server refused a chunk: {why}")
+                }
                 Err(e) if answered.elapsed() > self.limits.unreachable_max => {
                     return Err(e).context(format!(
                         "the replay server was out of reach for {:?}",
@@ -184,7 +218,9 @@ impl Courier {
     fn say_goodbye(&self, goodbye: Goodbye) {
         let said = codec::encode(Kind::Goodbye, self.spec_hash, &goodbye, &[])
             .context("encoding the goodbye")
-            .and_then(|bytes| Ok(self.ask::<()>(&self.keys.goodbye(), Kind::Done, bytes.into())?));
+            .and_then(|bytes| {
+                Ok(self.ask::<()>(&self.keys.goodbye(), Kind::Done, bytes.into())?)
+            });
         if let Err(e) = said {
             tracing::warn!("the replay server did not hear the goodbye: {e:#}");
         }
@@ -196,8 +232,19 @@ impl Courier {
         kind: Kind,
         payload: zenoh::bytes::ZBytes,
     ) -> Result<H, SessionError> {
-        let bytes = session::ask(&self.session, key, payload, Priority::Data, self.limits.ack_timeout)?;
-        let failed = |e: codec::CodecError| SessionError::Zenoh { key: key.into(), why: e.to_string() };
-        Ok(codec::decode(&bytes, kind, Some(self.spec_hash)).map_err(failed)?.0)
+        let bytes = session::ask(
+            &self.session,
+            key,
+            payload,
+            Priority::Data,
+            self.limits.ack_timeout,
+        )?;
+        let failed = |e: codec::CodecError| SessionError::Zenoh {
+            key: key.into(),
+            why: e.to_string(),
+        };
+        Ok(codec::decode(&bytes, kind, Some(self.spec_hash))
+            .map_err(failed)?
+            .0)
     }
 }

@@ -26,7 +26,9 @@ struct Args {
 
 fn main() -> ExitCode {
     let args = Args::parse();
-    tracing_subscriber::fmt().with_writer(std::io::stderr).init();
+    tracing_subscriber::fmt()
+        .with_writer(std::io::stderr)
+        .init();
     match run(args) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
@@ -38,6 +40,19 @@ fn main() -> ExitCode {
 
 fn run(args: Args) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(false)?;
-    let Args { connect, id, envs, namespace } = args;
-    driml_actor::run(RunArgs { connect, namespace, actor: id, envs }, &shutdown)
+    let Args {
+        connect,
+        id,
+        envs,
+        namespace,
+    } = args;
+    driml_actor::run(
+        RunArgs {
+            connect,
+            namespace,
+            actor: id,
+            envs,
+        },
+        &shutdown,
+    )
 }

@@ -59,10 +59,15 @@ impl NetworkPolicy {
     ///
     /// # Errors
     /// Weights that do not fit the model.
-    pub fn new(model: &ModelConfig, frame: (usize, usize), safetensors: &[u8]) -> anyhow::Result<Self> {
+    pub fn new(
+        model: &ModelConfig,
+        frame: (usize, usize),
+        safetensors: &[u8],
+    ) -> anyhow::Result<Self> {
         let input = (model.height, model.width);
-        let enlarge =
-            (frame != input).then(|| Enlarge::new(frame, input, model.channels)).transpose()?;
+        let enlarge = (frame != input)
+            .then(|| Enlarge::new(frame, input, model.channels))
+            .transpose()?;
         Ok(Self {
             network: PolicyNetwork::new(model, safetensors)?,
             enlarge,
@@ -91,7 +96,8 @@ impl Policy for NetworkPolicy {
         let input = match &self.enlarge {
             None => states,
             Some(enlarge) => {
-                self.enlarged.resize(actions.len() * enlarge.output_bytes(), 0);
+                self.enlarged
+                    .resize(actions.len() * enlarge.output_bytes(), 0);
                 enlarge.apply(states, &mut self.enlarged);
                 &self.enlarged
             }

@@ -30,17 +30,25 @@ impl Recorder {
             epoch,
             sequence: 0,
             first_transition: 0,
-            weights_version: 0, leaving: false,
+            weights_version: 0,
+            leaving: false,
             streams,
             steps,
             frame_bytes,
         };
-        Self { header, chunk: Chunk::zeroed(header), filled_steps: 0 }
+        Self {
+            header,
+            chunk: Chunk::zeroed(header),
+            filled_steps: 0,
+        }
     }
 
     /// Stamps the chunk being filled with the weights that act in it; only before its first step.
     pub fn set_weights_version(&mut self, version: u64) {
-        assert_eq!(self.filled_steps, 0, "one chunk, one version of the weights");
+        assert_eq!(
+            self.filled_steps, 0,
+            "one chunk, one version of the weights"
+        );
         self.header.weights_version = version;
         self.chunk.header.weights_version = version;
     }
@@ -64,7 +72,12 @@ impl Recorder {
         for (stream, frame) in frames.chunks_exact(frame_bytes).enumerate() {
             let row = stream * self.header.steps as usize + self.filled_steps as usize;
             self.chunk.frame_mut(row).copy_from_slice(frame);
-            self.chunk.set(row, actions[stream], rewards[stream], end_on_the_wire(ends[stream]));
+            self.chunk.set(
+                row,
+                actions[stream],
+                rewards[stream],
+                end_on_the_wire(ends[stream]),
+            );
         }
         self.filled_steps += 1;
         (self.filled_steps == self.header.steps).then(|| self.next_chunk())
@@ -99,9 +112,16 @@ mod tests {
         assert_eq!(chunks[1].frames(), [3, 4, 5, 103, 104, 105]);
         assert_eq!(chunks[1].actions(), [3, 4, 5, 3, 4, 5]);
         assert_eq!((chunks[1].reward(0), chunks[1].reward(3)), (0.5, -1.0));
-        assert_eq!((chunks[1].end(0), chunks[1].end(3)), (End::Running, End::Terminal));
+        assert_eq!(
+            (chunks[1].end(0), chunks[1].end(3)),
+            (End::Running, End::Terminal)
+        );
         let numbers = chunks.iter().map(|c| {
-            (c.header.sequence, c.header.first_transition, c.header.weights_version)
+            (
+                c.header.sequence,
+                c.header.first_transition,
+                c.header.weights_version,
+            )
         });
         assert_eq!(numbers.collect::<Vec<_>>(), [(0, 0, 0), (1, 6, 3)]);
     }

@@ -39,8 +39,13 @@ pub struct RunArgs {
 /// Nobody to join, settings or weights that do not fit, a world that fails, chunks that cannot be delivered.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let session = session::open(&Endpoints { listen: Vec::new(), connect: args.connect })?;
-    let Some(hello) = session::join(&session, &keys, shutdown)? else { return Ok(()) };
+    let session = session::open(&Endpoints {
+        listen: Vec::new(),
+        connect: args.connect,
+    })?;
+    let Some(hello) = session::join(&session, &keys, shutdown)? else {
+        return Ok(());
+    };
     let mut settings = ActorSettings::from_toml(&hello.config_toml)
         .context("the settings that the replay server sent")?;
     if let Some(envs) = args.envs {
@@ -50,14 +55,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let spec_hash = settings.spec.hash();
     let first =
         weight_watch::first_weights(&session, &keys, spec_hash, WEIGHTS_WAIT_MAX, shutdown)?;
-    let Some((header, weights)) = first else { return Ok(()) };
+    let Some((header, weights)) = first else {
+        return Ok(());
+    };
     let limits = DeliveryLimits {
         chunks_in_flight_max: settings.actor.chunks_in_flight_max as usize,
         ack_timeout: Duration::from_millis(settings.actor.ack_timeout_ms),
         unreachable_max: Duration::from_millis(settings.actor.unreachable_max_ms),
     };
     let envs = settings.actor.envs;
-    let mut collector = Collector::new(settings, args.actor, new_epoch(), header.version, &weights)?;
+    let mut collector =
+        Collector::new(settings, args.actor, new_epoch(), header.version, &weights)?;
     let newest = weight_watch::watch(
         session.clone(),
         keys.clone(),
@@ -78,12 +86,18 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         limits,
         shutdown.clone(),
     )?;
-    tracing::info!("actor {} steps {envs} copies, run {spec_hash:016x}", args.actor);
+    tracing::info!(
+        "actor {} steps {envs} copies, run {spec_hash:016x}",
+        args.actor
+    );
     while !shutdown.is_set() && !delivery.is_finished() {
         if let Some((header, weights)) = newest.take()
             && let Err(e) = collector.set_weights(header.version, &weights)
         {
-            tracing::warn!("weights {} were refused, the old ones stay: {e:#}", header.version);
+            tracing::warn!(
+                "weights {} were refused, the old ones stay: {e:#}",
+                header.version
+            );
         }
         let chunk = collector.collect(delivery.inserted_total())?;
         if !delivery.send(chunk) {
@@ -92,9 +106,16 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     }
     let produced = collector.produced();
     let unwanted = delivery.finish()?;
-    tracing::info!("actor {} leaves: {} transitions delivered", args.actor, produced - unwanted);
+    tracing::info!(
+        "actor {} leaves: {} transitions delivered",
+        args.actor,
+        produced - unwanted
+    );
     drop(alive);
-    session.close().wait().map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+    session
+        .close()
+        .wait()
+        .map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
 /// A number that no other life of this actor has: nanoseconds since 1970.

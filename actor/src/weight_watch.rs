@@ -29,7 +29,10 @@ pub(crate) struct Newest {
 impl Newest {
     /// Takes the newest weights, if they came since the last call.
     pub(crate) fn take(&self) -> Option<Weights> {
-        self.slot.lock().unwrap_or_else(PoisonError::into_inner).take()
+        self.slot
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .take()
     }
 
     fn put(&self, weights: Weights) {
@@ -112,17 +115,26 @@ pub(crate) fn watch(
                     slot.put(weights);
                 }
                 Ok(_) => {}
-                Err(e) => tracing::warn!("keeping weights {version}, newer ones did not come: {e:#}"),
+                Err(e) => {
+                    tracing::warn!("keeping weights {version}, newer ones did not come: {e:#}")
+                }
             }
         }
     };
-    std::thread::Builder::new().name("weight-watch".into()).spawn(work)?;
+    std::thread::Builder::new()
+        .name("weight-watch".into())
+        .spawn(work)?;
     Ok(newest)
 }
 
 fn pull(session: &Session, keys: &Keys, spec_hash: u64) -> anyhow::Result<Weights> {
-    let bytes =
-        session::ask(session, &keys.weights(), ZBytes::new(), Priority::DataLow, PULL_TIMEOUT)?;
+    let bytes = session::ask(
+        session,
+        &keys.weights(),
+        ZBytes::new(),
+        Priority::DataLow,
+        PULL_TIMEOUT,
+    )?;
     let (header, planes) = WeightsHeader::decode(&bytes, spec_hash)?;
     Ok((header, planes.to_vec()))
 }

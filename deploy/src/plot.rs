@@ -33,7 +33,11 @@ struct Curve {
 /// A folder that is no run's, a column that is not there, a file that cannot be written.
 pub(crate) fn run(args: &PlotArgs) -> anyhow::Result<()> {
     let read = |folder: &PathBuf| read(folder, &args.column);
-    let curves = args.runs.iter().map(read).collect::<anyhow::Result<Vec<_>>>()?;
+    let curves = args
+        .runs
+        .iter()
+        .map(read)
+        .collect::<anyhow::Result<Vec<_>>>()?;
     draw(&args.out, &args.column, &curves)?;
     print(&format!("{}\n", args.out.display()))
 }
@@ -42,13 +46,23 @@ fn read(folder: &Path, column: &str) -> anyhow::Result<Curve> {
     let path = folder.join("metrics.csv");
     let mut file = csv::Reader::from_path(&path)
         .map_err(|e| usage!("{} is not the folder of a run: {e}", folder.display()))?;
-    let header = file.headers().with_context(|| format!("reading {}", path.display()))?.clone();
+    let header = file
+        .headers()
+        .with_context(|| format!("reading {}", path.display()))?
+        .clone();
     let place = |name: &str| header.iter().position(|field| field == name);
-    let frames = place("frames")
-        .ok_or_else(|| usage!("{} has no column \"frames\": it is no run's", path.display()))?;
+    let frames = place("frames").ok_or_else(|| {
+        usage!(
+            "{} has no column \"frames\": it is no run's",
+            path.display()
+        )
+    })?;
     let value = place(column).ok_or_else(|| {
         let columns = header.iter().collect::<Vec<_>>().join(", ");
-        usage!("{} has no column {column:?}; it has {columns}", path.display())
+        usage!(
+            "{} has no column {column:?}; it has {columns}",
+            path.display()
+        )
     })?;
     let mut points = Vec::new();
     for (line, row) in file.records().enumerate() {
@@ -58,12 +72,21 @@ fn read(folder: &Path, column: &str) -> anyhow::Result<Curve> {
             continue;
         }
         let number = |text: &str| {
-            text.parse::<f64>()
-                .map_err(|_| usage!("{}, row {}: {text:?} is no number", path.display(), line + 2))
+            text.parse::<f64>().map_err(|_| {
+                usage!(
+                    "{}, row {}: {text:?} is no number",
+                    path.display(),
+                    line + 2
+                )
+            })
         };
         points.push((number(&row[frames])?, number(&row[value])?));
     }
-    let name = folder.file_name().unwrap_or(folder.as_os_str()).to_string_lossy().into_owned();
+    let name = folder
+        .file_name()
+        .unwrap_or(folder.as_os_str())
+        .to_string_lossy()
+        .into_owned();
     Ok(Curve { name, points })
 }
 
@@ -71,7 +94,9 @@ fn draw(out: &Path, column: &str, curves: &[Curve]) -> anyhow::Result<()> {
     let points = || curves.iter().flat_map(|curve| &curve.points);
     let frames_max = points().map(|point| point.0).fold(1.0, f64::max);
     let low = points().map(|point| point.1).fold(f64::INFINITY, f64::min);
-    let high = points().map(|point| point.1).fold(f64::NEG_INFINITY, f64::max);
+    let high = points()
+        .map(|point| point.1)
+        .fold(f64::NEG_INFINITY, f64::max);
     if !(low.is_finite() && high.is_finite()) {
         return Err(usage!("none of these runs has a value of {column:?} yet").into());
     }

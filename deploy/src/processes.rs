@@ -347,10 +347,14 @@ impl Launch<'_> {
 
     /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
     fn hear_the_learner_out(&mut self, hurry: &impl Fn() -> bool) {
-        let Some(learner) = self.parts.get_mut(LEARNER) else { return };
+        let Some(learner) = self.parts.get_mut(LEARNER) else {
+            return;
+        };
         learner.ask_to_stop();
         let deadline = Instant::now() + LEARNER_DRAIN_MAX;
-        let Some(statuses) = &mut self.statuses else { return };
+        let Some(statuses) = &mut self.statuses else {
+            return;
+        };
         while Instant::now() < deadline && !hurry() {
             if let Err(e) = statuses.ask_learner() {
                 tracing::debug!("a last question: {e:#}");

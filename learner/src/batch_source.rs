@@ -123,8 +123,13 @@ impl Fetcher {
     fn fetch(&self) -> anyhow::Result<Option<Fetched>> {
         let request = BatchRequest { rows: self.rows };
         let request = codec::encode(Kind::BatchRequest, self.spec_hash, &request, &[])?;
-        let bytes =
-            session::ask(&self.session, &self.key, request.into(), Priority::Data, REQUEST_TIMEOUT)?;
+        let bytes = session::ask(
+            &self.session,
+            &self.key,
+            request.into(),
+            Priority::Data,
+            REQUEST_TIMEOUT,
+        )?;
         let (reply, planes) =
             codec::decode(&bytes, Kind::BatchReply, Some(self.spec_hash)).context("a batch")?;
         match reply {

@@ -97,9 +97,11 @@ impl AffinityConfig {
         }
         let alphabet = match self.alphabet.ok_or_else(|| missing("affinity.alphabet"))? {
             AlphabetKind::Raw => Alphabet::raw(num_actions),
-            AlphabetKind::Visible => {
-                Alphabet::new(self.visible.as_ref().ok_or_else(|| missing("affinity.visible"))?)
-            }
+            AlphabetKind::Visible => Alphabet::new(
+                self.visible
+                    .as_ref()
+                    .ok_or_else(|| missing("affinity.visible"))?,
+            ),
         }
         .map_err(bad)?;
         if alphabet.num_actions() != num_actions {
@@ -143,13 +145,29 @@ impl Config {
         for (key, value, max) in [
             ("batch_rows", u64::from(self.batch_rows), 65_536),
             ("batches_in_flight", u64::from(self.batches_in_flight), 64),
-            ("publish_period_updates", self.publish_period_updates, u64::MAX),
-            ("checkpoint_period_updates", self.checkpoint_period_updates, u64::MAX),
-            ("checkpoints_kept", u64::from(self.checkpoints_kept), 1_000_000),
+            (
+                "publish_period_updates",
+                self.publish_period_updates,
+                u64::MAX,
+            ),
+            (
+                "checkpoint_period_updates",
+                self.checkpoint_period_updates,
+                u64::MAX,
+            ),
+            (
+                "checkpoints_kept",
+                u64::from(self.checkpoints_kept),
+                1_000_000,
+            ),
         ] {
             if value == 0 || value > max {
                 let why = format!("it must lie between 1 and {max}");
-                return Err(ConfigError { key, value: value.to_string(), why });
+                return Err(ConfigError {
+                    key,
+                    value: value.to_string(),
+                    why,
+                });
             }
         }
         Ok(())

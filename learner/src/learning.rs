@@ -40,10 +40,15 @@ impl Learning {
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
         let mut rng = ChaCha8Rng::from_seed(spec.seed_for("learner", 0));
         let learner = Learner::new(part.model.clone(), part.learner.update.clone(), &mut init)?;
-        let affinity = part.learner.affinity.estimator(part.model.num_actions, &mut rng)?;
+        let affinity = part
+            .learner
+            .affinity
+            .estimator(part.model.num_actions, &mut rng)?;
         let from = (spec.frame_height as usize, spec.frame_width as usize);
         let to = (part.model.height, part.model.width);
-        let enlarge = (from != to).then(|| Enlarge::new(from, to, part.model.channels)).transpose()?;
+        let enlarge = (from != to)
+            .then(|| Enlarge::new(from, to, part.model.channels))
+            .transpose()?;
         Ok(Self {
             spec_hash: spec.hash(),
             learner,
@@ -129,12 +134,17 @@ impl Learning {
 
     /// Whether the actors are due newer weights after this many updates.
     pub const fn publication_is_due(&self) -> bool {
-        self.learner.updates().is_multiple_of(self.part.learner.publish_period_updates)
+        self.learner
+            .updates()
+            .is_multiple_of(self.part.learner.publish_period_updates)
     }
 
     /// Whether a checkpoint is due after this many updates.
     pub const fn checkpoint_is_due(&self) -> bool {
-        self.updates() > 0 && self.updates().is_multiple_of(self.part.learner.checkpoint_period_updates)
+        self.updates() > 0
+            && self
+                .updates()
+                .is_multiple_of(self.part.learner.checkpoint_period_updates)
     }
 
     /// The present weights as a new version.

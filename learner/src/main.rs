@@ -23,7 +23,9 @@ struct Args {
 
 fn main() -> ExitCode {
     let args = Args::parse();
-    tracing_subscriber::fmt().with_writer(std::io::stderr).init();
+    tracing_subscriber::fmt()
+        .with_writer(std::io::stderr)
+        .init();
     match run(args) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
@@ -35,6 +37,17 @@ fn main() -> ExitCode {
 
 fn run(args: Args) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(false)?;
-    let Args { connect, run_dir, namespace } = args;
-    driml_learner::run(RunArgs { connect, namespace, run_dir }, &shutdown)
+    let Args {
+        connect,
+        run_dir,
+        namespace,
+    } = args;
+    driml_learner::run(
+        RunArgs {
+            connect,
+            namespace,
+            run_dir,
+        },
+        &shutdown,
+    )
 }

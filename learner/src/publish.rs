@@ -100,16 +100,28 @@ impl Outlets {
             newest: affinity.clone(),
             shutdown: shutdown.clone(),
         };
-        std::thread::Builder::new().name("affinity".into()).spawn(move || sender.run())?;
+        std::thread::Builder::new()
+            .name("affinity".into())
+            .spawn(move || sender.run())?;
         let _queryables = [weights_queryable, status_queryable];
-        Ok(Self { weights, status, heard, affinity, version, spec_hash, _queryables })
+        Ok(Self {
+            weights,
+            status,
+            heard,
+            affinity,
+            version,
+            spec_hash,
+            _queryables,
+        })
     }
 
     /// Makes `weights` the ones that actors get, and announces them.
     pub(crate) fn publish(&self, (header, safetensors): Weights) -> anyhow::Result<()> {
         let head = codec::seal(Kind::Weights, self.spec_hash, &header, &safetensors)?;
         *lock(&self.weights) = Some((head, safetensors));
-        let announced = WeightsVersion { version: header.version };
+        let announced = WeightsVersion {
+            version: header.version,
+        };
         let bytes = codec::encode(Kind::WeightsVersion, self.spec_hash, &announced, &[])?;
         if let Err(e) = self.version.put(bytes).wait() {
             tracing::warn!("weights {} were not announced: {e}", header.version);
@@ -160,7 +172,10 @@ impl AffinitySender {
             let Some(update) = slot.take() else { continue };
             drop(slot);
             if let Err(e) = self.send(&update) {
-                tracing::warn!("affinity {} did not arrive, the next one will: {e:#}", update.version);
+                tracing::warn!(
+                    "affinity {} did not arrive, the next one will: {e:#}",
+                    update.version
+                );
             }
         }
     }
@@ -168,8 +183,13 @@ impl AffinitySender {
     fn send(&self, update: &AffinityUpdate) -> anyhow::Result<()> {
         let bytes = codec::encode(Kind::Affinity, self.spec_hash, update, &[])?;
         let payload = ZBytes::from(bytes);
-        let answer =
-            session::ask(&self.session, &self.key, payload, Priority::DataHigh, AFFINITY_TIMEOUT)?;
+        let answer = session::ask(
+            &self.session,
+            &self.key,
+            payload,
+            Priority::DataHigh,
+            AFFINITY_TIMEOUT,
+        )?;
         codec::decode::<()>(&answer, Kind::Done, Some(self.spec_hash))?;
         Ok(())
     }

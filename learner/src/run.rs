@@ -42,8 +42,13 @@ pub struct RunArgs {
 /// Nobody to join, settings that cannot work, an update that failed, a disk that refuses.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let session = session::open(&Endpoints { listen: Vec::new(), connect: args.connect })?;
-    let Some(hello) = session::join(&session, &keys, shutdown)? else { return Ok(()) };
+    let session = session::open(&Endpoints {
+        listen: Vec::new(),
+        connect: args.connect,
+    })?;
+    let Some(hello) = session::join(&session, &keys, shutdown)? else {
+        return Ok(());
+    };
     let part = LearnerPart::from_toml(&hello.config_toml)
         .context("the settings that the replay server sent")?;
     let (rows, in_flight) = (part.learner.batch_rows, part.learner.batches_in_flight);
@@ -92,7 +97,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     tracing::info!("finished after {} updates", learning.updates());
     shutdown.wait();
     outlets.wait_until_heard(LAST_WORD_MAX);
-    session.close().wait().map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+    session
+        .close()
+        .wait()
+        .map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
 /// Leaves the run's settings beside the checkpoints, for `driml evaluate`; a file that is there is the launcher's.

@@ -91,7 +91,9 @@ pub enum UpdateError {
     #[error("this batch cannot be learned from: {0}")]
     Batch(String),
     /// A setting out of its range.
-    #[error("[learner.update] {0}: outside its range, which the presets and the documentation of LearnerSettings give")]
+    #[error(
+        "[learner.update] {0}: outside its range, which the presets and the documentation of LearnerSettings give"
+    )]
     Settings(String),
     /// State that does not fit the network, as from another run's checkpoint.
     #[error("learner state does not fit: {0}")]

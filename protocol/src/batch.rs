@@ -66,7 +66,10 @@ impl Batch {
     /// A batch of zeros, to be filled in place.
     pub fn zeroed(header: BatchHeader) -> Self {
         let bytes = planes_bytes(&header).expect("a batch is far below the address space");
-        Self { header, planes: vec![0; bytes] }
+        Self {
+            header,
+            planes: vec![0; bytes],
+        }
     }
 
     /// Rows, B.
@@ -166,8 +169,7 @@ impl Batch {
         let rows = self.rows();
         let mut rest = self.planes.as_mut_slice();
         let mut take = |i: usize| -> &mut [u8] {
-            let (head, tail) =
-                std::mem::take(&mut rest).split_at_mut(offsets[i + 1] - offsets[i]);
+            let (head, tail) = std::mem::take(&mut rest).split_at_mut(offsets[i + 1] - offsets[i]);
             rest = tail;
             head
         };
@@ -191,7 +193,12 @@ impl Batch {
     /// # Errors
     /// A batch over the codec's limits.
     pub fn seal(self, spec_hash: u64) -> Result<(Vec<u8>, Vec<u8>), CodecError> {
-        let head = codec::seal(Kind::BatchReply, spec_hash, &BatchReply::Batch(self.header), &self.planes)?;
+        let head = codec::seal(
+            Kind::BatchReply,
+            spec_hash,
+            &BatchReply::Batch(self.header),
+            &self.planes,
+        )?;
         Ok((head, self.planes))
     }
 
@@ -209,14 +216,21 @@ impl Batch {
                 planes.len()
             )));
         }
-        Ok(Self { header, planes: planes.to_vec() })
+        Ok(Self {
+            header,
+            planes: planes.to_vec(),
+        })
     }
 }
 
 fn planes_bytes(header: &BatchHeader) -> Option<usize> {
     let (rows, positives) = (header.rows as usize, header.positives as usize);
     let states = (header.state_bytes as usize).checked_mul(positives.checked_add(2)?)?;
-    rows.checked_mul(states.checked_add(10)?.checked_add(positives.checked_mul(2)?)?)
+    rows.checked_mul(
+        states
+            .checked_add(10)?
+            .checked_add(positives.checked_mul(2)?)?,
+    )
 }
 
 /// The planes of a batch, borrowed for writing, row by row.
@@ -255,7 +269,14 @@ impl BatchRowsMut<'_> {
     }
 
     /// Writes the scalars of `row`.
-    pub fn set(&mut self, row: usize, action: u8, next_action: u8, n_step_return: f32, discount: f32) {
+    pub fn set(
+        &mut self,
+        row: usize,
+        action: u8,
+        next_action: u8,
+        n_step_return: f32,
+        discount: f32,
+    ) {
         self.action[row] = action;
         self.next_action[row] = next_action;
         self.n_step_return[4 * row..4 * row + 4].copy_from_slice(&n_step_return.to_le_bytes());

@@ -58,7 +58,9 @@ pub enum Kind {
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 pub enum CodecError {
     /// Fewer or more bytes than the prefix promises.
-    #[error("the message has {have} bytes, not the {need} that it needs: it was cut off or padded on the way")]
+    #[error(
+        "the message has {have} bytes, not the {need} that it needs: it was cut off or padded on the way"
+    )]
     Length {
         /// Bytes at hand.
         have: usize,
@@ -66,10 +68,14 @@ pub enum CodecError {
         need: usize,
     },
     /// Not one of our messages.
-    #[error("the message does not start with DRML: the sender is not part of DRIML, or the bytes were damaged")]
+    #[error(
+        "the message does not start with DRML: the sender is not part of DRIML, or the bytes were damaged"
+    )]
     Magic,
     /// Another protocol version.
-    #[error("the sender speaks protocol version {theirs}, this part version {ours}: run the same build of driml everywhere")]
+    #[error(
+        "the sender speaks protocol version {theirs}, this part version {ours}: run the same build of driml everywhere"
+    )]
     Version {
         /// The sender's.
         theirs: u16,
@@ -101,7 +107,9 @@ pub enum CodecError {
     #[error("the message's header makes no sense: {0}")]
     Header(String),
     /// Larger than a message may be.
-    #[error("the message has {have} bytes, more than the {max} allowed: use smaller chunks or batches")]
+    #[error(
+        "the message has {have} bytes, more than the {max} allowed: use smaller chunks or batches"
+    )]
     TooLarge {
         /// Bytes at hand.
         have: usize,
@@ -115,7 +123,10 @@ fn encode_header<H: Serialize>(header: &H) -> Result<Vec<u8>, CodecError> {
     let bytes = bincode::serde::encode_to_vec(header, bincode::config::standard())
         .map_err(|e| CodecError::Header(e.to_string()))?;
     if bytes.len() > HEADER_BYTES_MAX {
-        return Err(CodecError::TooLarge { have: bytes.len(), max: HEADER_BYTES_MAX });
+        return Err(CodecError::TooLarge {
+            have: bytes.len(),
+            max: HEADER_BYTES_MAX,
+        });
     }
     Ok(bytes)
 }
@@ -136,7 +147,10 @@ pub fn seal<H: Serialize>(
     planes: &[u8],
 ) -> Result<Vec<u8>, CodecError> {
     if planes.len() > PLANES_BYTES_MAX {
-        return Err(CodecError::TooLarge { have: planes.len(), max: PLANES_BYTES_MAX });
+        return Err(CodecError::TooLarge {
+            have: planes.len(),
+            max: PLANES_BYTES_MAX,
+        });
     }
     let header = encode_header(header)?;
     let mut out = Vec::with_capacity(PREFIX_BYTES + header.len());
@@ -178,26 +192,40 @@ pub fn decode<H: DeserializeOwned>(
     kind: Kind,
     spec_hash: Option<u64>,
 ) -> Result<(H, &[u8]), CodecError> {
-    let prefix: &[u8; PREFIX_BYTES] =
-        bytes.first_chunk().ok_or(CodecError::Length { have: bytes.len(), need: PREFIX_BYTES })?;
+    let prefix: &[u8; PREFIX_BYTES] = bytes.first_chunk().ok_or(CodecError::Length {
+        have: bytes.len(),
+        need: PREFIX_BYTES,
+    })?;
     if prefix[0..4] != MAGIC {
         return Err(CodecError::Magic);
     }
     let version = u16::from_le_bytes([prefix[4], prefix[5]]);
     if version != PROTOCOL_VERSION {
-        return Err(CodecError::Version { theirs: version, ours: PROTOCOL_VERSION });
+        return Err(CodecError::Version {
+            theirs: version,
+            ours: PROTOCOL_VERSION,
+        });
     }
     let header_len = le_u32(&prefix[16..20]) as usize;
     let planes_len = usize::try_from(le_u64(&prefix[20..28])).unwrap_or(usize::MAX);
     if header_len > HEADER_BYTES_MAX {
-        return Err(CodecError::TooLarge { have: header_len, max: HEADER_BYTES_MAX });
+        return Err(CodecError::TooLarge {
+            have: header_len,
+            max: HEADER_BYTES_MAX,
+        });
     }
     if planes_len > PLANES_BYTES_MAX {
-        return Err(CodecError::TooLarge { have: planes_len, max: PLANES_BYTES_MAX });
+        return Err(CodecError::TooLarge {
+            have: planes_len,
+            max: PLANES_BYTES_MAX,
+        });
     }
     let need = PREFIX_BYTES + header_len + planes_len;
     if bytes.len() != need {
-        return Err(CodecError::Length { have: bytes.len(), need });
+        return Err(CodecError::Length {
+            have: bytes.len(),
+            need,
+        });
     }
     let (header, planes) = bytes[PREFIX_BYTES..].split_at(header_len);
     if checksum(&prefix[..28], header, planes) != le_u32(&prefix[28..32]) {
@@ -205,7 +233,10 @@ pub fn decode<H: DeserializeOwned>(
     }
     let their_kind = u16::from_le_bytes([prefix[6], prefix[7]]);
     if their_kind != kind as u16 {
-        return Err(CodecError::Kind { theirs: their_kind, ours: kind as u16 });
+        return Err(CodecError::Kind {
+            theirs: their_kind,
+            ours: kind as u16,
+        });
     }
     let theirs = le_u64(&prefix[8..16]);
     if let Some(ours) = spec_hash
@@ -217,7 +248,10 @@ pub fn decode<H: DeserializeOwned>(
     let (value, used) = bincode::serde::decode_from_slice(header, config)
         .map_err(|e| CodecError::Header(e.to_string()))?;
     if used != header.len() {
-        return Err(CodecError::Header(format!("{} bytes after its end", header.len() - used)));
+        return Err(CodecError::Header(format!(
+            "{} bytes after its end",
+            header.len() - used
+        )));
     }
     Ok((value, planes))
 }

@@ -32,7 +32,9 @@ impl Settings {
     /// # Errors
     /// Text that is not TOML.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
-        let table = text.parse::<toml::Table>().map_err(|e| ConfigError::Syntax(e.to_string()))?;
+        let table = text
+            .parse::<toml::Table>()
+            .map_err(|e| ConfigError::Syntax(e.to_string()))?;
         Ok(Self(table))
     }
 
@@ -42,7 +44,10 @@ impl Settings {
     /// No such table, or one that does not fit `T`.
     pub fn table<T: DeserializeOwned>(&self, name: &'static str) -> Result<T, ConfigError> {
         let value = self.0.get(name).ok_or(ConfigError::Missing(name))?;
-        let why = |e: toml::de::Error| ConfigError::Table { table: name, why: e.message().to_owned() };
+        let why = |e: toml::de::Error| ConfigError::Table {
+            table: name,
+            why: e.message().to_owned(),
+        };
         value.clone().try_into().map_err(why)
     }
 }

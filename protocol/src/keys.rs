@@ -16,7 +16,9 @@ impl Keys {
         let good = |c: char| c.is_ascii_alphanumeric() || "-_/".contains(c);
         let chunks_filled = !namespace.split('/').any(str::is_empty);
         if chunks_filled && namespace.chars().all(good) {
-            Ok(Self { namespace: namespace.into() })
+            Ok(Self {
+                namespace: namespace.into(),
+            })
         } else {
             Err(format!(
                 "namespace {namespace:?} cannot be used: take letters, digits, '-' and '_', in parts separated by single '/'"

@@ -22,8 +22,8 @@ pub use codec::{CodecError, Kind};
 pub use control::{Goodbye, Hello};
 pub use keys::Keys;
 pub use metric::{LearnerStatus, ReplayStatus, Waiting};
-pub use shutdown::Shutdown;
 pub use run_spec::{Horizon, RunSpec, TimeoutRule};
+pub use shutdown::Shutdown;
 pub use transition::{Chunk, ChunkHeader, End, InsertReply};
 pub use weights::{WeightsHeader, WeightsVersion};
 

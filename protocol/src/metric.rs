@@ -82,14 +82,21 @@ pub struct ReplayStatus {
 impl ReplayStatus {
     /// Rows sampled per transition inserted after the warm-up; none before.
     pub fn replay_ratio(&self) -> Option<f64> {
-        let after = self.transitions_inserted.checked_sub(self.warmup_transitions)?;
+        let after = self
+            .transitions_inserted
+            .checked_sub(self.warmup_transitions)?;
         (after > 0).then(|| self.rows_sampled as f64 / after as f64)
     }
 
     /// Mean k over all positives served; none before the first.
     pub fn mean_k(&self) -> Option<f64> {
         let positives: u64 = self.k_histogram.iter().skip(1).sum();
-        let weighted: u64 = self.k_histogram.iter().enumerate().map(|(k, &n)| k as u64 * n).sum();
+        let weighted: u64 = self
+            .k_histogram
+            .iter()
+            .enumerate()
+            .map(|(k, &n)| k as u64 * n)
+            .sum();
         (positives > 0).then(|| weighted as f64 / positives as f64)
     }
 }

@@ -139,17 +139,33 @@ impl RunSpec {
         ];
         for (key, value, max) in sides {
             if value == 0 || value > max {
-                return bad(key, value.to_string(), "it must be at least 1 and of a sensible size");
+                return bad(
+                    key,
+                    value.to_string(),
+                    "it must be at least 1 and of a sensible size",
+                );
             }
         }
         if self.num_actions == 0 || self.num_actions > 255 {
-            return bad("num_actions", self.num_actions.to_string(), "a world has 1 to 255 actions");
+            return bad(
+                "num_actions",
+                self.num_actions.to_string(),
+                "a world has 1 to 255 actions",
+            );
         }
         if self.n_step == 0 || self.n_step > 1000 {
-            return bad("n_step", self.n_step.to_string(), "a return spans 1 to 1000 steps");
+            return bad(
+                "n_step",
+                self.n_step.to_string(),
+                "a return spans 1 to 1000 steps",
+            );
         }
         if !(0.0..=1.0).contains(&self.gamma) {
-            return bad("gamma", self.gamma.to_string(), "a discount lies between 0 and 1");
+            return bad(
+                "gamma",
+                self.gamma.to_string(),
+                "a discount lies between 0 and 1",
+            );
         }
         let k_max = self.horizon.k_max();
         if self.horizon != Horizon::None && (k_max == 0 || k_max > 1000) {

@@ -87,7 +87,13 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
         why,
     };
     let list = |list: &[String]| -> String {
-        format!("[{}]", list.iter().map(|e| format!("{e:?}")).collect::<Vec<_>>().join(", "))
+        format!(
+            "[{}]",
+            list.iter()
+                .map(|e| format!("{e:?}"))
+                .collect::<Vec<_>>()
+                .join(", ")
+        )
     };
     let router = !endpoints.listen.is_empty();
     let max = MESSAGE_BYTES_MAX.to_string();
@@ -96,22 +102,33 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
         ("listen/endpoints", &list(&endpoints.listen)),
         ("connect/endpoints", &list(&endpoints.connect)),
         ("connect/timeout_ms", if router { "-1" } else { "10000" }),
-        ("connect/exit_on_failure", if router { "false" } else { "true" }),
-        ("connect/retry", "{ period_init_ms: 50, period_max_ms: 1000, period_increase_factor: 2 }"),
+        (
+            "connect/exit_on_failure",
+            if router { "false" } else { "true" },
+        ),
+        (
+            "connect/retry",
+            "{ period_init_ms: 50, period_max_ms: 1000, period_increase_factor: 2 }",
+        ),
         ("scouting/delay", "20"),
         ("scouting/multicast/enabled", "false"),
         ("scouting/gossip/enabled", "false"),
         ("transport/unicast/open_timeout", "2000"),
         ("transport/unicast/accept_timeout", "5000"),
         ("transport/link/tx/queue/size/data", "16"),
-        ("transport/link/tx/queue/congestion_control/block/wait_before_close", "3600000000"),
+        (
+            "transport/link/tx/queue/congestion_control/block/wait_before_close",
+            "3600000000",
+        ),
         ("transport/link/rx/max_message_size", &max),
         ("transport/link/rx/buffer_size", "4194304"),
         ("transport/shared_memory/enabled", "false"),
     ];
     let mut config = zenoh::Config::default();
     for (key, value) in settings {
-        config.insert_json5(key, value).map_err(|e| fail(format!("{key} = {value}: {e}")))?;
+        config
+            .insert_json5(key, value)
+            .map_err(|e| fail(format!("{key} = {value}: {e}")))?;
     }
     zenoh::open(config).wait().map_err(|e| fail(e.to_string()))
 }
@@ -136,7 +153,10 @@ pub fn ask(
     priority: Priority,
     timeout: Duration,
 ) -> Result<Vec<u8>, SessionError> {
-    let failed = |why: String| SessionError::Zenoh { key: key.into(), why };
+    let failed = |why: String| SessionError::Zenoh {
+        key: key.into(),
+        why,
+    };
     let replies = session
         .get(key)
         .payload(payload)
@@ -147,11 +167,16 @@ pub fn ask(
         .timeout(timeout)
         .wait()
         .map_err(|e| failed(e.to_string()))?;
-    let silent = || SessionError::NoReply { key: key.into(), within_ms: timeout.as_millis() };
+    let silent = || SessionError::NoReply {
+        key: key.into(),
+        within_ms: timeout.as_millis(),
+    };
     let reply = replies.recv().map_err(|_| silent())?;
     match reply.into_result() {
         Ok(sample) => Ok(sample.payload().to_bytes().into_owned()),
-        Err(e) => Err(failed(e.payload().try_to_string().unwrap_or_default().into_owned())),
+        Err(e) => Err(failed(
+            e.payload().try_to_string().unwrap_or_default().into_owned(),
+        )),
     }
 }
 
@@ -166,10 +191,20 @@ pub fn answer(query: &Query, payload: ZBytes) {
 ///
 /// # Errors
 /// Nobody there within a minute, or another protocol version.
-pub fn join(session: &Session, keys: &Keys, shutdown: &Shutdown) -> Result<Option<Hello>, JoinError> {
+pub fn join(
+    session: &Session,
+    keys: &Keys,
+    shutdown: &Shutdown,
+) -> Result<Option<Hello>, JoinError> {
     let started = Instant::now();
     loop {
-        match ask(session, &keys.hello(), ZBytes::new(), Priority::Data, JOIN_TRY) {
+        match ask(
+            session,
+            &keys.hello(),
+            ZBytes::new(),
+            Priority::Data,
+            JOIN_TRY,
+        ) {
             Ok(bytes) => return Ok(Some(codec::decode(&bytes, Kind::Hello, None)?.0)),
             Err(last) if started.elapsed() > JOIN_MAX => return Err(JoinError::Nobody { last }),
             Err(e) => tracing::debug!("no replay server yet: {e}"),

@@ -45,7 +45,10 @@ impl Shutdown {
     }
 
     fn flag(&self) -> std::sync::MutexGuard<'_, bool> {
-        self.state.0.lock().expect("no thread panics while holding the flag")
+        self.state
+            .0
+            .lock()
+            .expect("no thread panics while holding the flag")
     }
 
     /// A flag that SIGINT and SIGTERM raise and, if `exit_with_parent`, the death of this process's parent.
@@ -54,10 +57,15 @@ impl Shutdown {
     /// The operating system gave no thread, runtime or signal handler.
     pub fn on_signals(exit_with_parent: bool) -> std::io::Result<Self> {
         let shutdown = Self::default();
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()?;
         let (mut interrupt, mut terminate) = {
             let _inside = runtime.enter();
-            (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?)
+            (
+                signal(SignalKind::interrupt())?,
+                signal(SignalKind::terminate())?,
+            )
         };
         let raised = shutdown.clone();
         let parent = std::os::unix::process::parent_id();
@@ -66,16 +74,18 @@ impl Shutdown {
                 tokio::time::sleep(PARENT_POLL).await;
             }
         };
-        std::thread::Builder::new().name("signals".into()).spawn(move || {
-            runtime.block_on(async {
-                tokio::select! {
-                    _ = interrupt.recv() => {}
-                    _ = terminate.recv() => {}
-                    () = parent_died => {}
-                }
-            });
-            raised.set();
-        })?;
+        std::thread::Builder::new()
+            .name("signals".into())
+            .spawn(move || {
+                runtime.block_on(async {
+                    tokio::select! {
+                        _ = interrupt.recv() => {}
+                        _ = terminate.recv() => {}
+                        () = parent_died => {}
+                    }
+                });
+                raised.set();
+            })?;
         Ok(shutdown)
     }
 }

@@ -67,7 +67,8 @@ impl ChunkHeader {
     }
 
     fn planes_bytes(&self) -> Option<usize> {
-        self.transitions().checked_mul(self.frame_bytes as usize + 1 + 1 + 4)
+        self.transitions()
+            .checked_mul(self.frame_bytes as usize + 1 + 1 + 4)
     }
 }
 
@@ -84,8 +85,13 @@ pub struct Chunk {
 impl Chunk {
     /// A chunk of zeros, to be filled in place.
     pub fn zeroed(header: ChunkHeader) -> Self {
-        let bytes = header.planes_bytes().expect("an actor's chunk is far below the address space");
-        Self { header, planes: vec![0; bytes] }
+        let bytes = header
+            .planes_bytes()
+            .expect("an actor's chunk is far below the address space");
+        Self {
+            header,
+            planes: vec![0; bytes],
+        }
     }
 
     fn rows(&self) -> usize {
@@ -145,7 +151,10 @@ impl Chunk {
     /// # Errors
     /// A chunk over the codec's limits.
     pub fn seal(&self, spec_hash: u64) -> Result<(Vec<u8>, &[u8]), CodecError> {
-        Ok((codec::seal(Kind::Chunk, spec_hash, &self.header, &self.planes)?, &self.planes))
+        Ok((
+            codec::seal(Kind::Chunk, spec_hash, &self.header, &self.planes)?,
+            &self.planes,
+        ))
     }
 
     /// Reads a chunk and checks lengths, actions, ends and rewards.
@@ -153,7 +162,8 @@ impl Chunk {
     /// # Errors
     /// Whatever makes it unfit to be stored; the message says what.
     pub fn decode(bytes: &[u8], spec_hash: u64, num_actions: u32) -> Result<Self, CodecError> {
-        let (header, planes): (ChunkHeader, _) = codec::decode(bytes, Kind::Chunk, Some(spec_hash))?;
+        let (header, planes): (ChunkHeader, _) =
+            codec::decode(bytes, Kind::Chunk, Some(spec_hash))?;
         if header.planes_bytes() != Some(planes.len()) || header.transitions() == 0 {
             return Err(CodecError::Header(format!(
                 "{} streams of {} steps of {} bytes do not fill {} bytes of planes",
@@ -163,15 +173,26 @@ impl Chunk {
                 planes.len()
             )));
         }
-        let chunk = Self { header, planes: planes.to_vec() };
-        if let Some(action) = chunk.actions().iter().find(|&&a| u32::from(a) >= num_actions) {
-            return Err(CodecError::Header(format!("action {action} of {num_actions}")));
+        let chunk = Self {
+            header,
+            planes: planes.to_vec(),
+        };
+        if let Some(action) = chunk
+            .actions()
+            .iter()
+            .find(|&&a| u32::from(a) >= num_actions)
+        {
+            return Err(CodecError::Header(format!(
+                "action {action} of {num_actions}"
+            )));
         }
         if let Some(end) = chunk.ends().iter().find(|&&e| End::from_byte(e).is_none()) {
             return Err(CodecError::Header(format!("end {end} is none that exists")));
         }
         if let Some(row) = (0..chunk.rows()).find(|&row| !chunk.reward(row).is_finite()) {
-            return Err(CodecError::Header(format!("the reward of row {row} is not finite")));
+            return Err(CodecError::Header(format!(
+                "the reward of row {row} is not finite"
+            )));
         }
         Ok(chunk)
     }

@@ -27,7 +27,11 @@ pub struct WeightsHeader {
 impl WeightsHeader {
     /// Describes `safetensors`.
     pub fn new(version: u64, updates: u64, safetensors: &[u8]) -> Self {
-        Self { version, updates, sha256: Sha256::digest(safetensors).into() }
+        Self {
+            version,
+            updates,
+            sha256: Sha256::digest(safetensors).into(),
+        }
     }
 
     /// The hash in hexadecimal.
@@ -42,7 +46,9 @@ impl WeightsHeader {
     pub fn decode(bytes: &[u8], spec_hash: u64) -> Result<(Self, &[u8]), CodecError> {
         let (header, planes): (Self, _) = codec::decode(bytes, Kind::Weights, Some(spec_hash))?;
         if header.sha256 != <[u8; 32]>::from(Sha256::digest(planes)) {
-            return Err(CodecError::Header("the weights' SHA-256 is not the one announced".into()));
+            return Err(CodecError::Header(
+                "the weights' SHA-256 is not the one announced".into(),
+            ));
         }
         Ok((header, planes))
     }

@@ -5,9 +5,9 @@
 use std::fmt::Debug;
 
 use driml_protocol::{
-    AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader, CodecError, End, Goodbye, Hello,
-    Horizon, InsertReply, Kind, LearnerStatus, NO_ACTION, PROTOCOL_VERSION, ReplayStatus, RunSpec, TimeoutRule,
-    Waiting, WeightsHeader, WeightsVersion,
+    AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader, CodecError,
+    End, Goodbye, Hello, Horizon, InsertReply, Kind, LearnerStatus, NO_ACTION, PROTOCOL_VERSION,
+    ReplayStatus, RunSpec, TimeoutRule, Waiting, WeightsHeader, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PLANES_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -32,7 +32,12 @@ impl Sample {
         assert_eq!((&back, planes.len()), (header, 0));
         let (back, _) = codec::decode::<H>(&bytes, kind, None).unwrap();
         assert_eq!(&back, header, "where any run is welcome");
-        Self { name: format!("{header:?}"), kind, bytes, read: reader::<H>(kind) }
+        Self {
+            name: format!("{header:?}"),
+            kind,
+            bytes,
+            read: reader::<H>(kind),
+        }
     }
 }
 
@@ -71,6 +76,7 @@ fn chunk() -> Chunk {
         sequence: 5,
         first_transition: 60,
         weights_version: 7,
+        leaving: true,
         streams: 2,
         steps: 3,
         frame_bytes: 5,
@@ -96,7 +102,13 @@ fn batch() -> Batch {
     for row in 0..3 {
         rows.frame_t(row).fill(10 + row as u8);
         rows.frame_n(row).fill(20 + row as u8);
-        rows.set(row, row as u8, 4 + row as u8, 0.5 + row as f32, 0.25 * row as f32);
+        rows.set(
+            row,
+            row as u8,
+            4 + row as u8,
+            0.5 + row as f32,
+            0.25 * row as f32,
+        );
     }
     rows.set(1, 1, NO_ACTION, 1.5, 0.0);
     rows.positive(0, 0, 2).fill(30);
@@ -112,21 +124,34 @@ fn join((mut head, planes): (Vec<u8>, impl AsRef<[u8]>)) -> Vec<u8> {
 
 fn weights() -> Vec<u8> {
     let planes: Vec<u8> = (0..40).collect();
-    codec::encode(Kind::Weights, SPEC, &WeightsHeader::new(4, 312, &planes), &planes).unwrap()
+    codec::encode(
+        Kind::Weights,
+        SPEC,
+        &WeightsHeader::new(4, 312, &planes),
+        &planes,
+    )
+    .unwrap()
 }
 
 /// One or more messages of every kind.
 fn samples() -> Vec<Sample> {
     let replies = [
-        InsertReply::Stored { inserted_total: 1 << 40 },
+        InsertReply::Stored {
+            inserted_total: 1 << 40,
+        },
         InsertReply::Wait { inserted_total: 0 },
         InsertReply::OutOfOrder { expected: 3 },
         InsertReply::Finished { inserted_total: 7 },
-        InsertReply::Refused { why: "frames of 7 bytes".into() },
+        InsertReply::Refused {
+            why: "frames of 7 bytes".into(),
+        },
     ];
     let waits = [
         Waiting::Nobody,
-        Waiting::WarmUp { have: 3, need: 1000 },
+        Waiting::WarmUp {
+            have: 3,
+            need: 1000,
+        },
         Waiting::LearnerWaitsForActors,
         Waiting::ActorsWaitForLearner,
         Waiting::Finished,
@@ -139,15 +164,36 @@ fn samples() -> Vec<Sample> {
         waiting: Waiting::WarmUp { have: 5, need: 9 },
         ..ReplayStatus::default()
     };
-    let learner = LearnerStatus { updates: 3, dim: [Some(0.5), None, None, Some(1.5)], ..LearnerStatus::default() };
-    let affinity = AffinityUpdate { version: 2, num_actions: 3, matrix: vec![0.25, 0.5, 0.25].repeat(3) };
-    let hello = Hello { config_toml: "[run]\nseed = 1\n".into(), inserted_total: 12 };
-    let goodbye = Goodbye { actor: 1, epoch: 2, produced: 3 };
-    let mut samples: Vec<Sample> = replies.iter().map(|r| Sample::of(Kind::InsertReply, r)).collect();
+    let learner = LearnerStatus {
+        updates: 3,
+        dim: [Some(0.5), None, None, Some(1.5)],
+        ..LearnerStatus::default()
+    };
+    let affinity = AffinityUpdate {
+        version: 2,
+        num_actions: 3,
+        matrix: [0.25, 0.5, 0.25].repeat(3),
+    };
+    let hello = Hello {
+        config_toml: "[run]\nseed = 1\n".into(),
+        inserted_total: 12,
+    };
+    let goodbye = Goodbye {
+        actor: 1,
+        epoch: 2,
+        produced: 3,
+    };
+    let mut samples: Vec<Sample> = replies
+        .iter()
+        .map(|r| Sample::of(Kind::InsertReply, r))
+        .collect();
     samples.extend(waits.map(|waiting| Sample::of(Kind::BatchReply, &BatchReply::Wait(waiting))));
     samples.extend([
         Sample::of(Kind::BatchReply, &BatchReply::Finished),
-        Sample::of(Kind::BatchReply, &BatchReply::Refused { why: String::new() }),
+        Sample::of(
+            Kind::BatchReply,
+            &BatchReply::Refused { why: String::new() },
+        ),
         Sample::of(Kind::BatchRequest, &BatchRequest { rows: 256 }),
         Sample::of(Kind::Affinity, &affinity),
         Sample::of(Kind::WeightsVersion, &WeightsVersion { version: 9 }),
@@ -159,11 +205,26 @@ fn samples() -> Vec<Sample> {
         Sample::of(Kind::Done, &()),
     ]);
     let with_planes = [
-        ("chunk", Kind::Chunk, join(chunk().seal(SPEC).unwrap()), read_chunk as fn(&[u8]) -> _),
-        ("batch", Kind::BatchReply, join(batch().seal(SPEC).unwrap()), read_batch),
+        (
+            "chunk",
+            Kind::Chunk,
+            join(chunk().seal(SPEC).unwrap()),
+            read_chunk as fn(&[u8]) -> _,
+        ),
+        (
+            "batch",
+            Kind::BatchReply,
+            join(batch().seal(SPEC).unwrap()),
+            read_batch,
+        ),
         ("weights", Kind::Weights, weights(), read_weights),
     ];
-    samples.extend(with_planes.map(|(name, kind, bytes, read)| Sample { name: name.into(), kind, bytes, read }));
+    samples.extend(with_planes.map(|(name, kind, bytes, read)| Sample {
+        name: name.into(),
+        kind,
+        bytes,
+        read,
+    }));
     samples
 }
 
@@ -176,7 +237,9 @@ fn forge(version: u16, kind: u16, lengths: (u32, u64), header: &[u8], planes: &[
     bytes.extend(lengths.0.to_le_bytes());
     bytes.extend(lengths.1.to_le_bytes());
     let mut hasher = crc32fast::Hasher::new();
-    [&bytes, header, planes].iter().for_each(|part| hasher.update(part));
+    [&bytes, header, planes]
+        .iter()
+        .for_each(|part| hasher.update(part));
     bytes.extend(hasher.finalize().to_le_bytes());
     bytes.extend_from_slice(header);
     bytes.extend_from_slice(planes);
@@ -184,7 +247,13 @@ fn forge(version: u16, kind: u16, lengths: (u32, u64), header: &[u8], planes: &[
 }
 
 fn forge_whole(kind: Kind, header: &[u8], planes: &[u8]) -> Vec<u8> {
-    forge(PROTOCOL_VERSION, kind as u16, (header.len() as u32, planes.len() as u64), header, planes)
+    forge(
+        PROTOCOL_VERSION,
+        kind as u16,
+        (header.len() as u32, planes.len() as u64),
+        header,
+        planes,
+    )
 }
 
 #[test]
@@ -192,19 +261,39 @@ fn chunk_batch_and_weights_come_back() {
     let bytes = join(chunk().seal(SPEC).unwrap());
     let back = Chunk::decode(&bytes, SPEC, ACTIONS).unwrap();
     assert_eq!(back, chunk());
-    assert_eq!((back.actions()[4], back.reward(4), back.end(3)), (4, -2.0, End::Terminal));
+    assert_eq!(
+        (back.actions()[4], back.reward(4), back.end(3)),
+        (4, -2.0, End::Terminal)
+    );
     assert_eq!(back.frames()[5 * 5..], [6; 5]);
 
     let bytes = join(batch().seal(SPEC).unwrap());
     let (reply, planes) = codec::decode(&bytes, Kind::BatchReply, Some(SPEC)).unwrap();
-    let BatchReply::Batch(header) = reply else { panic!("{reply:?}") };
+    let BatchReply::Batch(header) = reply else {
+        panic!("{reply:?}")
+    };
     let back = Batch::from_planes(header, planes).unwrap();
     assert_eq!(back, batch());
-    assert_eq!(back.frames_t(), [10, 10, 10, 10, 11, 11, 11, 11, 12, 12, 12, 12]);
-    assert_eq!(back.frames_n(), [20, 20, 20, 20, 21, 21, 21, 21, 22, 22, 22, 22]);
-    assert_eq!(back.frames_k(), [30, 30, 30, 30, 0, 0, 0, 0, 32, 32, 32, 32]);
-    assert_eq!((back.actions(), back.next_actions()), (&[0, 1, 2][..], &[4, NO_ACTION, 6][..]));
-    assert_eq!((back.positive_valid(), back.ks()), (&[1, 0, 1][..], &[2, 0, 255][..]));
+    assert_eq!(
+        back.frames_t(),
+        [10, 10, 10, 10, 11, 11, 11, 11, 12, 12, 12, 12]
+    );
+    assert_eq!(
+        back.frames_n(),
+        [20, 20, 20, 20, 21, 21, 21, 21, 22, 22, 22, 22]
+    );
+    assert_eq!(
+        back.frames_k(),
+        [30, 30, 30, 30, 0, 0, 0, 0, 32, 32, 32, 32]
+    );
+    assert_eq!(
+        (back.actions(), back.next_actions()),
+        (&[0, 1, 2][..], &[4, NO_ACTION, 6][..])
+    );
+    assert_eq!(
+        (back.positive_valid(), back.ks()),
+        (&[1, 0, 1][..], &[2, 0, 255][..])
+    );
     assert_eq!(back.n_step_returns(), [0.5, 1.5, 2.5]);
     assert_eq!(back.bootstrap_discounts(), [0.0, 0.0, 0.5]);
 
@@ -218,7 +307,10 @@ fn chunk_batch_and_weights_come_back() {
 fn every_kind_has_a_sample_that_is_read() {
     let samples = samples();
     for kind in 1..=12 {
-        assert!(samples.iter().any(|sample| sample.kind as u16 == kind), "kind {kind}");
+        assert!(
+            samples.iter().any(|sample| sample.kind as u16 == kind),
+            "kind {kind}"
+        );
     }
     for sample in &samples {
         assert_eq!((sample.read)(&sample.bytes), Ok(()), "{}", sample.name);
@@ -227,29 +319,58 @@ fn every_kind_has_a_sample_that_is_read() {
 
 #[test]
 fn every_truncation_and_every_padding_is_refused() {
-    for Sample { name, bytes, read, .. } in samples() {
+    for Sample {
+        name, bytes, read, ..
+    } in samples()
+    {
         for length in 0..bytes.len() {
             let refused = read(&bytes[..length]).unwrap_err();
-            let need = if length < PREFIX_BYTES { PREFIX_BYTES } else { bytes.len() };
-            assert_eq!(refused, CodecError::Length { have: length, need }, "{name} cut to {length}");
+            let need = if length < PREFIX_BYTES {
+                PREFIX_BYTES
+            } else {
+                bytes.len()
+            };
+            assert_eq!(
+                refused,
+                CodecError::Length { have: length, need },
+                "{name} cut to {length}"
+            );
         }
         let mut padded = bytes.clone();
         padded.push(0);
-        let longer = CodecError::Length { have: padded.len(), need: bytes.len() };
+        let longer = CodecError::Length {
+            have: padded.len(),
+            need: bytes.len(),
+        };
         assert_eq!(read(&padded), Err(longer), "{name}");
     }
 }
 
 #[test]
 fn every_flipped_bit_is_refused() {
-    for Sample { name, mut bytes, read, .. } in samples() {
+    for Sample {
+        name,
+        mut bytes,
+        read,
+        ..
+    } in samples()
+    {
         for bit in 0..8 * bytes.len() {
             bytes[bit / 8] ^= 1 << (bit % 8);
             let refused = read(&bytes).expect_err(&format!("{name} with bit {bit} flipped"));
             let expected = match bit / 8 {
                 0..4 => refused == CodecError::Magic,
-                4..6 => matches!(refused, CodecError::Version { ours: PROTOCOL_VERSION, .. }),
-                16..28 => matches!(refused, CodecError::Length { .. } | CodecError::TooLarge { .. }),
+                4..6 => matches!(
+                    refused,
+                    CodecError::Version {
+                        ours: PROTOCOL_VERSION,
+                        ..
+                    }
+                ),
+                16..28 => matches!(
+                    refused,
+                    CodecError::Length { .. } | CodecError::TooLarge { .. }
+                ),
                 _ => refused == CodecError::Checksum,
             };
             assert!(expected, "{name} with bit {bit} flipped: {refused}");
@@ -261,48 +382,128 @@ fn every_flipped_bit_is_refused() {
 #[test]
 fn each_mismatch_has_its_own_error() {
     let header = [5u8];
-    let read = |bytes: &[u8], hash| codec::decode::<WeightsVersion>(bytes, Kind::WeightsVersion, hash).map(|_| ());
+    let read = |bytes: &[u8], hash| {
+        codec::decode::<WeightsVersion>(bytes, Kind::WeightsVersion, hash).map(|_| ())
+    };
     let good = forge_whole(Kind::WeightsVersion, &header, &[]);
-    assert_eq!(good, codec::encode(Kind::WeightsVersion, SPEC, &WeightsVersion { version: 5 }, &[]).unwrap());
+    assert_eq!(
+        good,
+        codec::encode(
+            Kind::WeightsVersion,
+            SPEC,
+            &WeightsVersion { version: 5 },
+            &[]
+        )
+        .unwrap()
+    );
     assert_eq!(read(&good, Some(SPEC)), Ok(()));
 
-    let newer = forge(PROTOCOL_VERSION + 1, Kind::WeightsVersion as u16, (1, 0), &header, &[]);
-    let version = CodecError::Version { theirs: PROTOCOL_VERSION + 1, ours: PROTOCOL_VERSION };
+    let newer = forge(
+        PROTOCOL_VERSION + 1,
+        Kind::WeightsVersion as u16,
+        (1, 0),
+        &header,
+        &[],
+    );
+    let version = CodecError::Version {
+        theirs: PROTOCOL_VERSION + 1,
+        ours: PROTOCOL_VERSION,
+    };
     assert_eq!(read(&newer, Some(SPEC)), Err(version));
     for kind in [0, Kind::Goodbye as u16, 13, u16::MAX] {
         let other = forge(PROTOCOL_VERSION, kind, (1, 0), &header, &[]);
-        let refused = CodecError::Kind { theirs: kind, ours: Kind::WeightsVersion as u16 };
+        let refused = CodecError::Kind {
+            theirs: kind,
+            ours: Kind::WeightsVersion as u16,
+        };
         assert_eq!(read(&other, Some(SPEC)), Err(refused));
     }
-    assert_eq!(read(&good, Some(SPEC + 1)), Err(CodecError::RunSpec { theirs: SPEC, ours: SPEC + 1 }));
+    assert_eq!(
+        read(&good, Some(SPEC + 1)),
+        Err(CodecError::RunSpec {
+            theirs: SPEC,
+            ours: SPEC + 1
+        })
+    );
     assert_eq!(read(&good, None), Ok(()), "where any run is welcome");
-    assert_eq!(read(b"", Some(SPEC)), Err(CodecError::Length { have: 0, need: PREFIX_BYTES }));
+    assert_eq!(
+        read(b"", Some(SPEC)),
+        Err(CodecError::Length {
+            have: 0,
+            need: PREFIX_BYTES
+        })
+    );
     assert_eq!(read(&[0; 64], Some(SPEC)), Err(CodecError::Magic));
     let longer = forge_whole(Kind::WeightsVersion, &[5, 0], &[]);
-    assert!(matches!(read(&longer, Some(SPEC)), Err(CodecError::Header(_))), "a byte after the header's end");
+    assert!(
+        matches!(read(&longer, Some(SPEC)), Err(CodecError::Header(_))),
+        "a byte after the header's end"
+    );
 }
 
 #[test]
 fn huge_lengths_are_refused_without_taking_memory() {
     let read = |lengths| {
-        let bytes = forge(PROTOCOL_VERSION, Kind::WeightsVersion as u16, lengths, &[5], &[]);
+        let bytes = forge(
+            PROTOCOL_VERSION,
+            Kind::WeightsVersion as u16,
+            lengths,
+            &[5],
+            &[],
+        );
         codec::decode::<WeightsVersion>(&bytes, Kind::WeightsVersion, Some(SPEC)).unwrap_err()
     };
     let header = HEADER_BYTES_MAX as u32 + 1;
-    assert_eq!(read((header, 0)), CodecError::TooLarge { have: header as usize, max: HEADER_BYTES_MAX });
-    assert_eq!(read((u32::MAX, u64::MAX)), CodecError::TooLarge { have: u32::MAX as usize, max: HEADER_BYTES_MAX });
-    assert_eq!(read((1, u64::MAX)), CodecError::TooLarge { have: usize::MAX, max: PLANES_BYTES_MAX });
+    assert_eq!(
+        read((header, 0)),
+        CodecError::TooLarge {
+            have: header as usize,
+            max: HEADER_BYTES_MAX
+        }
+    );
+    assert_eq!(
+        read((u32::MAX, u64::MAX)),
+        CodecError::TooLarge {
+            have: u32::MAX as usize,
+            max: HEADER_BYTES_MAX
+        }
+    );
+    assert_eq!(
+        read((1, u64::MAX)),
+        CodecError::TooLarge {
+            have: usize::MAX,
+            max: PLANES_BYTES_MAX
+        }
+    );
     let need = PREFIX_BYTES + 1 + PLANES_BYTES_MAX;
-    assert_eq!(read((1, PLANES_BYTES_MAX as u64)), CodecError::Length { have: PREFIX_BYTES + 1, need });
+    assert_eq!(
+        read((1, PLANES_BYTES_MAX as u64)),
+        CodecError::Length {
+            have: PREFIX_BYTES + 1,
+            need
+        }
+    );
     // A header that claims more elements than any header has room for.
     let claim = [&[1u8, 3, 253][..], &u64::MAX.to_le_bytes()].concat();
     let bytes = forge_whole(Kind::Affinity, &claim, &[]);
     let refused = codec::decode::<AffinityUpdate>(&bytes, Kind::Affinity, Some(SPEC)).unwrap_err();
     assert!(matches!(refused, CodecError::Header(_)), "{refused}");
     // The sender keeps to the limit too.
-    let hello = Hello { config_toml: "x".repeat(HEADER_BYTES_MAX), inserted_total: 0 };
+    let hello = Hello {
+        config_toml: "x".repeat(HEADER_BYTES_MAX),
+        inserted_total: 0,
+    };
     let refused = codec::seal(Kind::Hello, SPEC, &hello, &[]).unwrap_err();
-    assert!(matches!(refused, CodecError::TooLarge { max: HEADER_BYTES_MAX, .. }), "{refused}");
+    assert!(
+        matches!(
+            refused,
+            CodecError::TooLarge {
+                max: HEADER_BYTES_MAX,
+                ..
+            }
+        ),
+        "{refused}"
+    );
 }
 
 #[test]
@@ -310,28 +511,63 @@ fn counts_that_do_not_fit_their_planes_are_refused() {
     let header = chunk().header;
     let planes = &join(chunk().seal(SPEC).unwrap())[..];
     let planes = &planes[planes.len() - 6 * 11..];
-    let read = |header: ChunkHeader| read_chunk(&codec::encode(Kind::Chunk, SPEC, &header, planes).unwrap());
+    let read = |header: ChunkHeader| {
+        read_chunk(&codec::encode(Kind::Chunk, SPEC, &header, planes).unwrap())
+    };
     assert_eq!(read(header), Ok(()));
     let most = u32::MAX;
     for wrong in [
-        ChunkHeader { streams: 3, ..header },
+        ChunkHeader {
+            streams: 3,
+            ..header
+        },
         ChunkHeader { steps: 0, ..header },
-        ChunkHeader { frame_bytes: 4, ..header },
-        ChunkHeader { streams: most, steps: most, frame_bytes: most, ..header },
-        ChunkHeader { streams: 1 << 31, steps: 1 << 31, frame_bytes: 4, ..header },
+        ChunkHeader {
+            frame_bytes: 4,
+            ..header
+        },
+        ChunkHeader {
+            streams: most,
+            steps: most,
+            frame_bytes: most,
+            ..header
+        },
+        ChunkHeader {
+            streams: 1 << 31,
+            steps: 1 << 31,
+            frame_bytes: 4,
+            ..header
+        },
     ] {
-        assert!(matches!(read(wrong), Err(CodecError::Header(_))), "{wrong:?}");
+        assert!(
+            matches!(read(wrong), Err(CodecError::Header(_))),
+            "{wrong:?}"
+        );
     }
     let header = batch().header;
     for wrong in [
         BatchHeader { rows: 0, ..header },
         BatchHeader { rows: 4, ..header },
-        BatchHeader { positives: 0, ..header },
-        BatchHeader { rows: most, positives: most, state_bytes: most, ..header },
+        BatchHeader {
+            positives: 0,
+            ..header
+        },
+        BatchHeader {
+            rows: most,
+            positives: most,
+            state_bytes: most,
+            ..header
+        },
     ] {
-        assert!(Batch::from_planes(wrong, &[0; 3 * 24]).is_err(), "{wrong:?}");
+        assert!(
+            Batch::from_planes(wrong, &[0; 3 * 24]).is_err(),
+            "{wrong:?}"
+        );
     }
-    assert!(Batch::from_planes(BatchHeader { rows: 0, ..header }, &[]).is_err(), "no rows at all");
+    assert!(
+        Batch::from_planes(BatchHeader { rows: 0, ..header }, &[]).is_err(),
+        "no rows at all"
+    );
 }
 
 #[test]
@@ -343,15 +579,29 @@ fn what_no_world_gives_is_refused() {
         read_chunk(&codec::encode(Kind::Chunk, SPEC, &chunk().header, &planes).unwrap())
     };
     assert_eq!(decode(&|_| {}), Ok(()));
-    assert!(decode(&|planes| planes[30 + 2] = ACTIONS as u8).unwrap_err().to_string().contains("action 15"));
-    assert!(decode(&|planes| planes[36 + 5] = 4).unwrap_err().to_string().contains("end 4"));
+    assert!(
+        decode(&|planes| planes[30 + 2] = ACTIONS as u8)
+            .unwrap_err()
+            .to_string()
+            .contains("action 15")
+    );
+    assert!(
+        decode(&|planes| planes[36 + 5] = 4)
+            .unwrap_err()
+            .to_string()
+            .contains("end 4")
+    );
     for reward in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-        let refused = decode(&|planes| planes[42 + 4..42 + 8].copy_from_slice(&reward.to_le_bytes()));
+        let refused =
+            decode(&|planes| planes[42 + 4..42 + 8].copy_from_slice(&reward.to_le_bytes()));
         assert!(refused.unwrap_err().to_string().contains("row 1"));
     }
     let announced = WeightsHeader::new(1, 1, b"these");
     let bytes = codec::encode(Kind::Weights, SPEC, &announced, b"those").unwrap();
-    assert!(matches!(WeightsHeader::decode(&bytes, SPEC), Err(CodecError::Header(_))));
+    assert!(matches!(
+        WeightsHeader::decode(&bytes, SPEC),
+        Err(CodecError::Header(_))
+    ));
 }
 
 /// Any change of a field, and of the protocol version, makes another run.
@@ -373,21 +623,63 @@ fn the_hash_knows_every_field() {
     };
     let base = || spec.clone();
     let others = [
-        RunSpec { world: "procgen/maze".into(), ..base() },
-        RunSpec { agent: "c51".into(), ..base() },
+        RunSpec {
+            world: "procgen/maze".into(),
+            ..base()
+        },
+        RunSpec {
+            agent: "c51".into(),
+            ..base()
+        },
         RunSpec { seed: 2, ..base() },
-        RunSpec { frame_height: 32, ..base() },
-        RunSpec { frame_width: 32, ..base() },
-        RunSpec { frame_channels: 1, ..base() },
-        RunSpec { frame_stack: 4, ..base() },
-        RunSpec { num_actions: 14, ..base() },
-        RunSpec { n_step: 1, ..base() },
-        RunSpec { gamma: 0.9, ..base() },
-        RunSpec { horizon: Horizon::Nhg { k_max: 4 }, ..base() },
-        RunSpec { horizon: Horizon::Uniform { k_max: 5 }, ..base() },
-        RunSpec { horizon: Horizon::Fixed { k: 5 }, ..base() },
-        RunSpec { horizon: Horizon::None, ..base() },
-        RunSpec { timeout: TimeoutRule::Bootstrap, ..base() },
+        RunSpec {
+            frame_height: 32,
+            ..base()
+        },
+        RunSpec {
+            frame_width: 32,
+            ..base()
+        },
+        RunSpec {
+            frame_channels: 1,
+            ..base()
+        },
+        RunSpec {
+            frame_stack: 4,
+            ..base()
+        },
+        RunSpec {
+            num_actions: 14,
+            ..base()
+        },
+        RunSpec {
+            n_step: 1,
+            ..base()
+        },
+        RunSpec {
+            gamma: 0.9,
+            ..base()
+        },
+        RunSpec {
+            horizon: Horizon::Nhg { k_max: 4 },
+            ..base()
+        },
+        RunSpec {
+            horizon: Horizon::Uniform { k_max: 5 },
+            ..base()
+        },
+        RunSpec {
+            horizon: Horizon::Fixed { k: 5 },
+            ..base()
+        },
+        RunSpec {
+            horizon: Horizon::None,
+            ..base()
+        },
+        RunSpec {
+            timeout: TimeoutRule::Bootstrap,
+            ..base()
+        },
     ];
     let mut hashes: Vec<u64> = others.iter().map(RunSpec::hash).collect();
     hashes.push(spec.hash());
@@ -426,12 +718,13 @@ proptest! {
         rewards in prop::collection::vec(-1e30f32..1e30, 45),
     ) {
         let mut chunk = Chunk::zeroed(ChunkHeader {
-            actor, epoch, sequence, first_transition, weights_version: epoch ^ 1, streams, steps, frame_bytes,
+            actor, epoch, sequence, first_transition, weights_version: epoch ^ 1,
+            leaving: fill > 99, streams, steps, frame_bytes,
         });
-        for row in 0..chunk.header.transitions() {
+        for (row, &reward) in rewards.iter().enumerate().take(chunk.header.transitions()) {
             chunk.frame_mut(row).fill(fill.wrapping_add(row as u8));
             let end = End::from_byte((row % 4) as u8).unwrap();
-            chunk.set(row, (row % 15) as u8, rewards[row], end);
+            chunk.set(row, (row % 15) as u8, reward, end);
         }
         let bytes = join(chunk.seal(SPEC).unwrap());
         prop_assert_eq!(Chunk::decode(&bytes, SPEC, ACTIONS), Ok(chunk));

@@ -93,15 +93,11 @@ impl Episodes {
             out.copy_from_slice(ring.frame(index));
             return;
         }
+        // A run spec has 1 to 16 frames in its stack.
+        let mut frames: [&[u8]; FRAME_STACK_MAX] = [&[]; FRAME_STACK_MAX];
         let mut index = index;
         for slot in (0..self.frame_stack).rev() {
-            interleave(
-                ring.frame(index),
-                out,
-                slot,
-                self.frame_stack,
-                self.pixel_bytes,
-            );
+            frames[slot] = ring.frame(index);
             if slot > 0 {
                 match ring.previous(index) {
                     Previous::Start => {}
@@ -112,29 +108,37 @@ impl Episodes {
                 }
             }
         }
+        interleave(&frames[..self.frame_stack], self.pixel_bytes, out);
     }
 }
 
-/// Writes `frame` [pixels, C] into the channels of `slot` of `out` [pixels, stack, C].
-fn interleave(frame: &[u8], out: &mut [u8], slot: usize, stack: usize, pixel_bytes: usize) {
-    fn pixels<const C: usize>(frame: &[u8], out: &mut [u8], slot: usize, stack: usize) {
-        let to = out
-            .as_chunks_mut::<C>()
-            .0
-            .iter_mut()
-            .skip(slot)
-            .step_by(stack);
-        to.zip(frame.as_chunks::<C>().0)
-            .for_each(|(to, from)| *to = *from);
+/// Longest frame stack that a run spec allows.
+const FRAME_STACK_MAX: usize = 16;
+
+/// Writes `frames`, each [pixels, C], into `out` [pixels, stack, C].
+///
+/// A pixel of the output is written at once: the sizes in use are compiled, the others take their time.
+fn interleave(frames: &[&[u8]], pixel_bytes: usize, out: &mut [u8]) {
+    fn compiled<const STACK: usize, const C: usize>(frames: &[&[u8]], out: &mut [u8]) {
+        let frames: [&[[u8; C]]; STACK] = std::array::from_fn(|slot| frames[slot].as_chunks().0);
+        let (pixels, _) = out.as_chunks_mut::<C>().0.as_chunks_mut::<STACK>();
+        // Equal lengths, known before the loop, keep bounds checks out of it.
+        let frames = frames.map(|frame| &frame[..pixels.len()]);
+        for (i, pixel) in pixels.iter_mut().enumerate() {
+            for slot in 0..STACK {
+                pixel[slot] = frames[slot][i];
+            }
+        }
     }
-    match pixel_bytes {
-        1 => pixels::<1>(frame, out, slot, stack),
-        3 => pixels::<3>(frame, out, slot, stack),
-        4 => pixels::<4>(frame, out, slot, stack),
-        _ => {
-            let to = out.chunks_exact_mut(pixel_bytes).skip(slot).step_by(stack);
-            to.zip(frame.chunks_exact(pixel_bytes))
-                .for_each(|(to, from)| to.copy_from_slice(from));
+    match (frames.len(), pixel_bytes) {
+        (4, 1) => compiled::<4, 1>(frames, out),
+        (4, 3) => compiled::<4, 3>(frames, out),
+        (stack, _) => {
+            for (slot, frame) in frames.iter().enumerate() {
+                let to = out.chunks_exact_mut(pixel_bytes).skip(slot).step_by(stack);
+                to.zip(frame.chunks_exact(pixel_bytes))
+                    .for_each(|(to, from)| to.copy_from_slice(from));
+            }
         }
     }
 }

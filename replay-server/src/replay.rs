@@ -109,7 +109,8 @@ impl Replay {
 
     /// Stores a chunk, whole, or says why not.
     ///
-    /// A retry is answered `Stored`, and the chunk of an actor that leaves is stored, whatever the limiter says; a chunk that is not next is never stored.
+    /// A retry is answered `Stored`, and the chunk of an actor that leaves is stored, whatever the limiter says; a chunk that
+    /// is not next is never stored.
     pub fn insert(&mut self, chunk: &Chunk) -> InsertReply {
         let verdict = match self.unfit(chunk) {
             Some(why) => Verdict::Refused(why),
@@ -128,7 +129,9 @@ impl Replay {
             }
             _ if self.limiter.all_in() => InsertReply::Finished { inserted_total },
             Verdict::OutOfOrder { expected } => InsertReply::OutOfOrder { expected },
-            Verdict::Next if !self.limiter.may_insert() && !self.starving && !chunk.header.leaving => {
+            Verdict::Next
+                if !self.limiter.may_insert() && !self.starving && !chunk.header.leaving =>
+            {
                 InsertReply::Wait { inserted_total }
             }
             Verdict::Next => {

@@ -33,7 +33,10 @@ pub struct Client {
 
 impl Client {
     pub(crate) fn join(endpoint: &str, deadline: Instant) -> Self {
-        let endpoints = Endpoints { listen: Vec::new(), connect: vec![endpoint.to_owned()] };
+        let endpoints = Endpoints {
+            listen: Vec::new(),
+            connect: vec![endpoint.to_owned()],
+        };
         // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
         let session = loop {
             match session::open(&endpoints) {
@@ -42,9 +45,19 @@ impl Client {
             }
         };
         let keys = Keys::new(NAMESPACE).unwrap();
-        let hello = session::join(&session, &keys, &Shutdown::default()).unwrap();
-        let spec = Settings::parse(&hello.config_toml).unwrap().table("run").unwrap();
-        Self { session, keys, spec, config_toml: hello.config_toml }
+        let hello = session::join(&session, &keys, &Shutdown::default())
+            .unwrap()
+            .expect("nobody tells this client to stop");
+        let spec = Settings::parse(&hello.config_toml)
+            .unwrap()
+            .table("run")
+            .unwrap();
+        Self {
+            session,
+            keys,
+            spec,
+            config_toml: hello.config_toml,
+        }
     }
 
     /// Sends bytes and gives the bytes of the answer.
@@ -52,12 +65,22 @@ impl Client {
     /// # Errors
     /// Nobody answered.
     pub fn ask(&self, key: &str, payload: Vec<u8>) -> Result<Vec<u8>, SessionError> {
-        session::ask(&self.session, key, payload.into(), Priority::Data, ANSWER_MAX)
+        session::ask(
+            &self.session,
+            key,
+            payload.into(),
+            Priority::Data,
+            ANSWER_MAX,
+        )
     }
 
     fn ask_for<T: DeserializeOwned>(&self, key: &str, kind: Kind, payload: Vec<u8>) -> Option<T> {
         let answer = self.ask(key, payload).ok()?;
-        Some(codec::decode(&answer, kind, Some(self.spec.hash())).unwrap().0)
+        Some(
+            codec::decode(&answer, kind, Some(self.spec.hash()))
+                .unwrap()
+                .0,
+        )
     }
 
     /// The replay server's status; none if it did not answer.
@@ -71,12 +94,20 @@ impl Client {
     }
 
     /// Waits until the replay server's status is as wanted, and gives it.
-    pub fn wait_for_replay(&self, what: &str, wanted: impl Fn(&ReplayStatus) -> bool) -> ReplayStatus {
+    pub fn wait_for_replay(
+        &self,
+        what: &str,
+        wanted: impl Fn(&ReplayStatus) -> bool,
+    ) -> ReplayStatus {
         wait_for(what, || self.replay().filter(&wanted))
     }
 
     /// Waits until the learner's status is as wanted, and gives it.
-    pub fn wait_for_learner(&self, what: &str, wanted: impl Fn(&LearnerStatus) -> bool) -> LearnerStatus {
+    pub fn wait_for_learner(
+        &self,
+        what: &str,
+        wanted: impl Fn(&LearnerStatus) -> bool,
+    ) -> LearnerStatus {
         wait_for(what, || self.learner().filter(&wanted))
     }
 
@@ -90,7 +121,8 @@ impl Client {
     /// # Panics
     /// If nobody answers, or not in the run's own words.
     pub fn insert_bytes(&self, bytes: Vec<u8>) -> InsertReply {
-        self.ask_for(&self.keys.ingest(), Kind::InsertReply, bytes).expect("chunks are always answered")
+        self.ask_for(&self.keys.ingest(), Kind::InsertReply, bytes)
+            .expect("chunks are always answered")
     }
 }
 

@@ -37,7 +37,10 @@ pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
         if let Some(seen) = look() {
             return seen;
         }
-        assert!(started.elapsed() < DEADLINE, "waited {DEADLINE:?} for: {what}");
+        assert!(
+            started.elapsed() < DEADLINE,
+            "waited {DEADLINE:?} for: {what}"
+        );
         thread::sleep(LOOK_AGAIN);
     }
 }
@@ -46,10 +49,13 @@ pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
 ///
 /// The line does not go through `eprintln!`, whose output the test runner keeps to itself when a test passes.
 pub fn skipped_offline(test: &str) -> bool {
-    let offline = std::env::var_os("DRIML_OFFLINE").is_some_and(|value| !value.is_empty() && value != "0");
+    let offline =
+        std::env::var_os("DRIML_OFFLINE").is_some_and(|value| !value.is_empty() && value != "0");
     if offline {
         let line = format!("skipped: {test} (DRIML_OFFLINE=1)\n");
-        std::io::stderr().write_all(line.as_bytes()).expect("stderr is there while tests run");
+        std::io::stderr()
+            .write_all(line.as_bytes())
+            .expect("stderr is there while tests run");
     }
     offline
 }

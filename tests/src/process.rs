@@ -61,17 +61,30 @@ impl Output {
     }
 
     fn so_far(&self) -> String {
-        self.text.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        self.text
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
     }
 }
 
 impl Process {
     pub(crate) fn start(name: String, mut command: Command) -> Self {
-        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        let mut child = command.spawn().unwrap_or_else(|e| panic!("starting {command:?}: {e}"));
+        command
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped());
+        let mut child = command
+            .spawn()
+            .unwrap_or_else(|e| panic!("starting {command:?}: {e}"));
         let stdout = Output::read(child.stdout.take().expect("it is piped"));
         let stderr = Output::read(child.stderr.take().expect("it is piped"));
-        Self { name, child, stdout, stderr }
+        Self {
+            name,
+            child,
+            stdout,
+            stderr,
+        }
     }
 
     /// Sends a signal. It has not been waited for, so its number is still its own.
@@ -91,10 +104,15 @@ impl Process {
     pub fn wait_for_stderr(&mut self, words: &str) {
         wait_for(&format!("{}: {words:?} on stderr", self.name), || {
             // In this order: what it said just before its end is not missed.
-            let ended = self.child.try_wait().unwrap().is_some() && self.stderr.reader.is_finished();
+            let ended =
+                self.child.try_wait().unwrap().is_some() && self.stderr.reader.is_finished();
             let said = self.stderr.so_far();
             let found = said.contains(words);
-            assert!(found || !ended, "{} ended without saying {words:?}:\n{said}", self.name);
+            assert!(
+                found || !ended,
+                "{} ended without saying {words:?}:\n{said}",
+                self.name
+            );
             found.then_some(())
         });
     }
@@ -136,7 +154,12 @@ impl Drop for Process {
         let _ = self.child.wait();
         if thread::panicking() {
             // The test runner shows this beside the failure.
-            println!("--- {}\n{}{}", self.name, self.stdout.so_far(), self.stderr.so_far());
+            println!(
+                "--- {}\n{}{}",
+                self.name,
+                self.stdout.so_far(),
+                self.stderr.so_far()
+            );
         }
     }
 }
@@ -165,7 +188,11 @@ impl Ended {
     /// If it does not, with what it holds.
     #[track_caller]
     pub fn expect_said(self, words: &str) -> Self {
-        assert!(self.stderr.contains(words), "wanted {words:?} on stderr, found:\n{}", self.stderr);
+        assert!(
+            self.stderr.contains(words),
+            "wanted {words:?} on stderr, found:\n{}",
+            self.stderr
+        );
         self
     }
 }

@@ -12,7 +12,10 @@ use sha2::{Digest, Sha256};
 
 /// The counts of `summary.json` that every run has.
 #[derive(Clone, Debug, Deserialize)]
-#[allow(missing_docs, reason = "the names are those of the file, which the launcher documents")]
+#[allow(
+    missing_docs,
+    reason = "the names are those of the file, which the launcher documents"
+)]
 pub struct Summary {
     pub outcome: String,
     pub frames: u64,
@@ -65,7 +68,9 @@ impl RunFolder {
     pub fn setting(&self, path: &str) -> f64 {
         let config = toml::Value::Table(self.config());
         let value = path.split('.').fold(&config, |table, key| &table[key]);
-        value.as_float().unwrap_or_else(|| value.as_integer().unwrap() as f64)
+        value
+            .as_float()
+            .unwrap_or_else(|| value.as_integer().unwrap() as f64)
     }
 
     /// `summary.json`.
@@ -76,7 +81,9 @@ impl RunFolder {
     /// `metrics.csv`: its header and its rows.
     pub fn metrics(&self) -> (Vec<String>, Vec<Vec<String>>) {
         let text = self.text("metrics.csv");
-        let mut rows = text.lines().map(|line| line.split(',').map(str::to_owned).collect());
+        let mut rows = text
+            .lines()
+            .map(|line| line.split(',').map(str::to_owned).collect());
         let header = rows.next().unwrap();
         (header, rows.collect())
     }
@@ -91,7 +98,10 @@ impl RunFolder {
         let entries = fs::read_dir(self.path.join("checkpoints")).unwrap();
         let mut paths: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
         paths.sort();
-        assert!(paths.iter().all(|path| path.extension().is_none()), "left from an unfinished save: {paths:?}");
+        assert!(
+            paths.iter().all(|path| path.extension().is_none()),
+            "left from an unfinished save: {paths:?}"
+        );
         paths
     }
 
@@ -99,12 +109,19 @@ impl RunFolder {
     ///
     /// Computed from the file's own tensors, by the safetensors library alone.
     pub fn checkpoint_sha256(&self) -> String {
-        let path = self.checkpoints().pop().expect("there is a checkpoint").join("online.safetensors");
+        let path = self
+            .checkpoints()
+            .pop()
+            .expect("there is a checkpoint")
+            .join("online.safetensors");
         let bytes = fs::read(path).unwrap();
         let tensors = SafeTensors::deserialize(&bytes).unwrap();
         let published = tensors.iter().filter(|(name, _)| !name.starts_with("dim."));
         let file = safetensors::serialize(published, None).unwrap();
-        Sha256::digest(file).iter().map(|byte| format!("{byte:02x}")).collect()
+        Sha256::digest(file)
+            .iter()
+            .map(|byte| format!("{byte:02x}"))
+            .collect()
     }
 
     /// Checks what holds of every run that ended in order, and gives its summary.
@@ -116,22 +133,48 @@ impl RunFolder {
         let summary = self.summary();
         let said = format!("{summary:#?}");
         assert_eq!(summary.outcome, outcome, "{said}");
-        assert_eq!((summary.transitions_lost, summary.transitions_duplicated), (0, 0), "{said}");
+        assert_eq!(
+            (summary.transitions_lost, summary.transitions_duplicated),
+            (0, 0),
+            "{said}"
+        );
         assert_eq!(summary.messages_refused, 0, "{said}");
         assert_eq!(summary.frames, summary.transitions_inserted, "{said}");
-        assert_eq!(summary.k_histogram.iter().sum::<u64>(), summary.rows_sampled, "{said}");
-        assert!(summary.wall_seconds > 0.0 && summary.frames_per_second > 0.0, "{said}");
+        assert_eq!(
+            summary.k_histogram.iter().sum::<u64>(),
+            summary.rows_sampled,
+            "{said}"
+        );
+        assert!(
+            summary.wall_seconds > 0.0 && summary.frames_per_second > 0.0,
+            "{said}"
+        );
 
         let (header, rows) = self.metrics();
-        assert!(rows.iter().all(|row| row.len() == header.len()), "{header:?}\n{rows:?}");
-        let column = |name: &str| header.iter().position(|it| it == name).unwrap_or_else(|| panic!("no column {name}"));
+        assert!(
+            rows.iter().all(|row| row.len() == header.len()),
+            "{header:?}\n{rows:?}"
+        );
+        let column = |name: &str| {
+            header
+                .iter()
+                .position(|it| it == name)
+                .unwrap_or_else(|| panic!("no column {name}"))
+        };
         let last = rows.last().expect("there is a row");
         assert_eq!(last[column("frames")], summary.frames.to_string());
         assert_eq!(last[column("updates")], summary.updates.to_string());
 
-        assert_eq!(self.checkpoint_sha256(), summary.weights_sha256, "of the newest checkpoint and of the last weights");
+        assert_eq!(
+            self.checkpoint_sha256(),
+            summary.weights_sha256,
+            "of the newest checkpoint and of the last weights"
+        );
         let kept = self.checkpoints().len();
-        assert!((1..=self.setting("learner.checkpoints_kept") as usize).contains(&kept), "{kept} checkpoints");
+        assert!(
+            (1..=self.setting("learner.checkpoints_kept") as usize).contains(&kept),
+            "{kept} checkpoints"
+        );
         summary
     }
 
@@ -144,14 +187,23 @@ impl RunFolder {
         let summary = self.check("finished");
         let said = format!("{summary:#?}");
         let rows = self.setting("learner.batch_rows") as u64;
-        let (warmup, ratio) = (self.setting("replay.warmup_transitions") as u64, self.setting("replay.replay_ratio"));
-        assert!(summary.frames >= self.setting("replay.transitions_max") as u64, "{said}");
+        let (warmup, ratio) = (
+            self.setting("replay.warmup_transitions") as u64,
+            self.setting("replay.replay_ratio"),
+        );
+        assert!(
+            summary.frames >= self.setting("replay.transitions_max") as u64,
+            "{said}"
+        );
         assert_eq!(summary.rows_sampled, summary.updates * rows, "{said}");
         let allowed = ratio * (summary.frames - warmup) as f64 / rows as f64;
         assert_eq!(summary.updates, allowed as u64, "{said}");
         let publications = summary.updates / self.setting("learner.publish_period_updates") as u64;
         // One set of weights before the first update, one for what came after the last publication.
-        assert!((publications + 1..=publications + 2).contains(&summary.weights_version), "{said}");
+        assert!(
+            (publications + 1..=publications + 2).contains(&summary.weights_version),
+            "{said}"
+        );
         summary
     }
 }

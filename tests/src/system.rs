@@ -42,9 +42,16 @@ impl TestSystem {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
         // Not in the target folder: a unix socket's path must be short.
-        let folder = tempfile::Builder::new().prefix("driml-test-").tempdir().unwrap();
+        let folder = tempfile::Builder::new()
+            .prefix("driml-test-")
+            .tempdir()
+            .unwrap();
         let program = program.into();
-        Self { program, folder, mark: format!("{}-{count}", std::process::id()) }
+        Self {
+            program,
+            folder,
+            mark: format!("{}-{count}", std::process::id()),
+        }
     }
 
     /// A path in the system's folder.
@@ -86,12 +93,18 @@ impl TestSystem {
 
     /// Starts a replay server on this system's endpoint, with the settings that `flags` ask for.
     pub fn start_replay_server(&self, flags: &str) -> Process {
-        self.start_part(&format!("replay-server --listen {} {flags}", self.endpoint()))
+        self.start_part(&format!(
+            "replay-server --listen {} {flags}",
+            self.endpoint()
+        ))
     }
 
     /// Starts a learner whose checkpoints go into the run folder `run_dir`.
     pub fn start_learner(&self, run_dir: &str) -> Process {
-        self.start_part(&format!("learner --connect {} --run-dir {run_dir}", self.endpoint()))
+        self.start_part(&format!(
+            "learner --connect {} --run-dir {run_dir}",
+            self.endpoint()
+        ))
     }
 
     /// Starts an actor.
@@ -110,15 +123,22 @@ impl TestSystem {
         let processes = fs::read_dir("/proc").unwrap().flatten();
         let carries_mark = |folder: &Path| {
             let variables = fs::read(folder.join("environ")).unwrap_or_default();
-            variables.split(|&byte| byte == 0).any(|variable| variable == mark.as_bytes())
+            variables
+                .split(|&byte| byte == 0)
+                .any(|variable| variable == mark.as_bytes())
         };
         let survivor = |entry: fs::DirEntry| {
             let pid = entry.file_name().to_str()?.parse().ok()?;
             // One that has ended and was not waited for has no environment any more.
             carries_mark(&entry.path()).then_some(())?;
             let words = fs::read(entry.path().join("cmdline")).unwrap_or_default();
-            let words = words.split(|&byte| byte == 0).skip(1).filter(|word| !word.is_empty());
-            let args = words.map(|word| String::from_utf8_lossy(word).into_owned()).collect();
+            let words = words
+                .split(|&byte| byte == 0)
+                .skip(1)
+                .filter(|word| !word.is_empty());
+            let args = words
+                .map(|word| String::from_utf8_lossy(word).into_owned())
+                .collect();
             Some(Survivor { pid, args })
         };
         processes.filter_map(survivor).collect()
@@ -127,7 +147,9 @@ impl TestSystem {
     /// The process that runs `part` (`learner`, `actor`, `replay-server`), once it is there.
     pub fn find_part(&self, part: &str) -> Survivor {
         let is_part = |it: &Survivor| it.args.first().is_some_and(|first| first == part);
-        wait_for(&format!("a process {part}"), || self.survivors().into_iter().find(is_part))
+        wait_for(&format!("a process {part}"), || {
+            self.survivors().into_iter().find(is_part)
+        })
     }
 }
 

@@ -21,14 +21,34 @@ fn parts_find_each_other_and_end_in_order() {
     let status = client.wait_for_learner("the learner's last update", |learner| learner.finished);
     let replay = client.replay().unwrap();
     assert_eq!(replay.waiting, Waiting::Finished);
-    assert_eq!((replay.transitions_inserted, replay.rows_sampled, status.updates), (1280, 8640, 540));
-    assert_eq!((replay.transitions_lost, replay.transitions_duplicated, replay.messages_refused), (0, 0, 0));
+    assert_eq!(
+        (
+            replay.transitions_inserted,
+            replay.rows_sampled,
+            status.updates
+        ),
+        (1280, 8640, 540)
+    );
+    assert_eq!(
+        (
+            replay.transitions_lost,
+            replay.transitions_duplicated,
+            replay.messages_refused
+        ),
+        (0, 0, 0)
+    );
     let run = system.run_folder("run");
     assert_eq!(run.checkpoint_sha256(), status.weights_sha256);
 
-    learner.stop().expect_code(0).expect_said("finished after 540 updates");
+    learner
+        .stop()
+        .expect_code(0)
+        .expect_said("finished after 540 updates");
     drop(client);
-    server.stop().expect_code(0).expect_said("stops with 1280 transitions stored");
+    server
+        .stop()
+        .expect_code(0)
+        .expect_said("stops with 1280 transitions stored");
     assert_eq!(system.survivors(), []);
 }
 
@@ -46,12 +66,23 @@ fn parts_that_are_told_to_stop_lose_nothing() {
         actor.stop().expect_code(0).expect_said("leaves: ");
     }
     let replay = client.wait_for_replay("the actors' absence", |replay| replay.actors == 0);
-    assert_eq!((replay.transitions_lost, replay.transitions_duplicated), (0, 0));
-    assert!(learner.is_running() && server.is_running(), "they do not depend on actors");
+    assert_eq!(
+        (replay.transitions_lost, replay.transitions_duplicated),
+        (0, 0)
+    );
+    assert!(
+        learner.is_running() && server.is_running(),
+        "they do not depend on actors"
+    );
 
     // The learner uses up what the replay ratio allows, then waits; told to stop, it saves.
-    client.wait_for_replay("a waiting learner", |replay| replay.waiting == Waiting::LearnerWaitsForActors);
-    learner.stop().expect_code(0).expect_said("saved run/checkpoints/checkpoint-");
+    client.wait_for_replay("a waiting learner", |replay| {
+        replay.waiting == Waiting::LearnerWaitsForActors
+    });
+    learner
+        .stop()
+        .expect_code(0)
+        .expect_said("saved run/checkpoints/checkpoint-");
     assert!(!system.run_folder("run").checkpoints().is_empty());
     drop(client);
     server.signal(Signal::SIGINT);
@@ -63,11 +94,15 @@ fn an_actor_killed_and_started_again_goes_on() {
     let system = system();
     // Long enough that the first actor cannot finish it before it is killed.
     let flags = "--env chain --preset smoke --frames 20008 --set replay.warmup_transitions=2000";
-    let _server = system.start_replay_server(&format!("--agent driml-ada {flags} --set replay.replay_ratio=2"));
+    let _server = system.start_replay_server(&format!(
+        "--agent driml-ada {flags} --set replay.replay_ratio=2"
+    ));
     let learner = system.start_learner("run");
     let actor = system.start_actor(3);
     let client = system.connect();
-    client.wait_for_replay("some transitions", |replay| replay.transitions_inserted > 500);
+    client.wait_for_replay("some transitions", |replay| {
+        replay.transitions_inserted > 500
+    });
     actor.signal(Signal::SIGKILL);
     assert_eq!(actor.wait().signal, Some(Signal::SIGKILL as i32));
     let before = client.wait_for_replay("the actor's absence", |replay| replay.actors == 0);
@@ -79,6 +114,13 @@ fn an_actor_killed_and_started_again_goes_on() {
     let replay = client.replay().unwrap();
     assert!(replay.transitions_inserted >= 20_008 && replay.finished);
     // A killed actor says no goodbye: what it had and did not deliver was never announced, and is missed by nobody.
-    assert_eq!((replay.transitions_lost, replay.transitions_duplicated, replay.messages_refused), (0, 0, 0));
+    assert_eq!(
+        (
+            replay.transitions_lost,
+            replay.transitions_duplicated,
+            replay.messages_refused
+        ),
+        (0, 0, 0)
+    );
     learner.stop().expect_code(0);
 }

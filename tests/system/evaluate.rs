@@ -10,24 +10,44 @@ use crate::{SHORT, system};
 /// A system with a run in `run`.
 fn with_run() -> TestSystem {
     let system = system();
-    system.run(&format!("local --lockstep --agent driml-fix {SHORT} --run-dir run")).expect_code(0);
+    system
+        .run(&format!(
+            "local --lockstep --agent driml-fix {SHORT} --run-dir run"
+        ))
+        .expect_code(0);
     system
 }
 
 #[test]
 fn it_prints_the_agent_beside_a_random_policy() {
     let system = with_run();
-    let ended = system.run("evaluate --run run --episodes 7 --seed 2").expect_code(0);
+    let ended = system
+        .run("evaluate --run run --episodes 7 --seed 2")
+        .expect_code(0);
     let lines: Vec<_> = ended.stdout.lines().collect();
     assert_eq!(lines.len(), 3, "{lines:?}");
-    assert_eq!(lines[0], "chain as trained on, 7 episodes each, weights after 540 updates, seed 2");
+    assert_eq!(
+        lines[0],
+        "chain as trained on, 7 episodes each, weights after 540 updates, seed 2"
+    );
     for (line, policy) in lines[1..].iter().zip(["driml-fix", "random"]) {
-        assert!(line.starts_with(policy) && line.contains("standard deviation"), "{line}");
+        assert!(
+            line.starts_with(policy) && line.contains("standard deviation"),
+            "{line}"
+        );
     }
-    let again = system.run("evaluate --run run --episodes 7 --seed 2").expect_code(0);
-    assert_eq!(ended.stdout, again.stdout, "the same seed plays the same episodes");
+    let again = system
+        .run("evaluate --run run --episodes 7 --seed 2")
+        .expect_code(0);
+    assert_eq!(
+        ended.stdout, again.stdout,
+        "the same seed plays the same episodes"
+    );
     // The chain has no levels to hold back.
-    system.run("evaluate --run run --levels unseen").expect_code(64).expect_said("use --levels train");
+    system
+        .run("evaluate --run run --levels unseen")
+        .expect_code(64)
+        .expect_said("use --levels train");
 }
 
 #[test]
@@ -35,11 +55,22 @@ fn a_folder_that_is_no_run_s() {
     let system = system();
     fs::create_dir(system.path("empty")).unwrap();
     for folder in ["empty", "none"] {
-        let ended = system.run(&format!("evaluate --run {folder}")).expect_code(64);
-        assert!(ended.stderr.starts_with(&format!("error: {folder} is not the folder of a run")), "{}", ended.stderr);
+        let ended = system
+            .run(&format!("evaluate --run {folder}"))
+            .expect_code(64);
+        assert!(
+            ended
+                .stderr
+                .starts_with(&format!("error: {folder} is not the folder of a run")),
+            "{}",
+            ended.stderr
+        );
     }
     fs::write(system.path("empty/config.toml"), "[run]\n").unwrap();
-    system.run("evaluate --run empty").expect_code(64).expect_said("config.toml that driml wrote");
+    system
+        .run("evaluate --run empty")
+        .expect_code(64)
+        .expect_said("config.toml that driml wrote");
 }
 
 #[test]
@@ -47,18 +78,31 @@ fn a_damaged_checkpoint_is_named_and_not_used() {
     let system = with_run();
     let newest = system.run_folder("run").checkpoints().pop().unwrap();
     let name = newest.file_name().unwrap().to_str().unwrap();
-    for file in ["online.safetensors", "target.safetensors", "optimizer.safetensors", "state.json"] {
+    for file in [
+        "online.safetensors",
+        "target.safetensors",
+        "optimizer.safetensors",
+        "state.json",
+    ] {
         let path = newest.join(file);
         let whole = fs::read(&path).unwrap();
         for broken in [&whole[..whole.len() / 2], &whole[..0], &flipped(&whole)] {
             fs::write(&path, broken).unwrap();
             let ended = system.run("evaluate --run run --episodes 1").expect_code(1);
             let said = ended.stderr.lines().last().unwrap();
-            assert!(said.starts_with(&format!("error: run/checkpoints/{name}/{file} is damaged: ")), "{said}");
+            assert!(
+                said.starts_with(&format!(
+                    "error: run/checkpoints/{name}/{file} is damaged: "
+                )),
+                "{said}"
+            );
             assert!(said.contains("remove the folder it is in"), "{said}");
         }
         fs::remove_file(&path).unwrap();
-        system.run("evaluate --run run --episodes 1").expect_code(1).expect_said(&format!("{file} is damaged: it is missing"));
+        system
+            .run("evaluate --run run --episodes 1")
+            .expect_code(1)
+            .expect_said(&format!("{file} is damaged: it is missing"));
         fs::write(&path, &whole).unwrap();
     }
     system.run("evaluate --run run --episodes 1").expect_code(0);
@@ -83,5 +127,8 @@ fn weights_of_another_run_are_refused() {
         .expect_said("belongs to a run with specification")
         .expect_said("resume with the settings it was made with");
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
-    system.run("evaluate --run run").expect_code(64).expect_said("has no checkpoint yet");
+    system
+        .run("evaluate --run run")
+        .expect_code(64)
+        .expect_said("has no checkpoint yet");
 }

@@ -8,7 +8,10 @@ use crate::{LONG, system};
 
 /// A launched run that has learned something.
 fn launched(system: &TestSystem) -> Process {
-    let process = system.start(&format!("local --agent driml-ada {LONG} --listen {} --run-dir run", system.endpoint()));
+    let process = system.start(&format!(
+        "local --agent driml-ada {LONG} --listen {} --run-dir run",
+        system.endpoint()
+    ));
     let client = system.connect();
     client.wait_for_learner("some updates", |learner| learner.updates > 100);
     process
@@ -19,7 +22,10 @@ fn an_interrupt_saves_and_ends_all_parts() {
     let system = system();
     let process = launched(&system);
     process.signal(Signal::SIGINT);
-    let ended = process.wait().expect_code(130).expect_said("stopping: actors deliver what they have");
+    let ended = process
+        .wait()
+        .expect_code(130)
+        .expect_said("stopping: actors deliver what they have");
     assert_eq!(system.survivors(), []);
     assert!(ended.stdout.contains("interrupted: "), "{}", ended.stdout);
     let summary = system.run_folder("run").check("interrupted");
@@ -35,7 +41,10 @@ fn a_second_interrupt_ends_at_once() {
     process.signal(Signal::SIGINT);
     process.wait_for_stderr("Ctrl-C again ends at once");
     process.signal(Signal::SIGINT);
-    process.wait().expect_code(1).expect_said("ended at once by an interrupt: what was not saved is lost");
+    process
+        .wait()
+        .expect_code(1)
+        .expect_said("ended at once by an interrupt: what was not saved is lost");
     assert_eq!(system.survivors(), []);
     assert_eq!(system.run_folder("run").summary().outcome, "failed");
 }
@@ -45,7 +54,9 @@ fn dies(part: &str, name: &str) {
     let system = system();
     let process = launched(&system);
     system.find_part(part).signal(Signal::SIGKILL);
-    process.wait().expect_code(1).expect_said(&format!("error: {name} was ended by signal 9 SIGKILL (log: "));
+    process.wait().expect_code(1).expect_said(&format!(
+        "error: {name} was ended by signal 9 SIGKILL (log: "
+    ));
     assert_eq!(system.survivors(), []);
     assert_eq!(system.run_folder("run").summary().outcome, "failed");
 }
@@ -71,6 +82,11 @@ fn parts_end_with_their_launcher() {
     let process = launched(&system);
     process.signal(Signal::SIGKILL);
     process.wait();
-    wait_for("the end of all parts", || system.survivors().is_empty().then_some(()));
-    assert!(!system.run_folder("run").checkpoints().is_empty(), "the learner saved");
+    wait_for("the end of all parts", || {
+        system.survivors().is_empty().then_some(())
+    });
+    assert!(
+        !system.run_folder("run").checkpoints().is_empty(),
+        "the learner saved"
+    );
 }

@@ -1,12 +1,16 @@
 //! `driml local` with a process for each part: what a run leaves behind, in every world that needs nothing installed.
 //! How runs end badly is in `failures`.
 
+use std::net::{Ipv4Addr, TcpListener};
+
 use crate::{SHORT, system};
 
 #[test]
 fn c51_leaves_a_whole_run_folder() {
     let system = system();
-    let ended = system.run(&format!("local --agent c51 {SHORT} --run-dir run")).expect_code(0);
+    let ended = system
+        .run(&format!("local --agent c51 {SHORT} --run-dir run"))
+        .expect_code(0);
     let run = system.run_folder("run");
     let summary = run.check_finished();
     // Chosen so that chunks and batches fit without a remainder; the promise is within 1%.
@@ -16,24 +20,54 @@ fn c51_leaves_a_whole_run_folder() {
     assert_eq!(summary.mean_k, None, "c51 draws no positive");
 
     let (header, rows) = run.metrics();
-    for name in ["seconds", "frames", "replay_ratio", "c51_kl", "dim_4t4", "waiting", "rss_mib_learner", "rss_mib_actor_0"] {
-        assert!(header.iter().any(|it| it == name), "{name} is not in {header:?}");
+    for name in [
+        "seconds",
+        "frames",
+        "replay_ratio",
+        "c51_kl",
+        "dim_4t4",
+        "waiting",
+        "rss_mib_learner",
+        "rss_mib_actor_0",
+    ] {
+        assert!(
+            header.iter().any(|it| it == name),
+            "{name} is not in {header:?}"
+        );
     }
     assert!(!rows.is_empty());
     for part in ["replay-server", "learner", "actor-0"] {
         let log = run.log(part);
-        assert!(log.contains("INFO") && !log.contains("panicked"), "{part}:\n{log}");
+        assert!(
+            log.contains("INFO") && !log.contains("panicked"),
+            "{part}:\n{log}"
+        );
     }
-    assert!(ended.stdout.contains("trains      c51 on chain, seed 1"), "{}", ended.stdout);
-    assert!(ended.stdout.contains("finished: 1280 frames and 540 updates"), "{}", ended.stdout);
+    assert!(
+        ended.stdout.contains("trains      c51 on chain, seed 1"),
+        "{}",
+        ended.stdout
+    );
+    assert!(
+        ended
+            .stdout
+            .contains("finished: 1280 frames and 540 updates"),
+        "{}",
+        ended.stdout
+    );
     assert_eq!(system.survivors(), []);
 }
 
 #[test]
 fn driml_ada_with_two_actors_over_tcp() {
     let system = system();
-    // Port 0 cannot work here, as nobody could tell the parts which one it became; so the sockets are the launcher's own.
-    system.run(&format!("local --agent driml-ada {SHORT} --actors 2 --run-dir run")).expect_code(0);
+    let flags = format!(
+        "{SHORT} --actors 2 --listen {} --run-dir run",
+        free_tcp_endpoint()
+    );
+    system
+        .run(&format!("local --agent driml-ada {flags}"))
+        .expect_code(0);
     let run = system.run_folder("run");
     let summary = run.check_finished();
     assert_eq!(summary.replay_ratio, Some(8.0));
@@ -41,12 +75,33 @@ fn driml_ada_with_two_actors_over_tcp() {
     assert!(1.0 < mean_k && mean_k < 5.0, "{mean_k}");
     for part in ["actor-0", "actor-1"] {
         let log = run.log(part);
-        assert!(log.contains("leaves: ") && !log.contains("leaves: 0 "), "{log}");
+        assert!(
+            log.contains("leaves: ") && !log.contains("leaves: 0 "),
+            "{log}"
+        );
     }
     // The replay server says whose affinity it used; the learner sends one after each update.
     let (header, rows) = run.metrics();
-    let affinity = header.iter().position(|it| it == "affinity_version").unwrap();
-    assert_ne!(rows.last().unwrap()[affinity], "0", "the learner's affinity reached the replay server");
+    let affinity = header
+        .iter()
+        .position(|it| it == "affinity_version")
+        .unwrap();
+    assert_ne!(
+        rows.last().unwrap()[affinity],
+        "0",
+        "the learner's affinity reached the replay server"
+    );
+}
+
+/// An endpoint that nobody listens on, at a loopback address of this process's own so that nobody takes it meanwhile.
+fn free_tcp_endpoint() -> String {
+    let [_, high, middle, low] = std::process::id().to_be_bytes();
+    let address = Ipv4Addr::new(127, high, middle, low);
+    let free = TcpListener::bind((address, 0))
+        .unwrap()
+        .local_addr()
+        .unwrap();
+    format!("tcp/{free}")
 }
 
 #[test]
@@ -63,11 +118,20 @@ fn mspacman_with_stacked_and_enlarged_frames() {
 #[test]
 fn the_settings_that_a_run_leaves_repeat_it() {
     let system = system();
-    system.run(&format!("local --agent driml-randk {SHORT} --seed 5 --run-dir a")).expect_code(0);
-    system.run("local --config a/config.toml --run-dir b").expect_code(0);
+    system
+        .run(&format!(
+            "local --agent driml-randk {SHORT} --seed 5 --run-dir a"
+        ))
+        .expect_code(0);
+    system
+        .run("local --config a/config.toml --run-dir b")
+        .expect_code(0);
     let (a, b) = (system.run_folder("a"), system.run_folder("b"));
     assert_eq!(a.config(), b.config());
     // Processes race, so the weights differ; the counts do not.
     let (a, b) = (a.check_finished(), b.check_finished());
-    assert_eq!((a.frames, a.updates, a.rows_sampled), (b.frames, b.updates, b.rows_sampled));
+    assert_eq!(
+        (a.frames, a.updates, a.rows_sampled),
+        (b.frames, b.updates, b.rows_sampled)
+    );
 }

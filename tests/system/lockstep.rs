@@ -7,7 +7,9 @@ use driml_tests::{Summary, TestSystem};
 use crate::{SHORT, system};
 
 fn run(system: &TestSystem, flags: &str, name: &str) -> Summary {
-    system.run(&format!("local --lockstep {flags} --run-dir {name}")).expect_code(0);
+    system
+        .run(&format!("local --lockstep {flags} --run-dir {name}"))
+        .expect_code(0);
     system.run_folder(name).check_finished()
 }
 
@@ -19,7 +21,10 @@ fn the_seed_decides_the_weights() {
     let same = run(&system, &format!("{flags} --seed 3"), "same");
     let other = run(&system, &format!("{flags} --seed 4"), "other");
     assert_eq!(first.weights_sha256, same.weights_sha256);
-    assert_eq!((first.k_histogram, first.episodes), (same.k_histogram, same.episodes));
+    assert_eq!(
+        (first.k_histogram, first.episodes),
+        (same.k_histogram, same.episodes)
+    );
     assert_ne!(first.weights_sha256, other.weights_sha256);
     // And so do the settings that the first run left.
     let again = run(&system, "--config first/config.toml", "again");
@@ -48,12 +53,29 @@ fn c51_learns_the_chain_and_evaluation_shows_it() {
     let world: ChainConfig = world.try_into().unwrap();
     let wanted = 0.9 * optimal_return(&world);
     let while_training = summary.mean_return.unwrap();
-    assert!(while_training >= wanted, "the last 100 episodes, with exploration: {while_training} of {wanted}");
+    assert!(
+        while_training >= wanted,
+        "the last 100 episodes, with exploration: {while_training} of {wanted}"
+    );
 
-    let ended = system.run("evaluate --run run --episodes 40").expect_code(0);
+    let ended = system
+        .run("evaluate --run run --episodes 40")
+        .expect_code(0);
     let mean = |policy: &str| -> f64 {
-        let line = ended.stdout.lines().find(|line| line.starts_with(policy)).expect("each policy has a line");
-        line.split_once("mean return").unwrap().1.split(',').next().unwrap().trim().parse().unwrap()
+        let line = ended
+            .stdout
+            .lines()
+            .find(|line| line.starts_with(policy))
+            .expect("each policy has a line");
+        line.split_once("mean return")
+            .unwrap()
+            .1
+            .split(',')
+            .next()
+            .unwrap()
+            .trim()
+            .parse()
+            .unwrap()
     };
     let (learned, random) = (mean("c51"), mean("random"));
     assert!(learned >= wanted, "greedy: {learned} of {wanted}");

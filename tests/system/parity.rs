@@ -20,13 +20,30 @@ fn cases() -> Vec<PathBuf> {
 #[test]
 fn all_cases_are_within_tolerance() {
     let cases = cases();
-    let args: Vec<_> = cases.iter().map(|path| path.display().to_string()).collect();
-    let ended = system().run(&format!("parity {}", args.join(" "))).expect_code(0);
+    let args: Vec<_> = cases
+        .iter()
+        .map(|path| path.display().to_string())
+        .collect();
+    let ended = system()
+        .run(&format!("parity {}", args.join(" ")))
+        .expect_code(0);
     for path in &args {
-        assert!(ended.stdout.lines().any(|line| line == path), "{path} is not in\n{}", ended.stdout);
+        assert!(
+            ended.stdout.lines().any(|line| line == path),
+            "{path} is not in\n{}",
+            ended.stdout
+        );
     }
-    let verdicts: Vec<_> = ended.stdout.lines().filter(|line| line.starts_with("  ")).collect();
-    assert!(verdicts.len() > 20 * cases.len() && verdicts.iter().all(|line| line.ends_with("  ok")), "{}", ended.stdout);
+    let verdicts: Vec<_> = ended
+        .stdout
+        .lines()
+        .filter(|line| line.starts_with("  "))
+        .collect();
+    assert!(
+        verdicts.len() > 20 * cases.len() && verdicts.iter().all(|line| line.ends_with("  ok")),
+        "{}",
+        ended.stdout
+    );
 }
 
 #[test]
@@ -34,22 +51,40 @@ fn a_truncated_case_is_no_case() {
     let system = system();
     let whole = fs::read(&cases()[0]).unwrap();
     fs::write(system.path("cut.safetensors"), &whole[..whole.len() - 1]).unwrap();
-    system.run("parity cut.safetensors").expect_code(1).expect_said("error: cut.safetensors: not a whole safetensors file");
+    system
+        .run("parity cut.safetensors")
+        .expect_code(1)
+        .expect_said("error: cut.safetensors: not a whole safetensors file");
 }
 
 #[test]
 fn a_case_with_another_expectation_fails() {
     let system = system();
     let good = cases()[0].display().to_string();
-    for tensor in ["expect.loss.total", "expect.target_projection", "expect.grad_norm", "expect.updated.head.weight"] {
+    for tensor in [
+        "expect.loss.total",
+        "expect.target_projection",
+        "expect.grad_norm",
+        "expect.updated.head.weight",
+    ] {
         let mut bytes = fs::read(&good).unwrap();
         change(&mut bytes, tensor);
         fs::write(system.path("changed.safetensors"), bytes).unwrap();
-        let ended = system.run(&format!("parity changed.safetensors {good}")).expect_code(1);
+        let ended = system
+            .run(&format!("parity changed.safetensors {good}"))
+            .expect_code(1);
         let ended = ended.expect_said("error: 1 of 2 files are out of tolerance");
-        let failed: Vec<_> = ended.stdout.lines().filter(|line| line.ends_with("FAILED")).collect();
+        let failed: Vec<_> = ended
+            .stdout
+            .lines()
+            .filter(|line| line.ends_with("FAILED"))
+            .collect();
         let name = tensor.trim_start_matches("expect.");
-        assert!(failed.len() == 1 && failed[0].contains(name), "{tensor}: {failed:?}\n{}", ended.stdout);
+        assert!(
+            failed.len() == 1 && failed[0].contains(name),
+            "{tensor}: {failed:?}\n{}",
+            ended.stdout
+        );
     }
 }
 

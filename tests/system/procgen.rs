@@ -17,6 +17,14 @@ fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
     let summary = system.run_folder("run").check_finished();
     assert_eq!((summary.frames, summary.updates), (608, 25));
     assert!(summary.mean_k.is_some());
-    let ended = system.run("evaluate --run run --episodes 2 --levels unseen").expect_code(0);
-    assert!(ended.stdout.starts_with("procgen:bigfish on unseen levels, 2 episodes each"), "{}", ended.stdout);
+    let ended = system
+        .run("evaluate --run run --episodes 2 --levels unseen")
+        .expect_code(0);
+    assert!(
+        ended
+            .stdout
+            .starts_with("procgen:bigfish on unseen levels, 2 episodes each"),
+        "{}",
+        ended.stdout
+    );
 }

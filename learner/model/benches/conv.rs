@@ -17,12 +17,21 @@ const LAYERS: [(&str, [usize; 6], bool); 4] = [
 ];
 
 fn values(len: usize, scale: f32) -> Vec<f32> {
-    (0..len).map(|index| ((index * 7919 % 1009) as f32 / 1009.0 - 0.5) * scale).collect()
+    (0..len)
+        .map(|index| ((index * 7919 % 1009) as f32 / 1009.0 - 0.5) * scale)
+        .collect()
 }
 
 fn stock(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
-    let images = if images.dtype() == DType::U8 { (images.to_dtype(DType::F32)? / 255.0)? } else { images.clone() };
-    let maps = images.permute((0, 3, 1, 2))?.contiguous()?.conv2d(weight, 0, stride, 1, 1)?;
+    let images = if images.dtype() == DType::U8 {
+        (images.to_dtype(DType::F32)? / 255.0)?
+    } else {
+        images.clone()
+    };
+    let maps = images
+        .permute((0, 3, 1, 2))?
+        .contiguous()?
+        .conv2d(weight, 0, stride, 1, 1)?;
     maps.broadcast_add(&bias.reshape((1, (), 1, 1))?)?.relu()
 }
 
@@ -32,13 +41,28 @@ fn layers(criterion: &mut Criterion) {
         let len = BATCH * height * width * channels_in;
         let device = &Device::Cpu;
         let images = if frames {
-            Tensor::from_vec((0..len).map(|index| (index * 31 % 256) as u8).collect(), shape, device).unwrap()
+            Tensor::from_vec(
+                (0..len).map(|index| (index * 31 % 256) as u8).collect(),
+                shape,
+                device,
+            )
+            .unwrap()
         } else {
-            Var::from_vec(values(len, 1.0), shape, device).unwrap().as_tensor().clone()
+            Var::from_vec(values(len, 1.0), shape, device)
+                .unwrap()
+                .as_tensor()
+                .clone()
         };
         let weight_shape = (channels_out, channels_in, kernel, kernel);
-        let weight = Var::from_vec(values(weight_shape.0 * channels_in * kernel * kernel, 0.1), weight_shape, device);
-        let (weight, bias) = (weight.unwrap(), Var::zeros(channels_out, DType::F32, device).unwrap());
+        let weight = Var::from_vec(
+            values(weight_shape.0 * channels_in * kernel * kernel, 0.1),
+            weight_shape,
+            device,
+        );
+        let (weight, bias) = (
+            weight.unwrap(),
+            Var::zeros(channels_out, DType::F32, device).unwrap(),
+        );
 
         let mut group = criterion.benchmark_group(name);
         group.sample_size(10);

@@ -11,7 +11,11 @@ use rand_chacha::rand_core::SeedableRng;
 const SIZES: [(usize, usize); 2] = [(64, 64), (104, 80)];
 
 fn config((height, width): (usize, usize), dim: DimParts) -> ModelConfig {
-    let layer = |out, kernel, stride| ConvLayer { out, kernel, stride };
+    let layer = |out, kernel, stride| ConvLayer {
+        out,
+        kernel,
+        stride,
+    };
     ModelConfig {
         height,
         width,
@@ -33,38 +37,74 @@ fn parameters(config: &ModelConfig) -> Parameters {
 }
 
 fn frames(config: &ModelConfig, batch: usize) -> Vec<u8> {
-    (0..batch * config.frame_len()).map(|index| (index * 31 % 256) as u8).collect()
+    (0..batch * config.frame_len())
+        .map(|index| (index * 31 % 256) as u8)
+        .collect()
 }
 
 fn learner(criterion: &mut Criterion) {
     const BATCH: usize = 256;
     for size in SIZES {
-        let mut group = criterion.benchmark_group(format!("network {}x{}x3 batch {BATCH}", size.0, size.1));
+        let mut group =
+            criterion.benchmark_group(format!("network {}x{}x3 batch {BATCH}", size.0, size.1));
         group.sample_size(20);
-        let heads = DimParts { psi3: true, phi3: true, psi4: true, phi4: true, action: true };
+        let heads = DimParts {
+            psi3: true,
+            phi3: true,
+            psi4: true,
+            phi4: true,
+            action: true,
+        };
         let config = config(size, heads);
         let parameters = parameters(&config);
         let network = Network::new(&config, &parameters).unwrap();
         let shape = (BATCH, size.0, size.1, 3);
         let frames = Tensor::from_vec(frames(&config, BATCH), shape, &Device::Cpu).unwrap();
-        let actions = Tensor::from_vec((0..BATCH as u32).map(|row| row % 15).collect(), BATCH, &Device::Cpu).unwrap();
+        let actions = Tensor::from_vec(
+            (0..BATCH as u32).map(|row| row % 15).collect(),
+            BATCH,
+            &Device::Cpu,
+        )
+        .unwrap();
 
         group.bench_function("forward", |bencher| {
-            bencher.iter(|| network.logits(&network.features(&frames).unwrap().f4).unwrap());
+            bencher.iter(|| {
+                network
+                    .logits(&network.features(&frames).unwrap().f4)
+                    .unwrap()
+            });
         });
         group.bench_function("forward and backward", |bencher| {
             bencher.iter(|| {
-                let logits = network.logits(&network.features(&frames).unwrap().f4).unwrap();
+                let logits = network
+                    .logits(&network.features(&frames).unwrap().f4)
+                    .unwrap();
                 logits.sqr().unwrap().sum_all().unwrap().backward().unwrap()
             });
         });
         group.bench_function("psi4 forward and backward", |bencher| {
             let f4 = network.features(&frames).unwrap().f4.detach();
-            bencher.iter(|| network.psi4(&f4, &actions).unwrap().sum_all().unwrap().backward().unwrap());
+            bencher.iter(|| {
+                network
+                    .psi4(&f4, &actions)
+                    .unwrap()
+                    .sum_all()
+                    .unwrap()
+                    .backward()
+                    .unwrap()
+            });
         });
         group.bench_function("psi3 forward and backward", |bencher| {
             let f3 = network.features(&frames).unwrap().f3.detach();
-            bencher.iter(|| network.psi3(&f3, &actions).unwrap().sum_all().unwrap().backward().unwrap());
+            bencher.iter(|| {
+                network
+                    .psi3(&f3, &actions)
+                    .unwrap()
+                    .sum_all()
+                    .unwrap()
+                    .backward()
+                    .unwrap()
+            });
         });
         group.finish();
     }
@@ -75,7 +115,11 @@ fn actor(criterion: &mut Criterion) {
         let mut group = criterion.benchmark_group(format!("policy {}x{}x3", size.0, size.1));
         group.sample_size(50);
         let config = config(size, DimParts::NONE);
-        let mut policy = PolicyNetwork::new(&config, &parameters(&config).to_safetensors(|_| true).unwrap()).unwrap();
+        let mut policy = PolicyNetwork::new(
+            &config,
+            &parameters(&config).to_safetensors(|_| true).unwrap(),
+        )
+        .unwrap();
         for batch in [1, 32, 256] {
             let frames = frames(&config, batch);
             let mut actions = vec![0; batch];

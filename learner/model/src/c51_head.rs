@@ -14,6 +14,7 @@ use crate::weights::Parameters;
 /// Distributions that one task takes.
 const TASK_DISTRIBUTIONS: usize = 256;
 
+#[derive(Debug)]
 pub(crate) struct C51Head {
     weight: Tensor,
     bias: Tensor,
@@ -41,7 +42,9 @@ impl C51Head {
 
     /// Expected returns [B, A] of logits [B, A, atoms]; no gradient flows.
     pub(crate) fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
-        Ok(logits.contiguous()?.apply_op1_no_bwd(&Expectation { support: self.support.clone() })?)
+        Ok(logits.contiguous()?.apply_op1_no_bwd(&Expectation {
+            support: self.support.clone(),
+        })?)
     }
 }
 
@@ -54,10 +57,18 @@ impl CustomOp1 for Expectation {
         "c51-expectation"
     }
 
-    fn cpu_fwd(&self, logits: &CpuStorage, layout: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
+    fn cpu_fwd(
+        &self,
+        logits: &CpuStorage,
+        layout: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (batch, actions, atoms) = layout.shape().dims3()?;
         if atoms != self.support.len() {
-            candle_core::bail!("logits {:?} over {} atoms", layout.shape(), self.support.len());
+            candle_core::bail!(
+                "logits {:?} over {} atoms",
+                layout.shape(),
+                self.support.len()
+            );
         }
         let mut values = vec![0.0; batch * actions];
         values

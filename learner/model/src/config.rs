@@ -72,7 +72,13 @@ pub struct DimParts {
 
 impl DimParts {
     /// No DIM head at all: the C51 agent, target networks and actors.
-    pub const NONE: Self = Self { psi3: false, phi3: false, psi4: false, phi4: false, action: false };
+    pub const NONE: Self = Self {
+        psi3: false,
+        phi3: false,
+        psi4: false,
+        phi4: false,
+        action: false,
+    };
 
     /// Whether the action embedding exists: Psi is conditioned on the action, and there is a Psi.
     pub fn embeds_action(&self) -> bool {
@@ -104,33 +110,52 @@ impl ModelConfig {
             }
         }
         if self.num_actions > ACTIONS_MAX {
-            return fail(format!("num_actions is {}, must be 1 to {ACTIONS_MAX}", self.num_actions));
+            return fail(format!(
+                "num_actions is {}, must be 1 to {ACTIONS_MAX}",
+                self.num_actions
+            ));
         }
         if self.atoms < 2 {
             return fail(format!("atoms is {}, must be at least 2", self.atoms));
         }
         if !(self.v_min.is_finite() && self.v_max.is_finite() && self.v_min < self.v_max) {
-            return fail(format!("v_min {} must be below v_max {}, both finite", self.v_min, self.v_max));
+            return fail(format!(
+                "v_min {} must be below v_max {}, both finite",
+                self.v_min, self.v_max
+            ));
         }
         if self.conv.is_empty() {
             return fail("conv is empty, at least one convolution is needed".to_owned());
         }
         let (mut height, mut width) = (self.height, self.width);
         for (index, layer) in self.conv.iter().enumerate() {
-            for (name, size) in [("out", layer.out), ("kernel", layer.kernel), ("stride", layer.stride)] {
+            for (name, size) in [
+                ("out", layer.out),
+                ("kernel", layer.kernel),
+                ("stride", layer.stride),
+            ] {
                 if size == 0 || size > DIMENSION_MAX {
-                    return fail(format!("conv[{index}].{name} is {size}, must be 1 to {DIMENSION_MAX}"));
+                    return fail(format!(
+                        "conv[{index}].{name} is {size}, must be 1 to {DIMENSION_MAX}"
+                    ));
                 }
             }
             if layer.kernel > height || layer.kernel > width {
-                return fail(format!("conv[{index}].kernel {} exceeds its input {height}x{width}", layer.kernel));
+                return fail(format!(
+                    "conv[{index}].kernel {} exceeds its input {height}x{width}",
+                    layer.kernel
+                ));
             }
             (height, width) = (layer.output_side(height), layer.output_side(width));
         }
         for (name, shape) in self.parameter_shapes() {
-            let len = shape.iter().try_fold(1usize, |len, &size| len.checked_mul(size));
+            let len = shape
+                .iter()
+                .try_fold(1usize, |len, &size| len.checked_mul(size));
             if len.is_none_or(|len| len > PARAMETER_LEN_MAX) {
-                return fail(format!("{name} would have shape {shape:?}, more than {PARAMETER_LEN_MAX} scalars"));
+                return fail(format!(
+                    "{name} would have shape {shape:?}, more than {PARAMETER_LEN_MAX} scalars"
+                ));
             }
         }
         Ok(())
@@ -138,14 +163,24 @@ impl ModelConfig {
 
     /// The same network without its DIM heads: what target networks and actors hold.
     pub fn without_dim(&self) -> Self {
-        Self { dim: DimParts::NONE, ..self.clone() }
+        Self {
+            dim: DimParts::NONE,
+            ..self.clone()
+        }
     }
 
     /// Shape of f3: height, width, channels of the last convolution's output. Meaningful for a valid configuration.
     pub fn local_shape(&self) -> (usize, usize, usize) {
-        self.conv.iter().fold((self.height, self.width, self.channels), |(height, width, _), layer| {
-            (layer.output_side(height), layer.output_side(width), layer.out)
-        })
+        self.conv.iter().fold(
+            (self.height, self.width, self.channels),
+            |(height, width, _), layer| {
+                (
+                    layer.output_side(height),
+                    layer.output_side(width),
+                    layer.out,
+                )
+            },
+        )
     }
 
     /// Bytes of one input frame: height * width * channels.
@@ -157,7 +192,9 @@ impl ModelConfig {
     pub fn atoms_support(&self) -> Vec<f32> {
         let (v_min, v_max) = (f64::from(self.v_min), f64::from(self.v_max));
         let step = (v_max - v_min) / (self.atoms - 1) as f64;
-        (0..self.atoms).map(|i| (v_min + i as f64 * step) as f32).collect()
+        (0..self.atoms)
+            .map(|i| (v_min + i as f64 * step) as f32)
+            .collect()
     }
 
     /// Names and PyTorch shapes of all parameters: torso first, then head, then the DIM heads that exist.
@@ -176,20 +213,34 @@ impl ModelConfig {
 
         let mut channels_in = self.channels;
         for (index, conv) in self.conv.iter().enumerate() {
-            layer(&format!("torso.conv{}", index + 1), vec![conv.out, channels_in, conv.kernel, conv.kernel], true);
+            layer(
+                &format!("torso.conv{}", index + 1),
+                vec![conv.out, channels_in, conv.kernel, conv.kernel],
+                true,
+            );
             channels_in = conv.out;
         }
         let (local_height, local_width, local_channels) = self.local_shape();
-        let flat = local_height.saturating_mul(local_width).saturating_mul(local_channels);
+        let flat = local_height
+            .saturating_mul(local_width)
+            .saturating_mul(local_channels);
         layer("torso.fc", vec![self.hidden, flat], true);
-        layer("head", vec![self.num_actions.saturating_mul(self.atoms), self.hidden], true);
+        layer(
+            "head",
+            vec![self.num_actions.saturating_mul(self.atoms), self.hidden],
+            true,
+        );
 
         let mut block = |name: &str, input: usize, hidden: usize, skip_bias: bool| {
             layer(&format!("{name}.hidden"), vec![hidden, input], true);
             layer(&format!("{name}.out"), vec![hidden, hidden], true);
             layer(&format!("{name}.skip"), vec![hidden, input], skip_bias);
         };
-        let embed = if self.dim.embeds_action() { self.action_embed } else { 0 };
+        let embed = if self.dim.embeds_action() {
+            self.action_embed
+        } else {
+            0
+        };
         if self.dim.embeds_action() {
             block("dim.action", self.num_actions, self.action_embed, true);
         }

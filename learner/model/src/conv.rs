@@ -1,142 +1,347 @@
-//! The convolution as a candle operation with gradients, its batch split over the rayon pool.
+//! A stack of convolutions as one candle operation with gradients, its batch split over the rayon pool.
 //! It supports what the torso needs: the CPU, square kernels, no padding, no dilation, always bias and ReLU.
 //!
 //! candle's own backward pass is about 10 times slower on the CPU: it has no matrix product for the image's gradient, a
-//! single thread for the bias's, and it always computes both.
+//! single thread for the bias's, and it always computes both. The layers are one operation because candle adds every
+//! gradient to fresh zeros; here the maps between layers, and their gradients, stay in the cache of the core at work.
 
 use std::cell::RefCell;
+use std::sync::{Mutex, PoisonError};
 
-use candle_core::{CpuStorage, CustomOp3, DType, Layout, Result, Shape, Tensor, bail};
+use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
-use crate::im2col::{ConvGradients, ConvScratch, ConvShape, Images, backward, forward};
-use crate::linear::{add_in_order, floats};
+use crate::im2col::{ConvGradients, ConvScratch, ConvShape, Images, backward, forward, grown};
+use crate::linear::{add_in_order, cpu, floats};
 
 /// Images that one task takes. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_IMAGES: usize = 16;
 
 thread_local! {
-    static SCRATCH: RefCell<ConvScratch> = RefCell::default();
+    static SCRATCH: RefCell<TaskScratch> = RefCell::default();
 }
 
-/// relu(conv2d(images, weight) + bias) without padding, differentiable in all floating-point arguments.
-///
-/// `images` [B, H, W, C] u8 (scaled by 1/255, no gradient) or f32; `weight` [out, C, k, k] f32; `bias` [out] f32.
-/// Result [B, (H - k) / stride + 1, (W - k) / stride + 1, out] f32, channels last. Where the result is 0 the gradient
-/// is 0, as in PyTorch. Results and gradients have the same bits whatever the number of threads.
+/// relu(conv2d(images, weight) + bias) without padding: [`conv_stack`] of one layer.
 ///
 /// # Errors
-/// Shapes that do not match, a kernel that is not square or larger than the image, a stride of 0, other types.
-pub fn conv2d_relu(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
-    let (_, height, width, channels) = images.dims4()?;
-    let (channels_out, channels_in, kernel, kernel_width) = weight.dims4()?;
-    if channels != channels_in || kernel != kernel_width || bias.dims() != [channels_out] {
-        bail!(
-            "convolution of images {:?} with weight {:?} and bias {:?}",
-            images.shape(),
-            weight.shape(),
-            bias.shape()
-        );
-    }
-    if stride == 0 || kernel == 0 || kernel > height.min(width) || channels * channels_out == 0 {
-        bail!("convolution of images {:?} with weight {:?} and stride {stride}", images.shape(), weight.shape());
-    }
-    let shape = ConvShape { height, width, channels_in, channels_out, kernel, stride };
-    images.contiguous()?.apply_op3(&weight.contiguous()?, &bias.contiguous()?, ConvRelu(shape))
+/// As for [`conv_stack`].
+pub fn conv2d_relu(
+    images: &Tensor,
+    weight: &Tensor,
+    bias: &Tensor,
+    stride: usize,
+) -> Result<Tensor> {
+    conv_stack(images, &[(weight, bias, stride)])
 }
 
-struct ConvRelu(ConvShape);
+/// Convolutions without padding, each with bias and ReLU, differentiable in all floating-point arguments.
+///
+/// `images` [B, H, W, C] u8 (scaled by 1/255, no gradient) or f32. Each layer is (weight [out, in, k, k] f32, bias [out]
+/// f32, stride) and turns [B, h, w, in] into [B, (h - k) / stride + 1, (w - k) / stride + 1, out], channels last. Where an
+/// output is 0 its gradient is 0, as in PyTorch. Results and gradients have the same bits whatever the number of threads.
+///
+/// # Errors
+/// No layer, shapes that do not match, a kernel that is not square or larger than its input, a stride of 0, other types.
+pub fn conv_stack(images: &Tensor, layers: &[(&Tensor, &Tensor, usize)]) -> Result<Tensor> {
+    let (_, mut height, mut width, mut channels_in) = images.dims4()?;
+    if layers.is_empty() {
+        bail!("a stack of no convolutions");
+    }
+    let (mut shapes, mut parameters) = (Vec::new(), Vec::new());
+    for &(weight, bias, stride) in layers {
+        let (channels_out, weight_in, kernel, kernel_width) = weight.dims4()?;
+        let fits =
+            weight_in == channels_in && kernel == kernel_width && bias.dims() == [channels_out];
+        let exists = stride > 0
+            && kernel > 0
+            && kernel <= height.min(width)
+            && channels_in * channels_out > 0;
+        if !fits || !exists {
+            let (input, weight, bias) =
+                ([height, width, channels_in], weight.shape(), bias.shape());
+            bail!(
+                "convolution of images {input:?} with weight {weight:?}, bias {bias:?} and stride {stride}"
+            );
+        }
+        let shape = ConvShape {
+            height,
+            width,
+            channels_in,
+            channels_out,
+            kernel,
+            stride,
+        };
+        (height, width, channels_in) = (shape.out_height(), shape.out_width(), channels_out);
+        shapes.push(shape);
+        parameters.extend([weight.flatten_all()?, bias.clone()]);
+    }
+    // An operation has at most three arguments, so the parameters, which are small, travel as one vector.
+    let parameters = Tensor::cat(&parameters, 0)?;
+    images.contiguous()?.apply_op2(
+        &parameters,
+        ConvStack {
+            shapes,
+            between: Mutex::default(),
+        },
+    )
+}
 
-impl CustomOp3 for ConvRelu {
+struct ConvStack {
+    shapes: Vec<ConvShape>,
+    /// Of each task, the maps of all layers but the last: what the forward pass leaves to the backward pass.
+    between: Mutex<Vec<Vec<f32>>>,
+}
+
+/// One layer's parameters as the kernels want them.
+struct Layer<'a> {
+    shape: ConvShape,
+    packed: Vec<f32>,
+    bias: &'a [f32],
+}
+
+/// Buffers that a thread keeps between calls.
+#[derive(Default)]
+struct TaskScratch {
+    conv: ConvScratch,
+    grad_output: Vec<f32>,
+    grad_input: Vec<f32>,
+}
+
+impl ConvStack {
+    fn first(&self) -> &ConvShape {
+        &self.shapes[0]
+    }
+
+    fn last(&self) -> &ConvShape {
+        &self.shapes[self.shapes.len() - 1]
+    }
+
+    /// The layers, of `parameters` as [`conv_stack`] joined them.
+    fn layers<'a>(&self, mut parameters: &'a [f32]) -> Vec<Layer<'a>> {
+        let mut layers = Vec::with_capacity(self.shapes.len());
+        for &shape in &self.shapes {
+            let (weight, rest) = parameters.split_at(shape.weight_len());
+            let (bias, rest) = rest.split_at(shape.channels_out);
+            layers.push(Layer {
+                shape,
+                packed: shape.pack_weight(weight),
+                bias,
+            });
+            parameters = rest;
+        }
+        layers
+    }
+
+    /// Runs one task's images into `maps`, the last layer's, and returns those of the layers before.
+    fn task_forward(&self, layers: &[Layer<'_>], images: Images<'_>, maps: &mut [f32]) -> Vec<f32> {
+        let count = images.len() / self.first().image_len();
+        let between_len: usize = self.shapes[..self.shapes.len() - 1]
+            .iter()
+            .map(ConvShape::map_len)
+            .sum();
+        let mut between = vec![0.0; count * between_len];
+        let (mut input, mut free) = (images, &mut between[..]);
+        with_scratch(|scratch| {
+            for (index, layer) in layers.iter().enumerate() {
+                if index + 1 == layers.len() {
+                    forward(
+                        &layer.shape,
+                        input,
+                        &layer.packed,
+                        layer.bias,
+                        maps,
+                        &mut scratch.conv,
+                    );
+                } else {
+                    let (output, rest) =
+                        std::mem::take(&mut free).split_at_mut(count * layer.shape.map_len());
+                    forward(
+                        &layer.shape,
+                        input,
+                        &layer.packed,
+                        layer.bias,
+                        output,
+                        &mut scratch.conv,
+                    );
+                    (input, free) = (Images::Floats(output), rest);
+                }
+            }
+        });
+        between
+    }
+
+    /// The gradients of one task's images for their `maps`' gradients, with `between` as `task_forward` returned it.
+    ///
+    /// The result is the parameters' as [`conv_stack`] joined them, but for the packed order of the weights; the images'
+    /// are added to `grad_images`, if it is there.
+    fn task_backward(
+        &self,
+        layers: &[Layer<'_>],
+        images: Images<'_>,
+        mut between: &[f32],
+        (maps, grad_maps): (&[f32], &[f32]),
+        mut grad_images: Option<&mut [f32]>,
+    ) -> Vec<f32> {
+        let count = images.len() / self.first().image_len();
+        let mut sums = vec![0.0; self.parameters_len()];
+        let mut sums_left = &mut sums[..];
+        with_scratch(
+            |TaskScratch {
+                 conv,
+                 grad_output,
+                 grad_input,
+             }| {
+                grown(grad_output, grad_maps.len()).copy_from_slice(grad_maps);
+                let mut output = maps;
+                for (index, Layer { shape, packed, .. }) in layers.iter().enumerate().rev() {
+                    let before = sums_left.len() - shape.weight_len() - shape.channels_out;
+                    let (left, layer_sums) = std::mem::take(&mut sums_left).split_at_mut(before);
+                    let (packed_sum, bias_sum) = layer_sums.split_at_mut(shape.weight_len());
+                    sums_left = left;
+
+                    let input_len = count * shape.image_len();
+                    let (input, input_maps, grad_image) = if index == 0 {
+                        (images, output, grad_images.take())
+                    } else {
+                        let (earlier, input) = between.split_at(between.len() - input_len);
+                        between = earlier;
+                        let grad_input = grown(grad_input, input_len);
+                        grad_input.fill(0.0);
+                        (Images::Floats(input), input, Some(grad_input))
+                    };
+                    let grads = ConvGradients {
+                        packed: packed_sum,
+                        bias: bias_sum,
+                        images: grad_image,
+                    };
+                    backward(
+                        shape,
+                        input,
+                        packed,
+                        output,
+                        &grad_output[..output.len()],
+                        grads,
+                        conv,
+                    );
+                    output = input_maps;
+                    std::mem::swap(grad_output, grad_input);
+                }
+            },
+        );
+        sums
+    }
+
+    fn task_images<'a>(&self, images: Images<'a>, task: usize) -> Images<'a> {
+        let task_len = TASK_IMAGES * self.first().image_len();
+        images.slice(task * task_len..images.len().min((task + 1) * task_len))
+    }
+
+    /// Gradients with the weights back in PyTorch's order.
+    fn unpacked(&self, mut sums: &[f32]) -> Vec<f32> {
+        let mut result = Vec::with_capacity(sums.len());
+        for shape in &self.shapes {
+            let (packed, rest) = sums.split_at(shape.weight_len());
+            let (bias, rest) = rest.split_at(shape.channels_out);
+            result.extend(shape.unpack_weight(packed));
+            result.extend_from_slice(bias);
+            sums = rest;
+        }
+        result
+    }
+
+    fn parameters_len(&self) -> usize {
+        self.shapes
+            .iter()
+            .map(|shape| shape.weight_len() + shape.channels_out)
+            .sum()
+    }
+}
+
+impl CustomOp2 for ConvStack {
     fn name(&self) -> &'static str {
-        "conv2d-relu"
+        "conv-stack"
     }
 
     fn cpu_fwd(
         &self,
         images: &CpuStorage,
         images_layout: &Layout,
-        weight: &CpuStorage,
-        weight_layout: &Layout,
-        bias: &CpuStorage,
-        bias_layout: &Layout,
+        parameters: &CpuStorage,
+        parameters_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let shape = &self.0;
         let images = pixels(images, images_layout)?;
-        let packed = shape.pack_weight(floats(weight, weight_layout)?);
-        let bias = floats(bias, bias_layout)?;
-        let batch = images.len() / shape.image_len();
-        let mut maps = vec![0.0; batch * shape.map_len()];
-        maps.par_chunks_mut(TASK_IMAGES * shape.map_len()).enumerate().for_each(|(task, maps)| {
-            let images = task_images(shape, images, task);
-            with_scratch(|scratch| forward(shape, images, &packed, bias, maps, scratch));
-        });
-        let dims = (batch, shape.out_height(), shape.out_width(), shape.channels_out);
+        let layers = self.layers(floats(parameters, parameters_layout)?);
+        let last = self.last();
+        let batch = images.len() / self.first().image_len();
+        let mut maps = vec![0.0; batch * last.map_len()];
+        let tasks = maps
+            .par_chunks_mut(TASK_IMAGES * last.map_len())
+            .enumerate();
+        let between = tasks
+            .map(|(task, maps)| self.task_forward(&layers, self.task_images(images, task), maps));
+        let between = between.collect();
+        *self.between.lock().unwrap_or_else(PoisonError::into_inner) = between;
+        let dims = (
+            batch,
+            last.out_height(),
+            last.out_width(),
+            last.channels_out,
+        );
         Ok((CpuStorage::F32(maps), dims.into()))
     }
 
     fn bwd(
         &self,
         images: &Tensor,
-        weight: &Tensor,
-        bias: &Tensor,
+        parameters: &Tensor,
         maps: &Tensor,
         grad_maps: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let shape = &self.0;
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let needs_images = images.dtype() == DType::F32 && images.track_op();
         let grad_maps = grad_maps.contiguous()?;
 
         let (images_storage, images_layout) = images.storage_and_layout();
-        let (weight_storage, weight_layout) = weight.storage_and_layout();
+        let (parameters_storage, parameters_layout) = parameters.storage_and_layout();
         let (maps_storage, maps_layout) = maps.storage_and_layout();
         let (grad_storage, grad_layout) = grad_maps.storage_and_layout();
         let image_values = pixels(cpu(&images_storage)?, images_layout)?;
-        let packed = shape.pack_weight(floats(cpu(&weight_storage)?, weight_layout)?);
+        let layers = self.layers(floats(cpu(&parameters_storage)?, parameters_layout)?);
         let map_values = floats(cpu(&maps_storage)?, maps_layout)?;
         let grad_values = floats(cpu(&grad_storage)?, grad_layout)?;
+        let between = self.between.lock().unwrap_or_else(PoisonError::into_inner);
 
         let mut grad_images = vec![0.0f32; if needs_images { image_values.len() } else { 0 }];
-        let image_parts: Vec<Option<&mut [f32]>> = if needs_images {
-            grad_images.chunks_mut(TASK_IMAGES * shape.image_len()).map(Some).collect()
-        } else {
-            (0..map_values.len().div_ceil(TASK_IMAGES * shape.map_len())).map(|_| None).collect()
-        };
-        let task_len = TASK_IMAGES * shape.map_len();
-        // One buffer a task: the packed weight's gradient, then the bias's.
-        let sums: Vec<Vec<f32>> = map_values
+        let mut grad_parts = grad_images.chunks_mut(TASK_IMAGES * self.first().image_len());
+        let grad_parts: Vec<Option<&mut [f32]>> =
+            between.iter().map(|_| grad_parts.next()).collect();
+        let task_len = TASK_IMAGES * self.last().map_len();
+        let sums = map_values
             .par_chunks(task_len)
             .zip(grad_values.par_chunks(task_len))
-            .zip(image_parts)
+            .zip(between.par_iter())
+            .zip(grad_parts)
             .enumerate()
-            .map(|(task, ((maps, grad_maps), grad_images))| {
-                let mut sums = vec![0.0; shape.weight_len() + shape.channels_out];
-                let (packed_sum, bias_sum) = sums.split_at_mut(shape.weight_len());
-                let grads = ConvGradients { packed: packed_sum, bias: bias_sum, images: grad_images };
-                let images = task_images(shape, image_values, task);
-                with_scratch(|scratch| backward(shape, images, &packed, maps, grad_maps, grads, scratch));
-                sums
-            })
-            .collect();
-        let mut sum = add_in_order(sums, shape.weight_len() + shape.channels_out);
-        let grad_bias = sum.split_off(shape.weight_len());
+            .map(|(task, ((maps, between), grad_images))| {
+                self.task_backward(
+                    &layers,
+                    self.task_images(image_values, task),
+                    between,
+                    maps,
+                    grad_images,
+                )
+            });
+        let sum = add_in_order(sums.collect(), self.parameters_len());
 
-        let device = weight.device();
+        let device = parameters.device();
+        let grad_parameters = Tensor::from_vec(self.unpacked(&sum), parameters.shape(), device)?;
         let grad_images =
-            if needs_images { Some(Tensor::from_vec(grad_images, images.shape(), device)?) } else { None };
-        let grad_weight = Tensor::from_vec(shape.unpack_weight(&sum), weight.shape(), device)?;
-        let grad_bias = Tensor::from_vec(grad_bias, bias.shape(), device)?;
-        Ok((grad_images, Some(grad_weight), Some(grad_bias)))
+            needs_images.then(|| Tensor::from_vec(grad_images, images.shape(), device));
+        Ok((grad_images.transpose()?, Some(grad_parameters)))
     }
 }
 
-fn task_images<'a>(shape: &ConvShape, images: Images<'a>, task: usize) -> Images<'a> {
-    let first = task * TASK_IMAGES * shape.image_len();
-    images.slice(first..images.len().min(first + TASK_IMAGES * shape.image_len()))
-}
-
 /// Lends the thread's buffers to `work`, which must not start parallel work of its own.
-fn with_scratch<R>(work: impl FnOnce(&mut ConvScratch) -> R) -> R {
+fn with_scratch<R>(work: impl FnOnce(&mut TaskScratch) -> R) -> R {
     SCRATCH.with_borrow_mut(work)
 }
 
@@ -147,13 +352,5 @@ fn pixels<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<Images<'a>> {
             None => bail!("images must be contiguous"),
         },
         _ => Ok(Images::Floats(floats(storage, layout)?)),
-    }
-}
-
-/// The storage, which must be on the CPU.
-pub(crate) fn cpu(storage: &candle_core::Storage) -> Result<&CpuStorage> {
-    match storage {
-        candle_core::Storage::Cpu(storage) => Ok(storage),
-        _ => bail!("this operation runs on the CPU only"),
     }
 }

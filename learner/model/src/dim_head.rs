@@ -11,12 +11,14 @@ use crate::linear::{linear, linear_relu};
 use crate::weights::Parameters;
 
 /// A residual block on features, to which an action's embedding may be joined.
+#[derive(Debug)]
 pub(crate) struct Head {
     block: Block,
     features: usize,
 }
 
 /// The block's parameters; `out_bias` is the sum of the biases of `out` and, where it has one, `skip`.
+#[derive(Debug)]
 struct Block {
     hidden_weight: Tensor,
     hidden_bias: Tensor,
@@ -27,7 +29,11 @@ struct Block {
 
 impl Block {
     fn new(name: &str, parameters: &Parameters) -> Result<Self> {
-        let (hidden, out, skip) = (format!("{name}.hidden"), format!("{name}.out"), format!("{name}.skip"));
+        let (hidden, out, skip) = (
+            format!("{name}.hidden"),
+            format!("{name}.out"),
+            format!("{name}.skip"),
+        );
         Ok(Self {
             hidden_weight: parameters.tensor(&hidden, "weight")?,
             hidden_bias: parameters.tensor(&hidden, "bias")?,
@@ -51,7 +57,10 @@ impl Block {
     fn forward_joined(&self, features: &Tensor, joined: &Tensor, split: usize) -> Result<Tensor> {
         let parts = |weight: &Tensor| -> Result<(Tensor, Tensor)> {
             let joined_len = weight.dim(1)? - split;
-            Ok((weight.narrow(1, 0, split)?, weight.narrow(1, split, joined_len)?))
+            Ok((
+                weight.narrow(1, 0, split)?,
+                weight.narrow(1, split, joined_len)?,
+            ))
         };
         let (hidden_features, hidden_joined) = parts(&self.hidden_weight)?;
         let (skip_features, skip_joined) = parts(&self.skip_weight)?;
@@ -66,7 +75,10 @@ impl Block {
 impl Head {
     /// The head of this name on features of this width.
     pub(crate) fn new(name: &str, features: usize, parameters: &Parameters) -> Result<Self> {
-        Ok(Self { block: Block::new(name, parameters)?, features })
+        Ok(Self {
+            block: Block::new(name, parameters)?,
+            features,
+        })
     }
 
     /// Vectors [..., rkhs] of `features` [..., f], joined with `action` [B, e] if it is there.
@@ -79,6 +91,7 @@ impl Head {
 }
 
 /// The action's embedding: one-hot through a residual block, whose skip has a bias.
+#[derive(Debug)]
 pub(crate) struct ActionEmbedding {
     block: Block,
     skip_bias: Tensor,
@@ -108,9 +121,17 @@ impl ActionEmbedding {
         let indices = actions.detach().to_dtype(DType::I64)?.to_vec1::<i64>()?;
         let mut one_hot = vec![0.0f32; indices.len() * self.num_actions];
         for (row, &action) in one_hot.chunks_exact_mut(self.num_actions).zip(&indices) {
-            let entry = usize::try_from(action).ok().and_then(|action| row.get_mut(action));
-            *entry.ok_or_else(|| ModelError::Input(format!("action {action} of {}", self.num_actions)))? = 1.0;
+            let entry = usize::try_from(action)
+                .ok()
+                .and_then(|action| row.get_mut(action));
+            *entry.ok_or_else(|| {
+                ModelError::Input(format!("action {action} of {}", self.num_actions))
+            })? = 1.0;
         }
-        Ok(Tensor::from_vec(one_hot, (indices.len(), self.num_actions), actions.device())?)
+        Ok(Tensor::from_vec(
+            one_hot,
+            (indices.len(), self.num_actions),
+            actions.device(),
+        )?)
     }
 }

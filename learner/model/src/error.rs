@@ -39,7 +39,10 @@ pub enum ModelError {
 
 impl ModelError {
     pub(crate) fn parameter(name: &str, problem: impl Into<String>) -> Self {
-        Self::Parameter { name: name.to_owned(), problem: problem.into() }
+        Self::Parameter {
+            name: name.to_owned(),
+            problem: problem.into(),
+        }
     }
 }
 

@@ -18,8 +18,18 @@ pub(crate) struct Matrix<'a> {
 impl<'a> Matrix<'a> {
     /// Rows one after the other, `data` [rows, cols].
     pub(crate) fn new(data: &'a [f32], rows: usize, cols: usize) -> Self {
-        assert!(data.len() == rows * cols, "a {rows}x{cols} matrix over {} scalars", data.len());
-        Self { data, rows, cols, row_stride: cols, col_stride: 1 }
+        assert!(
+            data.len() == rows * cols,
+            "a {rows}x{cols} matrix over {} scalars",
+            data.len()
+        );
+        Self {
+            data,
+            rows,
+            cols,
+            row_stride: cols,
+            col_stride: 1,
+        }
     }
 
     /// The transposed matrix over the same data.
@@ -61,12 +71,30 @@ pub(crate) enum Output {
 ///
 /// # Panics
 /// If the shapes do not match.
-#[allow(unsafe_code, reason = "the gemm crate's entry point takes raw pointers")]
-pub(crate) fn multiply(out: &mut [f32], mode: Output, a: Matrix<'_>, b: Matrix<'_>, threads: Threads) {
+#[allow(
+    unsafe_code,
+    reason = "the gemm crate's entry point takes raw pointers"
+)]
+pub(crate) fn multiply(
+    out: &mut [f32],
+    mode: Output,
+    a: Matrix<'_>,
+    b: Matrix<'_>,
+    threads: Threads,
+) {
     let (m, k, n) = (a.rows, a.cols, b.cols);
-    assert!(b.rows == k, "product of {m}x{k} and {}x{n} matrices", b.rows);
-    assert!(out.len() == m * n, "product of {m}x{k} and {k}x{n} matrices into {} scalars", out.len());
-    let stride = |stride: usize| isize::try_from(stride).expect("strides are at most the length of a slice");
+    assert!(
+        b.rows == k,
+        "product of {m}x{k} and {}x{n} matrices",
+        b.rows
+    );
+    assert!(
+        out.len() == m * n,
+        "product of {m}x{k} and {k}x{n} matrices into {} scalars",
+        out.len()
+    );
+    let stride =
+        |stride: usize| isize::try_from(stride).expect("strides are at most the length of a slice");
     let parallelism = match threads {
         Threads::Caller => gemm::Parallelism::None,
         Threads::Pool => gemm::Parallelism::Rayon(rayon::current_num_threads()),

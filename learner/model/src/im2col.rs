@@ -164,8 +164,13 @@ pub(crate) fn forward(
     for (index, maps) in maps.chunks_mut(tile * shape.map_len()).enumerate() {
         let count = maps.len() / shape.map_len();
         let first = index * tile * shape.image_len();
-        let images = images.slice(first..first + count * shape.image_len()).floats(&mut scratch.images);
-        let patches = grown(&mut scratch.patches, count * shape.locations() * shape.patch_len());
+        let images = images
+            .slice(first..first + count * shape.image_len())
+            .floats(&mut scratch.images);
+        let patches = grown(
+            &mut scratch.patches,
+            count * shape.locations() * shape.patch_len(),
+        );
         im2col(shape, images, patches);
         let patches = Matrix::new(patches, count * shape.locations(), shape.patch_len());
         multiply(maps, Output::Replace, patches, weight, Threads::Caller);
@@ -192,7 +197,10 @@ pub(crate) fn backward(
     let mut first = 0;
     for (maps, grad_maps) in maps.chunks(tile_len).zip(grad_maps.chunks(tile_len)) {
         let count = maps.len() / shape.map_len();
-        let (rows, range) = (count * shape.locations(), first..first + count * shape.image_len());
+        let (rows, range) = (
+            count * shape.locations(),
+            first..first + count * shape.image_len(),
+        );
         first = range.end;
 
         let masked = grown(&mut scratch.grad_maps, maps.len());
@@ -207,13 +215,29 @@ pub(crate) fn backward(
         let grad = Matrix::new(masked, rows, shape.channels_out);
 
         let patches = grown(&mut scratch.patches, rows * shape.patch_len());
-        im2col(shape, images.slice(range.clone()).floats(&mut scratch.images), patches);
+        im2col(
+            shape,
+            images.slice(range.clone()).floats(&mut scratch.images),
+            patches,
+        );
         let patches = Matrix::new(patches, rows, shape.patch_len());
-        multiply(grads.packed, Output::Add, patches.transposed(), grad, Threads::Caller);
+        multiply(
+            grads.packed,
+            Output::Add,
+            patches.transposed(),
+            grad,
+            Threads::Caller,
+        );
 
         if let Some(grad_images) = &mut grads.images {
             let grad_patches = grown(&mut scratch.grad_patches, rows * shape.patch_len());
-            multiply(grad_patches, Output::Replace, grad, weight.transposed(), Threads::Caller);
+            multiply(
+                grad_patches,
+                Output::Replace,
+                grad,
+                weight.transposed(),
+                Threads::Caller,
+            );
             col2im(shape, grad_patches, &mut grad_images[range]);
         }
     }

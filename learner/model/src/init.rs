@@ -21,7 +21,10 @@ pub(crate) fn orthogonal(rows: usize, cols: usize, gain: f64, rng: &mut ChaCha8R
     let (count, len) = (rows.min(cols), rows.max(cols));
     let mut basis: Vec<Vec<f64>> = Vec::with_capacity(count);
     for _ in 0..count {
-        let mut vector: Vec<f64> = (0..len.div_ceil(2)).flat_map(|_| normal_pair(rng)).take(len).collect();
+        let mut vector: Vec<f64> = (0..len.div_ceil(2))
+            .flat_map(|_| normal_pair(rng))
+            .take(len)
+            .collect();
         for _ in 0..2 {
             for earlier in &basis {
                 let overlap = dot(earlier, &vector);
@@ -37,7 +40,11 @@ pub(crate) fn orthogonal(rows: usize, cols: usize, gain: f64, rng: &mut ChaCha8R
     let mut weight = vec![0.0; rows * cols];
     for (index, vector) in basis.iter().enumerate() {
         for (position, value) in vector.iter().enumerate() {
-            let at = if rows <= cols { index * cols + position } else { position * cols + index };
+            let at = if rows <= cols {
+                index * cols + position
+            } else {
+                position * cols + index
+            };
             weight[at] = (gain * value) as f32;
         }
     }

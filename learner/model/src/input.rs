@@ -22,10 +22,18 @@ impl Enlarge {
     /// [`ModelError::Config`] if a size is 0.
     pub fn new(from: (usize, usize), to: (usize, usize), channels: usize) -> Result<Self> {
         if from.0.min(from.1).min(to.0).min(to.1).min(channels) == 0 {
-            return Err(ModelError::Config(format!("resizing {from:?} to {to:?} with {channels} channels")));
+            return Err(ModelError::Config(format!(
+                "resizing {from:?} to {to:?} with {channels} channels"
+            )));
         }
-        let sources = |from: usize, to: usize| (0..to).map(|at| (2 * at + 1) * from / (2 * to)).collect();
-        Ok(Self { from, channels, source_rows: sources(from.0, to.0), source_cols: sources(from.1, to.1) })
+        let sources =
+            |from: usize, to: usize| (0..to).map(|at| (2 * at + 1) * from / (2 * to)).collect();
+        Ok(Self {
+            from,
+            channels,
+            source_rows: sources(from.0, to.0),
+            source_cols: sources(from.1, to.1),
+        })
     }
 
     /// Bytes of one source image.
@@ -45,14 +53,18 @@ impl Enlarge {
     pub fn apply(&self, images: &[u8], enlarged: &mut [u8]) {
         let count = images.len() / self.input_bytes();
         assert!(
-            images.len() == count * self.input_bytes() && enlarged.len() == count * self.output_bytes(),
+            images.len() == count * self.input_bytes()
+                && enlarged.len() == count * self.output_bytes(),
             "resizing {} bytes into {}, {} and {} an image",
             images.len(),
             enlarged.len(),
             self.input_bytes(),
             self.output_bytes()
         );
-        let (source_line, line) = (self.from.1 * self.channels, self.source_cols.len() * self.channels);
+        let (source_line, line) = (
+            self.from.1 * self.channels,
+            self.source_cols.len() * self.channels,
+        );
         let images = images.chunks_exact(self.input_bytes());
         for (image, enlarged) in images.zip(enlarged.chunks_exact_mut(self.output_bytes())) {
             let mut previous: Option<usize> = None;
@@ -63,7 +75,10 @@ impl Enlarge {
                     target.copy_from_slice(&done[(at - 1) * line..]);
                 } else {
                     let source = &image[row * source_line..][..source_line];
-                    for (pixel, &col) in target.chunks_exact_mut(self.channels).zip(&self.source_cols) {
+                    for (pixel, &col) in target
+                        .chunks_exact_mut(self.channels)
+                        .zip(&self.source_cols)
+                    {
                         pixel.copy_from_slice(&source[col * self.channels..][..self.channels]);
                     }
                 }
@@ -79,10 +94,15 @@ mod tests {
 
     #[test]
     fn every_pixel_is_its_nearest_source() {
-        for (from, to, channels) in [((64, 64), (104, 80), 3), ((21, 19), (84, 84), 12), ((3, 5), (2, 4), 1)] {
+        for (from, to, channels) in [
+            ((64, 64), (104, 80), 3),
+            ((21, 19), (84, 84), 12),
+            ((3, 5), (2, 4), 1),
+        ] {
             let enlarge = Enlarge::new(from, to, channels).unwrap();
-            let images: Vec<u8> =
-                (0..2 * from.0 * from.1 * channels).map(|index| (index * 7 % 251) as u8).collect();
+            let images: Vec<u8> = (0..2 * from.0 * from.1 * channels)
+                .map(|index| (index * 7 % 251) as u8)
+                .collect();
             let mut enlarged = vec![0; 2 * to.0 * to.1 * channels];
             enlarge.apply(&images, &mut enlarged);
             for (index, &value) in enlarged.iter().enumerate() {

@@ -21,7 +21,7 @@ mod torso;
 mod weights;
 
 pub use config::{ConvLayer, DimParts, ModelConfig};
-pub use conv::conv2d_relu;
+pub use conv::{conv_stack, conv2d_relu};
 pub use error::{ModelError, Result};
 pub use input::Enlarge;
 pub use linear::{linear, linear_relu, relu};

@@ -4,10 +4,9 @@
 //! candle's own path is a matrix product and a broadcast addition, whose backward pass sums the bias on a single thread,
 //! and its ReLU passes a gradient at exactly 0, which PyTorch's does not.
 
-use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
 use rayon::prelude::*;
 
-use crate::conv::cpu;
 use crate::gemm::{Matrix, Output, Threads, multiply};
 
 /// Rows that one task sums. Fixed, so that sums are taken in the same order whatever the number of threads.
@@ -44,14 +43,33 @@ pub fn relu(x: &Tensor) -> Result<Tensor> {
 }
 
 fn apply(x: &Tensor, w: &Tensor, b: &Tensor, relu: bool) -> Result<Tensor> {
-    let (inputs, outputs) = (x.dims().last().copied().unwrap_or(0), w.dims().first().copied().unwrap_or(0));
-    let fits = w.dims() == [outputs, inputs] && b.dims().last() == Some(&outputs) && inputs * outputs > 0;
-    let (rows, groups) = (x.elem_count() / inputs.max(1), b.elem_count() / outputs.max(1));
+    let (inputs, outputs) = (
+        x.dims().last().copied().unwrap_or(0),
+        w.dims().first().copied().unwrap_or(0),
+    );
+    let fits =
+        w.dims() == [outputs, inputs] && b.dims().last() == Some(&outputs) && inputs * outputs > 0;
+    let (rows, groups) = (
+        x.elem_count() / inputs.max(1),
+        b.elem_count() / outputs.max(1),
+    );
     if !fits || groups == 0 || rows % groups != 0 {
-        bail!("linear layer of x {:?} with weight {:?} and bias {:?}", x.shape(), w.shape(), b.shape());
+        bail!(
+            "linear layer of x {:?} with weight {:?} and bias {:?}",
+            x.shape(),
+            w.shape(),
+            b.shape()
+        );
     }
-    let op = Linear { rows, inputs, outputs, groups, relu };
-    x.contiguous()?.apply_op3(&w.contiguous()?, &b.contiguous()?, op)
+    let op = Linear {
+        rows,
+        inputs,
+        outputs,
+        groups,
+        relu,
+    };
+    x.contiguous()?
+        .apply_op3(&w.contiguous()?, &b.contiguous()?, op)
 }
 
 #[derive(Clone, Copy)]
@@ -82,13 +100,15 @@ impl CustomOp3 for Linear {
         let b = floats(b, b_layout)?;
         let group_len = self.rows / self.groups * self.outputs;
         let mut y = vec![0.0; self.rows * self.outputs];
-        y.par_chunks_mut(self.task_len()).enumerate().for_each(|(task, y)| {
-            let first = task * self.task_len();
-            for (row, y) in y.chunks_exact_mut(self.outputs).enumerate() {
-                let group = (first + row * self.outputs) / group_len;
-                y.copy_from_slice(&b[group * self.outputs..][..self.outputs]);
-            }
-        });
+        y.par_chunks_mut(self.task_len())
+            .enumerate()
+            .for_each(|(task, y)| {
+                let first = task * self.task_len();
+                for (row, y) in y.chunks_exact_mut(self.outputs).enumerate() {
+                    let group = (first + row * self.outputs) / group_len;
+                    y.copy_from_slice(&b[group * self.outputs..][..self.outputs]);
+                }
+            });
         multiply(&mut y, Output::Add, x, w.transposed(), Threads::Pool);
         if self.relu {
             y.par_chunks_mut(TASK_LEN).for_each(relu_in_place);
@@ -108,7 +128,11 @@ impl CustomOp3 for Linear {
         y: &Tensor,
         grad_y: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let grad_y = if self.relu { masked(&y.detach(), &grad_y.detach())? } else { grad_y.detach().contiguous()? };
+        let grad_y = if self.relu {
+            masked(&y.detach(), &grad_y.detach())?
+        } else {
+            grad_y.detach().contiguous()?
+        };
         let (x_storage, x_layout) = x.storage_and_layout();
         let (w_storage, w_layout) = w.storage_and_layout();
         let (grad_storage, grad_layout) = grad_y.storage_and_layout();
@@ -117,7 +141,11 @@ impl CustomOp3 for Linear {
         let device = w.device();
 
         let grad_x = x.track_op().then(|| -> Result<Tensor> {
-            let w = Matrix::new(floats(cpu(&w_storage)?, w_layout)?, self.outputs, self.inputs);
+            let w = Matrix::new(
+                floats(cpu(&w_storage)?, w_layout)?,
+                self.outputs,
+                self.inputs,
+            );
             let mut grad_x = vec![0.0; self.rows * self.inputs];
             multiply(&mut grad_x, Output::Replace, grad, w, Threads::Pool);
             Tensor::from_vec(grad_x, x.shape(), device)
@@ -125,7 +153,13 @@ impl CustomOp3 for Linear {
         let grad_w = w.track_op().then(|| -> Result<Tensor> {
             let x = Matrix::new(floats(cpu(&x_storage)?, x_layout)?, self.rows, self.inputs);
             let mut grad_w = vec![0.0; self.outputs * self.inputs];
-            multiply(&mut grad_w, Output::Replace, grad.transposed(), x, Threads::Pool);
+            multiply(
+                &mut grad_w,
+                Output::Replace,
+                grad.transposed(),
+                x,
+                Threads::Pool,
+            );
             Tensor::from_vec(grad_w, w.shape(), device)
         });
         let grad_b = b.track_op().then(|| -> Result<Tensor> {
@@ -134,7 +168,11 @@ impl CustomOp3 for Linear {
             }
             Tensor::from_vec(self.group_sums(grad_values), b.shape(), device)
         });
-        Ok((grad_x.transpose()?, grad_w.transpose()?, grad_b.transpose()?))
+        Ok((
+            grad_x.transpose()?,
+            grad_w.transpose()?,
+            grad_b.transpose()?,
+        ))
     }
 }
 
@@ -252,5 +290,13 @@ pub(crate) fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a
     match layout.contiguous_offsets() {
         Some((start, end)) => Ok(&storage.as_slice::<f32>()?[start..end]),
         None => bail!("a tensor of shape {:?} must be contiguous", layout.shape()),
+    }
+}
+
+/// The storage, which must be on the CPU.
+pub(crate) fn cpu(storage: &Storage) -> Result<&CpuStorage> {
+    match storage {
+        Storage::Cpu(storage) => Ok(storage),
+        _ => bail!("this operation runs on the CPU only"),
     }
 }

@@ -22,6 +22,7 @@ pub struct Features {
 /// Torso, C51 head and the DIM heads that the configuration has.
 ///
 /// It shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes this network.
+#[derive(Debug)]
 pub struct Network {
     input: [usize; 3],
     torso: Torso,
@@ -43,9 +44,15 @@ impl Network {
         config.validate()?;
         let channels = config.local_shape().2;
         let head = |exists: bool, name: &str, features: usize| {
-            exists.then(|| Head::new(name, features, parameters)).transpose()
+            exists
+                .then(|| Head::new(name, features, parameters))
+                .transpose()
         };
-        let action = config.dim.embeds_action().then(|| ActionEmbedding::new(config, parameters)).transpose()?;
+        let action = config
+            .dim
+            .embeds_action()
+            .then(|| ActionEmbedding::new(config, parameters))
+            .transpose()?;
         Ok(Self {
             input: [config.height, config.width, config.channels],
             torso: Torso::new(config, parameters)?,
@@ -65,7 +72,9 @@ impl Network {
     pub fn features(&self, frames: &Tensor) -> Result<Features> {
         if frames.dtype() != DType::U8 || frames.dims().get(1..) != Some(&self.input[..]) {
             let (dtype, shape, input) = (frames.dtype(), frames.shape(), self.input);
-            return Err(ModelError::Input(format!("frames {shape:?} of type {dtype:?}, wanted u8 [B, {input:?}]")));
+            return Err(ModelError::Input(format!(
+                "frames {shape:?} of type {dtype:?}, wanted u8 [B, {input:?}]"
+            )));
         }
         let (f3, f4) = self.torso.features(frames)?;
         Ok(Features { f3, f4 })
@@ -101,7 +110,12 @@ impl Network {
     /// # Errors
     /// Another shape, or no such head.
     pub fn phi3(&self, f3: &Tensor) -> Result<Tensor> {
-        by_location(self.phi3.as_ref().ok_or(ModelError::NoHead("phi3"))?.forward(f3, None)?)
+        by_location(
+            self.phi3
+                .as_ref()
+                .ok_or(ModelError::NoHead("phi3"))?
+                .forward(f3, None)?,
+        )
     }
 
     /// Psi_4 [B, rkhs] of `f4` [B, hidden] and `actions` [B] (integers; ignored if Psi does not see the action).
@@ -118,21 +132,21 @@ impl Network {
     /// # Errors
     /// Another shape, or no such head.
     pub fn phi4(&self, f4: &Tensor) -> Result<Tensor> {
-        self.phi4.as_ref().ok_or(ModelError::NoHead("phi4"))?.forward(f4, None)
+        self.phi4
+            .as_ref()
+            .ok_or(ModelError::NoHead("phi4"))?
+            .forward(f4, None)
     }
 
     fn embedded(&self, actions: &Tensor) -> Result<Option<Tensor>> {
-        self.action.as_ref().map(|action| action.forward(actions)).transpose()
+        self.action
+            .as_ref()
+            .map(|action| action.forward(actions))
+            .transpose()
     }
 }
 
 /// [B, h, w, rkhs] as [B, h * w, rkhs].
 fn by_location(maps: Tensor) -> Result<Tensor> {
     Ok(maps.flatten(1, 2)?)
-}
-
-impl std::fmt::Debug for Network {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Network").finish_non_exhaustive()
-    }
 }

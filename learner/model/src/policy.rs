@@ -4,6 +4,8 @@
 //! It runs the same kernels as `Network`. The batch is split over the rayon pool once, not layer by layer, so that a
 //! task's maps stay in its core's cache.
 
+use std::fmt;
+
 use rayon::prelude::*;
 
 use crate::c51_head::expected_returns;
@@ -36,7 +38,13 @@ impl PolicyNetwork {
     pub fn new(config: &ModelConfig, safetensors: &[u8]) -> Result<Self> {
         let config = config.without_dim();
         let weights = PolicyWeights::decode(&config, safetensors)?;
-        Ok(Self { support: config.atoms_support(), config, weights, scratch: Vec::new(), values: Vec::new() })
+        Ok(Self {
+            support: config.atoms_support(),
+            config,
+            weights,
+            scratch: Vec::new(),
+            values: Vec::new(),
+        })
     }
 
     /// Replaces the weights. On an error the old ones stay.
@@ -74,12 +82,17 @@ impl PolicyNetwork {
             let share = batch.div_ceil(tasks);
             let values = values.par_chunks_mut(share * actions);
             let frames = frames.par_chunks(share * frame_len);
-            values.zip(frames).zip(&mut self.scratch).for_each(|((values, frames), scratch)| {
-                weights.q_values(support, frames, values, scratch);
-            });
+            values
+                .zip(frames)
+                .zip(&mut self.scratch)
+                .for_each(|((values, frames), scratch)| {
+                    weights.q_values(support, frames, values, scratch);
+                });
         }
         match values.iter().position(|value| !value.is_finite()) {
-            Some(index) => Err(ModelError::NotFinite { row: index / actions }),
+            Some(index) => Err(ModelError::NotFinite {
+                row: index / actions,
+            }),
             None => Ok(()),
         }
     }
@@ -96,13 +109,28 @@ impl PolicyNetwork {
         let result = self.q_values(frames, &mut values);
         if result.is_ok() {
             for (action, values) in actions.iter_mut().zip(values.chunks_exact(count)) {
-                let better = |best: usize, next: usize| if values[next] > values[best] { next } else { best };
+                let better = |best: usize, next: usize| {
+                    if values[next] > values[best] {
+                        next
+                    } else {
+                        best
+                    }
+                };
                 let best = (1..count).fold(0, better);
-                *action = u8::try_from(best).expect("a valid configuration has at most 255 actions");
+                *action =
+                    u8::try_from(best).expect("a valid configuration has at most 255 actions");
             }
         }
         self.values = values;
         result
+    }
+}
+
+impl fmt::Debug for PolicyNetwork {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("PolicyNetwork")
+            .field("config", &self.config)
+            .finish_non_exhaustive()
     }
 }
 
@@ -139,46 +167,106 @@ impl PolicyWeights {
     fn decode(config: &ModelConfig, safetensors: &[u8]) -> Result<Self> {
         let mut parameters = decode(config, safetensors, is_dim)?;
         let mut take = |name: &str| {
-            let (_, values) = parameters.remove(name).expect("decode returns every parameter of the configuration");
+            let (_, values) = parameters
+                .remove(name)
+                .expect("decode returns every parameter of the configuration");
             values
         };
-        let (mut height, mut width, mut channels_in) = (config.height, config.width, config.channels);
+        let (mut height, mut width, mut channels_in) =
+            (config.height, config.width, config.channels);
         let mut convolutions = Vec::with_capacity(config.conv.len());
         for (index, layer) in config.conv.iter().enumerate() {
             let (channels_out, kernel, stride) = (layer.out, layer.kernel, layer.stride);
-            let shape = ConvShape { height, width, channels_in, channels_out, kernel, stride };
+            let shape = ConvShape {
+                height,
+                width,
+                channels_in,
+                channels_out,
+                kernel,
+                stride,
+            };
             let packed = shape.pack_weight(&take(&format!("torso.conv{}.weight", index + 1)));
             let bias = take(&format!("torso.conv{}.bias", index + 1));
-            convolutions.push(Convolution { shape, packed, bias });
+            convolutions.push(Convolution {
+                shape,
+                packed,
+                bias,
+            });
             (height, width, channels_in) = (shape.out_height(), shape.out_width(), channels_out);
         }
         // The inputs in our maps' order, row, column, channel, instead of PyTorch's channel, row, column.
         let column = |input: usize| input % channels_in * height * width + input / channels_in;
         let fc_weight = transposed(&take("torso.fc.weight"), config.hidden, column);
-        let fc = Dense { weight: fc_weight, bias: take("torso.fc.bias") };
-        let head_weight = transposed(&take("head.weight"), config.num_actions * config.atoms, |input| input);
-        let head = Dense { weight: head_weight, bias: take("head.bias") };
-        Ok(Self { convolutions, fc, head })
+        let fc = Dense {
+            weight: fc_weight,
+            bias: take("torso.fc.bias"),
+        };
+        let head_weight = transposed(
+            &take("head.weight"),
+            config.num_actions * config.atoms,
+            |input| input,
+        );
+        let head = Dense {
+            weight: head_weight,
+            bias: take("head.bias"),
+        };
+        Ok(Self {
+            convolutions,
+            fc,
+            head,
+        })
     }
 
     fn q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32], scratch: &mut Scratch) {
-        let frame_len = self.convolutions.first().map_or(1, |first| first.shape.image_len());
+        let frame_len = self
+            .convolutions
+            .first()
+            .map_or(1, |first| first.shape.image_len());
         let actions = self.head.bias.len() / support.len();
-        let tiles = frames.chunks(TILE_FRAMES * frame_len).zip(values.chunks_mut(TILE_FRAMES * actions));
+        let tiles = frames
+            .chunks(TILE_FRAMES * frame_len)
+            .zip(values.chunks_mut(TILE_FRAMES * actions));
         for (frames, values) in tiles {
             self.tile_q_values(support, frames, values, scratch);
         }
     }
 
-    fn tile_q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32], scratch: &mut Scratch) {
-        let Scratch { conv, maps, next_maps, hidden, logits } = scratch;
+    fn tile_q_values(
+        &self,
+        support: &[f32],
+        frames: &[u8],
+        values: &mut [f32],
+        scratch: &mut Scratch,
+    ) {
+        let Scratch {
+            conv,
+            maps,
+            next_maps,
+            hidden,
+            logits,
+        } = scratch;
         let batch = values.len() * support.len() / self.head.bias.len();
-        for (index, Convolution { shape, packed, bias }) in self.convolutions.iter().enumerate() {
+        for (
+            index,
+            Convolution {
+                shape,
+                packed,
+                bias,
+            },
+        ) in self.convolutions.iter().enumerate()
+        {
             let images = match index {
                 0 => Images::Bytes(frames),
                 _ => Images::Floats(&maps[..batch * shape.image_len()]),
             };
-            forward(shape, images, packed, bias, grown(next_maps, batch * shape.map_len()), conv);
+            forward(
+                shape,
+                images,
+                packed,
+                bias,
+                grown(next_maps, batch * shape.map_len()),
+                conv,
+            );
             std::mem::swap(maps, next_maps);
         }
         let flat = self.fc.weight.len() / self.fc.bias.len();
@@ -194,7 +282,12 @@ impl Dense {
         let outputs = self.bias.len();
         let inputs = self.weight.len() / outputs;
         let y = grown(y, batch * outputs);
-        linear::forward(Matrix::new(x, batch, inputs), Matrix::new(&self.weight, inputs, outputs), &self.bias, y);
+        linear::forward(
+            Matrix::new(x, batch, inputs),
+            Matrix::new(&self.weight, inputs, outputs),
+            &self.bias,
+            y,
+        );
         y
     }
 }

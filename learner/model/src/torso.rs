@@ -5,11 +5,12 @@ use candle_core::{CpuStorage, CustomOp1, Layout, Shape, Tensor};
 use rayon::prelude::*;
 
 use crate::config::ModelConfig;
-use crate::conv::conv2d_relu;
+use crate::conv::conv_stack;
 use crate::error::Result;
 use crate::linear::{floats, linear};
 use crate::weights::Parameters;
 
+#[derive(Debug)]
 pub(crate) struct Torso {
     /// Weight, bias and stride of each convolution.
     convolutions: Vec<(Tensor, Tensor, usize)>,
@@ -21,7 +22,11 @@ impl Torso {
     pub(crate) fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
         let convolutions = config.conv.iter().enumerate().map(|(index, layer)| {
             let name = format!("torso.conv{}", index + 1);
-            Ok((parameters.tensor(&name, "weight")?, parameters.tensor(&name, "bias")?, layer.stride))
+            Ok((
+                parameters.tensor(&name, "weight")?,
+                parameters.tensor(&name, "bias")?,
+                layer.stride,
+            ))
         });
         Ok(Self {
             convolutions: convolutions.collect::<Result<_>>()?,
@@ -32,10 +37,12 @@ impl Torso {
 
     /// f3 [B, h, w, c] after ReLU and f4 [B, hidden] before it, of `frames` [B, H, W, C].
     pub(crate) fn features(&self, frames: &Tensor) -> Result<(Tensor, Tensor)> {
-        let mut maps = frames.clone();
-        for (weight, bias, stride) in &self.convolutions {
-            maps = conv2d_relu(&maps, weight, bias, *stride)?;
-        }
+        let layers: Vec<_> = self
+            .convolutions
+            .iter()
+            .map(|(weight, bias, stride)| (weight, bias, *stride))
+            .collect();
+        let maps = conv_stack(frames, &layers)?;
         let flat = maps.apply_op1(ChannelsFirst)?;
         let f4 = linear(&flat, &self.fc_weight, &self.fc_bias)?;
         Ok((maps, f4))
@@ -50,14 +57,29 @@ impl CustomOp1 for ChannelsFirst {
         "channels-first"
     }
 
-    fn cpu_fwd(&self, maps: &CpuStorage, layout: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
+    fn cpu_fwd(
+        &self,
+        maps: &CpuStorage,
+        layout: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (batch, height, width, channels) = layout.shape().dims4()?;
         let flat = transposed_images(floats(maps, layout)?, height * width, channels);
-        Ok((CpuStorage::F32(flat), (batch, channels * height * width).into()))
+        Ok((
+            CpuStorage::F32(flat),
+            (batch, channels * height * width).into(),
+        ))
     }
 
-    fn bwd(&self, maps: &Tensor, _flat: &Tensor, grad: &Tensor) -> candle_core::Result<Option<Tensor>> {
-        Ok(Some(grad.contiguous()?.apply_op1_no_bwd(&ChannelsLast(maps.shape().clone()))?))
+    fn bwd(
+        &self,
+        maps: &Tensor,
+        _flat: &Tensor,
+        grad: &Tensor,
+    ) -> candle_core::Result<Option<Tensor>> {
+        Ok(Some(
+            grad.contiguous()?
+                .apply_op1_no_bwd(&ChannelsLast(maps.shape().clone()))?,
+        ))
     }
 }
 
@@ -69,7 +91,11 @@ impl CustomOp1 for ChannelsLast {
         "channels-last"
     }
 
-    fn cpu_fwd(&self, flat: &CpuStorage, layout: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
+    fn cpu_fwd(
+        &self,
+        flat: &CpuStorage,
+        layout: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (_, height, width, channels) = self.0.dims4()?;
         let maps = transposed_images(floats(flat, layout)?, channels, height * width);
         Ok((CpuStorage::F32(maps), self.0.clone()))
@@ -80,12 +106,16 @@ impl CustomOp1 for ChannelsLast {
 fn transposed_images(values: &[f32], rows: usize, cols: usize) -> Vec<f32> {
     let mut result = vec![0.0; values.len()];
     let len = rows * cols;
-    result.par_chunks_mut(len).zip(values.par_chunks(len)).with_min_len(16).for_each(|(result, values)| {
-        for (row, values) in values.chunks_exact(cols).enumerate() {
-            for (col, &value) in values.iter().enumerate() {
-                result[col * rows + row] = value;
+    result
+        .par_chunks_mut(len)
+        .zip(values.par_chunks(len))
+        .with_min_len(16)
+        .for_each(|(result, values)| {
+            for (row, values) in values.chunks_exact(cols).enumerate() {
+                for (col, &value) in values.iter().enumerate() {
+                    result[col * rows + row] = value;
+                }
             }
-        }
-    });
+        });
     result
 }

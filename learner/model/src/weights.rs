@@ -44,13 +44,22 @@ impl Parameters {
     /// # Errors
     /// [`ModelError::Parameter`] for the first parameter that is missing, unknown, not f32, of another shape or not
     /// finite; an invalid configuration.
-    pub fn from_tensors(config: &ModelConfig, mut tensors: HashMap<String, Tensor>, device: &Device) -> Result<Self> {
+    pub fn from_tensors(
+        config: &ModelConfig,
+        mut tensors: HashMap<String, Tensor>,
+        device: &Device,
+    ) -> Result<Self> {
         config.validate()?;
         let mut vars = BTreeMap::new();
         for (name, shape) in config.parameter_shapes() {
-            let tensor = tensors.remove(&name).ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
+            let tensor = tensors
+                .remove(&name)
+                .ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
             if tensor.dtype() != DType::F32 {
-                return Err(ModelError::parameter(&name, format!("has type {:?}, wanted F32", tensor.dtype())));
+                return Err(ModelError::parameter(
+                    &name,
+                    format!("has type {:?}, wanted F32", tensor.dtype()),
+                ));
             }
             check_shape(&name, tensor.dims(), &shape)?;
             let values = tensor.flatten_all()?.to_vec1::<f32>()?;
@@ -83,7 +92,10 @@ impl Parameters {
         let mut tensors = Vec::new();
         for (name, var) in self.iter().filter(|(name, _)| filter(name)) {
             let values = var.flatten_all()?.to_vec1::<f32>()?;
-            let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+            let bytes: Vec<u8> = values
+                .iter()
+                .flat_map(|value| value.to_le_bytes())
+                .collect();
             tensors.push((name, var.dims().to_vec(), bytes));
         }
         let mut views = Vec::with_capacity(tensors.len());
@@ -132,7 +144,10 @@ impl Parameters {
     fn copy_where(&self, filter: impl Fn(&str) -> bool) -> Result<Self> {
         let mut vars = BTreeMap::new();
         for (name, var) in self.iter().filter(|(name, _)| filter(name)) {
-            vars.insert(name.to_owned(), Var::from_tensor(&var.as_detached_tensor().copy()?)?);
+            vars.insert(
+                name.to_owned(),
+                Var::from_tensor(&var.as_detached_tensor().copy()?)?,
+            );
         }
         Ok(Self(vars))
     }
@@ -140,7 +155,9 @@ impl Parameters {
     /// The variable `layer.part` as a tensor that shares its storage and its gradient.
     pub(crate) fn tensor(&self, layer: &str, part: &str) -> Result<Tensor> {
         let name = format!("{layer}.{part}");
-        let var = self.get(&name).ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
+        let var = self
+            .get(&name)
+            .ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
         Ok(var.as_tensor().clone())
     }
 }
@@ -161,13 +178,21 @@ pub(crate) fn decode(
     let mut found: BTreeMap<&str, TensorView<'_>> = file.iter().collect();
     let mut parameters = BTreeMap::new();
     for (name, shape) in config.parameter_shapes() {
-        let view = found.remove(name.as_str()).ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
+        let view = found
+            .remove(name.as_str())
+            .ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
         if view.dtype() != Dtype::F32 {
-            return Err(ModelError::parameter(&name, format!("has type {:?}, wanted F32", view.dtype())));
+            return Err(ModelError::parameter(
+                &name,
+                format!("has type {:?}, wanted F32", view.dtype()),
+            ));
         }
         check_shape(&name, view.shape(), &shape)?;
         let (scalars, _) = view.data().as_chunks::<4>();
-        let values: Vec<f32> = scalars.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+        let values: Vec<f32> = scalars
+            .iter()
+            .map(|bytes| f32::from_le_bytes(*bytes))
+            .collect();
         check_finite(&name, &values)?;
         parameters.insert(name, (shape, values));
     }
@@ -181,12 +206,18 @@ fn check_shape(name: &str, found: &[usize], wanted: &[usize]) -> Result<()> {
     if found == wanted {
         return Ok(());
     }
-    Err(ModelError::parameter(name, format!("has shape {found:?}, wanted {wanted:?}")))
+    Err(ModelError::parameter(
+        name,
+        format!("has shape {found:?}, wanted {wanted:?}"),
+    ))
 }
 
 fn check_finite(name: &str, values: &[f32]) -> Result<()> {
     match values.iter().position(|value| !value.is_finite()) {
-        Some(index) => Err(ModelError::parameter(name, format!("is {} at index {index}", values[index]))),
+        Some(index) => Err(ModelError::parameter(
+            name,
+            format!("is {} at index {index}", values[index]),
+        )),
         None => Ok(()),
     }
 }

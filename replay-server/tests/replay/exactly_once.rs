@@ -21,7 +21,8 @@ fn header(actor: u32, epoch: u64, sequence: u64, first_transition: u64) -> Chunk
         epoch,
         sequence,
         first_transition,
-        weights_version: 0, leaving: false,
+        weights_version: 0,
+        leaving: false,
         streams: 2,
         steps: 3,
         frame_bytes: small_spec().frame_bytes() as u32,
@@ -342,9 +343,19 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
         "more than slack * ratio rows"
     );
     assert!(matches!(replay.sample(0), Err(Unready::Refused { .. })));
-    replay.sample(8).unwrap();
-    replay.sample(8).unwrap();
-    assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(12));
+    let leaving = ChunkHeader {
+        leaving: true,
+        ..header(1, 1, 0, 0)
+    };
+    assert_eq!(
+        insert(&mut replay, leaving),
+        stored(12),
+        "an actor that leaves does not wait"
+    );
+    for _ in 0..5 {
+        replay.sample(8).unwrap();
+    }
+    assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(18));
     assert!(replay.set_replay_ratio(3.9).is_err(), "2 * 3.9 < 8");
     replay.set_replay_ratio(8.0).unwrap();
     let foreign = AffinityUpdate {

@@ -2,7 +2,7 @@
 //! Its speed is measured in the benches.
 
 use candle_core::{DType, Device, Result, Tensor, Var};
-use driml_model::conv2d_relu;
+use driml_model::{conv_stack, conv2d_relu};
 
 use crate::support::{assert_close, bytes, double, floats, rng, values, variable};
 
@@ -23,16 +23,31 @@ const SHAPES: [[usize; 7]; 8] = [
 /// Pixels that no window reaches are cut off first: candle's backward pass fails on them.
 fn stock(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
     let used = |size: usize, kernel: usize| (size - kernel) / stride * stride + kernel;
-    let (height, width) = (used(images.dim(1)?, weight.dim(2)?), used(images.dim(2)?, weight.dim(3)?));
+    let (height, width) = (
+        used(images.dim(1)?, weight.dim(2)?),
+        used(images.dim(2)?, weight.dim(3)?),
+    );
     let images = images.narrow(1, 0, height)?.narrow(2, 0, width)?;
-    let maps = images.permute((0, 3, 1, 2))?.contiguous()?.conv2d(weight, 0, stride, 1, 1)?;
+    let maps = images
+        .permute((0, 3, 1, 2))?
+        .contiguous()?
+        .conv2d(weight, 0, stride, 1, 1)?;
     maps.permute((0, 2, 3, 1))?.broadcast_add(bias)?.relu()
 }
 
 #[test]
 fn float_images_match_candle_forward_and_backward() -> Result<()> {
     let rng = &mut rng(1);
-    for [batch, height, width, channels_in, channels_out, kernel, stride] in SHAPES {
+    for [
+        batch,
+        height,
+        width,
+        channels_in,
+        channels_out,
+        kernel,
+        stride,
+    ] in SHAPES
+    {
         let images = variable(&[batch, height, width, channels_in], rng);
         let weight = variable(&[channels_out, channels_in, kernel, kernel], rng);
         let bias = variable(&[channels_out], rng);
@@ -40,27 +55,84 @@ fn float_images_match_candle_forward_and_backward() -> Result<()> {
         let grad_maps = floats(maps.dims(), rng);
         let grads = (&maps * &grad_maps)?.sum_all()?.backward()?;
 
-        let reference = [&images, &weight, &bias].map(|var| Var::from_tensor(&double(var).unwrap()).unwrap());
+        let reference =
+            [&images, &weight, &bias].map(|var| Var::from_tensor(&double(var).unwrap()).unwrap());
         let wanted = stock(&reference[0], &reference[1], &reference[2], stride)?;
         let wanted_grads = (&wanted * double(&grad_maps)?)?.sum_all()?.backward()?;
 
         assert_close("maps", &maps, &wanted, 1e-6);
-        for (name, var, reference) in
-            [("images", &images, &reference[0]), ("weight", &weight, &reference[1]), ("bias", &bias, &reference[2])]
-        {
+        for (name, var, reference) in [
+            ("images", &images, &reference[0]),
+            ("weight", &weight, &reference[1]),
+            ("bias", &bias, &reference[2]),
+        ] {
             let what = format!("gradient of {name}, batch {batch}, {height}x{width}x{channels_in}");
-            assert_close(&what, grads.get(var).unwrap(), wanted_grads.get(reference).unwrap(), 3e-6);
+            assert_close(
+                &what,
+                grads.get(var).unwrap(),
+                wanted_grads.get(reference).unwrap(),
+                3e-6,
+            );
         }
     }
     Ok(())
 }
 
 #[test]
+fn a_stack_matches_its_layers_one_by_one() -> Result<()> {
+    let rng = &mut rng(5);
+    for batch in [1, 3, 7, 35] {
+        let images = variable(&[batch, 21, 26, 3], rng);
+        let shapes = [([5, 3, 4, 4], 2), ([7, 5, 3, 3], 2), ([6, 7, 2, 2], 1)];
+        let layers = shapes
+            .map(|(shape, stride)| (variable(&shape, rng), variable(&shape[..1], rng), stride));
+        let stacked = layers
+            .each_ref()
+            .map(|(weight, bias, stride)| (weight.as_tensor(), bias.as_tensor(), *stride));
+        let maps = conv_stack(&images, &stacked)?;
+        let grad_maps = floats(maps.dims(), rng);
+        let grads = (&maps * &grad_maps)?.sum_all()?.backward()?;
+
+        let mut wanted = images.as_tensor().clone();
+        for (weight, bias, stride) in stacked {
+            wanted = conv2d_relu(&wanted, weight, bias, stride)?;
+        }
+        let wanted_grads = (&wanted * &grad_maps)?.sum_all()?.backward()?;
+        assert_eq!(values(&maps), values(&wanted));
+        for var in layers
+            .iter()
+            .flat_map(|(weight, bias, _)| [weight, bias])
+            .chain([&images])
+        {
+            assert_eq!(
+                values(grads.get(var).unwrap()),
+                values(wanted_grads.get(var).unwrap())
+            );
+        }
+    }
+    assert!(conv_stack(&floats(&[1, 4, 4, 1], rng), &[]).is_err());
+    Ok(())
+}
+
+#[test]
 fn byte_images_match_candle_on_scaled_floats() -> Result<()> {
     let rng = &mut rng(2);
-    for [batch, height, width, channels_in, channels_out, kernel, stride] in SHAPES {
+    for [
+        batch,
+        height,
+        width,
+        channels_in,
+        channels_out,
+        kernel,
+        stride,
+    ] in SHAPES
+    {
         let shape = (batch, height, width, channels_in);
-        let images = Tensor::from_vec(bytes(batch * height * width * channels_in, rng), shape, &Device::Cpu)?;
+        let images = Tensor::from_vec(
+            bytes(batch * height * width * channels_in, rng),
+            shape,
+            &Device::Cpu,
+        )?;
         let weight = variable(&[channels_out, channels_in, kernel, kernel], rng);
         let bias = variable(&[channels_out], rng);
         let maps = conv2d_relu(&images, &weight, &bias, stride)?;
@@ -68,13 +140,24 @@ fn byte_images_match_candle_on_scaled_floats() -> Result<()> {
         let grads = (&maps * &grad_maps)?.sum_all()?.backward()?;
 
         let scaled = (images.to_dtype(DType::F64)? / 255.0)?;
-        let reference = [&weight, &bias].map(|var| Var::from_tensor(&double(var).unwrap()).unwrap());
+        let reference =
+            [&weight, &bias].map(|var| Var::from_tensor(&double(var).unwrap()).unwrap());
         let wanted = stock(&scaled, &reference[0], &reference[1], stride)?;
         let wanted_grads = (&wanted * double(&grad_maps)?)?.sum_all()?.backward()?;
 
         assert_close("maps", &maps, &wanted, 1e-6);
-        assert_close("weight", grads.get(&weight).unwrap(), wanted_grads.get(&reference[0]).unwrap(), 3e-6);
-        assert_close("bias", grads.get(&bias).unwrap(), wanted_grads.get(&reference[1]).unwrap(), 3e-6);
+        assert_close(
+            "weight",
+            grads.get(&weight).unwrap(),
+            wanted_grads.get(&reference[0]).unwrap(),
+            3e-6,
+        );
+        assert_close(
+            "bias",
+            grads.get(&bias).unwrap(),
+            wanted_grads.get(&reference[1]).unwrap(),
+            3e-6,
+        );
         assert!(grads.get(&images).is_none(), "an image needs no gradient");
     }
     Ok(())
@@ -84,10 +167,21 @@ fn byte_images_match_candle_on_scaled_floats() -> Result<()> {
 fn gradients_match_finite_differences() -> Result<()> {
     const STEP: f64 = 1e-2;
     let rng = &mut rng(3);
-    for [batch, height, width, channels_in, channels_out, kernel, stride] in &SHAPES[..5] {
+    for [
+        batch,
+        height,
+        width,
+        channels_in,
+        channels_out,
+        kernel,
+        stride,
+    ] in &SHAPES[..5]
+    {
         // Biases beyond anything a window can sum to: no output is near ReLU's kink, where differences mean nothing.
         let far = (kernel * kernel * channels_in) as f32;
-        let bias: Vec<f32> = (0..*channels_out).map(|out| if out % 3 == 1 { -far } else { far }).collect();
+        let bias: Vec<f32> = (0..*channels_out)
+            .map(|out| if out % 3 == 1 { -far } else { far })
+            .collect();
         let args = [
             variable(&[*batch, *height, *width, *channels_in], rng),
             variable(&[*channels_out, *channels_in, *kernel, *kernel], rng),
@@ -102,13 +196,28 @@ fn gradients_match_finite_differences() -> Result<()> {
                 let mut moved = args.each_ref().map(|arg| arg.as_tensor().clone());
                 moved[index] = (&moved[index] + (&direction * step)?)?;
                 let maps = conv2d_relu(&moved[0], &moved[1], &moved[2], *stride)?;
-                Ok(values(&maps).iter().zip(values(&grad_maps)).map(|(a, b)| a * b).sum())
+                Ok(values(&maps)
+                    .iter()
+                    .zip(values(&grad_maps))
+                    .map(|(a, b)| a * b)
+                    .sum())
             };
             let numeric = (loss(STEP)? - loss(-STEP)?) / (2.0 * STEP);
             let grad = grads.get(arg).unwrap();
-            let analytic: f64 = values(grad).iter().zip(values(&direction)).map(|(a, b)| a * b).sum();
-            let scale = values(grad).iter().map(|value| value * value).sum::<f64>().sqrt();
-            assert!((numeric - analytic).abs() < 1e-2 * scale, "argument {index}: {numeric} and {analytic}");
+            let analytic: f64 = values(grad)
+                .iter()
+                .zip(values(&direction))
+                .map(|(a, b)| a * b)
+                .sum();
+            let scale = values(grad)
+                .iter()
+                .map(|value| value * value)
+                .sum::<f64>()
+                .sqrt();
+            assert!(
+                (numeric - analytic).abs() < 1e-2 * scale,
+                "argument {index}: {numeric} and {analytic}"
+            );
         }
     }
     Ok(())
@@ -119,9 +228,15 @@ fn relu_passes_no_gradient_at_exactly_zero() -> Result<()> {
     let images = Var::zeros((1, 2, 2, 1), DType::F32, &Device::Cpu)?;
     let weight = Var::ones((1, 1, 2, 2), DType::F32, &Device::Cpu)?;
     let bias = Var::zeros(1, DType::F32, &Device::Cpu)?;
-    let grads = conv2d_relu(&images, &weight, &bias, 1)?.sum_all()?.backward()?;
+    let grads = conv2d_relu(&images, &weight, &bias, 1)?
+        .sum_all()?
+        .backward()?;
     for var in [&images, &weight, &bias] {
-        assert!(values(grads.get(var).unwrap()).iter().all(|&grad| grad == 0.0));
+        assert!(
+            values(grads.get(var).unwrap())
+                .iter()
+                .all(|&grad| grad == 0.0)
+        );
     }
     Ok(())
 }
@@ -130,7 +245,12 @@ fn relu_passes_no_gradient_at_exactly_zero() -> Result<()> {
 fn nan_stays_nan() -> Result<()> {
     let images = Tensor::new(f32::NAN, &Device::Cpu)?.reshape((1, 1, 1, 1))?;
     let weight = Tensor::ones((1, 1, 1, 1), DType::F32, &Device::Cpu)?;
-    let maps = conv2d_relu(&images, &weight, &Tensor::zeros(1, DType::F32, &Device::Cpu)?, 1)?;
+    let maps = conv2d_relu(
+        &images,
+        &weight,
+        &Tensor::zeros(1, DType::F32, &Device::Cpu)?,
+        1,
+    )?;
     assert!(values(&maps)[0].is_nan());
     Ok(())
 }
@@ -138,7 +258,11 @@ fn nan_stays_nan() -> Result<()> {
 #[test]
 fn shapes_that_do_not_match_are_errors() {
     let rng = &mut rng(4);
-    let (images, weight, bias) = (floats(&[2, 6, 6, 3], rng), floats(&[4, 3, 3, 3], rng), floats(&[4], rng));
+    let (images, weight, bias) = (
+        floats(&[2, 6, 6, 3], rng),
+        floats(&[4, 3, 3, 3], rng),
+        floats(&[4], rng),
+    );
     let fails = |images: &Tensor, weight: &Tensor, bias: &Tensor, stride| {
         assert!(conv2d_relu(images, weight, bias, stride).is_err());
     };

@@ -9,8 +9,12 @@ use crate::support::{assert_close, double, floats, rng, values, variable};
 /// The layer by candle's operations: x [rows, in], b [groups, out].
 fn stock(x: &Tensor, w: &Tensor, b: &Tensor, with_relu: bool) -> Result<Tensor> {
     let (rows, outputs, groups) = (x.dim(0)?, w.dim(0)?, b.dim(0)?);
-    let product = x.matmul(&w.t()?)?.reshape((groups, rows / groups, outputs))?;
-    let y = product.broadcast_add(&b.reshape((groups, 1, outputs))?)?.reshape((rows, outputs))?;
+    let product = x
+        .matmul(&w.t()?)?
+        .reshape((groups, rows / groups, outputs))?;
+    let y = product
+        .broadcast_add(&b.reshape((groups, 1, outputs))?)?
+        .reshape((rows, outputs))?;
     if with_relu { y.relu() } else { Ok(y) }
 }
 
@@ -18,8 +22,14 @@ fn stock(x: &Tensor, w: &Tensor, b: &Tensor, with_relu: bool) -> Result<Tensor> 
 fn it_matches_candle_forward_and_backward() -> Result<()> {
     let rng = &mut rng(1);
     // Rows, in, out, groups.
-    let shapes =
-        [[1, 1, 1, 1], [7, 5, 3, 1], [6, 33, 17, 3], [6, 8, 16, 6], [520, 12, 40, 1], [300, 64, 255, 100]];
+    let shapes = [
+        [1, 1, 1, 1],
+        [7, 5, 3, 1],
+        [6, 33, 17, 3],
+        [6, 8, 16, 6],
+        [520, 12, 40, 1],
+        [300, 64, 255, 100],
+    ];
     for [rows, inputs, outputs, groups] in shapes {
         for with_relu in [false, true] {
             let args = [
@@ -32,13 +42,22 @@ fn it_matches_candle_forward_and_backward() -> Result<()> {
             let grad_y = floats(y.dims(), rng);
             let grads = (&y * &grad_y)?.sum_all()?.backward()?;
 
-            let reference = args.each_ref().map(|arg| Var::from_tensor(&double(arg).unwrap()).unwrap());
+            let reference = args
+                .each_ref()
+                .map(|arg| Var::from_tensor(&double(arg).unwrap()).unwrap());
             let wanted = stock(&reference[0], &reference[1], &reference[2], with_relu)?;
             let wanted_grads = (&wanted * double(&grad_y)?)?.sum_all()?.backward()?;
             assert_close("y", &y, &wanted, 1e-6);
             for (index, (arg, reference)) in args.iter().zip(&reference).enumerate() {
-                let what = format!("gradient of argument {index}, {rows}x{inputs} to {outputs}, {groups} groups");
-                assert_close(&what, grads.get(arg).unwrap(), wanted_grads.get(reference).unwrap(), 3e-6);
+                let what = format!(
+                    "gradient of argument {index}, {rows}x{inputs} to {outputs}, {groups} groups"
+                );
+                assert_close(
+                    &what,
+                    grads.get(arg).unwrap(),
+                    wanted_grads.get(reference).unwrap(),
+                    3e-6,
+                );
             }
         }
     }
@@ -48,7 +67,11 @@ fn it_matches_candle_forward_and_backward() -> Result<()> {
 #[test]
 fn leading_dimensions_and_a_plain_bias_are_kept() -> Result<()> {
     let rng = &mut rng(2);
-    let (x, w, b) = (variable(&[2, 3, 4, 5], rng), variable(&[7, 5], rng), variable(&[7], rng));
+    let (x, w, b) = (
+        variable(&[2, 3, 4, 5], rng),
+        variable(&[7, 5], rng),
+        variable(&[7], rng),
+    );
     let y = linear(&x, &w, &b)?;
     assert_eq!(y.dims(), [2, 3, 4, 7]);
     let flat = linear(&x.reshape((24, 5))?, &w, &b)?;
@@ -73,10 +96,17 @@ fn relu_passes_no_gradient_at_exactly_zero() -> Result<()> {
 #[test]
 fn shapes_that_do_not_match_are_errors() {
     let rng = &mut rng(3);
-    let (x, w, b) = (floats(&[6, 5], rng), floats(&[7, 5], rng), floats(&[7], rng));
+    let (x, w, b) = (
+        floats(&[6, 5], rng),
+        floats(&[7, 5], rng),
+        floats(&[7], rng),
+    );
     assert!(linear(&x, &w, &b).is_ok());
     assert!(linear(&x, &w, &floats(&[6], rng)).is_err());
-    assert!(linear(&x, &w, &floats(&[4, 7], rng)).is_err(), "four groups of six rows");
+    assert!(
+        linear(&x, &w, &floats(&[4, 7], rng)).is_err(),
+        "four groups of six rows"
+    );
     assert!(linear(&x, &floats(&[7, 4], rng), &b).is_err());
     assert!(linear(&double(&x).unwrap(), &w, &b).is_err());
 }

@@ -9,7 +9,12 @@ use crate::support::{assert_close, bits, frames, parameters, rng, small};
 /// out(relu(hidden(x))) + skip(x) by candle's operations, x [rows, in].
 fn stock_block(parameters: &Parameters, name: &str, x: &Tensor) -> Result<Tensor> {
     let layer = |part: &str, x: &Tensor| {
-        let y = x.matmul(&parameters.get(&format!("{name}.{part}.weight")).unwrap().t()?)?;
+        let y = x.matmul(
+            &parameters
+                .get(&format!("{name}.{part}.weight"))
+                .unwrap()
+                .t()?,
+        )?;
         match parameters.get(&format!("{name}.{part}.bias")) {
             Some(bias) => y.broadcast_add(bias),
             None => Ok(y),
@@ -21,9 +26,13 @@ fn stock_block(parameters: &Parameters, name: &str, x: &Tensor) -> Result<Tensor
 /// Initial biases are 0; tests want them to matter.
 fn with_biases(config: &ModelConfig) -> Parameters {
     let (parameters, rng) = (parameters(config, 7), &mut rng(8));
-    for (name, var) in parameters.iter().filter(|(name, _)| name.ends_with(".bias")) {
+    for (name, var) in parameters
+        .iter()
+        .filter(|(name, _)| name.ends_with(".bias"))
+    {
         let values = crate::support::floats(var.dims(), rng);
-        var.set(&values).unwrap_or_else(|error| panic!("{name}: {error}"));
+        var.set(&values)
+            .unwrap_or_else(|error| panic!("{name}: {error}"));
     }
     parameters
 }
@@ -47,21 +56,43 @@ fn the_dim_heads_follow_their_formula_with_gradients() -> Result<()> {
         if action {
             let one_hot = Tensor::eye(5, DType::F32, &Device::Cpu)?.index_select(&actions, 0)?;
             let embedded = stock_block(&parameters, "dim.action", &one_hot)?;
-            let tiled = embedded.unsqueeze(1)?.repeat((1, h * w, 1))?.reshape((6 * h * w, ()))?;
+            let tiled = embedded
+                .unsqueeze(1)?
+                .repeat((1, h * w, 1))?
+                .reshape((6 * h * w, ()))?;
             local = Tensor::cat(&[&flat, &tiled], 1)?;
             global = Tensor::cat(&[&f4, &embedded], 1)?;
         }
         let by_location = |x: Tensor| x.reshape((6, h * w, config.rkhs));
         let pairs = [
-            ("psi3", network.psi3(&f3, &actions), by_location(stock_block(&parameters, "dim.psi3", &local)?)?),
-            ("phi3", network.phi3(&f3), by_location(stock_block(&parameters, "dim.phi3", &flat)?)?),
-            ("psi4", network.psi4(&f4, &actions), stock_block(&parameters, "dim.psi4", &global)?),
-            ("phi4", network.phi4(&f4), stock_block(&parameters, "dim.phi4", &f4)?),
+            (
+                "psi3",
+                network.psi3(&f3, &actions),
+                by_location(stock_block(&parameters, "dim.psi3", &local)?)?,
+            ),
+            (
+                "phi3",
+                network.phi3(&f3),
+                by_location(stock_block(&parameters, "dim.phi3", &flat)?)?,
+            ),
+            (
+                "psi4",
+                network.psi4(&f4, &actions),
+                stock_block(&parameters, "dim.psi4", &global)?,
+            ),
+            (
+                "phi4",
+                network.phi4(&f4),
+                stock_block(&parameters, "dim.phi4", &f4)?,
+            ),
         ];
         for (name, found, wanted) in pairs {
             let found = found.unwrap();
             assert_close(name, &found, &wanted, 1e-6);
-            let (found, wanted) = (found.sqr()?.sum_all()?.backward()?, wanted.sqr()?.sum_all()?.backward()?);
+            let (found, wanted) = (
+                found.sqr()?.sum_all()?.backward()?,
+                wanted.sqr()?.sum_all()?.backward()?,
+            );
             for (parameter, var) in parameters.iter() {
                 match (found.get(var), wanted.get(var)) {
                     (None, None) => {}
@@ -81,14 +112,22 @@ fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
     let network = Network::new(&config, &parameters).unwrap();
     let batch = frames(&config, 61, &mut rng(2));
     let run = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .unwrap();
         pool.install(|| {
             let features = network.features(&batch).unwrap();
             let logits = network.logits(&features.f4).unwrap();
             let phi3 = network.phi3(&features.f3).unwrap();
-            let loss = (logits.sqr().unwrap().sum_all().unwrap() + phi3.sqr().unwrap().sum_all().unwrap()).unwrap();
+            let loss = (logits.sqr().unwrap().sum_all().unwrap()
+                + phi3.sqr().unwrap().sum_all().unwrap())
+            .unwrap();
             let grads = loss.backward().unwrap();
-            let grads = parameters.iter().filter_map(|(_, var)| grads.get(var).map(bits)).collect::<Vec<_>>();
+            let grads = parameters
+                .iter()
+                .filter_map(|(_, var)| grads.get(var).map(bits))
+                .collect::<Vec<_>>();
             (bits(&logits), grads)
         })
     };
@@ -119,25 +158,56 @@ fn q_values_are_expectations_over_the_atoms() -> Result<()> {
     let support = Tensor::from_vec(config.atoms_support(), 11, &Device::Cpu)?;
     assert_eq!(config.atoms_support()[0], -2.0);
     assert_eq!(config.atoms_support()[10], 3.0);
-    let wanted = candle_nn::ops::softmax(&logits, 2)?.broadcast_mul(&support)?.sum(2)?;
+    let wanted = candle_nn::ops::softmax(&logits, 2)?
+        .broadcast_mul(&support)?
+        .sum(2)?;
     assert_close("values", &network.q_values(&logits).unwrap(), &wanted, 1e-6);
     Ok(())
 }
 
 #[test]
 fn heads_that_are_left_out_are_not_there() {
-    let config = ModelConfig { dim: DimParts { psi3: false, phi4: false, ..small().dim }, ..small() };
+    let config = ModelConfig {
+        dim: DimParts {
+            psi3: false,
+            phi4: false,
+            ..small().dim
+        },
+        ..small()
+    };
     let parameters = parameters(&config, 1);
-    assert!(parameters.iter().all(|(name, _)| !name.starts_with("dim.psi3") && !name.starts_with("dim.phi4")));
+    assert!(
+        parameters
+            .iter()
+            .all(|(name, _)| !name.starts_with("dim.psi3") && !name.starts_with("dim.phi4"))
+    );
     let network = Network::new(&config, &parameters).unwrap();
     let features = network.features(&frames(&config, 2, &mut rng(5))).unwrap();
     let actions = Tensor::zeros(2, DType::I64, &Device::Cpu).unwrap();
-    assert!(matches!(network.psi3(&features.f3, &actions), Err(ModelError::NoHead("psi3"))));
-    assert!(matches!(network.phi4(&features.f4), Err(ModelError::NoHead("phi4"))));
+    assert!(matches!(
+        network.psi3(&features.f3, &actions),
+        Err(ModelError::NoHead("psi3"))
+    ));
+    assert!(matches!(
+        network.phi4(&features.f4),
+        Err(ModelError::NoHead("phi4"))
+    ));
     assert!(network.psi4(&features.f4, &actions).is_ok());
 
-    let without_psi = ModelConfig { dim: DimParts { psi3: false, psi4: false, ..small().dim }, ..small() };
-    assert!(without_psi.parameter_shapes().iter().all(|(name, _)| !name.starts_with("dim.action")));
+    let without_psi = ModelConfig {
+        dim: DimParts {
+            psi3: false,
+            psi4: false,
+            ..small().dim
+        },
+        ..small()
+    };
+    assert!(
+        without_psi
+            .parameter_shapes()
+            .iter()
+            .all(|(name, _)| !name.starts_with("dim.action"))
+    );
 }
 
 #[test]
@@ -146,16 +216,30 @@ fn inputs_that_do_not_fit_are_errors() {
     let network = Network::new(&config, &parameters(&config, 1)).unwrap();
     let batch = frames(&config, 2, &mut rng(6));
     let features = network.features(&batch).unwrap();
-    assert!(network.features(&batch.to_dtype(DType::F32).unwrap()).is_err());
+    assert!(
+        network
+            .features(&batch.to_dtype(DType::F32).unwrap())
+            .is_err()
+    );
     assert!(network.features(&batch.narrow(1, 0, 35).unwrap()).is_err());
     assert!(network.features(&batch.get(0).unwrap()).is_err());
     for wrong in [5i64, -1] {
         let actions = Tensor::new(&[0, wrong], &Device::Cpu).unwrap();
-        assert!(matches!(network.psi4(&features.f4, &actions), Err(ModelError::Input(_))));
+        assert!(matches!(
+            network.psi4(&features.f4, &actions),
+            Err(ModelError::Input(_))
+        ));
     }
     let actions = Tensor::new(&[0i64, 1, 2], &Device::Cpu).unwrap();
-    assert!(network.psi4(&features.f4, &actions).is_err(), "three actions for two rows");
-    assert!(network.logits(&features.f4.narrow(1, 0, 5).unwrap()).is_err());
+    assert!(
+        network.psi4(&features.f4, &actions).is_err(),
+        "three actions for two rows"
+    );
+    assert!(
+        network
+            .logits(&features.f4.narrow(1, 0, 5).unwrap())
+            .is_err()
+    );
 }
 
 #[test]
@@ -163,7 +247,10 @@ fn configurations_that_cannot_work_are_errors() {
     let fails = |change: fn(&mut ModelConfig)| {
         let mut config = small();
         change(&mut config);
-        assert!(matches!(config.validate(), Err(ModelError::Config(_))), "{config:?}");
+        assert!(
+            matches!(config.validate(), Err(ModelError::Config(_))),
+            "{config:?}"
+        );
         assert!(Parameters::init(&config, &mut rng(1), &Device::Cpu).is_err());
     };
     assert!(small().validate().is_ok());

@@ -11,15 +11,27 @@ fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
     let config = small();
     let parameters = parameters(&config, 3);
     let network = Network::new(&config, &parameters).unwrap();
-    let mut policy = PolicyNetwork::new(&config, &parameters.to_safetensors(|_| true).unwrap()).unwrap();
+    let mut policy =
+        PolicyNetwork::new(&config, &parameters.to_safetensors(|_| true).unwrap()).unwrap();
     for batch in [1, 2, 5, 33, 70] {
         let frames = bytes(batch * config.frame_len(), &mut rng(batch as u64));
         let shape = (batch, config.height, config.width, config.channels);
         let tensor = Tensor::from_slice(&frames, shape, &Device::Cpu).unwrap();
-        let logits = network.logits(&network.features(&tensor).unwrap().f4).unwrap();
-        let wanted: Vec<f32> = network.q_values(&logits).unwrap().flatten_all().unwrap().to_vec1().unwrap();
+        let logits = network
+            .logits(&network.features(&tensor).unwrap().f4)
+            .unwrap();
+        let wanted: Vec<f32> = network
+            .q_values(&logits)
+            .unwrap()
+            .flatten_all()
+            .unwrap()
+            .to_vec1()
+            .unwrap();
         for threads in [1, 2, 3] {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let pool = rayon::ThreadPoolBuilder::new()
+                .num_threads(threads)
+                .build()
+                .unwrap();
             let mut values = vec![0.0; batch * 5];
             let mut actions = vec![0; batch];
             pool.install(|| {
@@ -27,10 +39,17 @@ fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
                 policy.greedy_actions(&frames, &mut actions).unwrap();
             });
             for (value, wanted) in values.iter().zip(&wanted) {
-                assert!((value - wanted).abs() < 1e-5, "batch {batch}, {threads} threads: {value}, {wanted}");
+                assert!(
+                    (value - wanted).abs() < 1e-5,
+                    "batch {batch}, {threads} threads: {value}, {wanted}"
+                );
             }
             for (action, values) in actions.iter().zip(values.chunks(5)) {
-                assert!(values.iter().all(|&value| value <= values[usize::from(*action)]));
+                assert!(
+                    values
+                        .iter()
+                        .all(|&value| value <= values[usize::from(*action)])
+                );
             }
         }
     }
@@ -43,9 +62,12 @@ fn ties_go_to_the_lowest_action() {
     for (_, var) in parameters.iter() {
         var.set(&var.zeros_like().unwrap()).unwrap();
     }
-    let mut policy = PolicyNetwork::new(&config, &parameters.to_safetensors(|_| true).unwrap()).unwrap();
+    let mut policy =
+        PolicyNetwork::new(&config, &parameters.to_safetensors(|_| true).unwrap()).unwrap();
     let mut actions = [9; 3];
-    policy.greedy_actions(&bytes(3 * config.frame_len(), &mut rng(1)), &mut actions).unwrap();
+    policy
+        .greedy_actions(&bytes(3 * config.frame_len(), &mut rng(1)), &mut actions)
+        .unwrap();
     assert_eq!(actions, [0; 3]);
 }
 
@@ -69,9 +91,14 @@ fn new_weights_take_effect() {
 
 #[test]
 fn wrong_lengths_and_overflow_are_errors() {
-    let config = ModelConfig { v_min: -1.0, v_max: 1.0, ..small().without_dim() };
+    let config = ModelConfig {
+        v_min: -1.0,
+        v_max: 1.0,
+        ..small().without_dim()
+    };
     let parameters = parameters(&config, 1);
-    let mut policy = PolicyNetwork::new(&config, &parameters.to_safetensors(|_| true).unwrap()).unwrap();
+    let mut policy =
+        PolicyNetwork::new(&config, &parameters.to_safetensors(|_| true).unwrap()).unwrap();
     let frames = bytes(2 * config.frame_len(), &mut rng(1));
     assert!(policy.greedy_actions(&frames, &mut []).is_err());
     assert!(policy.greedy_actions(&[], &mut []).is_ok(), "nothing to do");
@@ -80,7 +107,14 @@ fn wrong_lengths_and_overflow_are_errors() {
     assert!(policy.q_values(&frames, &mut [0.0; 9]).is_err());
 
     let weight = parameters.get("head.weight").unwrap();
-    weight.set(&(weight.ones_like().unwrap() * f64::from(f32::MAX)).unwrap()).unwrap();
-    policy.load(&parameters.to_safetensors(|_| true).unwrap()).unwrap();
-    assert!(matches!(policy.greedy_actions(&frames, &mut [0; 2]), Err(ModelError::NotFinite { row: 0 })));
+    weight
+        .set(&(weight.ones_like().unwrap() * f64::from(f32::MAX)).unwrap())
+        .unwrap();
+    policy
+        .load(&parameters.to_safetensors(|_| true).unwrap())
+        .unwrap();
+    assert!(matches!(
+        policy.greedy_actions(&frames, &mut [0; 2]),
+        Err(ModelError::NotFinite { row: 0 })
+    ));
 }

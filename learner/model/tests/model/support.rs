@@ -38,7 +38,12 @@ pub(crate) fn double(tensor: &Tensor) -> Result<Tensor> {
 }
 
 pub(crate) fn values(tensor: &Tensor) -> Vec<f64> {
-    double(tensor).unwrap().flatten_all().unwrap().to_vec1().unwrap()
+    double(tensor)
+        .unwrap()
+        .flatten_all()
+        .unwrap()
+        .to_vec1()
+        .unwrap()
 }
 
 pub(crate) fn bits(tensor: &Tensor) -> Vec<u32> {
@@ -52,8 +57,16 @@ pub(crate) fn assert_close(what: &str, found: &Tensor, wanted: &Tensor, toleranc
     assert_eq!(found.dims(), wanted.dims(), "{what}");
     let (found, wanted) = (values(found), values(wanted));
     let norm = wanted.iter().map(|value| value * value).sum::<f64>().sqrt();
-    let error = found.iter().zip(&wanted).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
-    assert!(error <= tolerance * norm, "{what}: error {error}, norm {norm}");
+    let error = found
+        .iter()
+        .zip(&wanted)
+        .map(|(a, b)| (a - b) * (a - b))
+        .sum::<f64>()
+        .sqrt();
+    assert!(
+        error <= tolerance * norm,
+        "{what}: error {error}, norm {norm}"
+    );
 }
 
 /// A small network with all heads; its sizes are no multiples of anything.
@@ -67,14 +80,32 @@ pub(crate) fn small() -> ModelConfig {
         v_min: -2.0,
         v_max: 3.0,
         conv: vec![
-            ConvLayer { out: 5, kernel: 8, stride: 4 },
-            ConvLayer { out: 7, kernel: 3, stride: 2 },
-            ConvLayer { out: 6, kernel: 2, stride: 1 },
+            ConvLayer {
+                out: 5,
+                kernel: 8,
+                stride: 4,
+            },
+            ConvLayer {
+                out: 7,
+                kernel: 3,
+                stride: 2,
+            },
+            ConvLayer {
+                out: 6,
+                kernel: 2,
+                stride: 1,
+            },
         ],
         hidden: 19,
         rkhs: 13,
         action_embed: 9,
-        dim: DimParts { psi3: true, phi3: true, psi4: true, phi4: true, action: true },
+        dim: DimParts {
+            psi3: true,
+            phi3: true,
+            psi4: true,
+            phi4: true,
+            action: true,
+        },
     }
 }
 

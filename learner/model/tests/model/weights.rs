@@ -9,11 +9,17 @@ use driml_model::{ModelConfig, ModelError, Parameters, PolicyNetwork};
 use crate::support::{bits, bytes, parameters, rng, small};
 
 fn tensors(parameters: &Parameters) -> HashMap<String, Tensor> {
-    parameters.iter().map(|(name, var)| (name.to_owned(), var.as_tensor().clone())).collect()
+    parameters
+        .iter()
+        .map(|(name, var)| (name.to_owned(), var.as_tensor().clone()))
+        .collect()
 }
 
 fn all_bits(parameters: &Parameters) -> Vec<(String, Vec<u32>)> {
-    parameters.iter().map(|(name, var)| (name.to_owned(), bits(var))).collect()
+    parameters
+        .iter()
+        .map(|(name, var)| (name.to_owned(), bits(var)))
+        .collect()
 }
 
 #[test]
@@ -27,7 +33,11 @@ fn the_seed_decides_the_weights() {
         assert_eq!(zero, name.ends_with(".bias"), "{name}");
     }
     let acting = parameters(&config.without_dim(), 5);
-    assert_eq!(all_bits(&acting), all_bits(&first.without_dim().unwrap()), "heads do not change the torso's weights");
+    assert_eq!(
+        all_bits(&acting),
+        all_bits(&first.without_dim().unwrap()),
+        "heads do not change the torso's weights"
+    );
 }
 
 #[test]
@@ -39,8 +49,14 @@ fn names_and_shapes_are_the_configuration_s() {
     for (name, shape) in shapes {
         assert_eq!(parameters.get(&name).unwrap().dims(), shape, "{name}");
     }
-    assert_eq!(parameters.get("torso.conv1.weight").unwrap().dims(), [5, 3, 8, 8]);
-    assert_eq!(parameters.get("dim.psi4.hidden.weight").unwrap().dims(), [13, 19 + 9]);
+    assert_eq!(
+        parameters.get("torso.conv1.weight").unwrap().dims(),
+        [5, 3, 8, 8]
+    );
+    assert_eq!(
+        parameters.get("dim.psi4.hidden.weight").unwrap().dims(),
+        [13, 19 + 9]
+    );
     assert!(parameters.get("dim.psi4.skip.bias").is_none());
     assert!(parameters.get("dim.action.skip.bias").is_some());
 }
@@ -50,11 +66,17 @@ fn safetensors_go_round() {
     let config = small();
     let written = parameters(&config, 1);
     let file = written.to_safetensors(|_| true).unwrap();
-    assert_eq!(file, written.copy().unwrap().to_safetensors(|_| true).unwrap(), "equal parameters give equal bytes");
+    assert_eq!(
+        file,
+        written.copy().unwrap().to_safetensors(|_| true).unwrap(),
+        "equal parameters give equal bytes"
+    );
     let read = Parameters::load_safetensors(&config, &file, &Device::Cpu).unwrap();
     assert_eq!(all_bits(&read), all_bits(&written));
 
-    let acting = written.to_safetensors(|name| !name.starts_with("dim.")).unwrap();
+    let acting = written
+        .to_safetensors(|name| !name.starts_with("dim."))
+        .unwrap();
     let read = Parameters::load_safetensors(&config.without_dim(), &acting, &Device::Cpu).unwrap();
     assert_eq!(all_bits(&read), all_bits(&written.without_dim().unwrap()));
 }
@@ -90,16 +112,34 @@ fn tensors_that_do_not_fit_are_named() {
     let nan = Tensor::new(&[f32::NAN; 19], &Device::Cpu).unwrap();
     let transposed = good["head.weight"].t().unwrap();
     let double = good["head.bias"].to_dtype(DType::F64).unwrap();
-    assert_eq!(problem(&|tensors| drop(tensors.remove("torso.fc.bias"))), "torso.fc.bias is missing");
-    assert_eq!(problem(&insert("dim.extra", nan.clone())), "dim.extra is not part of this network");
-    assert_eq!(problem(&insert("torso.fc.bias", nan)), "torso.fc.bias is NaN at index 0");
-    assert_eq!(problem(&insert("head.weight", transposed)), "head.weight has shape [19, 55], wanted [55, 19]");
-    assert_eq!(problem(&insert("head.bias", double)), "head.bias has type F64, wanted F32");
+    assert_eq!(
+        problem(&|tensors| drop(tensors.remove("torso.fc.bias"))),
+        "torso.fc.bias is missing"
+    );
+    assert_eq!(
+        problem(&insert("dim.extra", nan.clone())),
+        "dim.extra is not part of this network"
+    );
+    assert_eq!(
+        problem(&insert("torso.fc.bias", nan)),
+        "torso.fc.bias is NaN at index 0"
+    );
+    assert_eq!(
+        problem(&insert("head.weight", transposed)),
+        "head.weight has shape [19, 55], wanted [55, 19]"
+    );
+    assert_eq!(
+        problem(&insert("head.bias", double)),
+        "head.bias has type F64, wanted F32"
+    );
 }
 
 /// Loads the file both ways; both must fail and leave the policy as it was.
 fn assert_rejected(config: &ModelConfig, file: &[u8], what: &str) {
-    assert!(Parameters::load_safetensors(config, file, &Device::Cpu).is_err(), "{what}");
+    assert!(
+        Parameters::load_safetensors(config, file, &Device::Cpu).is_err(),
+        "{what}"
+    );
     let good = parameters(config, 1).to_safetensors(|_| true).unwrap();
     let mut policy = PolicyNetwork::new(config, &good).unwrap();
     let frames = bytes(2 * config.frame_len(), &mut rng(1));
@@ -114,16 +154,39 @@ fn assert_rejected(config: &ModelConfig, file: &[u8], what: &str) {
 fn broken_files_are_errors() {
     let config = small().without_dim();
     let file = parameters(&config, 2).to_safetensors(|_| true).unwrap();
-    for len in [0, 1, 7, 8, 9, 100, file.len() / 2, file.len() - 4, file.len() - 1] {
+    for len in [
+        0,
+        1,
+        7,
+        8,
+        9,
+        100,
+        file.len() / 2,
+        file.len() - 4,
+        file.len() - 1,
+    ] {
         assert_rejected(&config, &file[..len], &format!("cut to {len} bytes"));
     }
-    assert_rejected(&config, &[&file[..], &[0; 4]].concat(), "four bytes too many");
+    assert_rejected(
+        &config,
+        &[&file[..], &[0; 4]].concat(),
+        "four bytes too many",
+    );
     assert_rejected(&config, &[0xff; 64], "a header length beyond all memory");
 
-    let missing = parameters(&config, 2).to_safetensors(|name| name != "head.bias").unwrap();
+    let missing = parameters(&config, 2)
+        .to_safetensors(|name| name != "head.bias")
+        .unwrap();
     assert_rejected(&config, &missing, "a parameter missing");
-    let other = ModelConfig { hidden: 20, ..config.clone() };
-    assert_rejected(&config, &parameters(&other, 2).to_safetensors(|_| true).unwrap(), "another width");
+    let other = ModelConfig {
+        hidden: 20,
+        ..config.clone()
+    };
+    assert_rejected(
+        &config,
+        &parameters(&other, 2).to_safetensors(|_| true).unwrap(),
+        "another width",
+    );
 
     let mut not_finite = file.clone();
     let last = not_finite.len() - 4;

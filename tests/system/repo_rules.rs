@@ -1,0 +1,327 @@
+//! The rules of the repository that no compiler holds: which crate may know which, and what may be where.
+//! It builds nothing and needs no network; the graph of other people's crates is read from `Cargo.lock`.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fs,
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+const ALL: &[&str] = &[
+    "driml",
+    "driml-actor",
+    "driml-envs",
+    "driml-learner",
+    "driml-model",
+    "driml-protocol",
+    "driml-replay-server",
+    "procgen-sys",
+];
+
+/// Every package of ours, where it lies, and which others of ours it may know. Tests and benches count too.
+const ARROWS: &[(&str, &str, &[&str])] = &[
+    ("driml-protocol", "protocol", &[]),
+    ("procgen-sys", "actor/procgen-sys", &[]),
+    ("driml-envs", "actor/envs", &["procgen-sys"]),
+    ("driml-model", "learner/model", &[]),
+    (
+        "driml-actor",
+        "actor",
+        &["driml-protocol", "driml-envs", "driml-model"],
+    ),
+    ("driml-replay-server", "replay-server", &["driml-protocol"]),
+    (
+        "driml-learner",
+        "learner",
+        &["driml-protocol", "driml-model"],
+    ),
+    ("driml", "deploy", ALL),
+    ("driml-tests", "tests", ALL),
+];
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .parent()
+        .expect("this package lies in the workspace")
+        .into()
+}
+
+/// Packages of ours by name: their folder, and the packages of ours that they depend on in any way.
+fn ours() -> BTreeMap<String, (PathBuf, BTreeSet<String>)> {
+    let output = Command::new(env!("CARGO"))
+        .args([
+            "metadata",
+            "--no-deps",
+            "--format-version",
+            "1",
+            "--offline",
+        ])
+        .current_dir(root())
+        .output()
+        .unwrap();
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    let metadata: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let packages = metadata["packages"].as_array().unwrap();
+    let text = |value: &serde_json::Value| value.as_str().unwrap().to_owned();
+    let package = |package: &serde_json::Value| {
+        let folder = PathBuf::from(text(&package["manifest_path"]))
+            .parent()
+            .unwrap()
+            .to_owned();
+        let dependencies = package["dependencies"].as_array().unwrap().iter();
+        // Those with a path are ours, by whatever name they are used.
+        let ours = dependencies
+            .filter(|it| it["path"].is_string())
+            .map(|it| text(&it["name"]))
+            .collect();
+        (text(&package["name"]), (folder, ours))
+    };
+    packages.iter().map(package).collect()
+}
+
+#[test]
+fn arrows_between_crates_point_one_way() {
+    let ours = ours();
+    let names: BTreeSet<_> = ours.keys().map(String::as_str).collect();
+    let listed: BTreeSet<_> = ARROWS.iter().map(|(name, ..)| *name).collect();
+    assert_eq!(
+        names, listed,
+        "a new package needs a line in ARROWS, and a reason"
+    );
+    for (name, folder, allowed) in ARROWS {
+        let (found, dependencies) = &ours[*name];
+        assert_eq!(
+            found.strip_prefix(root()).unwrap(),
+            Path::new(folder),
+            "{name}"
+        );
+        for dependency in dependencies {
+            assert!(
+                allowed.contains(&dependency.as_str()),
+                "{name} may not know {dependency}"
+            );
+        }
+    }
+}
+
+/// Everything that `package` depends on according to `Cargo.lock`: on any platform, with tests and benches.
+fn depends_on(package: &str) -> BTreeSet<String> {
+    let lock: toml::Table = fs::read_to_string(root().join("Cargo.lock"))
+        .unwrap()
+        .parse()
+        .unwrap();
+    let mut edges = BTreeMap::<&str, Vec<&str>>::new();
+    for package in lock["package"].as_array().unwrap() {
+        let dependencies = package
+            .get("dependencies")
+            .and_then(toml::Value::as_array)
+            .into_iter()
+            .flatten();
+        // "name", or "name version" where there are several: versions of one crate are taken together.
+        let names = dependencies.map(|it| it.as_str().unwrap().split(' ').next().unwrap());
+        edges
+            .entry(package["name"].as_str().unwrap())
+            .or_default()
+            .extend(names);
+    }
+    let mut seen = BTreeSet::new();
+    let mut next = vec![package];
+    while let Some(name) = next.pop() {
+        if seen.insert(name.to_owned()) {
+            next.extend(&edges[name]);
+        }
+    }
+    seen
+}
+
+#[test]
+fn each_part_is_free_of_what_is_none_of_its_business() {
+    let free_of = |package: &str, foreign: &[&str]| {
+        let tree = depends_on(package);
+        for name in foreign {
+            let found = tree
+                .iter()
+                .find(|it| it == name || it.starts_with(&format!("{name}-")));
+            assert_eq!(found, None, "{package} has {name} in its tree");
+        }
+    };
+    free_of(
+        "driml-replay-server",
+        &["candle", "gemm", "safetensors", "rayon"],
+    );
+    free_of("driml-model", &["zenoh", "tokio", "bincode"]);
+    free_of(
+        "driml-envs",
+        &["zenoh", "tokio", "bincode", "candle", "gemm"],
+    );
+    free_of("procgen-sys", &["zenoh", "tokio", "candle"]);
+    // The names are right: the learner has them.
+    let learner = depends_on("driml-learner");
+    for name in [
+        "candle-core",
+        "gemm",
+        "safetensors",
+        "rayon",
+        "zenoh",
+        "tokio",
+        "bincode",
+    ] {
+        assert!(learner.contains(name), "{name}");
+    }
+}
+
+/// Every file of the repository that is not built, fetched or left by a run, with its path from the root.
+fn files() -> Vec<(String, PathBuf)> {
+    let mut files = Vec::new();
+    let mut folders = vec![root()];
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(folder).unwrap() {
+            let entry = entry.unwrap();
+            let path = entry.path();
+            let name = path
+                .strip_prefix(root())
+                .unwrap()
+                .to_str()
+                .expect("names here are plain")
+                .to_owned();
+            // `target` and `runs` are in .gitignore; a folder that cargo made has a tag.
+            if matches!(name.as_str(), ".git" | "target" | "runs")
+                || path.join("CACHEDIR.TAG").exists()
+            {
+                continue;
+            }
+            if entry.file_type().unwrap().is_dir() {
+                folders.push(path);
+            } else {
+                files.push((name, path));
+            }
+        }
+    }
+    files.sort();
+    files
+}
+
+fn rust_files() -> Vec<(String, String)> {
+    let rust = files()
+        .into_iter()
+        .filter(|(name, _)| name.ends_with(".rs"));
+    let files: Vec<_> = rust
+        .map(|(name, path)| (name, fs::read_to_string(path).unwrap()))
+        .collect();
+    assert!(
+        files.len() > 100,
+        "the walk found {} files only",
+        files.len()
+    );
+    files
+}
+
+/// The identifiers in a Rust file outside its comments. Strings count as code, which errs on the strict side.
+fn words(text: &str) -> BTreeSet<&str> {
+    let code = text
+        .lines()
+        .map(|line| line.split("//").next().unwrap_or_default());
+    code.flat_map(|code| code.split(|c: char| !(c.is_alphanumeric() || c == '_')))
+        .collect()
+}
+
+#[test]
+fn every_source_file_says_what_it_is_for() {
+    for (name, text) in rust_files() {
+        let first = text.lines().next().unwrap_or_default();
+        assert!(
+            first.starts_with("//! ") && first.len() > 12,
+            "{name} starts with {first:?}"
+        );
+    }
+}
+
+#[test]
+fn dangerous_words_stay_where_they_are_needed() {
+    // Put together here, so that this file does not hold them itself.
+    let word = |halves: [&str; 2]| halves.concat();
+    let rules: [(String, &[&str]); 3] = [
+        (
+            word(["un", "safe"]),
+            &["actor/procgen-sys/", "learner/model/src/gemm.rs"],
+        ),
+        (
+            word(["unsafe", "_code"]),
+            &["actor/procgen-sys/", "learner/model/src/gemm.rs"],
+        ),
+        (word(["bin", "code"]), &["protocol/src/codec.rs"]),
+    ];
+    for (word, places) in rules {
+        let mut seen = 0;
+        for (name, text) in rust_files() {
+            if words(&text).contains(word.as_str()) {
+                assert!(
+                    places.iter().any(|place| name.starts_with(place)),
+                    "{name} uses `{word}`"
+                );
+                seen += 1;
+            }
+        }
+        assert!(
+            seen > 0,
+            "nobody uses `{word}`: is this rule still about anything?"
+        );
+    }
+}
+
+#[test]
+fn nothing_points_at_the_machine_it_was_written_on() {
+    // Put together here for the same reason.
+    let places = ["work", "root"].map(|folder| format!("/{folder}/"));
+    for (name, path) in files() {
+        // A file that is no text, such as a parity case, is none that a person follows.
+        let Ok(text) = fs::read_to_string(path) else {
+            continue;
+        };
+        for (number, line) in text.lines().enumerate() {
+            let found = places.iter().find(|place| points_at(line, place));
+            assert_eq!(found, None, "{name}:{}: {line}", number + 1);
+        }
+    }
+}
+
+/// Whether `line` has `place` as the start of an absolute path, not as the middle of a longer one or of an address.
+fn points_at(line: &str, place: &str) -> bool {
+    line.match_indices(place).any(|(at, _)| {
+        let before = line[..at].chars().next_back();
+        before.is_none_or(|c| !(c.is_alphanumeric() || "._-~}*".contains(c)))
+    })
+}
+
+#[test]
+fn every_package_takes_the_workspace_s_lints_and_versions() {
+    for (_, folder, _) in ARROWS {
+        let manifest: toml::Table = fs::read_to_string(root().join(folder).join("Cargo.toml"))
+            .unwrap()
+            .parse()
+            .unwrap();
+        assert_eq!(
+            manifest["lints"]["workspace"].as_bool(),
+            Some(true),
+            "{folder}"
+        );
+        for kind in ["dependencies", "dev-dependencies", "build-dependencies"] {
+            let Some(table) = manifest.get(kind).and_then(toml::Value::as_table) else {
+                continue;
+            };
+            for (name, dependency) in table {
+                let taken = dependency.get("workspace").and_then(toml::Value::as_bool);
+                assert_eq!(
+                    taken,
+                    Some(true),
+                    "{folder}: {name} takes its version from the workspace"
+                );
+            }
+        }
+    }
+}
