@@ -47,10 +47,11 @@ impl Interrupts {
                             _ = terminate.recv() => {}
                             _ = hangup.recv() => {}
                         }
+                        // Counted from the wish's first signal: whoever keeps pressing is heard.
                         if last.is_none_or(|last| last.elapsed() > ONE_WISH) {
                             counted.add();
+                            last = Some(Instant::now());
                         }
-                        last = Some(Instant::now());
                     }
                 });
             })?;

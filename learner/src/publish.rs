@@ -25,9 +25,12 @@ use crate::learning::Weights;
 /// One delivery of the affinity matrix.
 const AFFINITY_TIMEOUT: Duration = Duration::from_secs(5);
 
+/// A message ready to travel: prefix and header, then the planes.
+type Message = (Vec<u8>, Vec<u8>);
+
 /// The learner's outlets; dropping it closes them.
 pub(crate) struct Outlets {
-    weights: Arc<Mutex<Option<(Vec<u8>, Vec<u8>)>>>,
+    weights: Arc<Mutex<Option<Message>>>,
     status: Arc<Mutex<LearnerStatus>>,
     heard: Arc<AtomicBool>,
     affinity: Arc<Newest>,
@@ -56,7 +59,7 @@ impl Outlets {
         shutdown: &Shutdown,
     ) -> anyhow::Result<Self> {
         let failed = |e: zenoh::Error| anyhow::anyhow!("declaring what the learner answers: {e}");
-        let weights: Arc<Mutex<Option<(Vec<u8>, Vec<u8>)>>> = Arc::default();
+        let weights: Arc<Mutex<Option<Message>>> = Arc::default();
         let held = weights.clone();
         let weights_queryable = session
             .declare_queryable(keys.weights())

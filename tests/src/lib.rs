@@ -13,7 +13,7 @@ mod system;
 
 pub use client::Client;
 pub use process::{Ended, Process};
-pub use run_folder::RunFolder;
+pub use run_folder::{RunFolder, Summary};
 pub use system::{Survivor, TestSystem};
 
 use std::{

@@ -36,6 +36,7 @@ impl Served {
             sequence,
             first_transition: 6 * sequence,
             weights_version: 1,
+            leaving: false,
             streams: 2,
             steps: 3,
             frame_bytes: spec.frame_bytes() as u32,

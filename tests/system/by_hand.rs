@@ -44,6 +44,8 @@ fn parts_find_each_other_and_end_in_order() {
         .stop()
         .expect_code(0)
         .expect_said("finished after 540 updates");
+    // Its folder is as good as a launched run's for an evaluation.
+    system.run("evaluate --run run --episodes 5").expect_code(0);
     drop(client);
     server
         .stop()

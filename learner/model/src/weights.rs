@@ -167,12 +167,15 @@ pub(crate) fn is_dim(name: &str) -> bool {
     name.starts_with("dim.")
 }
 
+/// Shape and values of each parameter.
+pub(crate) type Decoded = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
+
 /// Shapes and values of this configuration's parameters in a safetensors file; names that pass `ignore` may be there too.
 pub(crate) fn decode(
     config: &ModelConfig,
     bytes: &[u8],
     ignore: impl Fn(&str) -> bool,
-) -> Result<BTreeMap<String, (Vec<usize>, Vec<f32>)>> {
+) -> Result<BTreeMap<String, Shaped>> {
     config.validate()?;
     let file = SafeTensors::deserialize(bytes)?;
     let mut found: BTreeMap<&str, TensorView<'_>> = file.iter().collect();
@@ -221,3 +224,6 @@ fn check_finite(name: &str, values: &[f32]) -> Result<()> {
         None => Ok(()),
     }
 }
+
+/// A tensor's shape and its values, row-major.
+type Shaped = (Vec<usize>, Vec<f32>);
