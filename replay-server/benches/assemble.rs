@@ -97,23 +97,29 @@ fn bench(c: &mut Criterion) {
     let row = 64 * 64 * 3;
     let frames: Vec<u8> = (0..CAPACITY as usize * row).map(|i| i as u8).collect();
     let mut rng = ChaCha8Rng::seed_from_u64(2);
-    let mut copy_into = |out: &mut [u8]| {
-        for out in out.chunks_exact_mut(row) {
-            let at = rng.random_range(0..CAPACITY as usize) * row;
-            out.copy_from_slice(&frames[at..at + row]);
+    // `stack` neighbouring frames from a random place, again and again.
+    let mut copy_into = |out: &mut [u8], stack: usize| {
+        for out in out.chunks_exact_mut(stack * row) {
+            let at = rng.random_range(0..CAPACITY as usize - stack) * row;
+            out.copy_from_slice(&frames[at..at + stack * row]);
         }
     };
     let mut reused = vec![0; 3 * ROWS as usize * row];
     group.bench_function("plain copy into one buffer", |b| {
-        b.iter(|| copy_into(black_box(&mut reused)))
+        b.iter(|| copy_into(black_box(&mut reused), 1))
     });
-    group.bench_function("plain copy into a new buffer", |b| {
-        b.iter(|| {
-            let mut out = vec![0; 3 * ROWS as usize * row];
-            copy_into(black_box(&mut out));
-            out
+    for (stack, name) in [
+        (1, "plain copy into a new buffer"),
+        (4, "plain copy into a new buffer, stack of 4"),
+    ] {
+        group.bench_function(name, |b| {
+            b.iter(|| {
+                let mut out = vec![0; 3 * ROWS as usize * stack * row];
+                copy_into(black_box(&mut out), stack);
+                out
+            });
         });
-    });
+    }
     drop(frames);
     let (mut stacked, _) = filled(4);
     group.bench_function("sample, 3 states of 64x64x3, stack of 4", |b| {

@@ -5,21 +5,17 @@
 //! single thread for the bias's, and it always computes both. The layers are one operation because candle adds every
 //! gradient to fresh zeros; here the maps between layers, and their gradients, stay in the cache of the core at work.
 
-use std::cell::RefCell;
 use std::sync::{Mutex, PoisonError};
 
 use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
-use crate::im2col::{ConvGradients, ConvScratch, ConvShape, Images, backward, forward, grown};
+use crate::im2col::{ConvShape, Images};
 use crate::linear::{add_in_order, cpu, floats};
+use crate::stack::{Between, layers, parameters_len, stack_backward, stack_forward, unpacked};
 
 /// Images that one task takes. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_IMAGES: usize = 16;
-
-thread_local! {
-    static SCRATCH: RefCell<TaskScratch> = RefCell::default();
-}
 
 /// relu(conv2d(images, weight) + bias) without padding: [`conv_stack`] of one layer.
 ///
@@ -89,22 +85,7 @@ pub fn conv_stack(images: &Tensor, layers: &[(&Tensor, &Tensor, usize)]) -> Resu
 struct ConvStack {
     shapes: Vec<ConvShape>,
     /// Of each task, the maps of all layers but the last: what the forward pass leaves to the backward pass.
-    between: Mutex<Vec<Vec<f32>>>,
-}
-
-/// One layer's parameters as the kernels want them.
-struct Layer<'a> {
-    shape: ConvShape,
-    packed: Vec<f32>,
-    bias: &'a [f32],
-}
-
-/// Buffers that a thread keeps between calls.
-#[derive(Default)]
-struct TaskScratch {
-    conv: ConvScratch,
-    grad_output: Vec<f32>,
-    grad_input: Vec<f32>,
+    between: Mutex<Vec<Between>>,
 }
 
 impl ConvStack {
@@ -116,144 +97,10 @@ impl ConvStack {
         &self.shapes[self.shapes.len() - 1]
     }
 
-    /// The layers, of `parameters` as [`conv_stack`] joined them.
-    fn layers<'a>(&self, mut parameters: &'a [f32]) -> Vec<Layer<'a>> {
-        let mut layers = Vec::with_capacity(self.shapes.len());
-        for &shape in &self.shapes {
-            let (weight, rest) = parameters.split_at(shape.weight_len());
-            let (bias, rest) = rest.split_at(shape.channels_out);
-            layers.push(Layer {
-                shape,
-                packed: shape.pack_weight(weight),
-                bias,
-            });
-            parameters = rest;
-        }
-        layers
-    }
-
-    /// Runs one task's images into `maps`, the last layer's, and returns those of the layers before.
-    fn task_forward(&self, layers: &[Layer<'_>], images: Images<'_>, maps: &mut [f32]) -> Vec<f32> {
-        let count = images.len() / self.first().image_len();
-        let between_len: usize = self.shapes[..self.shapes.len() - 1]
-            .iter()
-            .map(ConvShape::map_len)
-            .sum();
-        let mut between = vec![0.0; count * between_len];
-        let (mut input, mut free) = (images, &mut between[..]);
-        with_scratch(|scratch| {
-            for (index, layer) in layers.iter().enumerate() {
-                if index + 1 == layers.len() {
-                    forward(
-                        &layer.shape,
-                        input,
-                        &layer.packed,
-                        layer.bias,
-                        maps,
-                        &mut scratch.conv,
-                    );
-                } else {
-                    let (output, rest) =
-                        std::mem::take(&mut free).split_at_mut(count * layer.shape.map_len());
-                    forward(
-                        &layer.shape,
-                        input,
-                        &layer.packed,
-                        layer.bias,
-                        output,
-                        &mut scratch.conv,
-                    );
-                    (input, free) = (Images::Floats(output), rest);
-                }
-            }
-        });
-        between
-    }
-
-    /// The gradients of one task's images for their `maps`' gradients, with `between` as `task_forward` returned it.
-    ///
-    /// The result is the parameters' as [`conv_stack`] joined them, but for the packed order of the weights; the images'
-    /// are added to `grad_images`, if it is there.
-    fn task_backward(
-        &self,
-        layers: &[Layer<'_>],
-        images: Images<'_>,
-        mut between: &[f32],
-        (maps, grad_maps): (&[f32], &[f32]),
-        mut grad_images: Option<&mut [f32]>,
-    ) -> Vec<f32> {
-        let count = images.len() / self.first().image_len();
-        let mut sums = vec![0.0; self.parameters_len()];
-        let mut sums_left = &mut sums[..];
-        with_scratch(
-            |TaskScratch {
-                 conv,
-                 grad_output,
-                 grad_input,
-             }| {
-                grown(grad_output, grad_maps.len()).copy_from_slice(grad_maps);
-                let mut output = maps;
-                for (index, Layer { shape, packed, .. }) in layers.iter().enumerate().rev() {
-                    let before = sums_left.len() - shape.weight_len() - shape.channels_out;
-                    let (left, layer_sums) = std::mem::take(&mut sums_left).split_at_mut(before);
-                    let (packed_sum, bias_sum) = layer_sums.split_at_mut(shape.weight_len());
-                    sums_left = left;
-
-                    let input_len = count * shape.image_len();
-                    let (input, input_maps, grad_image) = if index == 0 {
-                        (images, output, grad_images.take())
-                    } else {
-                        let (earlier, input) = between.split_at(between.len() - input_len);
-                        between = earlier;
-                        let grad_input = grown(grad_input, input_len);
-                        grad_input.fill(0.0);
-                        (Images::Floats(input), input, Some(grad_input))
-                    };
-                    let grads = ConvGradients {
-                        packed: packed_sum,
-                        bias: bias_sum,
-                        images: grad_image,
-                    };
-                    backward(
-                        shape,
-                        input,
-                        packed,
-                        output,
-                        &grad_output[..output.len()],
-                        grads,
-                        conv,
-                    );
-                    output = input_maps;
-                    std::mem::swap(grad_output, grad_input);
-                }
-            },
-        );
-        sums
-    }
-
+    /// The images of the task with this index.
     fn task_images<'a>(&self, images: Images<'a>, task: usize) -> Images<'a> {
         let task_len = TASK_IMAGES * self.first().image_len();
         images.slice(task * task_len..images.len().min((task + 1) * task_len))
-    }
-
-    /// Gradients with the weights back in PyTorch's order.
-    fn unpacked(&self, mut sums: &[f32]) -> Vec<f32> {
-        let mut result = Vec::with_capacity(sums.len());
-        for shape in &self.shapes {
-            let (packed, rest) = sums.split_at(shape.weight_len());
-            let (bias, rest) = rest.split_at(shape.channels_out);
-            result.extend(shape.unpack_weight(packed));
-            result.extend_from_slice(bias);
-            sums = rest;
-        }
-        result
-    }
-
-    fn parameters_len(&self) -> usize {
-        self.shapes
-            .iter()
-            .map(|shape| shape.weight_len() + shape.channels_out)
-            .sum()
     }
 }
 
@@ -270,7 +117,7 @@ impl CustomOp2 for ConvStack {
         parameters_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
         let images = pixels(images, images_layout)?;
-        let layers = self.layers(floats(parameters, parameters_layout)?);
+        let layers = layers(&self.shapes, floats(parameters, parameters_layout)?);
         let last = self.last();
         let batch = images.len() / self.first().image_len();
         let mut maps = vec![0.0; batch * last.map_len()];
@@ -278,8 +125,8 @@ impl CustomOp2 for ConvStack {
             .par_chunks_mut(TASK_IMAGES * last.map_len())
             .enumerate();
         let between = tasks
-            .map(|(task, maps)| self.task_forward(&layers, self.task_images(images, task), maps));
-        let between = between.collect();
+            .map(|(task, maps)| stack_forward(&layers, self.task_images(images, task), maps))
+            .collect();
         *self.between.lock().unwrap_or_else(PoisonError::into_inner) = between;
         let dims = (
             batch,
@@ -305,7 +152,10 @@ impl CustomOp2 for ConvStack {
         let (maps_storage, maps_layout) = maps.storage_and_layout();
         let (grad_storage, grad_layout) = grad_maps.storage_and_layout();
         let image_values = pixels(cpu(&images_storage)?, images_layout)?;
-        let layers = self.layers(floats(cpu(&parameters_storage)?, parameters_layout)?);
+        let layers = layers(
+            &self.shapes,
+            floats(cpu(&parameters_storage)?, parameters_layout)?,
+        );
         let map_values = floats(cpu(&maps_storage)?, maps_layout)?;
         let grad_values = floats(cpu(&grad_storage)?, grad_layout)?;
         let between = self.between.lock().unwrap_or_else(PoisonError::into_inner);
@@ -321,28 +171,19 @@ impl CustomOp2 for ConvStack {
             .zip(between.par_iter())
             .zip(grad_parts)
             .enumerate()
-            .map(|(task, ((maps, between), grad_images))| {
-                self.task_backward(
-                    &layers,
-                    self.task_images(image_values, task),
-                    between,
-                    maps,
-                    grad_images,
-                )
+            .map(|(task, (((maps, grad_maps), between), grad_images))| {
+                let images = self.task_images(image_values, task);
+                stack_backward(&layers, images, between, maps, grad_maps, grad_images)
             });
-        let sum = add_in_order(sums.collect(), self.parameters_len());
+        let sum = add_in_order(sums.collect(), parameters_len(&self.shapes));
 
         let device = parameters.device();
-        let grad_parameters = Tensor::from_vec(self.unpacked(&sum), parameters.shape(), device)?;
+        let grad_parameters =
+            Tensor::from_vec(unpacked(&self.shapes, &sum), parameters.shape(), device)?;
         let grad_images =
             needs_images.then(|| Tensor::from_vec(grad_images, images.shape(), device));
         Ok((grad_images.transpose()?, Some(grad_parameters)))
     }
-}
-
-/// Lends the thread's buffers to `work`, which must not start parallel work of its own.
-fn with_scratch<R>(work: impl FnOnce(&mut TaskScratch) -> R) -> R {
-    SCRATCH.with_borrow_mut(work)
 }
 
 fn pixels<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<Images<'a>> {

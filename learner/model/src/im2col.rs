@@ -55,6 +55,11 @@ impl ConvShape {
         self.patch_len() * self.channels_out
     }
 
+    /// Scalars in weight and bias.
+    pub(crate) fn parameters_len(&self) -> usize {
+        self.weight_len() + self.channels_out
+    }
+
     fn tile_images(&self) -> usize {
         (TILE_LEN / (self.locations() * self.patch_len())).max(1)
     }

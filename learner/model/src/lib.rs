@@ -17,6 +17,7 @@ mod input;
 mod linear;
 mod network;
 mod policy;
+mod stack;
 mod torso;
 mod weights;
 

@@ -162,13 +162,13 @@ impl Parameters {
     }
 }
 
+/// A tensor's shape and its values, row-major.
+type Shaped = (Vec<usize>, Vec<f32>);
+
 /// Whether a parameter belongs to the DIM heads.
 pub(crate) fn is_dim(name: &str) -> bool {
     name.starts_with("dim.")
 }
-
-/// Shape and values of each parameter.
-pub(crate) type Decoded = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
 /// Shapes and values of this configuration's parameters in a safetensors file; names that pass `ignore` may be there too.
 pub(crate) fn decode(
@@ -224,6 +224,3 @@ fn check_finite(name: &str, values: &[f32]) -> Result<()> {
         None => Ok(()),
     }
 }
-
-/// A tensor's shape and its values, row-major.
-type Shaped = (Vec<usize>, Vec<f32>);
