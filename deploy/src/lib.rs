@@ -72,10 +72,11 @@ pub fn main() -> ExitCode {
 }
 
 /// `DRIML_LOG` says what is logged, in the form of `RUST_LOG`. zenoh warns of each try to reach a part that is not there
-/// yet or any more, which is ours to judge: so only its errors are logged.
+/// yet or any more, which is ours to judge: so only its errors are logged, and of those not what its session says of
+/// messages that come while it closes, as at the end of every run.
 fn log_to_stderr() {
     let filter = EnvFilter::try_from_env("DRIML_LOG")
-        .unwrap_or_else(|_| EnvFilter::new("warn,driml=info,zenoh=error"));
+        .unwrap_or_else(|_| EnvFilter::new("warn,driml=info,zenoh=error,zenoh::api::session=off"));
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
