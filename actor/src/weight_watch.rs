@@ -115,6 +115,8 @@ pub(crate) fn watch(
                     slot.put(weights);
                 }
                 Ok(_) => {}
+                // The actor leaves: its session closes under this thread.
+                Err(_) if session.is_closed() => return,
                 Err(e) => {
                     tracing::warn!("keeping weights {version}, newer ones did not come: {e:#}")
                 }

@@ -39,6 +39,14 @@ pub(crate) struct Part {
     pumps: Vec<JoinHandle<()>>,
 }
 
+/// What suits candle in every part: its second pool spins while it waits, which costs more than it gives on busy cores, and
+/// glibc returns each large tensor to the system and faults it in again unless told to keep it.
+const FOR_CANDLE: [(&str, &str); 3] = [
+    ("CANDLE_NUM_THREADS", "1"),
+    ("MALLOC_MMAP_THRESHOLD_", "1000000000"),
+    ("MALLOC_TRIM_THRESHOLD_", "10000000000"),
+];
+
 impl Part {
     /// Starts this program with other arguments, in a process group of its own so that Ctrl-C does not reach it.
     ///
@@ -57,7 +65,7 @@ impl Part {
         let mut child = Command::new(program)
             .args(args)
             .env("RAYON_NUM_THREADS", threads.to_string())
-            .env("CANDLE_NUM_THREADS", threads.to_string())
+            .envs(FOR_CANDLE)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())

@@ -45,7 +45,7 @@ impl AdamSettings {
             ("adam.eps", self.eps, above_0(self.eps)),
         ] {
             if !fine {
-                return Err(UpdateError::Settings(format!("{name} is {value}")));
+                return Err(UpdateError::Settings(format!("{name} = {value}")));
             }
         }
         Ok(())

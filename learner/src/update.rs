@@ -64,7 +64,7 @@ impl LearnerSettings {
             ("target_period_updates", 0.0, self.target_period_updates > 0),
         ] {
             if !fine {
-                return Err(UpdateError::Settings(format!("{name} is {value}")));
+                return Err(UpdateError::Settings(format!("{name} = {value}")));
             }
         }
         self.lambda.validate()?;

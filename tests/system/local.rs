@@ -43,6 +43,11 @@ fn c51_leaves_a_whole_run_folder() {
             "{part}:\n{log}"
         );
     }
+    let warned = ended
+        .stderr
+        .lines()
+        .find(|line| line.contains(" WARN ") || line.contains(" ERROR "));
+    assert_eq!(warned, None, "an orderly run warns of nothing");
     assert!(
         ended.stdout.contains("trains      c51 on chain, seed 1"),
         "{}",

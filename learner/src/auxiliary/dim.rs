@@ -63,7 +63,7 @@ impl Lambda {
     pub fn validate(&self) -> Result<(), UpdateError> {
         for (name, value) in PAIRS.iter().zip(self.values()) {
             if !(value >= 0.0 && value.is_finite()) {
-                return Err(UpdateError::Settings(format!("lambda.{name} is {value}")));
+                return Err(UpdateError::Settings(format!("lambda.{name} = {value}")));
             }
         }
         Ok(())
