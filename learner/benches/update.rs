@@ -1,5 +1,6 @@
 //! One update at the paper's sizes: batch 256, 64x64x3 frames, 15 actions, 51 atoms; C51 alone and with DIM.
 //! Batches are made up, so that nothing but the arithmetic is measured.
+
 #![allow(missing_docs, reason = "criterion's macros make public functions")]
 
 use std::{hint::black_box, time::Duration};

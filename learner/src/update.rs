@@ -91,9 +91,7 @@ pub enum UpdateError {
     #[error("this batch cannot be learned from: {0}")]
     Batch(String),
     /// A setting out of its range.
-    #[error(
-        "[learner.update] {0}: outside its range, which the presets and the documentation of LearnerSettings give"
-    )]
+    #[error("{0}: that cannot work; start from a preset")]
     Settings(String),
     /// State that does not fit the network, as from another run's checkpoint.
     #[error("learner state does not fit: {0}")]
