@@ -107,13 +107,15 @@ fn draw(out: &Path, column: &str, curves: &[Curve]) -> anyhow::Result<()> {
     area.fill(&WHITE).map_err(|e| failed(&e))?;
     let mut chart = ChartBuilder::on(&area)
         .margin(12)
+        .margin_right(36)
         .x_label_area_size(44)
         .y_label_area_size(64)
         .build_cartesian_2d(0.0..frames_max, low - margin..high + margin)
         .map_err(|e| failed(&e))?;
     chart
         .configure_mesh()
-        .light_line_style(RGBColor(238, 238, 238))
+        .light_line_style(WHITE)
+        .bold_line_style(RGBColor(225, 225, 225))
         .x_desc("frames")
         .y_desc(column.replace('_', " "))
         .x_label_formatter(&|frames| format!("{frames:.0}"))
