@@ -64,8 +64,15 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         unreachable_max: Duration::from_millis(settings.actor.unreachable_max_ms),
     };
     let envs = settings.actor.envs;
-    let mut collector =
-        Collector::new(settings, args.actor, new_epoch(), header.version, &weights)?;
+    let pool = settings.chunk_memory();
+    let mut collector = Collector::new(
+        settings,
+        pool.clone(),
+        args.actor,
+        new_epoch(),
+        header.version,
+        &weights,
+    )?;
     let newest = weight_watch::watch(
         session.clone(),
         keys.clone(),
@@ -84,6 +91,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         spec_hash,
         hello.inserted_total,
         limits,
+        pool,
         shutdown.clone(),
     )?;
     tracing::info!(

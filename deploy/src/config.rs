@@ -4,7 +4,7 @@
 use driml_envs::{WorldConfig, WorldName};
 use driml_learner::EstimatorKind;
 use driml_model::ModelConfig;
-use driml_protocol::{Horizon, RunSpec};
+use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -213,7 +213,15 @@ fn read<T: DeserializeOwned>(table: &Table, name: &'static str) -> Result<T, Usa
 /// Reads every table as its part will.
 fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
     let tables = [
-        "run", "world", "input", "actor", "replay", "learner", "model", "local",
+        "run",
+        "world",
+        "input",
+        "actor",
+        "replay",
+        "learner",
+        "model",
+        "transport",
+        "local",
     ];
     if let Some(other) = table.keys().find(|key| !tables.contains(&key.as_str())) {
         return Err(usage!(
@@ -222,6 +230,7 @@ fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
         ));
     }
     let _: driml_actor::InputSize = read(table, "input")?;
+    let _: TransportConfig = read(table, "transport")?;
     Ok(RunConfig {
         run: read(table, "run")?,
         world: read(table, "world")?,

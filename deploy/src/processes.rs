@@ -87,6 +87,7 @@ pub(crate) fn run(
 
     let ran = launch.start_and_watch(&mut recorder);
     let ended = launch.end(&ran);
+    session::sweep_shared_memory();
     launch.screen.clear();
     let outcome = match (&ran, &ended) {
         (Ok(Outcome::Finished), Ok(())) => Outcome::Finished,

@@ -4,10 +4,7 @@
 use std::time::Duration;
 
 use anyhow::Context;
-use driml_protocol::{
-    Keys, Kind, LearnerStatus, ReplayStatus, codec,
-    session::{self, SessionError},
-};
+use driml_protocol::{Keys, Kind, LearnerStatus, ReplayStatus, codec, session};
 use serde::de::DeserializeOwned;
 use zenoh::{Session, Wait, bytes::ZBytes, qos::Priority};
 
@@ -58,15 +55,15 @@ impl Statuses {
     }
 
     fn ask<T: DeserializeOwned>(&self, key: &str, kind: Kind) -> anyhow::Result<T> {
-        let reply: Result<Vec<u8>, SessionError> = session::ask(
+        let answer = session::ask(
             &self.session,
             key,
             ZBytes::new(),
             Priority::InteractiveHigh,
             ANSWER_MAX,
-        );
-        let (status, _) =
-            codec::decode(&reply?, kind, Some(self.spec_hash)).with_context(|| key.to_owned())?;
+        )?;
+        let (status, _) = codec::decode(&answer.to_bytes(), kind, Some(self.spec_hash))
+            .with_context(|| key.to_owned())?;
         Ok(status)
     }
 

@@ -66,7 +66,7 @@ impl Outlets {
             .callback(move |query| {
                 // An actor that comes before the first weights hears nothing and asks again.
                 if let Some((head, planes)) = lock(&held).clone() {
-                    session::answer(&query, session::join_pieces([head, planes]));
+                    session::answer(&query, session::join_planes(head, planes.into()));
                 }
             })
             .wait()
@@ -193,7 +193,7 @@ impl AffinitySender {
             Priority::DataHigh,
             AFFINITY_TIMEOUT,
         )?;
-        codec::decode::<()>(&answer, Kind::Done, Some(self.spec_hash))?;
+        codec::decode::<()>(&answer.to_bytes(), Kind::Done, Some(self.spec_hash))?;
         Ok(())
     }
 }

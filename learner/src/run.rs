@@ -14,7 +14,7 @@ use driml_protocol::{
 use zenoh::Wait;
 
 use crate::{
-    batch_source::{BatchSource, Next},
+    batch_source::{BatchSource, Next, Requests},
     config::LearnerPart,
     learning::Learning,
     publish::Outlets,
@@ -51,15 +51,22 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     };
     let part = LearnerPart::from_toml(&hello.config_toml)
         .context("the settings that the replay server sent")?;
-    let (rows, in_flight) = (part.learner.batch_rows, part.learner.batches_in_flight);
-    let mut learning = Learning::new(part)?;
-    keep_settings(&args.run_dir, &hello.config_toml)?;
+    let requests = Requests {
+        rows: part.learner.batch_rows,
+        in_flight: part.learner.batches_in_flight,
+        shared_memory: part.transport.shared_memory,
+    };
     let folder = args.run_dir.join("checkpoints");
+    let mut learning = Learning::resume(part, &folder)?;
+    keep_settings(&args.run_dir, &hello.config_toml)?;
     let spec_hash = learning.spec_hash();
     let outlets = Outlets::open(&session, &keys, spec_hash, shutdown)?;
     outlets.publish(learning.next_weights()?)?;
-    let mut batches = BatchSource::start(&session, &keys, spec_hash, rows, in_flight, shutdown)?;
-    tracing::info!("learning from batches of {rows} rows, run {spec_hash:016x}");
+    let mut batches = BatchSource::start(&session, &keys, spec_hash, requests, shutdown)?;
+    tracing::info!(
+        "learning from batches of {} rows, run {spec_hash:016x}",
+        requests.rows
+    );
 
     let mut waiting_since = Instant::now();
     while !shutdown.is_set() {
@@ -97,10 +104,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     tracing::info!("finished after {} updates", learning.updates());
     shutdown.wait();
     outlets.wait_until_heard(LAST_WORD_MAX);
-    session
-        .close()
-        .wait()
-        .map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+    let closed = session.close().wait();
+    batches.end();
+    closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
 /// Leaves the run's settings beside the checkpoints, for `driml evaluate`; a file that is there is the launcher's.

@@ -4,6 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::{
+    Planes,
     codec::{self, CodecError, Kind},
     metric::Waiting,
 };
@@ -16,6 +17,8 @@ pub const NO_ACTION: u8 = 255;
 pub struct BatchRequest {
     /// Rows wanted, B.
     pub rows: u32,
+    /// Whether the batch may come through shared memory.
+    pub shared_memory: bool,
 }
 
 /// What a batch says of itself.
@@ -33,6 +36,16 @@ pub struct BatchHeader {
     pub mean_age: f64,
     /// Version of the newest weights that chose an action of this batch, and of the oldest.
     pub weights_versions: (u64, u64),
+}
+
+impl BatchHeader {
+    /// Bytes of the planes of such a batch.
+    ///
+    /// # Panics
+    /// If they are more than the address space, which no batch of a run is.
+    pub fn planes_bytes(&self) -> usize {
+        planes_bytes(self).expect("a batch is far below the address space")
+    }
 }
 
 /// The answer to a request.
@@ -59,17 +72,23 @@ pub enum BatchReply {
 pub struct Batch {
     /// What it says of itself.
     pub header: BatchHeader,
-    planes: Vec<u8>,
+    planes: Planes,
 }
 
 impl Batch {
     /// A batch of zeros, to be filled in place.
     pub fn zeroed(header: BatchHeader) -> Self {
-        let bytes = planes_bytes(&header).expect("a batch is far below the address space");
-        Self {
-            header,
-            planes: vec![0; bytes],
-        }
+        let planes = Planes::zeroed(header.planes_bytes());
+        Self { header, planes }
+    }
+
+    /// A batch in memory that may hold anything: every row is to be written with [`Batch::rows_mut`].
+    ///
+    /// # Panics
+    /// If the memory is not of [`BatchHeader::planes_bytes`].
+    pub fn in_memory(header: BatchHeader, planes: Planes) -> Self {
+        assert_eq!(planes.len(), header.planes_bytes(), "memory for a batch");
+        Self { header, planes }
     }
 
     /// Rows, B.
@@ -167,7 +186,7 @@ impl Batch {
         let offsets = self.offsets();
         let state_bytes = self.header.state_bytes as usize;
         let rows = self.rows();
-        let mut rest = self.planes.as_mut_slice();
+        let mut rest = &mut self.planes[..];
         let mut take = |i: usize| -> &mut [u8] {
             let (head, tail) = std::mem::take(&mut rest).split_at_mut(offsets[i + 1] - offsets[i]);
             rest = tail;
@@ -192,7 +211,7 @@ impl Batch {
     ///
     /// # Errors
     /// A batch over the codec's limits.
-    pub fn seal(self, spec_hash: u64) -> Result<(Vec<u8>, Vec<u8>), CodecError> {
+    pub fn seal(self, spec_hash: u64) -> Result<(Vec<u8>, Planes), CodecError> {
         let head = codec::seal(
             Kind::BatchReply,
             spec_hash,
@@ -206,7 +225,7 @@ impl Batch {
     ///
     /// # Errors
     /// Planes of another length.
-    pub fn from_planes(header: BatchHeader, planes: &[u8]) -> Result<Self, CodecError> {
+    pub fn from_planes(header: BatchHeader, planes: Planes) -> Result<Self, CodecError> {
         if planes_bytes(&header) != Some(planes.len()) || header.rows == 0 {
             return Err(CodecError::Header(format!(
                 "{} rows with {} positives of {} bytes do not fill {} bytes of planes",
@@ -216,10 +235,7 @@ impl Batch {
                 planes.len()
             )));
         }
-        Ok(Self {
-            header,
-            planes: planes.to_vec(),
-        })
+        Ok(Self { header, planes })
     }
 }
 
@@ -255,9 +271,15 @@ impl BatchRowsMut<'_> {
         &mut self.frames_t[row * self.state_bytes..(row + 1) * self.state_bytes]
     }
 
-    /// Where s_{t+n} of `row` is written.
+    /// Where s_{t+n} of `row` is written; zeros if the row does not bootstrap.
     pub fn frame_n(&mut self, row: usize) -> &mut [u8] {
         &mut self.frames_n[row * self.state_bytes..(row + 1) * self.state_bytes]
+    }
+
+    /// Marks `row` as having no positive `p`.
+    pub fn no_positive(&mut self, p: usize, row: usize) {
+        self.positive(p, row, 0).fill(0);
+        self.positive_valid[p * self.rows + row] = 0;
     }
 
     /// Marks positive `p` of `row` as `k` steps ahead and gives where s_{t+k} is written.

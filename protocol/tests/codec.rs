@@ -7,7 +7,7 @@ use std::fmt::Debug;
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader, CodecError,
     End, Goodbye, Hello, Horizon, InsertReply, Kind, LearnerStatus, NO_ACTION, PROTOCOL_VERSION,
-    ReplayStatus, RunSpec, TimeoutRule, Waiting, WeightsHeader, WeightsVersion,
+    Planes, PlanesPool, ReplayStatus, RunSpec, TimeoutRule, Waiting, WeightsHeader, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PLANES_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -60,7 +60,9 @@ fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
 
 fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
     match codec::decode(bytes, Kind::BatchReply, Some(SPEC))? {
-        (BatchReply::Batch(header), planes) => Batch::from_planes(header, planes).map(|_| ()),
+        (BatchReply::Batch(header), planes) => {
+            Batch::from_planes(header, planes.to_vec().into()).map(|_| ())
+        }
         _ => Ok(()),
     }
 }
@@ -194,7 +196,13 @@ fn samples() -> Vec<Sample> {
             Kind::BatchReply,
             &BatchReply::Refused { why: String::new() },
         ),
-        Sample::of(Kind::BatchRequest, &BatchRequest { rows: 256 }),
+        Sample::of(
+            Kind::BatchRequest,
+            &BatchRequest {
+                rows: 256,
+                shared_memory: true,
+            },
+        ),
         Sample::of(Kind::Affinity, &affinity),
         Sample::of(Kind::WeightsVersion, &WeightsVersion { version: 9 }),
         Sample::of(Kind::Goodbye, &goodbye),
@@ -272,7 +280,7 @@ fn chunk_batch_and_weights_come_back() {
     let BatchReply::Batch(header) = reply else {
         panic!("{reply:?}")
     };
-    let back = Batch::from_planes(header, planes).unwrap();
+    let back = Batch::from_planes(header, planes.to_vec().into()).unwrap();
     assert_eq!(back, batch());
     assert_eq!(
         back.frames_t(),
@@ -301,6 +309,35 @@ fn chunk_batch_and_weights_come_back() {
     let (header, planes) = WeightsHeader::decode(&bytes, SPEC).unwrap();
     assert_eq!((header.version, header.updates, planes.len()), (4, 312, 40));
     assert_eq!(header.sha256_hex().len(), 64);
+}
+
+/// However a message was cut on its way, what is received is what was sent, and in memory that held something else before.
+#[test]
+fn pieces_are_received_as_the_whole_is() {
+    let pool = PlanesPool::new(1);
+    let bytes = join(chunk().seal(SPEC).unwrap());
+    for at in 0..=bytes.len() {
+        let (first, second) = bytes.split_at(at);
+        pool.take_own(64).fill(0xAB);
+        let pieces = [first, &[], second];
+        let back = Chunk::receive(pieces, bytes.len(), &pool, SPEC, ACTIONS).unwrap();
+        assert_eq!(back, chunk(), "cut at {at}");
+        // A piece that is missing at the end, or a length that is not the sum of the pieces.
+        if at < bytes.len() {
+            assert!(Chunk::receive([first], at, &pool, SPEC, ACTIONS).is_err());
+            assert!(Chunk::receive([first], bytes.len(), &pool, SPEC, ACTIONS).is_err());
+        }
+    }
+    for flipped in 0..bytes.len() {
+        let mut damaged = bytes.clone();
+        damaged[flipped] ^= 1;
+        let (first, second) = damaged.split_at(flipped / 2);
+        let refused = Chunk::receive([first, second], bytes.len(), &pool, SPEC, ACTIONS);
+        assert_eq!(
+            refused.unwrap_err(),
+            Chunk::decode(&damaged, SPEC, ACTIONS).unwrap_err()
+        );
+    }
 }
 
 #[test]
@@ -560,12 +597,12 @@ fn counts_that_do_not_fit_their_planes_are_refused() {
         },
     ] {
         assert!(
-            Batch::from_planes(wrong, &[0; 3 * 24]).is_err(),
+            Batch::from_planes(wrong, Planes::zeroed(3 * 24)).is_err(),
             "{wrong:?}"
         );
     }
     assert!(
-        Batch::from_planes(BatchHeader { rows: 0, ..header }, &[]).is_err(),
+        Batch::from_planes(BatchHeader { rows: 0, ..header }, Planes::zeroed(0)).is_err(),
         "no rows at all"
     );
 }

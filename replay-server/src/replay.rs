@@ -3,7 +3,7 @@
 
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, BatchReply, Chunk, CodecError, Goodbye, InsertReply,
-    ReplayStatus, RunSpec, Waiting,
+    Planes, ReplayStatus, RunSpec, Waiting,
 };
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -221,6 +221,18 @@ impl Replay {
     /// # Errors
     /// The limiter or the lack of any valid anchor asks to wait; the run is over; `rows` can never be served.
     pub fn sample(&mut self, rows: u32) -> Result<Batch, Unready> {
+        self.sample_in(rows, Planes::zeroed)
+    }
+
+    /// [`Replay::sample`] into memory that `memory` gives, so many bytes, all of which are then written.
+    ///
+    /// # Errors
+    /// As [`Replay::sample`].
+    pub fn sample_in(
+        &mut self,
+        rows: u32,
+        memory: impl FnOnce(usize) -> Planes,
+    ) -> Result<Batch, Unready> {
         let rows_max = config::rows_max(&self.spec).min(self.limiter.rows_max());
         if rows == 0 || rows > rows_max {
             self.statistics.messages_refused += 1;
@@ -235,15 +247,8 @@ impl Replay {
         if !self.limiter.may_sample(rows) {
             return Err(Unready::Wait(self.limiter.waiting(rows)));
         }
-        let mut batch = Batch::zeroed(BatchHeader {
-            rows,
-            positives: self.spec.horizon.positives() as u32,
-            state_bytes: self.spec.state_bytes() as u32,
-            inserted_total: self.ring.inserted(),
-            mean_age: 0.0,
-            weights_versions: (0, u64::MAX),
-        });
-        let mut header = batch.header;
+        let mut header = self.batch_header(rows);
+        let mut batch = Batch::in_memory(header, memory(header.planes_bytes()));
         let mut age_total = 0;
         let mut rows_mut = batch.rows_mut();
         for row in 0..rows as usize {
@@ -269,6 +274,18 @@ impl Replay {
         self.limiter.sampled(rows);
         self.starving = false;
         Ok(batch)
+    }
+
+    /// What a batch of `rows` rows says of itself before any row is written.
+    pub(crate) fn batch_header(&self, rows: u32) -> BatchHeader {
+        BatchHeader {
+            rows,
+            positives: self.spec.horizon.positives() as u32,
+            state_bytes: self.spec.state_bytes() as u32,
+            inserted_total: self.ring.inserted(),
+            mean_age: 0.0,
+            weights_versions: (0, u64::MAX),
+        }
     }
 
     fn no_anchor(&mut self) -> Unready {
