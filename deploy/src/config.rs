@@ -65,6 +65,7 @@ pub(crate) struct Flags {
     pub(crate) actors: Option<u32>,
     pub(crate) envs: Option<u32>,
     pub(crate) frames: Option<u64>,
+    pub(crate) replay_shards: Option<u32>,
     pub(crate) seed: Option<u64>,
     pub(crate) sets: Vec<String>,
 }
@@ -108,6 +109,7 @@ pub(crate) fn resolve(
         ("local.actors", flags.actors.map(u64::from)),
         ("actor.envs", flags.envs.map(u64::from)),
         ("replay.transitions_max", flags.frames),
+        ("replay.shards", flags.replay_shards.map(u64::from)),
         ("run.seed", flags.seed),
     ];
     for (path, value) in by_flag {

@@ -2,18 +2,23 @@
 //! It does not reorder or keep batches: what arrives first is learned from first.
 
 use std::{
-    sync::mpsc,
+    sync::{Arc, Mutex, PoisonError, mpsc},
     thread::JoinHandle,
     time::{Duration, Instant},
 };
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Batch, BatchReply, BatchRequest, Keys, Kind, PlanesPool, Shutdown, codec,
-    session::{self, SessionError},
+    Batch, BatchHeader, BatchReply, BatchRequest, Keys, Kind, PlanesPool, ReplayStatus, Shutdown,
+    Tally, codec,
+    session::{self, Asked, SessionError},
     shutdown::join_within,
 };
-use zenoh::{Session, qos::Priority};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use zenoh::{Session, bytes::ZBytes, qos::Priority};
+
+use crate::shards::{self, Count};
 
 /// One request; the replay server answers within a second, if only to say that there is nothing yet.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
@@ -22,6 +27,8 @@ const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// How long the replay server may be out of reach before the learner gives up.
 const UNREACHABLE_MAX: Duration = Duration::from_secs(60);
 
+/// Pause before shards that hold nothing are asked again.
+const LOOK_AGAIN: Duration = Duration::from_millis(50);
 /// How long the threads may take to end.
 const THREADS_END_MAX: Duration = Duration::from_secs(2);
 
@@ -70,7 +77,7 @@ impl BatchSource {
     /// # Errors
     /// The operating system gave no thread.
     pub fn start(
-        session: &Session,
+        sessions: &[Session],
         keys: &Keys,
         spec_hash: u64,
         requests: Requests,
@@ -78,12 +85,16 @@ impl BatchSource {
     ) -> std::io::Result<Self> {
         let (sender, fetched) = mpsc::sync_channel(0);
         // A batch a thread, and the one that is learned from.
-        let pool = PlanesPool::new(requests.in_flight as usize + 1);
+        let pool = PlanesPool::new(requests.in_flight as usize + sessions.len());
+        let making = Arc::new(Mutex::new(Making::new(sessions.len())));
         let mut threads = Vec::new();
         for i in 0..requests.in_flight {
             let fetcher = Fetcher {
-                session: session.clone(),
-                key: keys.batch(),
+                sessions: sessions.to_vec(),
+                keys: keys.clone(),
+                making: making.clone(),
+                // Which rows come from which shard follows from the order of answers, so this need not be the run's.
+                rng: ChaCha8Rng::from_os_rng(),
                 spec_hash,
                 requests,
                 pool: pool.clone(),
@@ -129,9 +140,30 @@ impl BatchSource {
     }
 }
 
+/// The one batch that is put together from the parts of several shards. It outlives a failed try, because a part that was
+/// given is counted as sampled.
+struct Making {
+    counts: Vec<Count>,
+    /// Rows that are still to come from each shard.
+    pending: Vec<u32>,
+    parts: Vec<Batch>,
+}
+
+impl Making {
+    fn new(shards: usize) -> Self {
+        Self {
+            counts: vec![Count::default(); shards],
+            pending: vec![0; shards],
+            parts: Vec::new(),
+        }
+    }
+}
+
 struct Fetcher {
-    session: Session,
-    key: String,
+    sessions: Vec<Session>,
+    keys: Keys,
+    making: Arc<Mutex<Making>>,
+    rng: ChaCha8Rng,
     spec_hash: u64,
     requests: Requests,
     pool: PlanesPool,
@@ -167,22 +199,120 @@ impl Fetcher {
         }
     }
 
-    /// One request; `None` where the replay server has nothing yet.
+    /// One batch; `None` where the replay has nothing yet.
     fn fetch(&mut self) -> anyhow::Result<Option<Fetched>> {
+        if self.sessions.len() > 1 {
+            return self.fetch_parts();
+        }
+        let asked = self.ask(0, self.requests.rows, None)?;
+        Ok(match self.answer(asked)? {
+            Answer::Batch(batch) => Some(Fetched::Batch(batch)),
+            Answer::Wait => None,
+            Answer::Finished => Some(Fetched::Finished),
+        })
+    }
+
+    /// One batch, put together from what the shards give. One is put together at a time: each shard is told what the others
+    /// give, so that their rate limiters decide as one.
+    fn fetch_parts(&mut self) -> anyhow::Result<Option<Fetched>> {
+        let making = self.making.clone();
+        let mut making = making.lock().unwrap_or_else(PoisonError::into_inner);
+        let Making {
+            counts,
+            pending,
+            parts,
+        } = &mut *making;
+        if parts.is_empty() && pending.iter().all(|&rows| rows == 0) {
+            match shards::split(self.requests.rows, counts, &mut self.rng) {
+                Some(split) => *pending = split,
+                None => {
+                    self.shutdown.wait_timeout(LOOK_AGAIN);
+                    return self.recount(counts).map(|()| None);
+                }
+            }
+        }
+        let mut asked = Vec::new();
+        for shard in (0..pending.len()).filter(|&shard| pending[shard] > 0) {
+            let elsewhere = shards::elsewhere(counts, pending, shard);
+            asked.push((shard, self.ask(shard, pending[shard], Some(elsewhere))?));
+        }
+        let mut finished = false;
+        for (shard, asked) in asked {
+            match self.answer(asked)? {
+                Answer::Batch(part) => {
+                    let BatchHeader { tally, held, .. } = part.header;
+                    counts[shard] = Count { tally, held };
+                    pending[shard] = 0;
+                    parts.push(part);
+                }
+                Answer::Wait => {}
+                Answer::Finished => finished = true,
+            }
+        }
+        if pending.iter().all(|&rows| rows == 0) {
+            let header =
+                Batch::merged_header(parts).context("the shards' parts do not fit together")?;
+            let memory = self.pool.take_own(header.planes_bytes());
+            let whole = Batch::merge(parts, memory);
+            parts.clear();
+            return Ok(Some(Fetched::Batch(whole)));
+        }
+        self.recount(counts)?;
+        // A shard that has given its part knows of the others' transitions what they had then: it may be wrong about the end.
+        Ok((finished && parts.is_empty()).then_some(Fetched::Finished))
+    }
+
+    /// Asks all shards what they have counted.
+    fn recount(&self, counts: &mut [Count]) -> anyhow::Result<()> {
+        let key = self.keys.replay_status();
+        for (session, count) in self.sessions.iter().zip(counts) {
+            let answer = session::ask(
+                session,
+                &key,
+                ZBytes::new(),
+                Priority::DataHigh,
+                REQUEST_TIMEOUT,
+            )?;
+            let (status, _): (ReplayStatus, _) =
+                codec::decode(&answer.to_bytes(), Kind::ReplayStatus, Some(self.spec_hash))
+                    .context("a shard's status")?;
+            *count = Count {
+                tally: Tally {
+                    inserted: status.transitions_inserted,
+                    rows_sampled: status.rows_sampled,
+                },
+                held: status.transitions_held,
+            };
+        }
+        Ok(())
+    }
+
+    /// Asks a shard for `rows` rows.
+    fn ask(
+        &self,
+        shard: usize,
+        rows: u32,
+        elsewhere: Option<Tally>,
+    ) -> anyhow::Result<(Asked, bool)> {
         let request = BatchRequest {
-            rows: self.requests.rows,
+            rows,
             shared_memory: self.requests.shared_memory && self.by_socket == 0,
+            elsewhere,
         };
         let message = codec::encode(Kind::BatchRequest, self.spec_hash, &request, &[])?;
-        let answer = session::ask(
-            &self.session,
-            &self.key,
+        let asked = session::send(
+            &self.sessions[shard],
+            &self.keys.batch(),
             message.into(),
             Priority::Data,
             REQUEST_TIMEOUT,
-        )
-        .inspect_err(|e| {
-            if request.shared_memory && matches!(e, SessionError::NoReply { .. }) {
+        )?;
+        Ok((asked, request.shared_memory))
+    }
+
+    fn answer(&mut self, (asked, shared_memory): (Asked, bool)) -> anyhow::Result<Answer> {
+        let answer = asked.answer().inspect_err(|e| {
+            if shared_memory && matches!(e, SessionError::NoReply { .. }) {
                 self.by_socket = AVOID_COUNT;
             }
         })?;
@@ -195,13 +325,18 @@ impl Fetcher {
             Some(self.spec_hash),
         )
         .context("a batch")?;
-        match reply {
-            BatchReply::Batch(header) => {
-                Ok(Some(Fetched::Batch(Batch::from_planes(header, planes)?)))
-            }
-            BatchReply::Wait(_) => Ok(None),
-            BatchReply::Finished => Ok(Some(Fetched::Finished)),
+        Ok(match reply {
+            BatchReply::Batch(header) => Answer::Batch(Batch::from_planes(header, planes)?),
+            BatchReply::Wait(_) => Answer::Wait,
+            BatchReply::Finished => Answer::Finished,
             BatchReply::Refused { why } => bail!("the replay server refuses: {why}"),
-        }
+        })
     }
+}
+
+/// What a replay server answers.
+enum Answer {
+    Batch(Batch),
+    Wait,
+    Finished,
 }

@@ -18,7 +18,7 @@ pub mod transition;
 pub mod weights;
 
 pub use affinity::AffinityUpdate;
-pub use batch::{Batch, BatchHeader, BatchReply, BatchRequest, NO_ACTION};
+pub use batch::{Batch, BatchHeader, BatchReply, BatchRequest, NO_ACTION, Tally};
 pub use codec::{CodecError, Kind};
 pub use control::{Goodbye, Hello};
 pub use keys::Keys;

@@ -7,7 +7,8 @@ use std::fmt::Debug;
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader, CodecError,
     End, Goodbye, Hello, Horizon, InsertReply, Kind, LearnerStatus, NO_ACTION, PROTOCOL_VERSION,
-    Planes, PlanesPool, ReplayStatus, RunSpec, TimeoutRule, Waiting, WeightsHeader, WeightsVersion,
+    Planes, PlanesPool, ReplayStatus, RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader,
+    WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PLANES_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -96,7 +97,11 @@ fn batch() -> Batch {
         rows: 3,
         positives: 1,
         state_bytes: 4,
-        inserted_total: 99,
+        tally: Tally {
+            inserted: 99,
+            rows_sampled: 12,
+        },
+        held: 9,
         mean_age: 12.5,
         weights_versions: (8, 2),
     });
@@ -179,6 +184,7 @@ fn samples() -> Vec<Sample> {
     let hello = Hello {
         config_toml: "[run]\nseed = 1\n".into(),
         inserted_total: 12,
+        shard: (1, 2),
     };
     let goodbye = Goodbye {
         actor: 1,
@@ -201,6 +207,7 @@ fn samples() -> Vec<Sample> {
             &BatchRequest {
                 rows: 256,
                 shared_memory: true,
+                elsewhere: Some(Tally::default()),
             },
         ),
         Sample::of(Kind::Affinity, &affinity),
@@ -338,6 +345,56 @@ fn pieces_are_received_as_the_whole_is() {
             Chunk::decode(&damaged, SPEC, ACTIONS).unwrap_err()
         );
     }
+}
+
+#[test]
+fn parts_are_merged_row_by_row() {
+    let header = |rows, mean_age, versions| BatchHeader {
+        rows,
+        positives: 2,
+        state_bytes: 3,
+        tally: Tally {
+            inserted: 10,
+            rows_sampled: 1,
+        },
+        held: 5,
+        mean_age,
+        weights_versions: versions,
+    };
+    let part = |header: BatchHeader, first: u8| {
+        let mut batch = Batch::zeroed(header);
+        let mut rows = batch.rows_mut();
+        for row in 0..header.rows as usize {
+            let value = first + row as u8;
+            rows.set(row, value, value + 100, f32::from(value), 0.5);
+            rows.frame_t(row).fill(value);
+            rows.frame_n(row).fill(value + 20);
+            rows.positive(0, row, 1).fill(value + 40);
+            rows.positive(1, row, 2).fill(value + 60);
+        }
+        batch
+    };
+    let parts = [
+        part(header(2, 1.0, (7, 3)), 0),
+        part(header(1, 4.0, (9, 5)), 2),
+    ];
+    let whole = Batch::merged_header(&parts).unwrap();
+    let merged = Batch::merge(&parts, Planes::from(vec![0xAB; whole.planes_bytes()]));
+    let mut expected = part(whole, 0);
+    assert_eq!((whole.mean_age, whole.weights_versions), (2.0, (9, 3)));
+    assert_eq!((whole.tally.inserted, whole.held), (20, 10));
+    expected.header = whole;
+    assert_eq!(merged, expected);
+
+    let other = part(
+        BatchHeader {
+            state_bytes: 4,
+            ..header(1, 0.0, (1, 1))
+        },
+        0,
+    );
+    assert_eq!(Batch::merged_header(&[parts[0].clone(), other]), None);
+    assert_eq!(Batch::merged_header(&[]), None);
 }
 
 #[test]
@@ -529,6 +586,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
     let hello = Hello {
         config_toml: "x".repeat(HEADER_BYTES_MAX),
         inserted_total: 0,
+        shard: (0, 1),
     };
     let refused = codec::seal(Kind::Hello, SPEC, &hello, &[]).unwrap_err();
     assert!(

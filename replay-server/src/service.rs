@@ -24,6 +24,8 @@ use crate::{Config, Replay, Unready};
 
 /// How long a chunk or a request waits at the limiter before it is told to come back: far below every sender's time-out.
 const HOLD_MAX: Duration = Duration::from_secs(1);
+/// The same for a part of a batch: what another shard counts meanwhile does not wake it.
+const SHARD_HOLD_MAX: Duration = Duration::from_millis(50);
 /// Chunks, and requests, that wait for their thread; one more is told to come back at once.
 const QUEUE_MAX: usize = 4096;
 /// Threads that make batches: one assembles while another's reply is being sent.
@@ -46,6 +48,8 @@ pub struct RunArgs {
     pub connect: Vec<String>,
     /// Prefix of the run's keys.
     pub namespace: String,
+    /// Which of the replay's shards this is, from 0.
+    pub shard: u32,
     /// The run's resolved settings, which it hands to whoever joins.
     pub config_toml: String,
 }
@@ -60,7 +64,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     spec.validate()?;
     let config: Config = settings.table("replay")?;
     let batch_rows = batch_rows(&settings)?;
-    let replay = Replay::new(&spec, &config, batch_rows)?;
+    let replay = Replay::shard(&spec, &config, batch_rows, args.shard)?;
     let transport: TransportConfig = settings.table("transport")?;
     let pool = if transport.shared_memory {
         let bytes = replay.batch_header(batch_rows).planes_bytes();
@@ -76,6 +80,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let service = Arc::new(Service {
         spec_hash: spec.hash(),
         num_actions: spec.num_actions,
+        shard: (args.shard, config.shards),
         config_toml: args.config_toml,
         pool,
         replay: Mutex::new(replay),
@@ -128,6 +133,7 @@ fn batch_rows(settings: &Settings) -> anyhow::Result<u32> {
 struct Service {
     spec_hash: u64,
     num_actions: u32,
+    shard: (u32, u32),
     config_toml: String,
     /// Memory for chunks that arrive and batches that leave.
     pool: PlanesPool,
@@ -251,6 +257,7 @@ impl Service {
         let hello = Hello {
             config_toml: self.config_toml.clone(),
             inserted_total,
+            shard: self.shard,
         };
         self.reply(query, Kind::Hello, &hello);
     }
@@ -321,6 +328,14 @@ impl Service {
         };
         let arrived = Instant::now();
         let mut replay = self.replay();
+        let hold_max = match request.elsewhere {
+            Some(elsewhere) => {
+                replay.heard(elsewhere);
+                self.changed.notify_all();
+                SHARD_HOLD_MAX
+            }
+            None => HOLD_MAX,
+        };
         let sampled = loop {
             let memory = |bytes| match request.shared_memory {
                 true => self.pool.take(bytes),
@@ -328,7 +343,7 @@ impl Service {
             };
             match replay.sample_in(request.rows, memory) {
                 Err(Unready::Wait(waiting)) => {
-                    let left = HOLD_MAX.saturating_sub(arrived.elapsed());
+                    let left = hold_max.saturating_sub(arrived.elapsed());
                     if left.is_zero() || self.shutdown.is_set() {
                         break Err(Unready::Wait(waiting));
                     }

@@ -204,6 +204,7 @@ fn everything_else_that_a_replay_server_takes() {
             &BatchRequest {
                 rows: 16,
                 shared_memory: false,
+                elsewhere: None,
             },
             &[],
         )
@@ -223,6 +224,7 @@ fn everything_else_that_a_replay_server_takes() {
             &BatchRequest {
                 rows,
                 shared_memory: false,
+                elsewhere: None,
             },
             &[],
         )

@@ -72,7 +72,10 @@ fn check_batch(batch: &Batch, history: &History) {
     }
     assert_eq!(batch.header.mean_age, ages as f64 / rows as f64);
     assert_eq!(batch.header.weights_versions, versions);
-    assert_eq!(batch.header.inserted_total, history.inserted);
+    assert_eq!(
+        (batch.header.tally.inserted, batch.header.held),
+        (history.inserted, history.inserted.min(history.capacity))
+    );
 }
 
 /// What an actor knows of itself.
