@@ -2,7 +2,7 @@
 //! What is stored, sampled and allowed is the core's; here is only who asks and when the answer goes out.
 //!
 //! Chunks and batch requests wait in bounded queues with a thread each, so that a blocked one never holds up the threads on
-//! which zenoh receives. Everything small is answered where it arrives.
+//! which zenoh receives. Compressing and unpacking frames is done by those threads, outside the lock on the core. Everything small is answered where it arrives.
 
 use std::{
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, mpsc},
@@ -18,7 +18,7 @@ use driml_protocol::{
 };
 use zenoh::{Session, Wait, query::Query, query::Queryable, sample::SampleKind};
 
-use crate::{Config, Replay, Unready};
+use crate::{Config, Packer, Replay, Unready};
 
 /// How long a chunk or a request waits at the limiter before it is told to come back: far below every sender's time-out.
 const HOLD_MAX: Duration = Duration::from_secs(1);
@@ -59,6 +59,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         spec_hash: spec.hash(),
         num_actions: spec.num_actions,
         config_toml: args.config_toml,
+        packer: replay.packer(),
         replay: Mutex::new(replay),
         changed: Condvar::new(),
         shutdown: shutdown.clone(),
@@ -109,6 +110,7 @@ struct Service {
     spec_hash: u64,
     num_actions: u32,
     config_toml: String,
+    packer: Packer,
     replay: Mutex<Replay>,
     /// Something was stored or sampled: whoever waits at the limiter looks again.
     changed: Condvar,
@@ -265,10 +267,11 @@ impl Service {
                 return self.reply(query, Kind::InsertReply, &refused);
             }
         };
+        let packed = self.packer.pack(&chunk);
         let arrived = Instant::now();
         let mut replay = self.replay();
         let reply = loop {
-            match replay.insert(&chunk) {
+            match replay.insert_packed(&packed) {
                 InsertReply::Wait { inserted_total } => {
                     let left = HOLD_MAX.saturating_sub(arrived.elapsed());
                     if left.is_zero() || self.shutdown.is_set() {
@@ -296,8 +299,8 @@ impl Service {
         };
         let arrived = Instant::now();
         let mut replay = self.replay();
-        let sampled = loop {
-            match replay.sample(request.rows) {
+        let drawn = loop {
+            match replay.draw(request.rows) {
                 Err(Unready::Wait(waiting)) => {
                     let left = HOLD_MAX.saturating_sub(arrived.elapsed());
                     if left.is_zero() || self.shutdown.is_set() {
@@ -305,15 +308,15 @@ impl Service {
                     }
                     replay = self.wait(replay, left);
                 }
-                sampled => break sampled,
+                drawn => break drawn,
             }
         };
         replay.note_learner_waited(arrived.elapsed().as_secs_f64());
         drop(replay);
-        match sampled {
-            Ok(batch) => {
+        match drawn {
+            Ok(draft) => {
                 self.changed.notify_all();
-                match batch.seal(self.spec_hash) {
+                match draft.unpack().seal(self.spec_hash) {
                     Ok((head, planes)) => {
                         session::answer(query, session::join_pieces([head, planes]))
                     }
