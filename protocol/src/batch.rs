@@ -361,6 +361,11 @@ impl BatchRowsMut<'_> {
         &mut self.frames_n[row * self.state_bytes..(row + 1) * self.state_bytes]
     }
 
+    /// Positives a row, P.
+    pub const fn positives(&self) -> usize {
+        self.positive_valid.len() / self.rows
+    }
+
     /// Marks `row` as having no positive `p`.
     pub fn no_positive(&mut self, p: usize, row: usize) {
         self.positive(p, row, 0).fill(0);

@@ -1,7 +1,8 @@
 //! The replay server as a process: zenoh around the core, waiting at the limiter, and the last word to everyone.
 //! What is stored, sampled and allowed is the core's; here is only who asks and when the answer goes out.
 //!
-//! Every kind of question has threads of its own, so that one that waits never holds up another.
+//! Every kind of question has threads of its own, so that one that waits never holds up another. Compressing and unpacking
+//! frames is done by those threads, outside the lock on the core.
 
 use std::{
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
@@ -21,7 +22,7 @@ use driml_protocol::{
 };
 use zenoh::{Session, Wait, bytes::ZBytes, query::Query, query::Queryable, sample::SampleKind};
 
-use crate::{Config, Replay, Unready};
+use crate::{Config, Packer, Replay, Unready};
 
 /// How long a chunk or a request waits at the limiter before it is told to come back: far below every sender's time-out.
 const HOLD_MAX: Duration = Duration::from_secs(1);
@@ -82,6 +83,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         shard: (args.shard, config.shards),
         config_toml: args.config_toml,
         pool,
+        packer: replay.packer(),
         replay: Mutex::new(replay),
         changed: Condvar::new(),
         shutdown: shutdown.clone(),
@@ -136,6 +138,7 @@ struct Service {
     config_toml: String,
     /// Memory for chunks that arrive and batches that leave.
     pool: PlanesPool,
+    packer: Packer,
     replay: Mutex<Replay>,
     /// Something was stored or sampled: whoever waits at the limiter looks again.
     changed: Condvar,
@@ -245,10 +248,11 @@ impl Service {
                 return self.reply(query, Kind::InsertReply, &refused);
             }
         };
+        let packed = self.packer.pack(&chunk);
         let arrived = Instant::now();
         let mut replay = self.replay();
         let reply = loop {
-            match replay.insert(&chunk) {
+            match replay.insert_packed(&packed) {
                 InsertReply::Wait { inserted_total } => {
                     let left = HOLD_MAX.saturating_sub(arrived.elapsed());
                     if left.is_zero() || self.shutdown.is_set() {
@@ -285,12 +289,12 @@ impl Service {
             None => HOLD_MAX,
         };
         let mut said = false;
-        let sampled = loop {
+        let drawn = loop {
             let memory = |bytes| match request.shared_memory {
                 true => self.pool.take(bytes),
                 false => self.pool.take_own(bytes),
             };
-            match replay.sample_in(request.rows, memory) {
+            match replay.draw_in(request.rows, memory) {
                 Err(Unready::Wait(waiting)) => {
                     // A chunk that waits may be let in to end this; once, or those who wait would wake each other for ever.
                     if !std::mem::replace(&mut said, true) {
@@ -302,15 +306,15 @@ impl Service {
                     }
                     replay = self.wait(replay, left);
                 }
-                sampled => break sampled,
+                drawn => break drawn,
             }
         };
         replay.note_learner_waited(arrived.elapsed().as_secs_f64());
         drop(replay);
-        match sampled {
-            Ok(batch) => {
+        match drawn {
+            Ok(draft) => {
                 self.changed.notify_all();
-                match batch.seal(self.spec_hash) {
+                match draft.unpack().seal(self.spec_hash) {
                     Ok((head, planes)) => {
                         session::answer(query, session::join_planes(head, planes.freeze()))
                     }
