@@ -18,6 +18,8 @@ use driml_protocol::{
 };
 use zenoh::{Session, qos::Priority};
 
+use crate::config::Config;
+
 /// After `Shutdown`, how long the chunks at hand may take to be stored.
 const DRAIN_MAX: Duration = Duration::from_secs(20);
 /// Pause between two tries when the replay server is out of reach.
@@ -25,13 +27,24 @@ const RETRY_PAUSE: Duration = Duration::from_millis(200);
 
 /// Limits of one delivery.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct DeliveryLimits {
+pub struct DeliveryLimits {
     /// Chunks waiting; at this many `send` waits.
-    pub(crate) chunks_in_flight_max: usize,
+    pub chunks_in_flight_max: usize,
     /// One try.
-    pub(crate) ack_timeout: Duration,
+    pub ack_timeout: Duration,
     /// All tries for one chunk without any answer.
-    pub(crate) unreachable_max: Duration,
+    pub unreachable_max: Duration,
+}
+
+impl DeliveryLimits {
+    /// The limits that an actor's settings ask for.
+    pub const fn of(config: &Config) -> Self {
+        Self {
+            chunks_in_flight_max: config.chunks_in_flight_max as usize,
+            ack_timeout: Duration::from_millis(config.ack_timeout_ms),
+            unreachable_max: Duration::from_millis(config.unreachable_max_ms),
+        }
+    }
 }
 
 /// What the replay server said last.
@@ -42,7 +55,7 @@ struct Answers {
 }
 
 /// A thread that delivers, and the queue to it.
-pub(crate) struct Delivery {
+pub struct Delivery {
     queue: mpsc::SyncSender<Chunk>,
     answers: Arc<Answers>,
     thread: JoinHandle<anyhow::Result<u64>>,
@@ -53,7 +66,7 @@ impl Delivery {
     ///
     /// # Errors
     /// The operating system gave no thread.
-    pub(crate) fn start(
+    pub fn start(
         session: Session,
         keys: Keys,
         spec_hash: u64,
@@ -86,17 +99,17 @@ impl Delivery {
     }
 
     /// Transitions that the run has stored, as of the last answer.
-    pub(crate) fn inserted_total(&self) -> u64 {
+    pub fn inserted_total(&self) -> u64 {
         self.answers.inserted_total.load(Ordering::Relaxed)
     }
 
     /// The run has all the transitions it wants.
-    pub(crate) fn is_finished(&self) -> bool {
+    pub fn is_finished(&self) -> bool {
         self.answers.finished.load(Ordering::Relaxed)
     }
 
     /// Queues a chunk, waiting while the queue is full. `false`: the thread has ended; [`Self::finish`] says why.
-    pub(crate) fn send(&self, chunk: Chunk) -> bool {
+    pub fn send(&self, chunk: Chunk) -> bool {
         self.queue.send(chunk).is_ok()
     }
 
@@ -104,7 +117,7 @@ impl Delivery {
     ///
     /// # Errors
     /// A chunk that could not be delivered.
-    pub(crate) fn finish(self) -> anyhow::Result<u64> {
+    pub fn finish(self) -> anyhow::Result<u64> {
         drop(self.queue);
         self.thread
             .join()

@@ -6,7 +6,7 @@
 pub mod acting;
 mod collect;
 mod config;
-mod delivery;
+pub mod delivery;
 pub mod evaluate;
 pub mod policy;
 pub mod recorder;

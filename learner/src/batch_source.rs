@@ -25,13 +25,13 @@ enum Fetched {
 }
 
 /// The queue of fetched batches.
-pub(crate) struct BatchSource {
+pub struct BatchSource {
     fetched: mpsc::Receiver<Fetched>,
     threads: u32,
 }
 
 /// What the learner gets when it asks for its next batch.
-pub(crate) enum Next {
+pub enum Next {
     /// One.
     Batch(Batch),
     /// None within the time given.
@@ -41,8 +41,11 @@ pub(crate) enum Next {
 }
 
 impl BatchSource {
-    /// Starts `threads` requests in a row.
-    pub(crate) fn start(
+    /// Starts `threads` requests in a row, for batches of `rows` rows of the run with this hash.
+    ///
+    /// # Errors
+    /// The operating system gave no thread.
+    pub fn start(
         session: &Session,
         keys: &Keys,
         spec_hash: u64,
@@ -68,7 +71,10 @@ impl BatchSource {
     }
 
     /// The next batch; batches that are on their way when the first thread hears of the end still come.
-    pub(crate) fn next(&mut self, timeout: Duration) -> anyhow::Result<Next> {
+    ///
+    /// # Errors
+    /// The replay server refused, or was out of reach for too long.
+    pub fn next(&mut self, timeout: Duration) -> anyhow::Result<Next> {
         let deadline = Instant::now() + timeout;
         while self.threads > 0 {
             let left = deadline.saturating_duration_since(Instant::now());

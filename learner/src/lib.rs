@@ -6,7 +6,7 @@
 pub mod affinity;
 pub mod auxiliary;
 pub mod batch;
-mod batch_source;
+pub mod batch_source;
 pub mod checkpoint;
 mod config;
 mod learning;

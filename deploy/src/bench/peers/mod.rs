@@ -1,0 +1,232 @@
+//! `driml bench peers`: ours and theirs in turn, round after round, and the ratio of each pair beside its goal.
+//! What is compared with what is in `pairs`; a goal that is missed is shown and is no error.
+
+mod pairs;
+mod script;
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use anyhow::Context;
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    bench::{
+        alone,
+        effort::median,
+        figures::{self, Figure, MachineNote},
+        peers::{
+            pairs::{PAIRS, Pair, Theirs},
+            script::{Absent, Peer, Script},
+        },
+        recording::Recording,
+        table,
+    },
+    cli::{BenchPart, BenchPeersArgs},
+};
+
+/// Rounds, and those of a quick comparison.
+const ROUNDS: (u32, u32) = (5, 1);
+
+/// What one side found in every round, by what was measured.
+type Samples = BTreeMap<String, Vec<f64>>;
+
+/// A part's figures, and its peer's or why there are none.
+#[derive(Debug, Default)]
+struct Sides {
+    ours: Samples,
+    theirs: Samples,
+    units: BTreeMap<String, String>,
+    peer: String,
+    absent: Option<String>,
+}
+
+/// One line of the comparison.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Row {
+    part: String,
+    what: String,
+    unit: String,
+    /// Median over the rounds.
+    ours: f64,
+    /// The peer, with its version.
+    peer: String,
+    /// Median over the rounds; none if skipped.
+    theirs: Option<f64>,
+    /// Median over the rounds of ours by theirs, as the machine's speed drifts from round to round.
+    ratio: Option<f64>,
+    /// The least ratio that is wanted, if one is.
+    goal: Option<f64>,
+    /// Why there is nothing of the peer's.
+    skipped: Option<String>,
+}
+
+/// The comparison as JSON has it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Comparison {
+    rounds: u32,
+    quick: bool,
+    threads: u32,
+    machine: MachineNote,
+    rows: Vec<Row>,
+}
+
+/// Measures, and reports.
+///
+/// # Errors
+/// A part of ours that failed, or a file that cannot be written. A peer that is missing or fails is reported as skipped.
+pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
+    let rounds = args.rounds.unwrap_or(match args.flags.quick {
+        true => ROUNDS.1,
+        false => ROUNDS.0,
+    });
+    let parts: BTreeSet<_> = match args.only.as_slice() {
+        [] => PAIRS.iter().map(|pair| pair.part).collect(),
+        only => only.iter().copied().collect(),
+    };
+    let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
+    script::write_all(folder.path())?;
+    let frames = folder.path().join("frames");
+    if parts.contains(&BenchPart::Replay) {
+        Recording::play()?.write_frames(&frames)?;
+    }
+    let mut sides = BTreeMap::new();
+    for &part in &parts {
+        let mut found = Sides::default();
+        let script = Script::new(part, args, folder.path(), &frames);
+        found.absent = script.check().err().map(|Absent(why)| why);
+        found.peer = script.peer().name().to_owned();
+        sides.insert(part, (script, found));
+    }
+    for round in 1..=rounds {
+        for (part, (script, sides)) in &mut sides {
+            eprintln!("round {round} of {rounds}: {} of ours", part.name());
+            sides.add_ours(alone::figures(*part, &args.flags)?);
+            if sides.absent.is_none() {
+                eprintln!("round {round} of {rounds}: {}", sides.peer);
+                match script.run() {
+                    Ok((peer, figures)) => sides.add_theirs(peer, figures),
+                    Err(Absent(why)) => sides.absent = Some(why),
+                }
+            }
+        }
+    }
+    let of_part = |pair: &&Pair| sides.contains_key(&pair.part);
+    let rows = PAIRS.iter().filter(of_part).map(|pair| {
+        let (_, sides) = &sides[&pair.part];
+        row(pair, sides).with_context(|| format!("comparing {:?}", pair.ours))
+    });
+    let comparison = Comparison {
+        rounds,
+        quick: args.flags.quick,
+        threads: args.flags.threads,
+        machine: MachineNote::this(),
+        rows: rows.collect::<anyhow::Result<_>>()?,
+    };
+    figures::publish(
+        &comparison,
+        &describe(&comparison),
+        args.flags.json.as_deref(),
+    )
+}
+
+impl Sides {
+    fn add_ours(&mut self, figures: Vec<Figure>) {
+        for Figure { what, value, unit } in figures {
+            self.units.insert(what.clone(), unit);
+            self.ours.entry(what).or_default().push(value);
+        }
+    }
+
+    fn add_theirs(&mut self, peer: String, figures: BTreeMap<String, f64>) {
+        self.peer = peer;
+        for (what, value) in figures {
+            self.theirs.entry(what).or_default().push(value);
+        }
+    }
+}
+
+/// Medians and ratio of one pair; none if ours was not measured.
+fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
+    let ours = sides.ours.get(pair.ours)?;
+    let (peer, theirs) = match pair.theirs {
+        Theirs::Peers(what) => (sides.peer.clone(), sides.theirs.get(what)),
+        Theirs::Ours(what, name) => (name.to_owned(), sides.ours.get(what)),
+    };
+    let ratios = |theirs: &Vec<f64>| {
+        let pairs = ours.iter().zip(theirs);
+        median(
+            &pairs
+                .map(|(ours, theirs)| ours / theirs)
+                .collect::<Vec<_>>(),
+        )
+    };
+    let skipped = match theirs {
+        Some(_) => None,
+        None => Some(
+            sides
+                .absent
+                .clone()
+                .unwrap_or_else(|| "it was not measured".into()),
+        ),
+    };
+    Some(Row {
+        part: pair.part.name().into(),
+        what: pair.ours.into(),
+        unit: sides.units.get(pair.ours)?.clone(),
+        ours: median(ours),
+        theirs: theirs.map(|theirs| median(theirs)),
+        ratio: theirs.map(ratios),
+        goal: pair.goal,
+        peer,
+        skipped,
+    })
+}
+
+/// The table, and below it why rows were skipped.
+fn describe(comparison: &Comparison) -> String {
+    let mut cells = vec![
+        ["what", "ours", "theirs", "", "", "ratio", "goal", ""]
+            .map(String::from)
+            .to_vec(),
+    ];
+    let mut skipped = BTreeSet::new();
+    for row in &comparison.rows {
+        let number = |value: Option<f64>| value.map_or("-".into(), table::number);
+        let verdict = match (row.ratio, row.goal) {
+            (None, _) => "skipped",
+            (_, None) => "",
+            (Some(ratio), Some(goal)) if ratio >= goal => "reached",
+            _ => "missed",
+        };
+        cells.push(vec![
+            row.what.clone(),
+            number(Some(row.ours)),
+            number(row.theirs),
+            row.unit.clone(),
+            row.peer.clone(),
+            number(row.ratio),
+            number(row.goal),
+            verdict.into(),
+        ]);
+        skipped.extend(row.skipped.iter().map(|why| format!("skipped: {why}\n")));
+    }
+    let Comparison {
+        rounds,
+        threads,
+        machine,
+        ..
+    } = comparison;
+    let mut text = table::aligned(&cells, &[1, 2, 5, 6]);
+    text.extend(skipped);
+    text.push_str(&format!(
+        "Medians of {rounds} rounds of ours, theirs; the ratio is the median of the rounds' ratios. {threads} threads; {}, {} cores.\n",
+        machine.processor, machine.cores
+    ));
+    if comparison.quick {
+        text.push_str("Quick: a few iterations only, no figures to go by.\n");
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests;
