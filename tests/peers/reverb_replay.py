@@ -29,8 +29,8 @@ ROWS = 256
 SPAN = 8
 ITEMS = {"batch of 3 states": [-8, -7, -1], "batch of sequences of 8 states": slice(-8, None)}
 WORKERS = 2
-# Steps of all streams between two waits for the server's confirmations.
-STEPS_PER_FLUSH = 32
+# Steps of all streams between two waits for the server's confirmations: as many items as an actor of ours has on their way.
+STEPS_PER_FLUSH = 128
 
 
 def serve(port):

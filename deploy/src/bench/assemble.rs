@@ -32,12 +32,15 @@ pub(super) fn measure(recording: &Recording, effort: &Effort) -> anyhow::Result<
         }
     }
     let sampling = effort.rate_by_median(|| match replay.sample(rows) {
-        Ok(batch) => Ok(drop(black_box(batch))),
+        Ok(batch) => {
+            black_box(batch);
+            Ok(())
+        }
         Err(why) => bail!("no batch: {why:?}"),
     })?;
     drop(replay);
 
-    let held = vec![1; CAPACITY as usize * frame_bytes];
+    let held = vec![1_u8; CAPACITY as usize * frame_bytes];
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let copying = effort.rate_by_median(|| {
         let mut copy = Vec::with_capacity(3 * rows as usize * frame_bytes);

@@ -8,10 +8,6 @@ use crate::cli::BenchFlags;
 /// How long each thing is measured.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Effort {
-    /// A few iterations only.
-    pub(super) quick: bool,
-    /// Threads for arithmetic.
-    pub(super) threads: u32,
     /// Calls before the first that counts.
     warmup_calls: u32,
     /// Calls that count, at least.
@@ -28,8 +24,6 @@ impl Effort {
             false => (2, 3, Duration::from_secs(4)),
         };
         Self {
-            quick: flags.quick,
-            threads: flags.threads,
             warmup_calls,
             calls_min,
             time_min,
@@ -107,8 +101,6 @@ mod tests {
     #[test]
     fn calls_are_counted_after_the_warm_up() {
         let effort = Effort {
-            quick: true,
-            threads: 1,
             warmup_calls: 2,
             calls_min: 3,
             time_min: Duration::ZERO,

@@ -183,7 +183,9 @@ impl Run {
             Next::NotYet => bail!("no batch came within {} s", ANSWER_MAX.as_secs()),
             Next::Finished => bail!("the replay server says that the run is over"),
         });
+        // A request that is on its way wants its answer before the session is closed.
         shutdown.set();
+        while !matches!(source.next(ANSWER_MAX)?, Next::Finished) {}
         rate
     }
 

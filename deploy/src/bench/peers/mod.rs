@@ -16,7 +16,7 @@ use crate::{
         figures::{self, Figure, MachineNote},
         peers::{
             pairs::{PAIRS, Pair, Theirs},
-            script::{Absent, Peer, Script},
+            script::{Absent, Script},
         },
         recording::Recording,
         table,
@@ -54,6 +54,8 @@ struct Row {
     theirs: Option<f64>,
     /// Median over the rounds of ours by theirs, as the machine's speed drifts from round to round.
     ratio: Option<f64>,
+    /// That of each round.
+    ratios: Vec<f64>,
     /// The least ratio that is wanted, if one is.
     goal: Option<f64>,
     /// Why there is nothing of the peer's.
@@ -149,25 +151,15 @@ impl Sides {
 fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
     let ours = sides.ours.get(pair.ours)?;
     let (peer, theirs) = match pair.theirs {
-        Theirs::Peers(what) => (sides.peer.clone(), sides.theirs.get(what)),
+        Theirs::Peers(what) if what == pair.ours => (sides.peer.clone(), sides.theirs.get(what)),
+        Theirs::Peers(what) => (format!("{}: {what}", sides.peer), sides.theirs.get(what)),
         Theirs::Ours(what, name) => (name.to_owned(), sides.ours.get(what)),
     };
-    let ratios = |theirs: &Vec<f64>| {
-        let pairs = ours.iter().zip(theirs);
-        median(
-            &pairs
-                .map(|(ours, theirs)| ours / theirs)
-                .collect::<Vec<_>>(),
-        )
-    };
-    let skipped = match theirs {
-        Some(_) => None,
-        None => Some(
-            sides
-                .absent
-                .clone()
-                .unwrap_or_else(|| "it was not measured".into()),
-        ),
+    let rounds = ours.iter().zip(theirs.into_iter().flatten());
+    let ratios: Vec<_> = rounds.map(|(ours, theirs)| ours / theirs).collect();
+    let absent = || match &sides.absent {
+        Some(why) => why.clone(),
+        None => format!("{peer} was not measured"),
     };
     Some(Row {
         part: pair.part.name().into(),
@@ -175,10 +167,11 @@ fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
         unit: sides.units.get(pair.ours)?.clone(),
         ours: median(ours),
         theirs: theirs.map(|theirs| median(theirs)),
-        ratio: theirs.map(ratios),
+        ratio: theirs.map(|_| median(&ratios)),
+        ratios,
         goal: pair.goal,
+        skipped: theirs.is_none().then(absent),
         peer,
-        skipped,
     })
 }
 
