@@ -110,11 +110,12 @@ class Learner:
         if self.weights:
             features_k = self.online.features(self.images(batch["frames_k"]))
             valid = batch["positive_valid"].bool()
+            all_valid = bool(valid.all())
             for pair in self.weights:
                 for head, features, given in (("psi" + pair[0], features_t, action), ("phi" + pair[2], features_k, None)):
                     if head not in vectors:
                         found = self.online.vectors(head, features, given)
-                        vectors[head] = found if valid.all() else found[valid]
+                        vectors[head] = found if all_valid else found[valid]
                 dim[pair] = info_nce(vectors["psi" + pair[0]], vectors["phi" + pair[2]], self.config["tanh_clip"])
         return kl, dim, kl + sum(self.weights[pair] * loss for pair, loss in dim.items())
 

@@ -113,7 +113,7 @@ impl Run {
             .chain(sets)
             .map(Into::into)
             .collect();
-        let mut server = Part::start("replay-server", &args, 1, folder, &Screen::new(0))?;
+        let mut server = Part::start("replay-server", &args, 1, folder, &Screen::plain())?;
         let session = reach(endpoint, &mut server)?;
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
         let hello = session::join(&session, &keys, &Shutdown::default())?

@@ -93,10 +93,14 @@ pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
     }
     let mut sides = BTreeMap::new();
     for &part in &parts {
-        let mut found = Sides::default();
         let script = Script::new(part, args, folder.path(), &frames);
-        found.absent = script.check().err().map(|Absent(why)| why);
-        found.peer = script.peer().name().to_owned();
+        let mut found = Sides {
+            peer: script.peer().name().to_owned(),
+            ..Sides::default()
+        };
+        if let Err(absent) = script.check() {
+            found.skip(absent);
+        }
         sides.insert(part, (script, found));
     }
     for round in 1..=rounds {
@@ -107,7 +111,7 @@ pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
                 eprintln!("round {round} of {rounds}: {}", sides.peer);
                 match script.run() {
                     Ok((peer, figures)) => sides.add_theirs(peer, figures),
-                    Err(Absent(why)) => sides.absent = Some(why),
+                    Err(absent) => sides.skip(absent),
                 }
             }
         }
@@ -144,6 +148,12 @@ impl Sides {
         for (what, value) in figures {
             self.theirs.entry(what).or_default().push(value);
         }
+    }
+
+    /// Goes on without the peer.
+    fn skip(&mut self, Absent(why): Absent) {
+        eprintln!("skipped: {why}");
+        self.absent = Some(why);
     }
 }
 
