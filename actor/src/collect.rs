@@ -2,7 +2,7 @@
 //! The processes and the lockstep mode run this same code; it neither sends nor waits.
 
 use anyhow::Context;
-use driml_protocol::Chunk;
+use driml_protocol::{Chunk, PlanesPool};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -20,13 +20,14 @@ pub struct Collector {
 }
 
 impl Collector {
-    /// Makes the world and the policy with its first weights. `epoch` tells this life of actor `actor` from others;
+    /// Makes the world and the policy with its first weights; chunks lie in memory of `pool`. `epoch` tells this life of actor `actor` from others;
     /// it does not influence what is computed.
     ///
     /// # Errors
     /// A world that cannot be made or does not fit the run spec, or weights that do not fit the model.
     pub fn new(
         settings: ActorSettings,
+        pool: PlanesPool,
         actor: u32,
         epoch: u64,
         weights_version: u64,
@@ -66,6 +67,7 @@ impl Collector {
         Ok(Self {
             acting: Acting::new(world, spec.frame_stack as usize, rng)?,
             recorder: Recorder::new(
+                pool,
                 actor,
                 epoch,
                 config.envs,

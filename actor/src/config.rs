@@ -1,7 +1,10 @@
 //! The actor's settings, and what it takes from the run's other tables.
 //! It fills in no number: presets do, with their sources.
 
-use driml_protocol::{RunSpec, config::Settings};
+use driml_protocol::{
+    PlanesPool, RunSpec,
+    config::{Settings, TransportConfig},
+};
 use serde::{Deserialize, Serialize};
 
 /// The `[actor]` table.
@@ -51,6 +54,8 @@ pub struct ActorSettings {
     pub model: driml_model::ModelConfig,
     /// The actor's own.
     pub actor: Config,
+    /// How messages travel.
+    pub transport: TransportConfig,
 }
 
 impl ActorSettings {
@@ -66,11 +71,26 @@ impl ActorSettings {
             input: settings.table("input")?,
             model: settings.table("model")?,
             actor: settings.table("actor")?,
+            transport: settings.table("transport")?,
         };
         this.spec.validate()?;
         this.model.validate()?;
         this.actor.validate()?;
         Ok(this)
+    }
+}
+
+impl ActorSettings {
+    /// Memory for the chunks of one actor: one that is filled, and those that are not acknowledged.
+    pub fn chunk_memory(&self) -> PlanesPool {
+        let count = self.actor.chunks_in_flight_max as usize + 1;
+        let transitions = self.actor.envs as usize * self.actor.steps_per_chunk as usize;
+        if self.transport.shared_memory {
+            // A frame, an action, an end and a reward each.
+            PlanesPool::shared(count, count, transitions * (self.spec.frame_bytes() + 6))
+        } else {
+            PlanesPool::new(count)
+        }
     }
 }
 

@@ -2,7 +2,7 @@
 //! It does not send them.
 
 use driml_envs::StepEnd;
-use driml_protocol::{Chunk, ChunkHeader, End};
+use driml_protocol::{Chunk, ChunkHeader, End, PlanesPool};
 
 /// What a world ended, in the words of the wire.
 pub const fn end_on_the_wire(end: StepEnd) -> End {
@@ -17,6 +17,7 @@ pub const fn end_on_the_wire(end: StepEnd) -> End {
 /// Fills chunk after chunk.
 #[derive(Debug)]
 pub struct Recorder {
+    pool: PlanesPool,
     header: ChunkHeader,
     chunk: Chunk,
     filled_steps: u32,
@@ -24,7 +25,17 @@ pub struct Recorder {
 
 impl Recorder {
     /// A recorder for `streams` copies whose chunks have `steps` steps each.
-    pub fn new(actor: u32, epoch: u64, streams: u32, steps: u32, frame_bytes: u32) -> Self {
+    ///
+    /// # Panics
+    /// If a chunk would be larger than the address space.
+    pub fn new(
+        pool: PlanesPool,
+        actor: u32,
+        epoch: u64,
+        streams: u32,
+        steps: u32,
+        frame_bytes: u32,
+    ) -> Self {
         let header = ChunkHeader {
             actor,
             epoch,
@@ -38,7 +49,8 @@ impl Recorder {
         };
         Self {
             header,
-            chunk: Chunk::zeroed(header),
+            chunk: fresh(&pool, header),
+            pool,
             filled_steps: 0,
         }
     }
@@ -87,8 +99,15 @@ impl Recorder {
         self.header.first_transition = self.produced();
         self.header.sequence += 1;
         self.filled_steps = 0;
-        std::mem::replace(&mut self.chunk, Chunk::zeroed(self.header))
+        std::mem::replace(&mut self.chunk, fresh(&self.pool, self.header))
     }
+}
+
+fn fresh(pool: &PlanesPool, header: ChunkHeader) -> Chunk {
+    let bytes = header
+        .planes_bytes()
+        .expect("an actor's chunk is far below the address space");
+    Chunk::in_memory(header, pool.take(bytes))
 }
 
 #[cfg(test)]
@@ -97,7 +116,7 @@ mod tests {
 
     #[test]
     fn chunks_are_numbered_and_stream_major() {
-        let mut recorder = Recorder::new(7, 9, 2, 3, 1);
+        let mut recorder = Recorder::new(PlanesPool::new(1), 7, 9, 2, 3, 1);
         let ends = [StepEnd::Running, StepEnd::Terminal];
         let mut chunks = Vec::new();
         for step in 0..7_u8 {

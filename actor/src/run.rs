@@ -60,8 +60,15 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     };
     let limits = DeliveryLimits::of(&settings.actor);
     let envs = settings.actor.envs;
-    let mut collector =
-        Collector::new(settings, args.actor, new_epoch(), header.version, &weights)?;
+    let pool = settings.chunk_memory();
+    let mut collector = Collector::new(
+        settings,
+        pool.clone(),
+        args.actor,
+        new_epoch(),
+        header.version,
+        &weights,
+    )?;
     let newest = weight_watch::watch(
         session.clone(),
         keys.clone(),
@@ -80,6 +87,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         spec_hash,
         hello.inserted_total,
         limits,
+        pool,
         shutdown.clone(),
     )?;
     tracing::info!(

@@ -137,6 +137,7 @@ fn pull(session: &Session, keys: &Keys, spec_hash: u64) -> anyhow::Result<Weight
         Priority::DataLow,
         PULL_TIMEOUT,
     )?;
+    let bytes = bytes.to_bytes();
     let (header, planes) = WeightsHeader::decode(&bytes, spec_hash)?;
     Ok((header, planes.to_vec()))
 }

@@ -63,6 +63,9 @@ pub(crate) struct RunFlags {
     /// Actor processes [default: by cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
     pub(crate) actors: Option<u32>,
+    /// Replay servers among which the actors and the memory are spread [default: 1]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub(crate) replay_shards: Option<u32>,
     /// Copies of the world in each actor [default: 16]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub(crate) envs: Option<u32>,
@@ -123,7 +126,7 @@ pub(crate) struct ActorArgs {
 
 #[derive(Debug, Args)]
 pub(crate) struct LearnerArgs {
-    /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; may be given several times
+    /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; once for each of the run's replay shards
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) connect: Vec<String>,
     /// Where checkpoints go: DIR/checkpoints
@@ -141,6 +144,9 @@ pub(crate) struct ReplayServerArgs {
     /// Router to connect to as well
     #[arg(long, value_name = "ENDPOINT")]
     pub(crate) connect: Vec<String>,
+    /// Which of the run's --replay-shards this is
+    #[arg(long, value_name = "I", default_value_t = 0)]
+    pub(crate) shard: u32,
     #[command(flatten)]
     pub(crate) run: RunFlags,
     #[command(flatten)]

@@ -4,7 +4,7 @@
 use driml_envs::{WorldConfig, WorldName};
 use driml_learner::EstimatorKind;
 use driml_model::ModelConfig;
-use driml_protocol::{Horizon, RunSpec};
+use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -65,6 +65,7 @@ pub(crate) struct Flags {
     pub(crate) actors: Option<u32>,
     pub(crate) envs: Option<u32>,
     pub(crate) frames: Option<u64>,
+    pub(crate) replay_shards: Option<u32>,
     pub(crate) seed: Option<u64>,
     pub(crate) sets: Vec<String>,
 }
@@ -108,6 +109,7 @@ pub(crate) fn resolve(
         ("local.actors", flags.actors.map(u64::from)),
         ("actor.envs", flags.envs.map(u64::from)),
         ("replay.transitions_max", flags.frames),
+        ("replay.shards", flags.replay_shards.map(u64::from)),
         ("run.seed", flags.seed),
     ];
     for (path, value) in by_flag {
@@ -213,7 +215,15 @@ fn read<T: DeserializeOwned>(table: &Table, name: &'static str) -> Result<T, Usa
 /// Reads every table as its part will.
 fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
     let tables = [
-        "run", "world", "input", "actor", "replay", "learner", "model", "local",
+        "run",
+        "world",
+        "input",
+        "actor",
+        "replay",
+        "learner",
+        "model",
+        "transport",
+        "local",
     ];
     if let Some(other) = table.keys().find(|key| !tables.contains(&key.as_str())) {
         return Err(usage!(
@@ -222,6 +232,7 @@ fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
         ));
     }
     let _: driml_actor::InputSize = read(table, "input")?;
+    let _: TransportConfig = read(table, "transport")?;
     Ok(RunConfig {
         run: read(table, "run")?,
         world: read(table, "world")?,

@@ -143,6 +143,7 @@ fn replay_server(args: ReplayServerArgs) -> anyhow::Result<()> {
         listen: args.listen,
         connect: args.connect,
         namespace: args.join.namespace,
+        shard: args.shard,
         config_toml: config.to_toml(),
     };
     driml_replay_server::run(run, &shutdown)

@@ -30,6 +30,13 @@ pub(crate) fn run(args: LocalArgs) -> anyhow::Result<()> {
     let machine = Machine::this();
     let (config, from) = resolve(&args.run, &machine)?;
     check_endpoints(args.listen.as_slice())?;
+    let (shards, actors) = (config.replay.shards, config.local.actors);
+    if shards > actors {
+        return Err(usage!(
+            "{shards} replay shards for {actors} actors: a shard without actors would stay empty; add --actors {shards} or use fewer shards"
+        )
+        .into());
+    }
     let run_dir = args.run_dir.unwrap_or_else(|| default_run_dir(&config.run));
     record::check_free(&run_dir)?;
     print(&plan::describe(
@@ -43,6 +50,12 @@ pub(crate) fn run(args: LocalArgs) -> anyhow::Result<()> {
         procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
     }
     if args.lockstep {
+        if shards > 1 {
+            return Err(usage!(
+                "--lockstep runs everything in one process, with one replay: leave --replay-shards out"
+            )
+            .into());
+        }
         lockstep::run(&config, &run_dir)
     } else {
         processes::run(&config, &run_dir, args.listen)
@@ -58,6 +71,7 @@ pub(crate) fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, 
         actors: args.actors,
         envs: args.envs,
         frames: args.frames,
+        replay_shards: args.replay_shards,
         seed: args.seed,
         sets: args.sets.clone(),
     };

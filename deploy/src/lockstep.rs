@@ -9,7 +9,7 @@ use std::{
 use anyhow::{Context, bail};
 use driml_actor::{ActorSettings, Collector};
 use driml_learner::{LearnerPart, Learning};
-use driml_protocol::{Batch, Goodbye, InsertReply, LearnerStatus, Shutdown};
+use driml_protocol::{Batch, Goodbye, InsertReply, LearnerStatus, PlanesPool, Shutdown};
 use driml_replay_server::{Replay, Unready};
 
 use crate::{
@@ -99,7 +99,16 @@ impl Parts {
             weights_sha256: header.sha256_hex(),
             ..LearnerStatus::default()
         };
-        let actor = |id| Collector::new(settings.clone(), id, EPOCH, header.version, &weights);
+        let actor = |id| {
+            Collector::new(
+                settings.clone(),
+                PlanesPool::new(1),
+                id,
+                EPOCH,
+                header.version,
+                &weights,
+            )
+        };
         let actors = (0..config.local.actors)
             .map(actor)
             .collect::<anyhow::Result<Vec<_>>>()?;

@@ -118,9 +118,13 @@ pub(crate) fn describe(
     let processes = if lockstep {
         "one, all parts in lockstep".into()
     } else {
+        let servers = match replay.shards {
+            1 => "replay server".into(),
+            shards => format!("{shards} replay servers"),
+        };
         let actors = if local.actors == 1 { "actor" } else { "actors" };
         format!(
-            "replay server; learner with {} threads; {} {actors} with {} copies of the world each",
+            "{servers}; learner with {} threads; {} {actors} with {} copies of the world each",
             local.learner_threads, local.actors, actor.envs
         )
     };

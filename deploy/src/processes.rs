@@ -55,9 +55,12 @@ pub(crate) fn run(
     listen: Option<String>,
 ) -> anyhow::Result<()> {
     let interrupts = Interrupts::listen().context("listening for signals")?;
+    let servers = server_names(config.replay.shards);
     let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
-    let names: Vec<_> = ["replay-server".into(), "learner".into()]
-        .into_iter()
+    let names: Vec<_> = servers
+        .iter()
+        .cloned()
+        .chain(["learner".into()])
         .chain(actors)
         .collect();
     let mut recorder = Recorder::create(run_dir, &config.to_toml(), &names)?;
@@ -66,18 +69,21 @@ pub(crate) fn run(
         .prefix("driml-")
         .tempdir()
         .context("making a folder for the socket")?;
-    let endpoint = listen.unwrap_or_else(|| {
-        format!(
-            "unixsock-stream/{}",
-            meeting.path().join("driml.sock").display()
-        )
-    });
+    let socket = |name: &String| {
+        let path = meeting.path().join(format!("{name}.sock"));
+        format!("unixsock-stream/{}", path.display())
+    };
+    let mut endpoints: Vec<_> = servers.iter().map(socket).collect();
+    if let Some(listen) = listen {
+        endpoints[0] = listen;
+    }
     let screen = Screen::new(config.frames());
     let display = Display::new(screen.clone(), config.frames(), config.updates());
     let mut launch = Launch {
         config,
         run_dir,
-        endpoint,
+        servers,
+        endpoints,
         screen,
         display,
         interrupts,
@@ -87,6 +93,7 @@ pub(crate) fn run(
 
     let ran = launch.start_and_watch(&mut recorder);
     let ended = launch.end(&ran);
+    session::sweep_shared_memory();
     launch.screen.clear();
     let outcome = match (&ran, &ended) {
         (Ok(Outcome::Finished), Ok(())) => Outcome::Finished,
@@ -107,21 +114,36 @@ pub(crate) fn run(
 struct Launch<'a> {
     config: &'a RunConfig,
     run_dir: &'a Path,
-    endpoint: String,
+    /// Names of the replay servers, one a shard, and where each listens.
+    servers: Vec<String>,
+    endpoints: Vec<String>,
     screen: Screen,
     display: Display,
     interrupts: Interrupts,
-    /// Replay server, learner, actors, in this order, as far as they were started.
+    /// Replay servers, learner, actors, in this order, as far as they were started.
     parts: Vec<Part>,
     statuses: Option<Statuses>,
 }
 
-/// Places in `Launch::parts`.
-const REPLAY: usize = 0;
-const LEARNER: usize = 1;
-const FIRST_ACTOR: usize = 2;
+/// `replay-server`, or one for each of several shards.
+fn server_names(shards: u32) -> Vec<String> {
+    match shards {
+        1 => vec!["replay-server".into()],
+        _ => (0..shards).map(|i| format!("replay-server-{i}")).collect(),
+    }
+}
 
 impl Launch<'_> {
+    /// The learner's place in `parts`.
+    fn learner(&self) -> usize {
+        self.servers.len()
+    }
+
+    /// The first actor's place in `parts`.
+    fn first_actor(&self) -> usize {
+        self.servers.len() + 1
+    }
+
     fn start_and_watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
         let logs = self.run_dir.join("logs");
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
@@ -133,36 +155,36 @@ impl Launch<'_> {
                 .collect::<Vec<_>>()
         };
         let exit = "--exit-with-parent";
-        let args = part(&[
-            "replay-server",
-            "--listen",
-            &self.endpoint,
-            "--config",
-            &config,
-            exit,
-        ]);
-        self.parts.push(Part::start(
-            "replay-server",
-            &args,
-            PART_THREADS,
-            &logs,
-            &self.screen,
-        )?);
-        let Some(session) = self.connect()? else {
-            return Ok(Outcome::Interrupted);
-        };
+        for (shard, (name, endpoint)) in self.servers.iter().zip(&self.endpoints).enumerate() {
+            let shard = shard.to_string();
+            let args = part(&[
+                "replay-server",
+                "--listen",
+                endpoint,
+                "--shard",
+                &shard,
+                "--config",
+                &config,
+                exit,
+            ]);
+            let server = Part::start(name, &args, PART_THREADS, &logs, &self.screen)?;
+            self.parts.push(server);
+        }
+        let mut sessions = Vec::new();
+        for endpoint in self.endpoints.clone() {
+            match self.connect(&endpoint)? {
+                Some(session) => sessions.push(session),
+                None => return Ok(Outcome::Interrupted),
+            }
+        }
         let keys = Keys::new(NAMESPACE).map_err(Usage)?;
-        self.statuses = Some(Statuses::new(session, keys, self.config.run.hash()));
+        self.statuses = Some(Statuses::new(sessions, keys, self.config.run.hash()));
 
         let folder = self.run_dir.display().to_string();
-        let args = part(&[
-            "learner",
-            "--connect",
-            &self.endpoint,
-            "--run-dir",
-            &folder,
-            exit,
-        ]);
+        let mut args = part(&["learner", "--run-dir", &folder, exit]);
+        for endpoint in &self.endpoints {
+            args.extend(part(&["--connect", endpoint]));
+        }
         self.parts.push(Part::start(
             "learner",
             &args,
@@ -174,7 +196,7 @@ impl Launch<'_> {
             let args = part(&[
                 "actor",
                 "--connect",
-                &self.endpoint,
+                &self.endpoints[id as usize % self.endpoints.len()],
                 "--id",
                 &id.to_string(),
                 exit,
@@ -191,10 +213,10 @@ impl Launch<'_> {
     }
 
     /// A session to the replay server as soon as it listens; none if a person was faster.
-    fn connect(&mut self) -> anyhow::Result<Option<zenoh::Session>> {
+    fn connect(&mut self, endpoint: &str) -> anyhow::Result<Option<zenoh::Session>> {
         let endpoints = Endpoints {
             listen: Vec::new(),
-            connect: vec![self.endpoint.clone()],
+            connect: vec![endpoint.to_owned()],
         };
         let deadline = Instant::now() + LISTEN_MAX;
         loop {
@@ -211,8 +233,7 @@ impl Launch<'_> {
                     Ok(opened) => break opened,
                     Err(_) if Instant::now() > deadline => {
                         bail!(
-                            "the replay server does not listen on {} after {}",
-                            self.endpoint,
+                            "the replay server does not listen on {endpoint} after {}",
                             duration(LISTEN_MAX)
                         )
                     }
@@ -282,9 +303,10 @@ impl Launch<'_> {
 
     /// Whether all parts are as they should be: running, or actors that are not needed any more.
     fn check_alive(&mut self) -> anyhow::Result<()> {
+        let first_actor = self.first_actor();
         for (at, part) in self.parts.iter_mut().enumerate() {
             if let Some(status) = part.end()
-                && !(at >= FIRST_ACTOR && status.success())
+                && !(at >= first_actor && status.success())
             {
                 bail!("{}", part.obituary());
             }
@@ -311,8 +333,9 @@ impl Launch<'_> {
         };
         let mut late = Vec::new();
         let last = self.parts.len();
+        let (learner, first_actor) = (self.learner().min(last), self.first_actor().min(last));
         // When the run is finished, actors hear it from the replay server and end by themselves.
-        let actors = self.stop(FIRST_ACTOR.min(last)..last, !finished, actors_max, &hurry);
+        let actors = self.stop(first_actor..last, !finished, actors_max, &hurry);
         if finished {
             late.extend(actors);
         } else {
@@ -322,12 +345,7 @@ impl Launch<'_> {
                 .for_each(|actor| self.screen.line(&format!("while stopping, {actor}")));
         }
         self.hear_the_learner_out(&hurry);
-        late.extend(self.stop(
-            LEARNER.min(last)..FIRST_ACTOR.min(last),
-            true,
-            LEARNER_DRAIN_MAX,
-            &hurry,
-        ));
+        late.extend(self.stop(learner..first_actor, true, LEARNER_DRAIN_MAX, &hurry));
         if let Some(statuses) = &mut self.statuses {
             if let Err(e) = statuses.ask_replay() {
                 tracing::debug!("the replay server's last word: {e:#}");
@@ -335,7 +353,7 @@ impl Launch<'_> {
             // Before its router goes away, so that it does not try to reach it again.
             statuses.close();
         }
-        late.extend(self.stop(REPLAY..LEARNER.min(last), true, REPLAY_DRAIN_MAX, &hurry));
+        late.extend(self.stop(0..learner, true, REPLAY_DRAIN_MAX, &hurry));
         if hurry() {
             bail!("ended at once by an interrupt: what was not saved is lost");
         }
@@ -347,7 +365,8 @@ impl Launch<'_> {
 
     /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
     fn hear_the_learner_out(&mut self, hurry: &impl Fn() -> bool) {
-        let Some(learner) = self.parts.get_mut(LEARNER) else {
+        let at = self.learner();
+        let Some(learner) = self.parts.get_mut(at) else {
             return;
         };
         learner.ask_to_stop();

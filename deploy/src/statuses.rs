@@ -4,10 +4,7 @@
 use std::time::Duration;
 
 use anyhow::Context;
-use driml_protocol::{
-    Keys, Kind, LearnerStatus, ReplayStatus, codec,
-    session::{self, SessionError},
-};
+use driml_protocol::{Keys, Kind, LearnerStatus, ReplayStatus, codec, session};
 use serde::de::DeserializeOwned;
 use zenoh::{Session, Wait, bytes::ZBytes, qos::Priority};
 
@@ -16,20 +13,21 @@ const ANSWER_MAX: Duration = Duration::from_secs(2);
 
 /// A client of a run that asks its parts how they are.
 pub(crate) struct Statuses {
-    session: Session,
+    /// One for each shard of the replay.
+    sessions: Vec<Session>,
     keys: Keys,
     spec_hash: u64,
-    /// The replay server's last answer.
+    /// The replay servers' last answers, as of one.
     pub(crate) replay: ReplayStatus,
     /// The learner's last answer.
     pub(crate) learner: LearnerStatus,
 }
 
 impl Statuses {
-    /// A client over an open session.
-    pub(crate) fn new(session: Session, keys: Keys, spec_hash: u64) -> Self {
+    /// A client over open sessions, one for each shard of the replay.
+    pub(crate) fn new(sessions: Vec<Session>, keys: Keys, spec_hash: u64) -> Self {
         Self {
-            session,
+            sessions,
             keys,
             spec_hash,
             replay: ReplayStatus::default(),
@@ -37,13 +35,18 @@ impl Statuses {
         }
     }
 
-    /// Asks the replay server.
+    /// Asks the replay servers.
     ///
     /// # Errors
     /// No answer in time, or one that is not of this run.
     pub(crate) fn ask_replay(&mut self) -> anyhow::Result<()> {
         let key = self.keys.replay_status();
-        self.replay = self.ask(&key, Kind::ReplayStatus)?;
+        let answers = self
+            .sessions
+            .iter()
+            .map(|session| self.ask(session, &key, Kind::ReplayStatus));
+        let shards = answers.collect::<anyhow::Result<Vec<_>>>()?;
+        self.replay = ReplayStatus::merged(&shards);
         Ok(())
     }
 
@@ -53,27 +56,38 @@ impl Statuses {
     /// No answer in time, or one that is not of this run.
     pub(crate) fn ask_learner(&mut self) -> anyhow::Result<()> {
         let key = self.keys.learner_status();
-        self.learner = self.ask(&key, Kind::LearnerStatus)?;
+        let session = self
+            .sessions
+            .first()
+            .context("a run has at least one replay server")?;
+        self.learner = self.ask(session, &key, Kind::LearnerStatus)?;
         Ok(())
     }
 
-    fn ask<T: DeserializeOwned>(&self, key: &str, kind: Kind) -> anyhow::Result<T> {
-        let reply: Result<Vec<u8>, SessionError> = session::ask(
-            &self.session,
+    fn ask<T: DeserializeOwned>(
+        &self,
+        session: &Session,
+        key: &str,
+        kind: Kind,
+    ) -> anyhow::Result<T> {
+        let answer = session::ask(
+            session,
             key,
             ZBytes::new(),
             Priority::InteractiveHigh,
             ANSWER_MAX,
-        );
-        let (status, _) =
-            codec::decode(&reply?, kind, Some(self.spec_hash)).with_context(|| key.to_owned())?;
+        )?;
+        let (status, _) = codec::decode(&answer.to_bytes(), kind, Some(self.spec_hash))
+            .with_context(|| key.to_owned())?;
         Ok(status)
     }
 
     /// Leaves the run; the last answers stay.
     pub(crate) fn close(&self) {
-        if let Err(e) = self.session.close().wait() {
-            tracing::debug!("closing the session: {e}");
+        for session in &self.sessions {
+            if let Err(e) = session.close().wait() {
+                tracing::debug!("closing the session: {e}");
+            }
         }
     }
 }

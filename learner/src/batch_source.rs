@@ -2,13 +2,23 @@
 //! It does not reorder or keep batches: what arrives first is learned from first.
 
 use std::{
-    sync::mpsc,
+    sync::{Arc, Mutex, PoisonError, mpsc},
+    thread::JoinHandle,
     time::{Duration, Instant},
 };
 
 use anyhow::{Context, bail};
-use driml_protocol::{Batch, BatchReply, BatchRequest, Keys, Kind, Shutdown, codec, session};
-use zenoh::{Session, qos::Priority};
+use driml_protocol::{
+    Batch, BatchHeader, BatchReply, BatchRequest, Keys, Kind, PlanesPool, ReplayStatus, Shutdown,
+    Tally, codec,
+    session::{self, Asked, SessionError},
+    shutdown::join_within,
+};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use zenoh::{Session, bytes::ZBytes, qos::Priority};
+
+use crate::shards::{self, Count};
 
 /// One request; the replay server answers within a second, if only to say that there is nothing yet.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
@@ -16,6 +26,25 @@ const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// How long the replay server may be out of reach before the learner gives up.
 const UNREACHABLE_MAX: Duration = Duration::from_secs(60);
+
+/// Pause before shards that hold nothing are asked again.
+const LOOK_AGAIN: Duration = Duration::from_millis(50);
+/// How long the threads may take to end.
+const THREADS_END_MAX: Duration = Duration::from_secs(2);
+
+/// After a batch in shared memory was lost, how many come through the socket before shared memory is tried again.
+const AVOID_COUNT: u32 = 64;
+
+/// What is asked for, and how.
+#[derive(Clone, Copy, Debug)]
+pub struct Requests {
+    /// Rows of a batch.
+    pub rows: u32,
+    /// Requests on their way at once, and threads that wait for them.
+    pub in_flight: u32,
+    /// Whether batches may come through shared memory.
+    pub shared_memory: bool,
+}
 
 /// What a fetching thread says.
 enum Fetched {
@@ -27,7 +56,9 @@ enum Fetched {
 /// The queue of fetched batches.
 pub struct BatchSource {
     fetched: mpsc::Receiver<Fetched>,
-    threads: u32,
+    /// Threads that have not said that they are finished.
+    fetching: u32,
+    threads: Vec<JoinHandle<()>>,
 }
 
 /// What the learner gets when it asks for its next batch.
@@ -41,46 +72,65 @@ pub enum Next {
 }
 
 impl BatchSource {
-    /// Starts `threads` requests in a row, for batches of `rows` rows of the run with this hash.
+    /// Starts asking.
     ///
     /// # Errors
     /// The operating system gave no thread.
     pub fn start(
-        session: &Session,
+        sessions: &[Session],
         keys: &Keys,
         spec_hash: u64,
-        rows: u32,
-        threads: u32,
+        requests: Requests,
         shutdown: &Shutdown,
     ) -> std::io::Result<Self> {
         let (sender, fetched) = mpsc::sync_channel(0);
-        for i in 0..threads {
+        // A batch a thread, and the one that is learned from.
+        let pool = PlanesPool::new(requests.in_flight as usize + sessions.len());
+        let making = Arc::new(Mutex::new(Making::new(sessions.len())));
+        let mut threads = Vec::new();
+        for i in 0..requests.in_flight {
             let fetcher = Fetcher {
-                session: session.clone(),
-                key: keys.batch(),
+                sessions: sessions.to_vec(),
+                keys: keys.clone(),
+                making: making.clone(),
+                // Which rows come from which shard follows from the order of answers, so this need not be the run's.
+                rng: ChaCha8Rng::from_os_rng(),
                 spec_hash,
-                rows,
+                requests,
+                pool: pool.clone(),
+                by_socket: 0,
                 shutdown: shutdown.clone(),
             };
             let sender = sender.clone();
-            std::thread::Builder::new()
+            let thread = std::thread::Builder::new()
                 .name(format!("batches-{i}"))
                 .spawn(move || fetcher.run(&sender))?;
+            threads.push(thread);
         }
-        Ok(Self { fetched, threads })
+        Ok(Self {
+            fetched,
+            fetching: requests.in_flight,
+            threads,
+        })
+    }
+
+    /// Waits for the threads' end, which the end of the session brings about.
+    pub fn end(self) {
+        drop(self.fetched);
+        join_within(self.threads, THREADS_END_MAX);
     }
 
     /// The next batch; batches that are on their way when the first thread hears of the end still come.
     ///
     /// # Errors
-    /// The replay server refused, or was out of reach for too long.
+    /// The replay server was out of reach for too long, or refuses.
     pub fn next(&mut self, timeout: Duration) -> anyhow::Result<Next> {
         let deadline = Instant::now() + timeout;
-        while self.threads > 0 {
+        while self.fetching > 0 {
             let left = deadline.saturating_duration_since(Instant::now());
             match self.fetched.recv_timeout(left) {
                 Ok(Fetched::Batch(batch)) => return Ok(Next::Batch(batch)),
-                Ok(Fetched::Finished) => self.threads -= 1,
+                Ok(Fetched::Finished) => self.fetching -= 1,
                 Ok(Fetched::Failed(e)) => return Err(e),
                 Err(mpsc::RecvTimeoutError::Timeout) => return Ok(Next::NotYet),
                 Err(mpsc::RecvTimeoutError::Disconnected) => break,
@@ -90,16 +140,40 @@ impl BatchSource {
     }
 }
 
+/// The one batch that is put together from the parts of several shards. It outlives a failed try, because a part that was
+/// given is counted as sampled.
+struct Making {
+    counts: Vec<Count>,
+    /// Rows that are still to come from each shard.
+    pending: Vec<u32>,
+    parts: Vec<Batch>,
+}
+
+impl Making {
+    fn new(shards: usize) -> Self {
+        Self {
+            counts: vec![Count::default(); shards],
+            pending: vec![0; shards],
+            parts: Vec::new(),
+        }
+    }
+}
+
 struct Fetcher {
-    session: Session,
-    key: String,
+    sessions: Vec<Session>,
+    keys: Keys,
+    making: Arc<Mutex<Making>>,
+    rng: ChaCha8Rng,
     spec_hash: u64,
-    rows: u32,
+    requests: Requests,
+    pool: PlanesPool,
+    /// Batches that are still to come through the socket.
+    by_socket: u32,
     shutdown: Shutdown,
 }
 
 impl Fetcher {
-    fn run(self, sender: &mpsc::SyncSender<Fetched>) {
+    fn run(mut self, sender: &mpsc::SyncSender<Fetched>) {
         let mut answered = Instant::now();
         while !self.shutdown.is_set() {
             let fetched = match self.fetch() {
@@ -125,26 +199,144 @@ impl Fetcher {
         }
     }
 
-    /// One request; `None` where the replay server has nothing yet.
-    fn fetch(&self) -> anyhow::Result<Option<Fetched>> {
-        let request = BatchRequest { rows: self.rows };
-        let request = codec::encode(Kind::BatchRequest, self.spec_hash, &request, &[])?;
-        let bytes = session::ask(
-            &self.session,
-            &self.key,
-            request.into(),
+    /// One batch; `None` where the replay has nothing yet.
+    fn fetch(&mut self) -> anyhow::Result<Option<Fetched>> {
+        if self.sessions.len() > 1 {
+            return self.fetch_parts();
+        }
+        let asked = self.ask(0, self.requests.rows, None)?;
+        Ok(match self.answer(asked)? {
+            Answer::Batch(batch) => Some(Fetched::Batch(batch)),
+            Answer::Wait => None,
+            Answer::Finished => Some(Fetched::Finished),
+        })
+    }
+
+    /// One batch, put together from what the shards give. One is put together at a time: each shard is told what the others
+    /// give, so that their rate limiters decide as one.
+    fn fetch_parts(&mut self) -> anyhow::Result<Option<Fetched>> {
+        let making = self.making.clone();
+        let mut making = making.lock().unwrap_or_else(PoisonError::into_inner);
+        let Making {
+            counts,
+            pending,
+            parts,
+        } = &mut *making;
+        if parts.is_empty() && pending.iter().all(|&rows| rows == 0) {
+            match shards::split(self.requests.rows, counts, &mut self.rng) {
+                Some(split) => *pending = split,
+                None => {
+                    self.shutdown.wait_timeout(LOOK_AGAIN);
+                    return self.recount(counts).map(|()| None);
+                }
+            }
+        }
+        let mut asked = Vec::new();
+        for shard in (0..pending.len()).filter(|&shard| pending[shard] > 0) {
+            let elsewhere = shards::elsewhere(counts, pending, shard);
+            asked.push((shard, self.ask(shard, pending[shard], Some(elsewhere))?));
+        }
+        let mut finished = false;
+        for (shard, asked) in asked {
+            match self.answer(asked)? {
+                Answer::Batch(part) => {
+                    let BatchHeader { tally, held, .. } = part.header;
+                    counts[shard] = Count { tally, held };
+                    pending[shard] = 0;
+                    parts.push(part);
+                }
+                Answer::Wait => {}
+                Answer::Finished => finished = true,
+            }
+        }
+        if pending.iter().all(|&rows| rows == 0) {
+            let header =
+                Batch::merged_header(parts).context("the shards' parts do not fit together")?;
+            let memory = self.pool.take_own(header.planes_bytes());
+            let whole = Batch::merge(parts, memory);
+            parts.clear();
+            return Ok(Some(Fetched::Batch(whole)));
+        }
+        self.recount(counts)?;
+        // A shard that has given its part knows of the others' transitions what they had then: it may be wrong about the end.
+        Ok((finished && parts.is_empty()).then_some(Fetched::Finished))
+    }
+
+    /// Asks all shards what they have counted.
+    fn recount(&self, counts: &mut [Count]) -> anyhow::Result<()> {
+        let key = self.keys.replay_status();
+        for (session, count) in self.sessions.iter().zip(counts) {
+            let answer = session::ask(
+                session,
+                &key,
+                ZBytes::new(),
+                Priority::DataHigh,
+                REQUEST_TIMEOUT,
+            )?;
+            let (status, _): (ReplayStatus, _) =
+                codec::decode(&answer.to_bytes(), Kind::ReplayStatus, Some(self.spec_hash))
+                    .context("a shard's status")?;
+            *count = Count {
+                tally: Tally {
+                    inserted: status.transitions_inserted,
+                    rows_sampled: status.rows_sampled,
+                },
+                held: status.transitions_held,
+            };
+        }
+        Ok(())
+    }
+
+    /// Asks a shard for `rows` rows.
+    fn ask(
+        &self,
+        shard: usize,
+        rows: u32,
+        elsewhere: Option<Tally>,
+    ) -> anyhow::Result<(Asked, bool)> {
+        let request = BatchRequest {
+            rows,
+            shared_memory: self.requests.shared_memory && self.by_socket == 0,
+            elsewhere,
+        };
+        let message = codec::encode(Kind::BatchRequest, self.spec_hash, &request, &[])?;
+        let asked = session::send(
+            &self.sessions[shard],
+            &self.keys.batch(),
+            message.into(),
             Priority::Data,
             REQUEST_TIMEOUT,
         )?;
-        let (reply, planes) =
-            codec::decode(&bytes, Kind::BatchReply, Some(self.spec_hash)).context("a batch")?;
-        match reply {
-            BatchReply::Batch(header) => {
-                Ok(Some(Fetched::Batch(Batch::from_planes(header, planes)?)))
-            }
-            BatchReply::Wait(_) => Ok(None),
-            BatchReply::Finished => Ok(Some(Fetched::Finished)),
-            BatchReply::Refused { why } => bail!("the replay server refuses: {why}"),
-        }
+        Ok((asked, request.shared_memory))
     }
+
+    fn answer(&mut self, (asked, shared_memory): (Asked, bool)) -> anyhow::Result<Answer> {
+        let answer = asked.answer().inspect_err(|e| {
+            if shared_memory && matches!(e, SessionError::NoReply { .. }) {
+                self.by_socket = AVOID_COUNT;
+            }
+        })?;
+        self.by_socket = self.by_socket.saturating_sub(1);
+        let (reply, planes) = codec::receive(
+            answer.slices(),
+            answer.len(),
+            &self.pool,
+            Kind::BatchReply,
+            Some(self.spec_hash),
+        )
+        .context("a batch")?;
+        Ok(match reply {
+            BatchReply::Batch(header) => Answer::Batch(Batch::from_planes(header, planes)?),
+            BatchReply::Wait(_) => Answer::Wait,
+            BatchReply::Finished => Answer::Finished,
+            BatchReply::Refused { why } => bail!("the replay server refuses: {why}"),
+        })
+    }
+}
+
+/// What a replay server answers.
+enum Answer {
+    Batch(Batch),
+    Wait,
+    Finished,
 }

@@ -81,6 +81,8 @@ pub struct RunState<'a> {
     pub affinity: Option<&'a AffinityEstimator>,
     /// The learner's generator.
     pub rng: &'a ChaCha8Rng,
+    /// Newest version of the weights that was published.
+    pub weights_version: u64,
     /// Hash of the run's specification.
     pub run_spec_hash: u64,
 }
@@ -94,6 +96,8 @@ pub struct Restored {
     pub affinity: Option<AffinityEstimator>,
     /// The learner's generator.
     pub rng: ChaCha8Rng,
+    /// Newest version of the weights that had been published.
+    pub weights_version: u64,
 }
 
 /// `state.json`.
@@ -104,6 +108,7 @@ struct StateFile {
     run_spec_hash: String,
     updates: u64,
     adam_step: u64,
+    weights_version: u64,
     rng: ChaCha8Rng,
     affinity: Option<AffinityEstimator>,
     /// SHA-256 of the tensor files, by name.
@@ -148,6 +153,7 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
         run_spec_hash: hex_of(state.run_spec_hash),
         updates: learner.updates(),
         adam_step: learner.adam.step_count(),
+        weights_version: state.weights_version,
         rng: state.rng.clone(),
         affinity: state.affinity.cloned(),
         sha256,
@@ -295,6 +301,7 @@ pub fn load(
         learner,
         affinity: state.affinity,
         rng: state.rng,
+        weights_version: state.weights_version,
     })
 }
 

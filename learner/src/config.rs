@@ -2,7 +2,10 @@
 //! It fills in no number: presets do, with their sources.
 
 use driml_model::ModelConfig;
-use driml_protocol::{RunSpec, config::Settings};
+use driml_protocol::{
+    RunSpec,
+    config::{Settings, TransportConfig},
+};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
@@ -191,6 +194,8 @@ pub struct LearnerPart {
     pub model: ModelConfig,
     /// The learner's own.
     pub learner: Config,
+    /// How messages travel.
+    pub transport: TransportConfig,
 }
 
 impl LearnerPart {
@@ -204,6 +209,7 @@ impl LearnerPart {
             spec: settings.table("run")?,
             model: settings.table("model")?,
             learner: settings.table("learner")?,
+            transport: settings.table("transport")?,
         };
         let input: InputSize = settings.table("input")?;
         this.spec.validate()?;

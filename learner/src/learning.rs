@@ -60,6 +60,47 @@ impl Learning {
         })
     }
 
+    /// A learner that goes on from the newest checkpoint in `folder`; one at its start if there is none.
+    ///
+    /// Its next weights get a version above all that were published since that checkpoint, so that actors take them.
+    ///
+    /// # Errors
+    /// Settings that cannot work, or a checkpoint that is damaged, of another run or of other settings.
+    pub fn resume(part: LearnerPart, folder: &Path) -> anyhow::Result<Self> {
+        let mut this = Self::new(part)?;
+        let restored = checkpoint::load_latest(
+            folder,
+            &this.part.model,
+            &this.part.learner.update,
+            this.spec_hash,
+        )?;
+        let Some(restored) = restored else {
+            return Ok(this);
+        };
+        let same_affinity = match (&this.affinity, &restored.affinity) {
+            (Some(fresh), Some(found)) => found.has_settings_of(fresh),
+            (None, None) => true,
+            _ => false,
+        };
+        anyhow::ensure!(
+            same_affinity,
+            "the checkpoint in {} estimated the action affinity otherwise: resume with the settings it was made with, or choose another folder",
+            folder.display()
+        );
+        let published_since =
+            this.part.learner.checkpoint_period_updates / this.part.learner.publish_period_updates;
+        this.weights_version = restored.weights_version.saturating_add(published_since);
+        this.learner = restored.learner;
+        this.affinity = restored.affinity;
+        this.rng = restored.rng;
+        tracing::info!(
+            "resumed after {} updates from {}",
+            this.updates(),
+            folder.display()
+        );
+        Ok(this)
+    }
+
     /// Hash of the run spec.
     pub const fn spec_hash(&self) -> u64 {
         self.spec_hash
@@ -167,6 +208,7 @@ impl Learning {
             learner: &self.learner,
             affinity: self.affinity.as_ref(),
             rng: &self.rng,
+            weights_version: self.weights_version,
             run_spec_hash: self.spec_hash,
         };
         let path = checkpoint::save(folder, &state, self.part.learner.checkpoints_kept as usize)?;

@@ -15,6 +15,7 @@ pub mod optim;
 pub mod parity;
 mod publish;
 mod run;
+mod shards;
 pub mod target;
 pub mod update;
 

@@ -17,7 +17,7 @@ use zenoh::{
     bytes::ZBytes,
     pubsub::Publisher,
     qos::{CongestionControl, Priority},
-    query::Queryable,
+    query::{Query, Queryable},
 };
 
 use crate::learning::Weights;
@@ -25,8 +25,8 @@ use crate::learning::Weights;
 /// One delivery of the affinity matrix.
 const AFFINITY_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// A message ready to travel: prefix and header, then the planes.
-type Message = (Vec<u8>, Vec<u8>);
+/// Weights ready to travel.
+type Message = ZBytes;
 
 /// The learner's outlets; dropping it closes them.
 pub(crate) struct Outlets {
@@ -34,9 +34,9 @@ pub(crate) struct Outlets {
     status: Arc<Mutex<LearnerStatus>>,
     heard: Arc<AtomicBool>,
     affinity: Arc<Newest>,
-    version: Publisher<'static>,
+    versions: Vec<Publisher<'static>>,
     spec_hash: u64,
-    _queryables: [Queryable<()>; 2],
+    _queryables: Vec<Queryable<()>>,
 }
 
 /// A slot that keeps the newest affinity until it is sent.
@@ -51,32 +51,28 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Outlets {
-    /// Declares everything that others may ask, and starts the affinity's own thread.
+    /// Declares everything that others may ask, in every session, and starts the affinity's own thread.
     pub(crate) fn open(
-        session: &Session,
+        sessions: &[Session],
         keys: &Keys,
         spec_hash: u64,
         shutdown: &Shutdown,
     ) -> anyhow::Result<Self> {
         let failed = |e: zenoh::Error| anyhow::anyhow!("declaring what the learner answers: {e}");
         let weights: Arc<Mutex<Option<Message>>> = Arc::default();
-        let held = weights.clone();
-        let weights_queryable = session
-            .declare_queryable(keys.weights())
-            .callback(move |query| {
-                // An actor that comes before the first weights hears nothing and asks again.
-                if let Some((head, planes)) = lock(&held).clone() {
-                    session::answer(&query, session::join_pieces([head, planes]));
-                }
-            })
-            .wait()
-            .map_err(failed)?;
         let status: Arc<Mutex<LearnerStatus>> = Arc::default();
         let heard: Arc<AtomicBool> = Arc::default();
-        let (held, told) = (status.clone(), heard.clone());
-        let status_queryable = session
-            .declare_queryable(keys.learner_status())
-            .callback(move |query| {
+        let (mut versions, mut queryables) = (Vec::new(), Vec::new());
+        for session in sessions {
+            let held = weights.clone();
+            let answer_weights = move |query: Query| {
+                // An actor that comes before the first weights hears nothing and asks again.
+                if let Some(message) = lock(&held).clone() {
+                    session::answer(&query, message);
+                }
+            };
+            let (held, told) = (status.clone(), heard.clone());
+            let answer_status = move |query: Query| {
                 let status = lock(&held).clone();
                 match codec::encode(Kind::LearnerStatus, spec_hash, &status, &[]) {
                     Ok(bytes) => {
@@ -85,19 +81,21 @@ impl Outlets {
                     }
                     Err(e) => tracing::warn!("the learner's status was not sent: {e}"),
                 }
-            })
-            .wait()
-            .map_err(failed)?;
-        // An announcement that is dropped under congestion is made good by the next, or by the actors' own look.
-        let version = session
-            .declare_publisher(keys.weights_version())
-            .congestion_control(CongestionControl::Drop)
-            .priority(Priority::InteractiveHigh)
-            .wait()
-            .map_err(failed)?;
+            };
+            let queryable = session.declare_queryable(keys.weights());
+            queryables.push(queryable.callback(answer_weights).wait().map_err(failed)?);
+            let queryable = session.declare_queryable(keys.learner_status());
+            queryables.push(queryable.callback(answer_status).wait().map_err(failed)?);
+            // An announcement that is dropped under congestion is made good by the next, or by the actors' own look.
+            let publisher = session
+                .declare_publisher(keys.weights_version())
+                .congestion_control(CongestionControl::Drop)
+                .priority(Priority::InteractiveHigh);
+            versions.push(publisher.wait().map_err(failed)?);
+        }
         let affinity = Arc::new(Newest::default());
         let sender = AffinitySender {
-            session: session.clone(),
+            sessions: sessions.to_vec(),
             key: keys.affinity(),
             spec_hash,
             newest: affinity.clone(),
@@ -106,28 +104,29 @@ impl Outlets {
         std::thread::Builder::new()
             .name("affinity".into())
             .spawn(move || sender.run())?;
-        let _queryables = [weights_queryable, status_queryable];
         Ok(Self {
             weights,
             status,
             heard,
             affinity,
-            version,
+            versions,
             spec_hash,
-            _queryables,
+            _queryables: queryables,
         })
     }
 
     /// Makes `weights` the ones that actors get, and announces them.
     pub(crate) fn publish(&self, (header, safetensors): Weights) -> anyhow::Result<()> {
         let head = codec::seal(Kind::Weights, self.spec_hash, &header, &safetensors)?;
-        *lock(&self.weights) = Some((head, safetensors));
+        *lock(&self.weights) = Some(session::join_planes(head, safetensors.into()));
         let announced = WeightsVersion {
             version: header.version,
         };
         let bytes = codec::encode(Kind::WeightsVersion, self.spec_hash, &announced, &[])?;
-        if let Err(e) = self.version.put(bytes).wait() {
-            tracing::warn!("weights {} were not announced: {e}", header.version);
+        for version in &self.versions {
+            if let Err(e) = version.put(bytes.clone()).wait() {
+                tracing::warn!("weights {} were not announced: {e}", header.version);
+            }
         }
         let mut status = lock(&self.status);
         status.weights_version = header.version;
@@ -156,7 +155,7 @@ impl Outlets {
 }
 
 struct AffinitySender {
-    session: Session,
+    sessions: Vec<Session>,
     key: String,
     spec_hash: u64,
     newest: Arc<Newest>,
@@ -174,26 +173,28 @@ impl AffinitySender {
                 .unwrap_or_else(PoisonError::into_inner);
             let Some(update) = slot.take() else { continue };
             drop(slot);
-            if let Err(e) = self.send(&update) {
-                tracing::warn!(
-                    "affinity {} did not arrive, the next one will: {e:#}",
-                    update.version
-                );
+            for session in &self.sessions {
+                if let Err(e) = self.send(session, &update) {
+                    tracing::warn!(
+                        "affinity {} did not arrive, the next one will: {e:#}",
+                        update.version
+                    );
+                }
             }
         }
     }
 
-    fn send(&self, update: &AffinityUpdate) -> anyhow::Result<()> {
+    fn send(&self, session: &Session, update: &AffinityUpdate) -> anyhow::Result<()> {
         let bytes = codec::encode(Kind::Affinity, self.spec_hash, update, &[])?;
         let payload = ZBytes::from(bytes);
         let answer = session::ask(
-            &self.session,
+            session,
             &self.key,
             payload,
             Priority::DataHigh,
             AFFINITY_TIMEOUT,
         )?;
-        codec::decode::<()>(&answer, Kind::Done, Some(self.spec_hash))?;
+        codec::decode::<()>(&answer.to_bytes(), Kind::Done, Some(self.spec_hash))?;
         Ok(())
     }
 }

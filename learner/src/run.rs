@@ -7,17 +7,14 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_protocol::{
-    Keys, Shutdown,
-    session::{self, Endpoints},
-};
-use zenoh::Wait;
+use driml_protocol::{Keys, Shutdown};
 
 use crate::{
-    batch_source::{BatchSource, Next},
+    batch_source::{BatchSource, Next, Requests},
     config::LearnerPart,
     learning::Learning,
     publish::Outlets,
+    shards::Shards,
 };
 
 /// How long a learner that was told to stop stays to be asked for its last status.
@@ -28,7 +25,7 @@ const TICK: Duration = Duration::from_millis(200);
 /// What a learner is told at its start; everything else comes from the replay server.
 #[derive(Clone, Debug)]
 pub struct RunArgs {
-    /// Endpoints of the replay server.
+    /// Endpoints of the replay server; one for each shard.
     pub connect: Vec<String>,
     /// Prefix of the run's keys.
     pub namespace: String,
@@ -42,24 +39,27 @@ pub struct RunArgs {
 /// Nobody to join, settings that cannot work, an update that failed, a disk that refuses.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let session = session::open(&Endpoints {
-        listen: Vec::new(),
-        connect: args.connect,
-    })?;
-    let Some(hello) = session::join(&session, &keys, shutdown)? else {
+    let Some(shards) = Shards::join(&args.connect, &keys, shutdown)? else {
         return Ok(());
     };
-    let part = LearnerPart::from_toml(&hello.config_toml)
+    let part = LearnerPart::from_toml(&shards.config_toml)
         .context("the settings that the replay server sent")?;
-    let (rows, in_flight) = (part.learner.batch_rows, part.learner.batches_in_flight);
-    let mut learning = Learning::new(part)?;
-    keep_settings(&args.run_dir, &hello.config_toml)?;
+    let requests = Requests {
+        rows: part.learner.batch_rows,
+        in_flight: part.learner.batches_in_flight,
+        shared_memory: part.transport.shared_memory,
+    };
     let folder = args.run_dir.join("checkpoints");
+    let mut learning = Learning::resume(part, &folder)?;
+    keep_settings(&args.run_dir, &shards.config_toml)?;
     let spec_hash = learning.spec_hash();
-    let outlets = Outlets::open(&session, &keys, spec_hash, shutdown)?;
+    let outlets = Outlets::open(&shards.sessions, &keys, spec_hash, shutdown)?;
     outlets.publish(learning.next_weights()?)?;
-    let mut batches = BatchSource::start(&session, &keys, spec_hash, rows, in_flight, shutdown)?;
-    tracing::info!("learning from batches of {rows} rows, run {spec_hash:016x}");
+    let mut batches = BatchSource::start(&shards.sessions, &keys, spec_hash, requests, shutdown)?;
+    tracing::info!(
+        "learning from batches of {} rows, run {spec_hash:016x}",
+        requests.rows
+    );
 
     let mut waiting_since = Instant::now();
     while !shutdown.is_set() {
@@ -97,10 +97,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     tracing::info!("finished after {} updates", learning.updates());
     shutdown.wait();
     outlets.wait_until_heard(LAST_WORD_MAX);
-    session
-        .close()
-        .wait()
-        .map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+    let closed = shards.close();
+    batches.end();
+    closed
 }
 
 /// Leaves the run's settings beside the checkpoints, for `driml evaluate`; a file that is there is the launcher's.

@@ -4,6 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::{
+    Planes,
     codec::{self, CodecError, Kind},
     metric::Waiting,
 };
@@ -11,11 +12,38 @@ use crate::{
 /// Stands where a row has no next action: its transition ended the episode or the level.
 pub const NO_ACTION: u8 = 255;
 
+/// Planes of a batch.
+const PLANES: usize = 9;
+
 /// The learner's request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BatchRequest {
     /// Rows wanted, B.
     pub rows: u32,
+    /// Whether the batch may come through shared memory.
+    pub shared_memory: bool,
+    /// Where the replay has several shards: what all the others have counted together, and these rows are part of a batch.
+    pub elsewhere: Option<Tally>,
+}
+
+/// What the rate limiter counts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Tally {
+    /// Transitions stored.
+    pub inserted: u64,
+    /// Rows sampled.
+    pub rows_sampled: u64,
+}
+
+impl std::ops::Add for Tally {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            inserted: self.inserted.saturating_add(other.inserted),
+            rows_sampled: self.rows_sampled.saturating_add(other.rows_sampled),
+        }
+    }
 }
 
 /// What a batch says of itself.
@@ -27,12 +55,24 @@ pub struct BatchHeader {
     pub positives: u32,
     /// Bytes of one state.
     pub state_bytes: u32,
-    /// Transitions the run had stored when this was drawn.
-    pub inserted_total: u64,
+    /// What the replay server that drew this had counted then, this batch included.
+    pub tally: Tally,
+    /// Transitions that it held.
+    pub held: u64,
     /// Mean age of the rows, in transitions stored since.
     pub mean_age: f64,
     /// Version of the newest weights that chose an action of this batch, and of the oldest.
     pub weights_versions: (u64, u64),
+}
+
+impl BatchHeader {
+    /// Bytes of the planes of such a batch.
+    ///
+    /// # Panics
+    /// If they are more than the address space, which no batch of a run is.
+    pub fn planes_bytes(&self) -> usize {
+        planes_bytes(self).expect("a batch is far below the address space")
+    }
 }
 
 /// The answer to a request.
@@ -59,17 +99,81 @@ pub enum BatchReply {
 pub struct Batch {
     /// What it says of itself.
     pub header: BatchHeader,
-    planes: Vec<u8>,
+    planes: Planes,
 }
 
 impl Batch {
     /// A batch of zeros, to be filled in place.
     pub fn zeroed(header: BatchHeader) -> Self {
-        let bytes = planes_bytes(&header).expect("a batch is far below the address space");
-        Self {
-            header,
-            planes: vec![0; bytes],
+        let planes = Planes::zeroed(header.planes_bytes());
+        Self { header, planes }
+    }
+
+    /// A batch in memory that may hold anything: every row is to be written with [`Batch::rows_mut`].
+    ///
+    /// # Panics
+    /// If the memory is not of [`BatchHeader::planes_bytes`].
+    pub fn in_memory(header: BatchHeader, planes: Planes) -> Self {
+        assert_eq!(planes.len(), header.planes_bytes(), "memory for a batch");
+        Self { header, planes }
+    }
+
+    /// The rows of all `parts`, one part after the other, in memory that may hold anything; as many bytes as
+    /// [`Batch::merged_header`] says.
+    ///
+    /// # Panics
+    /// If there is no such header, or the memory is of another size.
+    pub fn merge(parts: &[Self], memory: Planes) -> Self {
+        let header = Self::merged_header(parts).expect("parts of one batch");
+        let mut merged = Self::in_memory(header, memory);
+        let offsets = merged.offsets();
+        let mut first_row = 0;
+        for part in parts {
+            for plane in 0..PLANES {
+                let per_positive = matches!(plane, 1 | 7 | 8);
+                let blocks = if per_positive { part.positives() } else { 1 };
+                let values = part.plane(plane);
+                let row_bytes = values.len() / (blocks.max(1) * part.rows());
+                for block in 0..blocks {
+                    let from =
+                        &values[block * part.rows() * row_bytes..][..part.rows() * row_bytes];
+                    let row = block * merged.rows() + first_row;
+                    merged.planes[offsets[plane] + row * row_bytes..][..from.len()]
+                        .copy_from_slice(from);
+                }
+            }
+            first_row += part.rows();
         }
+        merged
+    }
+
+    /// The header of [`Batch::merge`]; none if `parts` are none or differ in shape.
+    pub fn merged_header(parts: &[Self]) -> Option<BatchHeader> {
+        let mut merged = parts.first()?.header;
+        let mut age_total = 0.0;
+        (merged.rows, merged.tally, merged.held) = (0, Tally::default(), 0);
+        for BatchHeader {
+            rows,
+            positives,
+            state_bytes,
+            tally,
+            held,
+            mean_age,
+            weights_versions: (newest, oldest),
+        } in parts.iter().map(|part| part.header)
+        {
+            if (positives, state_bytes) != (merged.positives, merged.state_bytes) {
+                return None;
+            }
+            merged.rows += rows;
+            merged.tally = merged.tally + tally;
+            merged.held += held;
+            age_total += mean_age * f64::from(rows);
+            let (a, b) = merged.weights_versions;
+            merged.weights_versions = (a.max(newest), b.min(oldest));
+        }
+        merged.mean_age = age_total / f64::from(merged.rows);
+        Some(merged)
     }
 
     /// Rows, B.
@@ -87,7 +191,7 @@ impl Batch {
     }
 
     /// Byte offsets of the planes, in their order, and the end.
-    fn offsets(&self) -> [usize; 10] {
+    fn offsets(&self) -> [usize; PLANES + 1] {
         let (rows, positives, frames) = (self.rows(), self.positives(), self.frames_bytes());
         let lengths = [
             frames,
@@ -100,7 +204,7 @@ impl Batch {
             rows * positives,
             rows * positives,
         ];
-        let mut offsets = [0; 10];
+        let mut offsets = [0; PLANES + 1];
         for (i, length) in lengths.iter().enumerate() {
             offsets[i + 1] = offsets[i] + length;
         }
@@ -167,7 +271,7 @@ impl Batch {
         let offsets = self.offsets();
         let state_bytes = self.header.state_bytes as usize;
         let rows = self.rows();
-        let mut rest = self.planes.as_mut_slice();
+        let mut rest = &mut self.planes[..];
         let mut take = |i: usize| -> &mut [u8] {
             let (head, tail) = std::mem::take(&mut rest).split_at_mut(offsets[i + 1] - offsets[i]);
             rest = tail;
@@ -192,7 +296,7 @@ impl Batch {
     ///
     /// # Errors
     /// A batch over the codec's limits.
-    pub fn seal(self, spec_hash: u64) -> Result<(Vec<u8>, Vec<u8>), CodecError> {
+    pub fn seal(self, spec_hash: u64) -> Result<(Vec<u8>, Planes), CodecError> {
         let head = codec::seal(
             Kind::BatchReply,
             spec_hash,
@@ -206,7 +310,7 @@ impl Batch {
     ///
     /// # Errors
     /// Planes of another length.
-    pub fn from_planes(header: BatchHeader, planes: &[u8]) -> Result<Self, CodecError> {
+    pub fn from_planes(header: BatchHeader, planes: Planes) -> Result<Self, CodecError> {
         if planes_bytes(&header) != Some(planes.len()) || header.rows == 0 {
             return Err(CodecError::Header(format!(
                 "{} rows with {} positives of {} bytes do not fill {} bytes of planes",
@@ -216,10 +320,7 @@ impl Batch {
                 planes.len()
             )));
         }
-        Ok(Self {
-            header,
-            planes: planes.to_vec(),
-        })
+        Ok(Self { header, planes })
     }
 }
 
@@ -255,9 +356,15 @@ impl BatchRowsMut<'_> {
         &mut self.frames_t[row * self.state_bytes..(row + 1) * self.state_bytes]
     }
 
-    /// Where s_{t+n} of `row` is written.
+    /// Where s_{t+n} of `row` is written; zeros if the row does not bootstrap.
     pub fn frame_n(&mut self, row: usize) -> &mut [u8] {
         &mut self.frames_n[row * self.state_bytes..(row + 1) * self.state_bytes]
+    }
+
+    /// Marks `row` as having no positive `p`.
+    pub fn no_positive(&mut self, p: usize, row: usize) {
+        self.positive(p, row, 0).fill(0);
+        self.positive_valid[p * self.rows + row] = 0;
     }
 
     /// Marks positive `p` of `row` as `k` steps ahead and gives where s_{t+k} is written.

@@ -14,7 +14,7 @@
 
 use serde::{Serialize, de::DeserializeOwned};
 
-use crate::PROTOCOL_VERSION;
+use crate::{PROTOCOL_VERSION, Planes, PlanesPool};
 
 const MAGIC: [u8; 4] = *b"DRML";
 /// Length of the fixed prefix, bytes.
@@ -23,6 +23,9 @@ pub const PREFIX_BYTES: usize = 32;
 pub const HEADER_BYTES_MAX: usize = 1 << 20;
 /// Longest planes, bytes; longer ones are refused by both sides.
 pub const PLANES_BYTES_MAX: usize = 1 << 29;
+
+/// Bytes that are copied, then summed while they are in the nearest cache.
+const BLOCK_BYTES: usize = 1 << 14;
 
 /// What a message is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -181,7 +184,7 @@ pub fn encode<H: Serialize>(
     Ok(out)
 }
 
-/// Checks a message and gives its header and planes.
+/// Checks a message in one piece and gives its header and planes.
 ///
 /// `spec_hash` is the hash that this part runs, or `None` where any run is welcome (a part that joins to learn it).
 ///
@@ -192,68 +195,159 @@ pub fn decode<H: DeserializeOwned>(
     kind: Kind,
     spec_hash: Option<u64>,
 ) -> Result<(H, &[u8]), CodecError> {
-    let prefix: &[u8; PREFIX_BYTES] = bytes.first_chunk().ok_or(CodecError::Length {
-        have: bytes.len(),
-        need: PREFIX_BYTES,
-    })?;
-    if prefix[0..4] != MAGIC {
-        return Err(CodecError::Magic);
+    let prefix = Prefix::read(bytes.first_chunk(), bytes.len())?;
+    let (header, planes) = bytes[PREFIX_BYTES..].split_at(prefix.header_len());
+    let mut sum = prefix.checksum_begun();
+    sum.update(header);
+    sum.update(planes);
+    prefix.check(sum, kind, spec_hash)?;
+    Ok((decode_header(header)?, planes))
+}
+
+/// Checks a message that came in `pieces`, `len` bytes in all, and copies its planes into own memory of `pool`.
+///
+/// The checksum is the copy's, so what was checked cannot change afterwards, even if it came through shared memory.
+///
+/// # Errors
+/// As [`decode`].
+pub fn receive<'a, H: DeserializeOwned>(
+    pieces: impl IntoIterator<Item = &'a [u8]>,
+    len: usize,
+    pool: &PlanesPool,
+    kind: Kind,
+    spec_hash: Option<u64>,
+) -> Result<(H, Planes), CodecError> {
+    let mut pieces = Pieces {
+        current: &[],
+        rest: pieces.into_iter(),
+    };
+    let mut bytes = [0; PREFIX_BYTES];
+    pieces.copy_to(&mut bytes, None);
+    let prefix = Prefix::read((len >= PREFIX_BYTES).then_some(&bytes), len)?;
+    let mut sum = prefix.checksum_begun();
+    let mut header = vec![0; prefix.header_len()];
+    pieces.copy_to(&mut header, Some(&mut sum));
+    let mut planes = pool.take_own(prefix.planes_len());
+    pieces.copy_to(&mut planes, Some(&mut sum));
+    prefix.check(sum, kind, spec_hash)?;
+    Ok((decode_header(&header)?, planes))
+}
+
+/// Bytes that lie in several places.
+struct Pieces<'a, I> {
+    current: &'a [u8],
+    rest: I,
+}
+
+impl<'a, I: Iterator<Item = &'a [u8]>> Pieces<'a, I> {
+    /// Copies the next bytes into `out`, a block at a time, so that the sum finds each block of the copy in the cache.
+    /// Where the pieces end early, the rest of `out` stays as it is: the checksum will not fit.
+    fn copy_to(&mut self, out: &mut [u8], mut sum: Option<&mut crc32fast::Hasher>) {
+        let mut filled = 0;
+        while filled < out.len() {
+            if self.current.is_empty() {
+                match self.rest.next() {
+                    Some(next) => self.current = next,
+                    None => return,
+                }
+                continue;
+            }
+            let count = self.current.len().min(out.len() - filled).min(BLOCK_BYTES);
+            let (now, later) = self.current.split_at(count);
+            let copy = &mut out[filled..filled + count];
+            copy.copy_from_slice(now);
+            if let Some(sum) = &mut sum {
+                sum.update(copy);
+            }
+            self.current = later;
+            filled += count;
+        }
     }
-    let version = u16::from_le_bytes([prefix[4], prefix[5]]);
-    if version != PROTOCOL_VERSION {
-        return Err(CodecError::Version {
-            theirs: version,
-            ours: PROTOCOL_VERSION,
-        });
+}
+
+/// The fixed first bytes of a message whose magic, version and lengths are in order.
+struct Prefix([u8; PREFIX_BYTES]);
+
+impl Prefix {
+    /// `len` is the whole message's length.
+    fn read(bytes: Option<&[u8; PREFIX_BYTES]>, len: usize) -> Result<Self, CodecError> {
+        let this = Self(*bytes.ok_or(CodecError::Length {
+            have: len,
+            need: PREFIX_BYTES,
+        })?);
+        let prefix = &this.0;
+        if prefix[0..4] != MAGIC {
+            return Err(CodecError::Magic);
+        }
+        let version = u16::from_le_bytes([prefix[4], prefix[5]]);
+        if version != PROTOCOL_VERSION {
+            return Err(CodecError::Version {
+                theirs: version,
+                ours: PROTOCOL_VERSION,
+            });
+        }
+        for (have, max) in [
+            (this.header_len(), HEADER_BYTES_MAX),
+            (this.planes_len(), PLANES_BYTES_MAX),
+        ] {
+            if have > max {
+                return Err(CodecError::TooLarge { have, max });
+            }
+        }
+        let need = PREFIX_BYTES + this.header_len() + this.planes_len();
+        if len != need {
+            return Err(CodecError::Length { have: len, need });
+        }
+        Ok(this)
     }
-    let header_len = le_u32(&prefix[16..20]) as usize;
-    let planes_len = usize::try_from(le_u64(&prefix[20..28])).unwrap_or(usize::MAX);
-    if header_len > HEADER_BYTES_MAX {
-        return Err(CodecError::TooLarge {
-            have: header_len,
-            max: HEADER_BYTES_MAX,
-        });
+
+    fn header_len(&self) -> usize {
+        le_u32(&self.0[16..20]) as usize
     }
-    if planes_len > PLANES_BYTES_MAX {
-        return Err(CodecError::TooLarge {
-            have: planes_len,
-            max: PLANES_BYTES_MAX,
-        });
+
+    fn planes_len(&self) -> usize {
+        usize::try_from(le_u64(&self.0[20..28])).unwrap_or(usize::MAX)
     }
-    let need = PREFIX_BYTES + header_len + planes_len;
-    if bytes.len() != need {
-        return Err(CodecError::Length {
-            have: bytes.len(),
-            need,
-        });
+
+    /// A checksum over the prefix, to which header and planes are to be added.
+    fn checksum_begun(&self) -> crc32fast::Hasher {
+        let mut sum = crc32fast::Hasher::new();
+        sum.update(&self.0[..28]);
+        sum
     }
-    let (header, planes) = bytes[PREFIX_BYTES..].split_at(header_len);
-    if checksum(&prefix[..28], header, planes) != le_u32(&prefix[28..32]) {
-        return Err(CodecError::Checksum);
+
+    fn check(
+        &self,
+        sum: crc32fast::Hasher,
+        kind: Kind,
+        spec_hash: Option<u64>,
+    ) -> Result<(), CodecError> {
+        if sum.finalize() != le_u32(&self.0[28..32]) {
+            return Err(CodecError::Checksum);
+        }
+        let theirs = u16::from_le_bytes([self.0[6], self.0[7]]);
+        if theirs != kind as u16 {
+            return Err(CodecError::Kind {
+                theirs,
+                ours: kind as u16,
+            });
+        }
+        let theirs = le_u64(&self.0[8..16]);
+        match spec_hash {
+            Some(ours) if ours != theirs => Err(CodecError::RunSpec { theirs, ours }),
+            _ => Ok(()),
+        }
     }
-    let their_kind = u16::from_le_bytes([prefix[6], prefix[7]]);
-    if their_kind != kind as u16 {
-        return Err(CodecError::Kind {
-            theirs: their_kind,
-            ours: kind as u16,
-        });
-    }
-    let theirs = le_u64(&prefix[8..16]);
-    if let Some(ours) = spec_hash
-        && ours != theirs
-    {
-        return Err(CodecError::RunSpec { theirs, ours });
-    }
+}
+
+fn decode_header<H: DeserializeOwned>(bytes: &[u8]) -> Result<H, CodecError> {
     let config = bincode::config::standard().with_limit::<HEADER_BYTES_MAX>();
-    let (value, used) = bincode::serde::decode_from_slice(header, config)
+    let (header, used) = bincode::serde::decode_from_slice(bytes, config)
         .map_err(|e| CodecError::Header(e.to_string()))?;
-    if used != header.len() {
-        return Err(CodecError::Header(format!(
-            "{} bytes after its end",
-            header.len() - used
-        )));
+    match bytes.len() - used {
+        0 => Ok(header),
+        over => Err(CodecError::Header(format!("{over} bytes after its end"))),
     }
-    Ok((value, planes))
 }
 
 fn checksum(prefix: &[u8], header: &[u8], planes: &[u8]) -> u32 {

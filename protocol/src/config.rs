@@ -1,7 +1,7 @@
 //! How a part finds its own tables in the run's resolved settings.
 //! It does not know what the tables hold: each part has a Config of its own.
 
-use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 /// Why settings were refused.
 #[derive(Debug, thiserror::Error)]
@@ -20,6 +20,15 @@ pub enum ConfigError {
         /// What is wrong.
         why: String,
     },
+}
+
+/// The `[transport]` table: how messages travel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TransportConfig {
+    /// Whether chunks and batches go through shared memory between parts on one host; everything else, and whatever goes to
+    /// another host or does not arrive, goes through sockets.
+    pub shared_memory: bool,
 }
 
 /// The resolved settings of a run, one table a part.

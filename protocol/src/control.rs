@@ -10,6 +10,8 @@ pub struct Hello {
     pub config_toml: String,
     /// Transitions that the run has stored, for the exploration schedule.
     pub inserted_total: u64,
+    /// Which of the replay's shards this is, from 0, and how many there are.
+    pub shard: (u32, u32),
 }
 
 /// An actor's last word: its own count of what it produced, against which the replay server checks its count.

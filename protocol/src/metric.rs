@@ -36,6 +36,9 @@ impl std::fmt::Display for Waiting {
     }
 }
 
+/// Episodes over which a mean return is taken.
+pub const RETURNS_OF: u64 = 100;
+
 /// The replay server's account of itself.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ReplayStatus {
@@ -80,6 +83,55 @@ pub struct ReplayStatus {
 }
 
 impl ReplayStatus {
+    /// The account of a replay of several shards from each shard's own; of the mean age and the mean return it is the mean,
+    /// weighted by rows and by episodes that count.
+    pub fn merged(shards: &[Self]) -> Self {
+        let Some((first, others)) = shards.split_first() else {
+            return Self::default();
+        };
+        let weighted = |parts: &[(f64, f64)]| {
+            let weight: f64 = parts.iter().map(|(_, weight)| weight).sum();
+            let sum: f64 = parts.iter().map(|(value, weight)| value * weight).sum();
+            (weight > 0.0).then_some(sum / weight)
+        };
+        let returns: Vec<_> = shards
+            .iter()
+            .filter_map(|it| Some((it.mean_return?, it.episodes.min(RETURNS_OF) as f64)))
+            .collect();
+        let ages: Vec<_> = shards
+            .iter()
+            .map(|it| (it.mean_age, it.rows_sampled as f64))
+            .collect();
+        let add = |sums: &mut Vec<u64>, counts: &[u64]| {
+            sums.iter_mut().zip(counts).for_each(|(sum, n)| *sum += n);
+        };
+        let mut sum = first.clone();
+        for it in others {
+            sum.transitions_inserted += it.transitions_inserted;
+            sum.transitions_held += it.transitions_held;
+            sum.transitions_lost += it.transitions_lost;
+            sum.transitions_duplicated += it.transitions_duplicated;
+            sum.chunks_retried += it.chunks_retried;
+            sum.messages_refused += it.messages_refused;
+            sum.rows_sampled += it.rows_sampled;
+            sum.episodes += it.episodes;
+            add(&mut sum.k_histogram, &it.k_histogram);
+            add(&mut sum.action_histogram, &it.action_histogram);
+            sum.learner_waited_s += it.learner_waited_s;
+            sum.actors_waited_s += it.actors_waited_s;
+            sum.actors += it.actors;
+            sum.affinity_version = sum.affinity_version.min(it.affinity_version);
+            // Each knows of the others what the learner told it; the one that knows of the end is right.
+            sum.finished |= it.finished;
+            if it.waiting == Waiting::Finished || sum.waiting == Waiting::Nobody {
+                sum.waiting = it.waiting;
+            }
+        }
+        sum.mean_return = weighted(&returns);
+        sum.mean_age = weighted(&ages).unwrap_or_default();
+        sum
+    }
+
     /// Rows sampled per transition inserted after the warm-up; none before.
     pub fn replay_ratio(&self) -> Option<f64> {
         let after = self

@@ -9,8 +9,9 @@ use crate::{CodecError, Hello, Keys, Kind, Shutdown, codec};
 use zenoh::{
     Session, Wait,
     bytes::ZBytes,
+    handlers::FifoChannelHandler,
     qos::{CongestionControl, Priority},
-    query::{ConsolidationMode, Query, QueryTarget},
+    query::{ConsolidationMode, Query, QueryTarget, Reply},
 };
 
 /// How a part reaches the others.
@@ -36,7 +37,13 @@ pub enum SessionError {
         /// What zenoh said.
         why: String,
     },
-    /// Nobody answered.
+    /// Nobody is there who could answer.
+    #[error("{key}: nobody is there to answer")]
+    Nobody {
+        /// Where it was asked.
+        key: String,
+    },
+    /// Nobody answered in time.
     #[error("{key}: nobody answered within {within_ms} ms")]
     NoReply {
         /// Where it was asked.
@@ -72,6 +79,9 @@ pub enum JoinError {
 const JOIN_MAX: Duration = Duration::from_secs(60);
 /// One try of that.
 const JOIN_TRY: Duration = Duration::from_secs(2);
+
+/// What zenoh answers in the place of somebody who does not.
+const TIMED_OUT: &str = "Timeout";
 
 /// Longest message accepted from a peer, bytes.
 const MESSAGE_BYTES_MAX: usize = 1 << 29;
@@ -122,41 +132,61 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
         ),
         ("transport/link/rx/max_message_size", &max),
         ("transport/link/rx/buffer_size", "4194304"),
-        ("transport/shared_memory/enabled", "false"),
+        // Only what a part itself puts into shared memory goes through it.
+        (
+            "transport/shared_memory/transport_optimization/enabled",
+            "false",
+        ),
     ];
-    let mut config = zenoh::Config::default();
-    for (key, value) in settings {
-        config
-            .insert_json5(key, value)
-            .map_err(|e| fail(format!("{key} = {value}: {e}")))?;
-    }
-    zenoh::open(config).wait().map_err(|e| fail(e.to_string()))
+    let open_with = |shared_memory: &str| {
+        let mut config = zenoh::Config::default();
+        let last = ("transport/shared_memory/enabled", shared_memory);
+        for (key, value) in settings.iter().chain([&last]) {
+            config
+                .insert_json5(key, value)
+                .map_err(|e| format!("{key} = {value}: {e}"))?;
+        }
+        zenoh::open(config).wait().map_err(|e| e.to_string())
+    };
+    sweep_shared_memory();
+    open_with("true").or_else(|why| {
+        tracing::debug!("trying again without shared memory: {why}");
+        open_with("false").map_err(fail)
+    })
 }
 
-/// A payload of several pieces, joined without a copy.
-pub fn join_pieces(pieces: impl IntoIterator<Item = Vec<u8>>) -> ZBytes {
+/// Removes the shared memory of processes that ended without doing so, as killed ones do; that of living ones stays.
+pub fn sweep_shared_memory() {
+    zenoh::shm::cleanup_orphaned_shm_segments();
+}
+
+/// A message of a head and planes, joined without a copy.
+pub fn join_planes(head: Vec<u8>, planes: ZBytes) -> ZBytes {
     let mut writer = ZBytes::writer();
-    for piece in pieces {
-        writer.append(ZBytes::from(piece));
-    }
+    writer.append(ZBytes::from(head));
+    writer.append(planes);
     writer.finish()
 }
 
-/// Asks one question and waits for its one answer.
+/// A question that was sent.
+#[derive(Debug)]
+pub struct Asked {
+    key: String,
+    timeout: Duration,
+    replies: FifoChannelHandler<Reply>,
+}
+
+/// Sends one question; questions of one priority arrive in the order in which they were sent.
 ///
 /// # Errors
-/// Nobody there (at once), no answer in time, or the answerer's own error. All may be tried again.
-pub fn ask(
+/// zenoh refused. It may be tried again.
+pub fn send(
     session: &Session,
     key: &str,
     payload: ZBytes,
     priority: Priority,
     timeout: Duration,
-) -> Result<Vec<u8>, SessionError> {
-    let failed = |why: String| SessionError::Zenoh {
-        key: key.into(),
-        why,
-    };
+) -> Result<Asked, SessionError> {
     let replies = session
         .get(key)
         .payload(payload)
@@ -166,18 +196,57 @@ pub fn ask(
         .priority(priority)
         .timeout(timeout)
         .wait()
-        .map_err(|e| failed(e.to_string()))?;
-    let silent = || SessionError::NoReply {
+        .map_err(|e| SessionError::Zenoh {
+            key: key.into(),
+            why: e.to_string(),
+        })?;
+    Ok(Asked {
         key: key.into(),
-        within_ms: timeout.as_millis(),
-    };
-    let reply = replies.recv().map_err(|_| silent())?;
-    match reply.into_result() {
-        Ok(sample) => Ok(sample.payload().to_bytes().into_owned()),
-        Err(e) => Err(failed(
-            e.payload().try_to_string().unwrap_or_default().into_owned(),
-        )),
+        timeout,
+        replies,
+    })
+}
+
+impl Asked {
+    /// Waits for the one answer.
+    ///
+    /// # Errors
+    /// Nobody there (at once), no answer in time, or the answerer's own error. All may be tried again.
+    pub fn answer(self) -> Result<ZBytes, SessionError> {
+        let Self {
+            key,
+            timeout,
+            replies,
+        } = self;
+        let Ok(reply) = replies.recv() else {
+            return Err(SessionError::Nobody { key });
+        };
+        reply
+            .into_result()
+            .map(|it| it.payload().clone())
+            .map_err(|e| {
+                let why = e.payload().try_to_string().unwrap_or_default().into_owned();
+                let within_ms = timeout.as_millis();
+                match why.as_str() {
+                    TIMED_OUT => SessionError::NoReply { key, within_ms },
+                    _ => SessionError::Zenoh { key, why },
+                }
+            })
     }
+}
+
+/// Asks one question and waits for its one answer: [`send`] and [`Asked::answer`].
+///
+/// # Errors
+/// As those.
+pub fn ask(
+    session: &Session,
+    key: &str,
+    payload: ZBytes,
+    priority: Priority,
+    timeout: Duration,
+) -> Result<ZBytes, SessionError> {
+    send(session, key, payload, priority, timeout)?.answer()
 }
 
 /// Answers a question with `payload`; an asker that has gone away is logged and forgotten.
@@ -205,7 +274,11 @@ pub fn join(
             Priority::Data,
             JOIN_TRY,
         ) {
-            Ok(bytes) => return Ok(Some(codec::decode(&bytes, Kind::Hello, None)?.0)),
+            Ok(answer) => {
+                return Ok(Some(
+                    codec::decode(&answer.to_bytes(), Kind::Hello, None)?.0,
+                ));
+            }
             Err(last) if started.elapsed() > JOIN_MAX => return Err(JoinError::Nobody { last }),
             Err(e) => tracing::debug!("no replay server yet: {e}"),
         }

@@ -3,7 +3,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::codec::{self, CodecError, Kind};
+use crate::{
+    Planes, PlanesPool,
+    codec::{self, CodecError, Kind},
+};
 
 /// What a step ended, if anything.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -66,7 +69,8 @@ impl ChunkHeader {
         self.streams as usize * self.steps as usize
     }
 
-    fn planes_bytes(&self) -> Option<usize> {
+    /// Bytes of the planes of such a chunk; none if they are more than the address space.
+    pub fn planes_bytes(&self) -> Option<usize> {
         self.transitions()
             .checked_mul(self.frame_bytes as usize + 1 + 1 + 4)
     }
@@ -79,7 +83,7 @@ impl ChunkHeader {
 pub struct Chunk {
     /// What it says of itself.
     pub header: ChunkHeader,
-    planes: Vec<u8>,
+    planes: Planes,
 }
 
 impl Chunk {
@@ -90,8 +94,21 @@ impl Chunk {
             .expect("an actor's chunk is far below the address space");
         Self {
             header,
-            planes: vec![0; bytes],
+            planes: Planes::zeroed(bytes),
         }
+    }
+
+    /// A chunk in memory that may hold anything: every row is to be written.
+    ///
+    /// # Panics
+    /// If the memory is not of [`ChunkHeader::planes_bytes`].
+    pub fn in_memory(header: ChunkHeader, planes: Planes) -> Self {
+        assert_eq!(
+            Some(planes.len()),
+            header.planes_bytes(),
+            "memory for a chunk"
+        );
+        Self { header, planes }
     }
 
     fn rows(&self) -> usize {
@@ -157,13 +174,36 @@ impl Chunk {
         ))
     }
 
-    /// Reads a chunk and checks lengths, actions, ends and rewards.
+    /// The planes, to travel after a head from [`Chunk::seal`].
+    pub fn into_planes(self) -> Planes {
+        self.planes
+    }
+
+    /// Reads a chunk in one piece and checks lengths, actions, ends and rewards.
     ///
     /// # Errors
     /// Whatever makes it unfit to be stored; the message says what.
     pub fn decode(bytes: &[u8], spec_hash: u64, num_actions: u32) -> Result<Self, CodecError> {
-        let (header, planes): (ChunkHeader, _) =
-            codec::decode(bytes, Kind::Chunk, Some(spec_hash))?;
+        let (header, planes) = codec::decode(bytes, Kind::Chunk, Some(spec_hash))?;
+        Self::checked(header, planes.to_vec().into(), num_actions)
+    }
+
+    /// [`Chunk::decode`] of a message in `pieces`, `len` bytes in all; the chunk lies in own memory of `pool`.
+    ///
+    /// # Errors
+    /// As [`Chunk::decode`].
+    pub fn receive<'a>(
+        pieces: impl IntoIterator<Item = &'a [u8]>,
+        len: usize,
+        pool: &PlanesPool,
+        spec_hash: u64,
+        num_actions: u32,
+    ) -> Result<Self, CodecError> {
+        let (header, planes) = codec::receive(pieces, len, pool, Kind::Chunk, Some(spec_hash))?;
+        Self::checked(header, planes, num_actions)
+    }
+
+    fn checked(header: ChunkHeader, planes: Planes, num_actions: u32) -> Result<Self, CodecError> {
         if header.planes_bytes() != Some(planes.len()) || header.transitions() == 0 {
             return Err(CodecError::Header(format!(
                 "{} streams of {} steps of {} bytes do not fill {} bytes of planes",
@@ -173,10 +213,7 @@ impl Chunk {
                 planes.len()
             )));
         }
-        let chunk = Self {
-            header,
-            planes: planes.to_vec(),
-        };
+        let chunk = Self { header, planes };
         if let Some(action) = chunk
             .actions()
             .iter()

@@ -7,7 +7,8 @@ use std::fmt::Debug;
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader, CodecError,
     End, Goodbye, Hello, Horizon, InsertReply, Kind, LearnerStatus, NO_ACTION, PROTOCOL_VERSION,
-    ReplayStatus, RunSpec, TimeoutRule, Waiting, WeightsHeader, WeightsVersion,
+    Planes, PlanesPool, ReplayStatus, RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader,
+    WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PLANES_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -60,7 +61,9 @@ fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
 
 fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
     match codec::decode(bytes, Kind::BatchReply, Some(SPEC))? {
-        (BatchReply::Batch(header), planes) => Batch::from_planes(header, planes).map(|_| ()),
+        (BatchReply::Batch(header), planes) => {
+            Batch::from_planes(header, planes.to_vec().into()).map(|_| ())
+        }
         _ => Ok(()),
     }
 }
@@ -94,7 +97,11 @@ fn batch() -> Batch {
         rows: 3,
         positives: 1,
         state_bytes: 4,
-        inserted_total: 99,
+        tally: Tally {
+            inserted: 99,
+            rows_sampled: 12,
+        },
+        held: 9,
         mean_age: 12.5,
         weights_versions: (8, 2),
     });
@@ -177,6 +184,7 @@ fn samples() -> Vec<Sample> {
     let hello = Hello {
         config_toml: "[run]\nseed = 1\n".into(),
         inserted_total: 12,
+        shard: (1, 2),
     };
     let goodbye = Goodbye {
         actor: 1,
@@ -194,7 +202,14 @@ fn samples() -> Vec<Sample> {
             Kind::BatchReply,
             &BatchReply::Refused { why: String::new() },
         ),
-        Sample::of(Kind::BatchRequest, &BatchRequest { rows: 256 }),
+        Sample::of(
+            Kind::BatchRequest,
+            &BatchRequest {
+                rows: 256,
+                shared_memory: true,
+                elsewhere: Some(Tally::default()),
+            },
+        ),
         Sample::of(Kind::Affinity, &affinity),
         Sample::of(Kind::WeightsVersion, &WeightsVersion { version: 9 }),
         Sample::of(Kind::Goodbye, &goodbye),
@@ -272,7 +287,7 @@ fn chunk_batch_and_weights_come_back() {
     let BatchReply::Batch(header) = reply else {
         panic!("{reply:?}")
     };
-    let back = Batch::from_planes(header, planes).unwrap();
+    let back = Batch::from_planes(header, planes.to_vec().into()).unwrap();
     assert_eq!(back, batch());
     assert_eq!(
         back.frames_t(),
@@ -301,6 +316,85 @@ fn chunk_batch_and_weights_come_back() {
     let (header, planes) = WeightsHeader::decode(&bytes, SPEC).unwrap();
     assert_eq!((header.version, header.updates, planes.len()), (4, 312, 40));
     assert_eq!(header.sha256_hex().len(), 64);
+}
+
+/// However a message was cut on its way, what is received is what was sent, and in memory that held something else before.
+#[test]
+fn pieces_are_received_as_the_whole_is() {
+    let pool = PlanesPool::new(1);
+    let bytes = join(chunk().seal(SPEC).unwrap());
+    for at in 0..=bytes.len() {
+        let (first, second) = bytes.split_at(at);
+        pool.take_own(64).fill(0xAB);
+        let pieces = [first, &[], second];
+        let back = Chunk::receive(pieces, bytes.len(), &pool, SPEC, ACTIONS).unwrap();
+        assert_eq!(back, chunk(), "cut at {at}");
+        // A piece that is missing at the end, or a length that is not the sum of the pieces.
+        if at < bytes.len() {
+            assert!(Chunk::receive([first], at, &pool, SPEC, ACTIONS).is_err());
+            assert!(Chunk::receive([first], bytes.len(), &pool, SPEC, ACTIONS).is_err());
+        }
+    }
+    for flipped in 0..bytes.len() {
+        let mut damaged = bytes.clone();
+        damaged[flipped] ^= 1;
+        let (first, second) = damaged.split_at(flipped / 2);
+        let refused = Chunk::receive([first, second], bytes.len(), &pool, SPEC, ACTIONS);
+        assert_eq!(
+            refused.unwrap_err(),
+            Chunk::decode(&damaged, SPEC, ACTIONS).unwrap_err()
+        );
+    }
+}
+
+#[test]
+fn parts_are_merged_row_by_row() {
+    let header = |rows, mean_age, versions| BatchHeader {
+        rows,
+        positives: 2,
+        state_bytes: 3,
+        tally: Tally {
+            inserted: 10,
+            rows_sampled: 1,
+        },
+        held: 5,
+        mean_age,
+        weights_versions: versions,
+    };
+    let part = |header: BatchHeader, first: u8| {
+        let mut batch = Batch::zeroed(header);
+        let mut rows = batch.rows_mut();
+        for row in 0..header.rows as usize {
+            let value = first + row as u8;
+            rows.set(row, value, value + 100, f32::from(value), 0.5);
+            rows.frame_t(row).fill(value);
+            rows.frame_n(row).fill(value + 20);
+            rows.positive(0, row, 1).fill(value + 40);
+            rows.positive(1, row, 2).fill(value + 60);
+        }
+        batch
+    };
+    let parts = [
+        part(header(2, 1.0, (7, 3)), 0),
+        part(header(1, 4.0, (9, 5)), 2),
+    ];
+    let whole = Batch::merged_header(&parts).unwrap();
+    let merged = Batch::merge(&parts, Planes::from(vec![0xAB; whole.planes_bytes()]));
+    let mut expected = part(whole, 0);
+    assert_eq!((whole.mean_age, whole.weights_versions), (2.0, (9, 3)));
+    assert_eq!((whole.tally.inserted, whole.held), (20, 10));
+    expected.header = whole;
+    assert_eq!(merged, expected);
+
+    let other = part(
+        BatchHeader {
+            state_bytes: 4,
+            ..header(1, 0.0, (1, 1))
+        },
+        0,
+    );
+    assert_eq!(Batch::merged_header(&[parts[0].clone(), other]), None);
+    assert_eq!(Batch::merged_header(&[]), None);
 }
 
 #[test]
@@ -492,6 +586,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
     let hello = Hello {
         config_toml: "x".repeat(HEADER_BYTES_MAX),
         inserted_total: 0,
+        shard: (0, 1),
     };
     let refused = codec::seal(Kind::Hello, SPEC, &hello, &[]).unwrap_err();
     assert!(
@@ -560,12 +655,12 @@ fn counts_that_do_not_fit_their_planes_are_refused() {
         },
     ] {
         assert!(
-            Batch::from_planes(wrong, &[0; 3 * 24]).is_err(),
+            Batch::from_planes(wrong, Planes::zeroed(3 * 24)).is_err(),
             "{wrong:?}"
         );
     }
     assert!(
-        Batch::from_planes(BatchHeader { rows: 0, ..header }, &[]).is_err(),
+        Batch::from_planes(BatchHeader { rows: 0, ..header }, Planes::zeroed(0)).is_err(),
         "no rows at all"
     );
 }

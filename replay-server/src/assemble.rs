@@ -54,15 +54,19 @@ impl Assembler {
             discount as f32,
         );
         episodes.write_state(ring, window.index(0), rows.frame_t(row));
-        if let Some(i) = bootstrap {
-            episodes.write_state(ring, window.index(i), rows.frame_n(row));
+        match bootstrap {
+            Some(i) => episodes.write_state(ring, window.index(i), rows.frame_n(row)),
+            None => rows.frame_n(row).fill(0),
         }
         match self.draw_k(affinity, window, rng) {
             Some(k) => {
                 episodes.write_state(ring, window.index(k as usize), rows.positive(0, row, k));
                 k
             }
-            None => 0,
+            None => {
+                (0..self.horizon.positives()).for_each(|p| rows.no_positive(p, row));
+                0
+            }
         }
     }
 

@@ -7,12 +7,18 @@ use driml_protocol::{
 };
 use serde::{Deserialize, Serialize};
 
+/// Most shards of one replay.
+pub const SHARDS_MAX: u32 = 256;
+
 /// The replay server's settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// Transitions held; the oldest are overwritten beyond it. Memory: one frame and 32 bytes each, taken as they come.
     pub capacity_transitions: u64,
+    /// Replay servers among which the capacity and the actors are spread; the learner draws from each in proportion to what it
+    /// holds.
+    pub shards: u32,
     /// Rows sampled per transition inserted after the warm-up. More trains longer on each transition.
     pub replay_ratio: f64,
     /// Transitions stored before the replay ratio starts to count and the first row is sampled.
@@ -75,10 +81,14 @@ impl Config {
             let why = format!("a batch of this run has 1 to {rows_max} rows");
             return bad("learner.batch_rows", batch_rows.to_string(), why);
         }
+        if !(1..=SHARDS_MAX).contains(&self.shards) {
+            let why = format!("a replay has 1 to {SHARDS_MAX} shards");
+            return bad("replay.shards", self.shards.to_string(), why);
+        }
         let window = u64::from(reach(spec)) + u64::from(spec.frame_stack);
-        if self.capacity_transitions < window {
+        if self.capacity_transitions / u64::from(self.shards) < window {
             let why = format!(
-                "one sample spans {window} transitions (the longer of n_step and k_max, and the frame stack); hold at least that many for each copy of the world"
+                "one sample spans {window} transitions (the longer of n_step and k_max, and the frame stack); hold at least that many in each shard for each copy of the world"
             );
             return bad(
                 "replay.capacity_transitions",

@@ -16,6 +16,9 @@ struct Args {
     /// The run's resolved settings: a config.toml that driml wrote
     #[arg(long)]
     config: std::path::PathBuf,
+    /// Which of the replay's shards this is
+    #[arg(long, default_value_t = 0)]
+    shard: u32,
     /// Prefix of the run's keys
     #[arg(long, default_value = "driml")]
     namespace: String,
@@ -40,6 +43,7 @@ fn run(args: Args) -> anyhow::Result<()> {
     let Args {
         listen,
         config,
+        shard,
         namespace,
     } = args;
     let config_toml = std::fs::read_to_string(&config)
@@ -48,6 +52,7 @@ fn run(args: Args) -> anyhow::Result<()> {
         listen,
         connect: Vec::new(),
         namespace,
+        shard,
         config_toml,
     };
     driml_replay_server::run(args, &shutdown)

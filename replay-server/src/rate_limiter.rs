@@ -1,7 +1,7 @@
 //! Holds the replay ratio: it says which side is ahead and has to wait.
 //! It does not wait itself, keep time or know what is stored.
 
-use driml_protocol::Waiting;
+use driml_protocol::{Tally, Waiting};
 
 /// Counts transitions in and rows out, and keeps rows / transitions after the warm-up at the replay ratio.
 ///
@@ -14,8 +14,9 @@ pub struct RateLimiter {
     warmup_transitions: u64,
     slack_transitions: u64,
     transitions_max: Option<u64>,
-    inserted: u64,
-    rows_sampled: u64,
+    here: Tally,
+    /// What the replay's other shards have counted, as far as heard.
+    elsewhere: Tally,
     /// Where the present ratio began to count: transitions after the warm-up, and the rows allowed by then.
     since: (u64, f64),
 }
@@ -33,14 +34,30 @@ impl RateLimiter {
             warmup_transitions,
             slack_transitions,
             transitions_max,
-            inserted: 0,
-            rows_sampled: 0,
+            here: Tally::default(),
+            elsewhere: Tally::default(),
             since: (0, 0.0),
         }
     }
 
+    /// Transitions stored in all shards.
+    pub const fn inserted_total(&self) -> u64 {
+        self.here.inserted.saturating_add(self.elsewhere.inserted)
+    }
+
+    /// Takes what the other shards have counted; counts never fall.
+    pub fn heard(&mut self, elsewhere: Tally) {
+        let Tally {
+            inserted,
+            rows_sampled,
+        } = &mut self.elsewhere;
+        *inserted = elsewhere.inserted.max(*inserted);
+        *rows_sampled = elsewhere.rows_sampled.max(*rows_sampled);
+    }
+
     fn after_warmup(&self) -> u64 {
-        self.inserted.saturating_sub(self.warmup_transitions)
+        self.inserted_total()
+            .saturating_sub(self.warmup_transitions)
     }
 
     /// Rows allowed so far, whether sampled or not.
@@ -50,7 +67,8 @@ impl RateLimiter {
     }
 
     fn credit(&self) -> f64 {
-        self.rows_allowed() - self.rows_sampled as f64
+        let Tally { rows_sampled, .. } = self.here + self.elsewhere;
+        self.rows_allowed() - rows_sampled as f64
     }
 
     /// Whether a chunk may be stored now; chunks are stored whole, so inserts may overshoot by one chunk.
@@ -60,12 +78,13 @@ impl RateLimiter {
 
     /// Whether `rows` rows may be sampled now.
     pub fn may_sample(&self, rows: u32) -> bool {
-        self.inserted >= self.warmup_transitions && f64::from(rows) <= self.credit()
+        self.inserted_total() >= self.warmup_transitions && f64::from(rows) <= self.credit()
     }
 
     /// Whether all transitions of the run are in.
     pub fn all_in(&self) -> bool {
-        self.transitions_max.is_some_and(|max| self.inserted >= max)
+        self.transitions_max
+            .is_some_and(|max| self.inserted_total() >= max)
     }
 
     /// Whether all transitions are in and no further batch of `rows` is allowed.
@@ -80,18 +99,18 @@ impl RateLimiter {
 
     /// Counts `transitions` stored.
     pub fn inserted(&mut self, transitions: u64) {
-        self.inserted += transitions;
+        self.here.inserted += transitions;
     }
 
     /// Counts `rows` sampled.
     pub fn sampled(&mut self, rows: u32) {
         debug_assert!(self.may_sample(rows), "{rows} rows beyond the replay ratio");
-        self.rows_sampled += u64::from(rows);
+        self.here.rows_sampled += u64::from(rows);
     }
 
-    /// Rows sampled since the start.
-    pub const fn rows_sampled(&self) -> u64 {
-        self.rows_sampled
+    /// What was counted here since the start.
+    pub const fn tally(&self) -> Tally {
+        self.here
     }
 
     /// Changes the replay ratio from now on; rows allowed before stay allowed. The caller has validated it.
@@ -104,9 +123,9 @@ impl RateLimiter {
     pub fn waiting(&self, rows: u32) -> Waiting {
         if self.finished(rows) {
             Waiting::Finished
-        } else if self.inserted < self.warmup_transitions {
+        } else if self.inserted_total() < self.warmup_transitions {
             Waiting::WarmUp {
-                have: self.inserted,
+                have: self.inserted_total(),
                 need: self.warmup_transitions,
             }
         } else if !self.may_sample(rows) {

@@ -3,7 +3,7 @@
 
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, BatchReply, Chunk, CodecError, Goodbye, InsertReply,
-    ReplayStatus, RunSpec, Waiting,
+    Planes, ReplayStatus, RunSpec, Tally, Waiting,
 };
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -67,13 +67,35 @@ pub struct Replay {
 }
 
 impl Replay {
-    /// An empty replay for batches of `batch_rows` rows; its draws follow from `spec.seed` and the order of calls.
+    /// An empty replay for batches of `batch_rows` rows; its draws follow from `spec.seed` and the order of calls. Of several
+    /// shards it is the first: [`Replay::shard`].
     ///
     /// # Errors
     /// Settings that cannot work, or more memory than the system grants.
     pub fn new(spec: &RunSpec, config: &Config, batch_rows: u32) -> Result<Self, ConfigError> {
+        Self::shard(spec, config, batch_rows, 0)
+    }
+
+    /// Shard `shard` of `config.shards`, which holds its share of the capacity and draws its own numbers.
+    ///
+    /// # Errors
+    /// As [`Replay::new`], and a shard that does not exist.
+    pub fn shard(
+        spec: &RunSpec,
+        config: &Config,
+        batch_rows: u32,
+        shard: u32,
+    ) -> Result<Self, ConfigError> {
         config.validate(spec, batch_rows)?;
-        let ring = Ring::new(config.capacity_transitions, spec.frame_bytes()).map_err(|bytes| {
+        if shard >= config.shards {
+            return Err(ConfigError::Key {
+                key: "replay.shards",
+                value: config.shards.to_string(),
+                why: format!("there is no shard {shard}; the first is shard 0"),
+            });
+        }
+        let capacity = config.capacity_transitions / u64::from(config.shards);
+        let ring = Ring::new(capacity, spec.frame_bytes()).map_err(|bytes| {
             let why =
                 format!("the system does not grant the {bytes} bytes that this takes; hold fewer");
             ConfigError::Key {
@@ -83,7 +105,7 @@ impl Replay {
             }
         })?;
         let mut rng = ChaCha8Rng::seed_from_u64(spec.seed);
-        rng.set_stream(RNG_STREAM);
+        rng.set_stream(RNG_STREAM + u64::from(shard));
         Ok(Self {
             spec: spec.clone(),
             config: config.clone(),
@@ -116,7 +138,7 @@ impl Replay {
             Some(why) => Verdict::Refused(why),
             None => self.actors.judge(&chunk.header),
         };
-        let inserted_total = self.ring.inserted();
+        let inserted_total = self.inserted_total();
         match verdict {
             Verdict::Refused(why) => {
                 tracing::warn!("refused a chunk of actor {}: {why}", chunk.header.actor);
@@ -137,7 +159,7 @@ impl Replay {
             Verdict::Next => {
                 self.store(chunk);
                 InsertReply::Stored {
-                    inserted_total: self.ring.inserted(),
+                    inserted_total: self.inserted_total(),
                 }
             }
         }
@@ -221,6 +243,18 @@ impl Replay {
     /// # Errors
     /// The limiter or the lack of any valid anchor asks to wait; the run is over; `rows` can never be served.
     pub fn sample(&mut self, rows: u32) -> Result<Batch, Unready> {
+        self.sample_in(rows, Planes::zeroed)
+    }
+
+    /// [`Replay::sample`] into memory that `memory` gives, so many bytes, all of which are then written.
+    ///
+    /// # Errors
+    /// As [`Replay::sample`].
+    pub fn sample_in(
+        &mut self,
+        rows: u32,
+        memory: impl FnOnce(usize) -> Planes,
+    ) -> Result<Batch, Unready> {
         let rows_max = config::rows_max(&self.spec).min(self.limiter.rows_max());
         if rows == 0 || rows > rows_max {
             self.statistics.messages_refused += 1;
@@ -235,15 +269,8 @@ impl Replay {
         if !self.limiter.may_sample(rows) {
             return Err(Unready::Wait(self.limiter.waiting(rows)));
         }
-        let mut batch = Batch::zeroed(BatchHeader {
-            rows,
-            positives: self.spec.horizon.positives() as u32,
-            state_bytes: self.spec.state_bytes() as u32,
-            inserted_total: self.ring.inserted(),
-            mean_age: 0.0,
-            weights_versions: (0, u64::MAX),
-        });
-        let mut header = batch.header;
+        let mut header = self.batch_header(rows);
+        let mut batch = Batch::in_memory(header, memory(header.planes_bytes()));
         let mut age_total = 0;
         let mut rows_mut = batch.rows_mut();
         for row in 0..rows as usize {
@@ -264,11 +291,25 @@ impl Replay {
             header.weights_versions = (newest.max(version), oldest.min(version));
         }
         header.mean_age = age_total as f64 / f64::from(rows);
-        batch.header = header;
         self.statistics.mean_age = header.mean_age;
         self.limiter.sampled(rows);
+        header.tally = self.limiter.tally();
+        batch.header = header;
         self.starving = false;
         Ok(batch)
+    }
+
+    /// What a batch of `rows` rows says of itself before any row is written.
+    pub(crate) fn batch_header(&self, rows: u32) -> BatchHeader {
+        BatchHeader {
+            rows,
+            positives: self.spec.horizon.positives() as u32,
+            state_bytes: self.spec.state_bytes() as u32,
+            tally: self.limiter.tally(),
+            held: self.ring.inserted() - self.ring.oldest(),
+            mean_age: 0.0,
+            weights_versions: (0, u64::MAX),
+        }
     }
 
     fn no_anchor(&mut self) -> Unready {
@@ -335,9 +376,14 @@ impl Replay {
         self.statistics.actors = actors;
     }
 
-    /// Transitions stored since the start.
-    pub fn inserted_total(&self) -> u64 {
-        self.ring.inserted()
+    /// Transitions stored since the start, in all shards as far as heard.
+    pub const fn inserted_total(&self) -> u64 {
+        self.limiter.inserted_total()
+    }
+
+    /// Takes what the replay's other shards have counted.
+    pub fn heard(&mut self, elsewhere: Tally) {
+        self.limiter.heard(elsewhere);
     }
 
     /// Who waits for whom now, for batches of the size that the replay was made for.
@@ -360,7 +406,7 @@ impl Replay {
             transitions_duplicated: statistics.transitions_duplicated,
             chunks_retried: statistics.chunks_retried,
             messages_refused: statistics.messages_refused,
-            rows_sampled: self.limiter.rows_sampled(),
+            rows_sampled: self.limiter.tally().rows_sampled,
             warmup_transitions: self.config.warmup_transitions,
             episodes: statistics.episodes,
             mean_return: statistics.mean_return(),
@@ -388,7 +434,7 @@ impl Replay {
         let served: u64 = self.statistics.k_histogram.iter().sum();
         assert_eq!(
             served,
-            self.limiter.rows_sampled(),
+            self.limiter.tally().rows_sampled,
             "every row served has one k"
         );
     }

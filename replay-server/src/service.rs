@@ -6,26 +6,38 @@
 
 use std::{
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, mpsc},
+    thread::JoinHandle,
     time::{Duration, Instant},
 };
 
 use anyhow::Context;
 use driml_protocol::{
     AffinityUpdate, BatchReply, BatchRequest, Chunk, CodecError, Goodbye, Hello, InsertReply, Keys,
-    Kind, RunSpec, Shutdown, codec,
-    config::Settings,
+    Kind, PlanesPool, RunSpec, Shutdown, codec,
+    config::{Settings, TransportConfig},
     session::{self, Endpoints},
+    shutdown::join_within,
 };
-use zenoh::{Session, Wait, query::Query, query::Queryable, sample::SampleKind};
+use zenoh::{Session, Wait, bytes::ZBytes, query::Query, query::Queryable, sample::SampleKind};
 
 use crate::{Config, Replay, Unready};
 
 /// How long a chunk or a request waits at the limiter before it is told to come back: far below every sender's time-out.
 const HOLD_MAX: Duration = Duration::from_secs(1);
+/// The same for a part of a batch: what another shard counts meanwhile does not wake it.
+const SHARD_HOLD_MAX: Duration = Duration::from_millis(50);
 /// Chunks, and requests, that wait for their thread; one more is told to come back at once.
 const QUEUE_MAX: usize = 4096;
 /// Threads that make batches: one assembles while another's reply is being sent.
 const BATCH_THREADS: usize = 2;
+
+/// Pieces of memory kept for later chunks and batches.
+const SPARE_MAX: usize = 8;
+/// Batches in shared memory: those that are assembled, on their way, and being copied by the learner.
+const SHARED_BATCHES: usize = 6;
+
+/// How long the threads may take to end.
+const THREADS_END_MAX: Duration = Duration::from_secs(2);
 
 /// What a replay server is told at its start.
 #[derive(Clone, Debug)]
@@ -36,6 +48,8 @@ pub struct RunArgs {
     pub connect: Vec<String>,
     /// Prefix of the run's keys.
     pub namespace: String,
+    /// Which of the replay's shards this is, from 0.
+    pub shard: u32,
     /// The run's resolved settings, which it hands to whoever joins.
     pub config_toml: String,
 }
@@ -49,7 +63,15 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let spec: RunSpec = settings.table("run")?;
     spec.validate()?;
     let config: Config = settings.table("replay")?;
-    let replay = Replay::new(&spec, &config, batch_rows(&settings)?)?;
+    let batch_rows = batch_rows(&settings)?;
+    let replay = Replay::shard(&spec, &config, batch_rows, args.shard)?;
+    let transport: TransportConfig = settings.table("transport")?;
+    let pool = if transport.shared_memory {
+        let bytes = replay.batch_header(batch_rows).planes_bytes();
+        PlanesPool::shared(SPARE_MAX, SHARED_BATCHES, bytes)
+    } else {
+        PlanesPool::new(SPARE_MAX)
+    };
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let session = session::open(&Endpoints {
         listen: args.listen.clone(),
@@ -58,12 +80,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let service = Arc::new(Service {
         spec_hash: spec.hash(),
         num_actions: spec.num_actions,
+        shard: (args.shard, config.shards),
         config_toml: args.config_toml,
+        pool,
         replay: Mutex::new(replay),
         changed: Condvar::new(),
         shutdown: shutdown.clone(),
     });
-    let _answering = declare(&session, &keys, &service)
+    let (answering, threads) = declare(&session, &keys, &service)
         .map_err(|e| anyhow::anyhow!("declaring what the replay server answers: {e}"))?;
     let watched = service.clone();
     let _alive = session
@@ -91,10 +115,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         "replay server stops with {} transitions stored",
         service.replay().inserted_total()
     );
-    session
-        .close()
-        .wait()
-        .map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+    // Without the queryables no more comes, without the session nobody waits for a slow asker: the threads end.
+    drop(answering);
+    let closed = session.close().wait();
+    join_within(threads, THREADS_END_MAX);
+    closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
 /// The one number of the learner's that the limiter needs.
@@ -108,33 +133,37 @@ fn batch_rows(settings: &Settings) -> anyhow::Result<u32> {
 struct Service {
     spec_hash: u64,
     num_actions: u32,
+    shard: (u32, u32),
     config_toml: String,
+    /// Memory for chunks that arrive and batches that leave.
+    pool: PlanesPool,
     replay: Mutex<Replay>,
     /// Something was stored or sampled: whoever waits at the limiter looks again.
     changed: Condvar,
     shutdown: Shutdown,
 }
 
-/// Declares everything that the replay server answers; dropping the result ends it.
+/// Declares everything that the replay server answers; dropping the first ends it, and with it the threads.
 fn declare(
     session: &Session,
     keys: &Keys,
     service: &Arc<Service>,
-) -> zenoh::Result<Vec<Queryable<()>>> {
+) -> zenoh::Result<(Vec<Queryable<()>>, Vec<JoinHandle<()>>)> {
     let (chunks, waiting_chunks) = mpsc::sync_channel::<Query>(QUEUE_MAX);
     let (requests, waiting_requests) = mpsc::sync_channel::<Query>(QUEUE_MAX);
     let waiting_requests = Arc::new(Mutex::new(waiting_requests));
     let inserting = service.clone();
-    std::thread::Builder::new()
+    let insert = std::thread::Builder::new()
         .name("insert".into())
         .spawn(move || {
             for query in waiting_chunks {
                 inserting.insert(&query);
             }
         })?;
+    let mut threads = vec![insert];
     for i in 0..BATCH_THREADS {
         let (sampling, waiting) = (service.clone(), waiting_requests.clone());
-        std::thread::Builder::new()
+        let sample = std::thread::Builder::new()
             .name(format!("sample-{i}"))
             .spawn(move || {
                 loop {
@@ -146,6 +175,7 @@ fn declare(
                     sampling.sample(&query);
                 }
             })?;
+        threads.push(sample);
     }
     let answering = |key: String, answer: fn(&Service, &Query)| {
         let service = service.clone();
@@ -172,7 +202,7 @@ fn declare(
             overflow.reply(&query, Kind::BatchReply, &BatchReply::Wait(waiting));
         }
     };
-    Ok(vec![
+    let queryables = vec![
         answering(keys.hello(), Service::hello)?,
         answering(keys.goodbye(), Service::goodbye)?,
         answering(keys.affinity(), Service::affinity)?,
@@ -185,7 +215,8 @@ fn declare(
             .declare_queryable(keys.batch())
             .callback(batch)
             .wait()?,
-    ])
+    ];
+    Ok((queryables, threads))
 }
 
 impl Service {
@@ -226,6 +257,7 @@ impl Service {
         let hello = Hello {
             config_toml: self.config_toml.clone(),
             inserted_total,
+            shard: self.shard,
         };
         self.reply(query, Kind::Hello, &hello);
     }
@@ -253,11 +285,11 @@ impl Service {
     }
 
     fn insert(&self, query: &Query) {
-        let payload = query
-            .payload()
-            .map(|payload| payload.to_bytes())
-            .unwrap_or_default();
-        let chunk = match Chunk::decode(&payload, self.spec_hash, self.num_actions) {
+        let none = ZBytes::new();
+        let payload = query.payload().unwrap_or(&none);
+        let (pieces, len) = (payload.slices(), payload.len());
+        let chunk = match Chunk::receive(pieces, len, &self.pool, self.spec_hash, self.num_actions)
+        {
             Ok(chunk) => chunk,
             Err(e) => {
                 self.refuse("a chunk", &e);
@@ -296,10 +328,22 @@ impl Service {
         };
         let arrived = Instant::now();
         let mut replay = self.replay();
+        let hold_max = match request.elsewhere {
+            Some(elsewhere) => {
+                replay.heard(elsewhere);
+                self.changed.notify_all();
+                SHARD_HOLD_MAX
+            }
+            None => HOLD_MAX,
+        };
         let sampled = loop {
-            match replay.sample(request.rows) {
+            let memory = |bytes| match request.shared_memory {
+                true => self.pool.take(bytes),
+                false => self.pool.take_own(bytes),
+            };
+            match replay.sample_in(request.rows, memory) {
                 Err(Unready::Wait(waiting)) => {
-                    let left = HOLD_MAX.saturating_sub(arrived.elapsed());
+                    let left = hold_max.saturating_sub(arrived.elapsed());
                     if left.is_zero() || self.shutdown.is_set() {
                         break Err(Unready::Wait(waiting));
                     }
@@ -315,7 +359,7 @@ impl Service {
                 self.changed.notify_all();
                 match batch.seal(self.spec_hash) {
                     Ok((head, planes)) => {
-                        session::answer(query, session::join_pieces([head, planes]))
+                        session::answer(query, session::join_planes(head, planes.freeze()))
                     }
                     Err(e) => tracing::error!("a batch was not sent: {e}"),
                 }

@@ -72,6 +72,7 @@ impl Client {
             Priority::Data,
             ANSWER_MAX,
         )
+        .map(|answer| answer.to_bytes().into_owned())
     }
 
     fn ask_for<T: DeserializeOwned>(&self, key: &str, kind: Kind, payload: Vec<u8>) -> Option<T> {

@@ -201,7 +201,11 @@ fn everything_else_that_a_replay_server_takes() {
         codec::encode(
             Kind::BatchRequest,
             hash ^ 1,
-            &BatchRequest { rows: 16 },
+            &BatchRequest {
+                rows: 16,
+                shared_memory: false,
+                elsewhere: None,
+            },
             &[],
         )
         .unwrap(),
@@ -214,7 +218,17 @@ fn everything_else_that_a_replay_server_takes() {
         assert_eq!(counted(), before + 1);
     }
     for rows in [0, u32::MAX] {
-        let request = codec::encode(Kind::BatchRequest, hash, &BatchRequest { rows }, &[]).unwrap();
+        let request = codec::encode(
+            Kind::BatchRequest,
+            hash,
+            &BatchRequest {
+                rows,
+                shared_memory: false,
+                elsewhere: None,
+            },
+            &[],
+        )
+        .unwrap();
         let reply = client.ask(&client.keys.batch(), request).unwrap();
         let (reply, _): (BatchReply, _) =
             codec::decode(&reply, Kind::BatchReply, Some(hash)).unwrap();

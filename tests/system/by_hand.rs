@@ -126,3 +126,42 @@ fn an_actor_killed_and_started_again_goes_on() {
     );
     learner.stop().expect_code(0);
 }
+
+/// A learner that was killed goes on from its newest checkpoint, and the actors take its weights.
+#[test]
+fn a_killed_learner_s_successor_goes_on() {
+    let system = system();
+    let settings = "--set learner.checkpoint_period_updates=50";
+    let server = system.start_replay_server(&format!("--agent driml-ada {LONG} {settings}"));
+    let learner = system.start_learner("run");
+    let actor = system.start_actor(0);
+    let client = system.connect();
+    client.wait_for_learner("two checkpoints", |learner| learner.updates > 100);
+    let before = client.learner().unwrap();
+    learner.signal(Signal::SIGKILL);
+    learner.wait();
+
+    let learner = system.start_learner("run");
+    let after = client.wait_for_learner("later updates", |learner| {
+        learner.updates > before.updates && learner.weights_version > before.weights_version
+    });
+    assert!(after.updates > 100, "{after:#?}");
+    let replay = client.replay().unwrap();
+    assert_eq!(
+        (replay.transitions_lost, replay.transitions_duplicated),
+        (0, 0)
+    );
+    actor.stop().expect_code(0);
+    learner.stop().expect_code(0).expect_said("resumed after ");
+    drop(client);
+    server.stop().expect_code(0);
+
+    // What is in the folder is another run's to a run with other settings.
+    let server = system.start_replay_server(&format!("--agent c51 {LONG}"));
+    let learner = system.start_learner("run");
+    learner
+        .wait()
+        .expect_code(1)
+        .expect_said("resume with the settings it was made with");
+    server.stop().expect_code(0);
+}

@@ -1,6 +1,8 @@
 //! Runs that end before their time: Ctrl-C, a part that dies, a launcher that dies. No process is ever left.
 //! What a dead part's successor may do is in `by_hand`.
 
+use std::{fs, path::PathBuf};
+
 use driml_tests::{Process, TestSystem, wait_for};
 use nix::sys::signal::Signal;
 
@@ -96,4 +98,33 @@ fn parts_end_with_their_launcher() {
         !system.run_folder("run").checkpoints().is_empty(),
         "the learner saved"
     );
+}
+
+/// The shared memory that a process has open.
+fn shared_memory_of(pid: i32) -> Vec<PathBuf> {
+    let maps = fs::read_to_string(format!("/proc/{pid}/maps")).unwrap();
+    let mut files: Vec<_> = maps
+        .lines()
+        .filter_map(|line| line.split_whitespace().nth(5))
+        .filter(|path| path.ends_with(".zenoh"))
+        .map(PathBuf::from)
+        .collect();
+    files.dedup();
+    files
+}
+
+#[test]
+fn shared_memory_of_killed_parts_is_removed() {
+    let system = system();
+    let process = launched(&system);
+    let parts = ["replay-server", "learner", "actor"].map(|part| system.find_part(part));
+    let files: Vec<_> = parts
+        .iter()
+        .flat_map(|part| shared_memory_of(part.pid))
+        .collect();
+    assert!(files.len() > 1, "the parts share memory: {files:?}");
+    parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
+    process.wait().expect_code(1);
+    let left: Vec<_> = files.iter().filter(|file| file.exists()).collect();
+    assert!(left.is_empty(), "{left:?}");
 }

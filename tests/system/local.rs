@@ -140,3 +140,32 @@ fn the_settings_that_a_run_leaves_repeat_it() {
         (b.frames, b.updates, b.rows_sampled)
     );
 }
+
+/// Two actors, each with a replay server of its own, and one learner: the counts are those of one replay.
+#[test]
+fn two_replay_shards_are_one_replay() {
+    let system = system();
+    system
+        .run(&format!(
+            "local --agent driml-ada {SHORT} --actors 2 --replay-shards 2 --run-dir run"
+        ))
+        .expect_code(0);
+    assert_eq!(system.survivors(), []);
+    let summary = system.run_folder("run").check("finished");
+    // Each of the two limiters lets chunks in until it hears of the other's.
+    assert!((1280..=1800).contains(&summary.frames), "{summary:#?}");
+    assert_eq!(summary.updates * 16, summary.rows_sampled);
+    let owed = (summary.frames - 200) * 8 / 16;
+    assert!(owed - summary.updates <= 1, "{summary:#?}");
+
+    system
+        .run(&format!("local {SHORT} --replay-shards 2 --actors 1"))
+        .expect_code(64)
+        .expect_said("2 replay shards for 1 actors");
+    system
+        .run(&format!(
+            "local {SHORT} --replay-shards 2 --actors 2 --lockstep"
+        ))
+        .expect_code(64)
+        .expect_said("leave --replay-shards out");
+}

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use anyhow::Context;
 use driml_envs::{StepEnd, make_world};
-use driml_protocol::{Chunk, ChunkHeader, End};
+use driml_protocol::{Chunk, ChunkHeader, End, PlanesPool};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -69,14 +69,21 @@ impl Recording {
         self.frame_bytes
     }
 
-    /// Chunk after chunk of one actor, so many steps of the first so many streams each; the recording plays round and round.
-    pub(super) fn chunks(&self, actor: u32, streams: u32, steps: u32) -> Chunks<'_> {
+    /// Chunk after chunk of one actor, so many steps of the first so many streams each, in memory of `pool`; the recording
+    /// plays round and round.
+    pub(super) fn chunks(
+        &self,
+        actor: u32,
+        (streams, steps): (u32, u32),
+        pool: PlanesPool,
+    ) -> Chunks<'_> {
         assert!(
             streams as usize <= STREAMS,
             "{streams} of {STREAMS} streams"
         );
         Chunks {
             recording: self,
+            pool,
             next: ChunkHeader {
                 actor,
                 epoch: 1,
@@ -95,6 +102,7 @@ impl Recording {
 /// An actor's chunks without end, each filled anew as a real actor's are.
 pub(super) struct Chunks<'a> {
     recording: &'a Recording,
+    pool: PlanesPool,
     next: ChunkHeader,
 }
 
@@ -114,7 +122,8 @@ impl Iterator for Chunks<'_> {
             frames,
             steps,
         } = self.recording;
-        let mut chunk = Chunk::zeroed(self.next);
+        let bytes = self.next.planes_bytes()?;
+        let mut chunk = Chunk::in_memory(self.next, self.pool.take(bytes));
         let (streams, chunk_steps) = (self.next.streams as usize, self.next.steps as usize);
         for row in 0..streams * chunk_steps {
             let step = self.next.sequence as usize * chunk_steps + row % chunk_steps;
@@ -142,7 +151,7 @@ mod tests {
             frames: (0..STEPS * STREAMS).flat_map(place).collect(),
             steps: vec![(1, 0.5, End::Running); STEPS * STREAMS],
         };
-        let mut chunks = recording.chunks(3, 2, 3);
+        let mut chunks = recording.chunks(3, (2, 3), PlanesPool::new(1));
         let (first, second) = (chunks.next().unwrap(), chunks.next().unwrap());
         assert_eq!(first.frames(), [0, 0, 1, 0, 2, 0, 0, 1, 1, 1, 2, 1]);
         assert_eq!(second.frames(), [3, 0, 4, 0, 5, 0, 3, 1, 4, 1, 5, 1]);

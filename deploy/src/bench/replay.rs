@@ -3,6 +3,7 @@
 
 use std::{
     hint::black_box,
+    path::Path,
     time::{Duration, Instant},
 };
 
@@ -13,10 +14,10 @@ use driml_actor::{
 };
 use driml_learner::{
     LearnerPart,
-    batch_source::{BatchSource, Next},
+    batch_source::{BatchSource, Next, Requests},
 };
 use driml_protocol::{
-    Keys, RunSpec, Shutdown,
+    Keys, Shutdown,
     session::{self, Endpoints},
 };
 use zenoh::{Session, Wait};
@@ -55,16 +56,14 @@ pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
     let recording = Recording::play()?;
     let mut figures = Vec::new();
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
-    let socket = folder.path().join("s");
+    let socket = folder.path().join("s").display().to_string();
     let wires = [
-        (
-            "unix socket",
-            format!("unixsock-stream/{}", socket.display()),
-        ),
-        ("tcp", format!("tcp/{}", free_port()?)),
+        ("shared memory", format!("unixsock-stream/{socket}"), true),
+        ("unix socket", format!("unixsock-stream/{socket}"), false),
+        ("tcp", format!("tcp/{}", free_port()?), false),
     ];
-    for (wire, endpoint) in wires {
-        let mut run = Run::start(&endpoint, folder.path())?;
+    for (wire, endpoint, shared_memory) in wires {
+        let mut run = Run::start(&endpoint, shared_memory, folder.path())?;
         run.deliver(&recording, CHUNKS[3], |sent, _| sent >= CAPACITY)?;
         for chunk in CHUNKS {
             let transitions = chunk.0 * chunk.1;
@@ -72,12 +71,8 @@ pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
             let name = format!("insert, {transitions} transitions a chunk, {wire}");
             figures.push(Figure::found(name, rate, "transitions/s"));
         }
-        let rate = run.fetch(effort)?;
-        figures.push(Figure::found(
-            format!("batch of 3 states, {wire}"),
-            rate,
-            "batches/s",
-        ));
+        let (rate, name) = (run.fetch(effort)?, format!("batch of 3 states, {wire}"));
+        figures.push(Figure::found(name, rate, "batches/s"));
         run.end();
     }
     figures.extend(assemble::measure(&recording, effort)?);
@@ -94,23 +89,21 @@ struct Run {
     server: Part,
     session: Session,
     keys: Keys,
-    spec: RunSpec,
-    limits: DeliveryLimits,
-    batch_rows: u32,
-    batches_in_flight: u32,
+    actor: ActorSettings,
+    learner: LearnerPart,
     /// Deliveries so far; each is another actor.
     deliveries: u32,
 }
 
 impl Run {
-    fn start(endpoint: &str, folder: &std::path::Path) -> anyhow::Result<Self> {
+    fn start(endpoint: &str, shared_memory: bool, folder: &Path) -> anyhow::Result<Self> {
         let words = ["replay-server", "--listen", endpoint, "--exit-with-parent"];
         let run = ["--env", settings::WORLD, "--agent", AGENT];
-        let sets = SETTINGS.iter().flat_map(|set| ["--set", set]);
+        let transport = format!("transport.shared_memory={shared_memory}");
+        let sets = SETTINGS.into_iter().chain([transport.as_str()]);
+        let words = words.into_iter().chain(run);
         let args: Vec<String> = words
-            .into_iter()
-            .chain(run)
-            .chain(sets)
+            .chain(sets.flat_map(|set| ["--set", set]))
             .map(Into::into)
             .collect();
         let mut server = Part::start("replay-server", &args, 1, folder, &Screen::plain())?;
@@ -118,16 +111,12 @@ impl Run {
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
         let hello = session::join(&session, &keys, &Shutdown::default())?
             .context("nobody told this client to stop")?;
-        let actor = ActorSettings::from_toml(&hello.config_toml)?;
-        let learner = LearnerPart::from_toml(&hello.config_toml)?.learner;
         Ok(Self {
             server,
             session,
             keys,
-            spec: actor.spec,
-            limits: DeliveryLimits::of(&actor.actor),
-            batch_rows: learner.batch_rows,
-            batches_in_flight: learner.batches_in_flight,
+            actor: ActorSettings::from_toml(&hello.config_toml)?,
+            learner: LearnerPart::from_toml(&hello.config_toml)?,
             deliveries: 0,
         })
     }
@@ -137,19 +126,21 @@ impl Run {
     fn deliver(
         &mut self,
         recording: &Recording,
-        (streams, steps): (u32, u32),
+        chunk: (u32, u32),
         is_enough: impl Fn(u64, Instant) -> bool,
     ) -> anyhow::Result<f64> {
+        let pool = self.actor.chunk_memory();
         let delivery = Delivery::start(
             self.session.clone(),
             self.keys.clone(),
-            self.spec.hash(),
+            self.actor.spec.hash(),
             0,
-            self.limits,
+            DeliveryLimits::of(&self.actor.actor),
+            pool.clone(),
             Shutdown::default(),
         )?;
         self.deliveries += 1;
-        let mut chunks = recording.chunks(self.deliveries, streams, steps);
+        let mut chunks = recording.chunks(self.deliveries, chunk, pool);
         let started = Instant::now();
         while !is_enough(chunks.transitions(), started) {
             let chunk = chunks.next().context("chunks have no end")?;
@@ -166,12 +157,21 @@ impl Run {
     /// Batches a second, each read as a learner would.
     fn fetch(&self, effort: &Effort) -> anyhow::Result<f64> {
         let shutdown = Shutdown::default();
+        let LearnerPart {
+            spec,
+            learner,
+            transport,
+            ..
+        } = &self.learner;
         let mut source = BatchSource::start(
-            &self.session,
+            std::slice::from_ref(&self.session),
             &self.keys,
-            self.spec.hash(),
-            self.batch_rows,
-            self.batches_in_flight,
+            spec.hash(),
+            Requests {
+                rows: learner.batch_rows,
+                in_flight: learner.batches_in_flight,
+                shared_memory: transport.shared_memory,
+            },
             &shutdown,
         )?;
         let rate = effort.rate_overall(|| match source.next(ANSWER_MAX)? {

@@ -23,6 +23,7 @@ pub(super) fn of_run(
         config: None,
         actors: None,
         envs: None,
+        replay_shards: None,
         frames: None,
         seed: None,
         sets: sets.iter().map(|&set| set.to_owned()).collect(),

@@ -113,7 +113,7 @@ impl Run {
     /// The first moment after the learner's warm-up, and the last one at which both sides were still at work.
     fn watch(&mut self, endpoint: &str, config: &RunConfig) -> anyhow::Result<[Moment; 2]> {
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
-        let mut statuses = Statuses::new(self.reach(endpoint)?, keys, config.run.hash());
+        let mut statuses = Statuses::new(vec![self.reach(endpoint)?], keys, config.run.hash());
         let (mut first, mut last) = (None, None);
         while self.0.try_wait().context("looking at the run")?.is_none() {
             std::thread::sleep(POLL);

@@ -177,6 +177,7 @@ fn a_file_at_odds_with_itself_is_refused() {
 #[test]
 fn flags_come_before_set_and_both_before_the_machine() {
     let flags = Flags {
+        replay_shards: None,
         frames: Some(7_000),
         seed: Some(5),
         actors: Some(3),

@@ -51,6 +51,11 @@ impl ExactAffinity {
         Ok(exact)
     }
 
+    /// Whether both estimate in the same way over the same actions.
+    pub(super) fn has_settings_of(&self, other: &Self) -> bool {
+        self.alphabet == other.alphabet && self.settings == other.settings
+    }
+
     pub(super) const fn alphabet(&self) -> &Alphabet {
         &self.alphabet
     }

@@ -53,6 +53,15 @@ impl AffinityEstimator {
         }
     }
 
+    /// Whether both estimate in the same way over the same actions, however far each has come.
+    pub fn has_settings_of(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Learned(a), Self::Learned(b)) => a.has_settings_of(b),
+            (Self::Exact(a), Self::Exact(b)) => a.has_settings_of(b),
+            _ => false,
+        }
+    }
+
     /// Raw actions n, the side of the matrix.
     pub fn num_actions(&self) -> usize {
         match self {

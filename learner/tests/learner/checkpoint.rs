@@ -82,6 +82,7 @@ impl Run {
             learner,
             affinity: Some(affinity),
             rng,
+            weights_version: 7,
             run_spec_hash: SPEC,
         };
         save(folder, &state, keep).unwrap()
@@ -89,6 +90,7 @@ impl Run {
 
     fn resume(folder: &Path) -> Self {
         let restored = load(folder).unwrap().expect("a checkpoint");
+        assert_eq!(restored.weights_version, 7);
         let affinity = restored.affinity.expect("an estimate");
         Self {
             learner: restored.learner,

@@ -102,6 +102,7 @@ fn few_anchors_are_equally_likely() {
 fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
     let config = Config {
         capacity_transitions: 10_000,
+        shards: 1,
         replay_ratio: 64.0,
         warmup_transitions: 0,
         slack_transitions: 1,

@@ -72,7 +72,10 @@ fn check_batch(batch: &Batch, history: &History) {
     }
     assert_eq!(batch.header.mean_age, ages as f64 / rows as f64);
     assert_eq!(batch.header.weights_versions, versions);
-    assert_eq!(batch.header.inserted_total, history.inserted);
+    assert_eq!(
+        (batch.header.tally.inserted, batch.header.held),
+        (history.inserted, history.inserted.min(history.capacity))
+    );
 }
 
 /// What an actor knows of itself.
@@ -180,7 +183,8 @@ proptest! {
                     actor.next.steps = 1;
                 }
                 _ if history.inserted == 0 => {}
-                _ => match replay.sample(8) {
+                // Memory that held something else: whatever is not written shows.
+                _ => match replay.sample_in(8, |bytes| vec![0xAB; bytes].into()) {
                     Ok(batch) => {
                         check_batch(&batch, &history);
                         rows_sampled += 8;

@@ -9,6 +9,7 @@ use crate::history::spec;
 fn good() -> Config {
     Config {
         capacity_transitions: 10_000,
+        shards: 1,
         replay_ratio: 8.0,
         warmup_transitions: 1000,
         slack_transitions: 32,
@@ -110,7 +111,7 @@ fn each_fault_names_its_key_and_a_way_out() {
 
 #[test]
 fn unknown_and_missing_keys_are_refused() {
-    let text = "capacity_transitions = 10\nreplay_ratio = 8\nwarmup_transitions = 1\nslack_transitions = 2\n";
+    let text = "capacity_transitions = 10\nshards = 1\nreplay_ratio = 8\nwarmup_transitions = 1\nslack_transitions = 2\n";
     assert_eq!(
         toml::from_str::<Config>(text).unwrap().transitions_max,
         None

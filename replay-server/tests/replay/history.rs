@@ -68,6 +68,7 @@ pub(crate) fn spec(
 pub(crate) fn unlimited(capacity_transitions: u64) -> Config {
     Config {
         capacity_transitions,
+        shards: 1,
         replay_ratio: 1e6,
         warmup_transitions: 0,
         slack_transitions: 1 << 40,

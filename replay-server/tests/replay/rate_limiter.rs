@@ -105,6 +105,6 @@ proptest! {
             }
         }
         prop_assert!(allowed - (sampled as f64) < f64::from(rows) + 1e-6, "less than a batch is left");
-        prop_assert_eq!(limiter.rows_sampled(), sampled);
+        prop_assert_eq!(limiter.tally().rows_sampled, sampled);
     }
 }

@@ -70,6 +70,27 @@ pub(super) const PAIRS: &[Pair] = &[
     same(Policy, "256 frames of 64x64x3", Some(1.3)),
     same(Policy, "32 frames of 104x80x3", Some(1.3)),
     same(Policy, "256 frames of 104x80x3", Some(1.3)),
+    // Chunks of 256 transitions are what an actor sends.
+    replay(
+        "insert, 4 transitions a chunk, shared memory",
+        "insert",
+        None,
+    ),
+    replay(
+        "insert, 32 transitions a chunk, shared memory",
+        "insert",
+        None,
+    ),
+    replay(
+        "insert, 128 transitions a chunk, shared memory",
+        "insert",
+        None,
+    ),
+    replay(
+        "insert, 256 transitions a chunk, shared memory",
+        "insert",
+        Some(40.0),
+    ),
     replay("insert, 4 transitions a chunk, unix socket", "insert", None),
     replay(
         "insert, 32 transitions a chunk, unix socket",
@@ -81,7 +102,6 @@ pub(super) const PAIRS: &[Pair] = &[
         "insert",
         None,
     ),
-    // What an actor sends.
     replay(
         "insert, 256 transitions a chunk, unix socket",
         "insert",
@@ -89,12 +109,22 @@ pub(super) const PAIRS: &[Pair] = &[
     ),
     replay("insert, 256 transitions a chunk, tcp", "insert", Some(12.0)),
     replay(
+        "batch of 3 states, shared memory",
+        "batch of 3 states",
+        Some(10.0),
+    ),
+    replay(
         "batch of 3 states, unix socket",
         "batch of 3 states",
         Some(1.5),
     ),
     replay("batch of 3 states, tcp", "batch of 3 states", Some(1.5)),
     // With k chosen by the client, as only a sequence allows it there.
+    replay(
+        "batch of 3 states, shared memory",
+        "batch of sequences of 8 states",
+        None,
+    ),
     replay(
         "batch of 3 states, unix socket",
         "batch of sequences of 8 states",

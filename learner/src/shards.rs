@@ -1,0 +1,213 @@
+//! The replay's shards as the learner sees them: joining them all, and which rows of a batch come from which.
+//! It fetches nothing: `batch_source` does.
+
+use anyhow::{Context, ensure};
+use driml_protocol::{
+    Hello, Keys, Shutdown, Tally,
+    session::{self, Endpoints},
+};
+use rand::Rng;
+use zenoh::{Session, Wait};
+
+/// Sessions with all shards of a run, in the order of the endpoints, and what the run's settings are.
+pub(crate) struct Shards {
+    pub(crate) sessions: Vec<Session>,
+    pub(crate) config_toml: String,
+}
+
+impl Shards {
+    /// Joins the shard at each endpoint; `None` if told to stop before.
+    ///
+    /// # Errors
+    /// A shard that is not there, is given twice, is missing or belongs to another run.
+    pub(crate) fn join(
+        connect: &[String],
+        keys: &Keys,
+        shutdown: &Shutdown,
+    ) -> anyhow::Result<Option<Self>> {
+        let mut sessions = Vec::new();
+        let mut hellos = Vec::new();
+        for endpoint in connect {
+            let session = session::open(&Endpoints {
+                listen: Vec::new(),
+                connect: vec![endpoint.clone()],
+            })?;
+            let Some(hello) = session::join(&session, keys, shutdown)? else {
+                return Ok(None);
+            };
+            sessions.push(session);
+            hellos.push(hello);
+        }
+        let config_toml = one_run(connect, &hellos)?;
+        Ok(Some(Self {
+            sessions,
+            config_toml,
+        }))
+    }
+
+    /// Closes all sessions; the first error, if there is one.
+    pub(crate) fn close(&self) -> anyhow::Result<()> {
+        let closed = self.sessions.iter().map(|session| session.close().wait());
+        closed
+            .fold(Ok(()), |all, one| all.and(one))
+            .map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+    }
+}
+
+/// The settings of the one run whose shards all these are.
+fn one_run(connect: &[String], hellos: &[Hello]) -> anyhow::Result<String> {
+    let first = hellos
+        .first()
+        .context("no endpoint of a replay server was given")?;
+    for (at, hello) in hellos.iter().enumerate() {
+        let (endpoint, shard) = (&connect[at], hello.shard.0);
+        ensure!(
+            hello.config_toml == first.config_toml,
+            "{endpoint} and {} are replay servers of runs with different settings: start both with the same",
+            connect[0]
+        );
+        if let Some(earlier) = hellos[..at].iter().position(|it| it.shard.0 == shard) {
+            anyhow::bail!(
+                "{} and {endpoint} are both shard {shard}: start each replay server with its own --shard, and give each endpoint once",
+                connect[earlier]
+            );
+        }
+    }
+    let count = first.shard.1 as usize;
+    ensure!(
+        hellos.len() == count,
+        "the run's replay has {count} shards, {} endpoints were given: give --connect once for each shard",
+        hellos.len()
+    );
+    Ok(first.config_toml.clone())
+}
+
+/// What is known of one shard.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Count {
+    pub(crate) tally: Tally,
+    /// Transitions that it holds.
+    pub(crate) held: u64,
+}
+
+/// How many of `rows` rows come from each shard: each row's shard is drawn in proportion to what the shards hold, so that
+/// every transition of the whole replay is as likely as any other. `None` if they hold nothing.
+pub(crate) fn split(rows: u32, counts: &[Count], rng: &mut impl Rng) -> Option<Vec<u32>> {
+    let total: u64 = counts.iter().map(|count| count.held).sum();
+    if total == 0 {
+        return None;
+    }
+    let mut split = vec![0; counts.len()];
+    for _ in 0..rows {
+        let mut at = rng.random_range(0..total);
+        for (n, count) in split.iter_mut().zip(counts) {
+            if at < count.held {
+                *n += 1;
+                break;
+            }
+            at -= count.held;
+        }
+    }
+    Some(split)
+}
+
+/// What all shards but `this` have counted once they have given `pending` rows more, so many each.
+pub(crate) fn elsewhere(counts: &[Count], pending: &[u32], this: usize) -> Tally {
+    let others = counts.iter().zip(pending).enumerate();
+    others.filter(|(at, _)| *at != this).fold(
+        Tally::default(),
+        |sum, (_, (count, &rows_sampled))| {
+            let pending = Tally {
+                inserted: 0,
+                rows_sampled: rows_sampled.into(),
+            };
+            sum + count.tally + pending
+        },
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    fn count(held: u64, inserted: u64, rows_sampled: u64) -> Count {
+        Count {
+            tally: Tally {
+                inserted,
+                rows_sampled,
+            },
+            held,
+        }
+    }
+
+    /// Chi-square of the rows' shards against what each shard holds; 99.9% of such draws stay below the bound.
+    #[test]
+    fn each_transition_is_as_likely_wherever_it_lies() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let held = [1_000_000, 10, 0, 250_000, 499_990];
+        let counts = held.map(|held| count(held, 0, 0));
+        let mut drawn = [0u64; 5];
+        for _ in 0..4_000 {
+            let rows = split(256, &counts, &mut rng).unwrap();
+            assert_eq!(rows.iter().sum::<u32>(), 256);
+            drawn
+                .iter_mut()
+                .zip(rows)
+                .for_each(|(sum, n)| *sum += u64::from(n));
+        }
+        assert_eq!(drawn[2], 0, "nothing is drawn from an empty shard");
+        let rows: u64 = drawn.iter().sum();
+        let total: u64 = held.iter().sum();
+        let chi_square: f64 = drawn
+            .iter()
+            .zip(held)
+            .filter(|(_, held)| *held > 0)
+            .map(|(&drawn, held)| {
+                let expected = rows as f64 * held as f64 / total as f64;
+                (drawn as f64 - expected).powi(2) / expected
+            })
+            .sum();
+        assert!(chi_square < 16.27, "3 degrees of freedom: {chi_square}");
+        assert_eq!(split(8, &[count(0, 0, 0)], &mut rng), None);
+    }
+
+    #[test]
+    fn a_shard_is_told_of_all_others_and_of_the_rest_of_its_batch() {
+        let counts = [count(1, 10, 100), count(2, 20, 200), count(3, 30, 300)];
+        let told = |this| elsewhere(&counts, &[5, 6, 7], this);
+        assert_eq!(
+            told(1),
+            Tally {
+                inserted: 40,
+                rows_sampled: 412
+            }
+        );
+        assert_eq!(
+            told(2),
+            Tally {
+                inserted: 30,
+                rows_sampled: 311
+            }
+        );
+    }
+
+    #[test]
+    fn shards_that_do_not_make_one_replay_are_refused() {
+        let hello = |config: &str, shard| Hello {
+            config_toml: config.into(),
+            inserted_total: 0,
+            shard,
+        };
+        let connect = ["a".to_owned(), "b".to_owned()];
+        let said = |hellos: &[Hello]| one_run(&connect, hellos).unwrap_err().to_string();
+        assert!(said(&[hello("x", (0, 2)), hello("y", (1, 2))]).contains("different settings"));
+        assert!(said(&[hello("x", (1, 2)), hello("x", (1, 2))]).contains("both shard 1"));
+        assert!(said(&[hello("x", (0, 3)), hello("x", (1, 3))]).contains("has 3 shards"));
+        assert!(said(&[hello("x", (0, 2))]).contains("has 2 shards"));
+        let whole = [hello("x", (1, 2)), hello("x", (0, 2))];
+        assert_eq!(one_run(&connect, &whole).unwrap(), "x");
+    }
+}
