@@ -35,6 +35,8 @@ pub(super) struct MachineNote {
     pub(super) processor: String,
     /// Cores that this process may use.
     pub(super) cores: u32,
+    /// Mean number of tasks that wanted a core in the minute before.
+    pub(super) load: f64,
 }
 
 impl MachineNote {
@@ -44,8 +46,14 @@ impl MachineNote {
         Self {
             processor: processor(&cpuinfo).unwrap_or("unknown").to_owned(),
             cores: crate::machine::Machine::this().cores,
+            load: load(&fs::read_to_string("/proc/loadavg").unwrap_or_default()).unwrap_or(0.0),
         }
     }
+}
+
+/// The mean over the last minute in the kernel's table.
+fn load(loadavg: &str) -> Option<f64> {
+    loadavg.split_whitespace().next()?.parse().ok()
 }
 
 /// The processor's name in the kernel's table.
@@ -66,7 +74,7 @@ pub(super) struct Report {
     pub(super) quick: bool,
     /// Threads for arithmetic.
     pub(super) threads: u32,
-    /// Where.
+    /// Where, as it was before the first measurement.
     pub(super) machine: MachineNote,
     /// What was found.
     pub(super) figures: Vec<Figure>,
@@ -76,12 +84,17 @@ pub(super) struct Report {
 ///
 /// # Errors
 /// A file that cannot be written.
-pub(super) fn report(bench: &str, figures: &[Figure], flags: &BenchFlags) -> anyhow::Result<()> {
+pub(super) fn report(
+    bench: &str,
+    figures: &[Figure],
+    machine: MachineNote,
+    flags: &BenchFlags,
+) -> anyhow::Result<()> {
     let report = Report {
         bench: bench.to_owned(),
         quick: flags.quick,
         threads: flags.threads,
-        machine: MachineNote::this(),
+        machine,
         figures: figures.to_vec(),
     };
     let rows = figures
@@ -117,10 +130,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_processor_is_named() {
+    fn the_machine_is_described() {
         let cpuinfo = "processor\t: 0\nmodel name\t: AMD EPYC 9999\nflags\t: fpu\n";
         assert_eq!(processor(cpuinfo), Some("AMD EPYC 9999"));
         assert_eq!(processor(""), None);
+        assert_eq!(load("6.60 5.35 4.10 3/200 1234"), Some(6.6));
     }
 
     #[test]

@@ -17,7 +17,10 @@ mod system;
 mod table;
 
 use crate::{
-    bench::{effort::Effort, figures::Figure},
+    bench::{
+        effort::Effort,
+        figures::{Figure, MachineNote},
+    },
     cli::{BenchCommand, BenchFlags, BenchPart},
 };
 
@@ -26,13 +29,14 @@ use crate::{
 /// # Errors
 /// A part that failed, an engine that cannot be had, a file that cannot be written.
 pub(crate) fn run(command: &BenchCommand) -> anyhow::Result<()> {
+    let machine = MachineNote::this();
     let part = |part, flags: &BenchFlags| {
         let figures = if flags.here {
             measure(part, &Effort::new(flags))?
         } else {
             alone::figures(part, flags)?
         };
-        figures::report(part.name(), &figures, flags)
+        figures::report(part.name(), &figures, machine.clone(), flags)
     };
     match command {
         BenchCommand::Learner(flags) => part(BenchPart::Learner, flags),
@@ -40,7 +44,7 @@ pub(crate) fn run(command: &BenchCommand) -> anyhow::Result<()> {
         BenchCommand::Replay(flags) => part(BenchPart::Replay, flags),
         BenchCommand::Env(flags) => part(BenchPart::Env, flags),
         BenchCommand::System(args) => {
-            figures::report("system", &system::measure(args)?, &args.flags)
+            figures::report("system", &system::measure(args)?, machine, &args.flags)
         }
         BenchCommand::Peers(args) => peers::run(args),
     }

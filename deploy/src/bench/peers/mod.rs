@@ -24,6 +24,8 @@ use crate::{
     cli::{BenchPart, BenchPeersArgs},
 };
 
+/// The load above which something else is running, which slows the two sides unequally.
+const LOAD_MAX: f64 = 0.5;
 /// Rounds, and those of a quick comparison.
 const ROUNDS: (u32, u32) = (5, 1);
 
@@ -68,6 +70,7 @@ struct Comparison {
     rounds: u32,
     quick: bool,
     threads: u32,
+    /// Before the first measurement.
     machine: MachineNote,
     rows: Vec<Row>,
 }
@@ -85,6 +88,7 @@ pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
         [] => PAIRS.iter().map(|pair| pair.part).collect(),
         only => only.iter().copied().collect(),
     };
+    let machine = MachineNote::this();
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
     script::write_all(folder.path())?;
     let frames = folder.path().join("frames");
@@ -125,7 +129,7 @@ pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
         rounds,
         quick: args.flags.quick,
         threads: args.flags.threads,
-        machine: MachineNote::this(),
+        machine,
         rows: rows.collect::<anyhow::Result<_>>()?,
     };
     figures::publish(
@@ -225,6 +229,12 @@ fn describe(comparison: &Comparison) -> String {
         "Medians of {rounds} rounds of ours, theirs; the ratio is the median of the rounds' ratios. {threads} threads; {}, {} cores.\n",
         machine.processor, machine.cores
     ));
+    if machine.load > LOAD_MAX {
+        text.push_str(&format!(
+            "The machine was not idle before: {} tasks wanted a core. These are no figures to go by.\n",
+            table::number(machine.load)
+        ));
+    }
     if comparison.quick {
         text.push_str("Quick: a few iterations only, no figures to go by.\n");
     }
