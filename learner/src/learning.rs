@@ -7,6 +7,7 @@ use driml_model::Enlarge;
 use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, WeightsHeader};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
 
 use crate::{
     affinity::AffinityEstimator,
@@ -27,6 +28,8 @@ pub struct Learning {
     affinity: Option<AffinityEstimator>,
     rng: ChaCha8Rng,
     enlarge: Option<Enlarge>,
+    /// States of the last batch at the network's input size, if that is another: memory to use again.
+    enlarged: [Vec<u8>; 3],
     weights_version: u64,
 }
 
@@ -55,6 +58,7 @@ impl Learning {
             affinity,
             rng,
             enlarge,
+            enlarged: Default::default(),
             weights_version: 0,
             part,
         })
@@ -116,18 +120,13 @@ impl Learning {
     /// # Errors
     /// A batch that does not fit, or arithmetic that left the finite numbers; the learner is then as it was.
     pub fn update(&mut self, batch: &WireBatch) -> anyhow::Result<UpdateReport> {
-        let enlarged = |states: &[u8]| match &self.enlarge {
-            None => None,
-            Some(enlarge) => {
-                let count = states.len() / enlarge.input_bytes();
-                let mut out = vec![0; count * enlarge.output_bytes()];
-                enlarge.apply(states, &mut out);
-                Some(out)
+        let mut frames = [batch.frames_t(), batch.frames_k(), batch.frames_n()];
+        if let Some(enlarge) = &self.enlarge {
+            for (states, larger) in frames.iter_mut().zip(&mut self.enlarged) {
+                enlarge_all(enlarge, states, larger);
+                *states = larger;
             }
-        };
-        let states = [batch.frames_t(), batch.frames_k(), batch.frames_n()];
-        let larger = states.map(enlarged);
-        let frames = |i: usize| larger[i].as_deref().unwrap_or(states[i]);
+        }
         let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
         let without_positives;
         let positive_valid = if batch.positives() > 0 {
@@ -138,9 +137,9 @@ impl Learning {
         };
         let batch = Batch {
             rows: batch.rows(),
-            frames_t: frames(0),
-            frames_k: (batch.positives() > 0).then(|| frames(1)),
-            frames_n: frames(2),
+            frames_t: frames[0],
+            frames_k: (batch.positives() > 0).then_some(frames[1]),
+            frames_n: frames[2],
             action: batch.actions(),
             next_action: batch.next_actions(),
             n_step_return: &returns,
@@ -215,4 +214,16 @@ impl Learning {
         tracing::info!("saved {}", path.display());
         Ok(())
     }
+}
+
+/// Enlarges all `states` into `larger`, a share of them on each thread.
+fn enlarge_all(enlarge: &Enlarge, states: &[u8], larger: &mut Vec<u8>) {
+    let (from, to) = (enlarge.input_bytes(), enlarge.output_bytes());
+    let count = states.len() / from;
+    larger.resize(count * to, 0);
+    let share = count.div_ceil(rayon::current_num_threads()).max(1);
+    larger
+        .par_chunks_mut(share * to)
+        .zip(states.par_chunks(share * from))
+        .for_each(|(larger, states)| enlarge.apply(states, larger));
 }

@@ -336,6 +336,7 @@ impl Service {
             }
             None => HOLD_MAX,
         };
+        let mut said = false;
         let sampled = loop {
             let memory = |bytes| match request.shared_memory {
                 true => self.pool.take(bytes),
@@ -343,6 +344,10 @@ impl Service {
             };
             match replay.sample_in(request.rows, memory) {
                 Err(Unready::Wait(waiting)) => {
+                    // A chunk that waits may be let in to end this; once, or those who wait would wake each other for ever.
+                    if !std::mem::replace(&mut said, true) {
+                        self.changed.notify_all();
+                    }
                     let left = hold_max.saturating_sub(arrived.elapsed());
                     if left.is_zero() || self.shutdown.is_set() {
                         break Err(Unready::Wait(waiting));
