@@ -210,6 +210,8 @@ pub(crate) enum BenchCommand {
     Env(BenchFlags),
     /// A short run with real processes: its speed, how long the learner computes and waits, its memory
     System(BenchSystemArgs),
+    /// Replay servers under 1 to 64 actors and a learner, all synthetic and paced: what they store, serve and cost
+    Scale(BenchScaleArgs),
     /// All of these but the run, in turn with PyTorch, Reverb and gym3 doing the same work
     Peers(BenchPeersArgs),
 }
@@ -238,6 +240,29 @@ pub(crate) struct BenchSystemArgs {
     pub(crate) frames: Option<u64>,
     #[command(flatten)]
     pub(crate) flags: BenchFlags,
+}
+
+#[derive(Clone, Debug, Args)]
+pub(crate) struct BenchScaleArgs {
+    /// Transitions a second that each actor offers
+    #[arg(long, value_name = "N", default_value_t = 1000.0, value_parser = rate)]
+    pub(crate) actor_rate: f64,
+    /// Batches a second that the learner asks for
+    #[arg(long, value_name = "N", default_value_t = 20.0, value_parser = rate)]
+    pub(crate) batch_rate: f64,
+    /// Seconds for which each number of actors is watched
+    #[arg(long, value_name = "S", default_value_t = 5.0, value_parser = rate)]
+    pub(crate) seconds: f64,
+    #[command(flatten)]
+    pub(crate) flags: BenchFlags,
+}
+
+/// A number above 0 that is no more than a million.
+fn rate(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if value > 0.0 && value <= 1e6 => Ok(value),
+        _ => Err("it must be a number above 0, at most 1000000".into()),
+    }
 }
 
 /// A part that is measured by itself, and beside a peer.

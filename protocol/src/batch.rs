@@ -129,7 +129,7 @@ impl Batch {
         let offsets = merged.offsets();
         let mut first_row = 0;
         for part in parts {
-            for plane in 0..PLANES {
+            for (plane, &offset) in offsets[..PLANES].iter().enumerate() {
                 let per_positive = matches!(plane, 1 | 7 | 8);
                 let blocks = if per_positive { part.positives() } else { 1 };
                 let values = part.plane(plane);
@@ -138,8 +138,7 @@ impl Batch {
                     let from =
                         &values[block * part.rows() * row_bytes..][..part.rows() * row_bytes];
                     let row = block * merged.rows() + first_row;
-                    merged.planes[offsets[plane] + row * row_bytes..][..from.len()]
-                        .copy_from_slice(from);
+                    merged.planes[offset + row * row_bytes..][..from.len()].copy_from_slice(from);
                 }
             }
             first_row += part.rows();

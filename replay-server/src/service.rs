@@ -145,12 +145,15 @@ struct Service {
     shutdown: Shutdown,
 }
 
+/// The threads that answer.
+type Threads = Vec<JoinHandle<()>>;
+
 /// Declares everything that the replay server answers; dropping the first ends it, and with it the threads.
 fn declare(
     session: &Session,
     keys: &Keys,
     service: &Arc<Service>,
-) -> zenoh::Result<(Vec<Queryable<()>>, Vec<JoinHandle<()>>)> {
+) -> zenoh::Result<(Vec<Queryable<()>>, Threads)> {
     type Answer = fn(&Service, &Query);
     let answers: [(String, &str, usize, Answer); 6] = [
         (keys.ingest(), "insert", 1, Service::insert),

@@ -45,6 +45,7 @@ fn replay(compression: Compression, frame_stack: u32) -> Replay {
     };
     let config = Config {
         capacity_transitions: TRANSITIONS,
+        shards: 1,
         compression,
         compressed_bytes_max: None,
         replay_ratio: 1e9,

@@ -90,6 +90,24 @@ pub(super) fn report(
     machine: MachineNote,
     flags: &BenchFlags,
 ) -> anyhow::Result<()> {
+    let rows = figures
+        .iter()
+        .map(|it| vec![it.what.clone(), table::number(it.value), it.unit.clone()]);
+    let table = table::aligned(&rows.collect::<Vec<_>>(), &[1]);
+    report_as(bench, figures, &table, machine, flags)
+}
+
+/// [`report`] with another table.
+///
+/// # Errors
+/// As there.
+pub(super) fn report_as(
+    bench: &str,
+    figures: &[Figure],
+    table: &str,
+    machine: MachineNote,
+    flags: &BenchFlags,
+) -> anyhow::Result<()> {
     let report = Report {
         bench: bench.to_owned(),
         quick: flags.quick,
@@ -97,11 +115,7 @@ pub(super) fn report(
         machine,
         figures: figures.to_vec(),
     };
-    let rows = figures
-        .iter()
-        .map(|it| vec![it.what.clone(), table::number(it.value), it.unit.clone()]);
-    let table = table::aligned(&rows.collect::<Vec<_>>(), &[1]);
-    publish(&report, &table, flags.json.as_deref())
+    publish(&report, table, flags.json.as_deref())
 }
 
 /// Prints `table` and writes `report` to `json`; to stdout, alone, if that is `-`.

@@ -11,6 +11,7 @@ mod peers;
 mod policy;
 mod recording;
 mod replay;
+mod scale;
 mod settings;
 mod stock;
 mod system;
@@ -46,6 +47,7 @@ pub(crate) fn run(command: &BenchCommand) -> anyhow::Result<()> {
         BenchCommand::System(args) => {
             figures::report("system", &system::measure(args)?, machine, &args.flags)
         }
+        BenchCommand::Scale(args) => scale::run(args, machine),
         BenchCommand::Peers(args) => peers::run(args),
     }
 }

@@ -200,7 +200,7 @@ impl Run {
 }
 
 /// A session to the server as soon as it listens.
-fn reach(endpoint: &str, server: &mut Part) -> anyhow::Result<Session> {
+pub(super) fn reach(endpoint: &str, server: &mut Part) -> anyhow::Result<Session> {
     let endpoints = Endpoints {
         listen: Vec::new(),
         connect: vec![endpoint.to_owned()],
