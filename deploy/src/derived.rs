@@ -28,7 +28,7 @@ const FOLLOWS: [(&str, &str); 13] = [
         "follows from the world and run.frame_stack",
     ),
     ("model.num_actions", "follows from the world"),
-    ("model.dim", "follows from learner.update.lambda"),
+    ("model.dim", "follows from learner.update"),
 ];
 
 /// Writes the names that everything else follows from.
@@ -73,7 +73,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         driml_envs::num_actions(&config),
         whole(table, "run.frame_stack")?,
     );
-    let dim = update.lambda.dim_parts(num_actions > 1);
+    let dim = update.dim_parts(num_actions);
     let size = |value: usize| Value::Integer(value as i64);
     let dim = Value::try_from(dim).map_err(|e| usage!("the DIM heads as TOML: {e}"))?;
     for (path, value) in [

@@ -1,4 +1,4 @@
-//! Writes one row of a batch: s_t, a_t, a_{t+1}, the n-step return, s_{t+n}, and s_{t+k} with k drawn here.
+//! Writes one row of a batch: s_t, a_t, a_{t+1}, the n-step return, s_{t+n}, and s_{t+k} for each k, drawn here.
 //! It does not choose the anchor.
 
 use driml_protocol::{End, Horizon, NO_ACTION, RunSpec, TimeoutRule, batch::BatchRowsMut};
@@ -30,7 +30,7 @@ impl Assembler {
         }
     }
 
-    /// Writes the row of the window's anchor and gives its k, 0 without a positive.
+    /// Writes the row of the window's anchor and gives its k, of several positives the furthest, 0 without any.
     pub(crate) fn write_row(
         &mut self,
         (ring, episodes, affinity): (&Ring, &Episodes, &Affinity),
@@ -58,16 +58,20 @@ impl Assembler {
             Some(i) => episodes.write_state(ring, window.index(i), rows.frame_n(row)),
             None => rows.frame_n(row).fill(0),
         }
-        match self.draw_k(affinity, window, rng) {
-            Some(k) => {
-                episodes.write_state(ring, window.index(k as usize), rows.positive(0, row, k));
-                k
-            }
-            None => {
-                (0..self.horizon.positives()).for_each(|p| rows.no_positive(p, row));
-                0
+        let drawn = self.draw_k(affinity, window, rng);
+        for p in 0..self.horizon.positives() {
+            let k = match self.horizon {
+                Horizon::All { .. } => drawn.and_then(|furthest| horizon::all::k_of(p, furthest)),
+                _ => drawn,
+            };
+            match k {
+                Some(k) => {
+                    episodes.write_state(ring, window.index(k as usize), rows.positive(p, row, k));
+                }
+                None => rows.no_positive(p, row),
             }
         }
+        drawn.unwrap_or(0)
     }
 
     /// Sum of gamma^i r_{t+i} over i < n, and the i of the state to bootstrap from: n, unless the episode ended before.
@@ -89,7 +93,7 @@ impl Assembler {
         (sum, Some(n))
     }
 
-    /// k, or none without DIM or where a_t ended its episode or level.
+    /// k, or none where no positive is served or a_t ended its episode or level.
     ///
     /// H is the number of states after s_t, at most k_max, that come before the end of the episode or level.
     fn draw_k(&mut self, affinity: &Affinity, window: &Window, rng: &mut impl Rng) -> Option<u32> {
