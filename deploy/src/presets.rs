@@ -318,6 +318,33 @@ mod tests {
         }
     }
 
+    /// The worlds in which an agent's settings pass `test`.
+    fn worlds(name: &str, test: impl Fn(&Table) -> bool) -> String {
+        let chosen: Vec<_> = WorldName::all()
+            .filter(|&world| test(&layers(&PRESETS[0], world, agent(name).unwrap()).unwrap()))
+            .map(|world| world.to_string())
+            .collect();
+        chosen.join(" ")
+    }
+
+    #[test]
+    fn states_are_augmented_where_the_paper_says() {
+        let augments = |table: &Table| table["learner"].get("augment").is_some();
+        expect_test::expect!["procgen:bigfish procgen:bossfight procgen:chaser procgen:coinrun procgen:jumper procgen:leaper procgen:ninja"]
+            .assert_eq(&worlds("driml-fix", augments));
+        assert_eq!(worlds("curl", augments).split(' ').count(), 19);
+        for name in ["c51", "driml-ada", "driml-randk", "driml-noact", "cpc"] {
+            assert_eq!(worlds(name, augments), "", "{name}");
+        }
+    }
+
+    #[test]
+    fn driml_noact_looks_as_far_ahead_as_table_1_says() {
+        let five = |table: &Table| table["run"]["horizon"]["k"].as_integer() == Some(5);
+        expect_test::expect!["procgen:bossfight procgen:chaser procgen:climber procgen:fruitbot procgen:jumper procgen:maze procgen:miner procgen:plunder"]
+            .assert_eq(&worlds("driml-noact", five));
+    }
+
     #[test]
     fn driml_fix_looks_as_far_ahead_as_the_paper_says() {
         let k = |world: &str| {
