@@ -3,6 +3,7 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
+mod bench;
 mod child;
 mod cli;
 mod config;
@@ -118,6 +119,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Parity(args) => parity(&args),
         Command::Plot(args) => plot::run(&args),
+        Command::Bench(command) => bench::run(&command),
         Command::Presets => print(&presets::describe()),
         Command::Procgen(ProcgenCommand::Install) => {
             let engine = procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;

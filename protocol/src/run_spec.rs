@@ -7,7 +7,7 @@ use sha2::{Digest, Sha256};
 use crate::{PROTOCOL_VERSION, codec};
 
 /// Most positives a row can carry; a rule that asks for more is refused.
-const POSITIVES_MAX: usize = 32;
+pub const POSITIVES_MAX: usize = 32;
 
 /// How far ahead a positive lies: the rule by which the replay server draws k.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

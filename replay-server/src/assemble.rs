@@ -1,14 +1,68 @@
-//! Writes one row of a batch: s_t, a_t, a_{t+1}, the n-step return, s_{t+n}, and s_{t+k} for each k, drawn here.
-//! It does not choose the anchor.
+//! Makes one row of a batch: a_t, a_{t+1}, the n-step return, and which transitions' states are s_t, s_{t+n} and s_{t+k}, with
+//! each k drawn here. It does not choose the anchor and reads no frame.
 
-use driml_protocol::{End, Horizon, NO_ACTION, RunSpec, TimeoutRule, batch::BatchRowsMut};
+use driml_protocol::{
+    End, Horizon, NO_ACTION, RunSpec, TimeoutRule, batch::BatchRowsMut, run_spec::POSITIVES_MAX,
+};
 use rand::Rng;
 
 use crate::{
-    episodes::{Episodes, Window},
+    episodes::Window,
     horizon::{self, Affinity},
-    ring::Ring,
 };
+
+/// The states of a row, as indices in the ring.
+#[derive(Clone, Copy)]
+pub(crate) struct RowStates {
+    t: u64,
+    /// Where the row bootstraps from.
+    n: Option<u64>,
+    /// k of the first positive; the others follow it step by step.
+    k_first: u32,
+    /// Positives that the row has.
+    positives: usize,
+    /// s_{t+k} of each.
+    s_tpk: [u64; POSITIVES_MAX],
+}
+
+impl RowStates {
+    /// k, of several positives the furthest, 0 without any.
+    pub(crate) fn k(&self) -> u32 {
+        match self.positives {
+            0 => 0,
+            positives => self.k_first + positives as u32 - 1,
+        }
+    }
+
+    /// s_t, s_{t+n}, s_{t+k} for each k: those that the row has.
+    pub(crate) fn indices(&self) -> impl Iterator<Item = u64> {
+        let first = [Some(self.t), self.n].into_iter().flatten();
+        first.chain(self.s_tpk.into_iter().take(self.positives))
+    }
+
+    /// Calls `write` with the index and the place of each state, in the order of [`RowStates::indices`]; the places of the
+    /// states that the row does not have are filled with zeros.
+    pub(crate) fn write(
+        &self,
+        rows: &mut BatchRowsMut<'_>,
+        row: usize,
+        mut write: impl FnMut(u64, &mut [u8]),
+    ) {
+        write(self.t, rows.frame_t(row));
+        match self.n {
+            Some(index) => write(index, rows.frame_n(row)),
+            None => rows.frame_n(row).fill(0),
+        }
+        for p in 0..rows.positives() {
+            if p < self.positives {
+                let place = rows.positive(p, row, self.k_first + p as u32);
+                write(self.s_tpk[p], place);
+            } else {
+                rows.no_positive(p, row);
+            }
+        }
+    }
+}
 
 /// The rules of return and positive, and scratch space so that a row allocates nothing.
 pub(crate) struct Assembler {
@@ -30,14 +84,14 @@ impl Assembler {
         }
     }
 
-    /// Writes the row of the window's anchor and gives its k, of several positives the furthest, 0 without any.
+    /// Writes all of the row of the window's anchor but its states, and gives those.
     pub(crate) fn write_row(
         &mut self,
-        (ring, episodes, affinity): (&Ring, &Episodes, &Affinity),
+        affinity: &Affinity,
         window: &Window,
         rng: &mut impl Rng,
         (rows, row): (&mut BatchRowsMut<'_>, usize),
-    ) -> u32 {
+    ) -> RowStates {
         let anchor = window.step(0);
         let next_action = if anchor.end == End::Running {
             window.step(1).action
@@ -53,25 +107,24 @@ impl Assembler {
             n_step_return as f32,
             discount as f32,
         );
-        episodes.write_state(ring, window.index(0), rows.frame_t(row));
-        match bootstrap {
-            Some(i) => episodes.write_state(ring, window.index(i), rows.frame_n(row)),
-            None => rows.frame_n(row).fill(0),
+        let furthest = self.draw_k(affinity, window, rng).unwrap_or(0);
+        let k_first = match self.horizon {
+            Horizon::All { .. } => 1,
+            _ => furthest,
+        };
+        let mut states = RowStates {
+            t: window.index(0),
+            n: bootstrap.map(|i| window.index(i)),
+            k_first,
+            positives: 0,
+            s_tpk: [0; POSITIVES_MAX],
+        };
+        // A k of 0 is none.
+        for k in (k_first..=furthest).filter(|&k| k > 0) {
+            states.s_tpk[states.positives] = window.index(k as usize);
+            states.positives += 1;
         }
-        let drawn = self.draw_k(affinity, window, rng);
-        for p in 0..self.horizon.positives() {
-            let k = match self.horizon {
-                Horizon::All { .. } => drawn.and_then(|furthest| horizon::all::k_of(p, furthest)),
-                _ => drawn,
-            };
-            match k {
-                Some(k) => {
-                    episodes.write_state(ring, window.index(k as usize), rows.positive(p, row, k));
-                }
-                None => rows.no_positive(p, row),
-            }
-        }
-        drawn.unwrap_or(0)
+        states
     }
 
     /// Sum of gamma^i r_{t+i} over i < n, and the i of the state to bootstrap from: n, unless the episode ended before.
