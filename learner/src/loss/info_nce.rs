@@ -18,6 +18,14 @@ pub struct Scores {
 }
 
 impl Scores {
+    /// Scores of dot products of vectors of `rkhs` numbers.
+    pub fn new(rkhs: usize, tanh_clip: f64) -> Self {
+        Self {
+            scale: 1.0 / (rkhs as f64).sqrt(),
+            tanh_clip,
+        }
+    }
+
     /// The clipped score of a dot product, and its derivative by the dot product.
     ///
     /// With `e = exp(-2 |x| / c)`: `tanh = (1 - e) / (1 + e)` and its slope `4 e / (1 + e)^2`, which, unlike
