@@ -10,6 +10,8 @@ mod derived;
 mod display;
 mod error;
 mod evaluate;
+mod experiment;
+mod figure;
 mod interrupts;
 mod local;
 mod lockstep;
@@ -118,6 +120,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Parity(args) => parity(&args),
         Command::Plot(args) => plot::run(&args),
+        Command::Experiment(command) => experiment::run(&command),
         Command::Presets => print(&presets::describe()),
         Command::Procgen(ProcgenCommand::Install) => {
             let engine = procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
