@@ -41,11 +41,15 @@ impl Spread {
 impl fmt::Display for Spread {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let decimals = f.precision().unwrap_or(3);
-        write!(
-            f,
-            "{:.decimals$} (standard deviation {:.decimals$} over {} seeds)",
-            self.mean, self.sd, self.count
-        )
+        let mean = self.mean;
+        match self.count {
+            1 => write!(f, "{mean:.decimals$} (one seed)"),
+            count => write!(
+                f,
+                "{mean:.decimals$} (standard deviation {:.decimals$} over {count} seeds)",
+                self.sd
+            ),
+        }
     }
 }
 

@@ -130,13 +130,16 @@ impl Canvas {
         }
     }
 
-    /// A disc, as a polygon of 16 sides.
-    pub(super) fn dot(&mut self, (x, y): Point, radius: f64, fill: Colour) {
-        let corner = |i: i32| {
-            let angle = f64::from(i) * std::f64::consts::TAU / 16.0;
-            (x + radius * angle.cos(), y + radius * angle.sin())
-        };
-        self.area((0..16).map(corner).collect(), fill);
+    /// A disc.
+    pub(super) fn dot(&mut self, middle: Point, radius: f64, fill: Colour) {
+        self.area(circle(middle, radius).collect(), fill);
+    }
+
+    /// A circle.
+    pub(super) fn ring(&mut self, middle: Point, radius: f64, colour: Colour) {
+        let again = circle(middle, radius).take(1);
+        let points = circle(middle, radius).chain(again).collect();
+        self.line(points, Stroke::solid(colour, 1.4));
     }
 
     pub(super) fn rects(&mut self, rects: Vec<Rect>, fill: Colour) {
@@ -159,4 +162,12 @@ impl Canvas {
             self.shapes.push(Shape::Text { at, text, style });
         }
     }
+}
+
+/// A circle as a polygon of 16 sides.
+fn circle((x, y): Point, radius: f64) -> impl Iterator<Item = Point> {
+    (0..16).map(move |i| {
+        let angle = f64::from(i) * std::f64::consts::TAU / 16.0;
+        (x + radius * angle.cos(), y + radius * angle.sin())
+    })
 }

@@ -15,6 +15,7 @@ const LEGEND_LEADING: f64 = 18.0;
 const LEGEND_MARK: f64 = 22.0;
 const BAND_ALPHA: f32 = 0.18;
 const DOT_RADIUS: f64 = 3.0;
+const RING_RADIUS: f64 = 5.0;
 /// Share of an axis's range that is left free at its ends.
 const SLACK: f64 = 0.05;
 
@@ -110,8 +111,8 @@ pub(crate) enum Mark {
     Line,
     /// A dashed line through the points.
     Dashed,
-    /// The points alone.
-    Points,
+    /// Open circles, which leave another point on them visible.
+    Rings,
     /// The points, each with a vertical bar from its band's low to its high.
     Bars,
 }
@@ -297,7 +298,10 @@ impl Chart {
                     vec![(x, middle), (x + LEGEND_MARK, middle)],
                     pen(series.colour, series.mark),
                 ),
-                Mark::Points | Mark::Bars => {
+                Mark::Rings => {
+                    canvas.ring((x + LEGEND_MARK / 2.0, middle), RING_RADIUS, series.colour)
+                }
+                Mark::Bars => {
                     canvas.dot((x + LEGEND_MARK / 2.0, middle), DOT_RADIUS, series.colour);
                 }
             }
@@ -370,7 +374,12 @@ fn draw_series(canvas: &mut Canvas, plot: &Plot<'_>, series: &Series) {
             }
             canvas.line(points, pen(series.colour, series.mark));
         }
-        Mark::Points | Mark::Bars => {
+        Mark::Rings => {
+            for point in points {
+                canvas.ring(point, RING_RADIUS, series.colour);
+            }
+        }
+        Mark::Bars => {
             for point in points {
                 canvas.dot(point, DOT_RADIUS, series.colour);
             }

@@ -107,12 +107,11 @@ impl Heat {
             widths.fold(0.0, f64::max)
         };
         let names_width = widest(&self.names);
-        let left = names_width
-            + if self.labels.1.is_empty() {
-                6.0
-            } else {
-                LABEL_SIZE + 12.0
-            };
+        let left = match (self.names.is_empty(), self.labels.1.is_empty()) {
+            (true, true) => 0.0,
+            (false, true) => names_width + 6.0,
+            (_, false) => names_width + LABEL_SIZE + 12.0,
+        };
         let right = 14.0 + BAR_WIDTH + 6.0 + widest(&bar_labels) + LABEL_SIZE + 8.0;
         // Names of columns stand upright if they are longer than a cell is wide.
         let cell_guess = (place.width - left - right) / self.side as f64;
@@ -132,7 +131,7 @@ impl Heat {
             .min(place.height - below)
             .max(10.0);
         let cell = room / self.side as f64;
-        let map = Rect::new(place.x + left, place.y + 2.0, room, room);
+        let map = Rect::new(place.x + left, place.y, room, room);
 
         let unit = self.field.map_or(cell, |field| room / field.side);
         let cells = match self.field {

@@ -29,7 +29,7 @@ pub(crate) use self::{
 use crate::error::{Usage, usage};
 
 /// Pixels of a PNG for one unit of the figure: sharp on a dense screen and in print.
-const PNG_ZOOM: f32 = 1.6;
+const PNG_ZOOM: f32 = 1.5;
 /// Space around the panels and between them.
 const MARGIN: f64 = 18.0;
 const TITLE_SIZE: f64 = 17.0;
@@ -124,7 +124,7 @@ impl Figure {
             .iter()
             .flat_map(|note| font::wrap(note, NOTE_SIZE, width - 2.0 * MARGIN))
             .collect();
-        let head = MARGIN + TITLE_SIZE + 8.0 + notes.len() as f64 * NOTE_LEADING;
+        let head = MARGIN + TITLE_SIZE + 16.0 + notes.len() as f64 * NOTE_LEADING;
         let height = head + rows as f64 * (panel_height + MARGIN) + 4.0;
 
         let mut canvas = Canvas::new(width, height);

@@ -130,10 +130,9 @@ fn words(column: &str) -> (String, String) {
 }
 
 fn title(groups: &[Group<'_>]) -> String {
-    let names: Vec<_> = groups.iter().map(|group| group.name.as_str()).collect();
-    match names[..] {
-        [only] => only.to_owned(),
-        _ => format!("{} configurations", names.len()),
+    match groups {
+        [only] => only.name.clone(),
+        _ => format!("{} configurations compared", groups.len()),
     }
 }
 

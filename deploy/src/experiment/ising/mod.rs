@@ -27,7 +27,8 @@ const LOSS_WINDOW: usize = 10;
 struct Settings {
     /// What differs from the settings of a run in this world, as `--set` has it.
     sets: Vec<String>,
-    /// Seeds 1 to this.
+    /// Seeds 1 to this. No piece depends on it, so that more can be added later.
+    #[serde(skip_serializing)]
     seeds: u32,
     /// Updates of a training.
     updates: u64,
@@ -248,7 +249,8 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
         }),
         over("in the patch: true pair or other", 1, &|measured| {
             measured.auc_pairs
-        }),
+        })
+        .marked(Mark::Dashed),
     ];
     let losses = trained.iter().enumerate().map(|(seed, one)| {
         Series::line(
@@ -260,11 +262,8 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
     Figure {
         title: "What local DIM learns of the Ising world".into(),
         notes: vec![format!(
-            "Left: means of {LOSS_WINDOW} updates. Right: mean of {} seeds, band from smallest to largest; {} episodes on \
-             the way, {} at the end.",
-            trained.len(),
-            task.settings.check_episodes,
-            task.settings.episodes
+            "Left: means of {LOSS_WINDOW} updates. Right: mean and range over seeds; {} episodes on the way, {} at the end.",
+            task.settings.check_episodes, task.settings.episodes
         )],
         columns: 2,
         panel_size: (430.0, 330.0),
@@ -326,8 +325,9 @@ fn page(task: &Task, trained: &[Trained], command: String, smoke: bool) -> Page 
             ),
             format!("Before training: {untrained}."),
             format!(
-                "Inside the patch, true pairs against pairs of two episodes whose patches both cover the location: {}. So \
-                 the score tells *this* future from another patch's, and is no mere detector of patches.",
+                "Inside the patch, true pairs against pairs of two episodes whose patches both cover the location: {}. \
+                 (At 0.5 the score would be a mere detector of patches; at 1 it tells *this* future from any other \
+                 patch's.)",
                 last(&|measured| measured.auc_pairs)
             ),
             format!(
