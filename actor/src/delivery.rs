@@ -19,6 +19,8 @@ use driml_protocol::{
 };
 use zenoh::{Session, bytes::ZBytes, qos::Priority};
 
+use crate::config::Config;
+
 /// After `Shutdown`, how long the chunks at hand may take to be stored.
 const DRAIN_MAX: Duration = Duration::from_secs(20);
 /// Pause between two tries when the replay server is out of reach.
@@ -33,6 +35,17 @@ pub struct DeliveryLimits {
     pub ack_timeout: Duration,
     /// All tries for one chunk without any answer.
     pub unreachable_max: Duration,
+}
+
+impl DeliveryLimits {
+    /// The limits that an actor's settings ask for.
+    pub const fn of(config: &Config) -> Self {
+        Self {
+            chunks_in_flight_max: config.chunks_in_flight_max as usize,
+            ack_timeout: Duration::from_millis(config.ack_timeout_ms),
+            unreachable_max: Duration::from_millis(config.unreachable_max_ms),
+        }
+    }
 }
 
 /// What the sending side and the thread tell each other beside the chunks.

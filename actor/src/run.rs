@@ -58,11 +58,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let Some((header, weights)) = first else {
         return Ok(());
     };
-    let limits = DeliveryLimits {
-        chunks_in_flight_max: settings.actor.chunks_in_flight_max as usize,
-        ack_timeout: Duration::from_millis(settings.actor.ack_timeout_ms),
-        unreachable_max: Duration::from_millis(settings.actor.unreachable_max_ms),
-    };
+    let limits = DeliveryLimits::of(&settings.actor);
     let envs = settings.actor.envs;
     let pool = settings.chunk_memory();
     let mut collector = Collector::new(

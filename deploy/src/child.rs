@@ -47,6 +47,13 @@ const FOR_CANDLE: [(&str, &str); 3] = [
     ("MALLOC_TRIM_THRESHOLD_", "10000000000"),
 ];
 
+/// Gives a process the environment of every part, with so many threads for arithmetic.
+pub(crate) fn suit_candle(command: &mut Command, threads: u32) {
+    command
+        .env("RAYON_NUM_THREADS", threads.to_string())
+        .envs(FOR_CANDLE);
+}
+
 impl Part {
     /// Starts this program with other arguments, in a process group of its own so that Ctrl-C does not reach it.
     ///
@@ -62,10 +69,10 @@ impl Part {
         let log = logs.join(format!("{name}.log"));
         let program = std::env::current_exe().context("finding this program's own file")?;
         let file = File::create(&log).with_context(|| format!("making {}", log.display()))?;
-        let mut child = Command::new(program)
+        let mut command = Command::new(program);
+        suit_candle(&mut command, threads);
+        let mut child = command
             .args(args)
-            .env("RAYON_NUM_THREADS", threads.to_string())
-            .envs(FOR_CANDLE)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())

@@ -32,6 +32,9 @@ pub(crate) enum Command {
     /// Run one of the paper's experiments: figures, data and a page
     #[command(subcommand)]
     Experiment(ExperimentCommand),
+    /// Measure how fast the parts are, alone and beside what others use
+    #[command(subcommand)]
+    Bench(BenchCommand),
     /// List the presets
     Presets,
     /// Procgen's engine
@@ -240,6 +243,110 @@ pub(crate) struct ParityArgs {
     /// Case files (safetensors)
     #[arg(value_name = "FILE", required = true)]
     pub(crate) files: Vec<PathBuf>,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum BenchCommand {
+    /// Updates of the learner, and the same update from candle's stock operations
+    Learner(BenchFlags),
+    /// Frames through an actor's policy
+    Policy(BenchFlags),
+    /// Transitions into a replay server and batches out of it, over the wire; and its batches without the wire
+    Replay(BenchFlags),
+    /// Procgen's steps through our wrapper
+    Env(BenchFlags),
+    /// A short run with real processes: its speed, how long the learner computes and waits, its memory
+    System(BenchSystemArgs),
+    /// Replay servers under 1 to 64 actors and a learner, all synthetic and paced: what they store, serve and cost
+    Scale(BenchScaleArgs),
+    /// All of these but the run, in turn with PyTorch, Reverb and gym3 doing the same work
+    Peers(BenchPeersArgs),
+}
+
+/// What every bench can be told.
+#[derive(Clone, Debug, Args)]
+pub(crate) struct BenchFlags {
+    /// A few iterations only: shows that it works, measures little
+    #[arg(long)]
+    pub(crate) quick: bool,
+    /// Write the figures as JSON too; `-` is stdout, then without the table
+    #[arg(long, value_name = "FILE")]
+    pub(crate) json: Option<PathBuf>,
+    /// Threads for arithmetic
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub(crate) threads: u32,
+    /// Measure in this very process, whose environment is already that of a part
+    #[arg(long, hide = true)]
+    pub(crate) here: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct BenchSystemArgs {
+    /// Frames of the run [default: 12000, or 2500 with --quick]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(2_000..=100_000_000))]
+    pub(crate) frames: Option<u64>,
+    #[command(flatten)]
+    pub(crate) flags: BenchFlags,
+}
+
+#[derive(Clone, Debug, Args)]
+pub(crate) struct BenchScaleArgs {
+    /// Transitions a second that each actor offers
+    #[arg(long, value_name = "N", default_value_t = 1000.0, value_parser = rate)]
+    pub(crate) actor_rate: f64,
+    /// Batches a second that the learner asks for
+    #[arg(long, value_name = "N", default_value_t = 20.0, value_parser = rate)]
+    pub(crate) batch_rate: f64,
+    /// Seconds for which each number of actors is watched
+    #[arg(long, value_name = "S", default_value_t = 5.0, value_parser = rate)]
+    pub(crate) seconds: f64,
+    #[command(flatten)]
+    pub(crate) flags: BenchFlags,
+}
+
+/// A number above 0 that is no more than a million.
+fn rate(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if value > 0.0 && value <= 1e6 => Ok(value),
+        _ => Err("it must be a number above 0, at most 1000000".into()),
+    }
+}
+
+/// A part that is measured by itself, and beside a peer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
+pub(crate) enum BenchPart {
+    /// Beside PyTorch
+    Learner,
+    /// Beside PyTorch
+    Policy,
+    /// Beside Reverb
+    Replay,
+    /// Beside gym3
+    Env,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct BenchPeersArgs {
+    /// Only these parts
+    #[arg(long, value_enum, value_delimiter = ',', value_name = "PARTS")]
+    pub(crate) only: Vec<BenchPart>,
+    /// Rounds of ours, theirs [default: 5, or 1 with --quick]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub(crate) rounds: Option<u32>,
+    /// Python that has every peer, unless one of the next three says otherwise
+    #[arg(long, value_name = "PATH", default_value = "python3")]
+    pub(crate) python: PathBuf,
+    /// Python that has PyTorch
+    #[arg(long, value_name = "PATH")]
+    pub(crate) torch_python: Option<PathBuf>,
+    /// Python that has Reverb
+    #[arg(long, value_name = "PATH")]
+    pub(crate) reverb_python: Option<PathBuf>,
+    /// Python that has Procgen and gym3
+    #[arg(long, value_name = "PATH")]
+    pub(crate) gym3_python: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) flags: BenchFlags,
 }
 
 #[cfg(test)]

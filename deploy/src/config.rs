@@ -5,6 +5,7 @@ use driml_envs::{WorldConfig, WorldName};
 use driml_learner::EstimatorKind;
 use driml_model::ModelConfig;
 use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
+use driml_replay_server::Compression;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -169,6 +170,9 @@ fn fit_memory(
     derive(&mut derived)?;
     let run: RunSpec = read(&derived, "run")?;
     let replay: driml_replay_server::Config = read(&derived, "replay")?;
+    if replay.compression != Compression::None {
+        return fit_compressed(table, &run, &replay, machine);
+    }
     let bytes_each = replay_bytes_each(&run);
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
     let fits = |bytes: u64| bytes / bytes_each;
@@ -197,10 +201,57 @@ fn fit_memory(
     }))
 }
 
+/// Bounds the bytes of a compressed replay, as nobody knows beforehand how well its frames compress.
+///
+/// Half the free memory is taken, or what a person allowed; nothing is bounded where even frames that do not compress fit.
+fn fit_compressed(
+    table: &mut Table,
+    run: &RunSpec,
+    replay: &driml_replay_server::Config,
+    machine: &Machine,
+) -> Result<Option<String>, Usage> {
+    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
+    let free = gib(machine.memory_bytes);
+    let asked = replay.capacity_transitions;
+    let fields = asked.saturating_mul(COMPRESSED_FIELDS_BYTES);
+    let frames = asked.saturating_mul(run.frame_bytes() as u64);
+    let bytes = machine.replay_bytes().saturating_sub(fields);
+    if fields > machine.replay_bytes() / 2 {
+        return Err(usage!(
+            "replay.capacity_transitions = {asked} needs {:.1} GiB beside the frames, and {free:.1} GiB are free: --set replay.capacity_transitions={}",
+            gib(fields),
+            machine.replay_bytes() / 2 / COMPRESSED_FIELDS_BYTES
+        ));
+    }
+    match replay.compressed_bytes_max {
+        Some(max) if max.min(frames) > machine.replay_bytes_max() => Err(usage!(
+            "replay.compressed_bytes_max = {max} is {:.1} GiB, and {free:.1} GiB are free: --set replay.compressed_bytes_max={bytes}",
+            gib(max)
+        )),
+        Some(_) => Ok(None),
+        None if frames <= bytes => Ok(None),
+        None => {
+            Override::parse(&format!("replay.compressed_bytes_max={bytes}"))?.apply(table)?;
+            let run_frames = replay.transitions_max.unwrap_or(u64::MAX);
+            let matters = run_frames.saturating_mul(run.frame_bytes() as u64) > bytes;
+            Ok(matters.then(|| {
+                format!(
+                    "compressed frames may take {:.1} GiB, as {free:.1} GiB of memory are free; if they compress badly, the replay holds fewer than {asked} transitions",
+                    gib(bytes)
+                )
+            }))
+        }
+    }
+}
+
 /// Bytes that one transition takes in the replay: its frame and its small fields.
 pub(crate) const fn replay_bytes_each(run: &RunSpec) -> u64 {
     run.frame_bytes() as u64 + 32
 }
+
+/// Bytes that one transition takes at most in a compressed replay, beside its frame: its small fields, and its share of the
+/// list of blocks if each holds one frame.
+pub(crate) const COMPRESSED_FIELDS_BYTES: u64 = 128;
 
 fn read<T: DeserializeOwned>(table: &Table, name: &'static str) -> Result<T, Usage> {
     let value = table

@@ -37,6 +37,11 @@ impl Screen {
         Self { bar }
     }
 
+    /// Plain lines on stderr, without a progress display.
+    pub(crate) const fn plain() -> Self {
+        Self { bar: None }
+    }
+
     /// Writes one line.
     pub(crate) fn line(&self, line: &str) {
         match &self.bar {

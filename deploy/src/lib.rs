@@ -3,6 +3,7 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
+mod bench;
 mod child;
 mod cli;
 mod config;
@@ -74,11 +75,20 @@ pub fn main() -> ExitCode {
 }
 
 /// `DRIML_LOG` says what is logged, in the form of `RUST_LOG`. zenoh warns of each try to reach a part that is not there
-/// yet or any more, which is ours to judge: so only its errors are logged, and of those not what its session says of
-/// messages that come while it closes, as at the end of every run.
+/// yet or any more, which is ours to judge: so only its errors are logged, and of those neither what its session says of
+/// messages that come while it closes, as at the end of every run, nor that nobody wants an answer any more.
 fn log_to_stderr() {
-    let filter = EnvFilter::try_from_env("DRIML_LOG")
-        .unwrap_or_else(|_| EnvFilter::new("warn,driml=info,zenoh=error,zenoh::api::session=off"));
+    let usual = "warn,driml=info,zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off";
+    let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
+    let filter = wanted.map_or_else(
+        || EnvFilter::new(usual),
+        |wanted| {
+            EnvFilter::try_new(&wanted).unwrap_or_else(|e| {
+                eprintln!("DRIML_LOG={wanted} is no filter ({e}), so it is left out; take for example debug");
+                EnvFilter::new(usual)
+            })
+        },
+    );
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
@@ -121,6 +131,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Parity(args) => parity(&args),
         Command::Plot(args) => plot::run(&args),
         Command::Experiment(command) => experiment::run(&command),
+        Command::Bench(command) => bench::run(&command),
         Command::Presets => print(&presets::describe()),
         Command::Procgen(ProcgenCommand::Install) => {
             let engine = procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;

@@ -6,7 +6,7 @@ use std::{path::Path, time::Duration};
 use driml_model::ModelConfig;
 
 use crate::{
-    config::{RunConfig, replay_bytes_each},
+    config::{COMPRESSED_FIELDS_BYTES, RunConfig, replay_bytes_each},
     display::duration,
     machine::Machine,
 };
@@ -114,7 +114,11 @@ pub(crate) fn describe(
         local,
         ..
     } = config;
-    let bytes = config.frames().min(replay.capacity_transitions) * replay_bytes_each(run);
+    let held = config.frames().min(replay.capacity_transitions);
+    let compressed = replay.compressed_bytes_max.map_or(u64::MAX, |max| {
+        max.saturating_add(held * COMPRESSED_FIELDS_BYTES)
+    });
+    let bytes = compressed.min(held * replay_bytes_each(run));
     let processes = if lockstep {
         "one, all parts in lockstep".into()
     } else {
@@ -150,8 +154,7 @@ pub(crate) fn describe(
         (
             "replay",
             format!(
-                "the newest {} transitions, up to {} of memory",
-                replay.capacity_transitions.min(config.frames()),
+                "the newest {held} transitions, up to {} of memory",
                 size(bytes)
             ),
         ),

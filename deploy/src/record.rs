@@ -74,6 +74,8 @@ pub(crate) struct Summary {
     pub(crate) weights_sha256: String,
     /// Chunks recognised as a retry of a stored one.
     pub(crate) chunks_retried: u64,
+    /// Memory that the frames in the replay took at the end, MiB.
+    pub(crate) replay_frame_mib: u64,
     /// Messages refused as malformed or foreign.
     pub(crate) messages_refused: u64,
     /// Highest resident memory of each process, MiB.
@@ -271,6 +273,7 @@ impl Recorder {
             weights_version: learner.weights_version,
             weights_sha256: learner.weights_sha256.clone(),
             chunks_retried: replay.chunks_retried,
+            replay_frame_mib: replay.frame_bytes_held.div_ceil(1 << 20),
             messages_refused: replay.messages_refused,
             rss_mib_max: rss
                 .map(|(name, mib)| (name.clone(), mib.map(f64::round).into()))

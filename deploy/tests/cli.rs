@@ -105,6 +105,10 @@ fn clap_s_own_refusals_are_usage_too() {
         &["local", "--lockstep", "--listen", "tcp/127.0.0.1:1"],
         &["actor"],
         &["fly"],
+        &["bench"],
+        &["bench", "fly"],
+        &["bench", "peers", "--only", "scale"],
+        &["bench", "system", "--frames", "10"],
         &[],
     ] {
         usage(args);
@@ -198,4 +202,32 @@ fn nobody_to_join_is_a_failure_at_run_time() {
     assert_eq!(code, 1, "{text}");
     assert!(text.contains("error: "), "{text}");
     assert!(!text.contains("panicked"), "{text}");
+}
+
+#[test]
+fn benches_give_figures_and_name_the_peer_that_is_missing() {
+    let output = driml(&["bench", "policy", "--quick", "--json", "-"]);
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let figures = report["figures"].as_array().unwrap();
+    assert_eq!((figures.len(), &report["bench"]), (4, &"policy".into()));
+    assert!(figures.iter().all(|it| it["value"].as_f64().unwrap() > 0.0));
+
+    let peers = ["bench", "peers", "--quick", "--only", "policy"];
+    let output = driml(&[&peers[..], &["--python", "no-such-python"]].concat());
+    let table = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{table}");
+    let skipped = "skipped: no-such-python cannot be started (No such file or directory (os error 2)): name a Python that has PyTorch with --torch-python";
+    assert_eq!(
+        table
+            .lines()
+            .filter(|line| line.ends_with("  skipped"))
+            .count(),
+        4,
+        "{table}"
+    );
+    assert_eq!(
+        table.lines().filter(|line| *line == skipped).count(),
+        1,
+        "{table}"
+    );
 }

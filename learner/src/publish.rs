@@ -10,14 +10,15 @@ use std::{
 };
 
 use driml_protocol::{
-    AffinityUpdate, Keys, Kind, LearnerStatus, Shutdown, WeightsVersion, codec, session,
+    AffinityUpdate, Keys, Kind, LearnerStatus, Shutdown, WeightsVersion, answering::Answering,
+    codec, session,
 };
 use zenoh::{
     Session, Wait,
     bytes::ZBytes,
     pubsub::Publisher,
     qos::{CongestionControl, Priority},
-    query::{Query, Queryable},
+    query::Queryable,
 };
 
 use crate::learning::Weights;
@@ -25,12 +26,9 @@ use crate::learning::Weights;
 /// One delivery of the affinity matrix.
 const AFFINITY_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Weights ready to travel.
-type Message = ZBytes;
-
 /// The learner's outlets; dropping it closes them.
 pub(crate) struct Outlets {
-    weights: Arc<Mutex<Option<Message>>>,
+    weights: Arc<Mutex<Option<ZBytes>>>,
     status: Arc<Mutex<LearnerStatus>>,
     heard: Arc<AtomicBool>,
     affinity: Arc<Newest>,
@@ -59,33 +57,33 @@ impl Outlets {
         shutdown: &Shutdown,
     ) -> anyhow::Result<Self> {
         let failed = |e: zenoh::Error| anyhow::anyhow!("declaring what the learner answers: {e}");
-        let weights: Arc<Mutex<Option<Message>>> = Arc::default();
+        let weights: Arc<Mutex<Option<ZBytes>>> = Arc::default();
         let status: Arc<Mutex<LearnerStatus>> = Arc::default();
         let heard: Arc<AtomicBool> = Arc::default();
+        let held = weights.clone();
+        let weights_asked = Answering::start("weights", 1, move |query| {
+            // An actor that comes before the first weights hears nothing and asks again.
+            let message = lock(&held).clone();
+            if let Some(message) = message {
+                session::answer(query, message);
+            }
+        })?;
+        let (held, told) = (status.clone(), heard.clone());
+        let status_asked = Answering::start("status", 1, move |query| {
+            let status = lock(&held).clone();
+            match codec::encode(Kind::LearnerStatus, spec_hash, &status, &[]) {
+                Ok(bytes) => {
+                    session::answer(query, bytes.into());
+                    told.store(status.finished, Ordering::Relaxed);
+                }
+                Err(e) => tracing::warn!("the learner's status was not sent: {e}"),
+            }
+        })?;
         let (mut versions, mut queryables) = (Vec::new(), Vec::new());
         for session in sessions {
-            let held = weights.clone();
-            let answer_weights = move |query: Query| {
-                // An actor that comes before the first weights hears nothing and asks again.
-                if let Some(message) = lock(&held).clone() {
-                    session::answer(&query, message);
-                }
-            };
-            let (held, told) = (status.clone(), heard.clone());
-            let answer_status = move |query: Query| {
-                let status = lock(&held).clone();
-                match codec::encode(Kind::LearnerStatus, spec_hash, &status, &[]) {
-                    Ok(bytes) => {
-                        session::answer(&query, bytes.into());
-                        told.store(status.finished, Ordering::Relaxed);
-                    }
-                    Err(e) => tracing::warn!("the learner's status was not sent: {e}"),
-                }
-            };
-            let queryable = session.declare_queryable(keys.weights());
-            queryables.push(queryable.callback(answer_weights).wait().map_err(failed)?);
-            let queryable = session.declare_queryable(keys.learner_status());
-            queryables.push(queryable.callback(answer_status).wait().map_err(failed)?);
+            let weights = weights_asked.declare(session, keys.weights());
+            let status = status_asked.declare(session, keys.learner_status());
+            queryables.extend([weights.map_err(failed)?, status.map_err(failed)?]);
             // An announcement that is dropped under congestion is made good by the next, or by the actors' own look.
             let publisher = session
                 .declare_publisher(keys.weights_version())

@@ -47,10 +47,12 @@ impl Shards {
 
     /// Closes all sessions; the first error, if there is one.
     pub(crate) fn close(&self) -> anyhow::Result<()> {
-        let closed = self.sessions.iter().map(|session| session.close().wait());
-        closed
-            .fold(Ok(()), |all, one| all.and(one))
-            .map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+        let mut all = Ok(());
+        for session in &self.sessions {
+            let closed = session.close().wait();
+            all = all.and(closed.map_err(|e| anyhow::anyhow!("closing the session: {e}")));
+        }
+        all
     }
 }
 

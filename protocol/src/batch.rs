@@ -129,7 +129,7 @@ impl Batch {
         let offsets = merged.offsets();
         let mut first_row = 0;
         for part in parts {
-            for plane in 0..PLANES {
+            for (plane, &offset) in offsets[..PLANES].iter().enumerate() {
                 let per_positive = matches!(plane, 1 | 7 | 8);
                 let blocks = if per_positive { part.positives() } else { 1 };
                 let values = part.plane(plane);
@@ -138,8 +138,7 @@ impl Batch {
                     let from =
                         &values[block * part.rows() * row_bytes..][..part.rows() * row_bytes];
                     let row = block * merged.rows() + first_row;
-                    merged.planes[offsets[plane] + row * row_bytes..][..from.len()]
-                        .copy_from_slice(from);
+                    merged.planes[offset + row * row_bytes..][..from.len()].copy_from_slice(from);
                 }
             }
             first_row += part.rows();
@@ -359,6 +358,11 @@ impl BatchRowsMut<'_> {
     /// Where s_{t+n} of `row` is written; zeros if the row does not bootstrap.
     pub fn frame_n(&mut self, row: usize) -> &mut [u8] {
         &mut self.frames_n[row * self.state_bytes..(row + 1) * self.state_bytes]
+    }
+
+    /// Positives a row, P.
+    pub const fn positives(&self) -> usize {
+        self.positive_valid.len() / self.rows
     }
 
     /// Marks `row` as having no positive `p`.

@@ -4,6 +4,7 @@
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 pub mod affinity;
+pub mod answering;
 pub mod batch;
 pub mod codec;
 pub mod config;

@@ -46,6 +46,8 @@ pub struct ReplayStatus {
     pub transitions_inserted: u64,
     /// Transitions held now.
     pub transitions_held: u64,
+    /// Bytes of memory that their frames take.
+    pub frame_bytes_held: u64,
     /// Transitions that actors produced and that never arrived.
     pub transitions_lost: u64,
     /// Transitions stored twice.

@@ -91,6 +91,21 @@ impl Shutdown {
     }
 }
 
+/// Waits until all of `threads` have ended, at most for `wait_max`.
+///
+/// A thread that still runs while the process ends may find memory gone that it shares with others.
+pub fn join_within(threads: impl IntoIterator<Item = JoinHandle<()>>, wait_max: Duration) {
+    let started = Instant::now();
+    for thread in threads {
+        while !thread.is_finished() && started.elapsed() < wait_max {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        if thread.is_finished() && thread.join().is_err() {
+            tracing::error!("a thread had panicked");
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -104,20 +119,5 @@ mod tests {
         shutdown.set();
         waiter.join().unwrap();
         assert!(shutdown.is_set());
-    }
-}
-
-/// Waits until all of `threads` have ended, at most for `wait_max`.
-///
-/// A thread that still runs while the process ends may find memory gone that it shares with others.
-pub fn join_within(threads: impl IntoIterator<Item = JoinHandle<()>>, wait_max: Duration) {
-    let started = Instant::now();
-    for thread in threads {
-        while !thread.is_finished() && started.elapsed() < wait_max {
-            std::thread::sleep(Duration::from_millis(1));
-        }
-        if thread.is_finished() && thread.join().is_err() {
-            tracing::error!("a thread had panicked");
-        }
     }
 }

@@ -6,7 +6,7 @@ use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use driml_protocol::{Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule};
-use driml_replay_server::{Config, Replay};
+use driml_replay_server::{Compression, Config, Replay};
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -61,6 +61,8 @@ fn chunk(sequence: u64) -> Chunk {
 fn filled(frame_stack: u32) -> (Replay, Chunk) {
     let config = Config {
         capacity_transitions: CAPACITY,
+        compression: Compression::None,
+        compressed_bytes_max: None,
         replay_ratio: 1e9,
         warmup_transitions: 0,
         slack_transitions: 1 << 50,

@@ -1,14 +1,55 @@
-//! Writes one row of a batch: s_t, a_t, a_{t+1}, the n-step return, s_{t+n}, and s_{t+k} with k drawn here.
-//! It does not choose the anchor.
+//! Makes one row of a batch: a_t, a_{t+1}, the n-step return, and which transitions' states are s_t, s_{t+n} and s_{t+k}, with
+//! k drawn here. It does not choose the anchor and reads no frame.
 
 use driml_protocol::{End, Horizon, NO_ACTION, RunSpec, TimeoutRule, batch::BatchRowsMut};
 use rand::Rng;
 
 use crate::{
-    episodes::{Episodes, Window},
+    episodes::Window,
     horizon::{self, Affinity},
-    ring::Ring,
 };
+
+/// The states of a row, as indices in the ring.
+#[derive(Clone, Copy)]
+pub(crate) struct RowStates {
+    t: u64,
+    /// Where the row bootstraps from.
+    n: Option<u64>,
+    /// k and s_{t+k}.
+    positive: Option<(u32, u64)>,
+}
+
+impl RowStates {
+    /// k, 0 without a positive.
+    pub(crate) fn k(&self) -> u32 {
+        self.positive.map_or(0, |(k, _)| k)
+    }
+
+    /// s_t, s_{t+n}, s_{t+k}: those that the row has.
+    pub(crate) fn indices(&self) -> impl Iterator<Item = u64> {
+        let positive = self.positive.map(|(_, index)| index);
+        [Some(self.t), self.n, positive].into_iter().flatten()
+    }
+
+    /// Calls `write` with the index and the place of each state, in the order of [`RowStates::indices`]; the places of the
+    /// states that the row does not have are filled with zeros.
+    pub(crate) fn write(
+        &self,
+        rows: &mut BatchRowsMut<'_>,
+        row: usize,
+        mut write: impl FnMut(u64, &mut [u8]),
+    ) {
+        write(self.t, rows.frame_t(row));
+        match self.n {
+            Some(index) => write(index, rows.frame_n(row)),
+            None => rows.frame_n(row).fill(0),
+        }
+        match self.positive {
+            Some((k, index)) => write(index, rows.positive(0, row, k)),
+            None => (0..rows.positives()).for_each(|p| rows.no_positive(p, row)),
+        }
+    }
+}
 
 /// The rules of return and positive, and scratch space so that a row allocates nothing.
 pub(crate) struct Assembler {
@@ -30,14 +71,14 @@ impl Assembler {
         }
     }
 
-    /// Writes the row of the window's anchor and gives its k, 0 without a positive.
+    /// Writes all of the row of the window's anchor but its states, and gives those.
     pub(crate) fn write_row(
         &mut self,
-        (ring, episodes, affinity): (&Ring, &Episodes, &Affinity),
+        affinity: &Affinity,
         window: &Window,
         rng: &mut impl Rng,
         (rows, row): (&mut BatchRowsMut<'_>, usize),
-    ) -> u32 {
+    ) -> RowStates {
         let anchor = window.step(0);
         let next_action = if anchor.end == End::Running {
             window.step(1).action
@@ -53,20 +94,11 @@ impl Assembler {
             n_step_return as f32,
             discount as f32,
         );
-        episodes.write_state(ring, window.index(0), rows.frame_t(row));
-        match bootstrap {
-            Some(i) => episodes.write_state(ring, window.index(i), rows.frame_n(row)),
-            None => rows.frame_n(row).fill(0),
-        }
-        match self.draw_k(affinity, window, rng) {
-            Some(k) => {
-                episodes.write_state(ring, window.index(k as usize), rows.positive(0, row, k));
-                k
-            }
-            None => {
-                (0..self.horizon.positives()).for_each(|p| rows.no_positive(p, row));
-                0
-            }
+        let k = self.draw_k(affinity, window, rng);
+        RowStates {
+            t: window.index(0),
+            n: bootstrap.map(|i| window.index(i)),
+            positive: k.map(|k| (k, window.index(k as usize))),
         }
     }
 

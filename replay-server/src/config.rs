@@ -7,6 +7,8 @@ use driml_protocol::{
 };
 use serde::{Deserialize, Serialize};
 
+use crate::frames::{Compression, OVERHEAD_BYTES_MAX};
+
 /// Most shards of one replay.
 pub const SHARDS_MAX: u32 = 256;
 
@@ -19,6 +21,13 @@ pub struct Config {
     /// Replay servers among which the capacity and the actors are spread; the learner draws from each in proportion to what it
     /// holds.
     pub shards: u32,
+    /// How frames are kept in memory; batches do not depend on it.
+    #[serde(default)]
+    pub compression: Compression,
+    /// Bytes that compressed frames may take, beside at most 128 a transition: if they compress badly, the oldest are overwritten
+    /// before `capacity_transitions` are held. Without it they may take as much as uncompressed ones.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub compressed_bytes_max: Option<u64>,
     /// Rows sampled per transition inserted after the warm-up. More trains longer on each transition.
     pub replay_ratio: f64,
     /// Transitions stored before the replay ratio starts to count and the first row is sampled.
@@ -108,6 +117,22 @@ impl Config {
                 why,
             );
         }
+        if let Some(max) = self.compressed_bytes_max {
+            let least = compressed_bytes_least(window, spec.frame_bytes()) * u64::from(self.shards);
+            let why = match self.compression {
+                Compression::None => Some(
+                    "nothing is compressed; use compression = \"lz4\", or capacity_transitions"
+                        .into(),
+                ),
+                Compression::Lz4 if max < least => Some(format!(
+                    "one sample spans {window} transitions, which may not compress; use at least {least}"
+                )),
+                Compression::Lz4 => None,
+            };
+            if let Some(why) = why {
+                return bad("replay.compressed_bytes_max", max.to_string(), why);
+            }
+        }
         if self.warmup_transitions > self.capacity_transitions {
             let why = format!(
                 "the first of them would be overwritten before any is sampled; use at most capacity_transitions = {}",
@@ -142,6 +167,13 @@ impl Config {
         }
         Ok(())
     }
+}
+
+/// Bytes that `transitions` take if their frames do not compress at all, with what compression itself takes.
+pub const fn compressed_bytes_least(transitions: u64, frame_bytes: usize) -> u64 {
+    transitions
+        .saturating_mul(frame_bytes as u64)
+        .saturating_add(OVERHEAD_BYTES_MAX)
 }
 
 /// Most rows of one batch of this run, so that it stays below the codec's limit; larger requests are refused.

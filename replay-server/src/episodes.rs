@@ -35,7 +35,6 @@ impl Window {
 pub(crate) struct Episodes {
     reach: usize,
     frame_stack: usize,
-    pixel_bytes: usize,
     timeout: TimeoutRule,
 }
 
@@ -44,7 +43,6 @@ impl Episodes {
         Self {
             reach: config::reach(spec) as usize,
             frame_stack: spec.frame_stack as usize,
-            pixel_bytes: spec.frame_channels as usize,
             timeout: spec.timeout,
         }
     }
@@ -84,36 +82,61 @@ impl Episodes {
         true
     }
 
-    /// Writes the state at `index` into `out` [H, W, C * stack], a pixel's oldest channels first.
+    /// The frames that make the state at `index`.
     ///
     /// At the start of a level its first frame fills the slots of the frames before it. The stack must be held, which it is
     /// for every state of a window: it reaches back to the anchor's stack at most.
-    pub(crate) fn write_state(&self, ring: &Ring, index: u64, out: &mut [u8]) {
-        if self.frame_stack == 1 {
-            out.copy_from_slice(ring.frame(index));
-            return;
-        }
-        // A run spec has 1 to 16 frames in its stack.
-        let mut frames: [&[u8]; FRAME_STACK_MAX] = [&[]; FRAME_STACK_MAX];
-        let mut index = index;
-        for slot in (0..self.frame_stack).rev() {
-            frames[slot] = ring.frame(index);
-            if slot > 0 {
-                match ring.previous(index) {
-                    Previous::Start => {}
-                    Previous::Held(previous) => index = previous,
-                    Previous::Gone => {
-                        unreachable!("the stack of {index} was checked with its anchor")
-                    }
+    pub(crate) fn stack(&self, ring: &Ring, mut index: u64) -> Stack {
+        let mut stack = Stack {
+            length: self.frame_stack,
+            indices: [index; FRAME_STACK_MAX],
+        };
+        for slot in (0..self.frame_stack - 1).rev() {
+            match ring.previous(index) {
+                Previous::Start => {}
+                Previous::Held(previous) => index = previous,
+                Previous::Gone => {
+                    unreachable!("the stack of {index} was checked with its anchor")
                 }
             }
+            stack.indices[slot] = index;
         }
-        interleave(&frames[..self.frame_stack], self.pixel_bytes, out);
+        stack
     }
 }
 
 /// Longest frame stack that a run spec allows.
 const FRAME_STACK_MAX: usize = 16;
+
+/// The frames of one state, as indices in the ring, oldest first.
+pub(crate) struct Stack {
+    length: usize,
+    indices: [u64; FRAME_STACK_MAX],
+}
+
+impl Stack {
+    /// Indices of the frames, oldest first; at the start of a level the first one several times.
+    pub(crate) fn frames(&self) -> impl Iterator<Item = u64> {
+        self.indices.into_iter().take(self.length)
+    }
+
+    /// Writes the state into `out` [H, W, C * stack], a pixel's oldest channels first; `frame` gives a frame [H, W, C].
+    pub(crate) fn write<'a>(
+        &self,
+        pixel_bytes: usize,
+        out: &mut [u8],
+        frame: impl Fn(u64) -> &'a [u8],
+    ) {
+        if self.length == 1 {
+            return out.copy_from_slice(frame(self.indices[0]));
+        }
+        let mut frames: [&[u8]; FRAME_STACK_MAX] = [&[]; FRAME_STACK_MAX];
+        for (to, index) in frames.iter_mut().zip(self.frames()) {
+            *to = frame(index);
+        }
+        interleave(&frames[..self.length], pixel_bytes, out);
+    }
+}
 
 /// Writes `frames`, each [pixels, C], into `out` [pixels, stack, C].
 ///

@@ -12,11 +12,13 @@ mod actors;
 mod anchors;
 mod assemble;
 mod episodes;
+mod frames;
 mod ring;
 mod service;
 mod statistics;
 
 pub use actors::{ACTORS_MAX, STREAMS_MAX};
 pub use config::{Config, ConfigError};
+pub use frames::{Compression, Draft, PackedChunk, Packer};
 pub use replay::{Replay, Unready};
 pub use service::{RunArgs, run};

@@ -14,9 +14,13 @@ use crate::{
     assemble::Assembler,
     config::{self, Config, ConfigError},
     episodes::{Episodes, Window},
+    frames::{
+        CompressedFrames, Compression, Draft, Frames, PackedChunk, PackedStates, Packer,
+        PlainFrames,
+    },
     horizon::Affinity,
     rate_limiter::RateLimiter,
-    ring::{Link, Ring, Step},
+    ring::{Ring, Step},
     statistics::Statistics,
 };
 
@@ -94,8 +98,21 @@ impl Replay {
                 why: format!("there is no shard {shard}; the first is shard 0"),
             });
         }
-        let capacity = config.capacity_transitions / u64::from(config.shards);
-        let ring = Ring::new(capacity, spec.frame_bytes()).map_err(|bytes| {
+        let shards = u64::from(config.shards);
+        let capacity = config.capacity_transitions / shards;
+        let frame_bytes = spec.frame_bytes();
+        let frames = match config.compression {
+            Compression::None => PlainFrames::new(capacity, frame_bytes).map(Frames::Plain),
+            Compression::Lz4 => {
+                let bytes_max = config.compressed_bytes_max.map(|bytes| bytes / shards);
+                Ok(Frames::Compressed(CompressedFrames::new(
+                    frame_bytes,
+                    bytes_max,
+                )))
+            }
+        };
+        let ring = frames.and_then(|frames| Ring::new(capacity, frames));
+        let ring = ring.map_err(|bytes| {
             let why =
                 format!("the system does not grant the {bytes} bytes that this takes; hold fewer");
             ConfigError::Key {
@@ -129,11 +146,24 @@ impl Replay {
         })
     }
 
-    /// Stores a chunk, whole, or says why not.
+    /// Compresses chunks for this replay; it can do so while the replay is in use elsewhere.
+    pub fn packer(&self) -> Packer {
+        Packer {
+            compression: self.config.compression,
+        }
+    }
+
+    /// Stores a chunk: [`Replay::packer`] and [`Replay::insert_packed`] in one.
+    pub fn insert(&mut self, chunk: &Chunk) -> InsertReply {
+        self.insert_packed(&self.packer().pack(chunk))
+    }
+
+    /// Stores a chunk that this replay's packer packed, whole, or says why not.
     ///
     /// A retry is answered `Stored`, and the chunk of an actor that leaves is stored, whatever the limiter says; a chunk that
     /// is not next is never stored.
-    pub fn insert(&mut self, chunk: &Chunk) -> InsertReply {
+    pub fn insert_packed(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
+        let chunk = packed.chunk;
         let verdict = match self.unfit(chunk) {
             Some(why) => Verdict::Refused(why),
             None => self.actors.judge(&chunk.header),
@@ -157,7 +187,7 @@ impl Replay {
                 InsertReply::Wait { inserted_total }
             }
             Verdict::Next => {
-                self.store(chunk);
+                self.store(packed);
                 InsertReply::Stored {
                     inserted_total: self.inserted_total(),
                 }
@@ -181,6 +211,12 @@ impl Replay {
                 "{transitions} transitions in one chunk; the replay holds {capacity}: use 1 to that many"
             ));
         }
+        let bytes = config::compressed_bytes_least(transitions, frame_bytes);
+        if let Some(max) = self.config.compressed_bytes_max.filter(|&max| max < bytes) {
+            return Some(format!(
+                "a chunk that may take {bytes} bytes; compressed_bytes_max is {max}"
+            ));
+        }
         if header.sequence == u64::MAX || header.first_transition.checked_add(transitions).is_none()
         {
             return Some(format!(
@@ -198,21 +234,26 @@ impl Replay {
         ))
     }
 
-    fn store(&mut self, chunk: &Chunk) {
+    fn store(&mut self, packed: &PackedChunk<'_>) {
+        let chunk = packed.chunk;
         let header = chunk.header;
         let (streams, difference) = self.actors.accept(&header);
-        let (steps, frame_bytes) = (header.steps as usize, header.frame_bytes as usize);
-        for (number, stream) in streams.iter_mut().enumerate() {
-            for row in number * steps..(number + 1) * steps {
-                let (action, reward, end) =
-                    (chunk.actions()[row], chunk.reward(row), chunk.end(row));
-                let frame = &chunk.frames()[row * frame_bytes..][..frame_bytes];
-                let step = Step::new(action, reward, end, header.weights_version);
-                let index = self.ring.push(frame, step, stream.link);
-                stream.link = Link::following(index, end);
-                self.statistics.action_histogram[usize::from(action)] += 1;
-                stream.episode_return = stream.episode_return.map(|sum| sum + f64::from(reward));
-                if end.is_episode_end() {
+        let steps = header.steps as usize;
+        for ((number, stream), frames) in streams.iter_mut().enumerate().zip(packed.runs()) {
+            let rows = number * steps..(number + 1) * steps;
+            let step = |row| {
+                let (action, reward) = (chunk.actions()[row], chunk.reward(row));
+                Step::new(action, reward, chunk.end(row), header.weights_version)
+            };
+            stream.link = self
+                .ring
+                .push_run(frames, rows.clone().map(step), stream.link);
+            for step in rows.map(step) {
+                self.statistics.action_histogram[usize::from(step.action)] += 1;
+                stream.episode_return = stream
+                    .episode_return
+                    .map(|sum| sum + f64::from(step.reward));
+                if step.end.is_episode_end() {
                     self.statistics
                         .episode_ended(stream.episode_return.replace(0.0));
                 }
@@ -238,23 +279,32 @@ impl Replay {
         *transitions_duplicated = transitions_duplicated.saturating_add(duplicated);
     }
 
-    /// A batch of `rows` rows, anchors uniform over the valid ones and drawn with replacement, or why there is none.
+    /// Makes a batch: [`Replay::draw`] and [`Draft::unpack`] in one.
+    ///
+    /// # Errors
+    /// As [`Replay::draw`].
+    pub fn sample(&mut self, rows: u32) -> Result<Batch, Unready> {
+        self.draw(rows).map(Draft::unpack)
+    }
+
+    /// A batch of `rows` rows, anchors uniform over the valid ones and drawn with replacement, or why there is none. With
+    /// compression its frames are left to be unpacked, which needs the replay no more.
     ///
     /// # Errors
     /// The limiter or the lack of any valid anchor asks to wait; the run is over; `rows` can never be served.
-    pub fn sample(&mut self, rows: u32) -> Result<Batch, Unready> {
-        self.sample_in(rows, Planes::zeroed)
+    pub fn draw(&mut self, rows: u32) -> Result<Draft, Unready> {
+        self.draw_in(rows, Planes::zeroed)
     }
 
-    /// [`Replay::sample`] into memory that `memory` gives, so many bytes, all of which are then written.
+    /// [`Replay::draw`] into memory that `memory` gives, so many bytes, all of which are written by the time it is unpacked.
     ///
     /// # Errors
-    /// As [`Replay::sample`].
-    pub fn sample_in(
+    /// As [`Replay::draw`].
+    pub fn draw_in(
         &mut self,
         rows: u32,
         memory: impl FnOnce(usize) -> Planes,
-    ) -> Result<Batch, Unready> {
+    ) -> Result<Draft, Unready> {
         let rows_max = config::rows_max(&self.spec).min(self.limiter.rows_max());
         if rows == 0 || rows > rows_max {
             self.statistics.messages_refused += 1;
@@ -271,6 +321,8 @@ impl Replay {
         }
         let mut header = self.batch_header(rows);
         let mut batch = Batch::in_memory(header, memory(header.planes_bytes()));
+        let pixel_bytes = self.spec.frame_channels as usize;
+        let mut packed = PackedStates::new(self.spec.frame_bytes(), pixel_bytes);
         let mut age_total = 0;
         let mut rows_mut = batch.rows_mut();
         for row in 0..rows as usize {
@@ -280,11 +332,22 @@ impl Replay {
             {
                 return Err(self.no_anchor());
             }
-            let parts = (&self.ring, &self.episodes, &self.affinity);
-            let k =
-                self.assembler
-                    .write_row(parts, &self.window, &mut self.rng, (&mut rows_mut, row));
-            self.statistics.k_histogram[k as usize] += 1;
+            let states = self.assembler.write_row(
+                &self.affinity,
+                &self.window,
+                &mut self.rng,
+                (&mut rows_mut, row),
+            );
+            match self.ring.frames() {
+                Frames::Plain(frames) => states.write(&mut rows_mut, row, |index, out| {
+                    let stack = self.episodes.stack(&self.ring, index);
+                    stack.write(pixel_bytes, out, |index| frames.frame(index));
+                }),
+                Frames::Compressed(frames) => {
+                    packed.add_row((&self.ring, frames, &self.episodes), states);
+                }
+            }
+            self.statistics.k_histogram[states.k() as usize] += 1;
             age_total += self.ring.inserted() - 1 - self.window.index(0);
             let version = self.window.step(0).weights_version;
             let (newest, oldest) = header.weights_versions;
@@ -296,7 +359,7 @@ impl Replay {
         header.tally = self.limiter.tally();
         batch.header = header;
         self.starving = false;
-        Ok(batch)
+        Ok(Draft { batch, packed })
     }
 
     /// What a batch of `rows` rows says of itself before any row is written.
@@ -402,6 +465,7 @@ impl Replay {
         ReplayStatus {
             transitions_inserted: self.ring.inserted(),
             transitions_held: self.ring.inserted() - self.ring.oldest(),
+            frame_bytes_held: self.ring.frames().bytes_held(),
             transitions_lost: statistics.transitions_lost,
             transitions_duplicated: statistics.transitions_duplicated,
             chunks_retried: statistics.chunks_retried,

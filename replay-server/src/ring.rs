@@ -1,7 +1,9 @@
-//! The transitions held: every frame once, in one buffer, with links along its episode.
-//! It does not know actors, sampling or stacks; who follows whom is told by the caller.
+//! The transitions held: every frame once, with links along its episode.
+//! It does not know actors, sampling or stacks; how frames are kept is `frames`' business.
 
 use driml_protocol::End;
+
+use crate::frames::{Frames, Run};
 
 /// How a transition hangs together with what its stream stored before; `after` is the index of the one just before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -79,47 +81,56 @@ pub(crate) enum Previous {
     Gone,
 }
 
-/// The newest `capacity` transitions; number `i` since the start lies in slot `i % capacity`.
+/// The newest `capacity` transitions, or fewer if their frames may not take the memory; number `i` since the start lies in
+/// slot `i % capacity`.
 pub(crate) struct Ring {
     capacity: u64,
-    frame_bytes: usize,
+    oldest: u64,
     inserted: u64,
-    steps: Vec<Step>,
     /// Grows into its reservation, so that memory is taken only as transitions come.
-    frames: Vec<u8>,
+    steps: Vec<Step>,
+    frames: Frames,
 }
 
 impl Ring {
-    /// An empty ring of `capacity` frames of `frame_bytes` each.
+    /// An empty ring of `capacity` transitions with their `frames`.
     ///
     /// # Errors
     /// The system refuses to reserve that much memory: the bytes asked for.
-    pub(crate) fn new(capacity: u64, frame_bytes: usize) -> Result<Self, u64> {
-        let bytes = capacity.saturating_mul(frame_bytes as u64);
-        let (mut steps, mut frames) = (Vec::new(), Vec::new());
-        let reserve = |steps: &mut Vec<Step>, frames: &mut Vec<u8>| -> Option<()> {
-            steps
-                .try_reserve_exact(usize::try_from(capacity).ok()?)
-                .ok()?;
-            frames.try_reserve_exact(usize::try_from(bytes).ok()?).ok()
-        };
-        reserve(&mut steps, &mut frames).ok_or(bytes)?;
+    pub(crate) fn new(capacity: u64, frames: Frames) -> Result<Self, u64> {
+        let asked = capacity.saturating_mul(size_of::<Step>() as u64);
+        let mut steps = Vec::new();
+        let length = usize::try_from(capacity).map_err(|_| asked)?;
+        steps.try_reserve_exact(length).map_err(|_| asked)?;
         Ok(Self {
             capacity,
-            frame_bytes,
+            oldest: 0,
             inserted: 0,
             steps,
             frames,
         })
     }
 
-    /// Stores one transition, over the oldest one once the ring is full, and gives its index.
-    pub(crate) fn push(&mut self, frame: &[u8], step: Step, link: Link) -> u64 {
-        assert_eq!(
-            frame.len(),
-            self.frame_bytes,
-            "frames were measured when their chunk came"
-        );
+    /// Stores consecutive transitions of one stream, over the oldest ones once the ring is full.
+    ///
+    /// `link` is the first one's; the result is the link of the one that will follow the last.
+    pub(crate) fn push_run(
+        &mut self,
+        frames: Run<'_>,
+        steps: impl ExactSizeIterator<Item = Step>,
+        mut link: Link,
+    ) -> Link {
+        let inserted = self.inserted + steps.len() as u64;
+        let oldest = inserted.saturating_sub(self.capacity).max(self.oldest);
+        self.oldest = self.frames.push(frames, oldest);
+        for step in steps {
+            link = Link::following(self.push(step, link), step.end);
+        }
+        link
+    }
+
+    /// Stores one transition whose frame is stored, and gives its index.
+    fn push(&mut self, step: Step, link: Link) -> u64 {
         let index = self.inserted;
         let previous = match link {
             Link::EpisodeStart | Link::LevelStart { .. } => LEVEL_START,
@@ -134,14 +145,12 @@ impl Ring {
         let slot = self.slot(index);
         if slot == self.steps.len() {
             self.steps.push(step);
-            self.frames.extend_from_slice(frame);
         } else {
             self.steps[slot] = step;
-            self.frames[slot * self.frame_bytes..][..self.frame_bytes].copy_from_slice(frame);
         }
         self.inserted += 1;
         if let Link::Within { after } | Link::LevelStart { after } = link
-            && after >= self.oldest()
+            && after >= self.oldest
         {
             let slot = self.slot(after);
             self.steps[slot].next = index;
@@ -165,7 +174,7 @@ impl Ring {
 
     /// Index of the oldest transition held (of the next one, if none is).
     pub(crate) const fn oldest(&self) -> u64 {
-        self.inserted.saturating_sub(self.capacity)
+        self.oldest
     }
 
     /// The step at `index`, which must be held.
@@ -177,13 +186,9 @@ impl Ring {
         &self.steps[self.slot(index)]
     }
 
-    /// The frame at `index`, which must be held.
-    pub(crate) fn frame(&self, index: u64) -> &[u8] {
-        debug_assert!(
-            (self.oldest()..self.inserted).contains(&index),
-            "{index} is not held"
-        );
-        &self.frames[self.slot(index) * self.frame_bytes..][..self.frame_bytes]
+    /// The frames of all transitions held.
+    pub(crate) const fn frames(&self) -> &Frames {
+        &self.frames
     }
 
     /// What lies before `index` in its level.
@@ -198,13 +203,16 @@ impl Ring {
 
     /// Checks sizes and every link; panics at the first that is wrong. Slow: for tests.
     pub(crate) fn check_valid(&self) {
-        let held = self.inserted - self.oldest();
-        assert_eq!(self.steps.len() as u64, held, "one step a transition held");
         assert_eq!(
-            self.frames.len(),
-            self.steps.len() * self.frame_bytes,
-            "one frame a transition held"
+            self.steps.len() as u64,
+            self.inserted.min(self.capacity),
+            "one step a transition, until they are overwritten"
         );
+        assert!(
+            self.inserted - self.oldest <= self.capacity,
+            "no more are held than fit"
+        );
+        self.frames.check_valid(self.oldest, self.inserted);
         for index in self.oldest()..self.inserted {
             let step = self.step(index);
             if let Some(next) = step.next() {
@@ -245,6 +253,14 @@ mod tests {
     use rand::{Rng, SeedableRng};
 
     use super::*;
+    use crate::frames::{Frames, PlainFrames};
+
+    fn plain(capacity: u64, frame_bytes: usize) -> Result<Ring, u64> {
+        Ring::new(
+            capacity,
+            Frames::Plain(PlainFrames::new(capacity, frame_bytes)?),
+        )
+    }
 
     proptest! {
         /// Against a plain list of all that was ever pushed, in which every relation is searched for.
@@ -252,7 +268,7 @@ mod tests {
         fn equals_a_plain_list(seed in any::<u64>(), capacity in 1u64..40, streams in 1usize..4) {
             struct Pushed { stream: usize, frame: [u8; 2], reward: f32, end: End, cut: bool }
             let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-            let mut ring = Ring::new(capacity, 2).unwrap();
+            let mut ring = plain(capacity, 2).unwrap();
             let mut list: Vec<Pushed> = vec![];
             for index in 0..120u64 {
                 let stream = rng.random_range(0..streams);
@@ -267,13 +283,16 @@ mod tests {
                 };
                 let frame = rng.random::<[u8; 2]>();
                 let reward = rng.random();
-                prop_assert_eq!(ring.push(&frame, Step::new(3, reward, end, index), link), index);
+                let step = Step::new(3, reward, end, index);
+                let next = ring.push_run(Run::Plain(&frame), std::iter::once(step), link);
+                prop_assert_eq!(next, Link::following(index, end));
                 list.push(Pushed { stream, frame, reward, end, cut });
                 ring.check_valid();
                 prop_assert_eq!(ring.oldest(), (index + 1).saturating_sub(capacity));
                 for i in ring.oldest()..=index {
                     let pushed = &list[i as usize];
-                    prop_assert_eq!(ring.frame(i), pushed.frame);
+                    let Frames::Plain(frames) = ring.frames() else { unreachable!() };
+                    prop_assert_eq!(frames.frame(i), pushed.frame);
                     let step = ring.step(i);
                     prop_assert_eq!((step.reward, step.end, step.weights_version), (pushed.reward, pushed.end, i));
                     let of_stream = |pushed: &&Pushed| pushed.stream == list[i as usize].stream;
@@ -296,6 +315,6 @@ mod tests {
 
     #[test]
     fn memory_that_is_not_there_is_an_error() {
-        assert_eq!(Ring::new(1 << 50, 1 << 12).err(), Some(1 << 62));
+        assert_eq!(plain(1 << 50, 1 << 12).err(), Some(1 << 62));
     }
 }

@@ -1,11 +1,11 @@
 //! The replay server as a process: zenoh around the core, waiting at the limiter, and the last word to everyone.
 //! What is stored, sampled and allowed is the core's; here is only who asks and when the answer goes out.
 //!
-//! Chunks and batch requests wait in bounded queues with a thread each, so that a blocked one never holds up the threads on
-//! which zenoh receives. Everything small is answered where it arrives.
+//! Every kind of question has threads of its own, so that one that waits never holds up another. Compressing and unpacking
+//! frames is done by those threads, outside the lock on the core.
 
 use std::{
-    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, mpsc},
+    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
     thread::JoinHandle,
     time::{Duration, Instant},
 };
@@ -13,21 +13,21 @@ use std::{
 use anyhow::Context;
 use driml_protocol::{
     AffinityUpdate, BatchReply, BatchRequest, Chunk, CodecError, Goodbye, Hello, InsertReply, Keys,
-    Kind, PlanesPool, RunSpec, Shutdown, codec,
+    Kind, PlanesPool, RunSpec, Shutdown,
+    answering::Answering,
+    codec,
     config::{Settings, TransportConfig},
     session::{self, Endpoints},
     shutdown::join_within,
 };
 use zenoh::{Session, Wait, bytes::ZBytes, query::Query, query::Queryable, sample::SampleKind};
 
-use crate::{Config, Replay, Unready};
+use crate::{Config, Packer, Replay, Unready};
 
 /// How long a chunk or a request waits at the limiter before it is told to come back: far below every sender's time-out.
 const HOLD_MAX: Duration = Duration::from_secs(1);
 /// The same for a part of a batch: what another shard counts meanwhile does not wake it.
 const SHARD_HOLD_MAX: Duration = Duration::from_millis(50);
-/// Chunks, and requests, that wait for their thread; one more is told to come back at once.
-const QUEUE_MAX: usize = 4096;
 /// Threads that make batches: one assembles while another's reply is being sent.
 const BATCH_THREADS: usize = 2;
 
@@ -83,6 +83,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         shard: (args.shard, config.shards),
         config_toml: args.config_toml,
         pool,
+        packer: replay.packer(),
         replay: Mutex::new(replay),
         changed: Condvar::new(),
         shutdown: shutdown.clone(),
@@ -137,85 +138,38 @@ struct Service {
     config_toml: String,
     /// Memory for chunks that arrive and batches that leave.
     pool: PlanesPool,
+    packer: Packer,
     replay: Mutex<Replay>,
     /// Something was stored or sampled: whoever waits at the limiter looks again.
     changed: Condvar,
     shutdown: Shutdown,
 }
 
+/// The threads that answer.
+type Threads = Vec<JoinHandle<()>>;
+
 /// Declares everything that the replay server answers; dropping the first ends it, and with it the threads.
 fn declare(
     session: &Session,
     keys: &Keys,
     service: &Arc<Service>,
-) -> zenoh::Result<(Vec<Queryable<()>>, Vec<JoinHandle<()>>)> {
-    let (chunks, waiting_chunks) = mpsc::sync_channel::<Query>(QUEUE_MAX);
-    let (requests, waiting_requests) = mpsc::sync_channel::<Query>(QUEUE_MAX);
-    let waiting_requests = Arc::new(Mutex::new(waiting_requests));
-    let inserting = service.clone();
-    let insert = std::thread::Builder::new()
-        .name("insert".into())
-        .spawn(move || {
-            for query in waiting_chunks {
-                inserting.insert(&query);
-            }
-        })?;
-    let mut threads = vec![insert];
-    for i in 0..BATCH_THREADS {
-        let (sampling, waiting) = (service.clone(), waiting_requests.clone());
-        let sample = std::thread::Builder::new()
-            .name(format!("sample-{i}"))
-            .spawn(move || {
-                loop {
-                    let next = waiting
-                        .lock()
-                        .unwrap_or_else(PoisonError::into_inner)
-                        .recv();
-                    let Ok(query) = next else { return };
-                    sampling.sample(&query);
-                }
-            })?;
-        threads.push(sample);
-    }
-    let answering = |key: String, answer: fn(&Service, &Query)| {
-        let service = service.clone();
-        session
-            .declare_queryable(key)
-            .callback(move |query| answer(&service, &query))
-            .wait()
-    };
-    let overflow = service.clone();
-    let ingest = move |query: Query| {
-        if let Err(mpsc::TrySendError::Full(query)) = chunks.try_send(query) {
-            let inserted_total = overflow.replay().inserted_total();
-            overflow.reply(
-                &query,
-                Kind::InsertReply,
-                &InsertReply::Wait { inserted_total },
-            );
-        }
-    };
-    let overflow = service.clone();
-    let batch = move |query: Query| {
-        if let Err(mpsc::TrySendError::Full(query)) = requests.try_send(query) {
-            let waiting = overflow.replay().waiting();
-            overflow.reply(&query, Kind::BatchReply, &BatchReply::Wait(waiting));
-        }
-    };
-    let queryables = vec![
-        answering(keys.hello(), Service::hello)?,
-        answering(keys.goodbye(), Service::goodbye)?,
-        answering(keys.affinity(), Service::affinity)?,
-        answering(keys.replay_status(), Service::status)?,
-        session
-            .declare_queryable(keys.ingest())
-            .callback(ingest)
-            .wait()?,
-        session
-            .declare_queryable(keys.batch())
-            .callback(batch)
-            .wait()?,
+) -> zenoh::Result<(Vec<Queryable<()>>, Threads)> {
+    type Answer = fn(&Service, &Query);
+    let answers: [(String, &str, usize, Answer); 6] = [
+        (keys.ingest(), "insert", 1, Service::insert),
+        (keys.batch(), "sample", BATCH_THREADS, Service::sample),
+        (keys.affinity(), "affinity", 1, Service::affinity),
+        (keys.hello(), "hello", 1, Service::hello),
+        (keys.goodbye(), "goodbye", 1, Service::goodbye),
+        (keys.replay_status(), "status", 1, Service::status),
     ];
+    let (mut queryables, mut threads) = (Vec::new(), Vec::new());
+    for (key, name, count, answer) in answers {
+        let service = service.clone();
+        let answering = Answering::start(name, count, move |query| answer(&service, query))?;
+        queryables.push(answering.declare(session, key)?);
+        threads.extend(answering.into_threads());
+    }
     Ok((queryables, threads))
 }
 
@@ -297,10 +251,11 @@ impl Service {
                 return self.reply(query, Kind::InsertReply, &refused);
             }
         };
+        let packed = self.packer.pack(&chunk);
         let arrived = Instant::now();
         let mut replay = self.replay();
         let reply = loop {
-            match replay.insert(&chunk) {
+            match replay.insert_packed(&packed) {
                 InsertReply::Wait { inserted_total } => {
                     let left = HOLD_MAX.saturating_sub(arrived.elapsed());
                     if left.is_zero() || self.shutdown.is_set() {
@@ -337,12 +292,12 @@ impl Service {
             None => HOLD_MAX,
         };
         let mut said = false;
-        let sampled = loop {
+        let drawn = loop {
             let memory = |bytes| match request.shared_memory {
                 true => self.pool.take(bytes),
                 false => self.pool.take_own(bytes),
             };
-            match replay.sample_in(request.rows, memory) {
+            match replay.draw_in(request.rows, memory) {
                 Err(Unready::Wait(waiting)) => {
                     // A chunk that waits may be let in to end this; once, or those who wait would wake each other for ever.
                     if !std::mem::replace(&mut said, true) {
@@ -354,15 +309,15 @@ impl Service {
                     }
                     replay = self.wait(replay, left);
                 }
-                sampled => break sampled,
+                drawn => break drawn,
             }
         };
         replay.note_learner_waited(arrived.elapsed().as_secs_f64());
         drop(replay);
-        match sampled {
-            Ok(batch) => {
+        match drawn {
+            Ok(draft) => {
                 self.changed.notify_all();
-                match batch.seal(self.spec_hash) {
+                match draft.unpack().seal(self.spec_hash) {
                     Ok((head, planes)) => {
                         session::answer(query, session::join_planes(head, planes.freeze()))
                     }

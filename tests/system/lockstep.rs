@@ -32,6 +32,17 @@ fn the_seed_decides_the_weights() {
 }
 
 #[test]
+fn a_compressed_replay_leads_to_the_same_weights() {
+    let system = system();
+    let flags = "--env mspacman --agent driml-ada --preset smoke --frames 512";
+    let plain = run(&system, flags, "plain");
+    let lz4 = format!("{flags} --set replay.compression=lz4");
+    let lz4 = run(&system, &lz4, "lz4");
+    assert_eq!(plain.weights_sha256, lz4.weights_sha256);
+    assert_eq!(plain.k_histogram, lz4.k_histogram);
+}
+
+#[test]
 fn every_agent_runs_in_every_world_that_needs_nothing() {
     let system = system();
     for world in ["chain", "mspacman", "ising"] {

@@ -231,3 +231,27 @@ fn the_replay_fits_the_memory_and_says_so() {
         (1_000_000, 0)
     );
 }
+
+#[test]
+fn a_compressed_replay_is_bounded_in_bytes_instead() {
+    let lz4 = "replay.compression=lz4";
+    let million = "replay.transitions_max=1000000";
+    let config = with("procgen:bigfish", "c51", &[lz4, million]).unwrap();
+    let replay = &config.replay;
+    assert_eq!(
+        (replay.capacity_transitions, replay.compressed_bytes_max),
+        (1_000_000, Some((8 << 30) - 128_000_000))
+    );
+    expect!["compressed frames may take 7.9 GiB, as 16.0 GiB of memory are free; if they compress badly, the replay holds fewer than 1000000 transitions"].assert_eq(&config.notes.join("\n"));
+    // What fits without compressing at all needs no bound.
+    let capacity = "replay.capacity_transitions=100000";
+    let config = with("procgen:bigfish", "c51", &[lz4, capacity]).unwrap();
+    assert_eq!(config.replay.compressed_bytes_max, None);
+    let two_million = "replay.capacity_transitions=2000000";
+    let said = |set: &str| with("procgen:bigfish", "c51", &[lz4, two_million, set]).unwrap_err();
+    expect!["replay.compressed_bytes_max = 100000000000 is 93.1 GiB, and 16.0 GiB are free: --set replay.compressed_bytes_max=8333934592"].assert_eq(&said("replay.compressed_bytes_max=100000000000"));
+    expect!["replay.capacity_transitions = 100000000000 needs 11920.9 GiB beside the frames, and 16.0 GiB are free: --set replay.capacity_transitions=33554432"].assert_eq(&said("replay.capacity_transitions=100000000000"));
+    expect!["replay.compressed_bytes_max = 1000 cannot work: one sample spans 8 transitions, which may not compress; use at least 3244032"].assert_eq(&said("replay.compressed_bytes_max=1000"));
+    expect!["in the settings' [replay] table: unknown variant `zip`, expected `none` or `lz4`"]
+        .assert_eq(&said("replay.compression=zip"));
+}

@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use driml_protocol::{ChunkHeader, Horizon, InsertReply, Waiting};
-use driml_replay_server::{Config, Replay, Unready};
+use driml_replay_server::{Compression, Config, Replay, Unready};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -103,6 +103,8 @@ fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
     let config = Config {
         capacity_transitions: 10_000,
         shards: 1,
+        compression: Compression::None,
+        compressed_bytes_max: None,
         replay_ratio: 64.0,
         warmup_transitions: 0,
         slack_transitions: 1,

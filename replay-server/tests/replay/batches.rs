@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use driml_protocol::{Batch, ChunkHeader, Goodbye, Horizon, InsertReply, TimeoutRule, Waiting};
-use driml_replay_server::{Replay, Unready};
+use driml_replay_server::{Compression, Draft, Replay, Unready};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -104,6 +104,7 @@ proptest! {
         n_step in 1u32..8,
         horizon in horizons(),
         bootstrap in any::<bool>(),
+        lz4 in any::<bool>(),
         capacity in 24u64..160,
         (actors, streams) in (1u32..4, 1u32..4),
     ) {
@@ -112,7 +113,11 @@ proptest! {
         if bootstrap {
             spec.timeout = TimeoutRule::Bootstrap;
         }
-        let mut replay = Replay::new(&spec, &unlimited(capacity), 8).unwrap();
+        let mut config = unlimited(capacity);
+        if lz4 {
+            config.compression = Compression::Lz4;
+        }
+        let mut replay = Replay::new(&spec, &config, 8).unwrap();
         let mut history = History::new(&spec, capacity);
         let mut known: HashMap<u32, Actor> = HashMap::new();
         let (mut lost, mut retried, mut refused, mut rows_sampled) = (0, 0, 0, 0);
@@ -184,7 +189,7 @@ proptest! {
                 }
                 _ if history.inserted == 0 => {}
                 // Memory that held something else: whatever is not written shows.
-                _ => match replay.sample_in(8, |bytes| vec![0xAB; bytes].into()) {
+                _ => match replay.draw_in(8, |bytes| vec![0xAB; bytes].into()).map(Draft::unpack) {
                     Ok(batch) => {
                         check_batch(&batch, &history);
                         rows_sampled += 8;

@@ -2,7 +2,7 @@
 //! It does not test the effects of settings.
 
 use driml_protocol::{Horizon, RunSpec};
-use driml_replay_server::{Config, ConfigError, Replay};
+use driml_replay_server::{Compression, Config, ConfigError, Replay};
 
 use crate::history::spec;
 
@@ -10,6 +10,8 @@ fn good() -> Config {
     Config {
         capacity_transitions: 10_000,
         shards: 1,
+        compression: Compression::None,
+        compressed_bytes_max: None,
         replay_ratio: 8.0,
         warmup_transitions: 1000,
         slack_transitions: 32,
@@ -70,6 +72,21 @@ fn each_fault_names_its_key_and_a_way_out() {
                 ..good()
             },
             "hold fewer",
+        ),
+        (
+            Config {
+                compressed_bytes_max: Some(1 << 30),
+                ..good()
+            },
+            "nothing is compressed",
+        ),
+        (
+            Config {
+                compression: Compression::Lz4,
+                compressed_bytes_max: Some(1 << 20),
+                ..good()
+            },
+            "use at least 3146124",
         ),
         (
             Config {

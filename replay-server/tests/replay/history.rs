@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use driml_protocol::{Chunk, ChunkHeader, End, Horizon, NO_ACTION, RunSpec, TimeoutRule};
-use driml_replay_server::Config;
+use driml_replay_server::{Compression, Config};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -69,6 +69,8 @@ pub(crate) fn unlimited(capacity_transitions: u64) -> Config {
     Config {
         capacity_transitions,
         shards: 1,
+        compression: Compression::None,
+        compressed_bytes_max: None,
         replay_ratio: 1e6,
         warmup_transitions: 0,
         slack_transitions: 1 << 40,

@@ -4,6 +4,7 @@
 
 mod anchors;
 mod batches;
+mod compression;
 mod config;
 mod exactly_once;
 mod history;

@@ -1,0 +1,38 @@
+//! A bench in a process of its own, with the environment that the launcher gives the parts of a run.
+//! It measures nothing itself.
+
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, ensure};
+
+use crate::{
+    bench::figures::{Figure, Report},
+    child,
+    cli::{BenchFlags, BenchPart},
+};
+
+/// Runs this program again for one part's figures. Its progress goes to stderr.
+///
+/// # Errors
+/// A process that could not be started or failed.
+pub(super) fn figures(part: BenchPart, flags: &BenchFlags) -> anyhow::Result<Vec<Figure>> {
+    let program = std::env::current_exe().context("finding this program's own file")?;
+    let mut command = Command::new(program);
+    command
+        .args(["bench", part.name(), "--here", "--json", "-"])
+        .args(["--threads", &flags.threads.to_string()])
+        .args(flags.quick.then_some("--quick"))
+        .stdin(Stdio::null())
+        .stderr(Stdio::inherit());
+    child::suit_candle(&mut command, flags.threads);
+    let doing = || format!("measuring the {}", part.name());
+    let output = command.output().with_context(doing)?;
+    ensure!(
+        output.status.success(),
+        "{} failed: {}",
+        doing(),
+        output.status
+    );
+    let report: Report = serde_json::from_slice(&output.stdout).with_context(doing)?;
+    Ok(report.figures)
+}

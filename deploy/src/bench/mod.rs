@@ -1,0 +1,74 @@
+//! `driml bench`: how fast the parts are, alone and beside what others use for the same work.
+//! Nothing here passes or fails by its speed; a folder's file is one bench, and each figure says what it is of.
+
+mod alone;
+mod assemble;
+mod effort;
+mod env;
+mod figures;
+mod learner;
+mod peers;
+mod policy;
+mod recording;
+mod replay;
+mod scale;
+mod settings;
+mod stock;
+mod system;
+mod table;
+
+use crate::{
+    bench::{
+        effort::Effort,
+        figures::{Figure, MachineNote},
+    },
+    cli::{BenchCommand, BenchFlags, BenchPart},
+};
+
+/// Runs one bench and reports its figures.
+///
+/// # Errors
+/// A part that failed, an engine that cannot be had, a file that cannot be written.
+pub(crate) fn run(command: &BenchCommand) -> anyhow::Result<()> {
+    let machine = MachineNote::this();
+    let part = |part, flags: &BenchFlags| {
+        let figures = if flags.here {
+            measure(part, &Effort::new(flags))?
+        } else {
+            alone::figures(part, flags)?
+        };
+        figures::report(part.name(), &figures, machine.clone(), flags)
+    };
+    match command {
+        BenchCommand::Learner(flags) => part(BenchPart::Learner, flags),
+        BenchCommand::Policy(flags) => part(BenchPart::Policy, flags),
+        BenchCommand::Replay(flags) => part(BenchPart::Replay, flags),
+        BenchCommand::Env(flags) => part(BenchPart::Env, flags),
+        BenchCommand::System(args) => {
+            figures::report("system", &system::measure(args)?, machine, &args.flags)
+        }
+        BenchCommand::Scale(args) => scale::run(args, machine),
+        BenchCommand::Peers(args) => peers::run(args),
+    }
+}
+
+fn measure(part: BenchPart, effort: &Effort) -> anyhow::Result<Vec<Figure>> {
+    match part {
+        BenchPart::Learner => learner::measure(effort),
+        BenchPart::Policy => policy::measure(effort),
+        BenchPart::Replay => replay::measure(effort),
+        BenchPart::Env => env::measure(effort),
+    }
+}
+
+impl BenchPart {
+    /// As the command line has it.
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Learner => "learner",
+            Self::Policy => "policy",
+            Self::Replay => "replay",
+            Self::Env => "env",
+        }
+    }
+}

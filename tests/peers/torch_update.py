@@ -1,0 +1,211 @@
+"""The learner's update in PyTorch, eager: C51 with or without DIM, gradients clipped by their norm, Adam.
+
+It is the same work as `driml bench learner`: the same network, sizes, losses and optimiser, on made-up batches of bytes.
+`--check CASE.safetensors` shows it: losses, gradients and updated parameters against a float64 reference of tests/parity.
+PyTorch's fused Adam is taken, and of its two memory formats the faster one.
+"""
+
+import json
+import sys
+
+import torch
+from torch.nn import functional
+
+import measure
+from torch_network import Network
+
+ROWS = 256
+# As the presets `paper` and `paper-observation` have it for Procgen.
+CONFIG = {
+    "obs": {"height": 64, "width": 64, "channels": 3},
+    "actions": 15,
+    "atoms": 51,
+    "v_min": -10.0,
+    "v_max": 10.0,
+    "double_dqn": False,
+    "lambda": {"3t3": 0.0, "3t4": 0.0, "4t3": 0.0, "4t4": 0.0},
+    "tanh_clip": 20.0,
+    "max_grad_norm": 10.0,
+    "adam": {"lr": 2.5e-4, "beta1": 0.9, "beta2": 0.999, "eps": 0.01 / 256},
+    "model": {"conv": [[32, 8, 4], [64, 4, 2], [64, 3, 1]], "hidden": 512, "rkhs": 512, "action_embed": 64},
+}
+CASES = {
+    "C51, 64x64x3": ((64, 64), []),
+    "C51 + global-global DIM, 64x64x3": ((64, 64), ["4t4"]),
+    "C51 + local-local + global-global DIM, 64x64x3": ((64, 64), ["3t3", "4t4"]),
+    "C51 + global-global DIM, 104x80x3": ((104, 80), ["4t4"]),
+}
+GAMMA, N_STEP = 0.99, 7
+FORMATS = {"contiguous": torch.contiguous_format, "channels-last": torch.channels_last}
+
+
+def project(probs, reward, discount, v_min, v_max):
+    """Return distributions [B, N] one Bellman step earlier, back on the atoms. Bellemare et al. 2017, algorithm 1."""
+    rows, atoms = probs.shape
+    support = torch.linspace(v_min, v_max, atoms)
+    moved = (reward[:, None] + discount[:, None] * support).clamp(v_min, v_max)
+    position = ((moved - v_min) * ((atoms - 1) / (v_max - v_min))).clamp(0, atoms - 1)
+    low = position.floor()
+    above = position - low
+    low = low.long()
+    out = torch.zeros(rows, atoms)
+    out.scatter_add_(1, low, probs * (1 - above))
+    return out.scatter_add_(1, (low + 1).clamp(max=atoms - 1), probs * above)
+
+
+def info_nce(psi, phi, clip):
+    """Psi [B, R] or [B, L, R], Phi alike: mean over locations and anchors of -ln softmax of the positive's score."""
+    rkhs = psi.shape[-1]
+    if psi.dim() == 3 and phi.dim() == 3:
+        dots = psi.transpose(0, 1) @ phi.permute(1, 2, 0)
+    elif psi.dim() == 3:
+        dots = (psi @ phi.t()).transpose(0, 1)
+    elif phi.dim() == 3:
+        dots = psi @ phi.permute(1, 2, 0)
+    else:
+        dots = (psi @ phi.t()).unsqueeze(0)
+    scores = clip * torch.tanh(dots * (1 / (rkhs**0.5 * clip)))
+    return -scores.log_softmax(-1).diagonal(dim1=1, dim2=2).mean()
+
+
+class Learner:
+    def __init__(self, config, memory_format, online=None, target=None):
+        self.config, self.memory_format = config, memory_format
+        self.weights = {pair: weight for pair, weight in config["lambda"].items() if weight > 0}
+        self.online, self.target = Network(config, set(self.weights)), Network(config)
+        if online is None:
+            target = {name: value for name, value in self.online.state_dict().items() if not name.startswith("dim.")}
+        else:
+            self.online.load_state_dict(online)
+        self.target.load_state_dict(target)
+        self.online.to(memory_format=memory_format)
+        self.target.to(memory_format=memory_format).requires_grad_(False)
+        adam = config["adam"]
+        betas = (adam["beta1"], adam["beta2"])
+        self.adam = torch.optim.Adam(self.online.parameters(), adam["lr"], betas, adam["eps"], fused=True)
+
+    def images(self, frames):
+        """Bytes [B, H, W, C] as PyTorch's [B, C, H, W]."""
+        return frames.permute(0, 3, 1, 2).contiguous(memory_format=self.memory_format)
+
+    @torch.no_grad()
+    def projected(self, batch):
+        frames_n = self.images(batch["frames_n"])
+        logits = self.target.logits(self.target.features(frames_n)[1])
+        if self.config["double_dqn"]:
+            values = self.online.q_values(self.online.logits(self.online.features(frames_n)[1]))
+        else:
+            values = self.target.q_values(logits)
+        probs = logits[torch.arange(len(logits)), values.argmax(1)].softmax(-1)
+        discount, support = batch["bootstrap_discount"], (self.config["v_min"], self.config["v_max"])
+        return project(probs, batch["n_step_return"], discount, *support)
+
+    def losses(self, batch):
+        """The C51 loss, the DIM losses by pair, and their weighted sum."""
+        target, action = self.projected(batch), batch["action"]
+        features_t = self.online.features(self.images(batch["frames_t"]))
+        logits = self.online.logits(features_t[1])[torch.arange(len(action)), action]
+        kl = functional.kl_div(logits.log_softmax(-1), target, reduction="batchmean")
+        dim, vectors = {}, {}
+        if self.weights:
+            features_k = self.online.features(self.images(batch["frames_k"]))
+            valid = batch["positive_valid"].bool()
+            all_valid = bool(valid.all())
+            for pair in self.weights:
+                for head, features, given in (("psi" + pair[0], features_t, action), ("phi" + pair[2], features_k, None)):
+                    if head not in vectors:
+                        found = self.online.vectors(head, features, given)
+                        vectors[head] = found if all_valid else found[valid]
+                dim[pair] = info_nce(vectors["psi" + pair[0]], vectors["phi" + pair[2]], self.config["tanh_clip"])
+        return kl, dim, kl + sum(self.weights[pair] * loss for pair, loss in dim.items())
+
+    def update(self, batch):
+        """One update: losses and the gradients' norm before clipping."""
+        self.adam.zero_grad(set_to_none=True)
+        kl, dim, total = self.losses(batch)
+        total.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.online.parameters(), self.config["max_grad_norm"])
+        self.adam.step()
+        return kl.item(), {pair: loss.item() for pair, loss in dim.items()}, total.item(), norm.item()
+
+
+def made_up(config):
+    """A batch that no world gave."""
+    obs = config["obs"]
+    shape = (ROWS, obs["height"], obs["width"], obs["channels"])
+    batch = {f"frames_{which}": torch.randint(0, 256, shape, dtype=torch.uint8) for which in "tkn"}
+    batch["action"] = torch.randint(0, config["actions"], (ROWS,))
+    batch["n_step_return"] = torch.rand(ROWS) * 4 - 2
+    batch["bootstrap_discount"] = torch.full((ROWS,), GAMMA**N_STEP)
+    batch["positive_valid"] = torch.ones(ROWS, dtype=torch.uint8)
+    return batch
+
+
+def bench(effort):
+    figures, formats = {}, []
+    for what, ((height, width), pairs) in CASES.items():
+        config = dict(CONFIG, obs={"height": height, "width": width, "channels": 3})
+        config["lambda"] = {pair: float(pair in pairs) for pair in CONFIG["lambda"]}
+        batch, rates = made_up(config), {}
+        for name, memory_format in FORMATS.items():
+            learner = Learner(config, memory_format)
+            rates[name] = effort.rate_by_median(lambda: learner.update(batch))
+            print(f"  {what}, {name}: {rates[name]:.4g} updates/s", file=sys.stderr, flush=True)
+        best = max(rates, key=rates.get)
+        figures[what] = rates[best]
+        formats.append(best)
+    measure.report(f"PyTorch {torch.__version__}, {' or '.join(sorted(set(formats)))}", figures)
+
+
+def check(path):
+    """Whether one update of a parity case comes out as float64 has it; prints the largest errors."""
+    from safetensors import safe_open
+
+    with safe_open(path, "pt") as file:
+        config = json.loads(file.metadata()["config"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}
+
+    def group(prefix):
+        return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
+
+    expect, good = group("expect."), True
+
+    def line(what, error, tolerance):
+        nonlocal good
+        good &= error <= tolerance
+        print(f"  {what:<24} error {error:9.2e}  tolerance {tolerance:9.2e}  {'ok' if error <= tolerance else 'FAILED'}")
+
+    print(path)
+    for name, memory_format in FORMATS.items():
+        parameters = group("online.")
+        learner = Learner(
+            config,
+            memory_format,
+            {key: parameters[key] for key in Network(config, {p for p, w in config["lambda"].items() if w > 0}).state_dict()},
+            group("target."),
+        )
+        line(f"projection, {name}", (learner.projected(group("input.")) - expect["target_projection"]).abs().max().item(), 5e-6)
+        kl, dim, total, norm = learner.update(group("input."))
+        for what, value in {"c51_kl": kl, "total": total, **{f"dim.{pair}": loss for pair, loss in dim.items()}}.items():
+            expected = expect[f"loss.{what}"].item()
+            line(f"{what}, {name}", abs(value - expected), max(1e-4 * abs(expected), 1e-6))
+        expected = expect["grad_norm"].item()
+        line(f"grad_norm, {name}", abs(norm - expected), 1e-4 * expected)
+        updated = learner.online.state_dict().items()
+        line(f"updated, {name}", max((value - expect[f"updated.{key}"]).abs().max().item() for key, value in updated), 4e-6)
+    return good
+
+
+def main():
+    arguments = measure.parser(__doc__)
+    arguments.add_argument("--check", nargs="+", metavar="CASE", help="parity cases to check instead of measuring")
+    args = arguments.parse_args()
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(1)
+    if args.check:
+        sys.exit(0 if all([check(path) for path in args.check]) else 1)
+    bench(measure.Effort(args.quick))
+
+
+if __name__ == "__main__":
+    main()
