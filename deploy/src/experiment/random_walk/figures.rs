@@ -156,8 +156,8 @@ pub(super) fn convergence(results: &Results) -> Figure {
             )),
             Panel::Chart(times(
                 &format!(
-                    "Updates until the loss is within {} nats",
-                    settings.excess_reached
+                    "Updates until {:.0}% of I(S, S') is learnt",
+                    100.0 * (1.0 - settings.share_reached)
                 ),
                 Measure::Share,
             )),
