@@ -119,7 +119,8 @@ impl Canvas {
     }
 
     pub(super) fn line(&mut self, points: Vec<Point>, stroke: Stroke) {
-        if points.len() > 1 {
+        // A line without length has no direction to be drawn in.
+        if points.iter().any(|point| *point != points[0]) {
             self.shapes.push(Shape::Line { points, stroke });
         }
     }

@@ -23,7 +23,7 @@ pub(super) fn linear(low: f64, high: f64, count: usize) -> Vec<f64> {
         .collect()
 }
 
-/// Powers of ten in `low..=high`; with 2 and 5 times them where there are fewer than three.
+/// Powers of ten in `low..=high`; with multiples of them where there are fewer than three.
 pub(super) fn log(low: f64, high: f64) -> Vec<f64> {
     let (first, last) = (low.log10().floor() as i32, high.log10().ceil() as i32);
     let among = |times: &[f64]| -> Vec<f64> {
@@ -36,7 +36,11 @@ pub(super) fn log(low: f64, high: f64) -> Vec<f64> {
     if powers.len() >= 3 {
         return powers;
     }
-    among(&[1.0, 2.0, 5.0])
+    let few = among(&[1.0, 2.0, 5.0]);
+    if few.len() >= 3 {
+        return few;
+    }
+    among(&[1.0, 1.5, 2.0, 3.0, 5.0, 7.0])
 }
 
 /// The numbers as labels of one axis: the same decimals for all, thousands and millions as k and M.
@@ -112,6 +116,7 @@ mod tests {
         assert_eq!(linear(3.0, 3.0, 4), [3.0]);
         assert_eq!(log(1.0, 1000.0), [1.0, 10.0, 100.0, 1000.0]);
         assert_eq!(log(1.0, 25.0), [1.0, 2.0, 5.0, 10.0, 20.0]);
+        assert_eq!(log(80.0, 300.0), [100.0, 150.0, 200.0, 300.0]);
     }
 
     #[test]

@@ -30,7 +30,7 @@ pub(super) fn figure(folders: &[PathBuf]) -> anyhow::Result<Figure> {
                 .into(),
         ],
         columns: panels.len().min(2),
-        panel_size: (520.0, 500.0),
+        panel_size: (520.0, 440.0),
         panels,
     })
 }

@@ -143,7 +143,7 @@ pub(super) fn convergence(results: &Results) -> Figure {
     Figure {
         title: "Does InfoNCE converge as the spectral gap says?".into(),
         notes: vec![format!(
-            "Points: means of {} seeds; bars and bands: smallest to largest; samplings stand a little apart. Trainings that never got there are left out.",
+            "Points: means of {} seeds; bars and bands: smallest to largest; samplings stand a little apart. What is near enough from the start, at 0 updates, has no place on a logarithmic axis.",
             settings.seeds
         )],
         columns: 2,
