@@ -27,8 +27,11 @@ pub(crate) enum Command {
     Evaluate(EvaluateArgs),
     /// Check the learner's arithmetic against updates computed elsewhere in float64
     Parity(ParityArgs),
-    /// Draw a column of several runs' metrics over their frames
+    /// Draw what runs recorded over their frames: return, losses, k, speed; or their action affinity
     Plot(PlotArgs),
+    /// Run one of the paper's experiments: figures, data and a page
+    #[command(subcommand)]
+    Experiment(ExperimentCommand),
     /// Measure how fast the parts are, alone and beside what others use
     #[command(subcommand)]
     Bench(BenchCommand),
@@ -178,17 +181,61 @@ pub(crate) struct EvaluateArgs {
     pub(crate) seed: u64,
 }
 
+/// What the band over several seeds shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Band {
+    /// From the smallest to the largest value
+    Range,
+    /// One standard deviation to each side of the mean
+    Sd,
+}
+
 #[derive(Debug, Args)]
 pub(crate) struct PlotArgs {
-    /// Folders of runs
+    /// Folders of runs; those that differ in their seed alone become one line with a band
     #[arg(value_name = "RUN", required = true)]
     pub(crate) runs: Vec<PathBuf>,
-    /// Column of metrics.csv
-    #[arg(long, default_value = "mean_return")]
-    pub(crate) column: String,
-    /// Picture to write (SVG)
+    /// Column of metrics.csv, one chart each; may be given several times [default: return, losses, k, speed]
+    #[arg(long, value_name = "COLUMN")]
+    pub(crate) column: Vec<String>,
+    /// Draw the mean over so many frames before each point
+    #[arg(long, value_name = "FRAMES", value_parser = clap::value_parser!(u64).range(1..))]
+    pub(crate) smooth: Option<u64>,
+    /// What the band over several seeds shows
+    #[arg(long, value_enum, default_value_t = Band::Range)]
+    pub(crate) band: Band,
+    /// One line a run, whatever its settings
+    #[arg(long)]
+    pub(crate) separate: bool,
+    /// The action affinity A of each run's newest checkpoint as a heat map, instead of charts
+    #[arg(long, conflicts_with_all = ["column", "smooth", "band", "separate"])]
+    pub(crate) affinity: bool,
+    /// Picture to write, .svg or .png
     #[arg(long, value_name = "FILE", default_value = "plot.svg")]
     pub(crate) out: PathBuf,
+}
+
+/// The paper's experiments.
+#[derive(Debug, Subcommand)]
+pub(crate) enum ExperimentCommand {
+    /// Fig. 1: InfoNCE learns the transition ratio of a biased random walk; does it converge with the spectral gap?
+    RandomWalk(ExperimentFlags),
+    /// Fig. 2: local DIM finds the patch of an Ising model in noise
+    Ising(ExperimentFlags),
+}
+
+/// What every experiment takes.
+#[derive(Clone, Debug, Args)]
+pub(crate) struct ExperimentFlags {
+    /// The same in seconds: shows that everything works, and nothing else
+    #[arg(long)]
+    pub(crate) smoke: bool,
+    /// Where figures, data and page go; an experiment that was stopped goes on there [default: experiments/NAME]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+    /// Seeds 1 to N [default: as the experiment's settings say]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub(crate) seeds: Option<u32>,
 }
 
 #[derive(Debug, Args)]

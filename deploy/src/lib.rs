@@ -11,6 +11,8 @@ mod derived;
 mod display;
 mod error;
 mod evaluate;
+mod experiment;
+mod figure;
 mod interrupts;
 mod local;
 mod lockstep;
@@ -128,6 +130,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Parity(args) => parity(&args),
         Command::Plot(args) => plot::run(&args),
+        Command::Experiment(command) => experiment::run(&command),
         Command::Bench(command) => bench::run(&command),
         Command::Presets => print(&presets::describe()),
         Command::Procgen(ProcgenCommand::Install) => {

@@ -167,6 +167,7 @@ impl Recorder {
             "grad_norm",
             "q_mean",
             "mean_k",
+            "sd_k",
             "mean_age",
             "weights_version",
             "affinity_version",
@@ -222,6 +223,7 @@ impl Recorder {
             computed(learner.grad_norm),
             computed(learner.q_mean.into()),
             some(replay.mean_k()),
+            some(replay.sd_k()),
             format!("{:.1}", replay.mean_age),
             learner.weights_version.to_string(),
             replay.affinity_version.to_string(),
@@ -373,8 +375,8 @@ mod tests {
 
         let csv = fs::read_to_string(run.join("metrics.csv")).unwrap();
         let columns: Vec<_> = csv.lines().map(|line| line.split(',').count()).collect();
-        assert_eq!(columns, [24, 24, 24], "{csv}");
-        expect!["seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,c51_kl,dim_3t3,dim_3t4,dim_4t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,mean_age,weights_version,affinity_version,actors,waiting,rss_mib_replay_server,rss_mib_actor_0"]
+        assert_eq!(columns, [25, 25, 25], "{csv}");
+        expect!["seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,c51_kl,dim_3t3,dim_3t4,dim_4t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,sd_k,mean_age,weights_version,affinity_version,actors,waiting,rss_mib_replay_server,rss_mib_actor_0"]
             .assert_eq(csv.lines().next().unwrap());
 
         let json: serde_json::Value =

@@ -154,6 +154,17 @@ impl ReplayStatus {
             .sum();
         (positives > 0).then(|| weighted as f64 / positives as f64)
     }
+
+    /// Standard deviation of k over all positives served; none before the first.
+    pub fn sd_k(&self) -> Option<f64> {
+        let mean = self.mean_k()?;
+        let served = || self.k_histogram.iter().enumerate().skip(1);
+        let squares: f64 = served()
+            .map(|(k, &n)| (k as f64 - mean).powi(2) * n as f64)
+            .sum();
+        let positives: u64 = served().map(|(_, n)| n).sum();
+        Some((squares / positives as f64).sqrt())
+    }
 }
 
 /// The learner's account of itself.

@@ -26,6 +26,11 @@ impl Scores {
         }
     }
 
+    /// The clipped score of a dot product.
+    pub fn score(&self, dot: f32) -> f64 {
+        self.clip(dot).0
+    }
+
     /// The clipped score of a dot product, and its derivative by the dot product.
     ///
     /// With `e = exp(-2 |x| / c)`: `tanh = (1 - e) / (1 + e)` and its slope `4 e / (1 + e)^2`, which, unlike

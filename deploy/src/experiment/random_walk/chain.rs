@@ -1,0 +1,230 @@
+//! The biased random walk on 0..K, in closed form and by numerical linear algebra.
+//! It samples and learns nothing.
+//!
+//! From i to i + 1 with probability alpha, else to i - 1; at an end the step that would leave it stays.
+
+use rand::Rng;
+
+/// The walk.
+#[derive(Clone, Debug)]
+pub(super) struct Chain {
+    /// States K, at least 2.
+    pub(super) states: usize,
+    /// Probability of a step up, in (0, 1).
+    pub(super) alpha: f64,
+}
+
+impl Chain {
+    /// T [K, K], row-major: T[i, j] is the probability of going from i to j.
+    pub(super) fn transitions(&self) -> Vec<f64> {
+        let k = self.states;
+        let mut matrix = vec![0.0; k * k];
+        for i in 0..k {
+            matrix[i * k + (i + 1).min(k - 1)] += self.alpha;
+            matrix[i * k + i.saturating_sub(1)] += 1.0 - self.alpha;
+        }
+        matrix
+    }
+
+    fn odds(&self) -> f64 {
+        self.alpha / (1.0 - self.alpha)
+    }
+
+    /// The stationary law rho(i) = r^i (1 - r) / (1 - r^K), r = alpha / (1 - alpha); 1 / K at r = 1.
+    ///
+    /// Source: the paper's appendix; it holds for this chain exactly, as its steps balance in detail.
+    pub(super) fn stationary(&self) -> Vec<f64> {
+        let r = self.odds();
+        let powers: Vec<f64> = (0..self.states).map(|i| r.powi(i as i32)).collect();
+        let sum: f64 = powers.iter().sum();
+        powers.iter().map(|power| power / sum).collect()
+    }
+
+    /// I(S_t; S_{t+1}) at stationarity, in nats: H(rho) - h(alpha), as every row of T is (alpha, 1 - alpha).
+    ///
+    /// H(rho) = -ln rho(0) - ln(r) E[i], with E[i] = r / (1 - r) - K r^K / (1 - r^K); ln K at r = 1.
+    pub(super) fn mutual_information(&self) -> f64 {
+        let (r, k) = (self.odds(), self.states as f64);
+        let step = entropy(&[self.alpha, 1.0 - self.alpha]);
+        if (r - 1.0).abs() < 1e-6 {
+            return k.ln() - step;
+        }
+        let r_k = r.powi(self.states as i32);
+        let mean = r / (1.0 - r) - k * r_k / (1.0 - r_k);
+        let first = (1.0 - r) / (1.0 - r_k);
+        -first.ln() - r.ln() * mean - step
+    }
+
+    /// The same on a ring, which has no ends: ln K - h(alpha), in nats.
+    pub(super) fn mutual_information_of_a_ring(&self) -> f64 {
+        (self.states as f64).ln() - entropy(&[self.alpha, 1.0 - self.alpha])
+    }
+
+    /// The appendix's double sum for the mutual information, taken as it is printed, in nats.
+    ///
+    /// Its factor alpha^[j > i] (1 - alpha)^[j < i] is a law of steps only next to i; the printed sum has all i and j.
+    pub(super) fn mutual_information_as_printed(&self) -> f64 {
+        let rho = self.stationary();
+        let factor = |i: usize, j: usize| match j.cmp(&i) {
+            std::cmp::Ordering::Greater => self.alpha,
+            std::cmp::Ordering::Less => 1.0 - self.alpha,
+            std::cmp::Ordering::Equal => 1.0,
+        };
+        let all = (0..self.states).flat_map(|i| (0..self.states).map(move |j| (i, j)));
+        all.map(|(i, j)| rho[i] * factor(i, j) * (factor(i, j).ln() - rho[j].ln()))
+            .sum()
+    }
+
+    /// 1 - lambda_2 = 1 - 2 sqrt(alpha (1 - alpha)) cos(pi / K).
+    ///
+    /// Source: Feller, An Introduction to Probability Theory, vol. 1, XVI.3. The smallest eigenvalue is -lambda_2, so
+    /// this is the absolute gap as well.
+    pub(super) fn spectral_gap(&self) -> f64 {
+        let angle = std::f64::consts::PI / self.states as f64;
+        1.0 - 2.0 * (self.alpha * (1.0 - self.alpha)).sqrt() * angle.cos()
+    }
+
+    /// A step from `state`.
+    pub(super) fn step(&self, state: usize, rng: &mut impl Rng) -> usize {
+        if rng.random::<f64>() < self.alpha {
+            (state + 1).min(self.states - 1)
+        } else {
+            state.saturating_sub(1)
+        }
+    }
+}
+
+/// -sum p ln p, in nats.
+fn entropy(law: &[f64]) -> f64 {
+    -law.iter()
+        .filter(|p| **p > 0.0)
+        .map(|p| p * p.ln())
+        .sum::<f64>()
+}
+
+/// The stationary law of `t` [k, k] as the rows of T^(2^40), by squaring.
+pub(super) fn stationary_numerically(t: &[f64], k: usize) -> Vec<f64> {
+    let mut power = t.to_vec();
+    for _ in 0..40 {
+        let square = |i: usize, j: usize| (0..k).map(|l| power[i * k + l] * power[l * k + j]).sum();
+        let next: Vec<f64> = (0..k * k).map(|at| square(at / k, at % k)).collect();
+        // Rounding would let the rows' sums drift, and squaring double the drift.
+        power = next
+            .chunks(k)
+            .flat_map(|row| {
+                let sum: f64 = row.iter().sum();
+                row.iter().map(move |p| p / sum)
+            })
+            .collect();
+    }
+    power[..k].to_vec()
+}
+
+/// Sum of rho_i T_ij ln(T_ij / rho_j), in nats.
+pub(super) fn mutual_information_numerically(t: &[f64], k: usize) -> f64 {
+    let rho = stationary_numerically(t, k);
+    let term = |at: usize| match t[at] {
+        0.0 => 0.0,
+        p => rho[at / k] * p * (p / rho[at % k]).ln(),
+    };
+    (0..k * k).map(term).sum()
+}
+
+/// 1 - lambda_2 from the eigenvalues of the symmetric matrix sqrt(T_ij T_ji), which has T's as T balances in detail.
+pub(super) fn spectral_gap_numerically(t: &[f64], k: usize) -> f64 {
+    let symmetric = (0..k * k)
+        .map(|at| (t[at] * t[at % k * k + at / k]).sqrt())
+        .collect();
+    let mut values = eigenvalues(symmetric, k);
+    values.sort_by(f64::total_cmp);
+    values[k - 1] - values[k - 2]
+}
+
+/// Eigenvalues of a symmetric matrix [k, k] by Jacobi's rotations.
+fn eigenvalues(mut a: Vec<f64>, k: usize) -> Vec<f64> {
+    // Each sweep at least halves what is off the diagonal; later ones square it.
+    for _ in 0..60 {
+        for p in 0..k {
+            for q in p + 1..k {
+                let off = a[p * k + q];
+                if off.abs() < 1e-300 {
+                    continue;
+                }
+                let theta = (a[q * k + q] - a[p * k + p]) / (2.0 * off);
+                let tan = theta.signum() / (theta.abs() + theta.hypot(1.0));
+                let cos = 1.0 / tan.hypot(1.0);
+                let sin = tan * cos;
+                for i in 0..k {
+                    let (x, y) = (a[i * k + p], a[i * k + q]);
+                    (a[i * k + p], a[i * k + q]) = (cos * x - sin * y, sin * x + cos * y);
+                }
+                for i in 0..k {
+                    let (x, y) = (a[p * k + i], a[q * k + i]);
+                    (a[p * k + i], a[q * k + i]) = (cos * x - sin * y, sin * x + cos * y);
+                }
+            }
+        }
+    }
+    (0..k).map(|i| a[i * k + i]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn assert_near(a: f64, b: f64, what: &str) {
+        assert!(
+            (a - b).abs() < 1e-9 * b.abs().max(1.0),
+            "{what}: {a} and {b}"
+        );
+    }
+
+    #[test]
+    fn closed_forms_are_what_linear_algebra_finds() {
+        for states in [2, 3, 10, 17] {
+            for alpha in [0.05, 0.3, 0.499, 0.5, 0.7, 0.95] {
+                let chain = Chain { states, alpha };
+                let t = chain.transitions();
+                let what = format!("K = {states}, alpha = {alpha}");
+                for (a, b) in chain
+                    .stationary()
+                    .iter()
+                    .zip(stationary_numerically(&t, states))
+                {
+                    assert_near(*a, b, &what);
+                }
+                assert_near(
+                    chain.mutual_information(),
+                    mutual_information_numerically(&t, states),
+                    &what,
+                );
+                assert_near(
+                    chain.spectral_gap(),
+                    spectral_gap_numerically(&t, states),
+                    &what,
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn near_even_odds_the_formula_with_r_meets_the_one_without() {
+        let at = |alpha| Chain { states: 10, alpha }.mutual_information();
+        assert!((at(0.5 + 1e-6) - at(0.5)).abs() < 1e-6);
+    }
+
+    /// What the paper reads off its Fig. 1c is the other way round for the chain it describes.
+    #[test]
+    fn even_odds_are_where_the_walk_tells_most_about_its_next_state() {
+        let at = |alpha| Chain { states: 10, alpha };
+        let even = at(0.5).mutual_information();
+        for alpha in [0.05, 0.3, 0.45, 0.55, 0.9] {
+            let chain = at(alpha);
+            assert!(chain.mutual_information() < even);
+            assert!(chain.mutual_information_of_a_ring() > at(0.5).mutual_information_of_a_ring());
+            assert!(
+                chain.mutual_information_as_printed() > at(0.5).mutual_information_as_printed()
+            );
+        }
+    }
+}

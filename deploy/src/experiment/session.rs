@@ -1,0 +1,206 @@
+//! An experiment's folder: finished pieces of its grid, its data and its figures.
+//! It knows no experiment; what a piece is and what follows from all of them is theirs.
+
+use std::{
+    fs,
+    io::Write,
+    path::{Path, PathBuf},
+    time::Instant,
+};
+
+use anyhow::Context;
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+
+use super::{Page, Progress};
+use crate::{
+    cli::ExperimentFlags,
+    error::{Interrupted, usage},
+    figure::Figure,
+    interrupts::Interrupts,
+    print,
+};
+
+/// Finished pieces, one file each, and the settings they were made with. Git does not keep it.
+const PIECES: &str = "pieces";
+const SETTINGS: &str = "settings.json";
+
+/// A finished piece as it is kept.
+#[derive(Serialize, Deserialize)]
+struct Kept<T> {
+    seconds: f64,
+    result: T,
+}
+
+/// An experiment under way.
+#[derive(Debug)]
+pub(super) struct Session {
+    folder: PathBuf,
+    progress: Progress,
+    seconds: f64,
+}
+
+impl Session {
+    /// Opens the folder, or makes it. `units` is the work of all pieces together.
+    ///
+    /// # Errors
+    /// A folder whose pieces were made with other settings, a file system that refuses.
+    pub(super) fn open(
+        name: &str,
+        flags: &ExperimentFlags,
+        settings: &impl Serialize,
+        units: u64,
+    ) -> anyhow::Result<Self> {
+        let default = || Path::new("experiments").join(name);
+        let folder = flags.out.clone().unwrap_or_else(default);
+        let pieces = folder.join(PIECES);
+        fs::create_dir_all(&pieces).with_context(|| format!("making {}", pieces.display()))?;
+        let settings = serde_json::to_vec_pretty(settings).context("writing down the settings")?;
+        let path = pieces.join(SETTINGS);
+        match fs::read(&path) {
+            Ok(found) if found == settings => {}
+            Ok(_) => {
+                return Err(usage!(
+                    "{} holds pieces that were made with other settings: choose another --out, or remove {}",
+                    folder.display(),
+                    pieces.display()
+                )
+                .into());
+            }
+            Err(_) => write_whole(&path, &settings)?,
+        }
+        let interrupts = Interrupts::listen().context("listening for interrupts")?;
+        Ok(Self {
+            folder,
+            progress: Progress::new(units, interrupts),
+            seconds: 0.0,
+        })
+    }
+
+    /// Where everything goes.
+    pub(super) fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// The piece of this name, which is `units` of work: read if it is there, else made and kept.
+    ///
+    /// # Errors
+    /// What `make` says; an interrupt; a file system that refuses.
+    pub(super) fn piece<T: Serialize + DeserializeOwned>(
+        &mut self,
+        key: &str,
+        units: u64,
+        make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
+        let path = self.folder.join(PIECES).join(format!("{key}.json"));
+        let found: Option<Kept<T>> = fs::read(&path)
+            .ok()
+            .and_then(|text| serde_json::from_slice(&text).ok());
+        // A piece that cannot be read is made again.
+        if let Some(kept) = found {
+            self.progress.find(units);
+            self.seconds += kept.seconds;
+            return Ok(kept.result);
+        }
+        self.progress.begin(key);
+        let started = Instant::now();
+        let result = make(&mut self.progress).inspect_err(|e| {
+            if e.is::<Interrupted>() {
+                eprintln!("stopped; the same command goes on from the last whole piece");
+            }
+        })?;
+        let kept = Kept {
+            seconds: started.elapsed().as_secs_f64(),
+            result,
+        };
+        write_whole(
+            &path,
+            &serde_json::to_vec(&kept).context("keeping a piece")?,
+        )?;
+        self.seconds += kept.seconds;
+        Ok(kept.result)
+    }
+
+    /// Writes rows of data as `name.csv`.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn csv(
+        &self,
+        name: &str,
+        header: &[&str],
+        rows: impl IntoIterator<Item = Vec<String>>,
+    ) -> anyhow::Result<()> {
+        let path = self.folder.join(format!("{name}.csv"));
+        let doing = || format!("writing {}", path.display());
+        let mut file = csv::Writer::from_path(&path).with_context(doing)?;
+        file.write_record(header).with_context(doing)?;
+        for row in rows {
+            file.write_record(&row).with_context(doing)?;
+        }
+        file.flush().with_context(doing)
+    }
+
+    /// Writes a figure as SVG and PNG.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn figure(&self, stem: &str, figure: &Figure) -> anyhow::Result<()> {
+        figure.save_both(&self.folder, stem)
+    }
+
+    /// Writes the page, says where it is, and ends.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn finish(self, page: &Page) -> anyhow::Result<()> {
+        self.progress.clear();
+        let text = page.text(self.seconds);
+        write_whole(&self.folder.join("README.md"), text.as_bytes())?;
+        print(&format!(
+            "{}{}\n",
+            page.summary(),
+            self.folder.join("README.md").display()
+        ))
+    }
+}
+
+/// Writes a file beside its place and renames it into it.
+fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let aside = path.with_extension("tmp");
+    let doing = || format!("writing {}", path.display());
+    let mut file = fs::File::create(&aside).with_context(doing)?;
+    file.write_all(bytes).with_context(doing)?;
+    file.sync_all().with_context(doing)?;
+    fs::rename(&aside, path).with_context(doing)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::error::Usage;
+
+    #[test]
+    fn a_piece_is_made_once_and_other_settings_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let flags = ExperimentFlags {
+            smoke: true,
+            out: Some(folder.path().join("walk")),
+            seeds: None,
+        };
+        let open = |settings: &str| Session::open("walk", &flags, &settings, 4);
+        let mut session = open("a").unwrap();
+        let made = session.piece("one", 2, |_| Ok(7)).unwrap();
+        assert_eq!(made, 7);
+        let failed = session.piece::<u32>("two", 2, |_| anyhow::bail!("stopped"));
+        assert!(failed.is_err());
+
+        let mut again = open("a").unwrap();
+        let found = again.piece("one", 2, |_| -> anyhow::Result<i32> { panic!("is kept") });
+        assert_eq!(found.unwrap(), 7);
+        assert_eq!(again.piece("two", 2, |_| Ok(8)).unwrap(), 8);
+        // Cut off in the middle of a write by a crash of the machine.
+        fs::write(folder.path().join("walk/pieces/one.json"), "{\"seconds\":").unwrap();
+        assert_eq!(open("a").unwrap().piece("one", 2, |_| Ok(9)).unwrap(), 9);
+        assert!(open("b").unwrap_err().is::<Usage>());
+    }
+}

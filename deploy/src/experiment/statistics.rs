@@ -1,0 +1,132 @@
+//! Small statistics over seeds and pairs: mean and spread, rank correlation, area under the ROC curve.
+//! No test of significance: with a handful of seeds the spread itself says more.
+
+use std::fmt;
+
+/// Mean and standard deviation (n - 1) over seeds.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Spread {
+    pub(super) mean: f64,
+    /// 0 for a single value.
+    pub(super) sd: f64,
+    pub(super) min: f64,
+    pub(super) max: f64,
+    pub(super) count: usize,
+}
+
+impl Spread {
+    /// Of these values; none of no value.
+    pub(super) fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
+        let values: Vec<f64> = values.into_iter().collect();
+        let n = values.len() as f64;
+        if values.is_empty() {
+            return None;
+        }
+        let mean = values.iter().sum::<f64>() / n;
+        let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+        Some(Self {
+            mean,
+            sd: if values.len() > 1 {
+                (squares / (n - 1.0)).sqrt()
+            } else {
+                0.0
+            },
+            min: values.iter().copied().fold(f64::INFINITY, f64::min),
+            max: values.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+            count: values.len(),
+        })
+    }
+}
+
+impl fmt::Display for Spread {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let decimals = f.precision().unwrap_or(3);
+        let mean = self.mean;
+        match self.count {
+            1 => write!(f, "{mean:.decimals$} (one seed)"),
+            count => write!(
+                f,
+                "{mean:.decimals$} (standard deviation {:.decimals$} over {count} seeds)",
+                self.sd
+            ),
+        }
+    }
+}
+
+/// Ranks from 1; equal values share the mean of their ranks.
+fn ranks(values: &[f64]) -> Vec<f64> {
+    let mut order: Vec<usize> = (0..values.len()).collect();
+    order.sort_by(|&a, &b| values[a].total_cmp(&values[b]));
+    let mut ranks = vec![0.0; values.len()];
+    let mut start = 0;
+    for tie in order.chunk_by(|&a, &b| values[a] == values[b]) {
+        let shared = start as f64 + (tie.len() + 1) as f64 / 2.0;
+        for &index in tie {
+            ranks[index] = shared;
+        }
+        start += tie.len();
+    }
+    ranks
+}
+
+/// Spearman's rank correlation, in -1..=1; none of fewer than three pairs or where one side does not vary.
+pub(super) fn rank_correlation(pairs: &[(f64, f64)]) -> Option<f64> {
+    let x = ranks(&pairs.iter().map(|pair| pair.0).collect::<Vec<_>>());
+    let y = ranks(&pairs.iter().map(|pair| pair.1).collect::<Vec<_>>());
+    let mean = (pairs.len() as f64 + 1.0) / 2.0;
+    let product = |a: &[f64], b: &[f64]| -> f64 {
+        let terms = a.iter().zip(b);
+        terms.map(|(a, b)| (a - mean) * (b - mean)).sum()
+    };
+    let scale = (product(&x, &x) * product(&y, &y)).sqrt();
+    (pairs.len() > 2 && scale > 0.0).then(|| product(&x, &y) / scale)
+}
+
+/// Probability that a score of `yes` is above one of `no`, ties counting half: the area under the ROC curve.
+///
+/// 0.5 for scores that tell nothing; none if either is empty. Scores must be finite.
+pub(super) fn auc(yes: &[f64], no: &[f64]) -> Option<f64> {
+    if yes.is_empty() || no.is_empty() {
+        return None;
+    }
+    let all: Vec<f64> = yes.iter().chain(no).copied().collect();
+    let sum: f64 = ranks(&all)[..yes.len()].iter().sum();
+    let (n, m) = (yes.len() as f64, no.len() as f64);
+    Some((sum - n * (n + 1.0) / 2.0) / (n * m))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn spread_is_mean_and_standard_deviation() {
+        let spread = Spread::of([1.0, 3.0]).unwrap();
+        assert_eq!((spread.mean, spread.min, spread.max), (2.0, 1.0, 3.0));
+        assert!((spread.sd - 2f64.sqrt()).abs() < 1e-12);
+        assert_eq!(Spread::of([]), None);
+        assert_eq!(Spread::of([5.0]).unwrap().sd, 0.0);
+    }
+
+    #[test]
+    fn rank_correlation_knows_order_and_ties() {
+        let line = [(1.0, 10.0), (2.0, 100.0), (3.0, 1000.0)];
+        assert_eq!(rank_correlation(&line), Some(1.0));
+        let fall = line.map(|(x, y)| (x, -y));
+        assert_eq!(rank_correlation(&fall), Some(-1.0));
+        assert_eq!(rank_correlation(&[(1.0, 1.0); 4]), None);
+        // By hand: ranks of x 1, 2.5, 2.5, 4 and of y 1, 3, 2, 4 give 4.5 / sqrt(4.5 * 5).
+        let ties = [(1.0, 1.0), (2.0, 3.0), (2.0, 2.0), (3.0, 4.0)];
+        let expected = 4.5 / (4.5f64 * 5.0).sqrt();
+        assert!((rank_correlation(&ties).unwrap() - expected).abs() < 1e-12);
+    }
+
+    #[test]
+    fn auc_is_the_share_of_pairs_in_order() {
+        assert_eq!(auc(&[2.0, 3.0], &[0.0, 1.0]), Some(1.0));
+        assert_eq!(auc(&[1.0], &[1.0]), Some(0.5));
+        // Of the six pairs 2 > 1, 4 > 1, 4 > 3 are in order, 2 < 3 is not, and 2 = 2, 4 > 2.
+        assert_eq!(auc(&[2.0, 4.0], &[1.0, 3.0, 2.0]), Some(4.5 / 6.0));
+        assert_eq!(auc(&[], &[1.0]), None);
+    }
+}

@@ -1,0 +1,155 @@
+//! The font that comes along (DejaVu Sans, an open licence): widths and outlines of text.
+//! It knows no kerning and no right-to-left script; figures are in English.
+
+use std::sync::LazyLock;
+
+use ttf_parser::{Face, OutlineBuilder};
+
+/// Light or heavy letters.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Weight {
+    Regular,
+    Bold,
+}
+
+static REGULAR: LazyLock<Face<'static>> = LazyLock::new(|| face(dejavu::sans::regular()));
+static BOLD: LazyLock<Face<'static>> = LazyLock::new(|| face(dejavu::sans::bold()));
+
+fn face(bytes: &'static [u8]) -> Face<'static> {
+    Face::parse(bytes, 0).expect("the font is built in, and a test reads it")
+}
+
+impl Weight {
+    fn face(self) -> &'static Face<'static> {
+        match self {
+            Self::Regular => &REGULAR,
+            Self::Bold => &BOLD,
+        }
+    }
+}
+
+/// Width of a line of text.
+pub(super) fn width(text: &str, size: f64, weight: Weight) -> f64 {
+    let face = weight.face();
+    let units: f64 = text.chars().map(|c| advance(face, c)).sum();
+    units * size / f64::from(face.units_per_em())
+}
+
+fn advance(face: &Face<'_>, c: char) -> f64 {
+    let glyph = face.glyph_index(c).unwrap_or_default();
+    f64::from(face.glyph_hor_advance(glyph).unwrap_or_default())
+}
+
+/// `text` cut so that it fits `width_max`, with an ellipsis if anything was cut.
+pub(super) fn fit(text: &str, size: f64, weight: Weight, width_max: f64) -> String {
+    if width(text, size, weight) <= width_max {
+        return text.to_owned();
+    }
+    let mut cut: Vec<char> = text.chars().collect();
+    while cut.pop().is_some() {
+        let shorter: String = cut.iter().collect::<String>() + "\u{2026}";
+        if width(&shorter, size, weight) <= width_max {
+            return shorter;
+        }
+    }
+    String::new()
+}
+
+/// `text` in lines of at most `width_max`, broken at spaces; a longer word has its own line, cut. Sized as if bold.
+pub(super) fn wrap(text: &str, size: f64, width_max: f64) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        let longer = lines.last().map(|line| format!("{line} {word}"));
+        match longer {
+            Some(longer) if width(&longer, size, Weight::Bold) <= width_max => {
+                lines.pop();
+                lines.push(longer);
+            }
+            _ => lines.push(fit(word, size, Weight::Bold, width_max)),
+        }
+    }
+    lines
+}
+
+/// Gives the outlines of a line of text whose baseline starts at (0, 0), y downwards, to `path`.
+pub(super) fn outline(text: &str, size: f64, weight: Weight, path: &mut tiny_skia::PathBuilder) {
+    let face = weight.face();
+    let scale = size as f32 / f32::from(face.units_per_em());
+    let mut pen = Pen {
+        path,
+        x: 0.0,
+        scale,
+    };
+    for c in text.chars() {
+        face.outline_glyph(face.glyph_index(c).unwrap_or_default(), &mut pen);
+        pen.x += advance(face, c) as f32 * scale;
+    }
+}
+
+struct Pen<'a> {
+    path: &'a mut tiny_skia::PathBuilder,
+    x: f32,
+    scale: f32,
+}
+
+impl Pen<'_> {
+    fn at(&self, x: f32, y: f32) -> (f32, f32) {
+        (self.x + x * self.scale, -y * self.scale)
+    }
+}
+
+impl OutlineBuilder for Pen<'_> {
+    fn move_to(&mut self, x: f32, y: f32) {
+        let (x, y) = self.at(x, y);
+        self.path.move_to(x, y);
+    }
+
+    fn line_to(&mut self, x: f32, y: f32) {
+        let (x, y) = self.at(x, y);
+        self.path.line_to(x, y);
+    }
+
+    fn quad_to(&mut self, x1: f32, y1: f32, x: f32, y: f32) {
+        let ((x1, y1), (x, y)) = (self.at(x1, y1), self.at(x, y));
+        self.path.quad_to(x1, y1, x, y);
+    }
+
+    fn curve_to(&mut self, x1: f32, y1: f32, x2: f32, y2: f32, x: f32, y: f32) {
+        let ((x1, y1), (x2, y2), (x, y)) = (self.at(x1, y1), self.at(x2, y2), self.at(x, y));
+        self.path.cubic_to(x1, y1, x2, y2, x, y);
+    }
+
+    fn close(&mut self) {
+        self.path.close();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_letter_that_figures_use_is_there() {
+        for c in "abcxyzABCXYZ0123456789 .,:;-+*/()[]%\u{3b1}\u{3b5}\u{3bb}\u{3c1}\u{2026}\u{b1}\u{b7}\u{2212}".chars()
+        {
+            assert!(Weight::Regular.face().glyph_index(c).is_some(), "{c}");
+            assert!(Weight::Bold.face().glyph_index(c).is_some(), "{c}");
+        }
+    }
+
+    #[test]
+    fn long_text_is_cut_or_broken_to_fit() {
+        let text = "mean return of the last hundred episodes";
+        let cut = fit(text, 12.0, Weight::Regular, 100.0);
+        assert!(cut.ends_with('\u{2026}') && width(&cut, 12.0, Weight::Regular) <= 100.0);
+        assert_eq!(fit("k", 12.0, Weight::Regular, 100.0), "k");
+        let lines = wrap(text, 12.0, 120.0);
+        assert!(lines.len() > 2);
+        assert_eq!(lines.join(" "), text);
+        assert!(
+            lines
+                .iter()
+                .all(|line| width(line, 12.0, Weight::Bold) <= 120.0)
+        );
+    }
+}

@@ -1,0 +1,134 @@
+//! Round numbers along an axis, and how they are written.
+//! It draws nothing.
+
+/// Round numbers in `low..=high`, about `count` of them: steps of 1, 2 or 5 times a power of ten.
+pub(super) fn linear(low: f64, high: f64, count: usize) -> Vec<f64> {
+    let raw = (high - low) / count.max(1) as f64;
+    if !(raw.is_finite() && raw > 0.0) {
+        return vec![low];
+    }
+    let power = 10f64.powf(raw.log10().floor());
+    // The round step nearest to the one asked for, by ratio.
+    let off = |step: &f64| (step / raw).ln().abs();
+    let step = [1.0, 2.0, 5.0, 10.0]
+        .map(|times| times * power)
+        .into_iter()
+        .min_by(|a, b| off(a).total_cmp(&off(b)))
+        .unwrap_or(power);
+    let first = (low / step - 1e-9).ceil() as i64;
+    let last = (high / step + 1e-9).floor() as i64;
+    // At most a few more than asked for; the bound keeps an odd range from filling memory.
+    (first..=last.min(first + 50))
+        .map(|i| i as f64 * step)
+        .collect()
+}
+
+/// Powers of ten in `low..=high`; with multiples of them where there are fewer than three.
+pub(super) fn log(low: f64, high: f64) -> Vec<f64> {
+    let (first, last) = (low.log10().floor() as i32, high.log10().ceil() as i32);
+    let among = |times: &[f64]| -> Vec<f64> {
+        let all = (first..=last.min(first + 50))
+            .flat_map(|power| times.iter().map(move |times| times * 10f64.powi(power)));
+        all.filter(|value| (low * 0.999..=high * 1.001).contains(value))
+            .collect()
+    };
+    let powers = among(&[1.0]);
+    if powers.len() >= 3 {
+        return powers;
+    }
+    let few = among(&[1.0, 2.0, 5.0]);
+    if few.len() >= 3 {
+        return few;
+    }
+    among(&[1.0, 1.5, 2.0, 3.0, 5.0, 7.0])
+}
+
+/// The numbers as labels of one axis: the same decimals for all, thousands and millions as k and M.
+pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
+    let largest = ticks.iter().map(|tick| tick.abs()).fold(0.0, f64::max);
+    let smallest = ticks
+        .iter()
+        .map(|tick| tick.abs())
+        .filter(|tick| *tick > 0.0)
+        .fold(f64::INFINITY, f64::min);
+    let (divisor, unit) = if largest >= 1e7 {
+        (1e6, "M")
+    } else if largest >= 1e4 {
+        (1e3, "k")
+    } else {
+        (1.0, "")
+    };
+    let wide = largest / smallest >= 1000.0;
+    let decimals = (0..6)
+        .find(|&decimals| {
+            let texts: Vec<f64> = ticks
+                .iter()
+                .map(|tick| {
+                    let scale = 10f64.powi(decimals);
+                    (tick / divisor * scale).round() / scale
+                })
+                .collect();
+            ticks.iter().zip(&texts).all(|(tick, text)| {
+                (tick / divisor - text).abs() <= 1e-6 * (largest / divisor).min(1.0)
+            })
+        })
+        .unwrap_or(6) as usize;
+    ticks
+        .iter()
+        .map(|tick| {
+            let value = tick / divisor;
+            if *tick == 0.0 {
+                return "0".to_owned();
+            }
+            let text = if wide {
+                plain(*tick)
+            } else {
+                format!("{value:.decimals$}{unit}")
+            };
+            text.replace('-', "\u{2212}")
+        })
+        .collect()
+}
+
+/// One number on its own, in as few characters as it needs.
+fn plain(value: f64) -> String {
+    let size = value.abs();
+    if size >= 1e6 {
+        format!("{}M", value / 1e6)
+    } else if size >= 1e4 {
+        format!("{}k", value / 1e3)
+    } else if size >= 1e-4 {
+        let text = format!("{value:.6}");
+        text.trim_end_matches('0').trim_end_matches('.').to_owned()
+    } else {
+        format!("{value:e}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ticks_are_round_and_inside() {
+        assert_eq!(linear(0.0, 10.0, 5), [0.0, 2.0, 4.0, 6.0, 8.0, 10.0]);
+        assert_eq!(linear(-1.2, 1.2, 4), [-1.0, 0.0, 1.0]);
+        assert_eq!(linear(3.0, 3.0, 4), [3.0]);
+        assert_eq!(log(1.0, 1000.0), [1.0, 10.0, 100.0, 1000.0]);
+        assert_eq!(log(1.0, 25.0), [1.0, 2.0, 5.0, 10.0, 20.0]);
+        assert_eq!(log(80.0, 300.0), [100.0, 150.0, 200.0, 300.0]);
+    }
+
+    #[test]
+    fn labels_have_the_decimals_they_need() {
+        assert_eq!(labels(&[0.0, 0.5, 1.0]), ["0", "0.5", "1.0"]);
+        assert_eq!(labels(&[-2.0, 0.0, 2.0]), ["\u{2212}2", "0", "2"]);
+        assert_eq!(labels(&[0.0, 20_000.0, 40_000.0]), ["0", "20k", "40k"]);
+        assert_eq!(
+            labels(&[1.0, 10.0, 100.0, 1000.0]),
+            ["1", "10", "100", "1000"]
+        );
+        assert_eq!(labels(&[0.001, 0.01, 10.0]), ["0.001", "0.01", "10"]);
+        assert_eq!(labels(&[5e6, 1e7]), ["5M", "10M"]);
+    }
+}
