@@ -8,6 +8,7 @@ use std::{
     fs,
     path::Path,
     process::{Command, Output},
+    time::{Duration, Instant},
 };
 
 fn driml(folder: &Path, args: &[&str]) -> Output {
@@ -122,6 +123,187 @@ fn ising() {
     );
 }
 
+/// The parts of a page, and the files beside it.
+fn check_page(folder: &Path, files: &[&str]) -> String {
+    let page = fs::read_to_string(folder.join("README.md")).unwrap();
+    for part in [
+        "smoke length",
+        "**Claim.**",
+        "**Command.** `driml experiment",
+        "**Got.**\n\n* ",
+        "| --- |",
+        "**Differences from the paper.**",
+    ] {
+        assert!(page.contains(part), "{part}\n{page}");
+    }
+    let found = data(folder);
+    assert_eq!(found.keys().collect::<Vec<_>>(), files);
+    for (file, bytes) in &found {
+        let text = String::from_utf8_lossy(bytes);
+        assert!(bytes.len() > 20 && !text.contains("NaN"), "{file}");
+    }
+    page
+}
+
+/// Through real processes, so no two runs are alike; but what is finished stays as it is.
+#[test]
+fn procgen_without_the_engine() {
+    let root = tempfile::tempdir().unwrap();
+    let args = ["experiment", "procgen", "--smoke"];
+    run(root.path(), &args);
+    let folder = root.path().join("experiments/procgen");
+    let page = check_page(
+        &folder,
+        &[
+            "actions.csv",
+            "affinity.png",
+            "affinity.svg",
+            "aggregate.csv",
+            "aggregate.png",
+            "aggregate.svg",
+            "curves.csv",
+            "curves.png",
+            "curves.svg",
+            "k.csv",
+            "k.png",
+            "k.svg",
+            "k_histogram.csv",
+            "runs.csv",
+            "table.csv",
+        ],
+    );
+    let first = data(&folder);
+    let rows = |name: &str| String::from_utf8_lossy(&first[name]).lines().count() - 1;
+    assert_eq!(rows("runs.csv"), 2 * 2 * 2, "worlds, agents, seeds");
+    assert!(page.contains("| chain | random |"), "{page}");
+
+    // Nothing is run again, and the same runs give the same files.
+    run(root.path(), &args);
+    assert_eq!(data(&folder), first);
+
+    // A run that failed is moved aside and made anew; the others stay.
+    let summary = |name: &str| folder.join("runs").join(name).join("summary.json");
+    let text = fs::read_to_string(summary("chain-c51-seed2")).unwrap();
+    let failed = text.replace("\"finished\"", "\"failed\"");
+    fs::write(summary("chain-c51-seed2"), failed).unwrap();
+    let output = driml(root.path(), &args);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    assert!(said.contains("chain-c51-seed2 was not finished"), "{said}");
+    assert!(summary("chain-c51-seed2.unfinished-1").exists());
+    let again = fs::read_to_string(summary("chain-c51-seed2")).unwrap();
+    assert!(again.contains("\"finished\""), "{again}");
+    let untouched = data(&folder)["runs.csv"].clone();
+    let line = |bytes: &[u8], name: &str| {
+        let text = String::from_utf8_lossy(bytes).into_owned();
+        text.lines()
+            .find(|line| line.starts_with(name))
+            .unwrap()
+            .to_owned()
+    };
+    for name in ["chain,c51,1", "mspacman,driml-ada,2"] {
+        assert_eq!(line(&untouched, name), line(&first["runs.csv"], name));
+    }
+
+    // More agents can be added; another length cannot.
+    let report = ["--agents", "c51,cpc", "--report"];
+    run(root.path(), &[&args[..], &report].concat());
+    let page = fs::read_to_string(folder.join("README.md")).unwrap();
+    assert!(
+        page.contains("Missing, and in no number here: chain-cpc-seed1"),
+        "{page}"
+    );
+    let refused = driml(root.path(), &[&args[..], &["--frames", "900"]].concat());
+    assert_eq!(refused.status.code(), Some(64));
+}
+
+#[test]
+fn procgen_screen_without_the_engine() {
+    let root = tempfile::tempdir().unwrap();
+    run(
+        root.path(),
+        &["experiment", "procgen", "--screen", "--smoke", "--out", "s"],
+    );
+    let page = check_page(
+        &root.path().join("s"),
+        &["screen.csv", "screen.png", "screen.svg"],
+    );
+    assert!(
+        page.contains("| chain |") && page.contains("| mspacman |"),
+        "{page}"
+    );
+}
+
+#[test]
+fn pacman() {
+    let root = tempfile::tempdir().unwrap();
+    run(root.path(), &["experiment", "pacman", "--smoke"]);
+    let folder = root.path().join("experiments/pacman");
+    let files = [
+        "fig3.png",
+        "fig3.svg",
+        "final_loss.csv",
+        "ghosts.csv",
+        "loss.csv",
+        "noise.csv",
+    ];
+    check_page(&folder, &files);
+    let config = |name: &str| {
+        let path = folder.join("runs").join(name).join("config.toml");
+        fs::read_to_string(path).unwrap()
+    };
+    assert!(config("epsilon0.25-seed1").contains("epsilon = 0.25"));
+    let noise = config("noise-driml-fix-seed1");
+    assert!(
+        noise.contains("episodes_per_task = 8"),
+        "32 among 4 copies: {noise}"
+    );
+    assert!(noise.contains("[world.ising]"), "{noise}");
+    assert!(!config("ghosts-c51-seed1").contains("[world.ising]"));
+}
+
+/// A killed experiment takes its runs with it, and goes on at the next call.
+#[test]
+fn killed_and_resumed() {
+    let root = tempfile::tempdir().unwrap();
+    let mut args = vec![
+        "experiment",
+        "procgen",
+        "--smoke",
+        "--games",
+        "mspacman",
+        "--agents",
+        "c51",
+    ];
+    args.extend(["--seeds", "1", "--out", "x", "--frames", "20000"]);
+    let mut child = Command::new(env!("CARGO_BIN_EXE_driml"))
+        .args(&args)
+        .current_dir(root.path())
+        .spawn()
+        .unwrap();
+    let run = root.path().join("x/runs/mspacman-c51-seed1");
+    let deadline = Instant::now() + Duration::from_secs(60);
+    while !run.join("metrics.csv").exists() && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let output = driml(root.path(), &args);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    assert!(
+        said.contains("mspacman-c51-seed1 was not finished"),
+        "{said}"
+    );
+    let summary = |folder: &Path| fs::read_to_string(folder.join("summary.json")).unwrap();
+    assert!(summary(&run).contains("\"finished\""));
+    let aside = summary(&run.with_file_name("mspacman-c51-seed1.unfinished-1"));
+    assert!(
+        aside.contains("\"interrupted\""),
+        "it was let save what it had: {aside}"
+    );
+}
+
 #[test]
 fn an_experiment_that_is_not_there() {
     let root = tempfile::tempdir().unwrap();
@@ -129,6 +311,26 @@ fn an_experiment_that_is_not_there() {
         &["experiment"][..],
         &["experiment", "walk"],
         &["experiment", "ising", "--seeds", "0"],
+        &["experiment", "procgen", "--games", "pong"],
+        &["experiment", "procgen", "--agents", "dqn"],
+        &[
+            "experiment",
+            "procgen",
+            "--smoke",
+            "--games",
+            "chain",
+            "--set",
+            "run.gamma=2",
+        ],
+        &[
+            "experiment",
+            "procgen",
+            "--smoke",
+            "--report",
+            "--out",
+            "none",
+        ],
+        &["experiment", "pacman", "--episodes-per-task", "33"],
     ] {
         assert_eq!(driml(root.path(), args).status.code(), Some(64), "{args:?}");
     }

@@ -28,3 +28,21 @@ fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
         ended.stdout
     );
 }
+
+#[test]
+fn an_experiment_of_whole_runs_normalises_and_plays_unseen_levels() {
+    if skipped_offline("procgen::an_experiment_of_whole_runs_normalises_and_plays_unseen_levels") {
+        return;
+    }
+    let system = system();
+    system
+        .run("experiment procgen --smoke --games bigfish --agents c51,driml-ada --seeds 1 --frames 608 --out table")
+        .expect_code(0);
+    let page = std::fs::read_to_string(system.path("table").join("README.md")).unwrap();
+    for part in [
+        "(paper 4.45 ± 0.71)",
+        "Interquartile mean of normalised returns, unseen levels, `driml-ada`",
+    ] {
+        assert!(page.contains(part), "{part}\n{page}");
+    }
+}

@@ -312,3 +312,33 @@ fn a_compressed_replay_is_bounded_in_bytes_instead() {
     expect!["in the settings' [replay] table: unknown variant `zip`, expected `none` or `lz4`"]
         .assert_eq(&said("replay.compression=zip"));
 }
+
+#[test]
+fn a_fault_is_trained_with_only_where_it_is_asked_for() {
+    let plain = with("chain", "c51", &[]).unwrap();
+    assert_eq!(plain.replay.study, None);
+    expect![
+        "replay.study cannot be set by hand: it is a fault to be studied, and chosen by --study"
+    ]
+    .assert_eq(&with("chain", "c51", &["replay.study=bootstrap-from-next-state"]).unwrap_err());
+    let asked = Flags {
+        study: Some(Study::BootstrapFromNextState),
+        ..Flags::default()
+    };
+    let faulty = resolve(&source("paper", "chain", "c51"), &asked, &MACHINE).unwrap();
+    assert_eq!(faulty.replay.study, asked.study);
+    assert!(faulty.notes.iter().any(|note| note.contains("known fault")));
+
+    // Nor does a file bring it in by itself.
+    let file = Source::File("faulty.toml".into(), faulty.to_toml());
+    let said = resolve(&file, &Flags::default(), &MACHINE)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        said.contains("add --study bootstrap-from-next-state if that is meant"),
+        "{said}"
+    );
+    assert!(resolve(&file, &asked, &MACHINE).is_ok());
+    // What was trained with it can still be looked at.
+    assert!(RunConfig::parse("faulty.toml", &faulty.to_toml()).is_ok());
+}

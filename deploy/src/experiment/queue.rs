@@ -11,7 +11,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
@@ -20,6 +20,7 @@ use nix::{
 use super::{Progress, Session};
 use crate::{
     EXIT_USAGE,
+    error::usage,
     record::{Outcome, Summary},
 };
 
@@ -182,7 +183,7 @@ impl Queue {
                     let name = &plan.name;
                     // Settings that cannot work will not work for the others either.
                     if status.code() == Some(EXIT_USAGE.into()) {
-                        bail!("the run {name} cannot be made:\n{words}");
+                        return Err(usage!("the run {name} cannot be made:\n{words}").into());
                     }
                     progress.line(&format!(
                         "the run {name} failed ({status}) and is left out; the same command tries it again. Its last words:\n{words}"

@@ -144,7 +144,7 @@ fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
         let episodes = args
             .episodes_per_task
             .unwrap_or(continual.episodes_per_task);
-        if episodes % continual.envs != 0 {
+        if !episodes.is_multiple_of(continual.envs) {
             return Err(usage!(
                 "--episodes-per-task {episodes} is no multiple of the {} copies of the world, each of which changes its ghost \
                  by itself",

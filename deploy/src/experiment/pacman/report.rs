@@ -23,11 +23,14 @@ const RETURNS_OF: u64 = 100;
 /// Names of ghosts 0 to 3.
 const GHOSTS: [&str; 4] = ["red", "cyan", "orange", "green"];
 
+/// (x, y) in the order of x.
+type Points = Vec<(f64, f64)>;
+
 /// Training return over episodes.
 struct Trace {
     agent: String,
     seed: u32,
-    points: Vec<(f64, f64)>,
+    points: Points,
 }
 
 /// Final loss of a run of (a).
@@ -69,11 +72,7 @@ pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> 
 }
 
 /// Values of a loss in all runs with this epsilon.
-fn loss_of(
-    results: &Results,
-    epsilon: f64,
-    column: &str,
-) -> anyhow::Result<Vec<(u32, Vec<(f64, f64)>)>> {
+fn loss_of(results: &Results, epsilon: f64, column: &str) -> anyhow::Result<Vec<(u32, Points)>> {
     let runs = results
         .runs
         .iter()
@@ -412,6 +411,9 @@ fn page(results: &Results, mut got: Vec<String>, tables: Vec<Table>) -> Page {
             "Missing, and in no number here: {}.",
             results.missing.join(", ")
         ));
+    }
+    if got.is_empty() {
+        got.push("Too short for a number.".into());
     }
     let short = continual.episodes_per_task.min(noise.episodes_per_task) < 2 * RETURNS_OF;
     let mut differences = vec![

@@ -296,6 +296,10 @@ fn aggregate_figure(results: &Results, aggregates: &[Aggregate]) -> Figure {
                     .marked(Mark::Dashed),
             );
         }
+        let has = |kind: Kind| move |it: &&Aggregate| it.measure == measure && it.kind == kind;
+        let both = kinds
+            .iter()
+            .all(|&kind| aggregates.iter().any(|it| has(kind)(&it)));
         for (index, kind) in kinds.into_iter().enumerate() {
             let (mut points, mut band) = (Vec::new(), Vec::new());
             for it in aggregates
@@ -306,7 +310,13 @@ fn aggregate_figure(results: &Results, aggregates: &[Aggregate]) -> Figure {
                     .iter()
                     .position(|agent| *agent == it.agent)
                     .unwrap_or(0);
-                let x = place as f64 + 0.16 * (index as f64 - 0.5);
+                // Two kinds stand side by side.
+                let aside = if both {
+                    0.16 * (index as f64 - 0.5)
+                } else {
+                    0.0
+                };
+                let x = place as f64 + aside;
                 points.push((x, it.estimate.value));
                 band.push((x, it.estimate.low, it.estimate.high));
             }
@@ -325,6 +335,26 @@ fn aggregate_figure(results: &Results, aggregates: &[Aggregate]) -> Figure {
             series,
         ))
     };
+    let measured = |measure: &str| aggregates.iter().any(|it| it.measure == measure);
+    let panels = [
+        panel(
+            "Interquartile mean of normalised scores",
+            "interquartile mean",
+            "normalised return",
+            [Kind::Single, Kind::Unseen],
+            None,
+        ),
+        panel(
+            &format!("Probability that an agent is better than {baseline}"),
+            "probability of improvement",
+            "probability",
+            [Kind::Training, Kind::Unseen],
+            Some(0.5),
+        ),
+    ];
+    let panels = panels
+        .into_iter()
+        .zip(["interquartile mean", "probability of improvement"]);
     Figure {
         title: "Over all games".into(),
         notes: vec![
@@ -334,22 +364,7 @@ fn aggregate_figure(results: &Results, aggregates: &[Aggregate]) -> Figure {
         ],
         columns: 2,
         panel_size: (430.0, 320.0),
-        panels: vec![
-            panel(
-                "Interquartile mean of normalised scores",
-                "interquartile mean",
-                "normalised return",
-                [Kind::Single, Kind::Unseen],
-                None,
-            ),
-            panel(
-                &format!("Probability that an agent is better than {baseline}"),
-                "probability of improvement",
-                "probability",
-                [Kind::Training, Kind::Unseen],
-                Some(0.5),
-            ),
-        ],
+        panels: panels.filter(|(_, measure)| measured(measure)).map(|(panel, _)| panel).collect(),
     }
 }
 
@@ -564,12 +579,14 @@ fn differences(results: &Results, share: f64) -> Vec<String> {
                 .into(),
         );
     }
-    if results.worlds().len() < 16 {
-        lines.push(format!(
-            "{} of the sixteen games. `--screen` orders them by how soon C51 learns them; such a choice favours C51, as the \
-             return alone teaches quickly there.",
-            results.worlds().iter().filter(|world| world.starts_with("procgen:")).count()
-        ));
+    let worlds = results.worlds();
+    match worlds.iter().filter(|world| world.starts_with("procgen:")).count() {
+        0 => lines.push("None of Procgen's games, but worlds that need no engine.".into()),
+        games if games < 16 => lines.push(format!(
+            "{games} of the sixteen games. `driml experiment procgen --screen` orders them by how soon C51 learns them; such a \
+             choice favours C51, as the return alone teaches quickly there."
+        )),
+        _ => {}
     }
     lines
 }
