@@ -54,7 +54,7 @@ pub(crate) struct RunFlags {
     /// World: procgen:GAME, mspacman, chain or ising [default: procgen:bigfish]
     #[arg(long, value_name = "WORLD")]
     pub(crate) env: Option<String>,
-    /// Agent: c51, driml-fix, driml-ada or driml-randk [default: driml-ada]
+    /// Agent: c51, driml-fix, driml-ada, driml-randk, driml-noact, cpc or curl [default: driml-ada]
     #[arg(long, value_name = "AGENT")]
     pub(crate) agent: Option<String>,
     /// Named settings; `driml presets` lists them [default: paper]

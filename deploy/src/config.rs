@@ -2,7 +2,7 @@
 //! It fills in no number but those that follow from others and those that the machine decides.
 
 use driml_envs::{WorldConfig, WorldName};
-use driml_learner::EstimatorKind;
+use driml_learner::{EstimatorKind, Objective};
 use driml_model::ModelConfig;
 use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
 use driml_replay_server::Compression;
@@ -87,9 +87,10 @@ pub(crate) fn resolve(
             table
         }
         Source::File(name, text) => {
-            let read: Table = text
+            let mut read: Table = text
                 .parse()
                 .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
+            derived::complete(&mut read);
             derived::check(&read).map_err(|e| usage!("{name}: {e}"))?;
             read
         }
@@ -310,9 +311,10 @@ impl RunConfig {
     /// # Errors
     /// As [`resolve`].
     pub(crate) fn parse(name: &str, text: &str) -> Result<Self, Usage> {
-        let table: Table = text
+        let mut table: Table = text
             .parse()
             .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
+        derived::complete(&mut table);
         derived::check(&table)
             .and_then(|()| Self::from_table(table))
             .map_err(|e| usage!("{name}: {e}"))
@@ -375,16 +377,7 @@ impl RunConfig {
                 self.local.learner_threads
             ));
         }
-        let wanted = self.learner.update.lambda.wanted().contains(&true);
-        match (self.run.horizon, wanted) {
-            (Horizon::None, true) => Err(usage!(
-                "learner.update.lambda asks for DIM, but run.horizon draws no positive: set all four lambdas to 0, or --set 'run.horizon={{rule=\"fixed\",k=1}}'"
-            )),
-            (Horizon::None, false) | (_, true) => Ok(()),
-            (_, false) => Err(usage!(
-                "run.horizon draws positives, but all of learner.update.lambda are 0: --set 'run.horizon={{rule=\"none\"}}', or set a lambda above 0"
-            )),
-        }?;
+        self.check_objective()?;
         let learns_affinity = self.learner.affinity.estimator != EstimatorKind::None;
         let affinity = self
             .learner
@@ -404,6 +397,35 @@ impl RunConfig {
             _ => Ok(()),
         }?;
         Ok(())
+    }
+
+    /// The replay serves what the auxiliary objective needs and no more.
+    fn check_objective(&self) -> Result<(), Usage> {
+        let objective = self.learner.update.objective;
+        let (least, most) = objective.served();
+        let served = self.run.horizon.positives();
+        if (least..=most).contains(&served) {
+            return Ok(());
+        }
+        let rule = match objective {
+            Objective::None | Objective::Curl => r#"{rule="none"}"#,
+            Objective::Dim => r#"{rule="fixed",k=1}"#,
+            Objective::Cpc => r#"{rule="all",k_max=5}"#,
+        };
+        let later = |states: usize| match states {
+            0 => "no later state".into(),
+            1 => "one later state".into(),
+            states => format!("{states} later states"),
+        };
+        let needed = match objective {
+            Objective::Cpc => "one or more later states".into(),
+            _ => later(least),
+        };
+        Err(usage!(
+            "run.horizon serves {} a row, but learner.update.objective = {} looks at {needed}: --set 'run.horizon={rule}', or take another --agent",
+            later(served),
+            objective.name()
+        ))
     }
 }
 

@@ -28,7 +28,7 @@ const FOLLOWS: [(&str, &str); 13] = [
         "follows from the world and run.frame_stack",
     ),
     ("model.num_actions", "follows from the world"),
-    ("model.dim", "follows from learner.update.lambda"),
+    ("model.dim", "follows from learner.update"),
 ];
 
 /// Writes the names that everything else follows from.
@@ -73,7 +73,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         driml_envs::num_actions(&config),
         whole(table, "run.frame_stack")?,
     );
-    let dim = update.lambda.dim_parts(num_actions > 1);
+    let dim = update.dim_parts(num_actions);
     let size = |value: usize| Value::Integer(value as i64);
     let dim = Value::try_from(dim).map_err(|e| usage!("the DIM heads as TOML: {e}"))?;
     for (path, value) in [
@@ -113,6 +113,34 @@ fn visible_actions(table: &mut Table, world: WorldName, num_actions: usize) {
             .map(|action| Value::Integer(action.into()))
             .collect();
         put(table, "learner.affinity.visible", Value::Array(map));
+    }
+}
+
+/// Fills in what settings leave open that were written before there were several objectives: DIM, or none where all lambdas
+/// are 0, and the action as the network had it.
+pub(crate) fn complete(read: &mut Table) {
+    let number = |value: &Value| {
+        let whole = value.as_integer().map(|whole| whole as f64);
+        value.as_float().or(whole).unwrap_or(0.0)
+    };
+    let weighs = find(read, "learner.update.lambda")
+        .and_then(Value::as_table)
+        .is_some_and(|lambda| lambda.values().any(|value| number(value) > 0.0));
+    let action = find(read, "model.dim.action").and_then(Value::as_bool);
+    if find(read, "learner.update.lambda").is_some()
+        && find(read, "learner.update.objective").is_none()
+    {
+        let objective = if weighs { "dim" } else { "none" };
+        put(
+            read,
+            "learner.update.objective",
+            Value::String(objective.into()),
+        );
+        put(
+            read,
+            "learner.update.condition_on_action",
+            Value::Boolean(action.unwrap_or(false)),
+        );
     }
 }
 

@@ -71,26 +71,47 @@ pub(crate) const PRESETS: [Preset; 4] = [
 pub(crate) struct Agent {
     /// As `--agent` takes it.
     pub(crate) name: &'static str,
+    /// One line for `driml presets`.
+    about: &'static str,
     layer: Layer,
 }
 
 /// Every agent.
-pub(crate) const AGENTS: [Agent; 4] = [
+pub(crate) const AGENTS: [Agent; 7] = [
     Agent {
         name: "c51",
+        about: "the return alone",
         layer: layer!("agent/c51"),
     },
     Agent {
         name: "driml-fix",
+        about: "DIM at a fixed k, chosen by game; augments its states on seven of them",
         layer: layer!("agent/driml-fix"),
     },
     Agent {
         name: "driml-ada",
+        about: "DIM at a k that follows how predictable the stored actions are (the default)",
         layer: layer!("agent/driml-ada"),
     },
     Agent {
         name: "driml-randk",
+        about: "DIM at a k drawn uniformly",
         layer: layer!("agent/driml-randk"),
+    },
+    Agent {
+        name: "driml-noact",
+        about: "DIM that is not told the action",
+        layer: layer!("agent/driml-noact"),
+    },
+    Agent {
+        name: "cpc",
+        about: "one InfoNCE for each of k = 1..5, not told the action",
+        layer: layer!("agent/cpc"),
+    },
+    Agent {
+        name: "curl",
+        about: "two augmentations of the same state, the second one seen by the target network",
+        layer: layer!("agent/curl"),
     },
 ];
 
@@ -235,17 +256,20 @@ fn merge(lower: &mut Table, upper: Table) {
     }
 }
 
-/// What `driml presets` prints.
+/// What `driml presets` prints: presets, then agents.
 pub(crate) fn describe() -> String {
-    let width = PRESETS
-        .iter()
-        .map(|preset| preset.name.len())
+    let presets = PRESETS.iter().map(|preset| (preset.name, preset.about));
+    let agents = AGENTS.iter().map(|agent| (agent.name, agent.about));
+    let width = presets
+        .clone()
+        .chain(agents.clone())
+        .map(|(name, _)| name.len())
         .max()
         .unwrap_or(0);
-    let lines = PRESETS
-        .iter()
-        .map(|preset| format!("{:width$}  {}\n", preset.name, preset.about));
-    lines.collect()
+    let line = |(name, about)| format!("{name:width$}  {about}\n");
+    let presets: String = presets.map(line).collect();
+    let agents: String = agents.map(line).collect();
+    format!("--preset\n{presets}\n--agent\n{agents}")
 }
 
 #[cfg(test)]
@@ -292,6 +316,33 @@ mod tests {
         for layer in all_layers() {
             assert!(layer.text.starts_with("# "), "{}", layer.name);
         }
+    }
+
+    /// The worlds in which an agent's settings pass `test`.
+    fn worlds(name: &str, test: impl Fn(&Table) -> bool) -> String {
+        let chosen: Vec<_> = WorldName::all()
+            .filter(|&world| test(&layers(&PRESETS[0], world, agent(name).unwrap()).unwrap()))
+            .map(|world| world.to_string())
+            .collect();
+        chosen.join(" ")
+    }
+
+    #[test]
+    fn states_are_augmented_where_the_paper_says() {
+        let augments = |table: &Table| table["learner"].get("augment").is_some();
+        expect_test::expect!["procgen:bigfish procgen:bossfight procgen:chaser procgen:coinrun procgen:jumper procgen:leaper procgen:ninja"]
+            .assert_eq(&worlds("driml-fix", augments));
+        assert_eq!(worlds("curl", augments).split(' ').count(), 19);
+        for name in ["c51", "driml-ada", "driml-randk", "driml-noact", "cpc"] {
+            assert_eq!(worlds(name, augments), "", "{name}");
+        }
+    }
+
+    #[test]
+    fn driml_noact_looks_as_far_ahead_as_table_1_says() {
+        let five = |table: &Table| table["run"]["horizon"]["k"].as_integer() == Some(5);
+        expect_test::expect!["procgen:bossfight procgen:chaser procgen:climber procgen:fruitbot procgen:jumper procgen:maze procgen:miner procgen:plunder"]
+            .assert_eq(&worlds("driml-noact", five));
     }
 
     #[test]

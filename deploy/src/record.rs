@@ -64,7 +64,7 @@ pub(crate) struct Summary {
     pub(crate) frames_per_second: f64,
     /// Updates over wall seconds.
     pub(crate) updates_per_second: f64,
-    /// Mean k of all positives served.
+    /// Mean k of the rows served with a positive; of several positives the furthest counts.
     pub(crate) mean_k: Option<f64>,
     /// How often each k was served; index 0 counts rows without a positive.
     pub(crate) k_histogram: Vec<u64>,

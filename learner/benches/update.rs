@@ -1,41 +1,34 @@
-//! One update at the paper's sizes: batch 256, 64x64x3 frames, 15 actions, 51 atoms; C51 alone and with DIM.
-//! Batches are made up, so that nothing but the arithmetic is measured.
+//! One update at the paper's sizes: batch 256, 64x64x3 frames, 15 actions, 51 atoms; of each auxiliary objective, and of
+//! the augmentation of its states alone. Batches are made up, so that nothing but the arithmetic is measured.
 
 #![allow(missing_docs, reason = "criterion's macros make public functions")]
 
 use std::{hint::black_box, time::Duration};
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use driml_learner::{AdamSettings, Batch, Lambda, Learner, LearnerSettings};
-use driml_model::{ConvLayer, ModelConfig};
+use driml_learner::{
+    AdamSettings, Augment, AugmentSettings, Batch, Lambda, Learner, LearnerSettings, Objective,
+};
+use driml_model::{ConvLayer, DimParts, ModelConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 const ROWS: usize = 256;
 const ACTIONS: usize = 15;
+const STATE_BYTES: usize = 64 * 64 * 3;
+/// Positives a row of the agent cpc.
+const CPC: usize = 5;
 
-fn learner(lambda: Lambda) -> Learner {
+fn learner(objective: Objective, lambda: Lambda) -> Learner {
     let layer = |out, kernel, stride| ConvLayer {
         out,
         kernel,
         stride,
     };
-    let model = ModelConfig {
-        height: 64,
-        width: 64,
-        channels: 3,
-        num_actions: ACTIONS,
-        atoms: 51,
-        v_min: -10.0,
-        v_max: 10.0,
-        conv: vec![layer(32, 8, 4), layer(64, 4, 2), layer(64, 3, 1)],
-        hidden: 512,
-        rkhs: 512,
-        action_embed: 64,
-        dim: lambda.dim_parts(true),
-    };
     let settings = LearnerSettings {
         double_dqn: false,
+        objective,
+        condition_on_action: objective == Objective::Dim,
         lambda,
         tanh_clip: 20.0,
         max_grad_norm: 10.0,
@@ -48,46 +41,74 @@ fn learner(lambda: Lambda) -> Learner {
         target_period_updates: 312,
         target_tau: 0.95,
     };
+    let mut model = ModelConfig {
+        height: 64,
+        width: 64,
+        channels: 3,
+        num_actions: ACTIONS,
+        atoms: 51,
+        v_min: -10.0,
+        v_max: 10.0,
+        conv: vec![layer(32, 8, 4), layer(64, 4, 2), layer(64, 3, 1)],
+        hidden: 512,
+        rkhs: 512,
+        action_embed: 64,
+        dim: DimParts::NONE,
+    };
+    model.dim = settings.dim_parts(ACTIONS);
     Learner::new(model, settings, &mut ChaCha8Rng::seed_from_u64(1)).expect("settings in range")
 }
 
+fn frames(rows: usize, seed: u64) -> Vec<u8> {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    (0..rows * STATE_BYTES).map(|_| rng.random()).collect()
+}
+
 fn updates(criterion: &mut Criterion) {
-    let mut rng = ChaCha8Rng::seed_from_u64(2);
-    let mut frames = || {
-        (0..ROWS * 64 * 64 * 3)
-            .map(|_| rng.random())
-            .collect::<Vec<u8>>()
-    };
-    let (frames_t, frames_k, frames_n) = (frames(), frames(), frames());
+    let (frames_t, frames_k, frames_n) = (frames(ROWS, 2), frames(CPC * ROWS, 3), frames(ROWS, 4));
+    let anchors = frames(ROWS, 5);
     let action: Vec<u8> = (0..ROWS).map(|row| (row % ACTIONS) as u8).collect();
     let n_step_return: Vec<f32> = (0..ROWS).map(|row| row as f32 / 64.0 - 2.0).collect();
+    // Now and then an episode ends.
+    let valid: Vec<u8> = (0..CPC * ROWS).map(|at| u8::from(at % 100 != 0)).collect();
 
     let mut group = criterion.benchmark_group("update");
     group
         .throughput(Throughput::Elements(1))
         .sample_size(20)
         .measurement_time(Duration::from_secs(10));
-    for (name, l3t3, l4t4) in [
-        ("c51", 0.0, 0.0),
-        ("c51+4t4", 0.0, 1.0),
-        ("c51+3t3+4t4", 1.0, 1.0),
+    for (name, objective, l3t3, l4t4, positives, augmented) in [
+        ("c51", Objective::None, 0.0, 0.0, 0, false),
+        ("c51+4t4", Objective::Dim, 0.0, 1.0, 1, false),
+        ("c51+3t3+4t4", Objective::Dim, 1.0, 1.0, 1, false),
+        ("c51+4t4, augmented", Objective::Dim, 0.0, 1.0, 1, true),
+        ("cpc", Objective::Cpc, 0.0, 1.0, CPC, false),
+        ("curl", Objective::Curl, 0.0, 1.0, 1, true),
     ] {
-        let mut learner = learner(Lambda {
-            l3t3,
-            l3t4: 0.0,
-            l4t3: 0.0,
-            l4t4,
-        });
+        let mut learner = learner(
+            objective,
+            Lambda {
+                l3t3,
+                l3t4: 0.0,
+                l4t3: 0.0,
+                l4t4,
+            },
+        );
         let batch = Batch {
             rows: ROWS,
             frames_t: &frames_t,
-            frames_k: (l4t4 > 0.0).then_some(frames_k.as_slice()),
+            anchors: augmented.then_some(anchors.as_slice()),
+            positives,
+            frames_k: &frames_k[..positives * ROWS * STATE_BYTES],
             frames_n: &frames_n,
             action: &action,
             next_action: &action,
             n_step_return: &n_step_return,
             bootstrap_discount: &[0.93; ROWS],
-            positive_valid: &[1; ROWS],
+            positive_valid: match positives {
+                CPC => &valid,
+                _ => &[1; ROWS][..positives * ROWS],
+            },
         };
         group.bench_function(name, |bencher| {
             bencher.iter(|| black_box(learner.update(&batch).expect("a good batch")));
@@ -96,5 +117,32 @@ fn updates(criterion: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, updates);
+fn augmentation(criterion: &mut Criterion) {
+    let states = frames(ROWS, 6);
+    let mut seen = Vec::new();
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    let mut group = criterion.benchmark_group("augment");
+    group.throughput(Throughput::Elements(ROWS as u64));
+    for (name, crop_side, jitter) in [
+        ("crop and jitter", 0.8, 0.4),
+        ("crop", 0.8, 0.0),
+        ("jitter", 1.0, 0.4),
+        ("nothing", 1.0, 0.0),
+    ] {
+        let settings = AugmentSettings {
+            crop_side,
+            brightness: jitter,
+            contrast: jitter,
+            saturation: jitter,
+            hue: jitter,
+        };
+        let mut augment = Augment::new(settings, (64, 64, 3), 3);
+        group.bench_function(name, |bencher| {
+            bencher.iter(|| augment.apply(black_box(&states), &mut seen, &mut rng));
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, updates, augmentation);
 criterion_main!(benches);

@@ -3,20 +3,26 @@
 
 use driml_model::ModelConfig;
 
-use crate::update::UpdateError;
+use crate::{auxiliary::Auxiliary, update::UpdateError};
 
 /// Stands in `next_action` where a row has none: its transition ended the episode or the level.
 pub const NO_ACTION: u8 = 255;
 
 /// Rows (s_t, a_t, a_{t+1}, n-step return, discount, s_{t+k}, s_{t+n}), plane by plane; B rows each.
+///
+/// For CURL, whose positive is no later state, `anchors` and `frames_k` are two views of s_t.
 #[derive(Clone, Copy, Debug)]
 pub struct Batch<'a> {
     /// Rows, B, at least 1.
     pub rows: usize,
     /// s_t [B, H, W, C].
     pub frames_t: &'a [u8],
-    /// s_{t+k} [B, H, W, C]; `None` where the agent has no use for it.
-    pub frames_k: Option<&'a [u8]>,
+    /// s_t as the auxiliary objective sees it, augmented [B, H, W, C]; `None` where that is `frames_t`.
+    pub anchors: Option<&'a [u8]>,
+    /// Positives of a row, P; 0 where the agent has no use for any.
+    pub positives: usize,
+    /// s_{t+k} as the auxiliary objective sees it [P, B, H, W, C].
+    pub frames_k: &'a [u8],
     /// s_{t+n} [B, H, W, C].
     pub frames_n: &'a [u8],
     /// a_t [B].
@@ -27,38 +33,45 @@ pub struct Batch<'a> {
     pub n_step_return: &'a [f32],
     /// gamma^n, or 0 where the episode ended within the n steps [B], in [0, 1].
     pub bootstrap_discount: &'a [f32],
-    /// 0 where the row has no positive [B].
+    /// 0 where the row has no such positive [P, B].
     pub positive_valid: &'a [u8],
 }
 
 impl Batch<'_> {
-    /// Checks lengths against `model`, actions, returns and discounts.
+    /// Checks lengths against `model`, positives against `auxiliary`, actions, returns and discounts.
     ///
     /// # Errors
     /// [`UpdateError::Batch`] with the first fault found.
-    pub fn validate(&self, model: &ModelConfig, needs_positives: bool) -> Result<(), UpdateError> {
+    pub fn validate(&self, model: &ModelConfig, auxiliary: &Auxiliary) -> Result<(), UpdateError> {
         let fault = |what: String| Err(UpdateError::Batch(what));
         let rows = self.rows;
         if rows == 0 {
             return fault("it has no rows".to_owned());
         }
         let state_bytes = model.height * model.width * model.channels;
-        let frames_k = match self.frames_k {
-            Some(frames) => frames.len(),
-            None if needs_positives => {
-                return fault("it has no positives, which DIM needs".to_owned());
-            }
-            None => rows * state_bytes,
+        let (positives, views) = (self.positives, self.anchors.is_some());
+        let (fits, wants) = match auxiliary {
+            Auxiliary::None => (true, "any number"),
+            Auxiliary::Dim(_) => (positives == 1, "one"),
+            Auxiliary::Cpc(_) => (positives >= 1, "one or more"),
+            Auxiliary::Curl(_) => (positives == 1 && views, "two views of each state"),
         };
+        if !fits {
+            return fault(format!(
+                "it has {positives} positives a row; this agent needs {wants}"
+            ));
+        }
+        let anchors = self.anchors.unwrap_or(self.frames_t);
         for (name, length, row_length) in [
             ("frames_t", self.frames_t.len(), state_bytes),
-            ("frames_k", frames_k, state_bytes),
+            ("anchors", anchors.len(), state_bytes),
+            ("frames_k", self.frames_k.len(), positives * state_bytes),
             ("frames_n", self.frames_n.len(), state_bytes),
             ("action", self.action.len(), 1),
             ("next_action", self.next_action.len(), 1),
             ("n_step_return", self.n_step_return.len(), 1),
             ("bootstrap_discount", self.bootstrap_discount.len(), 1),
-            ("positive_valid", self.positive_valid.len(), 1),
+            ("positive_valid", self.positive_valid.len(), positives),
         ] {
             if length != rows * row_length {
                 return fault(format!(

@@ -290,7 +290,7 @@ pub fn load(
         loaded.map_err(|why| damaged(path, name, why.to_string()))
     };
     let online = parameters(model, ONLINE)?;
-    let target = parameters(&model.without_dim(), TARGET)?;
+    let target = parameters(&settings.target_model(model), TARGET)?;
     let moments = candle_core::safetensors::load_buffer(&tensors(OPTIMIZER)?, &Device::Cpu)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
     let mut learner = Learner::from_parameters(model.clone(), settings.clone(), online, target)?;

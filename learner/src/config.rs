@@ -14,6 +14,8 @@ use crate::{
         AffinityError, AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity,
         LearnedSettings,
     },
+    augment::AugmentSettings,
+    auxiliary::Objective,
     update::LearnerSettings,
 };
 
@@ -33,6 +35,8 @@ pub struct Config {
     pub checkpoints_kept: u32,
     /// Losses, optimiser and target network.
     pub update: LearnerSettings,
+    /// What is done to the states that the auxiliary objective sees; nothing if it is not there.
+    pub augment: Option<AugmentSettings>,
     /// Action affinity.
     pub affinity: AffinityConfig,
 }
@@ -173,7 +177,33 @@ impl Config {
                 });
             }
         }
-        Ok(())
+        if let Some(augment) = &self.augment {
+            augment
+                .validate()
+                .map_err(|(key, value, why)| ConfigError {
+                    key,
+                    value: value.to_string(),
+                    why: why.into(),
+                })?;
+        }
+        let bad = |value: &str, why: &str| {
+            Err(ConfigError {
+                key: "augment",
+                value: value.into(),
+                why: why.into(),
+            })
+        };
+        match (self.update.objective, self.augment) {
+            (Objective::Curl, None) => bad(
+                "(missing)",
+                "CURL compares two augmentations of a state: take the agent curl, or set all of learner.augment",
+            ),
+            (Objective::None, Some(_)) => bad(
+                "(there)",
+                "nothing but an auxiliary objective sees augmented states, and this agent has none",
+            ),
+            _ => Ok(()),
+        }
     }
 }
 

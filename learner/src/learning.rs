@@ -11,6 +11,8 @@ use rayon::prelude::*;
 
 use crate::{
     affinity::AffinityEstimator,
+    augment::Augment,
+    auxiliary::Objective,
     batch::Batch,
     checkpoint::{self, RunState},
     config::LearnerPart,
@@ -30,6 +32,9 @@ pub struct Learning {
     enlarge: Option<Enlarge>,
     /// States of the last batch at the network's input size, if that is another: memory to use again.
     enlarged: [Vec<u8>; 3],
+    augment: Option<Augment>,
+    /// What the auxiliary objective sees of the last batch, if that is not the plain states: memory to use again.
+    seen: [Vec<u8>; 2],
     weights_version: u64,
 }
 
@@ -52,6 +57,10 @@ impl Learning {
         let enlarge = (from != to)
             .then(|| Enlarge::new(from, to, part.model.channels))
             .transpose()?;
+        let augment = part.learner.augment.map(|settings| {
+            let size = (to.0, to.1, part.model.channels);
+            Augment::new(settings, size, spec.frame_channels as usize)
+        });
         Ok(Self {
             spec_hash: spec.hash(),
             learner,
@@ -59,6 +68,8 @@ impl Learning {
             rng,
             enlarge,
             enlarged: Default::default(),
+            augment,
+            seen: Default::default(),
             weights_version: 0,
             part,
         })
@@ -127,26 +138,39 @@ impl Learning {
                 *states = larger;
             }
         }
+        let [frames_t, mut frames_k, frames_n] = frames;
+        let (mut positives, mut valid) = (batch.positives(), batch.positive_valid());
+        let mut anchors = None;
+        // Kept only if the update succeeds.
+        let mut rng = self.rng.clone();
+        let all_valid;
+        if let Some(augment) = &mut self.augment {
+            if self.part.learner.update.objective == Objective::Curl {
+                // Two views of the same state; every row has them.
+                all_valid = vec![1; batch.rows()];
+                (frames_k, positives, valid) = (frames_t, 1, all_valid.as_slice());
+            }
+            let [seen_t, seen_k] = &mut self.seen;
+            augment.apply(frames_t, seen_t, &mut rng);
+            augment.apply(frames_k, seen_k, &mut rng);
+            (anchors, frames_k) = (Some(seen_t.as_slice()), seen_k);
+        }
         let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
-        let without_positives;
-        let positive_valid = if batch.positives() > 0 {
-            batch.positive_valid()
-        } else {
-            without_positives = vec![0; batch.rows()];
-            &without_positives
-        };
         let batch = Batch {
             rows: batch.rows(),
-            frames_t: frames[0],
-            frames_k: (batch.positives() > 0).then_some(frames[1]),
-            frames_n: frames[2],
+            frames_t,
+            anchors,
+            positives,
+            frames_k,
+            frames_n,
             action: batch.actions(),
             next_action: batch.next_actions(),
             n_step_return: &returns,
             bootstrap_discount: &discounts,
-            positive_valid,
+            positive_valid: valid,
         };
         let report = self.learner.update(&batch)?;
+        self.rng = rng;
         if let Some(affinity) = &mut self.affinity {
             affinity.observe(&batch.action_pairs(), &mut self.rng)?;
         }

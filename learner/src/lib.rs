@@ -4,6 +4,7 @@
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 pub mod affinity;
+pub mod augment;
 pub mod auxiliary;
 pub mod batch;
 pub mod batch_source;
@@ -22,7 +23,8 @@ pub mod update;
 pub use affinity::{
     AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
 };
-pub use auxiliary::dim::Lambda;
+pub use augment::{Augment, AugmentSettings};
+pub use auxiliary::{Objective, dim::Lambda};
 pub use batch::{Batch, NO_ACTION};
 pub use config::{AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart};
 pub use learning::{Learning, Weights};

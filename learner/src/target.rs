@@ -1,4 +1,4 @@
-//! The target network: a slow copy of the online network's torso and head.
+//! The target network: a slow copy of the online network's torso and C51 head, and of the head that encodes CURL's keys.
 //! It decides neither when it follows (`update` does) nor what is computed with it.
 
 use std::collections::HashMap;
@@ -14,23 +14,18 @@ use crate::{
 /// Names of the parameters that only the auxiliary loss uses begin so.
 pub const AUXILIARY_PREFIX: &str = "dim.";
 
-/// A deep copy of the acting part of `online`.
+/// A deep copy of what the target network of `model` has of `online`.
 ///
 /// # Errors
 /// A parameter that is missing.
 pub fn copy_of(model: &ModelConfig, online: &Parameters) -> Result<Parameters, UpdateError> {
     let mut tensors = HashMap::new();
-    for (name, var) in online
-        .iter()
-        .filter(|(name, _)| !name.starts_with(AUXILIARY_PREFIX))
-    {
-        tensors.insert(name.to_owned(), var.copy()?);
+    for (name, _) in model.parameter_shapes() {
+        if let Some(var) = online.get(&name) {
+            tensors.insert(name, var.copy()?);
+        }
     }
-    Ok(Parameters::from_tensors(
-        &model.without_dim(),
-        tensors,
-        &Device::Cpu,
-    )?)
+    Ok(Parameters::from_tensors(model, tensors, &Device::Cpu)?)
 }
 
 /// Moves `target` towards `online`, in place: `target <- tau * online + (1 - tau) * target`.

@@ -1,16 +1,18 @@
 //! One update: C51 plus the auxiliary objective, clipped, through Adam; then the target network's turn.
 //! It does not fetch batches, publish weights or keep checkpoints, and knows no process but its own.
 
-use std::collections::HashMap;
+use std::{borrow::Cow, collections::HashMap};
 
 use candle_core::{Device, Tensor};
-use driml_model::{DimParts, ModelConfig, Network, Parameters};
+use driml_model::{DimParts, Features, ModelConfig, Network, Parameters};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::{
     auxiliary::{
-        Auxiliary,
+        Auxiliary, Objective,
+        cpc::{self, Cpc},
+        curl::Curl,
         dim::{Dim, Lambda, PAIRS},
     },
     batch::Batch,
@@ -28,9 +30,13 @@ use crate::{
 pub struct LearnerSettings {
     /// Choose the action in s_{t+n} by the online network instead of the target network.
     pub double_dqn: bool,
-    /// Weights of the DIM losses; all 0 for an agent without DIM.
+    /// The auxiliary objective.
+    pub objective: Objective,
+    /// Whether Psi is given a_t, in a world where there is something to decide.
+    pub condition_on_action: bool,
+    /// Weights of the auxiliary losses, by pair of levels; all 0 for an agent without any.
     pub lambda: Lambda,
-    /// Bound c of the DIM scores' soft clip `c * tanh(x / c)`, above 0.
+    /// Bound c of the auxiliary scores' soft clip `c * tanh(x / c)`, above 0.
     pub tanh_clip: f64,
     /// Global 2-norm to which gradients are clipped, above 0.
     pub max_grad_norm: f64,
@@ -68,18 +74,37 @@ impl LearnerSettings {
             }
         }
         self.lambda.validate()?;
+        self.objective
+            .check(&self.lambda, self.condition_on_action)
+            .map_err(UpdateError::Objective)?;
         self.adam.validate()
     }
 
-    /// The auxiliary objective that the weights ask for.
+    /// The auxiliary objective.
     pub fn auxiliary(&self) -> Auxiliary {
-        if self.lambda.wanted().contains(&true) {
-            Auxiliary::Dim(Dim {
-                lambda: self.lambda,
-                tanh_clip: self.tanh_clip,
-            })
-        } else {
-            Auxiliary::None
+        let Self {
+            lambda, tanh_clip, ..
+        } = *self;
+        let pairs = Dim { lambda, tanh_clip };
+        match self.objective {
+            Objective::None => Auxiliary::None,
+            Objective::Dim => Auxiliary::Dim(pairs),
+            Objective::Cpc => Auxiliary::Cpc(Cpc { pairs }),
+            Objective::Curl => Auxiliary::Curl(Curl { tanh_clip }),
+        }
+    }
+
+    /// The heads that the online network needs in a world of `num_actions` actions.
+    pub fn dim_parts(&self, num_actions: usize) -> DimParts {
+        let action = self.condition_on_action && num_actions > 1;
+        self.objective.heads(&self.lambda, action)
+    }
+
+    /// The target network for an online network of `model`: torso, C51 head, and the head that encodes CURL's keys.
+    pub fn target_model(&self, model: &ModelConfig) -> ModelConfig {
+        ModelConfig {
+            dim: self.objective.target_heads(),
+            ..model.clone()
         }
     }
 }
@@ -93,6 +118,9 @@ pub enum UpdateError {
     /// A setting out of its range.
     #[error("{0}: that cannot work; start from a preset")]
     Settings(String),
+    /// Settings of the auxiliary objective that are at odds with each other.
+    #[error("{0}")]
+    Objective(String),
     /// State that does not fit the network, as from another run's checkpoint.
     #[error("learner state does not fit: {0}")]
     State(String),
@@ -115,7 +143,7 @@ pub enum UpdateError {
 pub struct UpdateReport {
     /// Mean KL divergence of the prediction from the projected target, in nats.
     pub c51_kl: f32,
-    /// DIM losses in nats, in the order of [`PAIRS`]; `None` for pairs of weight 0.
+    /// Auxiliary losses in nats, in the order of [`PAIRS`]; `None` for pairs of weight 0.
     pub dim: [Option<f32>; 4],
     /// `c51_kl + sum of lambda * dim`.
     pub total: f32,
@@ -130,7 +158,7 @@ pub struct UpdateReport {
 pub struct Evaluation {
     /// Mean KL divergence, in nats.
     pub c51_kl: f32,
-    /// DIM losses in nats, in the order of [`PAIRS`]; `None` for pairs of weight 0.
+    /// Auxiliary losses in nats, in the order of [`PAIRS`]; `None` for pairs of weight 0.
     pub dim: [Option<f32>; 4],
     /// `c51_kl + sum of lambda * dim`.
     pub total: f32,
@@ -162,14 +190,14 @@ impl Learner {
     /// A learner with initial weights drawn from `rng`; the target network is a copy.
     ///
     /// # Errors
-    /// Settings out of their ranges, or a model whose heads are not those that the lambdas use.
+    /// Settings out of their ranges, or a model whose heads are not those that the objective uses.
     pub fn new(
         model: ModelConfig,
         settings: LearnerSettings,
         rng: &mut ChaCha8Rng,
     ) -> Result<Self, UpdateError> {
         let online = Parameters::init(&model, rng, &Device::Cpu)?;
-        let target = target::copy_of(&model, &online)?;
+        let target = target::copy_of(&settings.target_model(&model), &online)?;
         Self::from_parameters(model, settings, online, target)
     }
 
@@ -188,15 +216,15 @@ impl Learner {
             action: model.dim.embeds_action(),
             ..model.dim
         };
-        let needed = settings.lambda.dim_parts(built.action);
+        let needed = settings.dim_parts(model.num_actions);
         if needed != built {
             return Err(UpdateError::Settings(format!(
-                "the lambdas use {needed:?}, the model builds {built:?}"
+                "the objective uses {needed:?}, the model builds {built:?}"
             )));
         }
         Ok(Self {
             online_network: Network::new(&model, &online)?,
-            target_network: Network::new(&model.without_dim(), &target)?,
+            target_network: Network::new(&settings.target_model(&model), &target)?,
             adam: Adam::new(settings.adam, &online),
             auxiliary: settings.auxiliary(),
             updates: 0,
@@ -269,7 +297,7 @@ impl Learner {
     /// # Errors
     /// A batch that does not fit, or losses that are not finite.
     pub fn evaluate(&self, batch: &Batch<'_>) -> Result<Evaluation, UpdateError> {
-        batch.validate(&self.model, self.auxiliary.needs_positives())?;
+        batch.validate(&self.model, &self.auxiliary)?;
         let (next_greedy_action, target_projection) = self.make_target(batch)?;
 
         let features_t = self
@@ -282,22 +310,11 @@ impl Learner {
 
         let mut total = kl;
         let mut dim = [None; 4];
-        if let (Auxiliary::Dim(objective), Some(frames_k)) = (&self.auxiliary, batch.frames_k) {
-            let features_k = self
-                .online_network
-                .features(&self.frames(batch.rows, frames_k)?)?;
-            let losses = objective.losses(
-                &self.online_network,
-                &features_t,
-                &features_k,
-                &Tensor::from_slice(batch.action, batch.rows, &Device::Cpu)?,
-                batch.positive_valid,
-            )?;
-            for (i, (loss, lambda)) in losses.iter().zip(objective.lambda.values()).enumerate() {
-                if let Some(loss) = loss {
-                    dim[i] = Some(finite(PAIRS[i], loss)?);
-                    total = (total + loss.affine(lambda, 0.0)?)?;
-                }
+        let losses = self.auxiliary_losses(batch, &features_t)?;
+        for (i, (loss, lambda)) in losses.iter().zip(self.settings.lambda.values()).enumerate() {
+            if let Some(loss) = loss {
+                dim[i] = Some(finite(PAIRS[i], loss)?);
+                total = (total + loss.affine(lambda, 0.0)?)?;
             }
         }
         let total_value = finite("the total loss", &total)?;
@@ -311,6 +328,48 @@ impl Learner {
             target_projection,
             gradients,
         })
+    }
+
+    /// The auxiliary losses, in the order of [`PAIRS`], before their weights; the torso sees what they need and no more.
+    ///
+    /// `features_t` are the online network's of the plain s_t, which serve again where the objective sees it plain.
+    fn auxiliary_losses(
+        &self,
+        batch: &Batch<'_>,
+        features_t: &Features,
+    ) -> Result<[Option<Tensor>; 4], UpdateError> {
+        if self.auxiliary == Auxiliary::None {
+            return Ok([const { None }; 4]);
+        }
+        let online = &self.online_network;
+        let seen = match batch.anchors {
+            Some(anchors) => Some(online.features(&self.frames(batch.rows, anchors)?)?),
+            None => None,
+        };
+        let anchors = seen.as_ref().unwrap_or(features_t);
+        let action = Tensor::from_slice(batch.action, batch.rows, &Device::Cpu)?;
+        let valid = batch.positive_valid;
+        match &self.auxiliary {
+            Auxiliary::None => Ok([const { None }; 4]),
+            Auxiliary::Dim(dim) => {
+                let later = online.features(&self.frames(batch.rows, batch.frames_k)?)?;
+                dim.losses(online, anchors, &later, &action, valid)
+            }
+            Auxiliary::Cpc(cpc) => {
+                let there = cpc::present(batch.frames_k, valid);
+                let count = valid.iter().filter(|&&valid| valid != 0).count();
+                let later = match count {
+                    0 => None,
+                    _ => Some(online.features(&self.frames(count, there)?)?),
+                };
+                cpc.losses(online, anchors, later.as_ref(), &action, valid)
+            }
+            Auxiliary::Curl(curl) => {
+                let target = &self.target_network;
+                let key = target.features(&self.frames(batch.rows, batch.frames_k)?)?;
+                curl.losses((online, anchors), (target, &key), &action)
+            }
+        }
     }
 
     /// Clips `gradients` and takes one step with them; moves the target network when it is its turn.
@@ -380,18 +439,22 @@ impl Learner {
         Ok((next_greedy, projected))
     }
 
-    fn frames(&self, rows: usize, frames: &[u8]) -> Result<Tensor, UpdateError> {
+    fn frames<'a>(
+        &self,
+        rows: usize,
+        frames: impl Into<Cow<'a, [u8]>>,
+    ) -> Result<Tensor, UpdateError> {
         let ModelConfig {
             height,
             width,
             channels,
             ..
         } = self.model;
-        Ok(Tensor::from_slice(
-            frames,
-            (rows, height, width, channels),
-            &Device::Cpu,
-        )?)
+        let shape = (rows, height, width, channels);
+        Ok(match frames.into() {
+            Cow::Borrowed(frames) => Tensor::from_slice(frames, shape, &Device::Cpu)?,
+            Cow::Owned(frames) => Tensor::from_vec(frames, shape, &Device::Cpu)?,
+        })
     }
 
     /// Puts back a state that [`Learner::online`], [`Learner::target`] and [`Adam`] had after `updates` updates.

@@ -64,7 +64,8 @@ pub struct ReplayStatus {
     pub episodes: u64,
     /// Mean undiscounted return of the last 100 episodes; none before the first.
     pub mean_return: Option<f64>,
-    /// How often each k was served; index 0 counts rows without a positive.
+    /// How often each k was served; index 0 counts rows without a positive. A row of several positives counts once, under
+    /// its furthest.
     pub k_histogram: Vec<u64>,
     /// Mean age of the rows served last, in transitions stored since theirs.
     pub mean_age: f64,
@@ -142,7 +143,7 @@ impl ReplayStatus {
         (after > 0).then(|| self.rows_sampled as f64 / after as f64)
     }
 
-    /// Mean k over all positives served; none before the first.
+    /// Mean k, over the rows served with a positive, of the furthest; none before the first.
     pub fn mean_k(&self) -> Option<f64> {
         let positives: u64 = self.k_histogram.iter().skip(1).sum();
         let weighted: u64 = self

@@ -6,11 +6,14 @@ use sha2::{Digest, Sha256};
 
 use crate::{PROTOCOL_VERSION, codec};
 
+/// Most positives a row can carry; a rule that asks for more is refused.
+pub const POSITIVES_MAX: usize = 32;
+
 /// How far ahead a positive lies: the rule by which the replay server draws k.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "rule", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Horizon {
-    /// No positive is served: the agent has no DIM loss.
+    /// No positive is served: the agent looks at no later state.
     None,
     /// k, or the steps left in the episode if fewer.
     Fixed {
@@ -27,6 +30,11 @@ pub enum Horizon {
         /// Environment steps ahead, at least 1.
         k_max: u32,
     },
+    /// Every k of 1..=k_max, each a positive of its own (CPC); those past the end of the episode are missing.
+    All {
+        /// Environment steps ahead, 1 to 32.
+        k_max: u32,
+    },
 }
 
 impl Horizon {
@@ -35,15 +43,16 @@ impl Horizon {
         match self {
             Self::None => 0,
             Self::Fixed { .. } | Self::Uniform { .. } | Self::Nhg { .. } => 1,
+            Self::All { k_max } => *k_max as usize,
         }
     }
 
-    /// The largest k that can be drawn, environment steps; 0 where none is.
+    /// The largest k that can be served, environment steps; 0 where none is.
     pub const fn k_max(&self) -> u32 {
         match *self {
             Self::None => 0,
             Self::Fixed { k } => k,
-            Self::Uniform { k_max } | Self::Nhg { k_max } => k_max,
+            Self::Uniform { k_max } | Self::Nhg { k_max } | Self::All { k_max } => k_max,
         }
     }
 }
@@ -170,6 +179,13 @@ impl RunSpec {
         let k_max = self.horizon.k_max();
         if self.horizon != Horizon::None && (k_max == 0 || k_max > 1000) {
             return bad("horizon", k_max.to_string(), "k lies between 1 and 1000");
+        }
+        if self.horizon.positives() > POSITIVES_MAX {
+            return bad(
+                "horizon",
+                k_max.to_string(),
+                "a row carries at most 32 positives",
+            );
         }
         Ok(())
     }

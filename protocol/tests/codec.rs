@@ -768,6 +768,10 @@ fn the_hash_knows_every_field() {
             ..base()
         },
         RunSpec {
+            horizon: Horizon::All { k_max: 5 },
+            ..base()
+        },
+        RunSpec {
             horizon: Horizon::None,
             ..base()
         },

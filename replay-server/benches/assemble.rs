@@ -61,6 +61,7 @@ fn chunk(sequence: u64) -> Chunk {
 fn filled(frame_stack: u32) -> (Replay, Chunk) {
     let config = Config {
         capacity_transitions: CAPACITY,
+        shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
         replay_ratio: 1e9,

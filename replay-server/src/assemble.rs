@@ -1,7 +1,9 @@
 //! Makes one row of a batch: a_t, a_{t+1}, the n-step return, and which transitions' states are s_t, s_{t+n} and s_{t+k}, with
-//! k drawn here. It does not choose the anchor and reads no frame.
+//! each k drawn here. It does not choose the anchor and reads no frame.
 
-use driml_protocol::{End, Horizon, NO_ACTION, RunSpec, TimeoutRule, batch::BatchRowsMut};
+use driml_protocol::{
+    End, Horizon, NO_ACTION, RunSpec, TimeoutRule, batch::BatchRowsMut, run_spec::POSITIVES_MAX,
+};
 use rand::Rng;
 
 use crate::{
@@ -15,20 +17,27 @@ pub(crate) struct RowStates {
     t: u64,
     /// Where the row bootstraps from.
     n: Option<u64>,
-    /// k and s_{t+k}.
-    positive: Option<(u32, u64)>,
+    /// k of the first positive; the others follow it step by step.
+    k_first: u32,
+    /// Positives that the row has.
+    positives: usize,
+    /// s_{t+k} of each.
+    s_tpk: [u64; POSITIVES_MAX],
 }
 
 impl RowStates {
-    /// k, 0 without a positive.
+    /// k, of several positives the furthest, 0 without any.
     pub(crate) fn k(&self) -> u32 {
-        self.positive.map_or(0, |(k, _)| k)
+        match self.positives {
+            0 => 0,
+            positives => self.k_first + positives as u32 - 1,
+        }
     }
 
-    /// s_t, s_{t+n}, s_{t+k}: those that the row has.
+    /// s_t, s_{t+n}, s_{t+k} for each k: those that the row has.
     pub(crate) fn indices(&self) -> impl Iterator<Item = u64> {
-        let positive = self.positive.map(|(_, index)| index);
-        [Some(self.t), self.n, positive].into_iter().flatten()
+        let first = [Some(self.t), self.n].into_iter().flatten();
+        first.chain(self.s_tpk.into_iter().take(self.positives))
     }
 
     /// Calls `write` with the index and the place of each state, in the order of [`RowStates::indices`]; the places of the
@@ -44,9 +53,13 @@ impl RowStates {
             Some(index) => write(index, rows.frame_n(row)),
             None => rows.frame_n(row).fill(0),
         }
-        match self.positive {
-            Some((k, index)) => write(index, rows.positive(0, row, k)),
-            None => (0..rows.positives()).for_each(|p| rows.no_positive(p, row)),
+        for p in 0..rows.positives() {
+            if p < self.positives {
+                let place = rows.positive(p, row, self.k_first + p as u32);
+                write(self.s_tpk[p], place);
+            } else {
+                rows.no_positive(p, row);
+            }
         }
     }
 }
@@ -94,12 +107,24 @@ impl Assembler {
             n_step_return as f32,
             discount as f32,
         );
-        let k = self.draw_k(affinity, window, rng);
-        RowStates {
+        let furthest = self.draw_k(affinity, window, rng).unwrap_or(0);
+        let k_first = match self.horizon {
+            Horizon::All { .. } => 1,
+            _ => furthest,
+        };
+        let mut states = RowStates {
             t: window.index(0),
             n: bootstrap.map(|i| window.index(i)),
-            positive: k.map(|k| (k, window.index(k as usize))),
+            k_first,
+            positives: 0,
+            s_tpk: [0; POSITIVES_MAX],
+        };
+        // A k of 0 is none.
+        for k in (k_first..=furthest).filter(|&k| k > 0) {
+            states.s_tpk[states.positives] = window.index(k as usize);
+            states.positives += 1;
         }
+        states
     }
 
     /// Sum of gamma^i r_{t+i} over i < n, and the i of the state to bootstrap from: n, unless the episode ended before.
@@ -121,7 +146,7 @@ impl Assembler {
         (sum, Some(n))
     }
 
-    /// k, or none without DIM or where a_t ended its episode or level.
+    /// k, or none where no positive is served or a_t ended its episode or level.
     ///
     /// H is the number of states after s_t, at most k_max, that come before the end of the episode or level.
     fn draw_k(&mut self, affinity: &Affinity, window: &Window, rng: &mut impl Rng) -> Option<u32> {

@@ -120,6 +120,31 @@ fn mspacman_with_stacked_and_enlarged_frames() {
     assert_eq!(summary.mean_k, Some(1.0), "driml-fix serves k = 1 here");
 }
 
+/// Five positives a row over zenoh for cpc, none for curl; and the checkpoints can be played.
+#[test]
+fn cpc_and_curl_get_what_they_need_and_no_more() {
+    let system = system();
+    for (agent, served) in [("cpc", 5), ("curl", 0)] {
+        system
+            .run(&format!("local --agent {agent} {SHORT} --run-dir {agent}"))
+            .expect_code(0);
+        let run = system.run_folder(agent);
+        let summary = run.check_finished();
+        assert_eq!((summary.frames, summary.updates), (1280, 540));
+        // Rows by their furthest k: every one up to 5 is served where the episode is long enough.
+        assert_eq!(summary.k_histogram.len(), served + 1);
+        assert!(summary.k_histogram.iter().all(|&count| count > 0));
+        let (header, rows) = run.metrics();
+        let loss = header.iter().position(|it| it == "dim_4t4").unwrap();
+        let last = rows.last().unwrap()[loss].parse::<f64>().unwrap();
+        assert!(last > 0.0 && last < 16f64.ln() + 1.0, "{agent}: {last}");
+        let ended = system
+            .run(&format!("evaluate --run {agent} --episodes 3"))
+            .expect_code(0);
+        assert!(ended.stdout.contains(agent), "{}", ended.stdout);
+    }
+}
+
 #[test]
 fn the_settings_that_a_run_leaves_repeat_it() {
     let system = system();

@@ -13,7 +13,7 @@ fn cases() -> Vec<PathBuf> {
     let mut paths: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
     paths.retain(|path| path.extension().is_some_and(|it| it == "safetensors"));
     paths.sort();
-    assert!(paths.len() >= 5, "{paths:?}");
+    assert!(paths.len() >= 10, "{paths:?}");
     paths
 }
 
@@ -40,7 +40,7 @@ fn all_cases_are_within_tolerance() {
         .filter(|line| line.starts_with("  "))
         .collect();
     assert!(
-        verdicts.len() > 20 * cases.len() && verdicts.iter().all(|line| line.ends_with("  ok")),
+        verdicts.len() > 12 * cases.len() && verdicts.iter().all(|line| line.ends_with("  ok")),
         "{}",
         ended.stdout
     );

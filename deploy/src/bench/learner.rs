@@ -96,7 +96,9 @@ impl MadeUp {
         Batch {
             rows: self.action.len(),
             frames_t,
-            frames_k: Some(frames_k),
+            anchors: None,
+            positives: 1,
+            frames_k,
             frames_n,
             action: &self.action,
             next_action: &self.next_action,

@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use anyhow::{Context, ensure};
+use anyhow::ensure;
 use candle_core::{D, DType, Device, Result, Tensor, Var};
 use candle_nn::{
     AdamW, Optimizer, ParamsAdamW,
@@ -77,7 +77,6 @@ impl StockLearner {
     /// # Errors
     /// A batch that does not fit.
     pub(super) fn update(&mut self, batch: &Batch<'_>) -> anyhow::Result<f32> {
-        let frames_k = batch.frames_k.context("a batch without positives")?;
         let (target, entropy) = self.projected(batch)?;
         let f4_t = self.f4(&self.online, batch.frames_t)?;
         let logits = self.logits(&self.online, &f4_t)?;
@@ -96,7 +95,7 @@ impl StockLearner {
             .affine(-1.0 / batch.rows as f64, 0.0)?;
         let kl = cross.affine(1.0, -entropy)?;
 
-        let f4_k = self.f4(&self.online, frames_k)?;
+        let f4_k = self.f4(&self.online, batch.frames_k)?;
         let psi = self.head(
             "dim.psi4",
             &Tensor::cat(&[&f4_t, &self.embedded(batch.action)?], 1)?,

@@ -58,7 +58,7 @@ fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
         }
     }
     // Two presets are for all 19 worlds, two for Procgen's 16 games.
-    assert_eq!(resolved, (2 * 19 + 2 * 16) * 4);
+    assert_eq!(resolved, (2 * 19 + 2 * 16) * AGENTS.len());
 }
 
 #[test]
@@ -95,6 +95,14 @@ fn what_nobody_uses_is_not_there() {
     assert_eq!(config.run.horizon, Horizon::None);
     assert_eq!(config.model.dim, driml_model::DimParts::NONE);
     assert_eq!(config.learner.affinity.learned, None);
+    let curl = with("mspacman", "curl", &[]).unwrap();
+    assert_eq!(curl.run.horizon, Horizon::None);
+    let heads = driml_model::DimParts {
+        psi4: true,
+        ..driml_model::DimParts::NONE
+    };
+    assert_eq!(curl.model.dim, heads);
+    assert!(!with("mspacman", "cpc", &[]).unwrap().model.dim.action);
     // Nothing to tell apart in a world with a single action.
     assert!(!with("ising", "driml-fix", &[]).unwrap().model.dim.action);
 }
@@ -107,15 +115,15 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
     expect![[r#"there is no setting "world.num_level" (did you mean "world.num_levels"?); [world] has center_agent, distribution_mode, num_levels, paint_vel_info, restrict_themes, start_level, use_backgrounds, use_sequential_levels"#]].assert_eq(&said("driml-ada", "world.num_level=5"));
     expect!["model.height cannot be set by hand: it follows from input.height"]
         .assert_eq(&said("driml-ada", "model.height=84"));
-    expect!["model.dim cannot be set by hand: it follows from learner.update.lambda"]
+    expect!["model.dim cannot be set by hand: it follows from learner.update"]
         .assert_eq(&said("driml-ada", "model.dim.psi3=true"));
     expect!["run.gamma = 1.5 cannot work: a discount lies between 0 and 1"]
         .assert_eq(&said("driml-ada", "run.gamma=1.5"));
     expect!["run.horizon = 0 cannot work: k lies between 1 and 1000"]
         .assert_eq(&said("driml-ada", "run.horizon={rule=\"fixed\",k=0}"));
-    expect!["in the settings' [run] table: unknown variant `always`, expected one of `none`, `fixed`, `uniform`, `nhg`"].assert_eq(&said("driml-ada", "run.horizon.rule=always"));
-    expect![[r#"run.horizon draws positives, but all of learner.update.lambda are 0: --set 'run.horizon={rule="none"}', or set a lambda above 0"#]].assert_eq(&said("driml-ada", "learner.update.lambda.4t4=0"));
-    expect![[r#"learner.update.lambda asks for DIM, but run.horizon draws no positive: set all four lambdas to 0, or --set 'run.horizon={rule="fixed",k=1}'"#]].assert_eq(&said("c51", "learner.update.lambda.4t4=1"));
+    expect!["in the settings' [run] table: unknown variant `always`, expected one of `none`, `fixed`, `uniform`, `nhg`, `all`"].assert_eq(&said("driml-ada", "run.horizon.rule=always"));
+    expect!["learner.update cannot work: objective = dim, but all lambdas are 0: set one above 0, or take the agent c51"].assert_eq(&said("driml-ada", "learner.update.lambda.4t4=0"));
+    expect!["learner.update cannot work: objective = none computes no auxiliary loss, but lambda.4t4 is above 0: set it to 0, or take another agent"].assert_eq(&said("c51", "learner.update.lambda.4t4=1"));
     expect!["run.horizon follows the action affinity, which nobody estimates: --set learner.affinity.estimator=learned"].assert_eq(&said("driml-ada", "learner.affinity.estimator=none"));
     expect!["learner.affinity.alphabet = (missing) cannot work: the chosen estimator needs it: start from a preset"].assert_eq(&said("driml-fix", "learner.affinity.estimator=exact"));
     expect!["replay.replay_ratio = 0 cannot work: rows per transition must be a number above 0"]
@@ -129,6 +137,32 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
         "driml-ada",
         "replay.capacity_transitions=100000000000",
     ));
+}
+
+#[test]
+fn agents_and_what_their_objectives_need() {
+    let said = |agent: &str, set: &[&str]| with("procgen:bigfish", agent, set).unwrap_err();
+    expect![[r#"run.horizon serves one later state a row, but learner.update.objective = none looks at no later state: --set 'run.horizon={rule="none"}', or take another --agent"#]].assert_eq(&said("c51", &["run.horizon={rule=\"fixed\",k=1}"]));
+    expect![[r#"run.horizon serves no later state a row, but learner.update.objective = dim looks at one later state: --set 'run.horizon={rule="fixed",k=1}', or take another --agent"#]].assert_eq(&said("driml-fix", &["run.horizon={rule=\"none\"}"]));
+    expect![[r#"run.horizon serves 5 later states a row, but learner.update.objective = dim looks at one later state: --set 'run.horizon={rule="fixed",k=1}', or take another --agent"#]].assert_eq(&said("driml-noact", &["run.horizon={rule=\"all\",k_max=5}"]));
+    expect![[r#"run.horizon serves no later state a row, but learner.update.objective = cpc looks at one or more later states: --set 'run.horizon={rule="all",k_max=5}', or take another --agent"#]].assert_eq(&said("cpc", &["run.horizon={rule=\"none\"}"]));
+    expect!["run.horizon = 33 cannot work: a row carries at most 32 positives"]
+        .assert_eq(&said("cpc", &["run.horizon.k_max=33"]));
+    expect!["learner.augment = (missing) cannot work: CURL compares two augmentations of a state: take the agent curl, or set all of learner.augment"].assert_eq(&said(
+        "c51",
+        &["learner.update.objective=curl", "learner.update.lambda.4t4=1"],
+    ));
+    expect!["learner.augment.hue = 0.6 cannot work: it must lie between 0 and 0.5, half a turn either way"]
+        .assert_eq(&said("curl", &["learner.augment.hue=0.6"]));
+    expect!["in the settings' [learner.update] table: unknown variant `clear`, expected one of `none`, `dim`, `cpc`, `curl`"].assert_eq(&said("curl", &["learner.update.objective=clear"]));
+    let five = with("procgen:heist", "driml-noact", &["run.horizon.k=5"]).unwrap();
+    assert_eq!(five.run.horizon, Horizon::Fixed { k: 5 });
+    assert!(!five.model.dim.action && five.model.dim.psi4);
+    // Any agent that looks at later states can augment.
+    let augment =
+        "learner.augment={crop_side=0.9,brightness=0.1,contrast=0.0,saturation=0,hue=0.2}";
+    let augmented = with("procgen:heist", "driml-noact", &[augment]).unwrap();
+    assert_eq!(augmented.learner.augment.unwrap().crop_side, 0.9);
 }
 
 #[test]
@@ -175,6 +209,29 @@ fn a_file_at_odds_with_itself_is_refused() {
 }
 
 #[test]
+fn settings_from_before_there_were_objectives_are_read() {
+    for (world, agent) in [
+        ("mspacman", "c51"),
+        ("mspacman", "driml-ada"),
+        ("ising", "driml-fix"),
+    ] {
+        let new = with(world, agent, &[]).unwrap();
+        let text = new.to_toml();
+        let without = |line: &&str| {
+            !line.starts_with("objective =") && !line.starts_with("condition_on_action =")
+        };
+        let old: Vec<_> = text.lines().filter(without).collect();
+        assert_eq!(old.len() + 2, text.lines().count());
+        let read = RunConfig::parse("old.toml", &old.join("\n")).unwrap();
+        assert_eq!(
+            (read.learner.update.objective, &read.model),
+            (new.learner.update.objective, &new.model)
+        );
+        assert_eq!(read.run.hash(), new.run.hash());
+    }
+}
+
+#[test]
 fn flags_come_before_set_and_both_before_the_machine() {
     let flags = Flags {
         replay_shards: None,
@@ -213,7 +270,6 @@ fn the_replay_fits_the_memory_and_says_so() {
     )
     .unwrap();
     expect![[r#"
-        the paper's driml-fix augments the DIM inputs on this game; this build does not augment, so expect other numbers
         the replay holds the newest 348617 transitions instead of 1000000: 8.0 GiB of memory are free, and half is taken"#]].assert_eq(&config.notes.join("\n"));
     assert!(config.replay.capacity_transitions < 400_000);
     let large = Machine {

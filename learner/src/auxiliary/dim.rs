@@ -113,10 +113,7 @@ impl Dim {
 
     /// How dot products of vectors of `rkhs` numbers become scores.
     pub fn scores(&self, rkhs: usize) -> Scores {
-        Scores {
-            scale: 1.0 / (rkhs as f64).sqrt(),
-            tanh_clip: self.tanh_clip,
-        }
+        Scores::new(rkhs, self.tanh_clip)
     }
 }
 
@@ -142,33 +139,87 @@ pub fn dots(
     action: &Tensor,
     wanted: [bool; 4],
 ) -> Result<[Option<Dots>; 4], UpdateError> {
-    let [local_local, local_global, global_local, global_global] = wanted;
-    let psi3 = when(local_local || local_global, || {
-        network.psi3(&features_t.f3, action)
-    })?;
-    let phi3 = when(local_local || global_local, || network.phi3(&features_k.f3))?;
-    let psi4 = when(global_local || global_global, || {
-        network.psi4(&features_t.f4, action)
-    })?;
-    let phi4 = when(local_global || global_global, || {
-        network.phi4(&features_k.f4)
-    })?;
-    let pair = |wanted: bool, psi: &Option<Tensor>, phi: &Option<Tensor>, multiply: Multiply| {
-        let both = psi.as_ref().zip(phi.as_ref()).filter(|_| wanted);
-        both.map(|(psi, phi)| {
-            multiply(psi, phi).map(|dots| Dots {
-                dots,
-                rkhs: psi.dims()[psi.rank() - 1],
-            })
+    Ok(Vectors::new(network, features_t, features_k, action, wanted)?.dots(wanted)?)
+}
+
+/// What the heads make of anchors (psi) and candidates (phi): [B, L, R] of local features, [B, R] of global ones.
+#[derive(Debug)]
+pub struct Vectors {
+    /// Of anchors, local.
+    pub psi3: Option<Tensor>,
+    /// Of candidates, local.
+    pub phi3: Option<Tensor>,
+    /// Of anchors, global.
+    pub psi4: Option<Tensor>,
+    /// Of candidates, global.
+    pub phi4: Option<Tensor>,
+}
+
+impl Vectors {
+    /// The vectors that the `wanted` pairs need.
+    ///
+    /// # Errors
+    /// A head that a wanted pair needs and `network` lacks.
+    pub fn new(
+        network: &Network,
+        features_t: &Features,
+        features_k: &Features,
+        action: &Tensor,
+        wanted: [bool; 4],
+    ) -> Result<Self, UpdateError> {
+        let [local_local, local_global, global_local, global_global] = wanted;
+        Ok(Self {
+            psi3: when(local_local || local_global, || {
+                network.psi3(&features_t.f3, action)
+            })?,
+            phi3: when(local_local || global_local, || network.phi3(&features_k.f3))?,
+            psi4: when(global_local || global_global, || {
+                network.psi4(&features_t.f4, action)
+            })?,
+            phi4: when(local_global || global_global, || {
+                network.phi4(&features_k.f4)
+            })?,
         })
-        .transpose()
-    };
-    Ok([
-        pair(local_local, &psi3, &phi3, local_local_dots)?,
-        pair(local_global, &psi3, &phi4, local_global_dots)?,
-        pair(global_local, &psi4, &phi3, global_local_dots)?,
-        pair(global_global, &psi4, &phi4, global_global_dots)?,
-    ])
+    }
+
+    /// Dot products for the `wanted` pairs whose vectors are there, in the order of [`PAIRS`]; as many anchors as candidates.
+    ///
+    /// # Errors
+    /// Vectors that do not fit each other.
+    pub fn dots(&self, wanted: [bool; 4]) -> candle_core::Result<[Option<Dots>; 4]> {
+        let Self {
+            psi3,
+            phi3,
+            psi4,
+            phi4,
+        } = self;
+        let pair =
+            |wanted: bool, psi: &Option<Tensor>, phi: &Option<Tensor>, multiply: Multiply| {
+                let both = psi.as_ref().zip(phi.as_ref()).filter(|_| wanted);
+                both.map(|(psi, phi)| with_rkhs(multiply(psi, phi)?, psi))
+                    .transpose()
+            };
+        let [local_local, local_global, global_local, global_global] = wanted;
+        Ok([
+            pair(local_local, psi3, phi3, local_local_dots)?,
+            pair(local_global, psi3, phi4, local_global_dots)?,
+            pair(global_local, psi4, phi3, global_local_dots)?,
+            pair(global_global, psi4, phi4, global_global_dots)?,
+        ])
+    }
+}
+
+/// Dot products of global vectors: `psi` [B, R] of anchors, `phi` [B, R] of candidates.
+///
+/// # Errors
+/// Vectors that do not fit each other.
+pub fn global_dots(psi: &Tensor, phi: &Tensor) -> candle_core::Result<Dots> {
+    with_rkhs(global_global_dots(psi, phi)?, psi)
+}
+
+fn with_rkhs(dots: Tensor, psi: &Tensor) -> candle_core::Result<Dots> {
+    let rkhs = psi.dims()[psi.rank() - 1];
+    Ok(Dots { dots, rkhs })
 }
 
 /// Dot products [L, B, B] of anchors and candidates.

@@ -1,9 +1,92 @@
 //! The menu of auxiliary objectives: what an agent learns beside the return.
 //! An item makes losses from features; it neither weighs them against C51 nor takes a step.
 
+pub mod cpc;
+pub mod curl;
 pub mod dim;
 
-use dim::Dim;
+use cpc::Cpc;
+use curl::Curl;
+use dim::{Dim, Lambda, PAIRS};
+use driml_model::DimParts;
+use serde::{Deserialize, Serialize};
+
+/// The name of an auxiliary objective, as settings have it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Objective {
+    /// The return alone.
+    None,
+    /// Deep InfoMax: one later state a row.
+    Dim,
+    /// Contrastive predictive coding: several later states a row.
+    Cpc,
+    /// Two views of the same state.
+    Curl,
+}
+
+impl Objective {
+    /// The name.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::Dim => "dim",
+            Self::Cpc => "cpc",
+            Self::Curl => "curl",
+        }
+    }
+
+    /// Checks the settings that only make sense together.
+    ///
+    /// # Errors
+    /// What is at odds, and what to do.
+    pub fn check(self, lambda: &Lambda, condition_on_action: bool) -> Result<(), String> {
+        let name = self.name();
+        let wanted = lambda.wanted();
+        let weighted = PAIRS.iter().zip(wanted).find(|(_, wanted)| *wanted);
+        match (self, weighted) {
+            (Self::None, Some((pair, _))) => Err(format!(
+                "objective = {name} computes no auxiliary loss, but lambda.{pair} is above 0: set it to 0, or take another agent"
+            )),
+            (Self::Dim | Self::Cpc | Self::Curl, None) => Err(format!(
+                "objective = {name}, but all lambdas are 0: set one above 0, or take the agent c51"
+            )),
+            (Self::Curl, _) if wanted != [false, false, false, true] => Err(format!(
+                "objective = {name} compares whole states, so lambda.4t4 alone may be above 0"
+            )),
+            (Self::Curl, _) if condition_on_action => Err(format!(
+                "objective = {name} compares views of one state, which no action parts: set condition_on_action to false"
+            )),
+            _ => Ok(()),
+        }
+    }
+
+    /// The heads that the online network needs; `action` says whether Psi is given a_t.
+    pub fn heads(self, lambda: &Lambda, action: bool) -> DimParts {
+        match self {
+            Self::None => DimParts::NONE,
+            Self::Dim | Self::Cpc => lambda.dim_parts(action),
+            Self::Curl => curl::HEADS,
+        }
+    }
+
+    /// The heads of which the target network keeps a slow copy.
+    pub const fn target_heads(self) -> DimParts {
+        match self {
+            Self::None | Self::Dim | Self::Cpc => DimParts::NONE,
+            Self::Curl => curl::HEADS,
+        }
+    }
+
+    /// Later states a row that the replay server may serve: the least and the most.
+    pub const fn served(self) -> (usize, usize) {
+        match self {
+            Self::None | Self::Curl => (0, 0),
+            Self::Dim => (1, 1),
+            Self::Cpc => (1, usize::MAX),
+        }
+    }
+}
 
 /// The auxiliary objective of an agent.
 #[derive(Clone, Debug, PartialEq)]
@@ -12,14 +95,8 @@ pub enum Auxiliary {
     None,
     /// Deep InfoMax between s_t and s_{t+k}.
     Dim(Dim),
-}
-
-impl Auxiliary {
-    /// Whether batches must bring s_{t+k}.
-    pub const fn needs_positives(&self) -> bool {
-        match self {
-            Self::None => false,
-            Self::Dim(_) => true,
-        }
-    }
+    /// Contrastive predictive coding between s_t and s_{t+1}, .., s_{t+P}.
+    Cpc(Cpc),
+    /// Two views of s_t.
+    Curl(Curl),
 }

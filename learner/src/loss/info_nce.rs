@@ -18,6 +18,14 @@ pub struct Scores {
 }
 
 impl Scores {
+    /// Scores of dot products of vectors of `rkhs` numbers.
+    pub fn new(rkhs: usize, tanh_clip: f64) -> Self {
+        Self {
+            scale: 1.0 / (rkhs as f64).sqrt(),
+            tanh_clip,
+        }
+    }
+
     /// The clipped score of a dot product.
     pub fn score(&self, dot: f32) -> f64 {
         self.clip(dot).0

@@ -14,7 +14,7 @@ use safetensors::SafeTensors;
 use serde::Deserialize;
 
 use crate::{
-    auxiliary::dim::Lambda,
+    auxiliary::{Objective, dim::Lambda},
     batch::{Batch, NO_ACTION},
     optim::AdamSettings,
     update::{LearnerSettings, UpdateError},
@@ -73,6 +73,10 @@ struct Config {
     v_min: f32,
     v_max: f32,
     double_dqn: bool,
+    /// Not there: DIM, or none if all lambdas are 0.
+    objective: Option<Objective>,
+    /// Not there: with the action, where there is DIM.
+    condition_on_action: Option<bool>,
     lambda: Lambda,
     tanh_clip: f64,
     max_grad_norm: f64,
@@ -100,7 +104,9 @@ pub(super) struct Case {
     config: Config,
     pub(super) settings: LearnerSettings,
     pub(super) rows: usize,
+    positives: usize,
     frames: [Vec<u8>; 3],
+    anchors: Option<Vec<u8>>,
     action: Vec<u8>,
     next_action: Vec<u8>,
     n_step_return: Vec<f32>,
@@ -112,13 +118,13 @@ pub(super) struct Case {
 }
 
 /// Every head of the DIM objective.
-pub(super) const fn all_parts() -> DimParts {
+pub(super) const fn all_parts(action: bool) -> DimParts {
     DimParts {
         psi3: true,
         phi3: true,
         psi4: true,
         phi4: true,
-        action: true,
+        action,
     }
 }
 
@@ -139,8 +145,15 @@ impl Case {
                 .map_err(|why| format(why.to_string()))?
                 .into_iter()
                 .collect();
+        let by_lambda = if config.lambda.wanted().contains(&true) {
+            Objective::Dim
+        } else {
+            Objective::None
+        };
         let settings = LearnerSettings {
             double_dqn: config.double_dqn,
+            objective: config.objective.unwrap_or(by_lambda),
+            condition_on_action: config.condition_on_action.unwrap_or(true),
             lambda: config.lambda,
             tanh_clip: config.tanh_clip,
             max_grad_norm: config.max_grad_norm,
@@ -151,7 +164,9 @@ impl Case {
         };
         let mut case = Self {
             rows: 0,
+            positives: 0,
             frames: Default::default(),
+            anchors: None,
             action: Vec::new(),
             next_action: Vec::new(),
             n_step_return: Vec::new(),
@@ -174,13 +189,35 @@ impl Case {
         } = self.config.obs;
         self.rows = self.tensor("input.action")?.elem_count();
         let rows = self.rows;
-        for (at, name) in ["input.frames_t", "input.frames_k", "input.frames_n"]
-            .into_iter()
-            .enumerate()
-        {
-            let frames = self.input(name, DType::U8, &[rows, height, width, channels])?;
-            self.frames[at] = frames.flatten_all()?.to_vec1()?;
-        }
+        let state = [rows, height, width, channels];
+        let bytes = |name: &str, shape: &[usize]| -> Result<Vec<u8>, ParityError> {
+            let tensor = self.input(name, DType::U8, shape)?;
+            Ok(tensor.flatten_all()?.to_vec1()?)
+        };
+        let (mut positives, mut anchors) = (1, None);
+        let (frames_k, valid) = match self.settings.objective {
+            Objective::None | Objective::Dim => (
+                bytes("input.frames_k", &state)?,
+                bytes("input.positive_valid", &[rows])?,
+            ),
+            Objective::Cpc => {
+                let valid = self.tensor("input.positive_valid")?.dims();
+                positives = valid.first().copied().unwrap_or(0);
+                let later = [&[positives], &state[..]].concat();
+                (
+                    bytes("input.frames_k", &later)?,
+                    bytes("input.positive_valid", &[positives, rows])?,
+                )
+            }
+            Objective::Curl => {
+                anchors = Some(bytes("input.view_query", &state)?);
+                (bytes("input.view_key", &state)?, vec![1; rows])
+            }
+        };
+        let frames_t = bytes("input.frames_t", &state)?;
+        let frames_n = bytes("input.frames_n", &state)?;
+        self.frames = [frames_t, frames_k, frames_n];
+        (self.positives, self.anchors, self.positive_valid) = (positives, anchors, valid);
         let actions: Vec<i64> = self.input("input.action", DType::I64, &[rows])?.to_vec1()?;
         let action = |action: i64| {
             u8::try_from(action)
@@ -198,9 +235,6 @@ impl Case {
             .to_vec1()?;
         self.bootstrap_discount = self
             .input("input.bootstrap_discount", DType::F32, &[rows])?
-            .to_vec1()?;
-        self.positive_valid = self
-            .input("input.positive_valid", DType::U8, &[rows])?
             .to_vec1()?;
         Ok(())
     }
@@ -241,7 +275,9 @@ impl Case {
         Batch {
             rows: self.rows,
             frames_t,
-            frames_k: Some(frames_k),
+            anchors: self.anchors.as_deref(),
+            positives: self.positives,
+            frames_k,
             frames_n,
             action: &self.action,
             next_action: &self.next_action,

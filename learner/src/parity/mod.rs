@@ -9,13 +9,18 @@ use std::{
 };
 
 use candle_core::{Device, Tensor};
-use driml_model::{Network, Parameters};
+use driml_model::{DimParts, Features, Network, Parameters};
 
 pub use case::ParityError;
 use case::{Case, all_parts};
 
 use crate::{
-    auxiliary::dim::{self, Dim, Dots, PAIRS},
+    auxiliary::{
+        Objective,
+        cpc::{self, Cpc},
+        curl::Curl,
+        dim::{self, Dim, Dots, Lambda, PAIRS},
+    },
     loss::info_nce::info_nce_loss,
     update::Learner,
 };
@@ -108,17 +113,17 @@ pub fn check_file(path: impl AsRef<Path>) -> Result<ParityReport, ParityError> {
 }
 
 fn check(case: &Case) -> Result<Vec<ParityLine>, ParityError> {
-    let model = case.model(case.settings.lambda.dim_parts(true));
+    let sizes = case.model(DimParts::NONE);
+    let model = case.model(case.settings.dim_parts(sizes.num_actions));
     let online =
         Parameters::from_tensors(&model, case.parameters("online.", &model), &Device::Cpu)?;
-    let acting = model.without_dim();
-    let target =
-        Parameters::from_tensors(&acting, case.parameters("target.", &acting), &Device::Cpu)?;
+    let slow = case.settings.target_model(&model);
+    let target = Parameters::from_tensors(&slow, case.parameters("target.", &slow), &Device::Cpu)?;
     let mut learner =
         Learner::from_parameters(model.clone(), case.settings.clone(), online, target)?;
 
     let mut lines = Vec::new();
-    let pairs = dim_losses(case)?;
+    let pairs = forward_losses(case)?;
     let evaluation = learner.evaluate(&case.batch())?;
 
     let width = f64::from(model.v_max - model.v_min);
@@ -152,7 +157,10 @@ fn check(case: &Case) -> Result<Vec<ParityLine>, ParityError> {
     };
     loss_line("loss.c51_kl", evaluation.c51_kl, false)?;
     let mut total_saturates = false;
-    for (i, (forward_only, saturates)) in pairs.into_iter().enumerate() {
+    for (i, pair) in pairs.into_iter().enumerate() {
+        let Some((forward_only, saturates)) = pair else {
+            continue;
+        };
         // A pair of weight 0 is not in the update; its loss comes from the forward pass alone.
         let got = evaluation.dim[i].unwrap_or(forward_only);
         loss_line(&format!("loss.dim.{}", PAIRS[i]), got, saturates)?;
@@ -201,38 +209,93 @@ fn check(case: &Case) -> Result<Vec<ParityLine>, ParityError> {
     Ok(lines)
 }
 
-/// The four DIM losses, forward only and untouched by lambda, and whether the scores of each saturate.
-fn dim_losses(case: &Case) -> Result<[(f32, bool); 4], ParityError> {
-    let model = case.model(all_parts());
-    let parameters =
-        Parameters::from_tensors(&model, case.parameters("online.", &model), &Device::Cpu)?;
-    let network = Network::new(&model, &parameters)?;
+/// The auxiliary losses of all pairs that the case speaks of, forward only and untouched by lambda, and whether the scores
+/// of each saturate.
+fn forward_losses(case: &Case) -> Result<[Option<(f32, bool)>; 4], ParityError> {
+    let settings = &case.settings;
+    let curl = settings.objective == Objective::Curl;
+    let heads = if curl {
+        settings.objective.target_heads()
+    } else {
+        all_parts(settings.condition_on_action)
+    };
+    let model = case.model(heads);
+    let network = |prefix: &str| -> Result<Network, ParityError> {
+        let named = case.parameters(prefix, &model);
+        let parameters = Parameters::from_tensors(&model, named, &Device::Cpu)?;
+        Ok(Network::new(&model, &parameters)?)
+    };
+    let online = network("online.")?;
+    let features = |network: &Network, frames: &[u8]| -> Result<Features, ParityError> {
+        let shape = (
+            frames.len() / model.frame_len(),
+            model.height,
+            model.width,
+            model.channels,
+        );
+        let frames = Tensor::from_slice(frames, shape, &Device::Cpu)?;
+        Ok(network.features(&frames)?)
+    };
     let batch = case.batch();
-    let frames = |frames: &[u8]| -> Result<Tensor, ParityError> {
-        let shape = (case.rows, model.height, model.width, model.channels);
-        Ok(Tensor::from_slice(frames, shape, &Device::Cpu)?)
-    };
-    let features_t = network.features(&frames(batch.frames_t)?)?;
-    let features_k = network.features(&frames(batch.frames_k.unwrap_or_default())?)?;
+    let valid = batch.positive_valid;
+    let anchors = features(&online, batch.anchors.unwrap_or(batch.frames_t))?;
     let action = Tensor::from_slice(batch.action, case.rows, &Device::Cpu)?;
-    let all = dim::dots(&network, &features_t, &features_k, &action, [true; 4])?;
-    let objective = Dim {
-        lambda: case.settings.lambda,
-        tanh_clip: case.settings.tanh_clip,
+    let every = Lambda {
+        l3t3: 1.0,
+        l3t4: 1.0,
+        l4t3: 1.0,
+        l4t4: 1.0,
     };
-    let mut losses = [(0.0, false); 4];
-    for (loss, dots) in losses.iter_mut().zip(all) {
-        if let Some(Dots { dots, rkhs }) = dots {
-            let scores = objective.scores(rkhs);
-            let largest = values(&dots)?
-                .iter()
-                .fold(0.0, |largest: f64, dot| largest.max(dot.abs()));
-            // Past c the slope of the clip is below 0.42.
-            let saturates = largest * scores.scale > scores.tanh_clip;
-            *loss = (
-                info_nce_loss(&dots, batch.positive_valid, scores)?.to_scalar()?,
-                saturates,
-            );
+    let pairs = Dim {
+        lambda: every,
+        tanh_clip: settings.tanh_clip,
+    };
+    // Past c the slope of the clip is below 0.42.
+    let saturates = |dots: &Dots| -> Result<bool, ParityError> {
+        let scores = pairs.scores(dots.rkhs);
+        let dots = values(&dots.dots)?;
+        let largest = dots
+            .iter()
+            .fold(0.0, |largest: f64, dot| largest.max(dot.abs()));
+        Ok(largest * scores.scale > scores.tanh_clip)
+    };
+    let mut losses = [None; 4];
+    match settings.objective {
+        Objective::None | Objective::Dim => {
+            let later = features(&online, batch.frames_k)?;
+            let all = dim::dots(&online, &anchors, &later, &action, [true; 4])?;
+            for (loss, dots) in losses.iter_mut().zip(all.iter().flatten()) {
+                let value = info_nce_loss(&dots.dots, valid, pairs.scores(dots.rkhs))?;
+                *loss = Some((value.to_scalar()?, saturates(dots)?));
+            }
+        }
+        Objective::Cpc => {
+            let later = features(&online, &cpc::present(batch.frames_k, valid))?;
+            let cpc = Cpc { pairs };
+            let all = cpc.losses(&online, &anchors, Some(&later), &action, valid)?;
+            for (loss, value) in losses.iter_mut().zip(all.iter().flatten()) {
+                *loss = Some((value.to_scalar()?, false));
+            }
+            for offset in cpc.offsets(&online, &anchors, Some(&later), &action, valid)? {
+                for (loss, dots) in losses.iter_mut().zip(offset.dots.iter().flatten()) {
+                    if let Some((_, saturated)) = loss {
+                        *saturated |= saturates(dots)?;
+                    }
+                }
+            }
+        }
+        Objective::Curl => {
+            let target = network("target.")?;
+            let key = features(&target, batch.frames_k)?;
+            let curl = Curl {
+                tanh_clip: settings.tanh_clip,
+            };
+            let all = curl.losses((&online, &anchors), (&target, &key), &action)?;
+            for (loss, value) in losses.iter_mut().zip(all) {
+                if let Some(value) = value {
+                    *loss = Some((value.to_scalar()?, false));
+                }
+            }
         }
     }
     Ok(losses)

@@ -1,7 +1,7 @@
 //! Small networks, settings and batches for these tests.
 //! Nothing here is measured or asserted.
 
-use driml_learner::{AdamSettings, Batch, Lambda, Learner, LearnerSettings, NO_ACTION};
+use driml_learner::{AdamSettings, Batch, Lambda, Learner, LearnerSettings, NO_ACTION, Objective};
 use driml_model::{ConvLayer, ModelConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -51,6 +51,12 @@ pub(crate) fn model(lambda: Lambda) -> ModelConfig {
 pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
     LearnerSettings {
         double_dqn: false,
+        objective: if lambda == NO_DIM {
+            Objective::None
+        } else {
+            Objective::Dim
+        },
+        condition_on_action: true,
         lambda,
         tanh_clip: 20.0,
         max_grad_norm: 10.0,
@@ -118,7 +124,9 @@ impl Rows {
         Batch {
             rows: self.action.len(),
             frames_t: &self.frames[0],
-            frames_k: Some(&self.frames[1]),
+            anchors: None,
+            positives: 1,
+            frames_k: &self.frames[1],
             frames_n: &self.frames[2],
             action: &self.action,
             next_action: &self.next_action,

@@ -3,6 +3,8 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod agents;
+mod augment;
 mod checkpoint;
 mod made_up;
 mod update;

@@ -123,7 +123,7 @@ fn without_dim_no_positives_are_needed_and_no_heads_are_built() {
             .all(|(name, _)| !name.starts_with("dim."))
     );
     let mut batch = rows.batch();
-    batch.frames_k = None;
+    (batch.positives, batch.frames_k, batch.positive_valid) = (0, &[], &[]);
     let report = learner.update(&batch).unwrap();
     assert_eq!(report.dim, [None; 4]);
     assert_eq!(report.total, report.c51_kl);
@@ -276,7 +276,7 @@ fn a_bad_batch_is_an_error_that_changes_nothing() {
     refused(|rows| rows.frames[1].truncate(7), "frames_k");
     refused(|rows| rows.positive_valid.clear(), "positive_valid");
     let mut batch = good.batch();
-    batch.frames_k = None;
+    (batch.positives, batch.frames_k, batch.positive_valid) = (0, &[], &[]);
     assert!(learner.update(&batch).is_err());
     batch.rows = 0;
     assert!(learner.update(&batch).is_err());

@@ -1,6 +1,7 @@
 //! How far ahead a positive lies: one file a rule, and the affinity that the adaptive rule walks along.
 //! It does not know the ring: the actions of one window come in, k comes out.
 
+pub mod all;
 pub mod fixed;
 pub mod nhg;
 pub mod uniform;
@@ -10,7 +11,8 @@ use rand::Rng;
 
 /// Draws k for an anchor whose next `actions.len()` states lie in its episode and level.
 ///
-/// `actions` are a_t, .., a_{t+H-1} with H = min(k_max, steps left), at least one. Result in 1..=H; `None` without DIM.
+/// `actions` are a_t, .., a_{t+H-1} with H = min(k_max, steps left), at least one. Result in 1..=H, of several positives the
+/// furthest; `None` where none is served.
 /// Source: Mazoure et al. 2020, Deep Reinforcement and InfoMax Learning.
 pub fn draw_k(
     horizon: Horizon,
@@ -29,6 +31,7 @@ pub fn draw_k(
             &actions[..actions.len().min(k_max as usize)],
             rng,
         )),
+        Horizon::All { k_max } => Some(all::furthest(k_max, steps_left)),
     }
 }
 

@@ -48,21 +48,25 @@ fn check_batch(batch: &Batch, history: &History) {
             .bootstrap
             .map_or(vec![0; bytes], |i| history.state(key, t + i));
         assert_eq!(state(batch.frames_n(), row), frame_n, "{context}");
-        if batch.positives() == 1 {
-            let k = usize::from(batch.ks()[row]);
+        assert_eq!(batch.positives(), spec.horizon.positives());
+        for p in 0..batch.positives() {
+            // Planes of positives are [P, B].
+            let at = p * rows + row;
+            let k = usize::from(batch.ks()[at]);
             let right = match (spec.horizon, want.steps_left) {
                 (_, 0) => k == 0,
                 (Horizon::Fixed { .. }, left) => k == left,
+                (Horizon::All { .. }, left) => k == if p < left { p + 1 } else { 0 },
                 (_, left) => (1..=left).contains(&k),
             };
             assert!(right, "{context}: k = {k}");
-            assert_eq!(batch.positive_valid()[row], u8::from(k > 0), "{context}");
+            assert_eq!(batch.positive_valid()[at], u8::from(k > 0), "{context}");
             let frame_k = if k == 0 {
                 vec![0; bytes]
             } else {
                 history.state(key, t + k)
             };
-            assert_eq!(state(batch.frames_k(), row), frame_k, "{context}: k = {k}");
+            assert_eq!(state(batch.frames_k(), at), frame_k, "{context}: k = {k}");
         }
         ages += history.inserted - 1 - record.index;
         versions = (
@@ -90,6 +94,7 @@ fn horizons() -> impl Strategy<Value = Horizon> {
         (1u32..7).prop_map(|k| Horizon::Fixed { k }),
         (1u32..7).prop_map(|k_max| Horizon::Uniform { k_max }),
         (1u32..7).prop_map(|k_max| Horizon::Nhg { k_max }),
+        (1u32..7).prop_map(|k_max| Horizon::All { k_max }),
     ]
 }
 

@@ -137,6 +137,10 @@ fn every_rule_stays_within_k_max_and_the_episode() {
         draw_k(Horizon::Fixed { k: 4 }, &affinity, &[0; 2], rng),
         Some(2)
     );
+    for (steps, furthest) in [(9, 4), (4, 4), (2, 2)] {
+        let all = Horizon::All { k_max: 4 };
+        assert_eq!(draw_k(all, &affinity, &vec![0; steps], rng), Some(furthest));
+    }
     assert_eq!(
         draw_k(Horizon::Nhg { k_max: 4 }, &affinity, &[0; 9], rng),
         Some(4)

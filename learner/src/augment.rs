@@ -1,0 +1,343 @@
+//! Augmentation: what the auxiliary objective sees of a state, cropped and recoloured at random; bytes in, bytes out.
+//! C51 never sees it. It knows neither networks nor losses, and keeps no generator of its own.
+
+use rand::Rng;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// Colour coefficients are whole multiples of 2^-12.
+const COLOUR_BITS: u32 = 12;
+/// Weights of neighbouring pixels are whole multiples of 1/256.
+const WHOLE: u16 = 256;
+
+/// The `[learner.augment]` table: how strongly states are changed. A state's frames are all changed alike.
+///
+/// `crop_side` at 1 and the others at 0 leave every byte as it was.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AugmentSettings {
+    /// Share of each side that a crop keeps, above 0, at most 1; the crop is resized to the whole.
+    pub crop_side: f64,
+    /// Colours are scaled by a factor from 1 - this to 1 + this, in [0, 1].
+    pub brightness: f64,
+    /// Distances from the state's mean grey are scaled by a factor from 1 - this to 1 + this, in [0, 1].
+    pub contrast: f64,
+    /// Distances from a pixel's own grey are scaled by a factor from 1 - this to 1 + this, in [0, 1].
+    pub saturation: f64,
+    /// Hues are turned by -this to this, in turns of the colour circle, in [0, 0.5].
+    pub hue: f64,
+}
+
+impl AugmentSettings {
+    /// Checks the ranges.
+    ///
+    /// # Errors
+    /// The first setting out of its range: its name, its value, the range.
+    pub fn validate(&self) -> Result<(), (&'static str, f64, &'static str)> {
+        let strength = |x: f64| (0.0..=1.0).contains(&x);
+        let from_0_to_1 = "it must lie between 0 and 1";
+        for (name, value, fine, range) in [
+            (
+                "augment.crop_side",
+                self.crop_side,
+                self.crop_side > 0.0 && self.crop_side <= 1.0,
+                "it must lie above 0 and be at most 1, which crops nothing",
+            ),
+            (
+                "augment.brightness",
+                self.brightness,
+                strength(self.brightness),
+                from_0_to_1,
+            ),
+            (
+                "augment.contrast",
+                self.contrast,
+                strength(self.contrast),
+                from_0_to_1,
+            ),
+            (
+                "augment.saturation",
+                self.saturation,
+                strength(self.saturation),
+                from_0_to_1,
+            ),
+            (
+                "augment.hue",
+                self.hue,
+                (0.0..=0.5).contains(&self.hue),
+                "it must lie between 0 and 0.5, half a turn either way",
+            ),
+        ] {
+            if !fine {
+                return Err((name, value, range));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// What is done to one state.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct View {
+    /// First row of the crop.
+    pub top: usize,
+    /// First column of the crop.
+    pub left: usize,
+    /// Factor on all colours.
+    pub brightness: f64,
+    /// Factor on distances from the state's mean grey.
+    pub contrast: f64,
+    /// Factor on distances from a pixel's own grey.
+    pub saturation: f64,
+    /// Turns of the colour circle; a third takes red to green.
+    pub hue: f64,
+}
+
+/// The two source pixels of an output pixel along one side, and the second one's share of it in 1/256.
+#[derive(Clone, Copy, Debug)]
+struct Tap {
+    near: usize,
+    far: usize,
+    far_weight: u16,
+}
+
+/// Changes states at random; its memory is used again at each call.
+#[derive(Debug)]
+pub struct Augment {
+    settings: AugmentSettings,
+    /// Height, width and channels of a state.
+    size: (usize, usize, usize),
+    frame_channels: usize,
+    /// Height and width of the crop, pixels.
+    crop: (usize, usize),
+    rows: Vec<Tap>,
+    cols: Vec<Tap>,
+    views: Vec<View>,
+    /// A line of a crop for each thread.
+    lines: Vec<Vec<u16>>,
+}
+
+impl Augment {
+    /// For states [height, width, stack * `frame_channels`]; `settings` are in their ranges, and no size is 0.
+    ///
+    /// A crop has `crop_side` of each side, rounded, and at least one pixel.
+    pub fn new(
+        settings: AugmentSettings,
+        (height, width, channels): (usize, usize, usize),
+        frame_channels: usize,
+    ) -> Self {
+        let side = |whole: usize| {
+            let kept = (whole as f64 * settings.crop_side).round() as usize;
+            kept.clamp(1, whole)
+        };
+        let crop = (side(height), side(width));
+        Self {
+            settings,
+            size: (height, width, channels),
+            frame_channels,
+            crop,
+            rows: taps(crop.0, height),
+            cols: taps(crop.1, width),
+            views: Vec::new(),
+            lines: Vec::new(),
+        }
+    }
+
+    /// Height and width of the crop, pixels.
+    pub const fn crop(&self) -> (usize, usize) {
+        self.crop
+    }
+
+    /// Draws what is done to one state: every place of the crop equally likely, factors and turn uniform in their ranges.
+    pub fn draw(&self, rng: &mut impl Rng) -> View {
+        let AugmentSettings {
+            brightness,
+            contrast,
+            saturation,
+            hue,
+            ..
+        } = self.settings;
+        let (height, width, _) = self.size;
+        let top = rng.random_range(0..=height - self.crop.0);
+        let left = rng.random_range(0..=width - self.crop.1);
+        let mut around = |middle: f64, by: f64| middle + by * (2.0 * rng.random::<f64>() - 1.0);
+        View {
+            top,
+            left,
+            brightness: around(1.0, brightness),
+            contrast: around(1.0, contrast),
+            saturation: around(1.0, saturation),
+            hue: around(0.0, hue),
+        }
+    }
+
+    /// Writes each of `states` [n, H, W, C], changed by a draw of its own, to `seen`, which gets their length.
+    ///
+    /// The draws are made in order before the work is spread over the threads, so `rng` alone decides the bytes.
+    pub fn apply(&mut self, states: &[u8], seen: &mut Vec<u8>, rng: &mut impl Rng) {
+        let (height, width, channels) = self.size;
+        let state_bytes = height * width * channels;
+        let count = states.len() / state_bytes;
+        let mut views = std::mem::take(&mut self.views);
+        views.clear();
+        views.extend((0..count).map(|_| self.draw(rng)));
+        let mut lines = std::mem::take(&mut self.lines);
+        let threads = rayon::current_num_threads().max(1);
+        lines.resize_with(threads, Vec::new);
+        let share = count.div_ceil(threads).max(1);
+        seen.resize(states.len(), 0);
+        seen.par_chunks_mut(share * state_bytes)
+            .zip(states.par_chunks(share * state_bytes))
+            .zip(views.par_chunks(share))
+            .zip(lines.par_iter_mut())
+            .for_each(|(((seen, states), views), line)| {
+                line.resize(self.crop.1 * channels, 0);
+                let pairs = seen
+                    .chunks_exact_mut(state_bytes)
+                    .zip(states.chunks_exact(state_bytes));
+                for ((seen, state), view) in pairs.zip(views) {
+                    self.change(state, view, seen, line);
+                }
+            });
+        (self.views, self.lines) = (views, lines);
+    }
+
+    /// Writes one state, changed, to `seen`.
+    pub fn apply_view(&self, state: &[u8], view: &View, seen: &mut [u8]) {
+        let mut line = vec![0; self.crop.1 * self.size.2];
+        self.change(state, view, seen, &mut line);
+    }
+
+    fn change(&self, state: &[u8], view: &View, seen: &mut [u8], line: &mut [u16]) {
+        let (height, width, channels) = self.size;
+        if self.crop == (height, width) {
+            seen.copy_from_slice(state);
+        } else {
+            let resize = match channels {
+                1 => Self::resize::<1>,
+                3 => Self::resize::<3>,
+                4 => Self::resize::<4>,
+                12 => Self::resize::<12>,
+                _ => Self::resize_any,
+            };
+            resize(self, state, view, seen, line);
+        }
+        recolour(seen, view, self.frame_channels);
+    }
+
+    /// [`Augment::resize_any`] for states of `C` channels, compiled for them.
+    fn resize<const C: usize>(&self, state: &[u8], view: &View, seen: &mut [u8], line: &mut [u16]) {
+        let (outputs, _) = seen.as_chunks_mut::<C>();
+        for (tap, outputs) in self.rows.iter().zip(outputs.chunks_exact_mut(self.size.1)) {
+            self.blend_rows(state, view, tap, line);
+            let (pixels, _) = line.as_chunks::<C>();
+            for (output, tap) in outputs.iter_mut().zip(&self.cols) {
+                let (near, far) = (&pixels[tap.near], &pixels[tap.far]);
+                for c in 0..C {
+                    output[c] = blend(near[c], far[c], tap.far_weight);
+                }
+            }
+        }
+    }
+
+    /// Resizes the view's crop of `state` to the whole state, bilinearly.
+    ///
+    /// Output pixel d lies at (d + 1/2) * crop / whole - 1/2 of the crop and mixes the two pixels beside it, in shares
+    /// of 1/256 and rounded once: what PyTorch's `interpolate(mode = "bilinear", align_corners = False)` does. Nearest
+    /// neighbours would double every fourth pixel, and the thin objects of a 64 x 64 frame with it.
+    fn resize_any(&self, state: &[u8], view: &View, seen: &mut [u8], line: &mut [u16]) {
+        let (_, width, channels) = self.size;
+        let outputs = seen.chunks_exact_mut(width * channels);
+        for (tap, outputs) in self.rows.iter().zip(outputs) {
+            self.blend_rows(state, view, tap, line);
+            for (output, tap) in outputs.chunks_exact_mut(channels).zip(&self.cols) {
+                let (near, far) = (tap.near * channels, tap.far * channels);
+                for (c, output) in output.iter_mut().enumerate() {
+                    *output = blend(line[near + c], line[far + c], tap.far_weight);
+                }
+            }
+        }
+    }
+
+    /// Mixes two rows of the crop into `line`, in 1/256 of a byte, exactly.
+    fn blend_rows(&self, state: &[u8], view: &View, tap: &Tap, line: &mut [u16]) {
+        let (_, width, channels) = self.size;
+        let row = |at: usize| {
+            let start = ((view.top + at) * width + view.left) * channels;
+            &state[start..start + line.len()]
+        };
+        let (near, far) = (row(tap.near), row(tap.far));
+        let (near_weight, far_weight) = (WHOLE - tap.far_weight, tap.far_weight);
+        for ((out, &near), &far) in line.iter_mut().zip(near).zip(far) {
+            *out = u16::from(near) * near_weight + u16::from(far) * far_weight;
+        }
+    }
+}
+
+/// Mixes two values in 1/256 of a byte, and rounds to a byte.
+fn blend(near: u16, far: u16, far_weight: u16) -> u8 {
+    let sum =
+        u32::from(near) * u32::from(WHOLE - far_weight) + u32::from(far) * u32::from(far_weight);
+    ((sum + (1 << 15)) >> 16) as u8
+}
+
+/// Where each of `to` output pixels lies among `from` source pixels, clamped at the ends.
+fn taps(from: usize, to: usize) -> Vec<Tap> {
+    let tap = |at: usize| {
+        let place = (at as f64 + 0.5) * from as f64 / to as f64 - 0.5;
+        let place = place.clamp(0.0, (from - 1) as f64);
+        let near = place.floor() as usize;
+        Tap {
+            near,
+            far: (near + 1).min(from - 1),
+            far_weight: ((place - place.floor()) * f64::from(WHOLE)).round() as u16,
+        }
+    };
+    (0..to).map(tap).collect()
+}
+
+/// Changes brightness, contrast, saturation and hue of a state in place; pixels are frames of `frame_channels` side by side.
+///
+/// With b, c, s the factors, m the mean of all bytes and M the turned and scaled distance from grey, a pixel x becomes
+/// b c M x + b (1 - c) m, rounded and clamped once; grey is the mean of the three channels, and a hue is turned about the axis
+/// of greys, so that the four changes commute and their order does not matter. (torchvision's `ColorJitter` draws an order,
+/// clamps in between, weighs the channels and turns hues in HSV.) Where a frame does not have three channels there is no
+/// saturation and no hue.
+fn recolour(state: &mut [u8], view: &View, frame_channels: usize) {
+    let unit = f64::from(1u32 << COLOUR_BITS);
+    let sum: u64 = state.iter().map(|&byte| u64::from(byte)).sum();
+    let mean = sum as f64 / state.len().max(1) as f64;
+    let gain = view.brightness * view.contrast;
+    let half = 1 << (COLOUR_BITS - 1);
+    let add = (view.brightness * (1.0 - view.contrast) * mean * unit).round() as i32 + half;
+    let whole = |coefficient: f64| (gain * coefficient * unit).round() as i32;
+    let byte = |sum: i32| (sum >> COLOUR_BITS).clamp(0, 255) as u8;
+    if frame_channels == 3 {
+        let (sin, cos) = (view.hue * std::f64::consts::TAU).sin_cos();
+        let (along, across) = (view.saturation * cos, view.saturation * sin / 3f64.sqrt());
+        let own = whole(1.0 / 3.0 + along * 2.0 / 3.0);
+        let next = whole(1.0 / 3.0 - along / 3.0 - across);
+        let last = whole(1.0 / 3.0 - along / 3.0 + across);
+        if (own, next, last, add) == (1 << COLOUR_BITS, 0, 0, half) {
+            return;
+        }
+        let (pixels, _) = state.as_chunks_mut::<3>();
+        for pixel in pixels {
+            let [r, g, b] = pixel.map(i32::from);
+            *pixel = [
+                byte(own * r + next * g + last * b + add),
+                byte(last * r + own * g + next * b + add),
+                byte(next * r + last * g + own * b + add),
+            ];
+        }
+    } else {
+        let own = whole(1.0);
+        if (own, add) == (1 << COLOUR_BITS, half) {
+            return;
+        }
+        let changed: [u8; 256] = std::array::from_fn(|value| byte(own * value as i32 + add));
+        state
+            .iter_mut()
+            .for_each(|value| *value = changed[usize::from(*value)]);
+    }
+}

@@ -1,0 +1,456 @@
+//! What holds of the agents beside C51 and DIM: CPC's offsets, CURL's two views, and what a learner of each keeps.
+//! The arithmetic's oracle is in `parity`.
+
+use std::fs;
+
+use driml_learner::{
+    AffinityConfig, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner, LearnerPart,
+    LearnerSettings, Learning, Objective, UpdateError,
+};
+use driml_model::{DimParts, ModelConfig};
+use driml_protocol::{
+    Batch as WireBatch, BatchHeader, Horizon, RunSpec, Tally, TimeoutRule, config::TransportConfig,
+};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::made_up::{ALL_DIM, NO_DIM, Rows, model, settings};
+
+const GLOBAL: Lambda = Lambda {
+    l4t4: 1.0,
+    ..NO_DIM
+};
+const POSITIVES: usize = 3;
+
+fn of(objective: Objective, lambda: Lambda) -> (ModelConfig, LearnerSettings) {
+    let settings = LearnerSettings {
+        objective,
+        condition_on_action: false,
+        ..settings(lambda)
+    };
+    let model = ModelConfig {
+        dim: settings.dim_parts(4),
+        ..model(lambda)
+    };
+    (model, settings)
+}
+
+fn learner(objective: Objective, lambda: Lambda) -> Learner {
+    let (model, settings) = of(objective, lambda);
+    Learner::new(model, settings, &mut ChaCha8Rng::seed_from_u64(1)).unwrap()
+}
+
+/// `rows` with `POSITIVES` positives a row; the batch borrows what `later` makes of them.
+fn cpc<'a>(rows: &'a Rows, frames_k: &'a [u8], valid: &'a [u8]) -> Batch<'a> {
+    Batch {
+        positives: POSITIVES,
+        frames_k,
+        positive_valid: valid,
+        ..rows.batch()
+    }
+}
+
+fn later(rows: &Rows) -> Vec<u8> {
+    rows.frames.concat()
+}
+
+fn curl(rows: &Rows) -> Batch<'_> {
+    Batch {
+        anchors: Some(&rows.frames[1]),
+        frames_k: &rows.frames[2],
+        ..rows.batch()
+    }
+}
+
+#[test]
+fn cpc_with_one_offset_is_dim() {
+    let rows = Rows::random(7, 2);
+    let one = learner(Objective::Cpc, ALL_DIM).evaluate(&rows.batch());
+    let dim = learner(Objective::Dim, ALL_DIM).evaluate(&rows.batch());
+    let (one, dim) = (one.unwrap(), dim.unwrap());
+    for (a, b) in one.dim.iter().zip(dim.dim) {
+        assert!((a.unwrap() - b.unwrap()).abs() < 1e-5, "{a:?} {b:?}");
+    }
+    assert!((one.total - dim.total).abs() < 1e-4);
+}
+
+#[test]
+fn cpc_is_the_mean_over_its_offsets() {
+    let rows = Rows::random(6, 3);
+    let frames_k = later(&rows);
+    let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 0], [0, 0, 0, 1, 0, 0]].concat();
+    let learner = learner(Objective::Cpc, ALL_DIM);
+    let all = learner.evaluate(&cpc(&rows, &frames_k, &valid)).unwrap();
+    let mut sums = [0.0; 4];
+    for (frames, valid) in rows.frames.iter().zip(valid.chunks(6)) {
+        let batch = Batch {
+            positives: 1,
+            frames_k: frames,
+            positive_valid: valid,
+            ..rows.batch()
+        };
+        let one = learner.evaluate(&batch).unwrap();
+        for (sum, loss) in sums.iter_mut().zip(one.dim) {
+            *sum += loss.unwrap();
+        }
+    }
+    for (loss, sum) in all.dim.iter().zip(sums) {
+        assert!((loss.unwrap() - sum / 3.0).abs() < 1e-5, "{loss:?} {sum}");
+    }
+}
+
+#[test]
+fn positives_that_are_missing_change_nothing() {
+    let rows = Rows::random(6, 4);
+    let mut frames_k = later(&rows);
+    let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]].concat();
+    let learner = learner(Objective::Cpc, ALL_DIM);
+    let before = learner.evaluate(&cpc(&rows, &frames_k, &valid)).unwrap();
+    let bytes = frames_k.len() / valid.len();
+    for at in (0..valid.len()).filter(|&at| valid[at] == 0) {
+        frames_k[at * bytes..(at + 1) * bytes].fill(99);
+    }
+    let after = learner.evaluate(&cpc(&rows, &frames_k, &valid)).unwrap();
+    assert_eq!((before.dim, before.total), (after.dim, after.total));
+}
+
+#[test]
+fn without_any_positive_cpc_learns_the_return() {
+    let rows = Rows::random(5, 5);
+    let frames_k = later(&rows);
+    for there in 0..2 {
+        let mut valid = [0; 5 * POSITIVES];
+        valid[..there].fill(1);
+        let mut learner = learner(Objective::Cpc, GLOBAL);
+        let report = learner.update(&cpc(&rows, &frames_k, &valid)).unwrap();
+        assert_eq!(report.dim, [None, None, None, Some(0.0)]);
+        assert_eq!(report.total, report.c51_kl);
+    }
+}
+
+#[test]
+fn cpc_and_curl_bring_their_losses_down() {
+    let rows = Rows::random(16, 6);
+    let (frames_k, valid) = (later(&rows), [1; 16 * POSITIVES]);
+    for (objective, batch) in [
+        (Objective::Cpc, cpc(&rows, &frames_k, &valid)),
+        (Objective::Curl, curl(&rows)),
+    ] {
+        let mut learner = learner(objective, GLOBAL);
+        let first = learner.update(&batch).unwrap().dim[3].unwrap();
+        for _ in 0..80 {
+            learner.update(&batch).unwrap();
+        }
+        let last = learner.update(&batch).unwrap().dim[3].unwrap();
+        assert!(last < 0.7 * first, "{objective:?}: {first} to {last}");
+    }
+}
+
+#[test]
+fn curl_compares_its_views_and_not_the_state() {
+    let rows = Rows::random(8, 7);
+    let learner = learner(Objective::Curl, GLOBAL);
+    let loss = |batch: &Batch<'_>| learner.evaluate(batch).unwrap().dim[3].unwrap();
+    let before = loss(&curl(&rows));
+    let mut other = rows.clone();
+    other.frames[0].fill(3);
+    assert_eq!(loss(&curl(&other)), before, "s_t itself");
+    // No row is masked: the end of an episode matters to neither view.
+    other.positive_valid.fill(0);
+    assert_eq!(loss(&curl(&other)), before, "positive_valid");
+    other.frames[1].fill(3);
+    assert_ne!(loss(&curl(&other)), before, "the query's view");
+    let mut other = rows.clone();
+    other.frames[2] = other.frames[1].clone();
+    let batch = Batch {
+        frames_n: &rows.frames[2],
+        ..curl(&other)
+    };
+    assert_ne!(loss(&batch), before, "the key's view");
+}
+
+#[test]
+fn the_target_network_keeps_a_copy_of_curl_s_head_and_of_no_other() {
+    let rows = Rows::random(6, 8);
+    let names = |learner: &Learner| -> Vec<String> {
+        let named = learner.target().iter().map(|(name, _)| name.to_owned());
+        named.filter(|name| name.starts_with("dim.")).collect()
+    };
+    assert!(names(&learner(Objective::Cpc, GLOBAL)).is_empty());
+    let mut learner = learner(Objective::Curl, GLOBAL);
+    let heads = names(&learner);
+    assert_eq!(heads.len(), 5, "{heads:?}");
+    assert!(heads.iter().all(|name| name.starts_with("dim.psi4.")));
+    let value = |learner: &Learner, online: bool| {
+        let of = if online {
+            learner.online()
+        } else {
+            learner.target()
+        };
+        let var = of.get("dim.psi4.out.weight").unwrap();
+        var.flatten_all().unwrap().to_vec1::<f32>().unwrap()
+    };
+    let start = value(&learner, false);
+    assert_eq!(start, value(&learner, true));
+    for _ in 0..2 {
+        learner.update(&curl(&rows)).unwrap();
+    }
+    assert_eq!(value(&learner, false), start, "its turn has not come");
+    learner.update(&curl(&rows)).unwrap();
+    let online = value(&learner, true);
+    for ((slow, online), start) in value(&learner, false).iter().zip(online).zip(start) {
+        assert!((slow - (0.95 * online + 0.05 * start)).abs() < 1e-6);
+    }
+    // Actors get none of it.
+    let acting = learner.model().without_dim();
+    let weights = learner.weights().unwrap();
+    let device = candle_core::Device::Cpu;
+    driml_model::Parameters::load_safetensors(&acting, &weights, &device).unwrap();
+}
+
+#[test]
+fn batches_that_an_agent_cannot_use_are_refused() {
+    let rows = Rows::random(5, 9);
+    let (frames_k, valid) = (later(&rows), [1; 5 * POSITIVES]);
+    let said = |objective, batch: &Batch<'_>| {
+        let error = learner(objective, GLOBAL).evaluate(batch).unwrap_err();
+        assert!(matches!(error, UpdateError::Batch(_)));
+        error.to_string()
+    };
+    let several = cpc(&rows, &frames_k, &valid);
+    assert!(said(Objective::Dim, &several).contains("3 positives a row; this agent needs one"));
+    let plain = rows.batch();
+    assert!(said(Objective::Curl, &plain).contains("needs two views of each state"));
+    let short = Batch {
+        positive_valid: &valid[1..],
+        ..several
+    };
+    assert!(said(Objective::Cpc, &short).contains("positive_valid"));
+    let short = Batch {
+        anchors: Some(&frames_k[..8]),
+        ..curl(&rows)
+    };
+    assert!(said(Objective::Curl, &short).contains("anchors"));
+}
+
+#[test]
+fn objectives_at_odds_with_their_settings_are_refused() {
+    let said = |objective, lambda, condition_on_action| {
+        let settings = LearnerSettings {
+            objective,
+            condition_on_action,
+            ..settings(lambda)
+        };
+        settings.validate().unwrap_err().to_string()
+    };
+    assert!(said(Objective::None, GLOBAL, false).contains("but lambda.4t4 is above 0"));
+    for objective in [Objective::Dim, Objective::Cpc, Objective::Curl] {
+        assert!(said(objective, NO_DIM, false).contains("but all lambdas are 0"));
+    }
+    assert!(said(Objective::Curl, ALL_DIM, false).contains("lambda.4t4 alone"));
+    assert!(said(Objective::Curl, GLOBAL, true).contains("condition_on_action"));
+}
+
+#[test]
+fn a_psi_that_is_not_given_the_action_does_not_see_it() {
+    let mut rows = Rows::random(6, 10);
+    let learner = learner(Objective::Dim, ALL_DIM);
+    assert!(!learner.model().dim.action);
+    let before = learner.evaluate(&rows.batch()).unwrap().dim;
+    rows.action.rotate_left(1);
+    assert_eq!(learner.evaluate(&rows.batch()).unwrap().dim, before);
+}
+
+const STATE: usize = 20 * 24 * 2;
+
+fn part(objective: Objective, augment: Option<AugmentSettings>) -> LearnerPart {
+    let (model, update) = of(objective, GLOBAL);
+    let horizon = match objective {
+        Objective::Cpc => Horizon::All { k_max: 3 },
+        Objective::Dim => Horizon::Fixed { k: 1 },
+        _ => Horizon::None,
+    };
+    LearnerPart {
+        spec: RunSpec {
+            world: "test".into(),
+            agent: objective.name().into(),
+            seed: 5,
+            frame_height: 20,
+            frame_width: 24,
+            frame_channels: 2,
+            frame_stack: 1,
+            num_actions: 4,
+            n_step: 3,
+            gamma: 0.9,
+            horizon,
+            timeout: TimeoutRule::Terminal,
+        },
+        model,
+        learner: Config {
+            batch_rows: 6,
+            batches_in_flight: 1,
+            publish_period_updates: 2,
+            checkpoint_period_updates: 2,
+            checkpoints_kept: 1,
+            update,
+            augment,
+            affinity: AffinityConfig {
+                estimator: EstimatorKind::None,
+                alphabet: None,
+                visible: None,
+                learned: None,
+                exact: None,
+            },
+        },
+        transport: TransportConfig {
+            shared_memory: false,
+        },
+    }
+}
+
+/// A batch as the replay server of this run would send it.
+fn served(part: &LearnerPart, seed: u64) -> WireBatch {
+    let positives = part.spec.horizon.positives();
+    let mut batch = WireBatch::zeroed(BatchHeader {
+        rows: 6,
+        positives: positives as u32,
+        state_bytes: STATE as u32,
+        tally: Tally::default(),
+        held: 9,
+        mean_age: 0.0,
+        weights_versions: (1, 1),
+    });
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut rows = batch.rows_mut();
+    for row in 0..6 {
+        rng.fill(rows.frame_t(row));
+        rng.fill(rows.frame_n(row));
+        for p in 0..positives {
+            if row > p {
+                rng.fill(rows.positive(p, row, p as u32 + 1));
+            } else {
+                rows.no_positive(p, row);
+            }
+        }
+        rows.set(row, (row % 4) as u8, 0, rng.random_range(-1.0..1.0), 0.9);
+    }
+    batch
+}
+
+const STRONG: AugmentSettings = AugmentSettings {
+    crop_side: 0.8,
+    brightness: 0.4,
+    contrast: 0.4,
+    saturation: 0.4,
+    hue: 0.4,
+};
+const NOTHING: AugmentSettings = AugmentSettings {
+    crop_side: 1.0,
+    brightness: 0.0,
+    contrast: 0.0,
+    saturation: 0.0,
+    hue: 0.0,
+};
+
+#[test]
+fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
+    for objective in [Objective::Dim, Objective::Cpc] {
+        let report = |augment| {
+            let part = part(objective, augment);
+            let batch = served(&part, 1);
+            Learning::new(part).unwrap().update(&batch).unwrap()
+        };
+        let (plain, identity, strong) = (report(None), report(Some(NOTHING)), report(Some(STRONG)));
+        // The augmented states go through a pass of their own, so the sum of gradients may round otherwise.
+        assert_eq!((plain.c51_kl, plain.dim), (identity.c51_kl, identity.dim));
+        assert!((plain.grad_norm - identity.grad_norm).abs() < 1e-5 * plain.grad_norm);
+        assert_eq!((plain.c51_kl, plain.q_mean), (strong.c51_kl, strong.q_mean));
+        assert_ne!(plain.dim, strong.dim);
+    }
+}
+
+/// The draws and the key encoder are part of a checkpoint: half a run and the other half are the run.
+#[test]
+fn an_augmenting_run_resumes_bit_for_bit() {
+    for objective in [Objective::Curl, Objective::Dim] {
+        let folder = std::env::temp_dir().join(format!(
+            "driml-agents-{}-{}",
+            objective.name(),
+            std::process::id()
+        ));
+        let _ = fs::remove_dir_all(&folder);
+        let part = part(objective, Some(STRONG));
+        let learn = |learning: &mut Learning, updates: std::ops::Range<u64>| {
+            for seed in updates {
+                learning.update(&served(&part, seed)).unwrap();
+            }
+        };
+        let mut straight = Learning::new(part.clone()).unwrap();
+        learn(&mut straight, 0..8);
+        let mut half = Learning::new(part.clone()).unwrap();
+        learn(&mut half, 0..4);
+        half.save(&folder).unwrap();
+        let mut resumed = Learning::resume(part.clone(), &folder).unwrap();
+        assert_eq!(resumed.updates(), 4);
+        learn(&mut resumed, 4..8);
+        let (mut a, mut b) = (folder.join("a"), folder.join("b"));
+        straight.save(&a).unwrap();
+        resumed.save(&b).unwrap();
+        for file in [
+            "online.safetensors",
+            "target.safetensors",
+            "optimizer.safetensors",
+        ] {
+            let read = |folder: &mut std::path::PathBuf| {
+                fs::read(folder.join("checkpoint-000000000008").join(file)).unwrap()
+            };
+            assert!(read(&mut a) == read(&mut b), "{objective:?}: {file}");
+        }
+        fs::remove_dir_all(&folder).unwrap();
+    }
+}
+
+/// A refused batch leaves the generator where it was.
+#[test]
+fn a_refused_batch_draws_nothing() {
+    let part = part(Objective::Curl, Some(STRONG));
+    let good = served(&part, 1);
+    let mut bad = served(&part, 2);
+    bad.rows_mut().set(0, 77, 0, 0.0, 0.9);
+    let mut learning = Learning::new(part.clone()).unwrap();
+    assert!(learning.update(&bad).is_err());
+    let after = learning.update(&good).unwrap();
+    assert_eq!(after, Learning::new(part).unwrap().update(&good).unwrap());
+}
+
+#[test]
+fn augmentation_and_objective_belong_together() {
+    let said = |objective, augment| {
+        part(objective, augment)
+            .learner
+            .validate()
+            .unwrap_err()
+            .to_string()
+    };
+    assert!(said(Objective::Curl, None).contains("take the agent curl"));
+    let mut c51 = part(Objective::Dim, Some(STRONG)).learner;
+    c51.update.objective = Objective::None;
+    assert!(
+        c51.validate()
+            .unwrap_err()
+            .to_string()
+            .contains("this agent has none")
+    );
+    let wild = AugmentSettings { hue: 0.7, ..STRONG };
+    assert_eq!(
+        said(Objective::Dim, Some(wild)),
+        "learner.augment.hue = 0.7 cannot work: it must lie between 0 and 0.5, half a turn either way"
+    );
+    assert_eq!(
+        part(Objective::Curl, Some(NOTHING)).model.dim,
+        DimParts {
+            psi4: true,
+            ..DimParts::NONE
+        }
+    );
+}

@@ -1,0 +1,403 @@
+//! Augmentation: its law, its bounds, and that at no strength it changes no byte.
+//! It tests no agent.
+
+use driml_learner::{Augment, AugmentSettings, augment::View};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+const NOTHING: AugmentSettings = AugmentSettings {
+    crop_side: 1.0,
+    brightness: 0.0,
+    contrast: 0.0,
+    saturation: 0.0,
+    hue: 0.0,
+};
+const PAPER: AugmentSettings = AugmentSettings {
+    crop_side: 0.8,
+    brightness: 0.4,
+    contrast: 0.4,
+    saturation: 0.4,
+    hue: 0.4,
+};
+const PLAIN: View = View {
+    top: 0,
+    left: 0,
+    brightness: 1.0,
+    contrast: 1.0,
+    saturation: 1.0,
+    hue: 0.0,
+};
+
+fn rng(seed: u64) -> ChaCha8Rng {
+    ChaCha8Rng::seed_from_u64(seed)
+}
+
+fn noise(bytes: usize, seed: u64) -> Vec<u8> {
+    let mut rng = rng(seed);
+    (0..bytes).map(|_| rng.random()).collect()
+}
+
+fn applied(settings: AugmentSettings, size: (usize, usize, usize), states: &[u8]) -> Vec<u8> {
+    let mut seen = vec![7; 3];
+    Augment::new(settings, size, 3).apply(states, &mut seen, &mut rng(1));
+    seen
+}
+
+#[test]
+fn at_no_strength_every_byte_stays() {
+    for (size, frame_channels) in [
+        ((64, 64, 3), 3),
+        ((84, 84, 12), 3),
+        ((12, 12, 1), 1),
+        ((5, 7, 10), 5),
+        ((1, 1, 3), 3),
+    ] {
+        let states = noise(9 * size.0 * size.1 * size.2, 2);
+        let mut seen = Vec::new();
+        let mut augment = Augment::new(NOTHING, size, frame_channels);
+        augment.apply(&states, &mut seen, &mut rng(3));
+        assert!(seen == states, "{size:?}");
+    }
+}
+
+/// Each change by itself, at its neutral value, with the code that does change things.
+#[test]
+fn neutral_values_change_no_byte_wherever_they_come_from() {
+    let states = noise(3 * 16 * 16 * 3, 4);
+    for (crop_side, strength) in [(1.0, 0.0), (0.8, 0.0), (1.0, 0.4)] {
+        let settings = AugmentSettings {
+            crop_side,
+            brightness: strength,
+            contrast: strength,
+            saturation: strength,
+            hue: strength,
+        };
+        let augment = Augment::new(settings, (16, 16, 3), 3);
+        let mut seen = vec![0; 16 * 16 * 3];
+        for state in states.chunks_exact(seen.len()) {
+            augment.apply_view(state, &PLAIN, &mut seen);
+            assert_eq!(seen == state, crop_side == 1.0);
+        }
+    }
+}
+
+/// A whole turn is no turn, to rounding.
+#[test]
+fn a_third_of_a_turn_takes_red_to_green() {
+    let augment = Augment::new(NOTHING, (1, 4, 3), 3);
+    let state = [200, 10, 60, 255, 0, 0, 0, 0, 255, 90, 90, 90];
+    let turned = |hue: f64| {
+        let mut seen = [0; 12];
+        augment.apply_view(&state, &View { hue, ..PLAIN }, &mut seen);
+        seen
+    };
+    let third = [60, 200, 10, 0, 255, 0, 255, 0, 0, 90, 90, 90];
+    assert_eq!(turned(1.0 / 3.0), third);
+    assert_eq!(turned(1.0), state);
+}
+
+#[test]
+fn factors_do_what_their_names_say() {
+    let augment = Augment::new(NOTHING, (1, 2, 3), 3);
+    // Means of the pixels: 60 and 100; of all: 80.
+    let state = [30, 60, 90, 80, 100, 120];
+    let changed = |view: View| {
+        let mut seen = [0; 6];
+        augment.apply_view(&state, &view, &mut seen);
+        seen
+    };
+    let (brightness, contrast, saturation) = (1.5, 0.5, 0.0);
+    assert_eq!(
+        changed(View {
+            brightness,
+            ..PLAIN
+        }),
+        [45, 90, 135, 120, 150, 180]
+    );
+    assert_eq!(
+        changed(View { contrast, ..PLAIN }),
+        [55, 70, 85, 80, 90, 100]
+    );
+    assert_eq!(
+        changed(View {
+            saturation,
+            ..PLAIN
+        }),
+        [60, 60, 60, 100, 100, 100]
+    );
+    // Out of range ends at the range.
+    assert_eq!(
+        changed(View {
+            brightness: 3.0,
+            ..PLAIN
+        }),
+        [90, 180, 255, 240, 255, 255]
+    );
+    // Without three channels there is no colour to turn or wash out.
+    let grey = Augment::new(NOTHING, (2, 3, 1), 1);
+    let mut seen = [0; 6];
+    let view = View {
+        saturation: 0.0,
+        hue: 0.3,
+        brightness: 0.5,
+        ..PLAIN
+    };
+    grey.apply_view(&state, &view, &mut seen);
+    assert_eq!(seen, [15, 30, 45, 40, 50, 60]);
+}
+
+/// Bilinear resizing in f64, by its definition.
+fn resized(
+    state: &[u8],
+    size: (usize, usize, usize),
+    crop: (usize, usize),
+    at: (usize, usize),
+) -> Vec<f64> {
+    let (height, width, channels) = size;
+    let place = |d: usize, from: usize, to: usize| {
+        let x = ((d as f64 + 0.5) * from as f64 / to as f64 - 0.5).clamp(0.0, (from - 1) as f64);
+        (
+            x.floor() as usize,
+            (x.floor() as usize + 1).min(from - 1),
+            x.fract(),
+        )
+    };
+    let mut out = Vec::new();
+    for y in 0..height {
+        let (y0, y1, v) = place(y, crop.0, height);
+        for x in 0..width {
+            let (x0, x1, u) = place(x, crop.1, width);
+            for c in 0..channels {
+                let pixel = |y: usize, x: usize| {
+                    f64::from(state[((at.0 + y) * width + at.1 + x) * channels + c])
+                };
+                let (top, bottom) = (
+                    pixel(y0, x0) * (1.0 - u) + pixel(y0, x1) * u,
+                    pixel(y1, x0) * (1.0 - u) + pixel(y1, x1) * u,
+                );
+                out.push(top * (1.0 - v) + bottom * v);
+            }
+        }
+    }
+    out
+}
+
+#[test]
+fn crops_are_resized_bilinearly() {
+    for (size, side, wanted) in [
+        ((64, 64, 3), 0.8, (51, 51)),
+        ((84, 84, 12), 0.8, (67, 67)),
+        ((104, 80, 3), 0.8, (83, 64)),
+        ((12, 12, 1), 0.5, (6, 6)),
+        ((9, 5, 4), 0.6, (5, 3)),
+        ((7, 8, 5), 0.01, (1, 1)),
+    ] {
+        let settings = AugmentSettings {
+            crop_side: side,
+            ..NOTHING
+        };
+        let augment = Augment::new(settings, size, 1);
+        assert_eq!(augment.crop(), wanted);
+        let state = noise(size.0 * size.1 * size.2, 5);
+        let mut rng = rng(6);
+        for _ in 0..4 {
+            let view = augment.draw(&mut rng);
+            let mut seen = vec![0; state.len()];
+            augment.apply_view(&state, &view, &mut seen);
+            let right = resized(&state, size, augment.crop(), (view.top, view.left));
+            for (at, (&seen, right)) in seen.iter().zip(right).enumerate() {
+                // Half a byte of rounding, and two weights within 1/512 of theirs.
+                let error = (f64::from(seen) - right).abs();
+                assert!(
+                    error < 0.5 + 2.0 * 255.0 / 512.0,
+                    "{size:?} at {at}: {error}"
+                );
+            }
+        }
+    }
+}
+
+/// Every place of the crop comes equally often: chi-square against the uniform law.
+#[test]
+fn crops_are_anywhere_with_equal_chances() {
+    let augment = Augment::new(PAPER, (64, 64, 3), 3);
+    assert_eq!(augment.crop(), (51, 51));
+    let mut rng = rng(7);
+    let (draws, places) = (28_000, 14);
+    let mut counts = [[0u32; 14]; 2];
+    let mut both = vec![0u32; places * places];
+    for _ in 0..draws {
+        let View { top, left, .. } = augment.draw(&mut rng);
+        counts[0][top] += 1;
+        counts[1][left] += 1;
+        both[top * places + left] += 1;
+    }
+    let chi_square = |counts: &[u32]| {
+        let expected = f64::from(draws) / counts.len() as f64;
+        let square = |&count: &u32| (f64::from(count) - expected).powi(2) / expected;
+        counts.iter().map(square).sum::<f64>()
+    };
+    // Quantiles of 99.9%: 13 and 195 degrees of freedom.
+    assert!(chi_square(&counts[0]) < 34.5 && chi_square(&counts[1]) < 34.5);
+    assert!(chi_square(&both) < 262.0, "{}", chi_square(&both));
+}
+
+/// Factors and turn: within their bounds, uniform over ten bins, and not the same for all.
+#[test]
+fn jitter_is_uniform_within_its_strength() {
+    let settings = AugmentSettings {
+        brightness: 0.1,
+        contrast: 0.2,
+        saturation: 0.3,
+        hue: 0.4,
+        ..PAPER
+    };
+    let augment = Augment::new(settings, (64, 64, 3), 3);
+    let mut rng = rng(8);
+    let draws = 20_000;
+    let mut bins = [[0u32; 10]; 4];
+    let mut products = [0.0; 3];
+    for _ in 0..draws {
+        let view = augment.draw(&mut rng);
+        // Each as a share of its range, from -1 to 1.
+        let shares = [
+            (view.brightness - 1.0) / 0.1,
+            (view.contrast - 1.0) / 0.2,
+            (view.saturation - 1.0) / 0.3,
+            view.hue / 0.4,
+        ];
+        for (bins, share) in bins.iter_mut().zip(shares) {
+            assert!((-1.0 - 1e-9..=1.0 + 1e-9).contains(&share), "{view:?}");
+            bins[(((share + 1.0) * 5.0) as usize).min(9)] += 1;
+        }
+        for (product, pair) in products.iter_mut().zip(shares.windows(2)) {
+            *product += pair[0] * pair[1];
+        }
+    }
+    for bins in bins {
+        let expected = f64::from(draws) / 10.0;
+        let square = |&count: &u32| (f64::from(count) - expected).powi(2) / expected;
+        let chi_square: f64 = bins.iter().map(square).sum();
+        assert!(chi_square < 27.9, "9 degrees of freedom, 99.9%: {bins:?}");
+    }
+    for product in products {
+        // Standard deviation of a product of two such shares: 1/3.
+        assert!((product / f64::from(draws)).abs() < 4.0 / 3.0 / f64::from(draws).sqrt());
+    }
+}
+
+/// What jitter does to bytes: brightness keeps the mean on average, and spreads it as its law says.
+#[test]
+fn brightness_moves_means_as_its_law_says() {
+    let settings = AugmentSettings {
+        brightness: 0.4,
+        ..NOTHING
+    };
+    let (count, bytes) = (4_000, 2 * 2 * 3);
+    let seen = applied(settings, (2, 2, 3), &vec![100; count * bytes]);
+    let means: Vec<f64> = seen
+        .chunks_exact(bytes)
+        .map(|state| state.iter().map(|&b| f64::from(b)).sum::<f64>() / bytes as f64)
+        .collect();
+    let mean = means.iter().sum::<f64>() / count as f64;
+    let variance = means.iter().map(|m| (m - mean).powi(2)).sum::<f64>() / count as f64;
+    // Uniform on 60..140: standard deviation 80 / sqrt(12) = 23.09.
+    assert!((mean - 100.0).abs() < 4.0 * 23.1 / (count as f64).sqrt());
+    assert!((variance.sqrt() - 23.09).abs() < 1.0, "{}", variance.sqrt());
+    assert!(means.iter().all(|mean| (60.0..=140.0).contains(mean)));
+}
+
+#[test]
+fn the_generator_alone_decides_and_rows_differ() {
+    let size = (16, 16, 3);
+    let state = noise(16 * 16 * 3, 9);
+    let states = state.repeat(33);
+    let first = applied(PAPER, size, &states);
+    for threads in [1, 2, 5] {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .unwrap();
+        assert!(pool.install(|| applied(PAPER, size, &states)) == first);
+    }
+    let mut different: Vec<_> = first.chunks_exact(state.len()).collect();
+    different.sort_unstable();
+    different.dedup();
+    assert_eq!(different.len(), 33, "each row has a draw of its own");
+    // One call after the other goes on with the generator, and memory used before leaves no trace.
+    let mut augment = Augment::new(PAPER, size, 3);
+    let (mut rng, mut seen) = (rng(1), vec![1; 7]);
+    for rows in [20, 13] {
+        augment.apply(&states[..rows * state.len()], &mut seen, &mut rng);
+        assert_eq!(seen.len(), rows * state.len());
+    }
+    assert!(seen == first[20 * state.len()..]);
+}
+
+/// The frames of a stack go through the same change: four equal frames stay equal.
+#[test]
+fn a_stack_is_changed_as_one() {
+    let frame = noise(12 * 12 * 3, 10);
+    let stacked: Vec<u8> = frame
+        .chunks_exact(3)
+        .flat_map(|pixel| pixel.repeat(4))
+        .collect();
+    let seen = applied(PAPER, (12, 12, 12), &stacked.repeat(8));
+    for pixel in seen.chunks_exact(12) {
+        assert!(pixel.chunks_exact(3).all(|frame| frame == &pixel[..3]));
+    }
+    // As the frame by itself is changed.
+    let alone = applied(PAPER, (12, 12, 3), &frame.repeat(8));
+    let newest: Vec<u8> = seen
+        .chunks_exact(12)
+        .flat_map(|pixel| &pixel[9..])
+        .copied()
+        .collect();
+    assert!(newest == alone);
+}
+
+#[test]
+fn settings_out_of_range_are_named() {
+    assert_eq!(PAPER.validate(), Ok(()));
+    assert_eq!(NOTHING.validate(), Ok(()));
+    for (name, settings) in [
+        (
+            "augment.crop_side",
+            AugmentSettings {
+                crop_side: 0.0,
+                ..PAPER
+            },
+        ),
+        (
+            "augment.crop_side",
+            AugmentSettings {
+                crop_side: 1.1,
+                ..PAPER
+            },
+        ),
+        (
+            "augment.brightness",
+            AugmentSettings {
+                brightness: -0.1,
+                ..PAPER
+            },
+        ),
+        (
+            "augment.contrast",
+            AugmentSettings {
+                contrast: f64::NAN,
+                ..PAPER
+            },
+        ),
+        (
+            "augment.saturation",
+            AugmentSettings {
+                saturation: 1.5,
+                ..PAPER
+            },
+        ),
+        ("augment.hue", AugmentSettings { hue: 0.6, ..PAPER }),
+    ] {
+        assert_eq!(settings.validate().unwrap_err().0, name);
+    }
+}
