@@ -35,8 +35,8 @@ pub(crate) enum Command {
     /// Measure how fast the parts are, alone and beside what others use
     #[command(subcommand)]
     Bench(BenchCommand),
-    /// List the presets
-    Presets,
+    /// List presets, agents and what differs by game; or print the settings of one game and agent with their sources
+    Presets(PresetsArgs),
     /// Procgen's engine
     #[command(subcommand)]
     Procgen(ProcgenCommand),
@@ -78,9 +78,19 @@ pub(crate) struct RunFlags {
     /// Seed of every generator of the run
     #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=i64::MAX as u64))]
     pub(crate) seed: Option<u64>,
+    /// For studies alone: train with a known fault of the paper's published code
+    #[arg(long, value_name = "FAULT", value_enum)]
+    pub(crate) study: Option<Fault>,
     /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub(crate) sets: Vec<String>,
+}
+
+/// A known fault of the paper's published code.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Fault {
+    /// n-step returns that bootstrap from s_{t+1}, with the end of an episode seen at step t alone
+    BootstrapFromNextState,
 }
 
 #[derive(Debug, Args)]
@@ -96,6 +106,9 @@ pub(crate) struct LocalArgs {
     /// Endpoint on which the parts meet [default: a unix socket in a fresh folder]
     #[arg(long, value_name = "ENDPOINT")]
     pub(crate) listen: Option<String>,
+    /// End as after Ctrl-C when the process that started this one ends
+    #[arg(long, hide = true)]
+    pub(crate) exit_with_parent: bool,
 }
 
 /// How a part reaches the run.
@@ -159,9 +172,11 @@ pub(crate) struct ReplayServerArgs {
 /// Which levels to play.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Levels {
-    /// Those trained on
+    /// Those trained on, in the order of the training
     Train,
-    /// Others of the same game (Procgen)
+    /// Those trained on, drawn at random, each an episode of its own (Procgen)
+    TrainSingle,
+    /// Others of the same game, each an episode of its own (Procgen)
     Unseen,
 }
 
@@ -179,6 +194,19 @@ pub(crate) struct EvaluateArgs {
     /// Seed of the worlds and of exploration
     #[arg(long, value_name = "S", default_value_t = 0)]
     pub(crate) seed: u64,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct PresetsArgs {
+    /// Print the settings for this game of Procgen, or another world
+    #[arg(long, value_name = "GAME")]
+    pub(crate) game: Option<String>,
+    /// Print the settings of this agent
+    #[arg(long, value_name = "AGENT")]
+    pub(crate) agent: Option<String>,
+    /// Print the settings of this preset
+    #[arg(long, value_name = "NAME")]
+    pub(crate) preset: Option<String>,
 }
 
 /// What the band over several seeds shows.
@@ -222,6 +250,67 @@ pub(crate) enum ExperimentCommand {
     RandomWalk(ExperimentFlags),
     /// Fig. 2: local DIM finds the patch of an Ising model in noise
     Ising(ExperimentFlags),
+    /// Fig. 3: Ms. PacMan's ghosts, predictable or not, and one lethal ghost that changes; C51 beside DRIML
+    Pacman(PacmanArgs),
+    /// Table 1: agents on Procgen's games, from a queue of whole runs
+    Procgen(ProcgenArgs),
+}
+
+/// What the experiments that are made of whole runs take.
+#[derive(Clone, Debug, Args)]
+pub(crate) struct QueueFlags {
+    /// Runs at once [default: as the experiment's settings say]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub(crate) jobs: Option<u32>,
+    /// Start nothing: figures, data and page of the runs that are finished
+    #[arg(long)]
+    pub(crate) report: bool,
+    /// One setting of every run, as `driml local` takes it; may be given several times
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub(crate) sets: Vec<String>,
+}
+
+#[derive(Clone, Debug, Args)]
+pub(crate) struct PacmanArgs {
+    #[command(flatten)]
+    pub(crate) flags: ExperimentFlags,
+    #[command(flatten)]
+    pub(crate) queue: QueueFlags,
+    /// Agents of the continual tasks; the first is what the others are compared with [default: c51,driml-fix]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) agents: Vec<String>,
+    /// Frames of each run with ghosts that move at random (a)
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1_000..=1_000_000_000))]
+    pub(crate) frames: Option<u64>,
+    /// Episodes until the next ghost is the lethal one (b, c); the paper's are 5000
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
+    pub(crate) episodes_per_task: Option<u64>,
+}
+
+#[derive(Clone, Debug, Args)]
+pub(crate) struct ProcgenArgs {
+    #[command(flatten)]
+    pub(crate) flags: ExperimentFlags,
+    #[command(flatten)]
+    pub(crate) queue: QueueFlags,
+    /// Games, such as bigfish,starpilot; or all [default: as the experiment's settings say]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) games: Vec<String>,
+    /// Agents; or all [default: c51,driml-fix,driml-ada]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) agents: Vec<String>,
+    /// Frames of each run; the paper's are 50000000
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(500..=1_000_000_000))]
+    pub(crate) frames: Option<u64>,
+    /// Episodes played with each run's weights on each kind of levels
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub(crate) episodes: Option<u32>,
+    /// Named settings of every run; `driml presets` lists them
+    #[arg(long, value_name = "NAME")]
+    pub(crate) preset: Option<String>,
+    /// Instead: short runs of c51 on every game, to see on which it learns soonest
+    #[arg(long)]
+    pub(crate) screen: bool,
 }
 
 /// What every experiment takes.

@@ -5,7 +5,7 @@ use driml_envs::{WorldConfig, WorldName};
 use driml_learner::{EstimatorKind, Objective};
 use driml_model::ModelConfig;
 use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
-use driml_replay_server::Compression;
+use driml_replay_server::{Compression, Study};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -68,6 +68,7 @@ pub(crate) struct Flags {
     pub(crate) frames: Option<u64>,
     pub(crate) replay_shards: Option<u32>,
     pub(crate) seed: Option<u64>,
+    pub(crate) study: Option<Study>,
     pub(crate) sets: Vec<String>,
 }
 
@@ -119,6 +120,7 @@ pub(crate) fn resolve(
             Override::parse(&format!("{path}={value}"))?.apply(&mut table)?;
         }
     }
+    study(&mut table, flags.study)?;
     let capacity_set = set(&mut table, &flags.sets)? || !sized_by_machine;
     let note = fit_memory(&mut table, capacity_set, machine)?;
     derive(&mut table)?;
@@ -128,6 +130,24 @@ pub(crate) fn resolve(
     })?;
     config.notes.extend(note);
     Ok(config)
+}
+
+/// Sets the fault to be studied; refuses settings that have one which nobody asked for.
+fn study(table: &mut Table, asked: Option<Study>) -> Result<(), Usage> {
+    let Some(replay) = table.get_mut("replay").and_then(Value::as_table_mut) else {
+        return Ok(());
+    };
+    if let (Some(found), None) = (replay.get("study"), asked) {
+        return Err(usage!(
+            "replay.study = {found}: these settings train with a known fault, for studies alone; add --study {} if that is meant",
+            found.as_str().unwrap_or("FAULT")
+        ));
+    }
+    if let Some(study) = asked {
+        let name = Value::try_from(study).map_err(|e| usage!("--study as TOML: {e}"))?;
+        replay.insert("study".into(), name);
+    }
+    Ok(())
 }
 
 /// Applies every `--set`; returns whether the replay's capacity was among them.
@@ -303,6 +323,11 @@ impl RunConfig {
         let mut config = parts_read(&table)?;
         config.validate()?;
         config.notes = presets::notes(&config.run.agent, &config.run.world);
+        if config.replay.study.is_some() {
+            let note =
+                "a study: the targets have a known fault of the paper's published code (--study)";
+            config.notes.push(note.into());
+        }
         Ok(config)
     }
 

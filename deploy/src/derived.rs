@@ -12,7 +12,7 @@ use crate::{
 };
 
 /// What follows, and from what.
-const FOLLOWS: [(&str, &str); 13] = [
+const FOLLOWS: [(&str, &str); 14] = [
     ("run.world", "is chosen by --env"),
     ("run.agent", "is chosen by --agent"),
     ("run.frame_height", "follows from the world"),
@@ -29,6 +29,10 @@ const FOLLOWS: [(&str, &str); 13] = [
     ),
     ("model.num_actions", "follows from the world"),
     ("model.dim", "follows from learner.update"),
+    (
+        "replay.study",
+        "is a fault to be studied, and chosen by --study",
+    ),
 ];
 
 /// Writes the names that everything else follows from.
@@ -42,16 +46,24 @@ pub(crate) fn name(table: &mut Table, world: &str, agent: &str) {
 /// # Errors
 /// Says what to set instead.
 pub(crate) fn refuse(path: &str) -> Result<(), Usage> {
-    let follows = FOLLOWS.iter().find(|(known, _)| {
-        path == *known
-            || path
-                .strip_prefix(known)
-                .is_some_and(|rest| rest.starts_with('.'))
-    });
-    match follows {
+    match followed(path) {
         Some((known, how)) => Err(usage!("{known} cannot be set by hand: it {how}")),
         None => Ok(()),
     }
+}
+
+/// How a setting follows from others; none of one that does not.
+pub(crate) fn follows(path: &str) -> Option<&'static str> {
+    followed(path).map(|(_, how)| how)
+}
+
+/// The entry of [`FOLLOWS`] that is `path` or a table around it.
+fn followed(path: &str) -> Option<(&'static str, &'static str)> {
+    let inside = |known: &str| {
+        let rest = path.strip_prefix(known);
+        rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+    };
+    FOLLOWS.into_iter().find(|(known, _)| inside(known))
 }
 
 /// Fills in what follows.

@@ -1,6 +1,8 @@
 //! `driml evaluate`: whole episodes with a run's newest checkpoint, and a random policy's beside them.
 //! It trains nothing and changes nothing in the run folder.
 
+use std::path::Path;
+
 use anyhow::Context;
 use driml_actor::{
     evaluate::episode_returns,
@@ -14,7 +16,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     cli::{EvaluateArgs, Levels},
     config::RunConfig,
-    error::usage,
+    error::{Usage, usage},
     print,
 };
 
@@ -32,63 +34,20 @@ const UNSEEN_LEVELS: u32 = 100_000;
 /// # Errors
 /// A folder that is no run's, a damaged checkpoint, levels that the world does not have.
 pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
-    let path = args.run.join("config.toml");
-    let text = std::fs::read_to_string(&path).map_err(|e| {
-        usage!(
-            "{} is not the folder of a run: reading {}: {e}",
-            args.run.display(),
-            path.display()
-        )
-    })?;
-    let config = RunConfig::parse(&path.display().to_string(), &text)?;
-    let world = levels(&config.world, args.levels)?;
-    let restored = checkpoint::load_latest(
-        &args.run.join("checkpoints"),
-        &config.model,
-        &config.learner.update,
-        config.run.hash(),
-    )?
-    .ok_or_else(|| {
-        usage!(
-            "{} has no checkpoint yet: let the run go on",
-            args.run.display()
-        )
-    })?;
-
-    let spec = &config.run;
-    let frame = (spec.frame_height as usize, spec.frame_width as usize);
-    let weights = restored.learner.weights()?;
-    let mut network = NetworkPolicy::new(&config.model, frame, &weights)?;
-    let mut random = RandomPolicy::new(u8::try_from(spec.num_actions)?);
-    let policies: [(&str, &mut dyn Policy); 2] =
-        [(&spec.agent, &mut network), ("random", &mut random)];
+    let player = Player::load(&args.run)?;
+    let world = levels(&player.config.world, args.levels)?;
+    let spec = &player.config.run;
     let which = match args.levels {
         Levels::Train => "as trained on",
+        Levels::TrainSingle => "on the levels trained on, one an episode",
         Levels::Unseen => "on unseen levels",
     };
     print(&format!(
         "{} {which}, {} episodes each, weights after {} updates, seed {}\n",
-        spec.world,
-        args.episodes,
-        restored.learner.updates(),
-        args.seed
+        spec.world, args.episodes, player.updates, args.seed
     ))?;
-    let episodes = args.episodes as usize;
-    for (name, policy) in policies {
-        let copies = episodes.min(COPIES_MAX);
-        let world = driml_envs::make_world(&world, copies, args.seed, 0)?;
-        let rounds = episodes.div_ceil(copies) as u64;
-        let rng = ChaCha8Rng::seed_from_u64(args.seed);
-        let returns = episode_returns(
-            world,
-            spec.frame_stack as usize,
-            policy,
-            EPSILON,
-            episodes,
-            rounds * STEPS_A_ROUND_MAX,
-            rng,
-        )
-        .with_context(|| format!("playing {} with the policy {name}", spec.world))?;
+    for (name, who) in [(spec.agent.as_str(), Who::Agent), ("random", Who::Random)] {
+        let returns = player.play(who, &world, args.episodes as usize, args.seed)?;
         let (mean, deviation) = mean_and_deviation(&returns);
         print(&format!(
             "{name:12} mean return {mean:8.3}, standard deviation {deviation:.3}\n"
@@ -97,22 +56,127 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Who chooses the actions.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Who {
+    /// The run's network.
+    Agent,
+    /// Every action equally likely.
+    Random,
+}
+
+/// A run's newest weights and its world, ready to play.
+pub(crate) struct Player {
+    config: RunConfig,
+    /// As safetensors.
+    weights: Vec<u8>,
+    updates: u64,
+}
+
+impl Player {
+    /// Reads the newest checkpoint of a run's folder.
+    ///
+    /// # Errors
+    /// A folder that is no run's or has no checkpoint, a damaged checkpoint.
+    pub(crate) fn load(folder: &Path) -> anyhow::Result<Self> {
+        let path = folder.join("config.toml");
+        let text = std::fs::read_to_string(&path).map_err(|e| {
+            usage!(
+                "{} is not the folder of a run: reading {}: {e}",
+                folder.display(),
+                path.display()
+            )
+        })?;
+        let config = RunConfig::parse(&path.display().to_string(), &text)?;
+        let restored = checkpoint::load_latest(
+            &folder.join("checkpoints"),
+            &config.model,
+            &config.learner.update,
+            config.run.hash(),
+        )?
+        .ok_or_else(|| {
+            usage!(
+                "{} has no checkpoint yet: let the run go on",
+                folder.display()
+            )
+        })?;
+        let weights = restored.learner.weights()?;
+        let updates = restored.learner.updates();
+        Ok(Self {
+            config,
+            weights,
+            updates,
+        })
+    }
+
+    /// Returns of whole episodes on the levels asked for; none if the world does not have them.
+    ///
+    /// # Errors
+    /// The policy or the world failed, or episodes do not end.
+    pub(crate) fn returns(
+        &self,
+        who: Who,
+        which: Levels,
+        episodes: u32,
+        seed: u64,
+    ) -> anyhow::Result<Option<Vec<f64>>> {
+        match levels(&self.config.world, which) {
+            Ok(world) => self.play(who, &world, episodes as usize, seed).map(Some),
+            Err(_) => Ok(None),
+        }
+    }
+
+    fn play(
+        &self,
+        who: Who,
+        world: &WorldConfig,
+        episodes: usize,
+        seed: u64,
+    ) -> anyhow::Result<Vec<f64>> {
+        let spec = &self.config.run;
+        let frame = (spec.frame_height as usize, spec.frame_width as usize);
+        let mut policy: Box<dyn Policy> = match who {
+            Who::Agent => Box::new(NetworkPolicy::new(
+                &self.config.model,
+                frame,
+                &self.weights,
+            )?),
+            Who::Random => Box::new(RandomPolicy::new(u8::try_from(spec.num_actions)?)),
+        };
+        let copies = episodes.min(COPIES_MAX);
+        let rounds = episodes.div_ceil(copies) as u64;
+        episode_returns(
+            driml_envs::make_world(world, copies, seed, 0)?,
+            spec.frame_stack as usize,
+            policy.as_mut(),
+            EPSILON,
+            episodes,
+            rounds * STEPS_A_ROUND_MAX,
+            ChaCha8Rng::seed_from_u64(seed),
+        )
+        .with_context(|| format!("playing {}", spec.world))
+    }
+}
+
 /// The world with the levels asked for.
-fn levels(world: &WorldConfig, levels: Levels) -> anyhow::Result<WorldConfig> {
+fn levels(world: &WorldConfig, levels: Levels) -> Result<WorldConfig, Usage> {
     let mut world = world.clone();
     match (&mut world, levels) {
         (_, Levels::Train) => {}
+        (WorldConfig::Procgen(procgen), Levels::TrainSingle) => {
+            procgen.use_sequential_levels = false;
+        }
         (WorldConfig::Procgen(procgen), Levels::Unseen) => {
             if procgen.num_levels == 0 {
-                return Err(
-                    usage!("this run trained on all levels there are: none is unseen").into(),
-                );
+                return Err(usage!(
+                    "this run trained on all levels there are: none is unseen"
+                ));
             }
             procgen.start_level += procgen.num_levels;
             procgen.num_levels = UNSEEN_LEVELS;
             procgen.use_sequential_levels = false;
         }
-        _ => return Err(usage!("this run's world has no levels: use --levels train").into()),
+        _ => return Err(usage!("this run's world has no levels: use --levels train")),
     }
     Ok(world)
 }

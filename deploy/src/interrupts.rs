@@ -10,6 +10,8 @@ use tokio::signal::unix::{SignalKind, signal};
 
 /// Signals closer together are one wish: tools such as `timeout` signal the process and its group.
 const ONE_WISH: Duration = Duration::from_millis(300);
+/// How often it is looked whether the parent lives.
+const PARENT_POLL: Duration = Duration::from_millis(500);
 
 /// A shared count of interrupts.
 #[derive(Clone, Debug, Default)]
@@ -18,11 +20,12 @@ pub(crate) struct Interrupts {
 }
 
 impl Interrupts {
-    /// Starts to listen for signals, for the rest of the process's life.
+    /// Starts to listen for signals, for the rest of the process's life; the death of the parent counts too, if
+    /// `exit_with_parent`.
     ///
     /// # Errors
     /// The operating system gave no thread, runtime or signal handler.
-    pub(crate) fn listen() -> std::io::Result<Self> {
+    pub(crate) fn listen(exit_with_parent: bool) -> std::io::Result<Self> {
         let this = Self::default();
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
@@ -36,13 +39,22 @@ impl Interrupts {
             )
         };
         let counted = this.clone();
+        let parent = std::os::unix::process::parent_id();
+        let parent_died = async move {
+            while !exit_with_parent || std::os::unix::process::parent_id() == parent {
+                tokio::time::sleep(PARENT_POLL).await;
+            }
+        };
         std::thread::Builder::new()
             .name("interrupts".into())
             .spawn(move || {
                 runtime.block_on(async {
                     let mut last: Option<Instant> = None;
+                    let mut orphan = false;
+                    tokio::pin!(parent_died);
                     loop {
                         tokio::select! {
+                            () = &mut parent_died, if !orphan => orphan = true,
                             _ = interrupt.recv() => {}
                             _ = terminate.recv() => {}
                             _ = hangup.recv() => {}

@@ -132,7 +132,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Plot(args) => plot::run(&args),
         Command::Experiment(command) => experiment::run(&command),
         Command::Bench(command) => bench::run(&command),
-        Command::Presets => print(&presets::describe()),
+        Command::Presets(args) => presets::print(&args),
         Command::Procgen(ProcgenCommand::Install) => {
             let engine = procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
             print(&format!(

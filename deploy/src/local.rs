@@ -8,10 +8,11 @@ use std::{
 
 use driml_envs::{WorldConfig, WorldName};
 use driml_protocol::RunSpec;
+use driml_replay_server::Study;
 
 use crate::{
     check_endpoints,
-    cli::{LocalArgs, RunFlags},
+    cli::{Fault, LocalArgs, RunFlags},
     config::{self, Flags, RunConfig, Source},
     error::{Usage, usage},
     lockstep,
@@ -56,9 +57,9 @@ pub(crate) fn run(args: LocalArgs) -> anyhow::Result<()> {
             )
             .into());
         }
-        lockstep::run(&config, &run_dir)
+        lockstep::run(&config, &run_dir, args.exit_with_parent)
     } else {
-        processes::run(&config, &run_dir, args.listen)
+        processes::run(&config, &run_dir, args.listen, args.exit_with_parent)
     }
 }
 
@@ -73,6 +74,9 @@ pub(crate) fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, 
         frames: args.frames,
         replay_shards: args.replay_shards,
         seed: args.seed,
+        study: args.study.map(|fault| match fault {
+            Fault::BootstrapFromNextState => Study::BootstrapFromNextState,
+        }),
         sets: args.sets.clone(),
     };
     let (source, from) = match &args.config {

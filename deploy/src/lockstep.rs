@@ -30,8 +30,12 @@ const EPOCH: u64 = 1;
 ///
 /// # Errors
 /// A part that failed, a file system that refuses; [`Interrupted`] if a person ended the run.
-pub(crate) fn run(config: &RunConfig, run_dir: &Path) -> anyhow::Result<()> {
-    let shutdown = Shutdown::on_signals(false).context("listening for signals")?;
+pub(crate) fn run(
+    config: &RunConfig,
+    run_dir: &Path,
+    exit_with_parent: bool,
+) -> anyhow::Result<()> {
+    let shutdown = Shutdown::on_signals(exit_with_parent).context("listening for signals")?;
     let mut recorder = Recorder::create(run_dir, &config.to_toml(), &[])?;
     let screen = Screen::new(config.frames());
     let mut parts = Parts::new(config)?;

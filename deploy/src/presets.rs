@@ -1,10 +1,13 @@
 //! The menu of presets: TOML layers that lie in `presets/`, built into the program and laid over one another.
 //! It checks no value: `config` does, once everything is in place.
 
+mod menu;
+
 use driml_envs::WorldName;
 use serde::Deserialize;
 use toml::{Table, Value};
 
+pub(crate) use self::menu::{print, world};
 use crate::error::{Usage, nearest, usage};
 
 /// One file of `presets/`.
@@ -181,14 +184,19 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
         ));
     }
     let mut table = Table::new();
-    let world_layer = world_layer(world);
-    for layer in [&BASE, &world_layer, &agent.layer]
-        .into_iter()
-        .chain(preset.layers)
-    {
-        lay(&mut table, layer, &world.to_string());
+    for layer in stack(preset, world, agent) {
+        lay(&mut table, &layer, &world.to_string());
     }
     Ok(table)
+}
+
+/// The files that are laid over one another, the lowest first.
+fn stack(preset: &Preset, world: WorldName, agent: &Agent) -> Vec<Layer> {
+    let over = preset.layers.iter().copied();
+    [BASE, world_layer(world), agent.layer]
+        .into_iter()
+        .chain(over)
+        .collect()
 }
 
 /// Lays one file over `table`: first what holds everywhere, then each `[[only]]` block that names `world`.
@@ -254,22 +262,6 @@ fn merge(lower: &mut Table, upper: Table) {
             }
         }
     }
-}
-
-/// What `driml presets` prints: presets, then agents.
-pub(crate) fn describe() -> String {
-    let presets = PRESETS.iter().map(|preset| (preset.name, preset.about));
-    let agents = AGENTS.iter().map(|agent| (agent.name, agent.about));
-    let width = presets
-        .clone()
-        .chain(agents.clone())
-        .map(|(name, _)| name.len())
-        .max()
-        .unwrap_or(0);
-    let line = |(name, about)| format!("{name:width$}  {about}\n");
-    let presets: String = presets.map(line).collect();
-    let agents: String = agents.map(line).collect();
-    format!("--preset\n{presets}\n--agent\n{agents}")
 }
 
 #[cfg(test)]

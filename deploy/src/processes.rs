@@ -53,8 +53,9 @@ pub(crate) fn run(
     config: &RunConfig,
     run_dir: &Path,
     listen: Option<String>,
+    exit_with_parent: bool,
 ) -> anyhow::Result<()> {
-    let interrupts = Interrupts::listen().context("listening for signals")?;
+    let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
     let servers = server_names(config.replay.shards);
     let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
     let names: Vec<_> = servers
@@ -157,7 +158,7 @@ impl Launch<'_> {
         let exit = "--exit-with-parent";
         for (shard, (name, endpoint)) in self.servers.iter().zip(&self.endpoints).enumerate() {
             let shard = shard.to_string();
-            let args = part(&[
+            let mut args = part(&[
                 "replay-server",
                 "--listen",
                 endpoint,
@@ -167,6 +168,9 @@ impl Launch<'_> {
                 &config,
                 exit,
             ]);
+            if let Some(study) = self.config.replay.study {
+                args.extend(part(&["--study", study.name()]));
+            }
             let server = Part::start(name, &args, PART_THREADS, &logs, &self.screen)?;
             self.parts.push(server);
         }

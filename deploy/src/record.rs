@@ -10,7 +10,7 @@ use std::{
 
 use anyhow::Context;
 use driml_protocol::{LearnerStatus, ReplayStatus};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::{
     display::{PAIRS, Rates},
@@ -18,7 +18,7 @@ use crate::{
 };
 
 /// How a run ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum Outcome {
     /// All frames are in, their updates done and the last checkpoint written.
@@ -30,7 +30,7 @@ pub(crate) enum Outcome {
 }
 
 /// `summary.json`.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Summary {
     /// How the run ended.
     pub(crate) outcome: Outcome,
@@ -68,6 +68,9 @@ pub(crate) struct Summary {
     pub(crate) mean_k: Option<f64>,
     /// How often each k was served; index 0 counts rows without a positive.
     pub(crate) k_histogram: Vec<u64>,
+    /// How often each action was taken; older runs do not say.
+    #[serde(default)]
+    pub(crate) action_histogram: Vec<u64>,
     /// Version of the last weights.
     pub(crate) weights_version: u64,
     /// SHA-256 of the last weights, hexadecimal.
@@ -270,6 +273,7 @@ impl Recorder {
             updates_per_second: learner.updates as f64 / wall_seconds,
             mean_k: replay.mean_k(),
             k_histogram: replay.k_histogram.clone(),
+            action_histogram: replay.action_histogram.clone(),
             weights_version: learner.weights_version,
             weights_sha256: learner.weights_sha256.clone(),
             chunks_retried: replay.chunks_retried,

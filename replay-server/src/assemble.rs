@@ -7,6 +7,7 @@ use driml_protocol::{
 use rand::Rng;
 
 use crate::{
+    config::Study,
     episodes::Window,
     horizon::{self, Affinity},
 };
@@ -68,17 +69,19 @@ impl RowStates {
 pub(crate) struct Assembler {
     horizon: Horizon,
     timeout: TimeoutRule,
+    study: Option<Study>,
     /// gamma^0 ..= gamma^n.
     discounts: Vec<f64>,
     actions: Vec<u8>,
 }
 
 impl Assembler {
-    pub(crate) fn new(spec: &RunSpec) -> Self {
+    pub(crate) fn new(spec: &RunSpec, study: Option<Study>) -> Self {
         let powers = std::iter::successors(Some(1.0), |power| Some(power * spec.gamma));
         Self {
             horizon: spec.horizon,
             timeout: spec.timeout,
+            study,
             discounts: powers.take(spec.n_step as usize + 1).collect(),
             actions: Vec::with_capacity(spec.horizon.k_max() as usize),
         }
@@ -98,8 +101,12 @@ impl Assembler {
         } else {
             NO_ACTION
         };
-        let (n_step_return, bootstrap) = self.n_step_return(window);
-        let discount = bootstrap.map_or(0.0, |i| self.discounts[i]);
+        let (n_step_return, follows) = self.n_step_return(window);
+        let bootstrap = match self.study {
+            None => follows.map(|i| (i, self.discounts[i])),
+            Some(Study::BootstrapFromNextState) => self.next_state(window),
+        };
+        let discount = bootstrap.map_or(0.0, |(_, discount)| discount);
         rows.set(
             row,
             anchor.action,
@@ -114,7 +121,7 @@ impl Assembler {
         };
         let mut states = RowStates {
             t: window.index(0),
-            n: bootstrap.map(|i| window.index(i)),
+            n: bootstrap.map(|(i, _)| window.index(i)),
             k_first,
             positives: 0,
             s_tpk: [0; POSITIVES_MAX],
@@ -144,6 +151,12 @@ impl Assembler {
             }
         }
         (sum, Some(n))
+    }
+
+    /// s_{t+1} at gamma^n, unless step t ended its episode: the fault of [`Study::BootstrapFromNextState`].
+    fn next_state(&self, window: &Window) -> Option<(usize, f64)> {
+        let n = self.discounts.len() - 1;
+        (!window.step(0).end.is_episode_end()).then(|| (1, self.discounts[n]))
     }
 
     /// k, or none where no positive is served or a_t ended its episode or level.

@@ -12,6 +12,23 @@ use crate::frames::{Compression, OVERHEAD_BYTES_MAX};
 /// Most shards of one replay.
 pub const SHARDS_MAX: u32 = 256;
 
+/// A known fault of the paper's published code, reproduced to show what it does: for studies alone.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Study {
+    /// The n-step return bootstraps from s_{t+1} instead of s_{t+n}, at gamma^n, unless step t itself ended the episode.
+    BootstrapFromNextState,
+}
+
+impl Study {
+    /// As settings and `--study` have it.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::BootstrapFromNextState => "bootstrap-from-next-state",
+        }
+    }
+}
+
 /// The replay server's settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -36,6 +53,9 @@ pub struct Config {
     pub slack_transitions: u64,
     /// Transitions of the whole run, warm-up included: once that many are stored, no more are taken. None runs on.
     pub transitions_max: Option<u64>,
+    /// A known fault to reproduce; none in every run that is not a study of it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub study: Option<Study>,
 }
 
 /// Why settings were refused.

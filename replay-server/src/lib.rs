@@ -18,7 +18,7 @@ mod service;
 mod statistics;
 
 pub use actors::{ACTORS_MAX, STREAMS_MAX};
-pub use config::{Config, ConfigError};
+pub use config::{Config, ConfigError, Study};
 pub use frames::{Compression, Draft, PackedChunk, Packer};
 pub use replay::{Replay, Unready};
 pub use service::{RunArgs, run};

@@ -138,7 +138,7 @@ impl Replay {
             episodes: Episodes::new(spec),
             anchors: Anchors::default(),
             window: Window::default(),
-            assembler: Assembler::new(spec),
+            assembler: Assembler::new(spec, config.study),
             affinity: Affinity::uniform(spec.num_actions),
             rng,
             statistics: Statistics::new(spec.horizon.k_max(), spec.num_actions),

@@ -26,6 +26,7 @@ pub(super) fn of_run(
         replay_shards: None,
         frames: None,
         seed: None,
+        study: None,
         sets: sets.iter().map(|&set| set.to_owned()).collect(),
     };
     Ok(local::resolve(&flags, &Machine::this())?.0)

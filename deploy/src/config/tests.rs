@@ -237,6 +237,7 @@ fn flags_come_before_set_and_both_before_the_machine() {
         replay_shards: None,
         frames: Some(7_000),
         seed: Some(5),
+        study: None,
         actors: Some(3),
         envs: Some(2),
         sets: vec!["run.seed=6".into()],

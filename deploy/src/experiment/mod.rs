@@ -4,9 +4,13 @@
 //! An experiment is a grid of pieces (a setting and a seed, say). [`Session`] keeps each finished piece, so one that was
 //! stopped goes on where it was; [`Page`] is the README that it leaves.
 
+mod aggregate;
 mod ising;
+mod pacman;
 mod page;
+mod procgen;
 mod progress;
+mod queue;
 mod random_walk;
 mod session;
 mod statistics;
@@ -26,6 +30,8 @@ pub(crate) fn run(command: &ExperimentCommand) -> anyhow::Result<()> {
     match command {
         ExperimentCommand::RandomWalk(flags) => random_walk::run(flags),
         ExperimentCommand::Ising(flags) => ising::run(flags),
+        ExperimentCommand::Pacman(args) => pacman::run(args),
+        ExperimentCommand::Procgen(args) => procgen::run(args),
     }
 }
 

@@ -3,6 +3,29 @@
 
 use super::progress::duration;
 
+/// Numbers in rows and columns.
+#[derive(Debug, Default)]
+pub(super) struct Table {
+    /// What it shows, and what its numbers are.
+    pub(super) caption: String,
+    pub(super) header: Vec<String>,
+    pub(super) rows: Vec<Vec<String>>,
+}
+
+impl Table {
+    fn text(&self) -> String {
+        let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
+        let rule = vec!["---".to_owned(); self.header.len()];
+        let rows: String = self.rows.iter().map(|row| line(row)).collect();
+        format!(
+            "{}\n\n{}{}{rows}\n",
+            self.caption,
+            line(&self.header),
+            line(&rule)
+        )
+    }
+}
+
 /// What stands on the page.
 #[derive(Debug, Default)]
 pub(super) struct Page {
@@ -16,6 +39,8 @@ pub(super) struct Page {
     pub(super) expected: Vec<String>,
     /// What came out, numbers first.
     pub(super) got: Vec<String>,
+    /// More of what came out.
+    pub(super) tables: Vec<Table>,
     /// Where it differs from the paper, and why.
     pub(super) differences: Vec<String>,
     /// How it was done: sizes, seeds.
@@ -42,9 +67,11 @@ impl Page {
             "**Time.** {} on a machine with {cores} cores.\n\n",
             duration(seconds)
         );
+        for (head, items) in [("Expected", &self.expected), ("Got", &self.got)] {
+            out += &format!("**{head}.**\n\n{}\n", list(items));
+        }
+        self.tables.iter().for_each(|table| out += &table.text());
         for (head, items) in [
-            ("Expected", &self.expected),
-            ("Got", &self.got),
             ("Differences from the paper", &self.differences),
             ("How", &self.setup),
         ] {
@@ -84,6 +111,11 @@ mod tests {
             claim: "C.".into(),
             command: "driml experiment t".into(),
             got: vec!["0.5".into()],
+            tables: vec![Table {
+                caption: "Numbers:".into(),
+                header: vec!["a".into(), "b".into()],
+                rows: vec![vec!["1".into(), "2".into()]],
+            }],
             figures: vec![("fig".into(), "A figure".into())],
             smoke: true,
             ..Page::default()
@@ -95,6 +127,7 @@ mod tests {
             "**Claim.** C.",
             "**Time.** 2 min on",
             "**Got.**\n\n* 0.5\n",
+            "Numbers:\n\n| a | b |\n| --- | --- |\n| 1 | 2 |\n\n",
             "![A figure](fig.png)",
         ] {
             assert!(text.contains(part), "{part}\n{text}");

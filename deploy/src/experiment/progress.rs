@@ -84,6 +84,19 @@ impl Progress {
         Ok(())
     }
 
+    /// Writes a line above the bar.
+    pub(super) fn line(&self, line: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| eprintln!("{line}")),
+            None => eprintln!("{line}"),
+        }
+    }
+
+    /// How often a person has asked to stop.
+    pub(super) fn wishes(&self) -> u32 {
+        self.interrupts.count()
+    }
+
     /// Takes the bar away.
     pub(super) fn clear(&self) {
         if let Some(bar) = &self.bar {

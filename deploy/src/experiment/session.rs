@@ -68,7 +68,7 @@ impl Session {
             }
             Err(_) => write_whole(&path, &settings)?,
         }
-        let interrupts = Interrupts::listen().context("listening for interrupts")?;
+        let interrupts = Interrupts::listen(false).context("listening for interrupts")?;
         Ok(Self {
             folder,
             progress: Progress::new(units, interrupts),
@@ -79,6 +79,16 @@ impl Session {
     /// Where everything goes.
     pub(super) fn folder(&self) -> &Path {
         &self.folder
+    }
+
+    /// The folder, and the progress of work that keeps itself there.
+    pub(super) fn work(&mut self) -> (&Path, &mut Progress) {
+        (&self.folder, &mut self.progress)
+    }
+
+    /// Counts the time that such work took.
+    pub(super) fn spend(&mut self, seconds: f64) {
+        self.seconds += seconds;
     }
 
     /// The piece of this name, which is `units` of work: read if it is there, else made and kept.

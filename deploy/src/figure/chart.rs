@@ -37,6 +37,8 @@ pub(crate) struct Axis {
     pub(super) scale: Scale,
     /// Values that it shows whatever the series have.
     pub(crate) shows: Vec<f64>,
+    /// Names of 0, 1, 2, ... instead of numbers; empty for numbers.
+    names: Vec<String>,
 }
 
 impl Axis {
@@ -46,6 +48,16 @@ impl Axis {
             label: label.to_owned(),
             scale: Scale::Linear,
             shows: Vec::new(),
+            names: Vec::new(),
+        }
+    }
+
+    /// An axis of things: the first at 0, the next at 1.
+    pub(crate) fn names(label: &str, names: &[String]) -> Self {
+        let last = names.len().saturating_sub(1) as f64;
+        Self {
+            names: names.to_vec(),
+            ..Self::linear(label).showing(&[-0.5, last + 0.5])
         }
     }
 
@@ -97,6 +109,9 @@ impl Axis {
     }
 
     fn ticks(&self, (low, high): (f64, f64), length: f64, each: f64) -> Vec<f64> {
+        if !self.names.is_empty() {
+            return (0..self.names.len()).map(|place| place as f64).collect();
+        }
         match self.scale {
             Scale::Linear => ticks::linear(low, high, (length / each).max(2.0) as usize),
             Scale::Log => ticks::log(10f64.powf(low), 10f64.powf(high)),
@@ -235,7 +250,15 @@ impl Chart {
     ) {
         let plot = frame.rect;
         let x_ticks = self.x.ticks(frame.x.1, plot.width, 74.0);
-        for (tick, label) in x_ticks.iter().zip(ticks::labels(&x_ticks)) {
+        let x_labels = match &self.x.names[..] {
+            [] => ticks::labels(&x_ticks),
+            names => {
+                let room = plot.width / names.len() as f64 - 4.0;
+                let fit = |name: &String| font::fit(name, TICK_SIZE, Weight::Regular, room);
+                names.iter().map(fit).collect()
+            }
+        };
+        for (tick, label) in x_ticks.iter().zip(x_labels) {
             let x = frame.at(*tick, 1.0).0;
             let line = vec![(x, plot.y), (x, plot.bottom())];
             canvas.line(line, Stroke::solid(GRID, 1.0));

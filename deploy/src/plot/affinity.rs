@@ -17,7 +17,7 @@ use crate::{
 ///
 /// # Errors
 /// A folder without settings or checkpoint, a run whose agent does not learn A.
-pub(super) fn figure(folders: &[PathBuf]) -> anyhow::Result<Figure> {
+pub(crate) fn figure(folders: &[PathBuf]) -> anyhow::Result<Figure> {
     let panels = folders
         .iter()
         .map(|folder| heat(folder).map(Panel::Heat))

@@ -19,10 +19,10 @@ pub(super) struct Group<'a> {
 }
 
 /// A line and its band over frames.
-#[derive(Debug, Default)]
-pub(super) struct Curve {
-    pub(super) points: Vec<(f64, f64)>,
-    pub(super) band: Vec<(f64, f64, f64)>,
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Curve {
+    pub(crate) points: Vec<(f64, f64)>,
+    pub(crate) band: Vec<(f64, f64, f64)>,
 }
 
 /// The runs, those that differ in their seed alone together if `together`; in the order in which they were named.
@@ -113,8 +113,21 @@ impl Group<'_> {
     }
 }
 
+/// One or several curves as one, with a band of their range if there are several.
+pub(crate) fn over_seeds(each: &[Vec<(f64, f64)>]) -> Curve {
+    let each: Vec<_> = each.iter().filter(|it| !it.is_empty()).cloned().collect();
+    match &each[..] {
+        [] => Curve::default(),
+        [only] => Curve {
+            points: thinned(only),
+            band: Vec::new(),
+        },
+        many => together(many, Band::Range),
+    }
+}
+
 /// Mean over the points of the last `frames` frames, at each point.
-fn smoothed(points: &[(f64, f64)], frames: f64) -> Vec<(f64, f64)> {
+pub(crate) fn smoothed(points: &[(f64, f64)], frames: f64) -> Vec<(f64, f64)> {
     let mut window = VecDeque::new();
     let mut smooth = Vec::with_capacity(points.len());
     for &(x, y) in points {

@@ -5,14 +5,16 @@ mod affinity;
 mod groups;
 mod runs;
 
+use self::groups::Group;
+pub(crate) use self::{
+    affinity::figure as affinities,
+    groups::{Curve, over_seeds, smoothed},
+    runs::Run,
+};
 use crate::{
     cli::{Band, PlotArgs},
     error::usage,
     figure::{Axis, Chart, Figure, Format, Panel, Series},
-    plot::{
-        groups::{Curve, Group},
-        runs::Run,
-    },
     print,
 };
 

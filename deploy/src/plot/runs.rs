@@ -14,7 +14,7 @@ const WORDS: [&str; 1] = ["waiting"];
 
 /// A run.
 #[derive(Debug)]
-pub(super) struct Run {
+pub(crate) struct Run {
     folder: PathBuf,
     /// The folder's name.
     pub(super) name: String,
@@ -32,7 +32,7 @@ impl Run {
     ///
     /// # Errors
     /// A folder without `metrics.csv`, or with one that is no run's.
-    pub(super) fn read(folder: &Path) -> anyhow::Result<Self> {
+    pub(crate) fn read(folder: &Path) -> anyhow::Result<Self> {
         let path = folder.join("metrics.csv");
         let mut file = csv::Reader::from_path(&path)
             .map_err(|e| usage!("{} is not the folder of a run: {e}", folder.display()))?;
@@ -71,7 +71,7 @@ impl Run {
     ///
     /// # Errors
     /// A column that is not there, or holds words.
-    pub(super) fn values(&self, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
+    pub(crate) fn values(&self, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
         let place = self.header.iter().position(|name| name == column);
         let path = self.folder.join("metrics.csv");
         let place = place.filter(|_| !WORDS.contains(&column)).ok_or_else(|| {
@@ -106,7 +106,7 @@ impl Run {
     }
 
     /// Whether the column is there and not empty.
-    pub(super) fn has_values(&self, column: &str) -> bool {
+    pub(crate) fn has_values(&self, column: &str) -> bool {
         let place = self.header.iter().position(|name| name == column);
         place.is_some_and(|place| self.rows.iter().any(|row| !row[place].is_empty()))
     }

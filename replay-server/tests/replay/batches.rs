@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use driml_protocol::{Batch, ChunkHeader, Goodbye, Horizon, InsertReply, TimeoutRule, Waiting};
-use driml_replay_server::{Compression, Draft, Replay, Unready};
+use driml_replay_server::{Compression, Draft, Replay, Study, Unready};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -110,6 +110,7 @@ proptest! {
         horizon in horizons(),
         bootstrap in any::<bool>(),
         lz4 in any::<bool>(),
+        study in any::<bool>(),
         capacity in 24u64..160,
         (actors, streams) in (1u32..4, 1u32..4),
     ) {
@@ -122,8 +123,10 @@ proptest! {
         if lz4 {
             config.compression = Compression::Lz4;
         }
+        config.study = study.then_some(Study::BootstrapFromNextState);
         let mut replay = Replay::new(&spec, &config, 8).unwrap();
         let mut history = History::new(&spec, capacity);
+        history.study = config.study;
         let mut known: HashMap<u32, Actor> = HashMap::new();
         let (mut lost, mut retried, mut refused, mut rows_sampled) = (0, 0, 0, 0);
         for _ in 0..150 {

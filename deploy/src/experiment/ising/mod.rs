@@ -337,6 +337,7 @@ fn page(task: &Task, trained: &[Trained], command: String, smoke: bool) -> Page 
                 (settings.batch_rows as f64).ln()
             ),
         ],
+        tables: Vec::new(),
         differences: vec![
             "The paper shows three heat maps and gives no number; the areas under the curve are ours.".into(),
             "The paper's appendix draws the patch's place anew at every time step, its main text once an episode. Ours \

@@ -361,6 +361,7 @@ fn page(results: &Results, command: String, smoke: bool) -> Page {
                 .into(),
         ],
         got,
+        tables: Vec::new(),
         differences: differences(&chain),
         setup: vec![
             format!(
