@@ -80,11 +80,12 @@ fn check(name: &str, files: &[&str]) {
     run(root.path(), &["experiment", name, "--smoke"]);
     assert_eq!(data(&folder), first);
 
-    // The folder holds pieces of other settings.
-    let refused = driml(
+    // More seeds are more pieces of the same grid; the full length is another grid.
+    run(
         root.path(),
-        &["experiment", name, "--smoke", "--seeds", "1"],
+        &["experiment", name, "--smoke", "--seeds", "3"],
     );
+    let refused = driml(root.path(), &["experiment", name]);
     let said = String::from_utf8(refused.stderr).unwrap();
     assert_eq!(refused.status.code(), Some(64), "{said}");
     assert!(said.contains("made with other settings"), "{said}");

@@ -112,7 +112,7 @@ mod tests {
     #[test]
     fn ticks_are_round_and_inside() {
         assert_eq!(linear(0.0, 10.0, 5), [0.0, 2.0, 4.0, 6.0, 8.0, 10.0]);
-        assert_eq!(linear(-1.2, 1.2, 4), [-1.0, 0.0, 1.0]);
+        assert_eq!(linear(-1.2, 1.2, 4), [-1.0, -0.5, 0.0, 0.5, 1.0]);
         assert_eq!(linear(3.0, 3.0, 4), [3.0]);
         assert_eq!(log(1.0, 1000.0), [1.0, 10.0, 100.0, 1000.0]);
         assert_eq!(log(1.0, 25.0), [1.0, 2.0, 5.0, 10.0, 20.0]);

@@ -36,7 +36,7 @@ pub(super) struct Trained {
     pub(super) checks: Vec<(u64, Measured)>,
     /// The measurement at the end, on more episodes.
     pub(super) last: Measured,
-    /// Scores at each location of the first episodes of the last measurement, as [`scores_of`] has them.
+    /// Scores at each location of the first episodes of the last measurement, in nats: log-softmax of the true pair plus ln B.
     pub(super) maps: Vec<Vec<f64>>,
 }
 

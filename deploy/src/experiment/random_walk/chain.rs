@@ -222,9 +222,8 @@ mod tests {
             let chain = at(alpha);
             assert!(chain.mutual_information() < even);
             assert!(chain.mutual_information_of_a_ring() > at(0.5).mutual_information_of_a_ring());
-            assert!(
-                chain.mutual_information_as_printed() > at(0.5).mutual_information_as_printed()
-            );
+            // More than ten states can hold.
+            assert!(chain.mutual_information_as_printed() > 10f64.ln());
         }
     }
 }

@@ -368,7 +368,7 @@ mod tests {
             alpha: 0.4,
         };
         for sampling in Sampling::ALL {
-            let mut train = || {
+            let train = || {
                 let mut progress = Progress::new(1, Interrupts::default());
                 train(&chain, &settings, sampling, 5, &mut progress).unwrap()
             };
