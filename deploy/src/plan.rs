@@ -14,8 +14,10 @@ use crate::{
 
 /// Arithmetic that a core sustains over a whole run, learner and actors together, in GFLOP/s.
 ///
-/// Basis: about half of what a core of a 2-core AMD EPYC machine does in a plain matrix product (90 GFLOP/s).
-const GFLOPS_PER_CORE: f64 = 40.0;
+/// Measured on 2 cores of an AMD EPYC with AVX-512: an update of `driml-ada` on bigfish alone, 16 GFLOP, takes 54 ms, which is
+/// 150 a core (`cargo bench --workspace --bench update`); actors and replay server share the cores with it, and other machines
+/// have narrower registers, so this is half of it.
+const GFLOPS_PER_CORE: f64 = 75.0;
 
 /// Multiplications and additions, each counted as one, of one row through parts of the network.
 struct RowFlops {
