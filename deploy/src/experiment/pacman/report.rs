@@ -157,11 +157,13 @@ fn figure(results: &Results, ghosts: &[Trace], noise: &[Trace]) -> anyhow::Resul
         let mut series = Vec::new();
         for (index, &epsilon) in settings.predictability.epsilons.iter().enumerate() {
             let window = settings.predictability.frames as f64 * SMOOTH;
-            let each = loss_of(results, epsilon, column)?;
-            let each: Vec<_> = each
-                .iter()
-                .map(|(_, points)| smoothed(points, window))
-                .collect();
+            let mut each = Vec::new();
+            for (_, points) in loss_of(results, epsilon, column)? {
+                let mut points = smoothed(&points, window);
+                // While the learner catches up at the end, several rows have the same frames.
+                points.dedup_by_key(|point| point.0);
+                each.push(points);
+            }
             let curve = over_seeds(&each);
             series.push(
                 Series::line(&format!("epsilon {epsilon}"), index, curve.points).banded(curve.band),

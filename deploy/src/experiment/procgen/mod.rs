@@ -1,9 +1,12 @@
 //! Table 1: agents on Procgen's games, as a queue of whole runs that are then played on levels seen and unseen.
-//! Figures, tables and page are in `report`, other people's numbers in `published`, the choice of games in `screen`.
+//! Data and figures are in `curves`, scores over all games in `scores`, the page in `page`, other people's numbers in
+//! `published`, the choice of games in `screen`.
 
+mod curves;
 mod k;
+mod page;
 mod published;
-mod report;
+mod scores;
 mod screen;
 
 use std::collections::BTreeMap;
@@ -19,7 +22,7 @@ use crate::{
     cli::{Levels, ProcgenArgs},
     error::{Usage, usage},
     evaluate::{Player, Who},
-    presets,
+    plot, presets,
 };
 
 const FULL: &str = include_str!("../../../experiments/procgen/config.toml");
@@ -170,8 +173,37 @@ pub(super) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     if args.screen {
         screen::report(session, &results)
     } else {
-        report::report(session, &results)
+        report(session, &results)
     }
+}
+
+/// Writes everything.
+fn report(session: Session, results: &Results) -> anyhow::Result<()> {
+    curves::write_runs(&session, results)?;
+    curves::write_table(&session, results)?;
+    session.figure("curves", &curves::figure(&session, results)?)?;
+    let aggregates = scores::of(results);
+    let rows = aggregates.iter().map(|it| {
+        let head = [it.measure, it.kind.name(), &it.agent].map(String::from);
+        let numbers = [it.estimate.value, it.estimate.low, it.estimate.high];
+        let numbers = numbers.map(|number| format!("{number:.4}"));
+        head.into_iter()
+            .chain([it.games.to_string()])
+            .chain(numbers)
+            .collect()
+    });
+    let header = ["measure", "of", "agent", "games", "value", "low", "high"];
+    session.csv("aggregate", &header, rows)?;
+    session.figure("aggregate", &scores::figure(results, &aggregates))?;
+    let adaptive: Vec<&Cell> = results.adaptive().collect();
+    if !adaptive.is_empty() {
+        session.figure("k", &curves::k_figure(&session, results)?)?;
+        curves::write_actions(&session, results)?;
+        let first = adaptive.iter().filter(|cell| cell.seed == adaptive[0].seed);
+        let folders: Vec<_> = first.map(|cell| cell.ran.folder.clone()).collect();
+        session.figure("affinity", &plot::affinities(&folders)?)?;
+    }
+    session.finish(&page::page(results, &aggregates, !adaptive.is_empty()))
 }
 
 fn played(ran: &Ran, who: Who, episodes: u32) -> anyhow::Result<Played> {
@@ -342,6 +374,11 @@ fn command(args: &ProcgenArgs, name: &str, session: &Session) -> String {
 }
 
 impl Results {
+    /// Runs whose k follows the affinity.
+    fn adaptive(&self) -> impl Iterator<Item = &Cell> {
+        self.cells.iter().filter(|cell| cell.agent == "driml-ada")
+    }
+
     /// The runs of an agent in a world, by seed.
     fn of<'a>(&'a self, world: &'a str, agent: &'a str) -> impl Iterator<Item = &'a Cell> {
         let here = move |cell: &&Cell| cell.world == world && cell.agent == agent;
@@ -379,6 +416,20 @@ enum Kind {
     Single,
     /// Greedy, on unseen levels, one an episode.
     Unseen,
+}
+
+impl Kind {
+    const ALL: [Self; 4] = [Self::Training, Self::Trained, Self::Single, Self::Unseen];
+
+    /// As figures and data have it.
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Training => "training",
+            Self::Trained => "greedy",
+            Self::Single => "levels trained on",
+            Self::Unseen => "unseen levels",
+        }
+    }
 }
 
 impl Cell {
