@@ -21,6 +21,7 @@ use super::{Progress, Session};
 use crate::{
     EXIT_USAGE,
     error::usage,
+    machine::Machine,
     record::{Outcome, Summary},
 };
 
@@ -73,6 +74,7 @@ pub(super) fn run_all(
     fs::create_dir_all(&root).with_context(|| format!("making {}", root.display()))?;
     let mut queue = Queue {
         root,
+        jobs,
         waiting: VecDeque::new(),
         running: Vec::new(),
     };
@@ -83,7 +85,7 @@ pub(super) fn run_all(
             queue.waiting.push_back(plan.clone());
         }
     }
-    let made = queue.make(jobs as usize, progress);
+    let made = queue.make(progress);
     if made.is_err() {
         queue.stop(progress);
     }
@@ -96,6 +98,8 @@ pub(super) fn run_all(
 
 struct Queue {
     root: PathBuf,
+    /// Runs at once.
+    jobs: u32,
     waiting: VecDeque<Plan>,
     running: Vec<Running>,
 }
@@ -126,9 +130,9 @@ impl Queue {
     }
 
     /// Starts and watches until nothing waits or runs.
-    fn make(&mut self, jobs: usize, progress: &mut Progress) -> anyhow::Result<()> {
+    fn make(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         loop {
-            while self.running.len() < jobs
+            while self.running.len() < self.jobs as usize
                 && let Some(plan) = self.waiting.pop_front()
             {
                 let running = self.start(plan, progress)?;
@@ -222,6 +226,7 @@ impl Queue {
         command
             .args(["local", "--exit-with-parent", "--run-dir"])
             .arg(&folder)
+            .args(self.threads())
             .args(&plan.args)
             .stdin(Stdio::null())
             .stdout(log.try_clone().with_context(doing)?)
@@ -235,6 +240,15 @@ impl Queue {
             done: 0,
             enough: false,
         })
+    }
+
+    /// The cores shared out among the runs at once, so that their learners do not get in each other's way.
+    fn threads(&self) -> Vec<String> {
+        if self.jobs == 1 {
+            return Vec::new();
+        }
+        let threads = (Machine::this().cores / self.jobs).max(1);
+        vec!["--set".into(), format!("local.learner_threads={threads}")]
     }
 
     /// A run whose parent was killed still saves what it has. It holds its log's lock, as a child shares our open file, so

@@ -18,7 +18,7 @@ use crate::{
 
 const NAME: &str = "pacman";
 /// Frames of an episode, about; only the estimate of the time left depends on it.
-const EPISODE_FRAMES: u64 = 120;
+const EPISODE_FRAMES: u64 = 190;
 /// Most frames of an episode: the world's step limit. A run of so many frames has all its episodes.
 const EPISODE_FRAMES_MAX: u64 = 500;
 
