@@ -4,6 +4,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use driml_learner::DeviceName;
 
 /// Deep Reinforcement and InfoMax Learning: actors, a replay server and a learner.
 #[derive(Debug, Parser)]
@@ -100,6 +101,9 @@ pub(crate) struct LocalArgs {
     /// Where settings, metrics, checkpoints, logs and summary go [default: runs/WORLD-AGENT-seedS-TIME]
     #[arg(long, value_name = "DIR")]
     pub(crate) run_dir: Option<PathBuf>,
+    /// What the learner computes on: cpu, cuda (the first GPU) or cuda:N [default: as the settings say, cpu]
+    #[arg(long, value_name = "DEVICE")]
+    pub(crate) device: Option<DeviceName>,
     /// All parts in one process in a fixed order: the same seed gives the same weights
     #[arg(long, conflicts_with = "listen")]
     pub(crate) lockstep: bool,
@@ -140,6 +144,14 @@ pub(crate) struct ActorArgs {
     pub(crate) join: JoinFlags,
 }
 
+/// What the learner computes on.
+#[derive(Clone, Copy, Debug, Args)]
+pub(crate) struct DeviceFlag {
+    /// What to compute on: cpu, cuda (the first GPU) or cuda:N
+    #[arg(long, value_name = "DEVICE", default_value_t = DeviceName::Cpu)]
+    pub(crate) device: DeviceName,
+}
+
 #[derive(Debug, Args)]
 pub(crate) struct LearnerArgs {
     /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; once for each of the run's replay shards
@@ -148,6 +160,8 @@ pub(crate) struct LearnerArgs {
     /// Where checkpoints go: DIR/checkpoints
     #[arg(long, value_name = "DIR")]
     pub(crate) run_dir: PathBuf,
+    #[command(flatten)]
+    pub(crate) on: DeviceFlag,
     #[command(flatten)]
     pub(crate) join: JoinFlags,
 }
@@ -332,12 +346,17 @@ pub(crate) struct ParityArgs {
     /// Case files (safetensors)
     #[arg(value_name = "FILE", required = true)]
     pub(crate) files: Vec<PathBuf>,
+    #[command(flatten)]
+    pub(crate) on: DeviceFlag,
+    /// With candle's own operations, as on a GPU, in place of this project's kernels
+    #[arg(long)]
+    pub(crate) stock: bool,
 }
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum BenchCommand {
     /// Updates of the learner, and the same update from candle's stock operations
-    Learner(BenchFlags),
+    Learner(BenchLearnerArgs),
     /// Frames through an actor's policy
     Policy(BenchFlags),
     /// Transitions into a replay server and batches out of it, over the wire; and its batches without the wire
@@ -367,6 +386,14 @@ pub(crate) struct BenchFlags {
     /// Measure in this very process, whose environment is already that of a part
     #[arg(long, hide = true)]
     pub(crate) here: bool,
+}
+
+#[derive(Clone, Debug, Args)]
+pub(crate) struct BenchLearnerArgs {
+    #[command(flatten)]
+    pub(crate) on: DeviceFlag,
+    #[command(flatten)]
+    pub(crate) flags: BenchFlags,
 }
 
 #[derive(Debug, Args)]

@@ -2,7 +2,7 @@
 //! It fills in no number but those that follow from others and those that the machine decides.
 
 use driml_envs::{WorldConfig, WorldName};
-use driml_learner::{EstimatorKind, Objective};
+use driml_learner::{DeviceName, EstimatorKind, Objective};
 use driml_model::ModelConfig;
 use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
 use driml_replay_server::{Compression, Study};
@@ -27,6 +27,8 @@ pub(crate) struct LocalConfig {
     pub(crate) actors: u32,
     /// Threads of the learner.
     pub(crate) learner_threads: u32,
+    /// What the learner computes on.
+    pub(crate) learner_device: DeviceName,
 }
 
 /// The resolved settings of a run.
@@ -105,6 +107,7 @@ pub(crate) fn resolve(
             "learner_threads",
             machine.learner_threads(),
         );
+        fill(&mut table, "local", "learner_device", "cpu");
         fill(&mut table, "actor", "envs", machine.envs());
         fill(&mut table, "actor", "world_threads", 0);
     }
@@ -172,12 +175,12 @@ fn set(table: &mut Table, sets: &[String]) -> Result<bool, Usage> {
     Ok(capacity_set)
 }
 
-fn fill(table: &mut Table, name: &str, key: &str, value: u32) {
+fn fill(table: &mut Table, name: &str, key: &str, value: impl Into<Value>) {
     let inner = table
         .entry(name)
         .or_insert_with(|| Value::Table(Table::new()));
     if let Some(inner) = inner.as_table_mut() {
-        inner.entry(key).or_insert(Value::Integer(value.into()));
+        inner.entry(key).or_insert(value.into());
     }
 }
 

@@ -135,6 +135,9 @@ pub(crate) fn complete(read: &mut Table) {
         let whole = value.as_integer().map(|whole| whole as f64);
         value.as_float().or(whole).unwrap_or(0.0)
     };
+    if find(read, "local").is_some() && find(read, "local.learner_device").is_none() {
+        put(read, "local.learner_device", Value::String("cpu".into()));
+    }
     let weighs = find(read, "learner.update.lambda")
         .and_then(Value::as_table)
         .is_some_and(|lambda| lambda.values().any(|value| number(value) > 0.0));

@@ -9,7 +9,7 @@ use driml_actor::{
     policy::{NetworkPolicy, Policy, RandomPolicy},
 };
 use driml_envs::WorldConfig;
-use driml_learner::checkpoint;
+use driml_learner::{Compute, checkpoint};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -92,6 +92,7 @@ impl Player {
             &folder.join("checkpoints"),
             &config.model,
             &config.learner.update,
+            &Compute::CPU,
             config.run.hash(),
         )?
         .ok_or_else(|| {

@@ -32,6 +32,7 @@ use std::{
 
 use anyhow::Context;
 use clap::Parser;
+use driml_learner::Operations;
 use driml_protocol::{Keys, Shutdown};
 use tracing_subscriber::EnvFilter;
 
@@ -122,6 +123,7 @@ fn run(command: Command) -> anyhow::Result<()> {
                     connect,
                     namespace,
                     run_dir: args.run_dir,
+                    device: args.on.device,
                 },
                 &shutdown,
             )
@@ -163,8 +165,12 @@ fn replay_server(args: ReplayServerArgs) -> anyhow::Result<()> {
 
 fn parity(args: &ParityArgs) -> anyhow::Result<()> {
     let mut failed = 0;
+    let mut compute = args.on.device.open()?;
+    if args.stock {
+        compute.operations = Operations::Stock;
+    }
     for file in &args.files {
-        let report = driml_learner::parity::check_file(file)?;
+        let report = driml_learner::parity::check_file(file, &compute)?;
         print(&report.to_string())?;
         failed += usize::from(!report.passed());
     }

@@ -27,8 +27,11 @@ const AGENT: &str = "driml-ada";
 ///
 /// # Errors
 /// Settings that cannot work, a run folder in use, an engine that cannot be had, a part that failed, an interrupt.
-pub(crate) fn run(args: LocalArgs) -> anyhow::Result<()> {
+pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
     let machine = Machine::this();
+    if let Some(device) = args.device {
+        args.run.sets.push(format!("local.learner_device={device}"));
+    }
     let (config, from) = resolve(&args.run, &machine)?;
     check_endpoints(args.listen.as_slice())?;
     let (shards, actors) = (config.replay.shards, config.local.actors);

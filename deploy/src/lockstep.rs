@@ -96,7 +96,7 @@ impl Parts {
         let part = LearnerPart::from_toml(&text)?;
         let batch_rows = part.learner.batch_rows;
         let replay = Replay::new(&config.run, &config.replay, batch_rows)?;
-        let mut learning = Learning::new(part)?;
+        let mut learning = Learning::new(part, &config.local.learner_device.open()?)?;
         let (header, weights) = learning.next_weights()?;
         let status = LearnerStatus {
             weights_version: header.version,

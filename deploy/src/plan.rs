@@ -3,7 +3,7 @@
 
 use std::{path::Path, time::Duration};
 
-use driml_learner::Objective;
+use driml_learner::{DeviceName, Objective};
 use driml_model::ModelConfig;
 
 use crate::{
@@ -134,10 +134,14 @@ pub(crate) fn describe(
             1 => "replay server".into(),
             shards => format!("{shards} replay servers"),
         };
+        let learner = match local.learner_device {
+            DeviceName::Cpu => format!("with {} threads", local.learner_threads),
+            gpu => format!("on {gpu}"),
+        };
         let actors = if local.actors == 1 { "actor" } else { "actors" };
         format!(
-            "{servers}; learner with {} threads; {} {actors} with {} copies of the world each",
-            local.learner_threads, local.actors, actor.envs
+            "{servers}; learner {learner}; {} {actors} with {} copies of the world each",
+            local.actors, actor.envs
         )
     };
     let lines = [

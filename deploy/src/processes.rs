@@ -185,7 +185,8 @@ impl Launch<'_> {
         self.statuses = Some(Statuses::new(sessions, keys, self.config.run.hash()));
 
         let folder = self.run_dir.display().to_string();
-        let mut args = part(&["learner", "--run-dir", &folder, exit]);
+        let device = self.config.local.learner_device.to_string();
+        let mut args = part(&["learner", "--run-dir", &folder, "--device", &device, exit]);
         for endpoint in &self.endpoints {
             args.extend(part(&["--connect", endpoint]));
         }

@@ -9,7 +9,7 @@ use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use driml_learner::{
     AdamSettings, Augment, AugmentSettings, Batch, Lambda, Learner, LearnerSettings, Objective,
 };
-use driml_model::{ConvLayer, DimParts, ModelConfig};
+use driml_model::{Compute, ConvLayer, DimParts, ModelConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -56,7 +56,13 @@ fn learner(objective: Objective, lambda: Lambda) -> Learner {
         dim: DimParts::NONE,
     };
     model.dim = settings.dim_parts(ACTIONS);
-    Learner::new(model, settings, &mut ChaCha8Rng::seed_from_u64(1)).expect("settings in range")
+    Learner::new(
+        model,
+        settings,
+        &Compute::CPU,
+        &mut ChaCha8Rng::seed_from_u64(1),
+    )
+    .expect("settings in range")
 }
 
 fn frames(rows: usize, seed: u64) -> Vec<u8> {

@@ -9,7 +9,7 @@ use std::{
 };
 
 use candle_core::Device;
-use driml_model::{ModelConfig, Parameters};
+use driml_model::{Compute, ModelConfig, Parameters};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -219,7 +219,7 @@ pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
     Ok(all)
 }
 
-/// Loads the newest checkpoint in `folder`; `None` if there is none. A damaged one is an error, not skipped.
+/// Loads the newest checkpoint in `folder` onto the device of `compute`; `None` if there is none. A damaged one is an error, not skipped.
 ///
 /// # Errors
 /// As [`load`].
@@ -227,15 +227,16 @@ pub fn load_latest(
     folder: &Path,
     model: &ModelConfig,
     settings: &LearnerSettings,
+    compute: &Compute,
     run_spec_hash: u64,
 ) -> Result<Option<Restored>, CheckpointError> {
     match list(folder)?.last() {
-        Some((_, path)) => load(path, model, settings, run_spec_hash).map(Some),
+        Some((_, path)) => load(path, model, settings, compute, run_spec_hash).map(Some),
         None => Ok(None),
     }
 }
 
-/// Loads one checkpoint.
+/// Loads one checkpoint onto the device of `compute`, whichever it was saved from.
 ///
 /// # Errors
 /// A file that is missing or is not what was written, a run of another specification, a network of other sizes.
@@ -243,6 +244,7 @@ pub fn load(
     path: &Path,
     model: &ModelConfig,
     settings: &LearnerSettings,
+    compute: &Compute,
     run_spec_hash: u64,
 ) -> Result<Restored, CheckpointError> {
     let text = read(&path.join(STATE))?;
@@ -286,14 +288,15 @@ pub fn load(
         }
     };
     let parameters = |model: &ModelConfig, name: &str| {
-        let loaded = Parameters::load_safetensors(model, &tensors(name)?, &Device::Cpu);
+        let loaded = Parameters::load_safetensors(model, &tensors(name)?, &compute.device);
         loaded.map_err(|why| damaged(path, name, why.to_string()))
     };
     let online = parameters(model, ONLINE)?;
     let target = parameters(&settings.target_model(model), TARGET)?;
     let moments = candle_core::safetensors::load_buffer(&tensors(OPTIMIZER)?, &Device::Cpu)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
-    let mut learner = Learner::from_parameters(model.clone(), settings.clone(), online, target)?;
+    let (model, settings) = (model.clone(), settings.clone());
+    let mut learner = Learner::from_parameters(model, settings, compute, online, target)?;
     learner
         .restore_progress(state.updates, state.adam_step, moments)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use driml_model::Enlarge;
+use driml_model::{Compute, Enlarge};
 use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, WeightsHeader};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -43,11 +43,16 @@ impl Learning {
     ///
     /// # Errors
     /// Settings that cannot work.
-    pub fn new(part: LearnerPart) -> anyhow::Result<Self> {
+    pub fn new(part: LearnerPart, compute: &Compute) -> anyhow::Result<Self> {
         let spec = &part.spec;
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
         let mut rng = ChaCha8Rng::from_seed(spec.seed_for("learner", 0));
-        let learner = Learner::new(part.model.clone(), part.learner.update.clone(), &mut init)?;
+        let learner = Learner::new(
+            part.model.clone(),
+            part.learner.update.clone(),
+            compute,
+            &mut init,
+        )?;
         let affinity = part
             .learner
             .affinity
@@ -81,12 +86,13 @@ impl Learning {
     ///
     /// # Errors
     /// Settings that cannot work, or a checkpoint that is damaged, of another run or of other settings.
-    pub fn resume(part: LearnerPart, folder: &Path) -> anyhow::Result<Self> {
-        let mut this = Self::new(part)?;
+    pub fn resume(part: LearnerPart, compute: &Compute, folder: &Path) -> anyhow::Result<Self> {
+        let mut this = Self::new(part, compute)?;
         let restored = checkpoint::load_latest(
             folder,
             &this.part.model,
             &this.part.learner.update,
+            compute,
             this.spec_hash,
         )?;
         let Some(restored) = restored else {

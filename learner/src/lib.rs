@@ -26,6 +26,8 @@ pub use affinity::{
 pub use augment::{Augment, AugmentSettings};
 pub use auxiliary::{Objective, dim::Lambda};
 pub use batch::{Batch, NO_ACTION};
+pub use driml_model::{Compute, DeviceName, Operations};
+
 pub use config::{AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart};
 pub use learning::{Learning, Weights};
 pub use optim::AdamSettings;

@@ -16,6 +16,9 @@ struct Args {
     /// Where checkpoints go
     #[arg(long)]
     run_dir: std::path::PathBuf,
+    /// What computes: cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: driml_model::DeviceName,
     /// Prefix of the run's keys
     #[arg(long, default_value = "driml")]
     namespace: String,
@@ -40,6 +43,7 @@ fn run(args: Args) -> anyhow::Result<()> {
     let Args {
         connect,
         run_dir,
+        device,
         namespace,
     } = args;
     driml_learner::run(
@@ -47,6 +51,7 @@ fn run(args: Args) -> anyhow::Result<()> {
             connect,
             namespace,
             run_dir,
+            device,
         },
         &shutdown,
     )

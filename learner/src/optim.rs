@@ -6,8 +6,10 @@ use std::{
     sync::Mutex,
 };
 
-use candle_core::{CpuStorage, Device, InplaceOp2, Layout, Tensor, backprop::GradStore, bail};
-use driml_model::Parameters;
+use candle_core::{
+    CpuStorage, DType, Device, InplaceOp2, Layout, Storage, Tensor, Var, backprop::GradStore, bail,
+};
+use driml_model::{Operations, Parameters};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -82,30 +84,41 @@ impl Gradients {
     ///
     /// # Errors
     /// [`UpdateError::NonFinite`] with the first parameter whose gradient is infinite or NaN.
-    pub fn norm(&self) -> Result<f64, UpdateError> {
-        let mut total = 0.0;
-        for (name, gradient) in &self.by_name {
-            let (storage, layout) = gradient.storage_and_layout();
-            let candle_core::Storage::Cpu(storage) = &*storage else {
-                return Err(UpdateError::Settings(
-                    "gradients must be on the CPU".to_owned(),
-                ));
-            };
-            let squares: f64 = slice(storage, layout)?
-                .par_chunks(CHUNK)
-                .map(sum_of_squares)
-                .collect::<Vec<_>>()
-                .iter()
-                .sum();
-            if !squares.is_finite() {
-                return Err(UpdateError::NonFinite {
-                    what: format!("the gradient of {name}"),
-                });
+    pub fn norm(&self, operations: Operations) -> Result<f64, UpdateError> {
+        let squares: Vec<f64> = match operations {
+            Operations::Own => {
+                let each = self.by_name.values().map(squares_on_cpu);
+                each.collect::<Result<_, _>>()?
             }
-            total += squares;
+            Operations::Stock => {
+                let squares = |g: &Tensor| g.to_dtype(DType::F64)?.sqr()?.sum_all();
+                let each = self.by_name.values().map(squares);
+                let each = each.collect::<candle_core::Result<Vec<_>>>()?;
+                // One copy to the host, not one a parameter.
+                Tensor::stack(&each, 0)?.to_vec1()?
+            }
+        };
+        let bad = self.by_name.keys().zip(&squares);
+        if let Some((name, _)) = bad.into_iter().find(|(_, it)| !it.is_finite()) {
+            return Err(UpdateError::NonFinite {
+                what: format!("the gradient of {name}"),
+            });
         }
-        Ok(total.sqrt())
+        Ok(squares.iter().sum::<f64>().sqrt())
     }
+}
+
+/// Sum of the squares of a tensor on the CPU.
+fn squares_on_cpu(tensor: &Tensor) -> candle_core::Result<f64> {
+    let (storage, layout) = tensor.storage_and_layout();
+    let Storage::Cpu(storage) = &*storage else {
+        bail!("this sum is the CPU's");
+    };
+    let parts: Vec<f64> = slice(storage, layout)?
+        .par_chunks(CHUNK)
+        .map(sum_of_squares)
+        .collect();
+    Ok(parts.iter().sum())
 }
 
 /// Sum of squares in f64, in eight interleaved parts so that it runs at the speed of memory.
@@ -132,39 +145,73 @@ pub fn clip_factor(norm: f64, max_norm: f64) -> f64 {
     (max_norm / (norm + 1e-6)).min(1.0)
 }
 
-/// Running moments of one parameter's gradient, in its layout.
-#[derive(Clone, Debug, PartialEq)]
-struct Moments {
-    shape: Vec<usize>,
-    m: Vec<f32>,
-    v: Vec<f32>,
+/// Running moments of one parameter's gradient.
+#[derive(Clone, Debug)]
+enum Moments {
+    /// In the parameter's layout, for the fused step.
+    Fused { m: Vec<f32>, v: Vec<f32> },
+    /// In its shape, on its device.
+    Tensors { m: Tensor, v: Tensor },
+}
+
+impl Moments {
+    fn new(m: &Tensor, v: &Tensor, operations: Operations) -> candle_core::Result<Self> {
+        Ok(match operations {
+            Operations::Own => Self::Fused {
+                m: m.flatten_all()?.to_vec1()?,
+                v: v.flatten_all()?.to_vec1()?,
+            },
+            Operations::Stock => Self::Tensors {
+                m: m.clone(),
+                v: v.clone(),
+            },
+        })
+    }
+
+    /// m and v on the CPU, in this shape.
+    fn tensors(&self, shape: &[usize]) -> candle_core::Result<[Tensor; 2]> {
+        Ok(match self {
+            Self::Fused { m, v } => [
+                Tensor::from_slice(m, shape, &Device::Cpu)?,
+                Tensor::from_slice(v, shape, &Device::Cpu)?,
+            ],
+            Self::Tensors { m, v } => [m.to_device(&Device::Cpu)?, v.to_device(&Device::Cpu)?],
+        })
+    }
 }
 
 /// Adam's state: the step count and both moments of every parameter, by name.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct Adam {
     settings: AdamSettings,
     step: u64,
-    moments: BTreeMap<String, Moments>,
+    operations: Operations,
+    /// By name, with the parameter's shape.
+    moments: BTreeMap<String, (Vec<usize>, Moments)>,
 }
 
 impl Adam {
     /// Moments of zero for each of `parameters`.
-    pub fn new(settings: AdamSettings, parameters: &Parameters) -> Self {
-        let zeros = |var: &Tensor| Moments {
-            shape: var.dims().to_vec(),
-            m: vec![0.0; var.elem_count()],
-            v: vec![0.0; var.elem_count()],
-        };
-        let moments = parameters
-            .iter()
-            .map(|(name, var)| (name.to_owned(), zeros(var)))
-            .collect();
-        Self {
+    ///
+    /// # Errors
+    /// A failing allocation.
+    pub fn new(
+        settings: AdamSettings,
+        parameters: &Parameters,
+        operations: Operations,
+    ) -> Result<Self, UpdateError> {
+        let mut moments = BTreeMap::new();
+        for (name, var) in parameters.iter() {
+            let zeros = var.zeros_like()?;
+            let both = Moments::new(&zeros, &zeros, operations)?;
+            moments.insert(name.to_owned(), (var.dims().to_vec(), both));
+        }
+        Ok(Self {
             settings,
             step: 0,
+            operations,
             moments,
-        }
+        })
     }
 
     /// Steps taken.
@@ -205,15 +252,17 @@ impl Adam {
             root_scale: (1.0 / (1.0 - beta2.powi(t)).sqrt()) as f32,
             eps: eps as f32,
         };
-        for (name, moments) in &mut self.moments {
+        for (name, (_, moments)) in &mut self.moments {
             let (Some(var), Some(gradient)) = (parameters.get(name), gradients.get(name)) else {
                 continue;
             };
-            let op = Step {
-                rule,
-                moments: Mutex::new(moments),
-            };
-            var.inplace_op2(gradient, &op)?;
+            match moments {
+                Moments::Fused { m, v } => {
+                    let moments = Mutex::new((m.as_mut_slice(), v.as_mut_slice()));
+                    var.inplace_op2(gradient, &Step { rule, moments })?;
+                }
+                Moments::Tensors { m, v } => rule.apply_to_tensors(var, gradient, m, v)?,
+            }
         }
         Ok(())
     }
@@ -224,16 +273,15 @@ impl Adam {
     /// A failing allocation.
     pub fn to_tensors(&self) -> Result<HashMap<String, Tensor>, UpdateError> {
         let mut tensors = HashMap::new();
-        for (name, Moments { shape, m, v }) in &self.moments {
-            for (which, values) in [("m", m), ("v", v)] {
-                let tensor = Tensor::from_slice(values, shape.as_slice(), &Device::Cpu)?;
+        for (name, (shape, moments)) in &self.moments {
+            for (which, tensor) in ["m", "v"].into_iter().zip(moments.tensors(shape)?) {
                 tensors.insert(format!("{which}.{name}"), tensor);
             }
         }
         Ok(tensors)
     }
 
-    /// Puts back what [`Adam::to_tensors`] gave after `step` steps, bit for bit.
+    /// Puts back what [`Adam::to_tensors`] gave after `step` steps, bit for bit, on `device`.
     ///
     /// # Errors
     /// A moment that is missing, of another shape, or of no parameter of this optimiser.
@@ -241,11 +289,11 @@ impl Adam {
         &mut self,
         step: u64,
         mut tensors: HashMap<String, Tensor>,
+        device: &Device,
     ) -> Result<(), UpdateError> {
         let mut restored = self.moments.clone();
-        for (name, moments) in &mut restored {
-            let Moments { shape, m, v } = moments;
-            for (which, values) in [("m", m), ("v", v)] {
+        for (name, (shape, moments)) in &mut restored {
+            let mut take = |which: &str| {
                 let name = format!("{which}.{name}");
                 let Some(tensor) = tensors.remove(&name) else {
                     return Err(UpdateError::State(format!("the moment {name} is missing")));
@@ -256,8 +304,9 @@ impl Adam {
                         "the moment {name} is {found:?}, not {shape:?}"
                     )));
                 }
-                *values = tensor.flatten_all()?.to_vec1()?;
-            }
+                Ok(tensor.to_device(device)?)
+            };
+            *moments = Moments::new(&take("m")?, &take("v")?, self.operations)?;
         }
         if let Some(name) = tensors.keys().min() {
             return Err(UpdateError::State(format!(
@@ -292,12 +341,28 @@ impl Rule {
             *p -= self.step_size * *m / (v.sqrt() * self.root_scale + self.eps);
         }
     }
+
+    /// The same on tensors.
+    fn apply_to_tensors(
+        &self,
+        p: &Var,
+        g: &Tensor,
+        m: &mut Tensor,
+        v: &mut Tensor,
+    ) -> candle_core::Result<()> {
+        let by = |tensor: &Tensor, factor: f32| tensor.affine(factor.into(), 0.0);
+        let g = by(g, self.factor)?;
+        *m = (by(m, self.beta1)? + by(&g, self.rest1)?)?;
+        *v = (by(v, self.beta2)? + by(&g.sqr()?, self.rest2)?)?;
+        let root = v.sqrt()?.affine(self.root_scale.into(), self.eps.into())?;
+        p.set(&(p.as_detached_tensor() - (by(m, self.step_size)? / root)?)?)
+    }
 }
 
 struct Step<'a> {
     rule: Rule,
     /// Uncontended: candle hands operations out by shared reference only.
-    moments: Mutex<&'a mut Moments>,
+    moments: Mutex<(&'a mut [f32], &'a mut [f32])>,
 }
 
 impl InplaceOp2 for Step<'_> {
@@ -318,7 +383,7 @@ impl InplaceOp2 for Step<'_> {
             .moments
             .lock()
             .expect("nothing panics while it holds this lock");
-        let Moments { m, v, .. } = &mut **moments;
+        let (m, v) = &mut *moments;
         if parameter.len() != m.len() || gradient.len() != m.len() {
             bail!(
                 "{} parameters, {} gradients, {} moments",

@@ -7,6 +7,7 @@ use std::{
 };
 
 use anyhow::Context;
+use driml_model::DeviceName;
 use driml_protocol::{Keys, Shutdown};
 
 use crate::{
@@ -31,14 +32,17 @@ pub struct RunArgs {
     pub namespace: String,
     /// Where checkpoints go: `RUN_DIR/checkpoints`.
     pub run_dir: PathBuf,
+    /// What computes.
+    pub device: DeviceName,
 }
 
 /// Runs the learner until `shutdown`. When the run has no more batches it saves, and stays to answer questions.
 ///
 /// # Errors
-/// Nobody to join, settings that cannot work, an update that failed, a disk that refuses.
+/// A device that is not there, nobody to join, settings that cannot work, an update that failed, a disk that refuses.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
+    let compute = args.device.open()?;
     let Some(shards) = Shards::join(&args.connect, &keys, shutdown)? else {
         return Ok(());
     };
@@ -50,14 +54,15 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         shared_memory: part.transport.shared_memory,
     };
     let folder = args.run_dir.join("checkpoints");
-    let mut learning = Learning::resume(part, &folder)?;
+    let mut learning = Learning::resume(part, &compute, &folder)?;
     keep_settings(&args.run_dir, &shards.config_toml)?;
     let spec_hash = learning.spec_hash();
     let outlets = Outlets::open(&shards.sessions, &keys, spec_hash, shutdown)?;
     outlets.publish(learning.next_weights()?)?;
     let mut batches = BatchSource::start(&shards.sessions, &keys, spec_hash, requests, shutdown)?;
     tracing::info!(
-        "learning from batches of {} rows, run {spec_hash:016x}",
+        "learning on {} from batches of {} rows, run {spec_hash:016x}",
+        args.device,
         requests.rows
     );
 

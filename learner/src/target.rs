@@ -3,8 +3,8 @@
 
 use std::collections::HashMap;
 
-use candle_core::{CpuStorage, Device, InplaceOp2, Layout, bail};
-use driml_model::{ModelConfig, Parameters};
+use candle_core::{CpuStorage, InplaceOp2, Layout, bail};
+use driml_model::{ModelConfig, Operations, Parameters};
 
 use crate::{
     optim::{slice, slice_mut},
@@ -25,7 +25,7 @@ pub fn copy_of(model: &ModelConfig, online: &Parameters) -> Result<Parameters, U
             tensors.insert(name, var.copy()?);
         }
     }
-    Ok(Parameters::from_tensors(model, tensors, &Device::Cpu)?)
+    Ok(Parameters::from_tensors(model, tensors, &online.device())?)
 }
 
 /// Moves `target` towards `online`, in place: `target <- tau * online + (1 - tau) * target`.
@@ -34,14 +34,25 @@ pub fn copy_of(model: &ModelConfig, online: &Parameters) -> Result<Parameters, U
 ///
 /// # Errors
 /// A parameter of the target that the online network lacks.
-pub fn follow(target: &Parameters, online: &Parameters, tau: f64) -> Result<(), UpdateError> {
+pub fn follow(
+    target: &Parameters,
+    online: &Parameters,
+    tau: f64,
+    operations: Operations,
+) -> Result<(), UpdateError> {
     for (name, var) in target.iter() {
         let Some(source) = online.get(name) else {
             return Err(UpdateError::State(format!(
                 "the online network has no {name}"
             )));
         };
-        var.inplace_op2(source, &Follow { tau: tau as f32 })?;
+        match operations {
+            Operations::Own => var.inplace_op2(source, &Follow { tau: tau as f32 })?,
+            Operations::Stock => {
+                let (kept, taken) = (var.affine(1.0 - tau, 0.0)?, source.affine(tau, 0.0)?);
+                var.set(&(kept + taken)?)?;
+            }
+        }
     }
     Ok(())
 }
@@ -80,7 +91,7 @@ impl InplaceOp2 for Follow {
 
 #[cfg(test)]
 mod tests {
-    use candle_core::{Result, Var};
+    use candle_core::{Device, Result, Var};
 
     use super::*;
 

@@ -4,7 +4,7 @@
 use std::{borrow::Cow, collections::HashMap};
 
 use candle_core::{Device, Tensor};
-use driml_model::{DimParts, Features, ModelConfig, Network, Parameters};
+use driml_model::{Compute, DimParts, Features, ModelConfig, Network, Parameters};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
@@ -177,6 +177,7 @@ pub struct Evaluation {
 pub struct Learner {
     model: ModelConfig,
     settings: LearnerSettings,
+    compute: Compute,
     auxiliary: Auxiliary,
     pub(crate) online: Parameters,
     pub(crate) target: Parameters,
@@ -187,27 +188,29 @@ pub struct Learner {
 }
 
 impl Learner {
-    /// A learner with initial weights drawn from `rng`; the target network is a copy.
+    /// A learner with initial weights drawn from `rng`, the same on every device; the target network is a copy.
     ///
     /// # Errors
     /// Settings out of their ranges, or a model whose heads are not those that the objective uses.
     pub fn new(
         model: ModelConfig,
         settings: LearnerSettings,
+        compute: &Compute,
         rng: &mut ChaCha8Rng,
     ) -> Result<Self, UpdateError> {
-        let online = Parameters::init(&model, rng, &Device::Cpu)?;
+        let online = Parameters::init(&model, rng, &compute.device)?;
         let target = target::copy_of(&settings.target_model(&model), &online)?;
-        Self::from_parameters(model, settings, online, target)
+        Self::from_parameters(model, settings, compute, online, target)
     }
 
-    /// A learner with given weights, before its first update.
+    /// A learner with given weights, on the device of `compute`, before its first update.
     ///
     /// # Errors
     /// As [`Learner::new`], and parameters that do not fit the model.
     pub fn from_parameters(
         model: ModelConfig,
         settings: LearnerSettings,
+        compute: &Compute,
         online: Parameters,
         target: Parameters,
     ) -> Result<Self, UpdateError> {
@@ -222,10 +225,13 @@ impl Learner {
                 "the objective uses {needed:?}, the model builds {built:?}"
             )));
         }
+        let operations = compute.operations;
+        let slow = settings.target_model(&model);
         Ok(Self {
-            online_network: Network::new(&model, &online)?,
-            target_network: Network::new(&settings.target_model(&model), &target)?,
-            adam: Adam::new(settings.adam, &online),
+            online_network: Network::with_operations(&model, &online, operations)?,
+            target_network: Network::with_operations(&slow, &target, operations)?,
+            adam: Adam::new(settings.adam, &online, operations)?,
+            compute: compute.clone(),
             auxiliary: settings.auxiliary(),
             updates: 0,
             model,
@@ -305,7 +311,12 @@ impl Learner {
             .features(&self.frames(batch.rows, batch.frames_t)?)?;
         let logits = self.online_network.logits(&features_t.f4)?;
         let q_values_t = flat(&self.online_network.q_values(&logits.detach())?)?;
-        let kl = kl_loss(&logits, batch.action, target_projection.clone())?;
+        let kl = kl_loss(
+            &logits,
+            batch.action,
+            target_projection.clone(),
+            self.compute.operations,
+        )?;
         let c51_kl = finite("the C51 loss", &kl)?;
 
         let mut total = kl;
@@ -347,6 +358,7 @@ impl Learner {
             None => None,
         };
         let anchors = seen.as_ref().unwrap_or(features_t);
+        // The network looks at them on the CPU.
         let action = Tensor::from_slice(batch.action, batch.rows, &Device::Cpu)?;
         let valid = batch.positive_valid;
         match &self.auxiliary {
@@ -378,7 +390,7 @@ impl Learner {
     /// # Errors
     /// Gradients that are not finite: nothing has then changed.
     pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
-        let norm = gradients.norm()?;
+        let norm = gradients.norm(self.compute.operations)?;
         self.adam.step(
             &self.online,
             gradients,
@@ -389,7 +401,8 @@ impl Learner {
             .updates
             .is_multiple_of(self.settings.target_period_updates)
         {
-            target::follow(&self.target, &self.online, self.settings.target_tau)?;
+            let (tau, operations) = (self.settings.target_tau, self.compute.operations);
+            target::follow(&self.target, &self.online, tau, operations)?;
         }
         Ok(norm)
     }
@@ -451,9 +464,11 @@ impl Learner {
             ..
         } = self.model;
         let shape = (rows, height, width, channels);
+        // Bytes travel to the device; they become numbers there.
+        let device = &self.compute.device;
         Ok(match frames.into() {
-            Cow::Borrowed(frames) => Tensor::from_slice(frames, shape, &Device::Cpu)?,
-            Cow::Owned(frames) => Tensor::from_vec(frames, shape, &Device::Cpu)?,
+            Cow::Borrowed(frames) => Tensor::from_slice(frames, shape, device)?,
+            Cow::Owned(frames) => Tensor::from_vec(frames, shape, device)?,
         })
     }
 
@@ -464,7 +479,8 @@ impl Learner {
         adam_step: u64,
         moments: HashMap<String, Tensor>,
     ) -> Result<(), UpdateError> {
-        self.adam.restore(adam_step, moments)?;
+        self.adam
+            .restore(adam_step, moments, &self.compute.device)?;
         self.updates = updates;
         Ok(())
     }

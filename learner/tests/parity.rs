@@ -5,7 +5,10 @@
 
 use std::{fs, path::PathBuf};
 
-use driml_learner::parity::{ParityReport, check_file};
+use driml_learner::{
+    Compute, Operations,
+    parity::{ParityReport, check_file},
+};
 
 fn cases() -> Vec<PathBuf> {
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../tests/parity");
@@ -19,11 +22,10 @@ fn cases() -> Vec<PathBuf> {
     files
 }
 
-#[test]
-fn every_open_case_is_within_tolerance() {
+fn all_within_tolerance(compute: &Compute) {
     let reports: Vec<ParityReport> = cases()
         .iter()
-        .map(|file| check_file(file).unwrap())
+        .map(|file| check_file(file, compute).unwrap())
         .collect();
     assert!(reports.len() >= 10, "the open cases are in tests/parity");
     for report in &reports {
@@ -31,6 +33,20 @@ fn every_open_case_is_within_tolerance() {
     }
     let failed = reports.iter().filter(|report| !report.passed()).count();
     assert_eq!(failed, 0, "of {} cases; see the lines above", reports.len());
+}
+
+#[test]
+fn every_open_case_is_within_tolerance() {
+    all_within_tolerance(&Compute::CPU);
+}
+
+/// What a GPU is given to compute, on the CPU: the same operations in the same order.
+#[test]
+fn so_it_is_with_candle_s_own_operations() {
+    all_within_tolerance(&Compute {
+        operations: Operations::Stock,
+        ..Compute::CPU
+    });
 }
 
 /// Rewrites the header of a case: its length, its text, and the data untouched.
@@ -51,7 +67,9 @@ fn a_broken_file_is_a_clear_error() {
     let says = |bytes: &[u8]| {
         let file = folder.join("broken.safetensors");
         fs::write(&file, bytes).unwrap();
-        let error = check_file(&file).expect_err("broken").to_string();
+        let error = check_file(&file, &Compute::CPU)
+            .expect_err("broken")
+            .to_string();
         assert!(error.contains("broken.safetensors"), "{error}");
         error
     };
@@ -90,5 +108,5 @@ fn a_broken_file_is_a_clear_error() {
         assert!(error.contains(said), "{from} as {to}: {error}");
     }
     fs::remove_dir_all(&folder).unwrap();
-    assert!(check_file(folder.join("none.safetensors")).is_err());
+    assert!(check_file(folder.join("none.safetensors"), &Compute::CPU).is_err());
 }

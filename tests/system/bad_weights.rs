@@ -3,7 +3,7 @@
 
 use std::sync::{Arc, Mutex};
 
-use driml_learner::{LearnerPart, Learning};
+use driml_learner::{Compute, LearnerPart, Learning};
 use driml_protocol::{
     Hello, Keys, Kind, PROTOCOL_VERSION, WeightsHeader, WeightsVersion, codec,
     session::{self, Endpoints},
@@ -89,7 +89,10 @@ fn an_actor_keeps_what_it_has() {
     let client = system.connect();
     let hash = client.spec.hash();
     let part = LearnerPart::from_toml(&client.config_toml).unwrap();
-    let (_, good) = Learning::new(part).unwrap().next_weights().unwrap();
+    let (_, good) = Learning::new(part, &Compute::CPU)
+        .unwrap()
+        .next_weights()
+        .unwrap();
     let learner = FakeLearner::new(&client);
 
     // Until there are weights that it may use, an actor asks again and steps nothing.

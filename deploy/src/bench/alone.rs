@@ -4,6 +4,7 @@
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, ensure};
+use driml_learner::DeviceName;
 
 use crate::{
     bench::figures::{Figure, Report},
@@ -15,13 +16,21 @@ use crate::{
 ///
 /// # Errors
 /// A process that could not be started or failed.
-pub(super) fn figures(part: BenchPart, flags: &BenchFlags) -> anyhow::Result<Vec<Figure>> {
+pub(super) fn figures(
+    part: BenchPart,
+    flags: &BenchFlags,
+    device: DeviceName,
+) -> anyhow::Result<Vec<Figure>> {
     let program = std::env::current_exe().context("finding this program's own file")?;
     let mut command = Command::new(program);
     command
         .args(["bench", part.name(), "--here", "--json", "-"])
         .args(["--threads", &flags.threads.to_string()])
         .args(flags.quick.then_some("--quick"))
+        .args(match device {
+            DeviceName::Cpu => Vec::new(),
+            gpu => vec!["--device".to_owned(), gpu.to_string()],
+        })
         .stdin(Stdio::null())
         .stderr(Stdio::inherit());
     child::suit_candle(&mut command, flags.threads);

@@ -1,7 +1,7 @@
 //! Updates of the learner at the paper's sizes, and one of them by candle's stock operations.
 //! Batches are made up: nothing but the arithmetic is measured.
 
-use driml_learner::{Batch, Learner};
+use driml_learner::{Batch, DeviceName, Learner};
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -30,11 +30,12 @@ const CASES: [(&str, &str, &str, &[&str]); 4] = [
 /// The update that candle's stock operations do too.
 const GLOBAL_DIM: &str = "C51 + global-global DIM, 64x64x3";
 
-/// Updates a second.
+/// Updates a second on a device; candle's stock operations beside it on the CPU alone.
 ///
 /// # Errors
 /// An update that failed.
-pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
+pub(super) fn measure(effort: &Effort, device: DeviceName) -> anyhow::Result<Vec<Figure>> {
+    let compute = device.open()?;
     let mut figures = Vec::new();
     for (name, agent, preset, sets) in CASES {
         let config = settings::of_run(settings::WORLD, agent, preset, sets)?;
@@ -42,10 +43,10 @@ pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
         let rows = MadeUp::draw(&config, &mut rng);
         let batch = rows.batch();
         let (model, update) = (config.model.clone(), config.learner.update.clone());
-        let mut learner = Learner::new(model, update, &mut rng)?;
+        let mut learner = Learner::new(model, update, &compute, &mut rng)?;
         let rate = effort.rate_by_median(|| learner.update(&batch).map(drop))?;
         figures.push(Figure::found(name, rate, "updates/s"));
-        if name == GLOBAL_DIM {
+        if name == GLOBAL_DIM && device == DeviceName::Cpu {
             let mut stock = StockLearner::new(&learner)?;
             let rate = effort.rate_by_median(|| stock.update(&batch).map(drop))?;
             let name = format!("{name}, candle's stock operations");

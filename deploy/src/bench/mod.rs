@@ -17,6 +17,8 @@ mod stock;
 mod system;
 mod table;
 
+use driml_learner::DeviceName;
+
 use crate::{
     bench::{
         effort::Effort,
@@ -31,19 +33,19 @@ use crate::{
 /// A part that failed, an engine that cannot be had, a file that cannot be written.
 pub(crate) fn run(command: &BenchCommand) -> anyhow::Result<()> {
     let machine = MachineNote::this();
-    let part = |part, flags: &BenchFlags| {
+    let part = |part, flags: &BenchFlags, device: DeviceName| {
         let figures = if flags.here {
-            measure(part, &Effort::new(flags))?
+            measure(part, &Effort::new(flags), device)?
         } else {
-            alone::figures(part, flags)?
+            alone::figures(part, flags, device)?
         };
         figures::report(part.name(), &figures, machine.clone(), flags)
     };
     match command {
-        BenchCommand::Learner(flags) => part(BenchPart::Learner, flags),
-        BenchCommand::Policy(flags) => part(BenchPart::Policy, flags),
-        BenchCommand::Replay(flags) => part(BenchPart::Replay, flags),
-        BenchCommand::Env(flags) => part(BenchPart::Env, flags),
+        BenchCommand::Learner(args) => part(BenchPart::Learner, &args.flags, args.on.device),
+        BenchCommand::Policy(flags) => part(BenchPart::Policy, flags, DeviceName::Cpu),
+        BenchCommand::Replay(flags) => part(BenchPart::Replay, flags, DeviceName::Cpu),
+        BenchCommand::Env(flags) => part(BenchPart::Env, flags, DeviceName::Cpu),
         BenchCommand::System(args) => {
             figures::report("system", &system::measure(args)?, machine, &args.flags)
         }
@@ -52,9 +54,9 @@ pub(crate) fn run(command: &BenchCommand) -> anyhow::Result<()> {
     }
 }
 
-fn measure(part: BenchPart, effort: &Effort) -> anyhow::Result<Vec<Figure>> {
+fn measure(part: BenchPart, effort: &Effort, device: DeviceName) -> anyhow::Result<Vec<Figure>> {
     match part {
-        BenchPart::Learner => learner::measure(effort),
+        BenchPart::Learner => learner::measure(effort, device),
         BenchPart::Policy => policy::measure(effort),
         BenchPart::Replay => replay::measure(effort),
         BenchPart::Env => env::measure(effort),

@@ -220,7 +220,7 @@ fn linear(net: &HashMap<String, Tensor>, name: &str, x: &Tensor) -> Result<Tenso
 
 #[cfg(test)]
 mod tests {
-    use driml_learner::Learner;
+    use driml_learner::{Compute, Learner};
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
@@ -239,7 +239,7 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let made_up = MadeUp::draw(&config, &mut rng);
         let update = config.learner.update.clone();
-        let mut learner = Learner::new(config.model, update, &mut rng).unwrap();
+        let mut learner = Learner::new(config.model, update, &Compute::CPU, &mut rng).unwrap();
         let mut stock = StockLearner::new(&learner).unwrap();
         for _ in 0..3 {
             let ours = learner.update(&made_up.batch()).unwrap().total;

@@ -21,9 +21,10 @@ const SOURCE_COLUMN: usize = 44;
 const GAME: &str = "bigfish";
 const AGENT: &str = "driml-ada";
 /// What the machine decides.
-const BY_MACHINE: [&str; 4] = [
+const BY_MACHINE: [&str; 5] = [
     "local.actors",
     "local.learner_threads",
+    "local.learner_device",
     "actor.envs",
     "actor.world_threads",
 ];

@@ -3,12 +3,14 @@
 //!
 //! Source: Bellemare et al. 2017.
 
-use candle_core::{CpuStorage, CustomOp1, Layout, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp1, D, Layout, Shape, Tensor};
+use candle_nn::ops::softmax;
 use rayon::prelude::*;
 
+use crate::compute::Operations;
 use crate::config::ModelConfig;
 use crate::error::Result;
-use crate::linear::{floats, linear, relu};
+use crate::linear::floats;
 use crate::weights::Parameters;
 
 /// Distributions that one task takes.
@@ -16,6 +18,7 @@ const TASK_DISTRIBUTIONS: usize = 256;
 
 #[derive(Debug)]
 pub(crate) struct C51Head {
+    operations: Operations,
     weight: Tensor,
     bias: Tensor,
     actions: usize,
@@ -24,8 +27,13 @@ pub(crate) struct C51Head {
 }
 
 impl C51Head {
-    pub(crate) fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
+    pub(crate) fn new(
+        config: &ModelConfig,
+        parameters: &Parameters,
+        operations: Operations,
+    ) -> Result<Self> {
         Ok(Self {
+            operations,
             weight: parameters.tensor("head", "weight")?,
             bias: parameters.tensor("head", "bias")?,
             actions: config.num_actions,
@@ -36,15 +44,23 @@ impl C51Head {
 
     /// Logits [B, A, atoms] of f4 [B, hidden] before its ReLU.
     pub(crate) fn logits(&self, f4: &Tensor) -> Result<Tensor> {
-        let logits = linear(&relu(f4)?, &self.weight, &self.bias)?;
+        let active = self.operations.relu(f4)?;
+        let logits = self.operations.linear(&active, &self.weight, &self.bias)?;
         Ok(logits.reshape(((), self.actions, self.atoms))?)
     }
 
     /// Expected returns [B, A] of logits [B, A, atoms]; no gradient flows.
     pub(crate) fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
-        Ok(logits.contiguous()?.apply_op1_no_bwd(&Expectation {
-            support: self.support.clone(),
-        })?)
+        match self.operations {
+            Operations::Own => Ok(logits.contiguous()?.apply_op1_no_bwd(&Expectation {
+                support: self.support.clone(),
+            })?),
+            Operations::Stock => {
+                let support = Tensor::new(self.support.as_slice(), logits.device())?;
+                let probs = softmax(&logits.detach(), D::Minus1)?;
+                Ok(probs.broadcast_mul(&support)?.sum(D::Minus1)?)
+            }
+        }
     }
 }
 

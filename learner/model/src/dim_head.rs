@@ -5,9 +5,9 @@
 
 use candle_core::{DType, Tensor};
 
+use crate::compute::Operations;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::linear::{linear, linear_relu};
 use crate::weights::Parameters;
 
 /// A residual block on features, to which an action's embedding may be joined.
@@ -20,6 +20,7 @@ pub(crate) struct Head {
 /// The block's parameters; `out_bias` is the sum of the biases of `out` and, where it has one, `skip`.
 #[derive(Debug)]
 struct Block {
+    operations: Operations,
     hidden_weight: Tensor,
     hidden_bias: Tensor,
     out_weight: Tensor,
@@ -28,13 +29,14 @@ struct Block {
 }
 
 impl Block {
-    fn new(name: &str, parameters: &Parameters) -> Result<Self> {
+    fn new(name: &str, parameters: &Parameters, operations: Operations) -> Result<Self> {
         let (hidden, out, skip) = (
             format!("{name}.hidden"),
             format!("{name}.out"),
             format!("{name}.skip"),
         );
         Ok(Self {
+            operations,
             hidden_weight: parameters.tensor(&hidden, "weight")?,
             hidden_bias: parameters.tensor(&hidden, "bias")?,
             out_weight: parameters.tensor(&out, "weight")?,
@@ -45,9 +47,10 @@ impl Block {
 
     /// The block without a joined input. The skip's result is the bias of `out`, so nothing is added separately.
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let hidden = linear_relu(x, &self.hidden_weight, &self.hidden_bias)?;
-        let skip = linear(x, &self.skip_weight, &self.out_bias)?;
-        Ok(linear(&hidden, &self.out_weight, &skip)?)
+        let with = self.operations;
+        let hidden = with.linear_relu(x, &self.hidden_weight, &self.hidden_bias)?;
+        let skip = with.linear(x, &self.skip_weight, &self.out_bias)?;
+        Ok(with.linear(&hidden, &self.out_weight, &skip)?)
     }
 
     /// The block on x = [features; joined], as W x = W_features features + W_joined joined.
@@ -55,6 +58,7 @@ impl Block {
     /// `joined` [B, e] serves all locations of its row, so its products become biases of one group a row, and the tiled
     /// concatenation is never built.
     fn forward_joined(&self, features: &Tensor, joined: &Tensor, split: usize) -> Result<Tensor> {
+        let with = self.operations;
         let parts = |weight: &Tensor| -> Result<(Tensor, Tensor)> {
             let joined_len = weight.dim(1)? - split;
             Ok((
@@ -64,19 +68,24 @@ impl Block {
         };
         let (hidden_features, hidden_joined) = parts(&self.hidden_weight)?;
         let (skip_features, skip_joined) = parts(&self.skip_weight)?;
-        let hidden_bias = linear(joined, &hidden_joined, &self.hidden_bias)?;
-        let hidden = linear_relu(features, &hidden_features, &hidden_bias)?;
-        let skip_bias = linear(joined, &skip_joined, &self.out_bias)?;
-        let skip = linear(features, &skip_features, &skip_bias)?;
-        Ok(linear(&hidden, &self.out_weight, &skip)?)
+        let hidden_bias = with.linear(joined, &hidden_joined, &self.hidden_bias)?;
+        let hidden = with.linear_relu(features, &hidden_features, &hidden_bias)?;
+        let skip_bias = with.linear(joined, &skip_joined, &self.out_bias)?;
+        let skip = with.linear(features, &skip_features, &skip_bias)?;
+        Ok(with.linear(&hidden, &self.out_weight, &skip)?)
     }
 }
 
 impl Head {
     /// The head of this name on features of this width.
-    pub(crate) fn new(name: &str, features: usize, parameters: &Parameters) -> Result<Self> {
+    pub(crate) fn new(
+        name: &str,
+        features: usize,
+        parameters: &Parameters,
+        operations: Operations,
+    ) -> Result<Self> {
         Ok(Self {
-            block: Block::new(name, parameters)?,
+            block: Block::new(name, parameters, operations)?,
             features,
         })
     }
@@ -99,22 +108,27 @@ pub(crate) struct ActionEmbedding {
 }
 
 impl ActionEmbedding {
-    pub(crate) fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
+    pub(crate) fn new(
+        config: &ModelConfig,
+        parameters: &Parameters,
+        operations: Operations,
+    ) -> Result<Self> {
         Ok(Self {
-            block: Block::new("dim.action", parameters)?,
+            block: Block::new("dim.action", parameters, operations)?,
             skip_bias: parameters.tensor("dim.action.skip", "bias")?,
             num_actions: config.num_actions,
         })
     }
 
-    /// Embeddings [B, e] of `actions` [B], integers below the number of actions.
+    /// Embeddings [B, e] of `actions` [B], integers below the number of actions; best on the CPU, where they are looked at.
     pub(crate) fn forward(&self, actions: &Tensor) -> Result<Tensor> {
         let one_hot = self.one_hot(actions)?;
         let block = &self.block;
-        let hidden = linear_relu(&one_hot, &block.hidden_weight, &block.hidden_bias)?;
+        let with = block.operations;
+        let hidden = with.linear_relu(&one_hot, &block.hidden_weight, &block.hidden_bias)?;
         let bias = (&block.out_bias + &self.skip_bias)?;
-        let skip = linear(&one_hot, &block.skip_weight, &bias)?;
-        Ok(linear(&hidden, &block.out_weight, &skip)?)
+        let skip = with.linear(&one_hot, &block.skip_weight, &bias)?;
+        Ok(with.linear(&hidden, &block.out_weight, &skip)?)
     }
 
     fn one_hot(&self, actions: &Tensor) -> Result<Tensor> {
@@ -131,7 +145,7 @@ impl ActionEmbedding {
         Ok(Tensor::from_vec(
             one_hot,
             (indices.len(), self.num_actions),
-            actions.device(),
+            self.block.hidden_weight.device(),
         )?)
     }
 }

@@ -6,6 +6,7 @@
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 mod c51_head;
+mod compute;
 mod config;
 mod conv;
 mod dim_head;
@@ -18,9 +19,11 @@ mod linear;
 mod network;
 mod policy;
 mod stack;
+mod stock;
 mod torso;
 mod weights;
 
+pub use compute::{Compute, DeviceError, DeviceName, Operations};
 pub use config::{ConvLayer, DimParts, ModelConfig};
 pub use conv::{conv_stack, conv2d_relu};
 pub use error::{ModelError, Result};

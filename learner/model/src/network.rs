@@ -4,6 +4,7 @@
 use candle_core::{DType, Tensor};
 
 use crate::c51_head::C51Head;
+use crate::compute::Operations;
 use crate::config::ModelConfig;
 use crate::dim_head::{ActionEmbedding, Head};
 use crate::error::{ModelError, Result};
@@ -24,6 +25,7 @@ pub struct Features {
 /// It shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes this network.
 #[derive(Debug)]
 pub struct Network {
+    operations: Operations,
     input: [usize; 3],
     torso: Torso,
     head: C51Head,
@@ -41,28 +43,47 @@ impl Network {
     /// # Errors
     /// An invalid configuration, or a parameter that is missing.
     pub fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
+        let device = parameters.device();
+        Self::with_operations(config, parameters, Operations::of(&device))
+    }
+
+    /// [`Network::new`] from these operations, not the faster ones of the parameters' device.
+    ///
+    /// # Errors
+    /// As [`Network::new`].
+    pub fn with_operations(
+        config: &ModelConfig,
+        parameters: &Parameters,
+        operations: Operations,
+    ) -> Result<Self> {
         config.validate()?;
         let channels = config.local_shape().2;
         let head = |exists: bool, name: &str, features: usize| {
             exists
-                .then(|| Head::new(name, features, parameters))
+                .then(|| Head::new(name, features, parameters, operations))
                 .transpose()
         };
         let action = config
             .dim
             .embeds_action()
-            .then(|| ActionEmbedding::new(config, parameters))
+            .then(|| ActionEmbedding::new(config, parameters, operations))
             .transpose()?;
         Ok(Self {
+            operations,
             input: [config.height, config.width, config.channels],
-            torso: Torso::new(config, parameters)?,
-            head: C51Head::new(config, parameters)?,
+            torso: Torso::new(config, parameters, operations)?,
+            head: C51Head::new(config, parameters, operations)?,
             action,
             psi3: head(config.dim.psi3, "dim.psi3", channels)?,
             phi3: head(config.dim.phi3, "dim.phi3", channels)?,
             psi4: head(config.dim.psi4, "dim.psi4", config.hidden)?,
             phi4: head(config.dim.phi4, "dim.phi4", config.hidden)?,
         })
+    }
+
+    /// What it is made of.
+    pub const fn operations(&self) -> Operations {
+        self.operations
     }
 
     /// f3 and f4 of `frames` [B, H, W, C] u8, which are scaled by 1/255.

@@ -4,14 +4,15 @@
 use candle_core::{CpuStorage, CustomOp1, Layout, Shape, Tensor};
 use rayon::prelude::*;
 
+use crate::compute::Operations;
 use crate::config::ModelConfig;
-use crate::conv::conv_stack;
 use crate::error::Result;
-use crate::linear::{floats, linear};
+use crate::linear::floats;
 use crate::weights::Parameters;
 
 #[derive(Debug)]
 pub(crate) struct Torso {
+    operations: Operations,
     /// Weight, bias and stride of each convolution.
     convolutions: Vec<(Tensor, Tensor, usize)>,
     fc_weight: Tensor,
@@ -19,7 +20,11 @@ pub(crate) struct Torso {
 }
 
 impl Torso {
-    pub(crate) fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
+    pub(crate) fn new(
+        config: &ModelConfig,
+        parameters: &Parameters,
+        operations: Operations,
+    ) -> Result<Self> {
         let convolutions = config.conv.iter().enumerate().map(|(index, layer)| {
             let name = format!("torso.conv{}", index + 1);
             Ok((
@@ -29,6 +34,7 @@ impl Torso {
             ))
         });
         Ok(Self {
+            operations,
             convolutions: convolutions.collect::<Result<_>>()?,
             fc_weight: parameters.tensor("torso.fc", "weight")?,
             fc_bias: parameters.tensor("torso.fc", "bias")?,
@@ -42,9 +48,14 @@ impl Torso {
             .iter()
             .map(|(weight, bias, stride)| (weight, bias, *stride))
             .collect();
-        let maps = conv_stack(frames, &layers)?;
-        let flat = maps.apply_op1(ChannelsFirst)?;
-        let f4 = linear(&flat, &self.fc_weight, &self.fc_bias)?;
+        let maps = self.operations.conv_stack(frames, &layers)?;
+        let flat = match self.operations {
+            Operations::Own => maps.apply_op1(ChannelsFirst)?,
+            Operations::Stock => maps.permute((0, 3, 1, 2))?.flatten_from(1)?,
+        };
+        let f4 = self
+            .operations
+            .linear(&flat, &self.fc_weight, &self.fc_bias)?;
         Ok((maps, f4))
     }
 }

@@ -115,6 +115,12 @@ impl Parameters {
         self.0.iter().map(|(name, var)| (name.as_str(), var))
     }
 
+    /// The device that holds them.
+    pub fn device(&self) -> Device {
+        let first = self.0.values().next();
+        first.map_or(Device::Cpu, |var| var.device().clone())
+    }
+
     /// Number of parameters (tensors, not scalars).
     pub fn len(&self) -> usize {
         self.0.len()

@@ -3,7 +3,7 @@
 
 use std::{borrow::Cow, ops::Range};
 
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use driml_model::{Features, Network};
 
 use super::dim::{Dim, Dots, Vectors};
@@ -51,7 +51,8 @@ impl Cpc {
             let all = vec![1; rows];
             for (sum, dots) in sums.iter_mut().zip(dots) {
                 if let Some(Dots { dots, rkhs }) = dots {
-                    let loss = info_nce_loss(&dots, &all, self.pairs.scores(rkhs))?;
+                    let loss =
+                        info_nce_loss(&dots, &all, self.pairs.scores(rkhs), network.operations())?;
                     *sum = Some(match sum.take() {
                         Some(sum) => (sum + loss)?,
                         None => loss,
@@ -63,7 +64,7 @@ impl Cpc {
         for ((loss, sum), wanted) in losses.iter_mut().zip(sums).zip(self.pairs.lambda.wanted()) {
             *loss = match (sum, wanted) {
                 (Some(sum), _) => Some(sum.affine(1.0 / positives as f64, 0.0)?),
-                (None, true) => Some(Tensor::new(0f32, &Device::Cpu)?),
+                (None, true) => Some(Tensor::new(0f32, features_t.f4.device())?),
                 (None, false) => None,
             };
         }
@@ -121,7 +122,7 @@ fn of_offset(
         if anchors.len() == rows {
             return Ok(Some(psi.clone()));
         }
-        let indices = Tensor::from_slice(anchors, anchors.len(), &Device::Cpu)?;
+        let indices = Tensor::from_slice(anchors, anchors.len(), psi.device())?;
         psi.index_select(&indices, 0).map(Some)
     };
     let phi = |phi: &Option<Tensor>| {

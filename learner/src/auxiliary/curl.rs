@@ -50,6 +50,7 @@ impl Curl {
         let Dots { dots, rkhs } = dim::global_dots(&query, &key)?;
         let scores = Scores::new(rkhs, self.tanh_clip);
         let all = vec![1; action.elem_count()];
-        Ok([None, None, None, Some(info_nce_loss(&dots, &all, scores)?)])
+        let loss = info_nce_loss(&dots, &all, scores, online.operations())?;
+        Ok([None, None, None, Some(loss)])
     }
 }

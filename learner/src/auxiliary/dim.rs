@@ -105,7 +105,12 @@ impl Dim {
         )?;
         for (loss, dots) in losses.iter_mut().zip(dots) {
             if let Some(Dots { dots, rkhs }) = dots {
-                *loss = Some(info_nce_loss(&dots, valid, self.scores(rkhs))?);
+                *loss = Some(info_nce_loss(
+                    &dots,
+                    valid,
+                    self.scores(rkhs),
+                    network.operations(),
+                )?);
             }
         }
         Ok(losses)
@@ -229,9 +234,18 @@ fn when<E>(wanted: bool, make: impl FnOnce() -> Result<Tensor, E>) -> Result<Opt
     if wanted { make().map(Some) } else { Ok(None) }
 }
 
+/// `batch` as a batched product takes it: the CPU's in any layout, others in one piece.
+fn as_operand(batch: Tensor) -> candle_core::Result<Tensor> {
+    if batch.device().is_cpu() {
+        Ok(batch)
+    } else {
+        batch.contiguous()
+    }
+}
+
 /// `psi` [B, L, R], `phi` [B, L, R].
 fn local_local_dots(psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
-    psi.transpose(0, 1)?.matmul(&phi.permute((1, 2, 0))?)
+    as_operand(psi.transpose(0, 1)?)?.matmul(&as_operand(phi.permute((1, 2, 0))?)?)
 }
 
 /// `psi` [B, L, R], `phi` [B, R].

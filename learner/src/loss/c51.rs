@@ -4,6 +4,9 @@
 use std::sync::Mutex;
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+use driml_model::Operations;
+
+use super::stock;
 
 /// Mean over rows of `KL(target || softmax(logits of the taken action))`, and its gradient.
 ///
@@ -79,7 +82,12 @@ pub fn softmax(row: &[f32], out: &mut [f32]) {
 ///
 /// # Errors
 /// Logits that are not [B, A, N] f32 with the B and N of `action` and `target`.
-pub fn kl_loss(logits: &Tensor, action: &[u8], target: Vec<f32>) -> Result<Tensor> {
+pub fn kl_loss(
+    logits: &Tensor,
+    action: &[u8],
+    target: Vec<f32>,
+    operations: Operations,
+) -> Result<Tensor> {
     let (rows, _, atoms) = logits.dims3()?;
     if rows != action.len() || target.len() != rows * atoms {
         bail!(
@@ -87,6 +95,9 @@ pub fn kl_loss(logits: &Tensor, action: &[u8], target: Vec<f32>) -> Result<Tenso
             action.len(),
             target.len()
         );
+    }
+    if operations == Operations::Stock {
+        return stock::kl_loss(logits, action, target);
     }
     let op = Kl {
         action: action.to_vec(),

@@ -4,9 +4,10 @@
 use std::sync::Mutex;
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+use driml_model::Operations;
 use rayon::prelude::*;
 
-use super::c51::scaled;
+use super::{c51::scaled, stock};
 
 /// How dot products become scores.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -128,13 +129,21 @@ fn anchor_loss(
 ///
 /// # Errors
 /// Dots that are not [L, B, B] f32 with the B of `valid`.
-pub fn info_nce_loss(dots: &Tensor, valid: &[u8], scores: Scores) -> Result<Tensor> {
+pub fn info_nce_loss(
+    dots: &Tensor,
+    valid: &[u8],
+    scores: Scores,
+    operations: Operations,
+) -> Result<Tensor> {
     let (_, anchors, candidates) = dots.dims3()?;
     if anchors != valid.len() || candidates != valid.len() {
         bail!(
             "scores of {anchors} anchors and {candidates} candidates meet {} rows",
             valid.len()
         );
+    }
+    if operations == Operations::Stock {
+        return stock::info_nce_loss(dots, valid, scores);
     }
     let op = InfoNce {
         valid: valid.to_vec(),

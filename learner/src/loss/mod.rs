@@ -4,3 +4,4 @@
 pub mod c51;
 pub mod info_nce;
 pub mod projection;
+mod stock;

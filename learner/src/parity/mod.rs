@@ -9,7 +9,7 @@ use std::{
 };
 
 use candle_core::{Device, Tensor};
-use driml_model::{DimParts, Features, Network, Parameters};
+use driml_model::{Compute, DimParts, Features, Network, Parameters};
 
 pub use case::ParityError;
 use case::{Case, all_parts};
@@ -89,11 +89,11 @@ impl fmt::Display for ParityReport {
     }
 }
 
-/// Runs one update on a case file and compares every tensor it expects.
+/// Runs one update on a case file, computed as `compute` says, and compares every tensor it expects.
 ///
 /// # Errors
 /// A file that cannot be read, is not a case, or lacks a tensor. Values out of tolerance are no error: see the report.
-pub fn check_file(path: impl AsRef<Path>) -> Result<ParityReport, ParityError> {
+pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityReport, ParityError> {
     let path = path.as_ref();
     let bytes = std::fs::read(path).map_err(|source| ParityError::Read {
         file: path.to_owned(),
@@ -104,7 +104,7 @@ pub fn check_file(path: impl AsRef<Path>) -> Result<ParityReport, ParityError> {
         why: Box::new(why),
     };
     let lines = Case::parse(&bytes)
-        .and_then(|case| check(&case))
+        .and_then(|case| check(&case, compute))
         .map_err(in_file)?;
     Ok(ParityReport {
         file: path.to_owned(),
@@ -112,18 +112,18 @@ pub fn check_file(path: impl AsRef<Path>) -> Result<ParityReport, ParityError> {
     })
 }
 
-fn check(case: &Case) -> Result<Vec<ParityLine>, ParityError> {
+fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError> {
     let sizes = case.model(DimParts::NONE);
     let model = case.model(case.settings.dim_parts(sizes.num_actions));
-    let online =
-        Parameters::from_tensors(&model, case.parameters("online.", &model), &Device::Cpu)?;
     let slow = case.settings.target_model(&model);
-    let target = Parameters::from_tensors(&slow, case.parameters("target.", &slow), &Device::Cpu)?;
-    let mut learner =
-        Learner::from_parameters(model.clone(), case.settings.clone(), online, target)?;
+    let device = &compute.device;
+    let online = Parameters::from_tensors(&model, case.parameters("online.", &model), device)?;
+    let target = Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?;
+    let settings = case.settings.clone();
+    let mut learner = Learner::from_parameters(model.clone(), settings, compute, online, target)?;
 
     let mut lines = Vec::new();
-    let pairs = forward_losses(case)?;
+    let pairs = forward_losses(case, compute)?;
     let evaluation = learner.evaluate(&case.batch())?;
 
     let width = f64::from(model.v_max - model.v_min);
@@ -211,7 +211,7 @@ fn check(case: &Case) -> Result<Vec<ParityLine>, ParityError> {
 
 /// The auxiliary losses of all pairs that the case speaks of, forward only and untouched by lambda, and whether the scores
 /// of each saturate.
-fn forward_losses(case: &Case) -> Result<[Option<(f32, bool)>; 4], ParityError> {
+fn forward_losses(case: &Case, compute: &Compute) -> Result<[Option<(f32, bool)>; 4], ParityError> {
     let settings = &case.settings;
     let curl = settings.objective == Objective::Curl;
     let heads = if curl {
@@ -222,8 +222,12 @@ fn forward_losses(case: &Case) -> Result<[Option<(f32, bool)>; 4], ParityError> 
     let model = case.model(heads);
     let network = |prefix: &str| -> Result<Network, ParityError> {
         let named = case.parameters(prefix, &model);
-        let parameters = Parameters::from_tensors(&model, named, &Device::Cpu)?;
-        Ok(Network::new(&model, &parameters)?)
+        let parameters = Parameters::from_tensors(&model, named, &compute.device)?;
+        Ok(Network::with_operations(
+            &model,
+            &parameters,
+            compute.operations,
+        )?)
     };
     let online = network("online.")?;
     let features = |network: &Network, frames: &[u8]| -> Result<Features, ParityError> {
@@ -233,7 +237,7 @@ fn forward_losses(case: &Case) -> Result<[Option<(f32, bool)>; 4], ParityError> 
             model.width,
             model.channels,
         );
-        let frames = Tensor::from_slice(frames, shape, &Device::Cpu)?;
+        let frames = Tensor::from_slice(frames, shape, &compute.device)?;
         Ok(network.features(&frames)?)
     };
     let batch = case.batch();
@@ -265,7 +269,12 @@ fn forward_losses(case: &Case) -> Result<[Option<(f32, bool)>; 4], ParityError> 
             let later = features(&online, batch.frames_k)?;
             let all = dim::dots(&online, &anchors, &later, &action, [true; 4])?;
             for (loss, dots) in losses.iter_mut().zip(all.iter().flatten()) {
-                let value = info_nce_loss(&dots.dots, valid, pairs.scores(dots.rkhs))?;
+                let value = info_nce_loss(
+                    &dots.dots,
+                    valid,
+                    pairs.scores(dots.rkhs),
+                    compute.operations,
+                )?;
                 *loss = Some((value.to_scalar()?, saturates(dots)?));
             }
         }

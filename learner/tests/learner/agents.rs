@@ -7,7 +7,7 @@ use driml_learner::{
     AffinityConfig, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner, LearnerPart,
     LearnerSettings, Learning, Objective, UpdateError,
 };
-use driml_model::{DimParts, ModelConfig};
+use driml_model::{Compute, DimParts, ModelConfig};
 use driml_protocol::{
     Batch as WireBatch, BatchHeader, Horizon, RunSpec, Tally, TimeoutRule, config::TransportConfig,
 };
@@ -37,7 +37,13 @@ fn of(objective: Objective, lambda: Lambda) -> (ModelConfig, LearnerSettings) {
 
 fn learner(objective: Objective, lambda: Lambda) -> Learner {
     let (model, settings) = of(objective, lambda);
-    Learner::new(model, settings, &mut ChaCha8Rng::seed_from_u64(1)).unwrap()
+    Learner::new(
+        model,
+        settings,
+        &Compute::CPU,
+        &mut ChaCha8Rng::seed_from_u64(1),
+    )
+    .unwrap()
 }
 
 /// `rows` with `POSITIVES` positives a row; the batch borrows what `later` makes of them.
@@ -358,7 +364,10 @@ fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
         let report = |augment| {
             let part = part(objective, augment);
             let batch = served(&part, 1);
-            Learning::new(part).unwrap().update(&batch).unwrap()
+            Learning::new(part, &Compute::CPU)
+                .unwrap()
+                .update(&batch)
+                .unwrap()
         };
         let (plain, identity, strong) = (report(None), report(Some(NOTHING)), report(Some(STRONG)));
         // The augmented states go through a pass of their own, so the sum of gradients may round otherwise.
@@ -385,12 +394,12 @@ fn an_augmenting_run_resumes_bit_for_bit() {
                 learning.update(&served(&part, seed)).unwrap();
             }
         };
-        let mut straight = Learning::new(part.clone()).unwrap();
+        let mut straight = Learning::new(part.clone(), &Compute::CPU).unwrap();
         learn(&mut straight, 0..8);
-        let mut half = Learning::new(part.clone()).unwrap();
+        let mut half = Learning::new(part.clone(), &Compute::CPU).unwrap();
         learn(&mut half, 0..4);
         half.save(&folder).unwrap();
-        let mut resumed = Learning::resume(part.clone(), &folder).unwrap();
+        let mut resumed = Learning::resume(part.clone(), &Compute::CPU, &folder).unwrap();
         assert_eq!(resumed.updates(), 4);
         learn(&mut resumed, 4..8);
         let (mut a, mut b) = (folder.join("a"), folder.join("b"));
@@ -417,10 +426,16 @@ fn a_refused_batch_draws_nothing() {
     let good = served(&part, 1);
     let mut bad = served(&part, 2);
     bad.rows_mut().set(0, 77, 0, 0.0, 0.9);
-    let mut learning = Learning::new(part.clone()).unwrap();
+    let mut learning = Learning::new(part.clone(), &Compute::CPU).unwrap();
     assert!(learning.update(&bad).is_err());
     let after = learning.update(&good).unwrap();
-    assert_eq!(after, Learning::new(part).unwrap().update(&good).unwrap());
+    assert_eq!(
+        after,
+        Learning::new(part, &Compute::CPU)
+            .unwrap()
+            .update(&good)
+            .unwrap()
+    );
 }
 
 #[test]

@@ -10,7 +10,7 @@ use driml_learner::{
     AffinityEstimator, Alphabet, LearnedAffinity, LearnedSettings, Learner,
     checkpoint::{CheckpointError, RunState, list, load_latest, save},
 };
-use driml_model::Parameters;
+use driml_model::{Compute, Parameters};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -106,7 +106,13 @@ impl Run {
 }
 
 fn load(folder: &Path) -> Result<Option<driml_learner::checkpoint::Restored>, CheckpointError> {
-    load_latest(folder, &model(ALL_DIM), &settings(ALL_DIM), SPEC)
+    load_latest(
+        folder,
+        &model(ALL_DIM),
+        &settings(ALL_DIM),
+        &Compute::CPU,
+        SPEC,
+    )
 }
 
 #[test]
@@ -198,7 +204,13 @@ fn every_kind_of_damage_is_reported_with_its_file() {
 fn another_run_s_checkpoint_is_refused() {
     let folder = Folder::new("other");
     Run::new().save(&folder.0, 1);
-    let error = load_latest(&folder.0, &model(ALL_DIM), &settings(ALL_DIM), SPEC + 1)
-        .expect_err("another run");
+    let error = load_latest(
+        &folder.0,
+        &model(ALL_DIM),
+        &settings(ALL_DIM),
+        &Compute::CPU,
+        SPEC + 1,
+    )
+    .expect_err("another run");
     assert!(matches!(error, CheckpointError::OtherRun { .. }), "{error}");
 }

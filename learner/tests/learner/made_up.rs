@@ -2,7 +2,7 @@
 //! Nothing here is measured or asserted.
 
 use driml_learner::{AdamSettings, Batch, Lambda, Learner, LearnerSettings, NO_ACTION, Objective};
-use driml_model::{ConvLayer, ModelConfig};
+use driml_model::{Compute, ConvLayer, ModelConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -75,6 +75,7 @@ pub(crate) fn learner(lambda: Lambda, seed: u64) -> Learner {
     Learner::new(
         model(lambda),
         settings(lambda),
+        &Compute::CPU,
         &mut ChaCha8Rng::seed_from_u64(seed),
     )
     .unwrap()

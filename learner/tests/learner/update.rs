@@ -5,7 +5,7 @@ use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
 use driml_learner::{Learner, UpdateError};
-use driml_model::Parameters;
+use driml_model::{Compute, Parameters};
 
 use crate::made_up::{ALL_DIM, NO_DIM, Rows, learner, model, settings};
 
@@ -40,7 +40,14 @@ fn changed(learner: &Learner, change: impl Fn(&str, &mut [f32])) -> Learner {
     let acting = model.without_dim();
     let target =
         Parameters::from_tensors(&acting, tensors(learner.target(), &|_, _| ()), &device).unwrap();
-    Learner::from_parameters(model.clone(), learner.settings().clone(), online, target).unwrap()
+    Learner::from_parameters(
+        model.clone(),
+        learner.settings().clone(),
+        &Compute::CPU,
+        online,
+        target,
+    )
+    .unwrap()
 }
 
 #[test]
@@ -222,7 +229,8 @@ fn double_dqn_chooses_by_the_online_network() {
     for double_dqn in [false, true] {
         settings.double_dqn = double_dqn;
         let mut rng = rand_chacha::rand_core::SeedableRng::seed_from_u64(16);
-        let learner = Learner::new(model(NO_DIM), settings.clone(), &mut rng).unwrap();
+        let learner =
+            Learner::new(model(NO_DIM), settings.clone(), &Compute::CPU, &mut rng).unwrap();
         // The online network alone turns to action 2.
         let learner = changed(&learner, |name, values| {
             if name == "head.bias" {
@@ -311,7 +319,8 @@ fn arithmetic_that_is_not_finite_is_an_error_that_changes_nothing() {
 #[test]
 fn a_model_whose_heads_the_lambdas_do_not_use_is_refused() {
     let mut rng = rand_chacha::rand_core::SeedableRng::seed_from_u64(23);
-    let error = Learner::new(model(ALL_DIM), settings(NO_DIM), &mut rng).expect_err("unused heads");
+    let error = Learner::new(model(ALL_DIM), settings(NO_DIM), &Compute::CPU, &mut rng)
+        .expect_err("unused heads");
     assert!(matches!(error, UpdateError::Settings(_)), "{error}");
 }
 

@@ -7,6 +7,7 @@ mod script;
 use std::collections::{BTreeMap, BTreeSet};
 
 use anyhow::Context;
+use driml_learner::DeviceName;
 use serde::{Deserialize, Serialize};
 
 use crate::{
@@ -110,7 +111,7 @@ pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
     for round in 1..=rounds {
         for (part, (script, sides)) in &mut sides {
             eprintln!("round {round} of {rounds}: {} of ours", part.name());
-            sides.add_ours(alone::figures(*part, &args.flags)?);
+            sides.add_ours(alone::figures(*part, &args.flags, DeviceName::Cpu)?);
             if sides.absent.is_none() {
                 eprintln!("round {round} of {rounds}: {}", sides.peer);
                 match script.run() {

@@ -8,7 +8,7 @@ use driml_learner::{
     auxiliary::dim::{Dim, dots},
     optim::{Adam, Gradients, clip_factor},
 };
-use driml_model::{ModelConfig, Network, Parameters};
+use driml_model::{ModelConfig, Network, Operations, Parameters};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -64,7 +64,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let parameters = Parameters::init(&task.model, &mut rng, &Device::Cpu)?;
     let network = Network::new(&task.model, &parameters)?;
-    let mut adam = Adam::new(task.learner.adam, &parameters);
+    let mut adam = Adam::new(task.learner.adam, &parameters, Operations::Own)?;
     let scorer = Scorer {
         task,
         network: &network,
@@ -84,7 +84,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
         let value = scorer.loss(&now, &next)?;
         loss.push(value.to_scalar::<f32>()?);
         let gradients = Gradients::take(&parameters, value.backward()?)?;
-        let factor = clip_factor(gradients.norm()?, task.learner.max_grad_norm);
+        let factor = clip_factor(gradients.norm(Operations::Own)?, task.learner.max_grad_norm);
         adam.step(&parameters, &gradients, factor)?;
         progress.advance(1)?;
     }

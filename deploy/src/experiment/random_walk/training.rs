@@ -7,7 +7,7 @@ use driml_learner::{
     auxiliary::dim::{Dim, dots},
     optim::{Adam, Gradients, clip_factor},
 };
-use driml_model::{ConvLayer, Features, ModelConfig, Network, Parameters};
+use driml_model::{ConvLayer, Features, ModelConfig, Network, Operations, Parameters};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -176,7 +176,7 @@ impl Heads {
         let parameters = Parameters::init(&model, rng, &Device::Cpu)?;
         Ok(Self {
             network: Network::new(&model, &parameters)?,
-            adam: Adam::new(settings.adam, &parameters),
+            adam: Adam::new(settings.adam, &parameters, Operations::Own)?,
             parameters,
             dim: Dim {
                 lambda,
@@ -211,7 +211,7 @@ impl Heads {
             .losses(&self.network, &now, &next, &action, &valid)?;
         for loss in losses.iter().flatten() {
             let gradients = Gradients::take(&self.parameters, loss.backward()?)?;
-            let factor = clip_factor(gradients.norm()?, self.max_grad_norm);
+            let factor = clip_factor(gradients.norm(Operations::Own)?, self.max_grad_norm);
             self.adam.step(&self.parameters, &gradients, factor)?;
         }
         Ok(())

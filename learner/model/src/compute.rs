@@ -1,0 +1,201 @@
+//! Where tensors live, and which operations compute them.
+//! It computes nothing: this project's kernels are in `conv` and `linear`, candle's own operations in `stock`.
+
+use std::{fmt, str::FromStr};
+
+use candle_core::{Device, Tensor};
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    conv, linear,
+    stock::{self, ConvLayerTensors},
+};
+
+/// Which operations the network and the losses are made of. Both give the same up to rounding, gradients included.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Operations {
+    /// This project's kernels, fused and blocked for the CPU, and there alone.
+    Own,
+    /// Compositions of candle's own operations: any device, several times slower on the CPU.
+    Stock,
+}
+
+impl Operations {
+    /// The faster ones of those that a device has.
+    pub fn of(device: &Device) -> Self {
+        if device.is_cpu() {
+            Self::Own
+        } else {
+            Self::Stock
+        }
+    }
+
+    pub(crate) fn conv_stack(
+        self,
+        images: &Tensor,
+        layers: &[ConvLayerTensors<'_>],
+    ) -> candle_core::Result<Tensor> {
+        match self {
+            Self::Own => conv::conv_stack(images, layers),
+            Self::Stock => stock::conv_stack(images, layers),
+        }
+    }
+
+    pub(crate) fn linear(self, x: &Tensor, w: &Tensor, b: &Tensor) -> candle_core::Result<Tensor> {
+        match self {
+            Self::Own => linear::linear(x, w, b),
+            Self::Stock => stock::linear(x, w, b),
+        }
+    }
+
+    pub(crate) fn linear_relu(
+        self,
+        x: &Tensor,
+        w: &Tensor,
+        b: &Tensor,
+    ) -> candle_core::Result<Tensor> {
+        match self {
+            Self::Own => linear::linear_relu(x, w, b),
+            Self::Stock => stock::relu(&stock::linear(x, w, b)?),
+        }
+    }
+
+    pub(crate) fn relu(self, x: &Tensor) -> candle_core::Result<Tensor> {
+        match self {
+            Self::Own => linear::relu(x),
+            Self::Stock => stock::relu(x),
+        }
+    }
+}
+
+/// A device and the operations used on it.
+#[derive(Clone, Debug)]
+pub struct Compute {
+    /// Where parameters, batches and losses live.
+    pub device: Device,
+    /// How they are computed there.
+    pub operations: Operations,
+}
+
+impl Compute {
+    /// The CPU with this project's kernels.
+    pub const CPU: Self = Self {
+        device: Device::Cpu,
+        operations: Operations::Own,
+    };
+
+    /// A device with the faster operations that it has.
+    pub fn on(device: &Device) -> Self {
+        Self {
+            device: device.clone(),
+            operations: Operations::of(device),
+        }
+    }
+}
+
+/// A device by its name: `cpu`, `cuda` (the first GPU) or `cuda:N`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum DeviceName {
+    /// The processor.
+    Cpu,
+    /// The NVIDIA GPU with this number, as the driver counts them.
+    Cuda(usize),
+}
+
+/// Why there is no such device.
+#[derive(Debug, thiserror::Error)]
+pub enum DeviceError {
+    /// Not the name of a device.
+    #[error("{0:?} is no device: take cpu, cuda or cuda:N")]
+    Name(String),
+    /// The driver refused, or the program has no CUDA in it.
+    #[error("{device} cannot be used: {why}; `driml doctor` says what is missing")]
+    Open {
+        /// The device that was asked for.
+        device: DeviceName,
+        /// What the tensor library says.
+        why: candle_core::Error,
+    },
+}
+
+impl DeviceName {
+    /// The device with the faster operations that it has.
+    ///
+    /// # Errors
+    /// A GPU that is not there, or a program that was built without the feature `cuda`.
+    pub fn open(self) -> Result<Compute, DeviceError> {
+        match self {
+            Self::Cpu => Ok(Compute::CPU),
+            Self::Cuda(ordinal) => {
+                let device = Device::new_cuda(ordinal)
+                    .map_err(|why| DeviceError::Open { device: self, why })?;
+                Ok(Compute::on(&device))
+            }
+        }
+    }
+}
+
+impl fmt::Display for DeviceName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Cpu => f.write_str("cpu"),
+            Self::Cuda(ordinal) => write!(f, "cuda:{ordinal}"),
+        }
+    }
+}
+
+impl From<DeviceName> for String {
+    fn from(device: DeviceName) -> Self {
+        device.to_string()
+    }
+}
+
+impl TryFrom<String> for DeviceName {
+    type Error = DeviceError;
+
+    fn try_from(name: String) -> Result<Self, DeviceError> {
+        name.parse()
+    }
+}
+
+impl FromStr for DeviceName {
+    type Err = DeviceError;
+
+    fn from_str(name: &str) -> Result<Self, DeviceError> {
+        let unknown = || DeviceError::Name(name.to_owned());
+        match name.split_once(':') {
+            None if name == "cpu" => Ok(Self::Cpu),
+            None if name == "cuda" => Ok(Self::Cuda(0)),
+            Some(("cuda", ordinal)) => ordinal.parse().map(Self::Cuda).map_err(|_| unknown()),
+            _ => Err(unknown()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn devices_have_names() {
+        for name in ["cpu", "cuda:0", "cuda:3"] {
+            assert_eq!(name.parse::<DeviceName>().unwrap().to_string(), name);
+        }
+        assert_eq!("cuda".parse::<DeviceName>().unwrap(), DeviceName::Cuda(0));
+        for wrong in ["", "gpu", "cuda:", "cuda:-1", "cpu:0", "CUDA"] {
+            let error = wrong.parse::<DeviceName>().unwrap_err().to_string();
+            assert!(error.contains("take cpu, cuda or cuda:N"), "{error}");
+        }
+    }
+
+    #[cfg(not(feature = "cuda"))]
+    #[test]
+    fn a_program_without_cuda_says_so() {
+        let error = DeviceName::Cuda(0).open().unwrap_err().to_string();
+        assert!(
+            error.contains("cuda:0 cannot be used") && error.contains("driml doctor"),
+            "{error}"
+        );
+    }
+}

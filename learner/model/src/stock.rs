@@ -1,0 +1,103 @@
+//! The network's layers as compositions of candle's own operations, for devices that this project has no kernels for.
+//! Same arguments, results and gradients as in `conv` and `linear`; only shapes are checked there and not here.
+//!
+//! candle's convolution has a naive backward pass on every device. A convolution here is a matrix product of patches with the
+//! kernel, so that its gradients are matrix products too.
+
+use candle_core::{DType, Result, Tensor};
+
+/// Weight [out, in, k, k], bias [out] and stride of a convolution.
+pub(crate) type ConvLayerTensors<'a> = (&'a Tensor, &'a Tensor, usize);
+
+/// As `conv::conv_stack`: images [B, H, W, C] to maps [B, h, w, c].
+pub(crate) fn conv_stack(images: &Tensor, layers: &[ConvLayerTensors<'_>]) -> Result<Tensor> {
+    let mut maps = match images.dtype() {
+        DType::U8 => images.to_dtype(DType::F32)?.affine(1.0 / 255.0, 0.0)?,
+        _ => images.clone(),
+    };
+    for &(weight, bias, stride) in layers {
+        maps = relu(&conv2d(&maps, weight, bias, stride)?)?;
+    }
+    Ok(maps)
+}
+
+/// As `linear::linear`: x [..., in], w [out, in], b [groups..., out].
+pub(crate) fn linear(x: &Tensor, w: &Tensor, b: &Tensor) -> Result<Tensor> {
+    let (outputs, inputs) = w.dims2()?;
+    let rows = x.elem_count() / inputs;
+    let groups = b.elem_count() / outputs;
+    let y = x
+        .reshape((rows, inputs))?
+        .matmul(&w.contiguous()?.t()?)?
+        .reshape((groups, rows / groups, outputs))?
+        .broadcast_add(&b.reshape((groups, 1, outputs))?)?;
+    let mut shape = x.dims().to_vec();
+    if let Some(last) = shape.last_mut() {
+        *last = outputs;
+    }
+    y.reshape(shape)
+}
+
+/// max(x, 0), whose gradient at exactly 0 is 0, unlike that of candle's `relu`; it keeps NaN.
+pub(crate) fn relu(x: &Tensor) -> Result<Tensor> {
+    let above = x.gt(0f32)?.to_dtype(x.dtype())?.detach();
+    x * above
+}
+
+/// Images [B, H, W, in] to [B, h, w, out], without ReLU.
+fn conv2d(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
+    let (batch, height, width, _) = images.dims4()?;
+    let (outputs, _, kernel, _) = weight.dims4()?;
+    if !kernel.is_multiple_of(stride) {
+        let maps = images
+            .permute((0, 3, 1, 2))?
+            .contiguous()?
+            .conv2d(weight, 0, stride, 1, 1)?
+            .permute((0, 2, 3, 1))?;
+        return maps.broadcast_add(bias);
+    }
+    let out = |side: usize| (side - kernel) / stride + 1;
+    let (rows, cols) = (out(height), out(width));
+    let patches = patches(images, (rows, cols), kernel / stride, stride)?;
+    linear(&patches, &as_patches(weight, stride)?, bias)?.reshape((batch, rows, cols, outputs))
+}
+
+/// The patches [B * h * w, k * k * c] under each output of a convolution with a kernel of `blocks` strides.
+///
+/// The image is cut into blocks of stride x stride pixels; a patch is `blocks` x `blocks` neighbouring ones. Its numbers are in
+/// the order block row, block column, row, column, channel.
+fn patches(
+    images: &Tensor,
+    (rows, cols): (usize, usize),
+    blocks: usize,
+    stride: usize,
+) -> Result<Tensor> {
+    let (batch, _, _, channels) = images.dims4()?;
+    let (block_rows, block_cols) = (rows + blocks - 1, cols + blocks - 1);
+    let block_len = stride * stride * channels;
+    let blocked = images
+        .narrow(1, 0, block_rows * stride)?
+        .narrow(2, 0, block_cols * stride)?
+        .reshape(vec![
+            batch, block_rows, stride, block_cols, stride, channels,
+        ])?
+        .permute(vec![0, 1, 3, 2, 4, 5])?
+        .reshape((batch, block_rows, block_cols, block_len))?;
+    let mut neighbours = Vec::with_capacity(blocks * blocks);
+    for row in 0..blocks {
+        for col in 0..blocks {
+            neighbours.push(blocked.narrow(1, row, rows)?.narrow(2, col, cols)?);
+        }
+    }
+    Tensor::cat(&neighbours, 3)?.reshape((batch * rows * cols, blocks * blocks * block_len))
+}
+
+/// A kernel [out, in, k, k] as a matrix [out, k * k * in], in the order of [`patches`].
+fn as_patches(weight: &Tensor, stride: usize) -> Result<Tensor> {
+    let (outputs, inputs, kernel, _) = weight.dims4()?;
+    let blocks = kernel / stride;
+    weight
+        .reshape(vec![outputs, inputs, blocks, stride, blocks, stride])?
+        .permute(vec![0, 2, 4, 3, 5, 1])?
+        .reshape((outputs, kernel * kernel * inputs))
+}
