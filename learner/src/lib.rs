@@ -10,6 +10,7 @@ pub mod batch;
 pub mod batch_source;
 pub mod checkpoint;
 mod config;
+pub mod gradients;
 mod learning;
 pub mod loss;
 pub mod optim;

@@ -16,11 +16,12 @@ use crate::{
         dim::{Dim, Lambda, PAIRS},
     },
     batch::Batch,
+    gradients::{Gradients, clip_factor},
     loss::{
         c51::{kl_loss, softmax},
         projection::project,
     },
-    optim::{Adam, AdamSettings, Gradients, clip_factor},
+    optim::{Adam, AdamSettings},
     target,
 };
 

@@ -218,7 +218,7 @@ mod tests {
     #[test]
     fn the_operation_gives_the_function() -> Result<()> {
         let logits = Var::from_slice(&LOGITS, (2, ACTIONS, 3), &Device::Cpu)?;
-        let loss = kl_loss(&logits, &[1, 0], TARGET.to_vec())?;
+        let loss = kl_loss(&logits, &[1, 0], TARGET.to_vec(), Operations::Own)?;
         let grads = loss.affine(3.0, 0.0)?.backward()?;
         let mut gradient = [0f32; 12];
         let expected = kl(&LOGITS, &[1, 0], ACTIONS, &TARGET, &mut gradient);
@@ -229,6 +229,25 @@ mod tests {
             .flatten_all()?
             .to_vec1::<f32>()?;
         assert_eq!(got, gradient.map(|g| g * 3.0));
+        Ok(())
+    }
+
+    #[test]
+    fn candle_s_own_operations_give_it_too() -> Result<()> {
+        for scale in [1.0, 1e4] {
+            let logits = LOGITS.map(|logit| logit * scale);
+            let var = Var::from_slice(&logits, (2, ACTIONS, 3), &Device::Cpu)?;
+            let loss = kl_loss(&var, &[1, 0], TARGET.to_vec(), Operations::Stock)?;
+            let mut gradient = [0f32; 12];
+            let expected = kl(&logits, &[1, 0], ACTIONS, &TARGET, &mut gradient);
+            let error = f64::from(loss.to_scalar::<f32>()?) - expected;
+            assert!(error.abs() <= 1e-6 * expected, "{scale}: {error}");
+            let grads = loss.backward()?;
+            let got = grads.get(&var).expect("a gradient").flatten_all()?;
+            for (got, expected) in got.to_vec1::<f32>()?.iter().zip(gradient) {
+                assert!((got - expected).abs() < 1e-6, "{scale}: {got}, {expected}");
+            }
+        }
         Ok(())
     }
 }

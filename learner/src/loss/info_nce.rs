@@ -289,7 +289,7 @@ mod tests {
     #[test]
     fn the_operation_gives_the_function() -> Result<()> {
         let var = Var::from_vec(dots(), (LOCATIONS, ROWS, ROWS), &Device::Cpu)?;
-        let loss = info_nce_loss(&var, &[1, 1, 1], SCORES)?;
+        let loss = info_nce_loss(&var, &[1, 1, 1], SCORES, Operations::Own)?;
         let grads = loss.affine(2.0, 0.0)?.backward()?;
         let (expected, gradient) = loss_of(&dots(), &[1, 1, 1]);
         assert_eq!(loss.to_scalar::<f32>()?, expected as f32);
@@ -299,6 +299,29 @@ mod tests {
             .flatten_all()?
             .to_vec1::<f32>()?;
         assert_eq!(got, gradient.iter().map(|g| g * 2.0).collect::<Vec<_>>());
+        Ok(())
+    }
+
+    #[test]
+    fn candle_s_own_operations_give_it_too() -> Result<()> {
+        for valid in [[1, 1, 1], [1, 0, 1], [0, 1, 0], [0, 0, 0]] {
+            let var = Var::from_vec(dots(), (LOCATIONS, ROWS, ROWS), &Device::Cpu)?;
+            let loss = info_nce_loss(&var, &valid, SCORES, Operations::Stock)?;
+            let (expected, gradient) = loss_of(&dots(), &valid);
+            let error = f64::from(loss.to_scalar::<f32>()?) - expected;
+            assert!(error.abs() < 1e-5, "{valid:?}: {error}");
+            let grads = loss.backward()?;
+            let got = match grads.get(&var) {
+                Some(got) => got.flatten_all()?.to_vec1::<f32>()?,
+                None => vec![0.0; gradient.len()],
+            };
+            for (got, expected) in got.iter().zip(gradient) {
+                assert!(
+                    (got - expected).abs() < 1e-6,
+                    "{valid:?}: {got}, {expected}"
+                );
+            }
+        }
         Ok(())
     }
 }

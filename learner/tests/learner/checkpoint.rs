@@ -14,7 +14,7 @@ use driml_model::{Compute, Parameters};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::made_up::{ACTIONS, ALL_DIM, Rows, learner, model, settings};
+use crate::made_up::{ACTIONS, ALL_DIM, Rows, STOCK, learner, learner_on, model, settings};
 
 const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
@@ -113,6 +113,37 @@ fn load(folder: &Path) -> Result<Option<driml_learner::checkpoint::Restored>, Ch
         &Compute::CPU,
         SPEC,
     )
+}
+
+#[test]
+fn a_checkpoint_goes_on_with_other_operations_than_it_was_saved_by() {
+    for (saver, loader) in [(&Compute::CPU, &STOCK), (&STOCK, &Compute::CPU)] {
+        let folder = Folder::new("operations");
+        let mut run = Run::new();
+        run.learner = learner_on(saver, ALL_DIM, 1);
+        run.updates(4);
+        run.save(&folder.0, 1);
+        let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
+        let restored = load_latest(&folder.0, &model, &settings, loader, SPEC).unwrap();
+        let mut resumed = restored.expect("a checkpoint").learner;
+        assert!(
+            run.learner.weights().unwrap() == resumed.weights().unwrap(),
+            "the weights are the same bits"
+        );
+        let rows = Rows::random(6, 9);
+        let (a, b) = (
+            run.learner.update(&rows.batch()).unwrap(),
+            resumed.update(&rows.batch()).unwrap(),
+        );
+        assert!((a.total - b.total).abs() < 1e-4 * a.total, "{a:?}\n{b:?}");
+        for (name, var) in run.learner.online().iter() {
+            let other = resumed.online().get(name).unwrap();
+            let difference = (var.as_tensor() - other.as_tensor()).unwrap().abs();
+            let largest = difference.unwrap().max_all().unwrap();
+            // With the moments lost, the step would be of another size altogether.
+            assert!(largest.to_scalar::<f32>().unwrap() < 1e-4, "{name}");
+        }
+    }
 }
 
 #[test]

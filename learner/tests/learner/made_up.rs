@@ -2,7 +2,7 @@
 //! Nothing here is measured or asserted.
 
 use driml_learner::{AdamSettings, Batch, Lambda, Learner, LearnerSettings, NO_ACTION, Objective};
-use driml_model::{Compute, ConvLayer, ModelConfig};
+use driml_model::{Compute, ConvLayer, ModelConfig, Operations};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -72,14 +72,19 @@ pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
 }
 
 pub(crate) fn learner(lambda: Lambda, seed: u64) -> Learner {
-    Learner::new(
-        model(lambda),
-        settings(lambda),
-        &Compute::CPU,
-        &mut ChaCha8Rng::seed_from_u64(seed),
-    )
-    .unwrap()
+    learner_on(&Compute::CPU, lambda, seed)
 }
+
+pub(crate) fn learner_on(compute: &Compute, lambda: Lambda, seed: u64) -> Learner {
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+    Learner::new(model(lambda), settings(lambda), compute, rng).unwrap()
+}
+
+/// The operations of a GPU, on the CPU.
+pub(crate) const STOCK: Compute = Compute {
+    operations: Operations::Stock,
+    ..Compute::CPU
+};
 
 /// A batch that owns its planes.
 #[derive(Clone)]

@@ -7,7 +7,7 @@ use candle_core::{Device, Tensor};
 use driml_learner::{Learner, UpdateError};
 use driml_model::{Compute, Parameters};
 
-use crate::made_up::{ALL_DIM, NO_DIM, Rows, learner, model, settings};
+use crate::made_up::{ALL_DIM, NO_DIM, Rows, STOCK, learner, learner_on, model, settings};
 
 type Values = HashMap<String, Vec<f32>>;
 
@@ -333,4 +333,47 @@ fn actors_get_torso_and_head_and_nothing_else() {
     let mut expected = values(learner.online());
     expected.retain(|name, _| !name.starts_with("dim."));
     assert_eq!(values(&loaded), expected);
+}
+
+#[test]
+fn candle_s_own_operations_learn_the_same() {
+    for lambda in [ALL_DIM, NO_DIM] {
+        let (mut ours, mut theirs) = (learner(lambda, 1), learner_on(&STOCK, lambda, 1));
+        // Past the third update the target network has moved.
+        for update in 0..5 {
+            let rows = Rows::random(8, update);
+            let (a, b) = (
+                ours.update(&rows.batch()).unwrap(),
+                theirs.update(&rows.batch()).unwrap(),
+            );
+            let close = |a: f64, b: f64| (a - b).abs() <= 1e-4 * a.abs().max(1e-2);
+            assert!(close(a.total.into(), b.total.into()), "{a:?}\n{b:?}");
+            assert!(close(a.grad_norm, b.grad_norm), "{a:?}\n{b:?}");
+        }
+        for (ours, theirs) in [
+            (ours.online(), theirs.online()),
+            (ours.target(), theirs.target()),
+        ] {
+            for (name, var) in ours.iter() {
+                let difference = (var.as_tensor() - theirs.get(name).unwrap().as_tensor()).unwrap();
+                let square = difference.sqr().unwrap().mean_all().unwrap();
+                let error = square.to_scalar::<f32>().unwrap().sqrt();
+                // A step is about the learning rate, 1e-3.
+                assert!(error < 2e-5, "{name} differs by {error}");
+            }
+        }
+    }
+}
+
+#[test]
+fn with_candle_s_own_operations_bad_arithmetic_changes_nothing_either() {
+    let mut learner = learner_on(&STOCK, ALL_DIM, 1);
+    let var = learner.online().get("head.bias").unwrap();
+    let values = vec![f32::NAN; var.elem_count()];
+    var.set(&Tensor::from_vec(values, var.dims(), &Device::Cpu).unwrap())
+        .unwrap();
+    let before = learner.weights().unwrap();
+    let error = learner.update(&Rows::random(4, 1).batch()).unwrap_err();
+    assert!(matches!(error, UpdateError::NonFinite { .. }), "{error}");
+    assert!(before == learner.weights().unwrap() && learner.updates() == 0);
 }

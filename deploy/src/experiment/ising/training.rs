@@ -6,7 +6,8 @@ use driml_envs::{Environment, IsingConfig, IsingWorld, StepEnd};
 use driml_learner::{
     LearnerSettings,
     auxiliary::dim::{Dim, dots},
-    optim::{Adam, Gradients, clip_factor},
+    gradients::{Gradients, clip_factor},
+    optim::Adam,
 };
 use driml_model::{ModelConfig, Network, Operations, Parameters};
 use rand::{Rng, SeedableRng};

@@ -5,7 +5,8 @@ use candle_core::{Device, Tensor};
 use driml_learner::{
     Lambda,
     auxiliary::dim::{Dim, dots},
-    optim::{Adam, Gradients, clip_factor},
+    gradients::{Gradients, clip_factor},
+    optim::Adam,
 };
 use driml_model::{ConvLayer, Features, ModelConfig, Network, Operations, Parameters};
 use rand::{Rng, SeedableRng};

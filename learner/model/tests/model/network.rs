@@ -2,7 +2,7 @@
 //! Values against another framework are in `parity`.
 
 use candle_core::{DType, Device, Result, Tensor};
-use driml_model::{DimParts, ModelConfig, ModelError, Network, Parameters};
+use driml_model::{ConvLayer, DimParts, ModelConfig, ModelError, Network, Operations, Parameters};
 
 use crate::support::{assert_close, bits, frames, parameters, rng, small};
 
@@ -35,6 +35,65 @@ fn with_biases(config: &ModelConfig) -> Parameters {
             .unwrap_or_else(|error| panic!("{name}: {error}"));
     }
     parameters
+}
+
+/// Every output of the network for a batch, one after the other, and the gradients of their weighted sum.
+fn outputs_and_gradients(
+    config: &ModelConfig,
+    parameters: &Parameters,
+    operations: Operations,
+) -> Result<(Vec<Tensor>, candle_core::backprop::GradStore)> {
+    let network = Network::with_operations(config, parameters, operations).unwrap();
+    let features = network.features(&frames(config, 6, &mut rng(1))).unwrap();
+    let actions = Tensor::new(&[0u32, 4, 2, 2, 1, 3], &Device::Cpu)?;
+    let logits = network.logits(&features.f4).unwrap();
+    let outputs = vec![
+        network.q_values(&logits).unwrap(),
+        logits,
+        network.psi3(&features.f3, &actions).unwrap(),
+        network.phi3(&features.f3).unwrap(),
+        network.psi4(&features.f4, &actions).unwrap(),
+        network.phi4(&features.f4).unwrap(),
+        features.f3,
+        features.f4,
+    ];
+    let mut total = Tensor::new(0f32, &Device::Cpu)?;
+    for (seed, output) in (10..).zip(&outputs[1..]) {
+        let weights = crate::support::floats(output.dims(), &mut rng(seed));
+        total = (total + (output * weights)?.sum_all()?)?;
+    }
+    let gradients = total.backward()?;
+    Ok((outputs, gradients))
+}
+
+#[test]
+fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
+    // Strides that divide their kernels and one that does not; a stride of 1; a kernel of 1.
+    let odd = small();
+    let even = ModelConfig {
+        conv: [(5, 8, 4), (7, 4, 2), (6, 1, 1)]
+            .map(|(out, kernel, stride)| ConvLayer {
+                out,
+                kernel,
+                stride,
+            })
+            .to_vec(),
+        ..small()
+    };
+    for config in [odd, even] {
+        let parameters = with_biases(&config);
+        let (ours, our_gradients) = outputs_and_gradients(&config, &parameters, Operations::Own)?;
+        let (theirs, their_gradients) =
+            outputs_and_gradients(&config, &parameters, Operations::Stock)?;
+        for (index, (ours, theirs)) in ours.iter().zip(&theirs).enumerate() {
+            assert_close(&format!("output {index}"), theirs, ours, 1e-6);
+        }
+        for (name, var) in parameters.iter() {
+            let (ours, theirs) = (our_gradients.get(var), their_gradients.get(var));
+            assert_close(name, theirs.unwrap(), ours.unwrap(), 2e-6);
+        }
+    }
+    Ok(())
 }
 
 #[test]
