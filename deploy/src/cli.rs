@@ -310,7 +310,7 @@ pub(crate) struct ProcgenArgs {
     /// Games, such as bigfish,starpilot; or all [default: as the experiment's settings say]
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) games: Vec<String>,
-    /// Agents; or all [default: c51,driml-fix,driml-ada]
+    /// Agents, driml-fix and driml-noact also with a k, as in driml-noact-k5; or all [default: c51,driml-fix,driml-ada]
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) agents: Vec<String>,
     /// Frames of each run; the paper's are 50000000

@@ -424,6 +424,9 @@ fn page(results: &Results, mut got: Vec<String>, tables: Vec<Table>) -> Page {
              where the paper's have 5,000 (`--frames 100000 --episodes-per-task 5000` for its length).",
             settings.predictability.frames, continual.episodes_per_task, noise.episodes_per_task
         ),
+        "The paper's text enlarges the frames to 42 x 38, its table of parameters to 84 x 84; what was taken is under \"How\". At 42 x 38 \
+         the last convolution has a single location, so \"local\" DIM compares whole frames too, one layer earlier than global DIM."
+            .into(),
         "The paper gives neither maze nor rewards nor the number of parallel worlds; ours are the preset's.".into(),
         format!(
             "Each of {} copies of the world changes its ghost after its own share of a task's episodes, so that a copy's frames do not \
@@ -432,6 +435,17 @@ fn page(results: &Results, mut got: Vec<String>, tables: Vec<Table>) -> Page {
         ),
         "The published code bootstraps its 7-step returns from s_{t+1}; ours, for C51 and DRIML alike, from s_{t+7}.".into(),
     ];
+    let replay = "replay.capacity_transitions=";
+    if let Some(capacity) = continual
+        .sets
+        .iter()
+        .find_map(|set| set.strip_prefix(replay))
+    {
+        differences.push(format!(
+            "The replay of (b) and (c) holds {capacity} transitions, about a task, as the paper's 1,000,000 are of its longer tasks: \
+             else the old ghosts' transitions would stay to the end."
+        ));
+    }
     if short {
         differences.push(format!(
             "The mean return is over {RETURNS_OF} episodes, half a task or more: the start of a task still shows the end of the one before."

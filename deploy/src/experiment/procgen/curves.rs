@@ -72,7 +72,7 @@ pub(super) fn write_table(session: &Session, results: &Results) -> anyhow::Resul
                 } else {
                     kind
                 };
-                let paper = published::table_1(world, agent).filter(|_| kind == Kind::Training);
+                let paper = published::paper(world, agent).filter(|_| kind == Kind::Training);
                 rows.push(vec![
                     world.to_owned(),
                     agent.to_owned(),

@@ -245,9 +245,10 @@ impl Settings {
 
     fn plan(&self, spot: &Spot) -> Plan {
         let (seed, frames) = (spot.seed.to_string(), self.frames.to_string());
+        let (agent, k) = with_k(&spot.agent);
         let mut args: Vec<String> = [
             ["--env", &spot.world],
-            ["--agent", &spot.agent],
+            ["--agent", agent],
             ["--preset", &self.preset],
             ["--seed", &seed],
             ["--frames", &frames],
@@ -256,7 +257,8 @@ impl Settings {
         .into_iter()
         .map(String::from)
         .collect();
-        for set in &self.sets {
+        let k = k.map(|k| format!("run.horizon.k={k}"));
+        for set in self.sets.iter().chain(&k) {
             args.extend(["--set".into(), set.clone()]);
         }
         Plan {
@@ -319,14 +321,28 @@ fn worlds(names: &[String]) -> Result<Vec<String>, Usage> {
     Ok(once(found))
 }
 
-/// Agents by name, each once; `all` is every one.
+/// Agents that look a fixed k ahead, so that another k can be asked for.
+const OF_FIXED_K: [&str; 2] = ["driml-fix", "driml-noact"];
+
+/// The agent and the k of a name such as `driml-noact-k5`; other names are the agent's alone.
+fn with_k(name: &str) -> (&str, Option<u32>) {
+    let split = name.rsplit_once("-k");
+    match split.and_then(|(agent, k)| Some((agent, k.parse().ok()?))) {
+        Some((agent, k)) if OF_FIXED_K.contains(&agent) => (agent, Some(k)),
+        _ => (name, None),
+    }
+}
+
+/// Agents by name, each once; `all` is every one, and a name with a k one that looks so far ahead.
 fn agents(names: &[String]) -> Result<Vec<String>, Usage> {
     let mut found = Vec::new();
     for name in names {
         if name == "all" {
             found.extend(published::AGENTS.map(String::from));
         } else {
-            found.push(presets::agent(name)?.name.to_owned());
+            let (agent, k) = with_k(name);
+            let agent = presets::agent(agent)?.name;
+            found.push(k.map_or_else(|| agent.to_owned(), |k| format!("{agent}-k{k}")));
         }
     }
     Ok(once(found))
@@ -480,6 +496,24 @@ mod tests {
         let said = names(&["bigfihs"]).unwrap_err().to_string();
         assert!(said.contains("did you mean"), "{said}");
         assert_eq!(agents(&["all".into()]).unwrap().len(), 7);
+    }
+
+    #[test]
+    fn an_agent_of_fixed_k_can_be_given_another() {
+        let names = |list: &[&str]| agents(&list.iter().map(|&it| it.into()).collect::<Vec<_>>());
+        let both = ["driml-noact-k1", "driml-noact-k5"];
+        assert_eq!(names(&both).unwrap(), both);
+        assert!(names(&["driml-ada-k5"]).is_err() && names(&["driml-noact-kx"]).is_err());
+        let file: File = toml::from_str(SMOKE).unwrap();
+        let spot = Spot {
+            world: "procgen:heist".into(),
+            agent: "driml-noact-k5".into(),
+            seed: 2,
+        };
+        let plan = file.grid.plan(&spot);
+        assert_eq!(plan.name, "heist-driml-noact-k5-seed2");
+        let has = |pair: [&str; 2]| plan.args.windows(2).any(|words| *words == pair);
+        assert!(has(["--agent", "driml-noact"]) && has(["--set", "run.horizon.k=5"]));
     }
 
     #[test]

@@ -194,7 +194,7 @@ fn table_1(results: &Results) -> Table {
         let cells = agents.iter().map(|agent| {
             let ours = Spread::of(results.means(world, agent, Kind::Training));
             let ours = ours.map_or("-".into(), |it| plus_minus(it.mean, it.sd, it.count));
-            match published::table_1(world, agent) {
+            match published::paper(world, agent) {
                 Some((mean, sd)) => format!("{ours} (paper {mean:.2} ± {sd:.2})"),
                 None => ours,
             }
@@ -208,7 +208,7 @@ fn table_1(results: &Results) -> Table {
     });
     Table {
         caption: "Training return, mean of the last 100 episodes: mean ± standard deviation over seeds; in brackets the \
-                  paper's table 1 after 50 million frames."
+                  paper's (table 1; for driml-noact-k1 and -k5 its ablation) after 50 million frames."
             .into(),
         header: ["game", "random"].iter().chain(&agents).map(|it| (*it).to_owned()).collect(),
         rows: rows.collect(),

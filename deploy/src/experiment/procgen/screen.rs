@@ -151,8 +151,9 @@ fn figure(results: &Results, screened: &[Screened]) -> anyhow::Result<Figure> {
 fn page(results: &Results, screened: &[Screened]) -> Page {
     let settings = &results.settings;
     let above = screened.iter().filter(|it| it.soonest.is_some()).count();
-    let chosen = screened.iter().take(CHOSEN.min(above));
+    let chosen = screened.iter().take(CHOSEN);
     let chosen: Vec<&str> = chosen.map(|it| short(&it.world)).collect();
+    let by_greedy = CHOSEN.saturating_sub(above).min(screened.len());
     let rows = screened.iter().map(|it| {
         vec![
             short(&it.world).to_owned(),
@@ -181,9 +182,13 @@ fn page(results: &Results, screened: &[Screened]) -> Page {
         ],
         got: vec![
             format!("{above} of {} games stayed above chance to the end of {} frames.", screened.len(), settings.frames),
-            match chosen.is_empty() {
-                true => "At this length there is nothing to choose from.".into(),
-                false => format!("The soonest: `--games {}`.", chosen.join(",")),
+            match by_greedy {
+                0 => format!("The soonest: `--games {}`.", chosen.join(",")),
+                _ => format!(
+                    "The first {CHOSEN} of the order below, {by_greedy} of them only by how surely the greedy policy beats the random one: \
+                     `--games {}`.",
+                    chosen.join(",")
+                ),
             },
         ],
         tables: vec![Table {
