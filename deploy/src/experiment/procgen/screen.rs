@@ -15,7 +15,7 @@ const EPISODES_MIN: f64 = 20.0;
 /// Episodes in the recorded mean return.
 const RETURNS_OF: f64 = 100.0;
 /// Games that the page proposes.
-const CHOSEN: usize = 4;
+const CHOSEN: usize = 3;
 
 /// How soon a game was learned.
 struct Screened {
