@@ -1,6 +1,7 @@
 //! Fig. 3: ghosts that can be predicted more or less, and one lethal ghost of four that changes, with and without noise in
-//! the walls. Whole runs through all processes; figures and page are in `report`.
+//! the walls. Whole runs through all processes; the picture is in `figure`, data and page in `report`.
 
+mod figure;
 mod report;
 
 use serde::{Deserialize, Serialize};
