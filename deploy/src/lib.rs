@@ -7,8 +7,11 @@ mod bench;
 mod child;
 mod cli;
 mod config;
+#[cfg(not(feature = "cuda"))]
+mod cuda;
 mod derived;
 mod display;
+mod doctor;
 mod error;
 mod evaluate;
 mod experiment;
@@ -32,7 +35,7 @@ use std::{
 
 use anyhow::Context;
 use clap::Parser;
-use driml_learner::Operations;
+use driml_learner::{DeviceName, Operations};
 use driml_protocol::{Keys, Shutdown};
 use tracing_subscriber::EnvFilter;
 
@@ -116,6 +119,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         }
         Command::Learner(args) => {
             check_endpoints(&args.connect)?;
+            ready_for(args.on.device)?;
             let shutdown = join(&args.join)?;
             let (connect, namespace) = (args.connect, args.join.namespace);
             driml_learner::run(
@@ -135,6 +139,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Experiment(command) => experiment::run(&command),
         Command::Bench(command) => bench::run(&command),
         Command::Presets(args) => presets::print(&args),
+        Command::Doctor(args) => doctor::run(&args),
         Command::Procgen(ProcgenCommand::Install) => {
             let engine = procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
             print(&format!(
@@ -165,6 +170,7 @@ fn replay_server(args: ReplayServerArgs) -> anyhow::Result<()> {
 
 fn parity(args: &ParityArgs) -> anyhow::Result<()> {
     let mut failed = 0;
+    ready_for(args.on.device)?;
     let mut compute = args.on.device.open()?;
     if args.stock {
         compute.operations = Operations::Stock;
@@ -180,6 +186,20 @@ fn parity(args: &ParityArgs) -> anyhow::Result<()> {
         args.files.len()
     );
     Ok(())
+}
+
+/// Makes sure that this program can compute on `device`: without CUDA in it, it goes on as the flavour that has it.
+///
+/// # Errors
+/// There is no such flavour, or it cannot start here.
+fn ready_for(device: DeviceName) -> anyhow::Result<()> {
+    match device {
+        DeviceName::Cpu => Ok(()),
+        #[cfg(not(feature = "cuda"))]
+        DeviceName::Cuda(_) => Err(cuda::hand_over()),
+        #[cfg(feature = "cuda")]
+        DeviceName::Cuda(_) => Ok(()),
+    }
 }
 
 /// Checks how a part reaches the run, and starts to listen for signals.

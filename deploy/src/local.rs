@@ -17,7 +17,7 @@ use crate::{
     error::{Usage, usage},
     lockstep,
     machine::Machine,
-    plan, presets, print, processes, record,
+    plan, presets, print, processes, ready_for, record,
 };
 
 const ENV: &str = "procgen:bigfish";
@@ -34,6 +34,7 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
     }
     let (config, from) = resolve(&args.run, &machine)?;
     check_endpoints(args.listen.as_slice())?;
+    ready_for(config.local.learner_device)?;
     let (shards, actors) = (config.replay.shards, config.local.actors);
     if shards > actors {
         return Err(usage!(

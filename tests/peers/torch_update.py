@@ -2,7 +2,8 @@
 
 It is the same work as `driml bench learner`: the same network, sizes, losses and optimiser, on made-up batches of bytes.
 `--check CASE.safetensors` shows it: losses, gradients and updated parameters against a float64 reference of tests/parity.
-PyTorch's fused Adam is taken, and of its two memory formats the faster one.
+PyTorch's fused Adam is taken, and of its two memory formats the faster one. With `--device cuda` an update starts with bytes in
+the host's memory and ends when its losses are back there; `--compile` has torch.compile fuse its forward pass.
 """
 
 import json
@@ -42,13 +43,13 @@ FORMATS = {"contiguous": torch.contiguous_format, "channels-last": torch.channel
 def project(probs, reward, discount, v_min, v_max):
     """Return distributions [B, N] one Bellman step earlier, back on the atoms. Bellemare et al. 2017, algorithm 1."""
     rows, atoms = probs.shape
-    support = torch.linspace(v_min, v_max, atoms)
+    support = torch.linspace(v_min, v_max, atoms, device=probs.device)
     moved = (reward[:, None] + discount[:, None] * support).clamp(v_min, v_max)
     position = ((moved - v_min) * ((atoms - 1) / (v_max - v_min))).clamp(0, atoms - 1)
     low = position.floor()
     above = position - low
     low = low.long()
-    out = torch.zeros(rows, atoms)
+    out = torch.zeros(rows, atoms, device=probs.device)
     out.scatter_add_(1, low, probs * (1 - above))
     return out.scatter_add_(1, (low + 1).clamp(max=atoms - 1), probs * above)
 
@@ -69,8 +70,8 @@ def info_nce(psi, phi, clip):
 
 
 class Learner:
-    def __init__(self, config, memory_format, online=None, target=None):
-        self.config, self.memory_format = config, memory_format
+    def __init__(self, config, memory_format, device, online=None, target=None, compiled=False):
+        self.config, self.memory_format, self.device = config, memory_format, device
         self.weights = {pair: weight for pair, weight in config["lambda"].items() if weight > 0}
         self.online, self.target = Network(config, set(self.weights)), Network(config)
         if online is None:
@@ -78,11 +79,17 @@ class Learner:
         else:
             self.online.load_state_dict(online)
         self.target.load_state_dict(target)
-        self.online.to(memory_format=memory_format)
-        self.target.to(memory_format=memory_format).requires_grad_(False)
+        self.online.to(device=device, memory_format=memory_format)
+        self.target.to(device=device, memory_format=memory_format).requires_grad_(False)
         adam = config["adam"]
         betas = (adam["beta1"], adam["beta2"])
         self.adam = torch.optim.Adam(self.online.parameters(), adam["lr"], betas, adam["eps"], fused=True)
+        if compiled:
+            self.losses = torch.compile(self.losses)
+
+    def on_device(self, batch):
+        """The batch where the network is; on the CPU nothing is copied."""
+        return {name: value.to(self.device, non_blocking=True) for name, value in batch.items()}
 
     def images(self, frames):
         """Bytes [B, H, W, C] as PyTorch's [B, C, H, W]."""
@@ -96,7 +103,7 @@ class Learner:
             values = self.online.q_values(self.online.logits(self.online.features(frames_n)[1]))
         else:
             values = self.target.q_values(logits)
-        probs = logits[torch.arange(len(logits)), values.argmax(1)].softmax(-1)
+        probs = logits[torch.arange(len(logits), device=logits.device), values.argmax(1)].softmax(-1)
         discount, support = batch["bootstrap_discount"], (self.config["v_min"], self.config["v_max"])
         return project(probs, batch["n_step_return"], discount, *support)
 
@@ -104,7 +111,7 @@ class Learner:
         """The C51 loss, the DIM losses by pair, and their weighted sum."""
         target, action = self.projected(batch), batch["action"]
         features_t = self.online.features(self.images(batch["frames_t"]))
-        logits = self.online.logits(features_t[1])[torch.arange(len(action)), action]
+        logits = self.online.logits(features_t[1])[torch.arange(len(action), device=action.device), action]
         kl = functional.kl_div(logits.log_softmax(-1), target, reduction="batchmean")
         dim, vectors = {}, {}
         if self.weights:
@@ -122,15 +129,15 @@ class Learner:
     def update(self, batch):
         """One update: losses and the gradients' norm before clipping."""
         self.adam.zero_grad(set_to_none=True)
-        kl, dim, total = self.losses(batch)
+        kl, dim, total = self.losses(self.on_device(batch))
         total.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.online.parameters(), self.config["max_grad_norm"])
         self.adam.step()
         return kl.item(), {pair: loss.item() for pair, loss in dim.items()}, total.item(), norm.item()
 
 
-def made_up(config):
-    """A batch that no world gave."""
+def made_up(config, device):
+    """A batch that no world gave, in the host's memory; pinned if it will be copied to a device."""
     obs = config["obs"]
     shape = (ROWS, obs["height"], obs["width"], obs["channels"])
     batch = {f"frames_{which}": torch.randint(0, 256, shape, dtype=torch.uint8) for which in "tkn"}
@@ -138,26 +145,39 @@ def made_up(config):
     batch["n_step_return"] = torch.rand(ROWS) * 4 - 2
     batch["bootstrap_discount"] = torch.full((ROWS,), GAMMA**N_STEP)
     batch["positive_valid"] = torch.ones(ROWS, dtype=torch.uint8)
-    return batch
+    return batch if device.type == "cpu" else {name: value.pin_memory() for name, value in batch.items()}
 
 
-def bench(effort):
+def timed(learner, batch):
+    """An update of which nothing is still under way on the device when it returns."""
+    learner.update(batch)
+    if learner.device.type == "cuda":
+        torch.cuda.synchronize(learner.device)
+
+
+def bench(effort, device, compiled):
     figures, formats = {}, []
     for what, ((height, width), pairs) in CASES.items():
         config = dict(CONFIG, obs={"height": height, "width": width, "channels": 3})
         config["lambda"] = {pair: float(pair in pairs) for pair in CONFIG["lambda"]}
-        batch, rates = made_up(config), {}
+        batch, rates = made_up(config, device), {}
         for name, memory_format in FORMATS.items():
-            learner = Learner(config, memory_format)
-            rates[name] = effort.rate_by_median(lambda: learner.update(batch))
+            learner = Learner(config, memory_format, device, compiled=compiled)
+            # It compiles during the warm-up.
+            rates[name] = effort.rate_by_median(lambda: timed(learner, batch))
             print(f"  {what}, {name}: {rates[name]:.4g} updates/s", file=sys.stderr, flush=True)
         best = max(rates, key=rates.get)
         figures[what] = rates[best]
         formats.append(best)
-    measure.report(f"PyTorch {torch.__version__}, {' or '.join(sorted(set(formats)))}", figures)
+    peer = [f"PyTorch {torch.__version__}", " or ".join(sorted(set(formats)))]
+    if device.type == "cuda":
+        peer.append(torch.cuda.get_device_name(device))
+    if compiled:
+        peer.append("compiled")
+    measure.report(", ".join(peer), figures)
 
 
-def check(path):
+def check(path, device):
     """Whether one update of a parity case comes out as float64 has it; prints the largest errors."""
     from safetensors import safe_open
 
@@ -176,15 +196,16 @@ def check(path):
         print(f"  {what:<24} error {error:9.2e}  tolerance {tolerance:9.2e}  {'ok' if error <= tolerance else 'FAILED'}")
 
     print(path)
+    parameters = group("online.")
+    if config.get("objective", "dim") != "dim" or not config.get("condition_on_action", True):
+        print("  skipped: another agent's loss, which this script does not have")
+        return True
+    names = Network(config, {pair for pair, weight in config["lambda"].items() if weight > 0}).state_dict().keys()
     for name, memory_format in FORMATS.items():
-        parameters = group("online.")
-        learner = Learner(
-            config,
-            memory_format,
-            {key: parameters[key] for key in Network(config, {p for p, w in config["lambda"].items() if w > 0}).state_dict()},
-            group("target."),
-        )
-        line(f"projection, {name}", (learner.projected(group("input.")) - expect["target_projection"]).abs().max().item(), 5e-6)
+        online, target = {key: parameters[key] for key in names}, group("target.")
+        learner = Learner(config, memory_format, device, online, target)
+        projected = learner.projected(learner.on_device(group("input."))).cpu()
+        line(f"projection, {name}", (projected - expect["target_projection"]).abs().max().item(), 5e-6)
         kl, dim, total, norm = learner.update(group("input."))
         for what, value in {"c51_kl": kl, "total": total, **{f"dim.{pair}": loss for pair, loss in dim.items()}}.items():
             expected = expect[f"loss.{what}"].item()
@@ -192,19 +213,25 @@ def check(path):
         expected = expect["grad_norm"].item()
         line(f"grad_norm, {name}", abs(norm - expected), 1e-4 * expected)
         updated = learner.online.state_dict().items()
-        line(f"updated, {name}", max((value - expect[f"updated.{key}"]).abs().max().item() for key, value in updated), 4e-6)
+        line(f"updated, {name}", max((value.cpu() - expect[f"updated.{key}"]).abs().max().item() for key, value in updated), 4e-6)
     return good
 
 
 def main():
     arguments = measure.parser(__doc__)
     arguments.add_argument("--check", nargs="+", metavar="CASE", help="parity cases to check instead of measuring")
+    arguments.add_argument("--device", type=torch.device, default="cpu", help="cpu, cuda or cuda:N [default: cpu]")
+    arguments.add_argument("--compile", action="store_true", help="fuse the forward pass with torch.compile")
     args = arguments.parse_args()
     torch.set_num_threads(args.threads)
     torch.manual_seed(1)
+    if args.device.type == "cuda":
+        # Convolutions in float32, as matrix products are by default and as ours are; the fastest algorithm for these sizes.
+        torch.backends.cudnn.allow_tf32 = False
+        torch.backends.cudnn.benchmark = True
     if args.check:
-        sys.exit(0 if all([check(path) for path in args.check]) else 1)
-    bench(measure.Effort(args.quick))
+        sys.exit(0 if all([check(path, args.device) for path in args.check]) else 1)
+    bench(measure.Effort(args.quick), args.device, args.compile)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ use crate::{
         figures::{Figure, MachineNote},
     },
     cli::{BenchCommand, BenchFlags, BenchPart},
+    ready_for,
 };
 
 /// Runs one bench and reports its figures.
@@ -34,6 +35,7 @@ use crate::{
 pub(crate) fn run(command: &BenchCommand) -> anyhow::Result<()> {
     let machine = MachineNote::this();
     let part = |part, flags: &BenchFlags, device: DeviceName| {
+        ready_for(device)?;
         let figures = if flags.here {
             measure(part, &Effort::new(flags), device)?
         } else {
