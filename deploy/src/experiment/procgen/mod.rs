@@ -9,7 +9,7 @@ mod published;
 mod scores;
 mod screen;
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, panic::resume_unwind, thread::ScopedJoinHandle};
 
 use driml_envs::WorldName;
 use serde::{Deserialize, Serialize};
@@ -209,10 +209,19 @@ fn report(session: Session, results: &Results) -> anyhow::Result<()> {
 fn played(ran: &Ran, who: Who, episodes: u32) -> anyhow::Result<Played> {
     let player = Player::load(&ran.folder)?;
     let on = |levels| player.returns(who, levels, episodes, PLAY_SEED);
-    Ok(Played {
-        trained: on(Levels::Train)?.unwrap_or_default(),
-        single: on(Levels::TrainSingle)?,
-        unseen: on(Levels::Unseen)?,
+    // A world steps on one thread.
+    std::thread::scope(|scope| {
+        let single = scope.spawn(|| on(Levels::TrainSingle));
+        let unseen = scope.spawn(|| on(Levels::Unseen));
+        let trained = on(Levels::Train)?.unwrap_or_default();
+        let join = |thread: ScopedJoinHandle<'_, _>| {
+            thread.join().unwrap_or_else(|panic| resume_unwind(panic))
+        };
+        Ok(Played {
+            trained,
+            single: join(single)?,
+            unseen: join(unseen)?,
+        })
     })
 }
 
