@@ -37,6 +37,8 @@ pub(crate) enum Command {
     Bench(BenchCommand),
     /// List presets, agents and what differs by game; or print the settings of one game and agent with their sources
     Presets(PresetsArgs),
+    /// What this machine can do and what it lacks, for training on the CPU and on a GPU
+    Doctor(DoctorArgs),
     /// Procgen's engine
     #[command(subcommand)]
     Procgen(ProcgenCommand),
@@ -207,6 +209,22 @@ pub(crate) struct PresetsArgs {
     /// Print the settings of this preset
     #[arg(long, value_name = "NAME")]
     pub(crate) preset: Option<String>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct DoctorArgs {
+    /// Where runs go: the disk that is looked at
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    pub(crate) run_dir: PathBuf,
+    /// Fail also where --device cuda would
+    #[arg(long)]
+    pub(crate) cuda: bool,
+    /// Print the facts as JSON
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Only the CUDA devices, as JSON: so the usual program asks its CUDA flavour
+    #[arg(long, hide = true)]
+    pub(crate) devices: bool,
 }
 
 /// What the band over several seeds shows.

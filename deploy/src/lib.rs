@@ -7,8 +7,11 @@ mod bench;
 mod child;
 mod cli;
 mod config;
+#[cfg(not(feature = "cuda"))]
+mod cuda;
 mod derived;
 mod display;
+mod doctor;
 mod error;
 mod evaluate;
 mod experiment;
@@ -133,6 +136,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Experiment(command) => experiment::run(&command),
         Command::Bench(command) => bench::run(&command),
         Command::Presets(args) => presets::print(&args),
+        Command::Doctor(args) => doctor::run(&args),
         Command::Procgen(ProcgenCommand::Install) => {
             let engine = procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
             print(&format!(

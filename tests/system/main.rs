@@ -6,6 +6,7 @@
 mod bad_messages;
 mod bad_weights;
 mod by_hand;
+mod doctor;
 mod evaluate;
 mod failures;
 mod local;

@@ -1,5 +1,5 @@
-//! Where the engine is kept, as the environment says.
-//! It only computes paths; `install` makes and checks what lies there.
+//! Where what is fetched is kept, as the environment says.
+//! It only computes paths; `install` makes and checks what lies there, `deploy/cuda/build.sh` follows the same rule.
 
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -8,16 +8,19 @@ use crate::install::InstallError;
 
 /// The cache folder and whether fetching is allowed.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Cache {
+pub struct Cache {
     /// The folder under which each version of the engine has its own.
-    pub(crate) folder: PathBuf,
+    pub folder: PathBuf,
     /// Whether nothing may be fetched (`DRIML_OFFLINE=1`).
-    pub(crate) offline: bool,
+    pub offline: bool,
 }
 
 impl Cache {
     /// As this process's environment says.
-    pub(crate) fn from_env() -> Result<Cache, InstallError> {
+    ///
+    /// # Errors
+    /// No variable says where it is.
+    pub fn from_env() -> Result<Cache, InstallError> {
         Cache::from_variables(|name| std::env::var_os(name))
     }
 

@@ -149,6 +149,22 @@ impl Engine {
         Engine::install_in(&Cache::from_env()?, progress, wheel::fetch)
     }
 
+    /// From where [`Engine::install`] would take the engine, for a person. Nothing is fetched or looked at more closely.
+    ///
+    /// # Errors
+    /// No pip, or `DRIML_OFFLINE=1` and no wheel in the cache folder.
+    pub fn source() -> Result<String, InstallError> {
+        Engine::source_in(&Cache::from_env()?, wheel::find_pip)
+    }
+
+    /// Loads the engine's library, which makes no game yet.
+    ///
+    /// # Errors
+    /// A library of the system that is missing, or anything else that the loader says.
+    pub fn check_loads(&self) -> Result<(), LoadError> {
+        library::load(&self.library()).map(drop)
+    }
+
     /// Unpacks a wheel that the user has fetched; what lay in the cache folder is replaced unless it is whole.
     ///
     /// # Errors
@@ -180,6 +196,24 @@ impl Engine {
     fn locate_in(cache: &Cache) -> Result<Engine, InstallError> {
         library::check_machine()?;
         Engine::whole(Engine::root_in(cache), LIBENV_SHA256)
+    }
+
+    fn source_in(
+        cache: &Cache,
+        pip: impl FnOnce() -> Option<String>,
+    ) -> Result<String, InstallError> {
+        let provided = cache.folder.join(WHEEL_NAME);
+        if provided.is_file() {
+            return Ok(provided.display().to_string());
+        }
+        if cache.offline {
+            return Err(InstallError::Offline {
+                root: Engine::root_in(cache),
+                reason: "it is not installed".to_owned(),
+            });
+        }
+        let pip = pip().ok_or(InstallError::NoPip)?;
+        Ok(format!("the package index with `{pip}`"))
     }
 
     fn install_in(

@@ -19,6 +19,7 @@ mod pinned;
 mod vec_game;
 mod wheel;
 
+pub use cache::Cache;
 pub use game::{DistributionMode, Game, ParseGameError, ParseModeError};
 pub use install::{Engine, InstallError};
 pub use library::LoadError;

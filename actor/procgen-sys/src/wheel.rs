@@ -31,6 +31,9 @@ const LICENSE_ENTRY: &str = "procgen-0.10.7.dist-info/LICENSE";
 /// How long pip may take; then it is ended and the fetch has failed.
 const FETCH_MAX: Duration = Duration::from_secs(600);
 
+/// The ways to call pip, in the order in which they are tried.
+const PIPS: [&[&str]; 3] = [&["pip"], &["pip3"], &["python3", "-m", "pip"]];
+
 /// Lines of pip's output that a message repeats.
 const OUTPUT_LINES_MAX: usize = 6;
 
@@ -66,8 +69,20 @@ pub fn download_command(to: &Path) -> String {
 
 /// Fetches the wheel into the folder `to` with the first pip there is, and gives its path.
 pub(crate) fn fetch(to: &Path) -> Result<PathBuf, InstallError> {
-    let pips: [&[&str]; 3] = [&["pip"], &["pip3"], &["python3", "-m", "pip"]];
-    fetch_with(&pips, to, FETCH_MAX)
+    fetch_with(&PIPS, to, FETCH_MAX)
+}
+
+/// The first pip there is, as a person calls it.
+pub(crate) fn find_pip() -> Option<String> {
+    let works = |pip: &[&str]| {
+        let mut command = Command::new(pip[0]);
+        command.args(&pip[1..]).arg("--version");
+        command.stdin(Stdio::null()).output()
+    };
+    let found = PIPS
+        .iter()
+        .find(|pip| works(pip).is_ok_and(|output| output.status.success()))?;
+    Some(found.join(" "))
 }
 
 fn fetch_with(pips: &[&[&str]], to: &Path, limit: Duration) -> Result<PathBuf, InstallError> {

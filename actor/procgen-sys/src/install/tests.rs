@@ -197,3 +197,22 @@ fn one_process_fetches_and_the_others_wait_for_it() {
     drop(turn);
     assert!(wait_for_turn(&cache, "a.lock", Duration::ZERO).is_some());
 }
+
+#[test]
+fn where_the_engine_would_come_from() {
+    let folder = tempfile::tempdir().unwrap();
+    let source = |offline, pip: Option<&str>| {
+        let cache = cache(folder.path(), offline);
+        Engine::source_in(&cache, || pip.map(str::to_owned))
+    };
+    assert!(source(false, Some("pip3")).unwrap().contains("`pip3`"));
+    assert!(matches!(source(false, None), Err(InstallError::NoPip)));
+    assert!(matches!(
+        source(true, Some("pip")),
+        Err(InstallError::Offline { .. })
+    ));
+    let wheel = cache(folder.path(), true).folder.join(WHEEL_NAME);
+    fs::create_dir_all(wheel.parent().unwrap()).unwrap();
+    fs::write(&wheel, "a wheel").unwrap();
+    assert_eq!(source(true, None).unwrap(), wheel.display().to_string());
+}
