@@ -1,0 +1,116 @@
+#!/usr/bin/env bash
+# Measures and trains on a machine with an NVIDIA GPU: driml doctor, parity and speed on the device, PyTorch on the same
+# device, then whole runs for so many minutes each. What is done is not done again: a call with the same --out goes on.
+# THIS SCRIPT HAS NOT BEEN RUN ON A GPU. It was written and checked on a machine that has none, where it ends at the start.
+
+set -euo pipefail
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
+
+say() { printf '=== %s\n' "$*"; }
+fail() { printf 'error: %s\n' "$*" >&2; exit 1; }
+
+usage() {
+    cat <<'TEXT'
+Usage: deploy/cuda/measure.sh [--out DIR] [--minutes N] [--seed S] [--device cuda:N] [--python PYTHON]
+
+  --out DIR        where results go [default: runs/cuda]
+  --minutes N      how long each of the six runs trains (bigfish, starpilot; c51, driml-fix, driml-ada) [default: 60]
+  --seed S         seed of the runs [default: 1]
+  --device cuda:N  the device [default: cuda]
+  --python PYTHON  a Python with PyTorch for CUDA: its update is measured on the same device, eager and compiled
+
+It needs `target/release/driml` (cargo build --release) and `target/release/driml-cuda` (deploy/cuda/build.sh).
+TEXT
+}
+
+out=runs/cuda minutes=60 seed=1 device=cuda python=
+while [ $# -gt 0 ]; do
+    [ $# -gt 1 ] || { usage >&2; [[ $1 = -h || $1 = --help ]] && exit 0; exit 64; }
+    case $1 in
+        --out) out=$2 ;;
+        --minutes) minutes=$2 ;;
+        --seed) seed=$2 ;;
+        --device) device=$2 ;;
+        --python) python=$2 ;;
+        *) usage >&2; exit 64 ;;
+    esac
+    shift 2
+done
+[[ $minutes =~ ^[1-9][0-9]*$ ]] || fail "--minutes takes a whole number above 0, not \"$minutes\""
+[[ $device =~ ^cuda(:[0-9]+)?$ ]] || fail "--device takes cuda or cuda:N, not \"$device\""
+
+# --- What it needs -------------------------------------------------------------------------------------------------------
+
+compgen -G '/proc/driver/nvidia/gpus/*/information' >/dev/null || [ -e /dev/nvidiactl ] || [ -e /dev/dxg ] ||
+    fail "there is no NVIDIA GPU here (neither /proc/driver/nvidia/gpus nor /dev/nvidiactl): nothing to measure.
+  In a container, give it the GPU (docker run --gpus all)."
+driml=$(realpath -m "${CARGO_TARGET_DIR:-$root/target}")/release/driml
+[ -x "$driml" ] || fail "there is no $driml: cargo build --release"
+[ -x "${DRIML_CUDA_PROGRAM:-$driml-cuda}" ] || fail "there is no $driml-cuda: deploy/cuda/build.sh --compute-cap N, with the GPU's compute capability"
+
+mkdir -p "$out"
+out=$(cd "$out" && pwd)
+# One at a time in a folder: two would move each other's runs aside.
+exec 9>"$out/.lock"
+flock -n 9 || fail "another measurement writes to $out"
+
+# --- The steps -----------------------------------------------------------------------------------------------------------
+
+failed=()
+# Runs the step $1, its output in $1.txt, unless it is done. A step that fails is told at the end; the others go on.
+step() {
+    local name=$1
+    shift
+    [ ! -f "$out/$name.done" ] || { say "$name: done before"; return 0; }
+    say "$name: $*"
+    # -i: after Ctrl-C the program still says how it ended.
+    if "$@" > >(tee -i "$out/$name.txt") 2>&1; then
+        touch "$out/$name.done"
+    else
+        failed+=("$name")
+        say "$name FAILED: see $out/$name.txt"
+    fi
+}
+
+# One whole run of game $1 and agent $2, ended as by Ctrl-C when its time is over: then it saves and writes its summary.
+train() {
+    local game=$1 agent=$2 folder code=0
+    folder=$out/runs/$game-$agent-$seed
+    if [ -e "$folder" ]; then
+        mkdir -p "$out/cut-off"
+        mv "$folder" "$out/cut-off/$(basename "$folder")-$(date +%s)"
+    fi
+    timeout --foreground --signal=INT --kill-after=300 "${minutes}m" \
+        "$driml" local --env "procgen:$game" --agent "$agent" --device "$device" --seed "$seed" --run-dir "$folder" || code=$?
+    # 124: the time was over. 130 is a person's Ctrl-C, after which the run is made anew.
+    [ "$code" = 0 ] || [ "$code" = 124 ] || return "$code"
+    [ -f "$folder/summary.json" ]
+}
+
+trap 'say "interrupted; the same call goes on from here"; exit 130' INT
+# First, and each time, as the machine may have changed.
+"$driml" doctor --cuda --run-dir "$out" | tee "$out/doctor.txt" || fail "driml doctor says above what is missing"
+
+# The usual program hands these over to driml-cuda, with the folder of CUDA's libraries.
+step parity "$driml" parity "$root"/tests/parity/*.safetensors --device "$device"
+step learner "$driml" bench learner --device "$device" --json "$out/learner.json"
+if [ -n "$python" ]; then
+    if "$python" -c 'import sys, torch; sys.exit(not torch.cuda.is_available())'; then
+        torch_update() { "$python" "$root/tests/peers/torch_update.py" --device "$device" "$@"; }
+        step torch-parity torch_update --check "$root"/tests/parity/*.safetensors
+        step torch-eager torch_update
+        step torch-compiled torch_update --compile
+    else
+        failed+=(torch)
+        say "$python has no PyTorch that can use this GPU: its steps are skipped"
+    fi
+fi
+for agent in driml-ada driml-fix c51; do
+    for game in bigfish starpilot; do
+        step "$game-$agent-$seed" train "$game" "$agent"
+    done
+done
+[ ! -d "$out/runs" ] || "$driml" plot "$out"/runs/* --smooth 10000 --out "$out/returns.svg" || failed+=(plot)
+
+[ ${#failed[@]} = 0 ] || fail "these failed, the same call tries them again: ${failed[*]}"
+say "all is in $out"
