@@ -1,6 +1,6 @@
 //! Scores over games and seeds as the field reports them: interquartile mean and probability of improvement, each with a
 //! stratified bootstrap interval. Source: Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the
-//! Statistical Precipice". It normalises nothing.
+//! Statistical Precipice". It normalises nothing. Besides, the score by which the paper sums up its table 1.
 
 use std::fmt;
 
@@ -43,6 +43,28 @@ pub(super) fn improvement(x: &Scores, y: &Scores) -> Option<Estimate> {
         let games = it[0].iter().zip(&it[1]);
         games.map(|(x, y)| better(x, y)).sum::<f64>() / it[0].len() as f64
     })
+}
+
+/// Mean over games of each agent's place between the game's worst agent, 0, and its best, 1, divided by the place of the
+/// agent `baseline`: `games[game][agent]`, the same agents in each game. None if no agents differ in any game, or if the
+/// baseline is the worst in all.
+///
+/// The paper does not define its "Norm.score"; this formula gives the last row of table 1 from its other rows. It depends on
+/// which agents are compared.
+pub(super) fn norm_scores(games: &[Vec<f64>], baseline: usize) -> Option<Vec<f64>> {
+    let agents = games.first()?.len();
+    let mut places = vec![0.0; agents];
+    for scores in games {
+        let worst = scores.iter().copied().fold(f64::INFINITY, f64::min);
+        let best = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        if best > worst {
+            for (place, score) in places.iter_mut().zip(scores) {
+                *place += (score - worst) / (best - worst);
+            }
+        }
+    }
+    let unit = places[baseline];
+    (unit > 0.0).then(|| places.iter().map(|place| place / unit).collect())
 }
 
 /// Mean without the lowest and the highest quarter, each rounded down to whole scores.
@@ -134,6 +156,17 @@ mod tests {
         }
         // 95% of 200 is 190; the bootstrap of a dozen seeds is a little narrow.
         assert!((170..=200).contains(&covered), "{covered} of {rounds}");
+    }
+
+    #[test]
+    fn the_norm_score_is_relative_to_worst_best_and_baseline() {
+        // Places: 1/2, 0, 1 and 1/2, 1, 0; the third game, where all are equal, says nothing.
+        let games = [vec![2.0, 1.0, 3.0], vec![0.0, 5.0, -5.0], vec![4.0; 3]];
+        assert_eq!(norm_scores(&games, 0), Some(vec![1.0, 1.0, 1.0]));
+        assert_eq!(norm_scores(&games[..1], 0), Some(vec![1.0, 0.0, 2.0]));
+        assert_eq!(norm_scores(&games[..1], 1), None);
+        assert_eq!(norm_scores(&games[2..], 0), None);
+        assert_eq!(norm_scores(&[], 0), None);
     }
 
     #[test]

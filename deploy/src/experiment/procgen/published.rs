@@ -104,6 +104,17 @@ pub(super) fn normalised(world: &str, score: f64) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::experiment::aggregate::norm_scores;
+
+    #[test]
+    fn the_formula_of_the_norm_score_gives_the_paper_s_last_row() {
+        let games = TABLE_1.map(|(_, row)| row.map(|(mean, _)| mean).to_vec());
+        let found = norm_scores(&games, 0).unwrap();
+        // Printed with two digits.
+        for (found, paper) in found.iter().zip([1.0, 0.23, 0.52, 0.59, 0.92, 1.48, 1.9]) {
+            assert!((found - paper).abs() < 0.015, "{found} for {paper}");
+        }
+    }
 
     #[test]
     fn every_game_is_in_both_tables() {
