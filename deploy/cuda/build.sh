@@ -116,12 +116,16 @@ export LIBRARY_PATH=$links${LIBRARY_PATH:+:$LIBRARY_PATH}
 # --- The program ---------------------------------------------------------------------------------------------------------
 
 target=$(realpath -m "${CARGO_TARGET_DIR:-$root/target}")
-options=(--release --locked --features cuda -p driml --target-dir "$target/cuda")
+# A folder for each compiler: cargo would not notice another one, and keep the kernels that the old one made.
+version=$("$CUDA_HOME/bin/nvcc" --version | sed -n 's/.*release \([0-9.]*\),.*/\1/p')
+[ -n "$version" ] || fail "$CUDA_HOME/bin/nvcc does not say its version"
+built=$target/cuda-$version
+options=(--release --locked --features cuda -p driml --target-dir "$built")
 [ "$offline" = no ] || options+=(--offline)
-say "building driml-cuda for compute capability $compute_cap with $CUDA_HOME; candle's kernels take several minutes"
+say "building driml-cuda for compute capability $compute_cap with CUDA $version in $CUDA_HOME; candle's kernels take several minutes"
 (cd "$root" && cargo build "${options[@]}")
 mkdir -p "$target/release"
 # Renamed into place, so that one that runs is not written over.
-cp "$target/cuda/release/driml" "$target/release/.driml-cuda.$$"
+cp "$built/release/driml" "$target/release/.driml-cuda.$$"
 mv -f "$target/release/.driml-cuda.$$" "$target/release/driml-cuda"
 say "$target/release/driml-cuda is ready after $SECONDS s; \`driml doctor\` says what is missing to run it"

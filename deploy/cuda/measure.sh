@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Measures and trains on a machine with an NVIDIA GPU: driml doctor, parity and speed on the device, PyTorch on the same
-# device, then whole runs for so many minutes each. What is done is not done again: a call with the same --out goes on.
+# device, then whole runs for so many minutes each. Steps that are done are not done again: a call with the same --out goes
+# on with the next. A run that was cut off begins anew, as `driml local` cannot resume one.
 # THIS SCRIPT HAS NOT BEEN RUN ON A GPU. It was written and checked on a machine that has none, where it ends at the start.
 
 set -euo pipefail
@@ -53,6 +54,12 @@ out=$(cd "$out" && pwd)
 # One at a time in a folder: two would move each other's runs aside.
 exec 9>"$out/.lock"
 flock -n 9 || fail "another measurement writes to $out"
+
+# Results of other settings or another program are not mixed with these.
+made_with="device $device, $minutes min a run, seed $seed, driml-cuda $(sha256sum "${DRIML_CUDA_PROGRAM:-$driml-cuda}" | cut -c1-16)"
+[ -f "$out/made-with.txt" ] || printf '%s\n' "$made_with" >"$out/made-with.txt"
+[ "$(cat "$out/made-with.txt")" = "$made_with" ] || fail "$out has results of: $(cat "$out/made-with.txt")
+  This call would make: $made_with. Choose another --out."
 
 # --- The steps -----------------------------------------------------------------------------------------------------------
 

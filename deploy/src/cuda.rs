@@ -11,7 +11,7 @@ use std::{
     fs::File,
     io::{Read, Seek},
     os::unix::process::CommandExt,
-    path::{Path, PathBuf},
+    path::{self, Path, PathBuf},
     process::{Command, Output, Stdio},
     time::{Duration, Instant},
 };
@@ -62,7 +62,8 @@ pub(crate) fn hand_over() -> anyhow::Error {
 /// The system does not say where this program's own file is.
 pub(crate) fn program() -> anyhow::Result<PathBuf> {
     match env::var_os(PROGRAM).filter(|it| !it.is_empty()) {
-        Some(program) => Ok(program.into()),
+        // Absolute: a bare name would be looked for on the PATH.
+        Some(program) => path::absolute(PathBuf::from(program)).context(PROGRAM),
         None => {
             let this = env::current_exe().context("finding this program's own file")?;
             Ok(this.with_file_name(NAME))

@@ -191,14 +191,14 @@ fn parity(args: &ParityArgs) -> anyhow::Result<()> {
 /// Makes sure that this program can compute on `device`: without CUDA in it, it goes on as the flavour that has it.
 ///
 /// # Errors
-/// There is no such flavour, or it cannot start here.
+/// There is no such flavour, it cannot start here, or there is no such device.
 fn ready_for(device: DeviceName) -> anyhow::Result<()> {
     match device {
         DeviceName::Cpu => Ok(()),
         #[cfg(not(feature = "cuda"))]
         DeviceName::Cuda(_) => Err(cuda::hand_over()),
         #[cfg(feature = "cuda")]
-        DeviceName::Cuda(_) => Ok(()),
+        DeviceName::Cuda(ordinal) => Ok(doctor::cuda::check(ordinal)?),
     }
 }
 

@@ -27,7 +27,8 @@ impl Gradients {
         let mut by_name = BTreeMap::new();
         for (name, var) in parameters.iter() {
             if let Some(gradient) = store.remove(var) {
-                by_name.insert(name.to_owned(), gradient.contiguous()?);
+                // candle leaves some gradients tied to the pass they come from; moments made of them would keep every pass.
+                by_name.insert(name.to_owned(), gradient.contiguous()?.detach());
             }
         }
         Ok(Self { by_name })

@@ -311,31 +311,34 @@ impl Learner {
             .online_network
             .features(&self.frames(batch.rows, batch.frames_t)?)?;
         let logits = self.online_network.logits(&features_t.f4)?;
-        let q_values_t = flat(&self.online_network.q_values(&logits.detach())?)?;
+        let q_values_t = self.online_network.q_values(&logits.detach())?;
         let kl = kl_loss(
             &logits,
             batch.action,
             target_projection.clone(),
             self.compute.operations,
         )?;
-        let c51_kl = finite("the C51 loss", &kl)?;
-
-        let mut total = kl;
-        let mut dim = [None; 4];
         let losses = self.auxiliary_losses(batch, &features_t)?;
-        for (i, (loss, lambda)) in losses.iter().zip(self.settings.lambda.values()).enumerate() {
+        let mut total = kl.clone();
+        for (loss, lambda) in losses.iter().zip(self.settings.lambda.values()) {
             if let Some(loss) = loss {
-                dim[i] = Some(finite(PAIRS[i], loss)?);
                 total = (total + loss.affine(lambda, 0.0)?)?;
             }
         }
-        let total_value = finite("the total loss", &total)?;
+        // Before any number is read: reading waits for a GPU, which should have all its work by then.
         let gradients = Gradients::take(&self.online, total.backward()?)?;
+        let c51_kl = finite("the C51 loss", &kl)?;
+        let mut dim = [None; 4];
+        for ((value, loss), pair) in dim.iter_mut().zip(&losses).zip(PAIRS) {
+            if let Some(loss) = loss {
+                *value = Some(finite(pair, loss)?);
+            }
+        }
         Ok(Evaluation {
             c51_kl,
             dim,
-            total: total_value,
-            q_values_t,
+            total: finite("the total loss", &total)?,
+            q_values_t: flat(&q_values_t)?,
             next_greedy_action,
             target_projection,
             gradients,

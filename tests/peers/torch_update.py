@@ -85,7 +85,9 @@ class Learner:
         betas = (adam["beta1"], adam["beta2"])
         self.adam = torch.optim.Adam(self.online.parameters(), adam["lr"], betas, adam["eps"], fused=True)
         if compiled:
-            self.losses = torch.compile(self.losses)
+            # Each learner has one shape; without this the second one of a process is compiled for all shapes.
+            torch.compiler.reset()
+            self.losses = torch.compile(self.losses, dynamic=False)
 
     def on_device(self, batch):
         """The batch where the network is; on the CPU nothing is copied."""
@@ -107,8 +109,8 @@ class Learner:
         discount, support = batch["bootstrap_discount"], (self.config["v_min"], self.config["v_max"])
         return project(probs, batch["n_step_return"], discount, *support)
 
-    def losses(self, batch):
-        """The C51 loss, the DIM losses by pair, and their weighted sum."""
+    def losses(self, batch, all_valid):
+        """The C51 loss, the DIM losses by pair, and their weighted sum; `all_valid`: whether every row has a positive."""
         target, action = self.projected(batch), batch["action"]
         features_t = self.online.features(self.images(batch["frames_t"]))
         logits = self.online.logits(features_t[1])[torch.arange(len(action), device=action.device), action]
@@ -117,7 +119,6 @@ class Learner:
         if self.weights:
             features_k = self.online.features(self.images(batch["frames_k"]))
             valid = batch["positive_valid"].bool()
-            all_valid = bool(valid.all())
             for pair in self.weights:
                 for head, features, given in (("psi" + pair[0], features_t, action), ("phi" + pair[2], features_k, None)):
                     if head not in vectors:
@@ -129,7 +130,9 @@ class Learner:
     def update(self, batch):
         """One update: losses and the gradients' norm before clipping."""
         self.adam.zero_grad(set_to_none=True)
-        kl, dim, total = self.losses(self.on_device(batch))
+        # Read on the host: on the device it would be waited for, and would cut the compiled graph in two.
+        all_valid = bool(batch["positive_valid"].all())
+        kl, dim, total = self.losses(self.on_device(batch), all_valid)
         total.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.online.parameters(), self.config["max_grad_norm"])
         self.adam.step()

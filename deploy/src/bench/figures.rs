@@ -4,6 +4,7 @@
 use std::{fs, path::Path};
 
 use anyhow::Context;
+use driml_learner::DeviceName;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::{bench::table, cli::BenchFlags, print};
@@ -37,6 +38,9 @@ pub(super) struct MachineNote {
     pub(super) cores: u32,
     /// Mean number of tasks that wanted a core in the minute before.
     pub(super) load: f64,
+    /// The GPU that computed, with its memory; none if the processor did.
+    #[serde(default)]
+    pub(super) gpu: Option<String>,
 }
 
 impl MachineNote {
@@ -47,6 +51,22 @@ impl MachineNote {
             processor: processor(&cpuinfo).unwrap_or("unknown").to_owned(),
             cores: crate::machine::Machine::this().cores,
             load: load(&fs::read_to_string("/proc/loadavg").unwrap_or_default()).unwrap_or(0.0),
+            gpu: None,
+        }
+    }
+
+    /// The same, of figures that were computed on `device`.
+    pub(super) fn computing_on(&self, device: DeviceName) -> Self {
+        let gpu = match device {
+            DeviceName::Cpu => None,
+            #[cfg(not(feature = "cuda"))]
+            DeviceName::Cuda(_) => None,
+            #[cfg(feature = "cuda")]
+            DeviceName::Cuda(ordinal) => Some(crate::doctor::cuda::name(ordinal)),
+        };
+        Self {
+            gpu,
+            ..self.clone()
         }
     }
 }

@@ -41,7 +41,7 @@ pub(crate) fn run(command: &BenchCommand) -> anyhow::Result<()> {
         } else {
             alone::figures(part, flags, device)?
         };
-        figures::report(part.name(), &figures, machine.clone(), flags)
+        figures::report(part.name(), &figures, machine.computing_on(device), flags)
     };
     match command {
         BenchCommand::Learner(args) => part(BenchPart::Learner, &args.flags, args.on.device),

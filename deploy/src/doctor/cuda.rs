@@ -150,9 +150,7 @@ fn program(driver: bool) -> Vec<Fact> {
     if missing.is_empty() && driver {
         let mut command = cuda::command(&program);
         command.args(["doctor", "--devices"]);
-        let asked = cuda::answer(command)
-            .and_then(|output| Ok(serde_json::from_slice::<Vec<Fact>>(&output.stdout)?));
-        match asked {
+        match cuda::answer(command).and_then(|output| facts_in(&output)) {
             Ok(devices) => facts.extend(devices),
             Err(why) => facts.push(Fact::missing(
                 "CUDA devices",
@@ -161,6 +159,17 @@ fn program(driver: bool) -> Vec<Fact> {
         }
     }
     facts
+}
+
+/// The facts that the other program wrote.
+#[cfg(not(feature = "cuda"))]
+fn facts_in(output: &std::process::Output) -> anyhow::Result<Vec<Fact>> {
+    if !output.status.success() {
+        let said = String::from_utf8_lossy(&output.stderr);
+        let last = said.lines().last().unwrap_or("it said nothing").to_owned();
+        anyhow::bail!("{}: {last}", output.status);
+    }
+    Ok(serde_json::from_slice(&output.stdout)?)
 }
 
 /// The devices: this very program is the CUDA flavour.
@@ -190,31 +199,60 @@ pub(super) fn devices() -> Vec<Fact> {
 /// The devices that this program can compute on.
 #[cfg(feature = "cuda")]
 pub(super) fn devices() -> Vec<Fact> {
+    match count() {
+        Ok(count) => (0..count).map(described).collect(),
+        Err(none) => vec![none],
+    }
+}
+
+/// Makes sure that there is a device with this number, and that this program was built for it.
+///
+/// # Errors
+/// What is wrong with it, and what to do.
+#[cfg(feature = "cuda")]
+pub(crate) fn check(ordinal: usize) -> Result<(), crate::error::Usage> {
+    let fact = match count() {
+        Ok(count) if ordinal < count => described(ordinal),
+        Ok(count) => Fact::missing(
+            DEVICE,
+            format!("the driver finds {count} device(s), counted from cuda:0"),
+        ),
+        Err(none) => none,
+    };
+    match fact.state {
+        State::Ok => Ok(()),
+        _ => Err(crate::error::usage!(
+            "{DEVICE}{ordinal} cannot be used: {}",
+            fact.text
+        )),
+    }
+}
+
+/// A device as a person reads it: its name, compute capability and memory.
+#[cfg(feature = "cuda")]
+pub(crate) fn name(ordinal: usize) -> String {
+    described(ordinal).text
+}
+
+/// How many devices the driver finds, at least one; else why there is none.
+#[cfg(feature = "cuda")]
+fn count() -> Result<usize, Fact> {
     use candle_core::cuda_backend::cudarc::driver::CudaContext;
 
-    let count = match CudaContext::device_count() {
-        Ok(0) => {
-            return vec![Fact::missing(
-                "CUDA devices",
-                "the driver finds none; does CUDA_VISIBLE_DEVICES hide them?",
-            )];
-        }
-        Ok(count) => count,
-        Err(why) => {
-            return vec![Fact::missing(
-                "CUDA devices",
-                format!("asking the driver: {why}"),
-            )];
-        }
+    let why = match CudaContext::device_count() {
+        Ok(0) => "the driver finds none; does CUDA_VISIBLE_DEVICES hide them?".to_owned(),
+        Ok(count) => return Ok(count as usize),
+        Err(why) => format!("asking the driver: {why}"),
     };
-    (0..count as usize)
-        .map(|ordinal| {
-            let what = format!("{DEVICE}{ordinal}");
-            device(ordinal, &what).unwrap_or_else(|why| {
-                Fact::missing(&what, format!("asking for its properties: {why}"))
-            })
-        })
-        .collect()
+    Err(Fact::missing("CUDA devices", why))
+}
+
+/// One device, also if the driver does not describe it.
+#[cfg(feature = "cuda")]
+fn described(ordinal: usize) -> Fact {
+    let what = format!("{DEVICE}{ordinal}");
+    device(ordinal, &what)
+        .unwrap_or_else(|why| Fact::missing(&what, format!("asking for its properties: {why}")))
 }
 
 /// One device: its name, compute capability and memory, and whether this program was built for it.

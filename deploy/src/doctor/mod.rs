@@ -1,7 +1,7 @@
 //! `driml doctor`: what this machine can do and what it lacks, one line a fact, with what to do about it.
 //! It changes nothing, fetches nothing and measures no speed.
 
-mod cuda;
+pub(crate) mod cuda;
 mod engine;
 mod fact;
 mod host;

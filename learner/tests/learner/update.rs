@@ -6,6 +6,8 @@ use std::collections::HashMap;
 use candle_core::{Device, Tensor};
 use driml_learner::{Learner, UpdateError};
 use driml_model::{Compute, Parameters};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 
 use crate::made_up::{ALL_DIM, NO_DIM, Rows, STOCK, learner, learner_on, model, settings};
 
@@ -376,4 +378,22 @@ fn with_candle_s_own_operations_bad_arithmetic_changes_nothing_either() {
     let error = learner.update(&Rows::random(4, 1).batch()).unwrap_err();
     assert!(matches!(error, UpdateError::NonFinite { .. }), "{error}");
     assert!(before == learner.weights().unwrap() && learner.updates() == 0);
+}
+
+#[test]
+fn gradients_hold_nothing_of_the_pass_that_they_come_from() {
+    // A kernel that its stride does not divide is candle's own convolution, whose gradient is a tracked tensor.
+    let mut model = model(NO_DIM);
+    for (layer, kernel) in model.conv.iter_mut().zip([4, 3]) {
+        (layer.kernel, layer.stride) = (kernel, 2);
+    }
+    let rng = &mut ChaCha8Rng::seed_from_u64(1);
+    let learner = Learner::new(model, settings(NO_DIM), &STOCK, rng).unwrap();
+    let evaluation = learner.evaluate(&Rows::random(4, 1).batch()).unwrap();
+    for (name, _) in learner.online().iter() {
+        assert!(
+            !evaluation.gradients.get(name).unwrap().track_op(),
+            "{name}"
+        );
+    }
 }

@@ -61,6 +61,7 @@ fn a_peer_that_is_missing_is_shown_as_skipped() {
             processor: "a processor".into(),
             cores: 2,
             load: 6.6,
+            gpu: None,
         },
         rows,
     };
