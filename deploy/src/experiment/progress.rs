@@ -62,6 +62,14 @@ impl Progress {
         self.found += units;
     }
 
+    /// Counts work that was done in vain and has to be done again.
+    pub(super) fn again(&mut self, units: u64) {
+        self.total += units;
+        if let Some(bar) = &self.bar {
+            bar.set_length(self.total);
+        }
+    }
+
     /// Counts work done.
     ///
     /// # Errors

@@ -17,7 +17,7 @@ use nix::{
     unistd::Pid,
 };
 
-use super::{Progress, Session};
+use super::{Progress, Session, session::write_whole};
 use crate::{
     EXIT_USAGE,
     error::usage,
@@ -25,6 +25,8 @@ use crate::{
     record::{Outcome, Summary},
 };
 
+/// Times that a run is tried in one call. A run may lose contact with its parts on a machine that is busy with much else.
+const TRIES: u32 = 2;
 /// Where the runs lie in an experiment's folder. Git does not keep them.
 const RUNS: &str = "runs";
 /// How often running children are looked at.
@@ -82,7 +84,7 @@ pub(super) fn run_all(
         if queue.finished(plan).is_some() {
             progress.find(plan.units);
         } else if !report {
-            queue.waiting.push_back(plan.clone());
+            queue.waiting.push_back((0, plan.clone()));
         }
     }
     let made = queue.make(progress);
@@ -96,17 +98,33 @@ pub(super) fn run_all(
     Ok(ran)
 }
 
+/// Makes sure that no run is missing, unless a report of what there is was asked for.
+///
+/// # Errors
+/// The names of those that are.
+pub(super) fn check_made(missing: &[String], report_only: bool) -> anyhow::Result<()> {
+    anyhow::ensure!(
+        missing.is_empty() || report_only,
+        "these runs failed and are in no number of the page; the same command tries them again: {}",
+        missing.join(", ")
+    );
+    Ok(())
+}
+
 struct Queue {
     root: PathBuf,
     /// Runs at once.
     jobs: u32,
-    waiting: VecDeque<Plan>,
+    /// How often each was tried, and its plan.
+    waiting: VecDeque<(u32, Plan)>,
     running: Vec<Running>,
 }
 
 /// A child and how far it is.
 struct Running {
     plan: Plan,
+    /// Which try this is, from 1.
+    tried: u32,
     child: Child,
     /// Of the plan's units.
     done: u64,
@@ -115,9 +133,14 @@ struct Running {
 }
 
 impl Queue {
-    /// The plan's run, if it is there and long enough.
+    /// The plan's run, if it is there, was made by this plan, and is whole and long enough.
     fn finished(&self, plan: &Plan) -> Option<Ran> {
         let folder = self.root.join(&plan.name);
+        let made_by: Vec<String> = serde_json::from_slice(&fs::read(self.call(plan)).ok()?).ok()?;
+        if made_by != plan.args {
+            return None;
+        }
+        last_row(&folder)?;
         let text = fs::read(folder.join("summary.json")).ok()?;
         let summary: Summary = serde_json::from_slice(&text).ok()?;
         let enough = plan.episodes.is_some_and(|all| summary.episodes >= all);
@@ -133,9 +156,9 @@ impl Queue {
     fn make(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         loop {
             while self.running.len() < self.jobs as usize
-                && let Some(plan) = self.waiting.pop_front()
+                && let Some((tried, plan)) = self.waiting.pop_front()
             {
-                let running = self.start(plan, progress)?;
+                let running = self.start(plan, tried + 1, progress)?;
                 self.running.push(running);
             }
             if self.running.is_empty() {
@@ -177,25 +200,40 @@ impl Queue {
             match ended.with_context(|| format!("waiting for {}", running.plan.name))? {
                 None => at += 1,
                 Some(status) => {
-                    let running = self.running.remove(at);
-                    progress.advance(running.plan.units - running.done)?;
-                    let plan = &running.plan;
-                    if self.finished(plan).is_some() {
+                    let Running {
+                        plan, tried, done, ..
+                    } = self.running.remove(at);
+                    if self.finished(&plan).is_some() {
+                        progress.advance(plan.units - done)?;
                         continue;
                     }
-                    let words = last_words(&self.log(plan));
+                    let words = last_words(&self.log(&plan));
                     let name = &plan.name;
                     // Settings that cannot work will not work for the others either.
                     if status.code() == Some(EXIT_USAGE.into()) {
                         return Err(usage!("the run {name} cannot be made:\n{words}").into());
                     }
-                    progress.line(&format!(
-                        "the run {name} failed ({status}) and is left out; the same command tries it again. Its last words:\n{words}"
-                    ));
+                    if tried < TRIES {
+                        progress.line(&format!(
+                            "the run {name} failed ({status}) and is tried once more. Its last words:\n{words}"
+                        ));
+                        progress.again(done);
+                        self.waiting.push_back((tried, plan));
+                    } else {
+                        progress.line(&format!(
+                            "the run {name} failed again ({status}) and is left out. Its last words:\n{words}"
+                        ));
+                        progress.advance(plan.units - done)?;
+                    }
                 }
             }
         }
         Ok(())
+    }
+
+    /// Where the arguments are that a run was made with.
+    fn call(&self, plan: &Plan) -> PathBuf {
+        self.root.join(format!("{}.call.json", plan.name))
     }
 
     fn log(&self, plan: &Plan) -> PathBuf {
@@ -203,7 +241,7 @@ impl Queue {
     }
 
     /// Starts a run in a process group of its own, so that Ctrl-C reaches it through us alone.
-    fn start(&self, plan: Plan, progress: &mut Progress) -> anyhow::Result<Running> {
+    fn start(&self, plan: Plan, tried: u32, progress: &mut Progress) -> anyhow::Result<Running> {
         let path = self.log(&plan);
         let doing = || format!("making {}", path.display());
         let log = File::options()
@@ -221,6 +259,8 @@ impl Queue {
                 aside.display()
             ));
         }
+        let call = serde_json::to_vec(&plan.args).context("writing down a call")?;
+        write_whole(&self.call(&plan), &call)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
         command
@@ -236,6 +276,7 @@ impl Queue {
         let child = command.spawn().with_context(starting)?;
         Ok(Running {
             plan,
+            tried,
             child,
             done: 0,
             enough: false,
@@ -357,7 +398,10 @@ fn tail(path: &Path, bytes: u64) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
+    use driml_protocol::{Horizon, LearnerStatus, ReplayStatus, RunSpec, TimeoutRule};
+
     use super::*;
+    use crate::record::Recorder;
 
     #[test]
     fn the_last_whole_row_counts() {
@@ -368,6 +412,55 @@ mod tests {
         assert_eq!(last_row(folder.path()), None);
         write("seconds,frames,updates,a,b,c,episodes\n1,200,3,,,,7\n2,30");
         assert_eq!(last_row(folder.path()), Some((200, 7)));
+    }
+
+    #[test]
+    fn a_run_counts_for_the_plan_that_made_it_alone() {
+        let root = tempfile::tempdir().unwrap();
+        let queue = Queue {
+            root: root.path().to_owned(),
+            jobs: 1,
+            waiting: VecDeque::new(),
+            running: Vec::new(),
+        };
+        let plan = |frames: u64| Plan {
+            name: "run".into(),
+            args: vec!["--frames".into(), frames.to_string()],
+            frames,
+            episodes: None,
+            units: frames,
+        };
+        let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
+        let folder = queue.root.join("run");
+        let mut recorder = Recorder::create(&folder, "", &[]).unwrap();
+        recorder.record(&replay, &learner, &[]).unwrap();
+        recorder
+            .finish(Outcome::Finished, &spec(), &replay, &learner)
+            .unwrap();
+        assert!(queue.finished(&plan(10)).is_none(), "nobody knows its call");
+        let call = serde_json::to_vec(&plan(10).args).unwrap();
+        fs::write(queue.call(&plan(10)), call).unwrap();
+        assert!(queue.finished(&plan(10)).is_some());
+        assert!(queue.finished(&plan(20)).is_none());
+        fs::write(folder.join("metrics.csv"), "seconds,frames\n").unwrap();
+        assert!(queue.finished(&plan(10)).is_none(), "its metrics are gone");
+    }
+
+    fn spec() -> RunSpec {
+        RunSpec {
+            world: "chain".into(),
+            agent: "c51".into(),
+            seed: 1,
+            frame_height: 12,
+            frame_width: 12,
+            frame_channels: 1,
+            frame_stack: 1,
+            num_actions: 3,
+            n_step: 7,
+            gamma: 0.99,
+            horizon: Horizon::None,
+            timeout: TimeoutRule::Terminal,
+        }
     }
 
     #[test]

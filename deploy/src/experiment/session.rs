@@ -50,8 +50,7 @@ impl Session {
         settings: &impl Serialize,
         units: u64,
     ) -> anyhow::Result<Self> {
-        let default = || Path::new("experiments").join(name);
-        let folder = flags.out.clone().unwrap_or_else(default);
+        let folder = folder(name, flags);
         let pieces = folder.join(PIECES);
         fs::create_dir_all(&pieces).with_context(|| format!("making {}", pieces.display()))?;
         let settings = serde_json::to_vec_pretty(settings).context("writing down the settings")?;
@@ -60,9 +59,8 @@ impl Session {
             Ok(found) if found == settings => {}
             Ok(_) => {
                 return Err(usage!(
-                    "{} holds pieces that were made with other settings: choose another --out, or remove {}",
-                    folder.display(),
-                    pieces.display()
+                    "{} holds what was made with other settings: choose another --out, or remove that folder",
+                    folder.display()
                 )
                 .into());
             }
@@ -74,6 +72,28 @@ impl Session {
             progress: Progress::new(units, interrupts),
             seconds: 0.0,
         })
+    }
+
+    /// [`Session::open`] of an experiment that is a queue of runs. For a report alone it makes no folder.
+    ///
+    /// # Errors
+    /// A report where nothing was made yet; as for [`Session::open`].
+    pub(super) fn open_queue(
+        name: &str,
+        flags: &ExperimentFlags,
+        settings: &impl Serialize,
+        units: u64,
+        report_only: bool,
+    ) -> anyhow::Result<Self> {
+        let folder = folder(name, flags);
+        if report_only && !folder.join(PIECES).join(SETTINGS).is_file() {
+            return Err(usage!(
+                "nothing was made in {} yet: there is nothing to report",
+                folder.display()
+            )
+            .into());
+        }
+        Self::open(name, flags, settings, units)
     }
 
     /// Where everything goes.
@@ -174,8 +194,14 @@ impl Session {
     }
 }
 
+/// The folder of the experiment `name`, by what the flags say.
+fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
+    let default = || Path::new("experiments").join(name);
+    flags.out.clone().unwrap_or_else(default)
+}
+
 /// Writes a file beside its place and renames it into it.
-fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let aside = path.with_extension("tmp");
     let doing = || format!("writing {}", path.display());
     let mut file = fs::File::create(&aside).with_context(doing)?;
@@ -198,6 +224,9 @@ mod tests {
             seeds: None,
         };
         let open = |settings: &str| Session::open("walk", &flags, &settings, 4);
+        let report = || Session::open_queue("walk", &flags, &"a", 4, true);
+        assert!(report().unwrap_err().is::<Usage>());
+        assert!(!folder.path().join("walk").exists());
         let mut session = open("a").unwrap();
         let made = session.piece("one", 2, |_| Ok(7)).unwrap();
         assert_eq!(made, 7);
@@ -212,5 +241,6 @@ mod tests {
         fs::write(folder.path().join("walk/pieces/one.json"), "{\"seconds\":").unwrap();
         assert_eq!(open("a").unwrap().piece("one", 2, |_| Ok(9)).unwrap(), 9);
         assert!(open("b").unwrap_err().is::<Usage>());
+        assert!(report().is_ok());
     }
 }

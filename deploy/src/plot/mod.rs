@@ -5,6 +5,8 @@ mod affinity;
 mod groups;
 mod runs;
 
+use std::collections::BTreeSet;
+
 use self::groups::Group;
 pub(crate) use self::{
     affinity::figure as affinities,
@@ -50,9 +52,12 @@ pub(crate) fn run(args: &PlotArgs) -> anyhow::Result<()> {
 }
 
 fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
+    let mut seen = BTreeSet::new();
     let runs = args
         .runs
         .iter()
+        // A folder given twice is one run, not two seeds.
+        .filter(|folder| seen.insert(folder.canonicalize().unwrap_or_else(|_| (*folder).clone())))
         .map(|folder| Run::read(folder))
         .collect::<anyhow::Result<Vec<_>>>()?;
     let columns = if args.column.is_empty() {
@@ -222,6 +227,19 @@ mod tests {
         let svg = std::fs::read_to_string(root.path().join("all.svg")).unwrap();
         assert!(svg.contains("the band is their smallest and largest value"));
         assert!(svg.contains("Not smoothed."));
+    }
+
+    #[test]
+    fn a_row_that_was_cut_off_is_left_out_and_a_folder_given_twice_is_one_run() {
+        let root = tempfile::tempdir().unwrap();
+        let a = run_folder(root.path(), "a", "c51", 1, &format!("{METRICS}4,3"));
+        let values = Run::read(&a).unwrap().values("mean_return").unwrap();
+        assert_eq!(values, [(10.0, 1.5), (20.0, 2.5)]);
+        let again = root.path().join(".").join("a");
+        let out = root.path().join("twice.svg");
+        run(&args(&[&a, &again], &["mean_return"], out.clone())).unwrap();
+        let svg = std::fs::read_to_string(out).unwrap();
+        assert!(!svg.contains("2 seeds"));
     }
 
     #[test]

@@ -34,8 +34,14 @@ impl Run {
     /// A folder without `metrics.csv`, or with one that is no run's.
     pub(crate) fn read(folder: &Path) -> anyhow::Result<Self> {
         let path = folder.join("metrics.csv");
-        let mut file = csv::Reader::from_path(&path)
+        let text = std::fs::read(&path)
             .map_err(|e| usage!("{} is not the folder of a run: {e}", folder.display()))?;
+        // What follows the last line's end is still being written, or was cut off.
+        let whole = text
+            .iter()
+            .rposition(|&byte| byte == b'\n')
+            .map_or(0, |end| end + 1);
+        let mut file = csv::Reader::from_reader(&text[..whole]);
         let reading = || format!("reading {}", path.display());
         let header: Vec<String> = file
             .headers()

@@ -119,7 +119,12 @@ fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
 /// The resolved settings, each with its source.
 fn sourced(preset: &'static Preset, world: WorldName, agent: &Agent) -> Result<String, Usage> {
     let source = Source::Layers(preset, world, agent.name);
-    let config = config::resolve(&source, &Flags::default(), &Machine::this())?;
+    // What the preset asks for, on any machine; memory that is free at this moment is no setting.
+    let machine = Machine {
+        memory_bytes: u64::MAX,
+        ..Machine::this()
+    };
+    let config = config::resolve(&source, &Flags::default(), &machine)?;
     let table: Table = config
         .to_toml()
         .parse()

@@ -331,7 +331,7 @@ fn page(task: &Task, trained: &[Trained], command: String, smoke: bool) -> Page 
                 last(&|measured| measured.auc_pairs)
             ),
             format!(
-                "Loss at the end: {} nats, of ln {} = {:.2} for a blind score.",
+                "Loss on the episodes of these measurements, at the end: {} nats, of ln {} = {:.2} for a blind score.",
                 last(&|measured| measured.loss),
                 settings.batch_rows,
                 (settings.batch_rows as f64).ln()

@@ -101,9 +101,10 @@ pub(super) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let settings = with_flags(args)?;
     let plans = settings.plans();
     let units = plans.iter().map(|(_, _, plan)| plan.units).sum();
-    let mut session = Session::open(NAME, &args.flags, &settings, units)?;
+    let report_only = args.queue.report;
+    let mut session = Session::open_queue(NAME, &args.flags, &settings, units, report_only)?;
     let runs: Vec<Plan> = plans.iter().map(|(_, _, plan)| plan.clone()).collect();
-    let ran = queue::run_all(&mut session, &runs, settings.jobs, args.queue.report)?;
+    let ran = queue::run_all(&mut session, &runs, settings.jobs, report_only)?;
     let mut results = Results {
         command: command(args, &session),
         smoke: args.flags.smoke,
@@ -120,7 +121,8 @@ pub(super) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     if results.runs.is_empty() {
         return Err(usage!("no run is finished yet: there is nothing to report").into());
     }
-    report::report(session, &results)
+    report::report(session, &results)?;
+    queue::check_made(&results.missing, report_only)
 }
 
 /// The settings of the length asked for, with what the flags replace.

@@ -126,13 +126,14 @@ pub(super) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
         sets: &settings.sets,
         episodes: settings.episodes,
     };
-    let mut session = Session::open(name, &args.flags, &common, units)?;
+    let report_only = args.queue.report;
+    let mut session = Session::open_queue(name, &args.flags, &common, units, report_only)?;
     let is_procgen = |world: &String| world.starts_with("procgen:");
-    if !args.queue.report && settings.worlds.iter().any(is_procgen) {
+    if !report_only && settings.worlds.iter().any(is_procgen) {
         procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
     }
     let runs: Vec<Plan> = plans.iter().map(|(_, plan)| plan.clone()).collect();
-    let ran = queue::run_all(&mut session, &runs, settings.jobs, args.queue.report)?;
+    let ran = queue::run_all(&mut session, &runs, settings.jobs, report_only)?;
     let mut results = Results {
         command: command(args, name, &session),
         smoke: args.flags.smoke,
@@ -171,10 +172,11 @@ pub(super) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
         return Err(usage!("no run is finished yet: there is nothing to report").into());
     }
     if args.screen {
-        screen::report(session, &results)
+        screen::report(session, &results)?;
     } else {
-        report(session, &results)
+        report(session, &results)?;
     }
+    queue::check_made(&results.missing, report_only)
 }
 
 /// Writes everything.

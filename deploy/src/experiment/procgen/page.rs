@@ -14,6 +14,8 @@ use crate::experiment::{Page, aggregate, page::Table, statistics::Spread};
 const PAPER_FRAMES: f64 = 50e6;
 /// Standard errors from which on a mean return counts as different from the random policy's.
 const ERRORS: f64 = 2.0;
+/// Seeds a game from which on a bootstrap over them says something.
+const SEEDS_MIN: u32 = 5;
 
 /// The page.
 pub(super) fn page(results: &Results, aggregates: &[Aggregate], adaptive: bool) -> Page {
@@ -67,8 +69,8 @@ pub(super) fn page(results: &Results, aggregates: &[Aggregate], adaptive: bool) 
         got: got(results, aggregates),
         tables,
         differences: differences(results, share),
-        setup: vec![
-            format!(
+        setup: [
+            Some(format!(
                 "Preset {}{}; {} frames a run, {} seed(s); {} episodes played on each kind of levels with the newest weights, \
                  epsilon 0.001. The time above is the sum over all runs; several may have run at once.",
                 settings.preset,
@@ -79,12 +81,22 @@ pub(super) fn page(results: &Results, aggregates: &[Aggregate], adaptive: bool) 
                 settings.frames,
                 settings.seeds,
                 settings.episodes
-            ),
-            "Interquartile mean, probability of improvement and their intervals: Agarwal et al. 2021; 2,000 resamples of seeds \
+            )),
+            (settings.seeds < SEEDS_MIN).then(|| {
+                format!(
+                    "The intervals are of {} seed(s) a game, and too narrow: so few values cannot tell how far others would spread. Take \
+                     them for no less than the spread between these very seeds; `--seeds {SEEDS_MIN}` or more makes them intervals.",
+                    settings.seeds
+                )
+            }),
+            Some("Interquartile mean, probability of improvement and their intervals: Agarwal et al. 2021; 2,000 resamples of seeds \
              within each game. Normalisation: (return - min) / (max - min) with Cobbe et al. 2020, appendix C, mode easy. It \
              is made for single levels, so only returns of an episode a level are normalised."
-                .into(),
-        ],
+                .into()),
+        ]
+        .into_iter()
+        .flatten()
+        .collect(),
         figures,
         data,
         smoke: results.smoke,
@@ -116,7 +128,8 @@ fn got(results: &Results, aggregates: &[Aggregate]) -> Vec<String> {
             format!(": {}", above.join(", "))
         };
         lines.push(format!(
-            "`{agent}` plays better than at random (by {ERRORS} standard errors, as trained) on {} of {} games{which}.",
+            "`{agent}` plays better than at random, in every seed by {ERRORS} standard errors of its episodes as trained, on {} of {} \
+             games{which}.",
             above.len(),
             played().count()
         ));
@@ -146,19 +159,19 @@ fn got(results: &Results, aggregates: &[Aggregate]) -> Vec<String> {
     lines
 }
 
-/// Whether the agent's episodes, of all seeds together, are better than the random policy's.
+/// Whether the episodes of each of the agent's seeds are better than the random policy's.
 fn is_above_random(results: &Results, world: &str, agent: &str) -> bool {
-    let all = results
-        .of(world, agent)
-        .flat_map(|cell| cell.played.trained.iter().copied());
-    let random = results.random[world].trained.iter().copied();
-    match (Spread::of(all), Spread::of(random)) {
-        (Some(agent), Some(random)) => {
-            let error = |it: &Spread| it.sd.powi(2) / it.count as f64;
-            agent.mean - random.mean > ERRORS * (error(&agent) + error(&random)).sqrt()
+    let random = Spread::of(results.random[world].trained.iter().copied());
+    results.of(world, agent).all(|cell| {
+        let played = Spread::of(cell.played.trained.iter().copied());
+        match (&played, &random) {
+            (Some(agent), Some(random)) => {
+                let error = |it: &Spread| it.sd.powi(2) / it.count as f64;
+                agent.mean - random.mean > ERRORS * (error(agent) + error(random)).sqrt()
+            }
+            _ => false,
         }
-        _ => false,
-    }
+    })
 }
 
 fn differences(results: &Results, share: f64) -> Vec<String> {

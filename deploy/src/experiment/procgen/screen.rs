@@ -14,6 +14,8 @@ const ERRORS: f64 = 3.0;
 const EPISODES_MIN: f64 = 20.0;
 /// Episodes in the recorded mean return.
 const RETURNS_OF: f64 = 100.0;
+/// Standard errors below which a proposed game is called a guess.
+const GUESSED: f64 = 2.0;
 /// Games that the page proposes.
 const CHOSEN: usize = 3;
 
@@ -153,6 +155,11 @@ fn page(results: &Results, screened: &[Screened]) -> Page {
     let above = screened.iter().filter(|it| it.soonest.is_some()).count();
     let chosen = screened.iter().take(CHOSEN);
     let chosen: Vec<&str> = chosen.map(|it| short(&it.world)).collect();
+    let guessed = screened.iter().take(CHOSEN);
+    let guessed: Vec<&str> = guessed
+        .filter(|it| it.soonest.is_none() && it.errors < GUESSED)
+        .map(|it| short(&it.world))
+        .collect();
     let by_greedy = CHOSEN.saturating_sub(above).min(screened.len());
     let rows = screened.iter().map(|it| {
         vec![
@@ -188,6 +195,13 @@ fn page(results: &Results, screened: &[Screened]) -> Page {
                     "The first {CHOSEN} of the order below, {by_greedy} of them only by how surely the greedy policy beats the random one: \
                      `--games {}`.",
                     chosen.join(",")
+                ),
+            },
+            match &guessed[..] {
+                [] => "Each of these beats the random policy, in training or greedily.".into(),
+                guessed => format!(
+                    "Less than {GUESSED} standard errors apart from the random policy, so no more than a guess: {}.",
+                    guessed.join(", ")
                 ),
             },
         ],
