@@ -123,10 +123,10 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
         ("scouting/delay", "20"),
         ("scouting/multicast/enabled", "false"),
         ("scouting/gossip/enabled", "false"),
+        ("transport/unicast/open_timeout", "2000"),
+        ("transport/unicast/accept_timeout", "5000"),
         // Long enough for a machine that is busy with much else: a part that got no processor for a while is not gone. One that
         // died is known at once, as its connection closes.
-        ("transport/unicast/open_timeout", "10000"),
-        ("transport/unicast/accept_timeout", "10000"),
         ("transport/link/tx/lease", "30000"),
         ("transport/link/tx/queue/size/data", "16"),
         (
