@@ -54,8 +54,12 @@ pub(super) struct Page {
 }
 
 impl Page {
-    /// As Markdown. `seconds` is the time that all pieces took.
-    pub(super) fn text(&self, seconds: f64) -> String {
+    /// As Markdown. `seconds` is the time that all pieces took together, of which so many are made `at_once`.
+    pub(super) fn text(&self, seconds: f64, at_once: u32) -> String {
+        let at_once = match at_once {
+            1 => String::new(),
+            jobs => format!(" of runs, {jobs} at once,"),
+        };
         let mut out = format!("# {}\n\n", self.title);
         if self.smoke {
             out += "**This is the smoke length: it shows that everything works, and its numbers mean nothing.**\n\n";
@@ -64,7 +68,7 @@ impl Page {
         out += &format!("**Claim.** {}\n\n", self.claim);
         out += &format!("**Command.** `{}`\n\n", self.command);
         out += &format!(
-            "**Time.** {} on a machine with {cores} cores.\n\n",
+            "**Time.** {}{at_once} on a machine with {cores} cores.\n\n",
             duration(seconds)
         );
         for (head, items) in [("Expected", &self.expected), ("Got", &self.got)] {
@@ -120,7 +124,7 @@ mod tests {
             smoke: true,
             ..Page::default()
         };
-        let text = page.text(130.0);
+        let text = page.text(130.0, 1);
         for part in [
             "# T\n",
             "smoke length",
@@ -132,7 +136,11 @@ mod tests {
         ] {
             assert!(text.contains(part), "{part}\n{text}");
         }
+        assert!(
+            page.text(130.0, 2)
+                .contains("**Time.** 2 min of runs, 2 at once, on")
+        );
         page.smoke = false;
-        assert!(!page.text(1.0).contains("smoke length"));
+        assert!(!page.text(1.0, 1).contains("smoke length"));
     }
 }

@@ -94,7 +94,7 @@ pub(super) fn run_all(
     made?;
     let ran: Vec<_> = plans.iter().map(|plan| queue.finished(plan)).collect();
     let seconds = ran.iter().flatten().map(|it| it.summary.wall_seconds);
-    session.spend(seconds.sum());
+    session.spend(seconds.sum(), jobs);
     Ok(ran)
 }
 

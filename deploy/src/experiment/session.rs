@@ -37,6 +37,8 @@ pub(super) struct Session {
     folder: PathBuf,
     progress: Progress,
     seconds: f64,
+    /// Of how many pieces at once this is the sum.
+    at_once: u32,
 }
 
 impl Session {
@@ -71,6 +73,7 @@ impl Session {
             folder,
             progress: Progress::new(units, interrupts),
             seconds: 0.0,
+            at_once: 1,
         })
     }
 
@@ -106,9 +109,10 @@ impl Session {
         (&self.folder, &mut self.progress)
     }
 
-    /// Counts the time that such work took.
-    pub(super) fn spend(&mut self, seconds: f64) {
+    /// Counts the time that such work took, added up over runs of which so many are made at once.
+    pub(super) fn spend(&mut self, seconds: f64, at_once: u32) {
         self.seconds += seconds;
+        self.at_once = at_once;
     }
 
     /// The piece of this name, which is `units` of work: read if it is there, else made and kept.
@@ -184,7 +188,7 @@ impl Session {
     /// A file system that refuses.
     pub(super) fn finish(self, page: &Page) -> anyhow::Result<()> {
         self.progress.clear();
-        let text = page.text(self.seconds);
+        let text = page.text(self.seconds, self.at_once);
         write_whole(&self.folder.join("README.md"), text.as_bytes())?;
         print(&format!(
             "{}{}\n",

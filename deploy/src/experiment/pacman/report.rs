@@ -431,7 +431,6 @@ fn page(results: &Results, losses: &[Loss], mut got: Vec<String>, tables: Vec<Ta
                     sets => format!(" with {}", sets.join(", ")),
                 }
             ),
-            "The time above is the sum over all runs; several may have run at once.".into(),
         ],
         figures: vec![("fig3".into(), "DIM loss by epsilon; return under changing lethal ghosts".into())],
         data: vec![

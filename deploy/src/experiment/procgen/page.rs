@@ -72,7 +72,7 @@ pub(super) fn page(results: &Results, aggregates: &[Aggregate], adaptive: bool) 
         setup: [
             Some(format!(
                 "Preset {}{}; {} frames a run, {} seed(s); {} episodes played on each kind of levels with the newest weights, \
-                 epsilon 0.001. The time above is the sum over all runs; several may have run at once.",
+                 epsilon 0.001.",
                 settings.preset,
                 match &settings.sets[..] {
                     [] => String::new(),
