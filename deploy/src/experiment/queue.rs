@@ -254,7 +254,7 @@ impl Queue {
         let folder = self.root.join(&plan.name);
         if let Some(aside) = move_aside(&folder)? {
             progress.line(&format!(
-                "{} was not finished: it is now {}, and the run starts anew",
+                "{} was not finished, or is of another call: it is now {}, and the run starts anew",
                 folder.display(),
                 aside.display()
             ));
