@@ -77,6 +77,9 @@ pub(crate) struct Summary {
     pub(crate) weights_sha256: String,
     /// Chunks recognised as a retry of a stored one.
     pub(crate) chunks_retried: u64,
+    /// Batches that did not reach the learner and were asked for again; older runs do not say.
+    #[serde(default)]
+    pub(crate) batches_retried: u64,
     /// Memory that the frames in the replay took at the end, MiB.
     pub(crate) replay_frame_mib: u64,
     /// Messages refused as malformed or foreign.
@@ -277,6 +280,7 @@ impl Recorder {
             weights_version: learner.weights_version,
             weights_sha256: learner.weights_sha256.clone(),
             chunks_retried: replay.chunks_retried,
+            batches_retried: replay.batches_retried,
             replay_frame_mib: replay.frame_bytes_held.div_ceil(1 << 20),
             messages_refused: replay.messages_refused,
             rss_mib_max: rss

@@ -9,12 +9,12 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Batch, BatchHeader, BatchReply, BatchRequest, Keys, Kind, PlanesPool, ReplayStatus, Shutdown,
-    Tally, codec,
+    Batch, BatchHeader, BatchReply, BatchRequest, Keys, Kind, PlanesPool, ReplayStatus, RequestId,
+    Shutdown, Tally, codec,
     session::{self, Asked, SessionError},
     shutdown::join_within,
 };
-use rand::SeedableRng;
+use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use zenoh::{Session, bytes::ZBytes, qos::Priority};
 
@@ -89,12 +89,14 @@ impl BatchSource {
         let making = Arc::new(Mutex::new(Making::new(sessions.len())));
         let mut threads = Vec::new();
         for i in 0..requests.in_flight {
+            // Which rows come from which shard follows from the order of answers, so this need not be the run's.
+            let mut rng = ChaCha8Rng::from_os_rng();
             let fetcher = Fetcher {
                 sessions: sessions.to_vec(),
                 keys: keys.clone(),
                 making: making.clone(),
-                // Which rows come from which shard follows from the order of answers, so this need not be the run's.
-                rng: ChaCha8Rng::from_os_rng(),
+                id: RequestId::first(rng.random()),
+                rng,
                 spec_hash,
                 requests,
                 pool: pool.clone(),
@@ -146,6 +148,8 @@ struct Making {
     counts: Vec<Count>,
     /// Rows that are still to come from each shard.
     pending: Vec<u32>,
+    /// The request for a part that each shard gets next.
+    ids: Vec<RequestId>,
     parts: Vec<Batch>,
 }
 
@@ -154,6 +158,7 @@ impl Making {
         Self {
             counts: vec![Count::default(); shards],
             pending: vec![0; shards],
+            ids: vec![RequestId::first(rand::random()); shards],
             parts: Vec::new(),
         }
     }
@@ -163,6 +168,8 @@ struct Fetcher {
     sessions: Vec<Session>,
     keys: Keys,
     making: Arc<Mutex<Making>>,
+    /// The request for a whole batch that comes next.
+    id: RequestId,
     rng: ChaCha8Rng,
     spec_hash: u64,
     requests: Requests,
@@ -204,8 +211,11 @@ impl Fetcher {
         if self.sessions.len() > 1 {
             return self.fetch_parts();
         }
-        let asked = self.ask(0, self.requests.rows, None)?;
-        Ok(match self.answer(asked)? {
+        self.id = self.id.again();
+        let asked = self.ask(0, self.id, self.requests.rows, None)?;
+        let answer = self.answer(asked)?;
+        self.id = self.id.next();
+        Ok(match answer {
             Answer::Batch(batch) => Some(Fetched::Batch(batch)),
             Answer::Wait => None,
             Answer::Finished => Some(Fetched::Finished),
@@ -220,6 +230,7 @@ impl Fetcher {
         let Making {
             counts,
             pending,
+            ids,
             parts,
         } = &mut *making;
         if parts.is_empty() && pending.iter().all(|&rows| rows == 0) {
@@ -234,11 +245,22 @@ impl Fetcher {
         let mut asked = Vec::new();
         for shard in (0..pending.len()).filter(|&shard| pending[shard] > 0) {
             let elsewhere = shards::elsewhere(counts, pending, shard);
-            asked.push((shard, self.ask(shard, pending[shard], Some(elsewhere))?));
+            ids[shard] = ids[shard].again();
+            let part = self.ask(shard, ids[shard], pending[shard], Some(elsewhere))?;
+            asked.push((shard, part));
         }
-        let mut finished = false;
+        let (mut finished, mut failed) = (false, None);
         for (shard, asked) in asked {
-            match self.answer(asked)? {
+            // A part that did not arrive is asked for again, by itself.
+            let answer = match self.answer(asked) {
+                Ok(answer) => answer,
+                Err(e) => {
+                    failed.get_or_insert(e);
+                    continue;
+                }
+            };
+            ids[shard] = ids[shard].next();
+            match answer {
                 Answer::Batch(part) => {
                     let BatchHeader { tally, held, .. } = part.header;
                     counts[shard] = Count { tally, held };
@@ -248,6 +270,9 @@ impl Fetcher {
                 Answer::Wait => {}
                 Answer::Finished => finished = true,
             }
+        }
+        if let Some(e) = failed {
+            return Err(e);
         }
         if pending.iter().all(|&rows| rows == 0) {
             let header =
@@ -291,10 +316,12 @@ impl Fetcher {
     fn ask(
         &self,
         shard: usize,
+        id: RequestId,
         rows: u32,
         elsewhere: Option<Tally>,
     ) -> anyhow::Result<(Asked, bool)> {
         let request = BatchRequest {
+            id,
             rows,
             shared_memory: self.requests.shared_memory && self.by_socket == 0,
             elsewhere,

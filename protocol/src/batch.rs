@@ -18,12 +18,55 @@ const PLANES: usize = 9;
 /// The learner's request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BatchRequest {
+    /// Which request this is.
+    pub id: RequestId,
     /// Rows wanted, B.
     pub rows: u32,
     /// Whether the batch may come through shared memory.
     pub shared_memory: bool,
     /// Where the replay has several shards: what all the others have counted together, and these rows are part of a batch.
     pub elsewhere: Option<Tally>,
+}
+
+/// Tells a request that repeats another from a new one: a batch that did not arrive must not count as sampled.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RequestId {
+    /// Who asks: a random number, as an asker is told from all others by nothing else. It waits for one request at a time.
+    pub asker: u64,
+    /// How many requests of this asker were answered before.
+    pub number: u64,
+    /// How often this one was sent before.
+    pub attempt: u64,
+}
+
+impl RequestId {
+    /// The first request of an asker.
+    pub const fn first(asker: u64) -> Self {
+        Self {
+            asker,
+            number: 0,
+            attempt: 0,
+        }
+    }
+
+    /// The same request, sent once more.
+    #[must_use]
+    pub const fn again(self) -> Self {
+        Self {
+            attempt: self.attempt + 1,
+            ..self
+        }
+    }
+
+    /// The request after this one, which was answered.
+    #[must_use]
+    pub const fn next(self) -> Self {
+        Self {
+            number: self.number + 1,
+            attempt: 0,
+            ..self
+        }
+    }
 }
 
 /// What the rate limiter counts.

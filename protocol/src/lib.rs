@@ -19,7 +19,7 @@ pub mod transition;
 pub mod weights;
 
 pub use affinity::AffinityUpdate;
-pub use batch::{Batch, BatchHeader, BatchReply, BatchRequest, NO_ACTION, Tally};
+pub use batch::{Batch, BatchHeader, BatchReply, BatchRequest, NO_ACTION, RequestId, Tally};
 pub use codec::{CodecError, Kind};
 pub use control::{Goodbye, Hello};
 pub use keys::Keys;
@@ -31,4 +31,4 @@ pub use transition::{Chunk, ChunkHeader, End, InsertReply};
 pub use weights::{WeightsHeader, WeightsVersion};
 
 /// The version of every message in this crate; parts of different versions refuse each other.
-pub const PROTOCOL_VERSION: u16 = 1;
+pub const PROTOCOL_VERSION: u16 = 2;

@@ -54,6 +54,8 @@ pub struct ReplayStatus {
     pub transitions_duplicated: u64,
     /// Chunks recognised as a retry of a stored one, and not stored again.
     pub chunks_retried: u64,
+    /// Batches that did not reach the learner, which asked again; they do not count as served.
+    pub batches_retried: u64,
     /// Messages refused as malformed or foreign.
     pub messages_refused: u64,
     /// Rows served since the start.
@@ -115,6 +117,7 @@ impl ReplayStatus {
             sum.transitions_lost += it.transitions_lost;
             sum.transitions_duplicated += it.transitions_duplicated;
             sum.chunks_retried += it.chunks_retried;
+            sum.batches_retried += it.batches_retried;
             sum.messages_refused += it.messages_refused;
             sum.rows_sampled += it.rows_sampled;
             sum.episodes += it.episodes;

@@ -7,8 +7,8 @@ use std::fmt::Debug;
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader, CodecError,
     End, Goodbye, Hello, Horizon, InsertReply, Kind, LearnerStatus, NO_ACTION, PROTOCOL_VERSION,
-    Planes, PlanesPool, ReplayStatus, RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader,
-    WeightsVersion,
+    Planes, PlanesPool, ReplayStatus, RequestId, RunSpec, Tally, TimeoutRule, Waiting,
+    WeightsHeader, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PLANES_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -205,6 +205,7 @@ fn samples() -> Vec<Sample> {
         Sample::of(
             Kind::BatchRequest,
             &BatchRequest {
+                id: RequestId::first(u64::MAX).again(),
                 rows: 256,
                 shared_memory: true,
                 elsewhere: Some(Tally::default()),

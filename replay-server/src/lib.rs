@@ -13,6 +13,7 @@ mod anchors;
 mod assemble;
 mod episodes;
 mod frames;
+mod requests;
 mod ring;
 mod service;
 mod statistics;

@@ -108,6 +108,12 @@ impl RateLimiter {
         self.here.rows_sampled += u64::from(rows);
     }
 
+    /// Counts `rows` that were sampled and did not arrive as not sampled.
+    pub fn taken_back(&mut self, rows: u32) {
+        let rows_sampled = &mut self.here.rows_sampled;
+        *rows_sampled = rows_sampled.saturating_sub(u64::from(rows));
+    }
+
     /// What was counted here since the start.
     pub const fn tally(&self) -> Tally {
         self.here

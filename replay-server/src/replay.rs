@@ -3,7 +3,7 @@
 
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, BatchReply, Chunk, CodecError, Goodbye, InsertReply,
-    Planes, ReplayStatus, RunSpec, Tally, Waiting,
+    Planes, ReplayStatus, RequestId, RunSpec, Tally, Waiting,
 };
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -20,6 +20,7 @@ use crate::{
     },
     horizon::Affinity,
     rate_limiter::RateLimiter,
+    requests::{Requests, Standing},
     ring::{Ring, Step},
     statistics::Statistics,
 };
@@ -58,6 +59,7 @@ pub struct Replay {
     batch_rows: u32,
     ring: Ring,
     actors: Actors,
+    requests: Requests,
     limiter: RateLimiter,
     episodes: Episodes,
     anchors: Anchors,
@@ -129,6 +131,7 @@ impl Replay {
             batch_rows,
             ring,
             actors: Actors::default(),
+            requests: Requests::default(),
             limiter: RateLimiter::new(
                 config.replay_ratio,
                 config.warmup_transitions,
@@ -287,6 +290,32 @@ impl Replay {
         self.draw(rows).map(Draft::unpack)
     }
 
+    /// [`Replay::draw_in`] for request `id`. What an earlier attempt at this request was given did not arrive: from now on it
+    /// does not count as sampled.
+    ///
+    /// # Errors
+    /// As [`Replay::draw`]; a request that nobody waits for any more is told to wait.
+    pub fn draw_for(
+        &mut self,
+        id: RequestId,
+        rows: u32,
+        memory: impl FnOnce(usize) -> Planes,
+    ) -> Result<Draft, Unready> {
+        match self.requests.enter(id) {
+            Standing::Overtaken => return Err(Unready::Wait(self.limiter.waiting(rows))),
+            Standing::Open(lost) => {
+                if !lost.is_empty() {
+                    tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
+                    self.limiter.taken_back(lost.len() as u32);
+                    self.statistics.taken_back(&lost);
+                }
+            }
+        }
+        let draft = self.draw_in(rows, memory)?;
+        self.requests.give(id.asker, draft.ks.clone());
+        Ok(draft)
+    }
+
     /// A batch of `rows` rows, anchors uniform over the valid ones and drawn with replacement, or why there is none. With
     /// compression its frames are left to be unpacked, which needs the replay no more.
     ///
@@ -323,6 +352,7 @@ impl Replay {
         let mut batch = Batch::in_memory(header, memory(header.planes_bytes()));
         let pixel_bytes = self.spec.frame_channels as usize;
         let mut packed = PackedStates::new(self.spec.frame_bytes(), pixel_bytes);
+        let mut ks = Vec::with_capacity(rows as usize);
         let mut age_total = 0;
         let mut rows_mut = batch.rows_mut();
         for row in 0..rows as usize {
@@ -347,7 +377,7 @@ impl Replay {
                     packed.add_row((&self.ring, frames, &self.episodes), states);
                 }
             }
-            self.statistics.k_histogram[states.k() as usize] += 1;
+            ks.push(states.k());
             age_total += self.ring.inserted() - 1 - self.window.index(0);
             let version = self.window.step(0).weights_version;
             let (newest, oldest) = header.weights_versions;
@@ -355,11 +385,12 @@ impl Replay {
         }
         header.mean_age = age_total as f64 / f64::from(rows);
         self.statistics.mean_age = header.mean_age;
+        self.statistics.served(&ks);
         self.limiter.sampled(rows);
         header.tally = self.limiter.tally();
         batch.header = header;
         self.starving = false;
-        Ok(Draft { batch, packed })
+        Ok(Draft { batch, packed, ks })
     }
 
     /// What a batch of `rows` rows says of itself before any row is written.
@@ -469,6 +500,7 @@ impl Replay {
             transitions_lost: statistics.transitions_lost,
             transitions_duplicated: statistics.transitions_duplicated,
             chunks_retried: statistics.chunks_retried,
+            batches_retried: statistics.batches_retried,
             messages_refused: statistics.messages_refused,
             rows_sampled: self.limiter.tally().rows_sampled,
             warmup_transitions: self.config.warmup_transitions,

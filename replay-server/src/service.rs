@@ -297,7 +297,7 @@ impl Service {
                 true => self.pool.take(bytes),
                 false => self.pool.take_own(bytes),
             };
-            match replay.draw_in(request.rows, memory) {
+            match replay.draw_for(request.id, request.rows, memory) {
                 Err(Unready::Wait(waiting)) => {
                     // A chunk that waits may be let in to end this; once, or those who wait would wake each other for ever.
                     if !std::mem::replace(&mut said, true) {

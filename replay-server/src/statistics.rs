@@ -12,6 +12,7 @@ pub(crate) struct Statistics {
     pub(crate) transitions_lost: u64,
     pub(crate) transitions_duplicated: u64,
     pub(crate) chunks_retried: u64,
+    pub(crate) batches_retried: u64,
     pub(crate) messages_refused: u64,
     pub(crate) episodes: u64,
     returns: VecDeque<f64>,
@@ -30,6 +31,21 @@ impl Statistics {
             k_histogram: vec![0; k_max as usize + 1],
             action_histogram: vec![0; num_actions as usize],
             ..Self::default()
+        }
+    }
+
+    /// Counts rows served with these `ks`.
+    pub(crate) fn served(&mut self, ks: &[u32]) {
+        for &k in ks {
+            self.k_histogram[k as usize] += 1;
+        }
+    }
+
+    /// Counts rows that [`Statistics::served`] counted as not served.
+    pub(crate) fn taken_back(&mut self, ks: &[u32]) {
+        self.batches_retried += 1;
+        for &k in ks {
+            self.k_histogram[k as usize] -= 1;
         }
     }
 

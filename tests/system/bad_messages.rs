@@ -3,7 +3,7 @@
 
 use driml_protocol::{
     AffinityUpdate, BatchReply, BatchRequest, Chunk, ChunkHeader, End, Goodbye, InsertReply, Kind,
-    PROTOCOL_VERSION, codec,
+    PROTOCOL_VERSION, RequestId, codec,
 };
 use driml_tests::{Client, Process, TestSystem};
 
@@ -202,6 +202,7 @@ fn everything_else_that_a_replay_server_takes() {
             Kind::BatchRequest,
             hash ^ 1,
             &BatchRequest {
+                id: RequestId::first(7),
                 rows: 16,
                 shared_memory: false,
                 elsewhere: None,
@@ -222,6 +223,7 @@ fn everything_else_that_a_replay_server_takes() {
             Kind::BatchRequest,
             hash,
             &BatchRequest {
+                id: RequestId::first(7),
                 rows,
                 shared_memory: false,
                 elsewhere: None,

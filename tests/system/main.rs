@@ -11,6 +11,7 @@ mod evaluate;
 mod failures;
 mod local;
 mod lockstep;
+mod lost_batches;
 mod parity;
 mod procgen;
 mod repo_rules;

@@ -19,12 +19,16 @@ pub struct Draft {
     pub(crate) batch: Batch,
     /// No rows if the batch has its frames.
     pub(crate) packed: PackedStates,
+    /// k of each row, of several the furthest; 0 where there is none.
+    pub(crate) ks: Vec<u32>,
 }
 
 impl Draft {
     /// The batch; with compression this is where most of the work is.
     pub fn unpack(self) -> Batch {
-        let Self { mut batch, packed } = self;
+        let Self {
+            mut batch, packed, ..
+        } = self;
         packed.write(&mut batch);
         batch
     }

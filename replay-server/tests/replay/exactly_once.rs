@@ -1,8 +1,10 @@
-//! Every transition is stored once, over a network that delays, repeats and drops messages and their answers.
+//! Every transition is stored once and every batch counted once, over a network that delays, repeats and drops messages and
+//! their answers.
 //! It does not look at rows.
 
 use driml_protocol::{
-    AffinityUpdate, Chunk, ChunkHeader, End, Goodbye, Horizon, InsertReply, RunSpec, Waiting,
+    AffinityUpdate, Chunk, ChunkHeader, End, Goodbye, Horizon, InsertReply, Planes, RequestId,
+    RunSpec, Waiting,
 };
 use driml_replay_server::{ACTORS_MAX, Replay, STREAMS_MAX, Unready};
 use proptest::prelude::*;
@@ -91,6 +93,54 @@ proptest! {
         prop_assert_eq!(status.transitions_inserted, produced.iter().sum::<u64>());
         prop_assert_eq!((status.transitions_lost, status.transitions_duplicated), (0, 0));
         prop_assert_eq!(status.messages_refused, 0);
+    }
+
+    #[test]
+    fn batches_that_do_not_arrive_do_not_count(seed in any::<u64>(), askers in 1u64..4, batches in 1u64..30) {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut config = unlimited(10_000);
+        (config.replay_ratio, config.slack_transitions) = (1.0, 10_000);
+        config.transitions_max = Some(8 * batches);
+        let spec = spec(3, 1, 1, Horizon::Uniform { k_max: 3 });
+        let mut replay = Replay::new(&spec, &config, 8).unwrap();
+        for sequence in 0.. {
+            let header = ChunkHeader { steps: 4, ..header(0, 9, sequence, 8 * sequence) };
+            if insert(&mut replay, header) != stored(8 * (sequence + 1)) {
+                break;
+            }
+        }
+        let mut asked: Vec<_> = (0..askers).map(RequestId::first).collect();
+        let mut ks = vec![0; 4];
+        let (mut arrived, mut lost) = (0, 0);
+        // What was sent, overtaken requests too, in the order of its arrival.
+        let mut in_flight: Vec<RequestId> = vec![];
+        for _ in 0..20_000 {
+            if arrived == batches {
+                break;
+            }
+            let asker = rng.random_range(0..askers) as usize;
+            asked[asker] = asked[asker].again();
+            in_flight.push(asked[asker]);
+            let at = rng.random_range(0..in_flight.len());
+            let id = in_flight.remove(at);
+            in_flight.truncate(20);
+            let draft = replay.draw_for(id, 8, Planes::zeroed);
+            replay.check_valid();
+            let is_awaited = asked[id.asker as usize] == id;
+            match draft {
+                Ok(draft) if is_awaited && rng.random_bool(0.7) => {
+                    arrived += 1;
+                    draft.unpack().ks().iter().for_each(|&k| ks[usize::from(k)] += 1);
+                    asked[id.asker as usize] = id.next();
+                }
+                Ok(_) => lost += 1,
+                Err(Unready::Finished | Unready::Wait(_)) => {}
+                Err(refused) => panic!("{refused:?}"),
+            }
+        }
+        let status = replay.status();
+        prop_assert_eq!((arrived, status.rows_sampled), (batches, 8 * batches));
+        prop_assert_eq!((status.batches_retried, status.k_histogram), (lost, ks));
     }
 }
 

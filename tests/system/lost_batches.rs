@@ -1,0 +1,192 @@
+//! Batches that get lost between the replay server and the learner, which asks again: none counts twice.
+//! The replay server is played by the test, around the real replay; the learner's side is the real one.
+
+use std::{
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicU32, Ordering},
+    },
+    time::Duration,
+};
+
+use driml_learner::batch_source::{BatchSource, Next, Requests};
+use driml_protocol::{
+    BatchReply, BatchRequest, Chunk, ChunkHeader, Horizon, InsertReply, Keys, Kind, Planes,
+    RunSpec, Shutdown, TimeoutRule, codec,
+    session::{self, Endpoints},
+};
+use driml_replay_server::{Compression, Config, Replay};
+use zenoh::{
+    Session, Wait,
+    query::{Query, Queryable},
+};
+
+/// Rows of a batch.
+const ROWS: u32 = 16;
+/// Transitions of the run, sampled once each; whole chunks of 8 for one and for three shards.
+const TRANSITIONS: u64 = 384;
+/// Of each so many batches and parts of batches, one is lost.
+const LOSES: u32 = 4;
+
+fn spec() -> RunSpec {
+    RunSpec {
+        world: "chain".into(),
+        agent: "driml-randk".into(),
+        seed: 1,
+        frame_height: 4,
+        frame_width: 4,
+        frame_channels: 1,
+        frame_stack: 1,
+        num_actions: 3,
+        n_step: 1,
+        gamma: 0.99,
+        horizon: Horizon::Uniform { k_max: 2 },
+        timeout: TimeoutRule::Terminal,
+    }
+}
+
+fn config(shards: u32) -> Config {
+    Config {
+        capacity_transitions: 1_000,
+        shards,
+        compression: Compression::None,
+        compressed_bytes_max: None,
+        replay_ratio: 1.0,
+        warmup_transitions: 0,
+        slack_transitions: 1_000,
+        transitions_max: Some(TRANSITIONS),
+        study: None,
+    }
+}
+
+/// A shard that holds its share of the run.
+fn full(shard: u32, shards: u32) -> Replay {
+    let spec = spec();
+    let mut replay = Replay::shard(&spec, &config(shards), ROWS, shard).unwrap();
+    for sequence in 0..TRANSITIONS / 8 / u64::from(shards) {
+        let chunk = Chunk::zeroed(ChunkHeader {
+            actor: 0,
+            epoch: 1,
+            sequence,
+            first_transition: 8 * sequence,
+            weights_version: 1,
+            leaving: false,
+            streams: 1,
+            steps: 8,
+            frame_bytes: spec.frame_bytes() as u32,
+        });
+        let stored = replay.insert(&chunk);
+        assert!(matches!(stored, InsertReply::Stored { .. }), "{stored:?}");
+    }
+    replay
+}
+
+/// Answers as a replay server does, but for some batches, which it draws and does not send.
+fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
+    let hash = spec().hash();
+    let payload = query.payload().unwrap().to_bytes();
+    let (request, _): (BatchRequest, _) =
+        codec::decode(&payload, Kind::BatchRequest, Some(hash)).unwrap();
+    let mut replay = replay.lock().unwrap();
+    if let Some(elsewhere) = request.elsewhere {
+        replay.heard(elsewhere);
+    }
+    let message = match replay.draw_for(request.id, request.rows, Planes::zeroed) {
+        Ok(_) if drawn.fetch_add(1, Ordering::Relaxed).is_multiple_of(LOSES) => return,
+        Ok(draft) => {
+            let (head, planes) = draft.unpack().seal(hash).unwrap();
+            [&head[..], &planes[..]].concat()
+        }
+        Err(unready) => {
+            codec::encode(Kind::BatchReply, hash, &BatchReply::from(unready), &[]).unwrap()
+        }
+    };
+    session::answer(query, message.into());
+}
+
+fn declare(
+    session: &Session,
+    key: String,
+    answer: impl Fn(&Query) + Send + Sync + 'static,
+) -> Queryable<()> {
+    let declared = session
+        .declare_queryable(key)
+        .callback(move |query| answer(&query));
+    declared.wait().unwrap()
+}
+
+/// Fetches all batches of a run from `shards` shards, of which some get lost.
+fn every_batch_comes_once(shards: u32) {
+    let folder = tempfile::tempdir().unwrap();
+    let keys = Keys::new("lossy").unwrap();
+    let hash = spec().hash();
+    let drawn = Arc::<AtomicU32>::default();
+    let (mut replays, mut declared, mut sessions) = (vec![], vec![], vec![]);
+    for shard in 0..shards {
+        let endpoint = format!("unixsock-stream/{}/{shard}.sock", folder.path().display());
+        let open = |listen, connect| session::open(&Endpoints { listen, connect }).unwrap();
+        let server = open(vec![endpoint.clone()], vec![]);
+        let replay = Arc::new(Mutex::new(full(shard, shards)));
+        let (asked, count) = (replay.clone(), drawn.clone());
+        let batches = declare(&server, keys.batch(), move |query| {
+            answer(query, &asked, &count)
+        });
+        let asked = replay.clone();
+        let status = declare(&server, keys.replay_status(), move |query| {
+            let status = asked.lock().unwrap().status();
+            let bytes = codec::encode(Kind::ReplayStatus, hash, &status, &[]).unwrap();
+            session::answer(query, bytes.into());
+        });
+        sessions.push(open(vec![], vec![endpoint]));
+        replays.push(replay);
+        declared.push((server, batches, status));
+    }
+    let requests = Requests {
+        rows: ROWS,
+        in_flight: 2,
+        shared_memory: false,
+    };
+    let stop = Shutdown::default();
+    let mut source = BatchSource::start(&sessions, &keys, hash, requests, &stop).unwrap();
+    let mut batches = 0;
+    loop {
+        match source.next(Duration::from_secs(60)).unwrap() {
+            Next::Batch(batch) => {
+                assert_eq!(batch.rows(), ROWS as usize);
+                batches += 1;
+            }
+            Next::Finished => break,
+            Next::NotYet => panic!("no batch in a minute, after {batches}"),
+        }
+    }
+    assert_eq!(batches * u64::from(ROWS), TRANSITIONS);
+    let statuses: Vec<_> = replays
+        .iter()
+        .map(|replay| {
+            let replay = replay.lock().unwrap();
+            replay.check_valid();
+            replay.status()
+        })
+        .collect();
+    let sampled: u64 = statuses.iter().map(|status| status.rows_sampled).sum();
+    let retried: u64 = statuses.iter().map(|status| status.batches_retried).sum();
+    assert_eq!(sampled, TRANSITIONS);
+    let lost = drawn.load(Ordering::Relaxed).div_ceil(LOSES);
+    assert!(
+        lost >= 5,
+        "of so many batches as there are, some were to get lost: {lost}"
+    );
+    assert_eq!(retried, u64::from(lost));
+    drop(declared);
+    source.end();
+}
+
+#[test]
+fn lost_batches_do_not_count() {
+    every_batch_comes_once(1);
+}
+
+#[test]
+fn lost_parts_of_batches_do_not_count() {
+    every_batch_comes_once(3);
+}
