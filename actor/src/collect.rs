@@ -10,6 +10,17 @@ use crate::{
     acting::Acting, config::ActorSettings, policy::NetworkPolicy, recorder::Recorder, schedule,
 };
 
+/// Which actor this is, and which life of it.
+#[derive(Clone, Copy, Debug)]
+pub struct Life {
+    /// Its number, unique in the run.
+    pub actor: u32,
+    /// Tells this life of it from others; it does not influence what is computed.
+    pub epoch: u64,
+    /// Updates after which the run goes on: a resumed run does not play the episodes of its start again.
+    pub after_updates: u64,
+}
+
 /// An actor that collects.
 pub struct Collector {
     settings: ActorSettings,
@@ -20,22 +31,21 @@ pub struct Collector {
 }
 
 impl Collector {
-    /// Makes the world and the policy with its first weights; chunks lie in memory of `pool`. `epoch` tells this life of actor `actor` from others;
-    /// it does not influence what is computed.
+    /// Makes the world and the policy with its first weights; chunks lie in memory of `pool`.
     ///
     /// # Errors
     /// A world that cannot be made or does not fit the run spec, or weights that do not fit the model.
     pub fn new(
         settings: ActorSettings,
         pool: PlanesPool,
-        actor: u32,
-        epoch: u64,
+        life: Life,
         weights_version: u64,
         safetensors: &[u8],
     ) -> anyhow::Result<Self> {
         let spec = &settings.spec;
         let config = &settings.actor;
-        let world_seed = spec.seed_for("world", u64::from(actor));
+        let stream = u64::from(life.actor) | life.after_updates << u32::BITS;
+        let world_seed = spec.seed_for("world", stream);
         let world = driml_envs::make_world(
             &settings.world,
             config.envs as usize,
@@ -62,14 +72,14 @@ impl Collector {
              write the run's settings anew with `driml local`",
             spec.world
         );
-        let rng = ChaCha8Rng::from_seed(spec.seed_for("exploration", u64::from(actor)));
+        let rng = ChaCha8Rng::from_seed(spec.seed_for("exploration", stream));
         let policy = NetworkPolicy::new(&settings.model, (shape.height, shape.width), safetensors)?;
         Ok(Self {
             acting: Acting::new(world, spec.frame_stack as usize, rng)?,
             recorder: Recorder::new(
                 pool,
-                actor,
-                epoch,
+                life.actor,
+                life.epoch,
                 config.envs,
                 config.steps_per_chunk,
                 spec.frame_bytes() as u32,

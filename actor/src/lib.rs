@@ -14,6 +14,6 @@ mod run;
 pub mod schedule;
 mod weight_watch;
 
-pub use collect::Collector;
+pub use collect::{Collector, Life};
 pub use config::{ActorSettings, Config, ConfigError, InputSize};
 pub use run::{RunArgs, run};

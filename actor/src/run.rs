@@ -11,7 +11,7 @@ use driml_protocol::{
 use zenoh::Wait;
 
 use crate::{
-    collect::Collector,
+    collect::{Collector, Life},
     config::ActorSettings,
     delivery::{Delivery, DeliveryLimits},
     weight_watch,
@@ -64,8 +64,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let mut collector = Collector::new(
         settings,
         pool.clone(),
-        args.actor,
-        new_epoch(),
+        Life {
+            actor: args.actor,
+            epoch: new_epoch(),
+            after_updates: hello.after_updates,
+        },
         header.version,
         &weights,
     )?;

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Measures and trains on a machine with an NVIDIA GPU: driml doctor, parity and speed on the device, PyTorch on the same
 # device, then whole runs for so many minutes each. Steps that are done are not done again: a call with the same --out goes
-# on with the next. A run that was cut off begins anew, as `driml local` cannot resume one.
+# on with the next, and a run that was cut off from its newest checkpoint, for the minutes that it lacks.
 # THIS SCRIPT HAS NOT BEEN RUN ON A GPU. It was written and checked on a machine that has none, where it ends at the start.
 
 set -euo pipefail
@@ -81,15 +81,21 @@ step() {
 
 # One whole run of game $1 and agent $2, ended as by Ctrl-C when its time is over: then it saves and writes its summary.
 train() {
-    local game=$1 agent=$2 folder code=0
+    local game=$1 agent=$2 folder code=0 spent=0 what
     folder=$out/runs/$game-$agent-$seed
-    if [ -e "$folder" ]; then
+    what=(--env "procgen:$game" --agent "$agent" --seed "$seed" --run-dir "$folder")
+    if compgen -G "$folder/checkpoints/checkpoint-*[0-9]" >/dev/null; then
+        what=(--resume "$folder")
+        # The first column of its last row, in whole seconds; none if there is only the header.
+        spent=$(tail -n 1 "$folder/metrics.csv" | sed -En 's/^([0-9]+)\.[0-9]+,.*/\1/p')
+    elif [ -e "$folder" ]; then
         mkdir -p "$out/cut-off"
         mv "$folder" "$out/cut-off/$(basename "$folder")-$(date +%s)"
     fi
-    timeout --foreground --signal=INT --kill-after=300 "${minutes}m" \
-        "$driml" local --env "procgen:$game" --agent "$agent" --device "$device" --seed "$seed" --run-dir "$folder" || code=$?
-    # 124: the time was over. 130 is a person's Ctrl-C, after which the run is made anew.
+    local left=$((minutes * 60 - ${spent:-0}))
+    [ "$left" -ge 60 ] || left=60
+    timeout --foreground --signal=INT --kill-after=300 "${left}s" "$driml" local "${what[@]}" --device "$device" || code=$?
+    # 124: the time was over. 130 is a person's Ctrl-C, after which the same call goes on with the run.
     [ "$code" = 0 ] || [ "$code" = 124 ] || return "$code"
     [ -f "$folder/summary.json" ]
 }

@@ -68,7 +68,8 @@ impl Part {
     ) -> anyhow::Result<Self> {
         let log = logs.join(format!("{name}.log"));
         let program = std::env::current_exe().context("finding this program's own file")?;
-        let file = File::create(&log).with_context(|| format!("making {}", log.display()))?;
+        let file = File::options().create(true).append(true).open(&log);
+        let file = file.with_context(|| format!("making {}", log.display()))?;
         let mut command = Command::new(program);
         suit_candle(&mut command, threads);
         let mut child = command

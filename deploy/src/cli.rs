@@ -96,6 +96,21 @@ pub(crate) enum Fault {
     BootstrapFromNextState,
 }
 
+/// What a resumed run has settled: all but how long it is and where its learner computes.
+const RESUMED: [&str; 11] = [
+    "env",
+    "agent",
+    "preset",
+    "config",
+    "actors",
+    "replay_shards",
+    "envs",
+    "seed",
+    "sets",
+    "run_dir",
+    "lockstep",
+];
+
 #[derive(Debug, Args)]
 pub(crate) struct LocalArgs {
     #[command(flatten)]
@@ -103,6 +118,9 @@ pub(crate) struct LocalArgs {
     /// Where settings, metrics, checkpoints, logs and summary go [default: runs/WORLD-AGENT-seedS-TIME]
     #[arg(long, value_name = "DIR")]
     pub(crate) run_dir: Option<PathBuf>,
+    /// Go on with the interrupted run in this folder, from its newest checkpoint and with its own settings
+    #[arg(long, value_name = "DIR", conflicts_with_all = RESUMED)]
+    pub(crate) resume: Option<PathBuf>,
     /// What the learner computes on: cpu, cuda (the first GPU) or cuda:N [default: as the settings say, cpu]
     #[arg(long, value_name = "DEVICE")]
     pub(crate) device: Option<DeviceName>,
@@ -179,6 +197,9 @@ pub(crate) struct ReplayServerArgs {
     /// Which of the run's --replay-shards this is
     #[arg(long, value_name = "I", default_value_t = 0)]
     pub(crate) shard: u32,
+    /// Go on after so many updates: those of the newest checkpoint in the learner's run folder
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=u64::from(u32::MAX)))]
+    pub(crate) after_updates: u64,
     #[command(flatten)]
     pub(crate) run: RunFlags,
     #[command(flatten)]

@@ -10,6 +10,8 @@ use std::{
 use driml_protocol::{LearnerStatus, ReplayStatus};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
+use crate::resume::Behind;
+
 /// Rates are means over the last so much time.
 const RATE_WINDOW: Duration = Duration::from_secs(20);
 /// How often a line is written where there is no terminal.
@@ -100,10 +102,10 @@ pub(crate) struct Display {
 }
 
 impl Display {
-    /// A view of a run of so many frames and updates.
-    pub(crate) fn new(screen: Screen, frames_max: u64, updates_max: u64) -> Self {
+    /// A view of a run of so many frames and updates, with so much `behind` it.
+    pub(crate) fn new(screen: Screen, frames_max: u64, updates_max: u64, behind: Behind) -> Self {
         let mut rates = Rates::default();
-        rates.add(Instant::now(), 0, 0);
+        rates.add(Instant::now(), behind.frames, behind.updates);
         Self {
             screen,
             frames_max,
@@ -207,7 +209,7 @@ mod tests {
 
     #[test]
     fn the_view_says_what_a_person_wants_to_know() {
-        let mut display = Display::new(Screen { bar: None }, 200_000, 6_218);
+        let mut display = Display::new(Screen { bar: None }, 200_000, 6_218, Behind::default());
         let replay = ReplayStatus {
             transitions_inserted: 33_000,
             rows_sampled: 256_000,

@@ -26,6 +26,7 @@ mod plot;
 mod presets;
 mod processes;
 mod record;
+mod resume;
 mod statuses;
 
 use std::{
@@ -163,6 +164,7 @@ fn replay_server(args: ReplayServerArgs) -> anyhow::Result<()> {
         connect: args.connect,
         namespace: args.join.namespace,
         shard: args.shard,
+        after_updates: args.after_updates,
         config_toml: config.to_toml(),
     };
     driml_replay_server::run(run, &shutdown)

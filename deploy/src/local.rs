@@ -17,7 +17,7 @@ use crate::{
     error::{Usage, usage},
     lockstep,
     machine::Machine,
-    plan, presets, print, processes, ready_for, record,
+    plan, presets, print, processes, ready_for, record, resume,
 };
 
 const ENV: &str = "procgen:bigfish";
@@ -32,7 +32,17 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
     if let Some(device) = args.device {
         args.run.sets.push(format!("local.learner_device={device}"));
     }
-    let (config, from) = resolve(&args.run, &machine)?;
+    let (config, from, behind) = match &args.resume {
+        Some(folder) => {
+            let (config, behind) = resume::find(folder, &flags(&args.run), &machine)?;
+            let from = format!("its checkpoint after {} updates", behind.updates);
+            (config, from, Some(behind))
+        }
+        None => {
+            let (config, from) = resolve(&args.run, &machine)?;
+            (config, from, None)
+        }
+    };
     check_endpoints(args.listen.as_slice())?;
     ready_for(config.local.learner_device)?;
     let (shards, actors) = (config.replay.shards, config.local.actors);
@@ -42,13 +52,20 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
         )
         .into());
     }
-    let run_dir = args.run_dir.unwrap_or_else(|| default_run_dir(&config.run));
-    record::check_free(&run_dir)?;
+    let run_dir = match args.resume {
+        Some(folder) => folder,
+        None => {
+            let run_dir = args.run_dir.unwrap_or_else(|| default_run_dir(&config.run));
+            record::check_free(&run_dir)?;
+            run_dir
+        }
+    };
     print(&plan::describe(
         &config,
         &from,
         &run_dir,
         args.lockstep,
+        behind.unwrap_or_default(),
         &machine,
     ))?;
     if matches!(config.world, WorldConfig::Procgen(_)) {
@@ -63,7 +80,13 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
         }
         lockstep::run(&config, &run_dir, args.exit_with_parent)
     } else {
-        processes::run(&config, &run_dir, args.listen, args.exit_with_parent)
+        processes::run(
+            &config,
+            &run_dir,
+            behind,
+            args.listen,
+            args.exit_with_parent,
+        )
     }
 }
 
@@ -72,17 +95,6 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
 /// # Errors
 /// Flags or a file that cannot work.
 pub(crate) fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String), Usage> {
-    let flags = Flags {
-        actors: args.actors,
-        envs: args.envs,
-        frames: args.frames,
-        replay_shards: args.replay_shards,
-        seed: args.seed,
-        study: args.study.map(|fault| match fault {
-            Fault::BootstrapFromNextState => Study::BootstrapFromNextState,
-        }),
-        sets: args.sets.clone(),
-    };
     let (source, from) = match &args.config {
         Some(path) => {
             let name = path.display().to_string();
@@ -106,7 +118,21 @@ pub(crate) fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, 
             )
         }
     };
-    Ok((config::resolve(&source, &flags, machine)?, from))
+    Ok((config::resolve(&source, &flags(args), machine)?, from))
+}
+
+fn flags(args: &RunFlags) -> Flags {
+    Flags {
+        actors: args.actors,
+        envs: args.envs,
+        frames: args.frames,
+        replay_shards: args.replay_shards,
+        seed: args.seed,
+        study: args.study.map(|fault| match fault {
+            Fault::BootstrapFromNextState => Study::BootstrapFromNextState,
+        }),
+        sets: args.sets.clone(),
+    }
 }
 
 fn default_run_dir(run: &RunSpec) -> PathBuf {

@@ -7,7 +7,7 @@ use std::{
 };
 
 use anyhow::{Context, bail};
-use driml_actor::{ActorSettings, Collector};
+use driml_actor::{ActorSettings, Collector, Life};
 use driml_learner::{LearnerPart, Learning};
 use driml_protocol::{Batch, Goodbye, InsertReply, LearnerStatus, PlanesPool, Shutdown};
 use driml_replay_server::{Replay, Unready};
@@ -19,6 +19,7 @@ use crate::{
     print,
     processes::describe,
     record::{Outcome, Recorder},
+    resume::Behind,
 };
 
 /// How often progress is shown and recorded.
@@ -39,7 +40,12 @@ pub(crate) fn run(
     let mut recorder = Recorder::create(run_dir, &config.to_toml(), &[])?;
     let screen = Screen::new(config.frames());
     let mut parts = Parts::new(config)?;
-    let mut display = Display::new(screen.clone(), config.frames(), config.updates());
+    let mut display = Display::new(
+        screen.clone(),
+        config.frames(),
+        config.updates(),
+        Behind::default(),
+    );
     let mut shown = Instant::now();
     let folder = run_dir.join("checkpoints");
 
@@ -103,12 +109,16 @@ impl Parts {
             weights_sha256: header.sha256_hex(),
             ..LearnerStatus::default()
         };
-        let actor = |id| {
+        let actor = |actor| {
+            let life = Life {
+                actor,
+                epoch: EPOCH,
+                after_updates: 0,
+            };
             Collector::new(
                 settings.clone(),
                 PlanesPool::new(1),
-                id,
-                EPOCH,
+                life,
                 header.version,
                 &weights,
             )

@@ -10,6 +10,7 @@ use crate::{
     config::{COMPRESSED_FIELDS_BYTES, RunConfig, replay_bytes_each},
     display::duration,
     machine::Machine,
+    resume::Behind,
 };
 
 /// Arithmetic that a core sustains over a whole run, learner and actors together, in GFLOP/s.
@@ -106,12 +107,13 @@ pub(crate) fn estimate(config: &RunConfig, cores: u32) -> Duration {
     Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX)
 }
 
-/// The plan, one fact a line.
+/// The plan of a run that has so much `behind` it, one fact a line.
 pub(crate) fn describe(
     config: &RunConfig,
     from: &str,
     run_dir: &Path,
     lockstep: bool,
+    behind: Behind,
     machine: &Machine,
 ) -> String {
     let RunConfig {
@@ -127,6 +129,7 @@ pub(crate) fn describe(
         max.saturating_add(held * COMPRESSED_FIELDS_BYTES)
     });
     let bytes = compressed.min(held * replay_bytes_each(run));
+    let left = 1.0 - behind.updates as f64 / config.updates().max(1) as f64;
     let processes = if lockstep {
         "one, all parts in lockstep".into()
     } else {
@@ -175,7 +178,7 @@ pub(crate) fn describe(
             "time",
             format!(
                 "about {} (coarse: from the network's arithmetic)",
-                about(estimate(config, machine.cores))
+                about(estimate(config, machine.cores).mul_f64(left))
             ),
         ),
     ];
@@ -236,6 +239,7 @@ mod tests {
             "preset paper",
             Path::new("runs/x"),
             false,
+            Behind::default(),
             &MACHINE,
         );
         // The time depends on a measured constant.

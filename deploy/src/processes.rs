@@ -21,6 +21,7 @@ use crate::{
     interrupts::Interrupts,
     print,
     record::{Outcome, Recorder, Summary},
+    resume::Behind,
     statuses::Statuses,
 };
 
@@ -45,13 +46,14 @@ const DRAIN_POLL: Duration = Duration::from_millis(100);
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
 const PART_THREADS: u32 = 1;
 
-/// Trains with one process for each part, and leaves `run_dir`.
+/// Trains with one process for each part, and leaves `run_dir`; a run that is `resumed` has it already, and so much behind it.
 ///
 /// # Errors
 /// A part that failed or went silent, a file system that refuses; [`Interrupted`] if a person ended the run.
 pub(crate) fn run(
     config: &RunConfig,
     run_dir: &Path,
+    resumed: Option<Behind>,
     listen: Option<String>,
     exit_with_parent: bool,
 ) -> anyhow::Result<()> {
@@ -64,7 +66,13 @@ pub(crate) fn run(
         .chain(["learner".into()])
         .chain(actors)
         .collect();
-    let mut recorder = Recorder::create(run_dir, &config.to_toml(), &names)?;
+    let mut recorder = match resumed {
+        Some(behind) => {
+            Recorder::go_on(run_dir, &config.to_toml(), &names, behind, config.frames())?
+        }
+        None => Recorder::create(run_dir, &config.to_toml(), &names)?,
+    };
+    let behind = resumed.unwrap_or_default();
     // A unix socket's path must be short, so it lies beside other temporary files and not in the run folder.
     let meeting = tempfile::Builder::new()
         .prefix("driml-")
@@ -79,10 +87,11 @@ pub(crate) fn run(
         endpoints[0] = listen;
     }
     let screen = Screen::new(config.frames());
-    let display = Display::new(screen.clone(), config.frames(), config.updates());
+    let display = Display::new(screen.clone(), config.frames(), config.updates(), behind);
     let mut launch = Launch {
         config,
         run_dir,
+        behind,
         servers,
         endpoints,
         screen,
@@ -105,6 +114,10 @@ pub(crate) fn run(
     ran.and(ended)?;
     print(&describe(&summary, run_dir))?;
     if outcome == Outcome::Interrupted {
+        eprintln!(
+            "`driml local --resume {}` goes on with it",
+            run_dir.display()
+        );
         Err(Interrupted.into())
     } else {
         Ok(())
@@ -115,6 +128,7 @@ pub(crate) fn run(
 struct Launch<'a> {
     config: &'a RunConfig,
     run_dir: &'a Path,
+    behind: Behind,
     /// Names of the replay servers, one a shard, and where each listens.
     servers: Vec<String>,
     endpoints: Vec<String>,
@@ -157,13 +171,15 @@ impl Launch<'_> {
         };
         let exit = "--exit-with-parent";
         for (shard, (name, endpoint)) in self.servers.iter().zip(&self.endpoints).enumerate() {
-            let shard = shard.to_string();
+            let (shard, after) = (shard.to_string(), self.behind.updates.to_string());
             let mut args = part(&[
                 "replay-server",
                 "--listen",
                 endpoint,
                 "--shard",
                 &shard,
+                "--after-updates",
+                &after,
                 "--config",
                 &config,
                 exit,

@@ -2,8 +2,8 @@
 //! It reads no status from anywhere: whoever runs the parts hands them over.
 
 use std::{
-    fs::{self, File},
-    io::Write,
+    fs::{self, File, TryLockError},
+    io::{ErrorKind, Write},
     path::{Path, PathBuf},
     time::Instant,
 };
@@ -15,7 +15,11 @@ use serde::{Deserialize, Serialize};
 use crate::{
     display::{PAIRS, Rates},
     error::{Usage, usage},
+    resume::Behind,
 };
+
+const METRICS: &str = "metrics.csv";
+const SUMMARY: &str = "summary.json";
 
 /// How a run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -40,6 +44,10 @@ pub(crate) struct Summary {
     pub(crate) agent: String,
     /// The seed.
     pub(crate) seed: u64,
+    /// Updates that the run had behind it when it was resumed, the last time; 0 if it never was. What was lost, sent twice or
+    /// drawn is counted from there on, frames, updates, rows and episodes from the start.
+    #[serde(default)]
+    pub(crate) resumed_after_updates: u64,
     /// Frames that trained: transitions stored.
     pub(crate) frames: u64,
     /// Updates done.
@@ -91,6 +99,13 @@ pub(crate) struct Summary {
 /// Writes a run folder.
 #[derive(Debug)]
 pub(crate) struct Recorder {
+    /// Nobody else writes to the folder meanwhile.
+    _lock: File,
+    behind: Behind,
+    /// Seconds, frames and episodes in the last row before the run was resumed.
+    seconds_before: f64,
+    frames_before: u64,
+    episodes_before: u64,
     folder: PathBuf,
     metrics: csv::Writer<File>,
     processes: Vec<String>,
@@ -130,24 +145,68 @@ impl Recorder {
         check_free(folder)?;
         fs::create_dir_all(folder)
             .with_context(|| format!("making the run folder {}", folder.display()))?;
+        let lock = lock(folder)?;
+        let head = header(processes);
+        Self::begin(folder, config_toml, processes, lock, Rows::none(head))
+    }
+
+    /// Goes on to `frames_max` frames in the folder of an interrupted run, which has so much `behind` it: the rows of metrics up
+    /// to there stay.
+    ///
+    /// # Errors
+    /// A run that is still going on, metrics of other columns, or a file system that refuses.
+    pub(crate) fn go_on(
+        folder: &Path,
+        config_toml: &str,
+        processes: &[String],
+        behind: Behind,
+        frames_max: u64,
+    ) -> anyhow::Result<Self> {
+        let lock = lock(folder)?;
+        let rows = Rows::read(&folder.join(METRICS), header(processes), behind, frames_max)?;
+        match fs::remove_file(folder.join(SUMMARY)) {
+            Err(e) if e.kind() != ErrorKind::NotFound => {
+                return Err(e).with_context(|| format!("removing the last {SUMMARY}"));
+            }
+            _ => {}
+        }
+        let mut this = Self::begin(folder, config_toml, processes, lock, rows)?;
+        this.behind = behind;
+        this.rates = Rates::default();
+        this.rates.add(this.started, behind.frames, behind.updates);
+        Ok(this)
+    }
+
+    fn begin(
+        folder: &Path,
+        config_toml: &str,
+        processes: &[String],
+        lock: File,
+        rows: Rows,
+    ) -> anyhow::Result<Self> {
         let head = "# The resolved settings of this run; `driml local --config` with this file repeats it.\n\n";
         write_whole(
             &folder.join("config.toml"),
             format!("{head}{config_toml}").as_bytes(),
         )?;
-        let path = folder.join("metrics.csv");
-        let metrics =
-            csv::Writer::from_path(&path).with_context(|| format!("making {}", path.display()))?;
+        let path = folder.join(METRICS);
+        write_whole(&path, &rows.to_csv()?)?;
+        let file = File::options().append(true).open(&path);
+        let file = file.with_context(|| format!("opening {}", path.display()))?;
         let mut this = Self {
+            _lock: lock,
+            behind: Behind::default(),
+            seconds_before: rows.last("seconds").unwrap_or(0.0),
+            frames_before: rows.last("frames").unwrap_or(0),
+            episodes_before: rows.last("episodes").unwrap_or(0),
             folder: folder.to_owned(),
-            metrics,
+            metrics: csv::Writer::from_writer(file),
             processes: processes.to_vec(),
             rss_max: vec![None; processes.len()],
             started: Instant::now(),
             rates: Rates::default(),
         };
         this.rates.add(this.started, 0, 0);
-        this.write_header()?;
         Ok(this)
     }
 
@@ -156,44 +215,11 @@ impl Recorder {
         self.folder.join("config.toml")
     }
 
-    fn write_header(&mut self) -> anyhow::Result<()> {
-        let counts = [
-            "seconds",
-            "frames",
-            "updates",
-            "frames_per_second",
-            "updates_per_second",
-            "replay_ratio",
-            "episodes",
-            "mean_return",
-            "c51_kl",
-        ];
-        let rest = [
-            "total_loss",
-            "grad_norm",
-            "q_mean",
-            "mean_k",
-            "sd_k",
-            "mean_age",
-            "weights_version",
-            "affinity_version",
-            "actors",
-            "waiting",
-        ];
-        let dim = PAIRS.map(|pair| format!("dim_{pair}"));
-        let rss: Vec<_> = self
-            .processes
-            .iter()
-            .map(|name| format!("rss_mib_{}", name.replace('-', "_")))
-            .collect();
-        let counts = counts.map(String::from);
-        let rest = rest.map(String::from);
-        self.metrics
-            .write_record(counts.iter().chain(&dim).chain(&rest).chain(&rss))
-            .context("writing metrics.csv")
+    fn seconds(&self) -> f64 {
+        self.seconds_before + self.started.elapsed().as_secs_f64()
     }
 
-    /// Adds a row of metrics. `rss_mib` is in the order of the processes given at the start; none for one that ended.
+    /// Adds a row of metrics, in a resumed run once it is further than its last row. `rss_mib` is in the order of the processes given at the start; none for one that ended.
     ///
     /// # Errors
     /// A file system that refuses.
@@ -208,18 +234,23 @@ impl Recorder {
         for (max, now) in self.rss_max.iter_mut().zip(rss_mib) {
             *max = now.map_or(*max, |now| Some(max.map_or(now, |max: f64| max.max(now))));
         }
+        let (frames, updates) = (replay.transitions_inserted, learner.updates);
+        let resumed = self.behind.updates > 0;
+        if resumed && (updates <= self.behind.updates || frames < self.frames_before) {
+            return Ok(());
+        }
         let (frames_rate, updates_rate) = self.rates.per_second();
         let some = |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.6}"));
         // What has not been computed is left empty: a 0 would look like a loss.
         let computed = |value: f64| some((learner.updates > 0).then_some(value));
         let mut row = vec![
-            format!("{:.3}", self.started.elapsed().as_secs_f64()),
+            format!("{:.3}", self.seconds()),
             replay.transitions_inserted.to_string(),
             learner.updates.to_string(),
             format!("{frames_rate:.2}"),
             format!("{updates_rate:.3}"),
             some(replay.replay_ratio()),
-            replay.episodes.to_string(),
+            (self.episodes_before + replay.episodes).to_string(),
             some(replay.mean_return),
             computed(learner.c51_kl.into()),
         ];
@@ -255,25 +286,29 @@ impl Recorder {
         replay: &ReplayStatus,
         learner: &LearnerStatus,
     ) -> anyhow::Result<Summary> {
-        let wall_seconds = self.started.elapsed().as_secs_f64();
+        let wall_seconds = self.seconds();
+        // A resumed run that did not get anywhere still has behind it what it had.
+        let frames = replay.transitions_inserted.max(self.behind.frames);
+        let updates = learner.updates.max(self.behind.updates);
         let rss = self.processes.iter().zip(&self.rss_max);
         let summary = Summary {
             outcome,
             world: run.world.clone(),
             agent: run.agent.clone(),
             seed: run.seed,
-            frames: replay.transitions_inserted,
-            updates: learner.updates,
+            resumed_after_updates: self.behind.updates,
+            frames,
+            updates,
             transitions_inserted: replay.transitions_inserted,
             transitions_lost: replay.transitions_lost,
             transitions_duplicated: replay.transitions_duplicated,
             rows_sampled: replay.rows_sampled,
             replay_ratio: replay.replay_ratio(),
-            episodes: replay.episodes,
+            episodes: self.episodes_before + replay.episodes,
             mean_return: replay.mean_return,
             wall_seconds,
-            frames_per_second: replay.transitions_inserted as f64 / wall_seconds,
-            updates_per_second: learner.updates as f64 / wall_seconds,
+            frames_per_second: frames as f64 / wall_seconds,
+            updates_per_second: updates as f64 / wall_seconds,
             mean_k: replay.mean_k(),
             k_histogram: replay.k_histogram.clone(),
             action_histogram: replay.action_histogram.clone(),
@@ -289,8 +324,136 @@ impl Recorder {
         };
         let mut text = serde_json::to_vec_pretty(&summary).context("writing summary.json")?;
         text.push(b'\n');
-        write_whole(&self.folder.join("summary.json"), &text)?;
+        write_whole(&self.folder.join(SUMMARY), &text)?;
         Ok(summary)
+    }
+}
+
+/// Keeps other launchers out of a run folder as long as the file is held.
+pub(crate) fn lock(folder: &Path) -> anyhow::Result<File> {
+    let path = folder.join(".lock");
+    let doing = || format!("locking {}", path.display());
+    let file = File::create(&path).with_context(doing)?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(usage!(
+            "the run in {} is still going on: end it first, or wait",
+            folder.display()
+        )
+        .into()),
+        Err(TryLockError::Error(e)) => Err(e).with_context(doing),
+    }
+}
+
+/// The columns of the metrics.
+fn header(processes: &[String]) -> Vec<String> {
+    let counts = [
+        "seconds",
+        "frames",
+        "updates",
+        "frames_per_second",
+        "updates_per_second",
+        "replay_ratio",
+        "episodes",
+        "mean_return",
+        "c51_kl",
+    ];
+    let rest = [
+        "total_loss",
+        "grad_norm",
+        "q_mean",
+        "mean_k",
+        "sd_k",
+        "mean_age",
+        "weights_version",
+        "affinity_version",
+        "actors",
+        "waiting",
+    ];
+    let dim = PAIRS.map(|pair| format!("dim_{pair}"));
+    let rss = processes
+        .iter()
+        .map(|name| format!("rss_mib_{}", name.replace('-', "_")));
+    let counts = counts.map(String::from).into_iter();
+    counts
+        .chain(dim)
+        .chain(rest.map(String::from))
+        .chain(rss)
+        .collect()
+}
+
+/// Rows of metrics that a run begins with.
+struct Rows {
+    header: Vec<String>,
+    rows: Vec<csv::StringRecord>,
+}
+
+impl Rows {
+    const fn none(header: Vec<String>) -> Self {
+        Self {
+            header,
+            rows: Vec::new(),
+        }
+    }
+
+    /// The rows of an interrupted run up to what it has `behind` it, of no more than `frames_max` frames.
+    fn read(
+        path: &Path,
+        header: Vec<String>,
+        behind: Behind,
+        frames_max: u64,
+    ) -> anyhow::Result<Self> {
+        let reading = || format!("reading {}", path.display());
+        let text = match fs::read(path) {
+            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(Self::none(header)),
+            read => read.with_context(reading)?,
+        };
+        // What follows the last line's end was cut off.
+        let whole = text.iter().rposition(|&byte| byte == b'\n');
+        let mut reader = csv::Reader::from_reader(&text[..whole.map_or(0, |end| end + 1)]);
+        let found = reader.headers().with_context(reading)?;
+        if !found.is_empty() && found != header {
+            return Err(usage!(
+                "{} has other columns than this program writes: go on with the version of driml that began the run",
+                path.display()
+            )
+            .into());
+        }
+        let mut this = Self::none(header);
+        let rows: Vec<_> = reader
+            .records()
+            .collect::<Result<_, _>>()
+            .with_context(reading)?;
+        for row in rows {
+            let count = |name| this.value::<u64>(&row, name);
+            let (Some(updates), Some(frames)) = (count("updates"), count("frames")) else {
+                return Err(usage!("{}: {row:?} is no row of metrics", path.display()).into());
+            };
+            // Actors run ahead: without the second condition a run that now ends sooner would end before its rows.
+            if updates <= behind.updates && frames <= frames_max {
+                this.rows.push(row);
+            }
+        }
+        Ok(this)
+    }
+
+    fn value<T: std::str::FromStr>(&self, row: &csv::StringRecord, name: &str) -> Option<T> {
+        let column = self.header.iter().position(|it| it == name)?;
+        row.get(column)?.parse().ok()
+    }
+
+    /// What the last row has in the column `name`.
+    fn last<T: std::str::FromStr>(&self, name: &str) -> Option<T> {
+        self.value(self.rows.last()?, name)
+    }
+
+    fn to_csv(&self) -> anyhow::Result<Vec<u8>> {
+        let mut csv = csv::Writer::from_writer(Vec::new());
+        csv.write_record(&self.header)?;
+        for row in &self.rows {
+            csv.write_record(row)?;
+        }
+        Ok(csv.into_inner()?)
     }
 }
 
@@ -410,6 +573,67 @@ mod tests {
         }
         assert_eq!(json["outcome"], "finished");
         assert_eq!(json["rss_mib_max"]["replay-server"], 12.0);
+    }
+
+    #[test]
+    fn a_resumed_run_goes_on_in_its_metrics() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = folder.path().join("run");
+        let processes = ["replay-server".into()];
+        let mut recorder = Recorder::create(&run, "[run]\n", &processes).unwrap();
+        let (mut replay, mut learner) = statuses();
+        for (frames, updates, episodes) in [(1_000, 0, 1), (2_000, 31, 7), (3_000, 62, 9)] {
+            (replay.transitions_inserted, replay.episodes) = (frames, episodes);
+            learner.updates = updates;
+            recorder.record(&replay, &learner, &[]).unwrap();
+        }
+        let behind = Behind {
+            updates: 31,
+            frames: 2_000,
+        };
+        let said = Recorder::go_on(&run, "", &processes, behind, 9_999).unwrap_err();
+        assert!(said.to_string().contains("is still going on"), "{said}");
+        recorder
+            .finish(Outcome::Interrupted, &spec(), &replay, &learner)
+            .unwrap();
+        drop(recorder);
+        // A launcher that was killed while it wrote.
+        let path = run.join("metrics.csv");
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, format!("{text}9.0,40")).unwrap();
+
+        let other = ["replay-server".into(), "actor-0".into()];
+        let said = Recorder::go_on(&run, "", &other, behind, 9_999).unwrap_err();
+        assert!(said.to_string().contains("has other columns"), "{said}");
+        let mut recorder = Recorder::go_on(&run, "[new]\n", &processes, behind, 9_999).unwrap();
+        assert!(!run.join("summary.json").exists());
+        // While the replay fills again nothing is new.
+        (replay.transitions_inserted, replay.episodes) = (1_500, 1);
+        learner.updates = 31;
+        recorder.record(&replay, &learner, &[]).unwrap();
+        (replay.transitions_inserted, replay.episodes) = (2_100, 2);
+        learner.updates = 32;
+        recorder.record(&replay, &learner, &[]).unwrap();
+        let summary = recorder
+            .finish(Outcome::Finished, &spec(), &replay, &learner)
+            .unwrap();
+        let counts = (summary.frames, summary.updates, summary.episodes);
+        assert_eq!(counts, (2_100, 32, 7 + 2));
+        assert_eq!(summary.resumed_after_updates, 31);
+        let all = Behind {
+            updates: 99,
+            ..behind
+        };
+        let read = |frames_max| Rows::read(&path, header(&processes), all, frames_max).unwrap();
+        assert_eq!(read(2_050).rows.len(), 2);
+        let rows = read(9_999);
+        let column = |name| -> Vec<f64> {
+            let values = rows.rows.iter().map(|row| rows.value(row, name).unwrap());
+            values.collect()
+        };
+        assert_eq!(column("frames"), [1_000.0, 2_000.0, 2_100.0]);
+        assert_eq!(column("episodes"), [1.0, 7.0, 9.0]);
+        assert!(column("seconds").is_sorted());
     }
 
     #[test]

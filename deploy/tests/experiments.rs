@@ -284,7 +284,17 @@ fn killed_and_resumed() {
         .unwrap();
     let run = root.path().join("x/runs/mspacman-c51-seed1");
     let deadline = Instant::now() + Duration::from_secs(60);
-    while !run.join("metrics.csv").exists() && Instant::now() < deadline {
+    let saved = |run: &Path| {
+        let checkpoints = fs::read_dir(run.join("checkpoints"));
+        checkpoints.map_or(0, |all| {
+            all.filter(|it| {
+                let name = it.as_ref().unwrap().file_name();
+                name.to_str().unwrap().starts_with("checkpoint-")
+            })
+            .count()
+        })
+    };
+    while saved(&run) == 0 && Instant::now() < deadline {
         std::thread::sleep(Duration::from_millis(20));
     }
     child.kill().unwrap();
@@ -293,16 +303,16 @@ fn killed_and_resumed() {
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(0), "{said}");
     assert!(
-        said.contains("mspacman-c51-seed1 was not finished"),
+        said.contains("mspacman-c51-seed1 goes on from its checkpoint"),
         "{said}"
     );
-    let summary = |folder: &Path| fs::read_to_string(folder.join("summary.json")).unwrap();
-    assert!(summary(&run).contains("\"finished\""));
-    let aside = summary(&run.with_file_name("mspacman-c51-seed1.unfinished-1"));
+    let summary = fs::read_to_string(run.join("summary.json")).unwrap();
     assert!(
-        aside.contains("\"interrupted\""),
-        "it was let save what it had: {aside}"
+        summary.contains("\"finished\"") && !summary.contains("\"resumed_after_updates\": 0,"),
+        "{summary}"
     );
+    let page = fs::read_to_string(root.path().join("x/README.md")).unwrap();
+    assert!(page.contains("1 of 1 runs were interrupted"), "{page}");
 }
 
 #[test]

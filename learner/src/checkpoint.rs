@@ -3,7 +3,7 @@
 
 use std::{
     collections::BTreeMap,
-    fs::{self, File},
+    fs::{self, File, TryLockError},
     io::{self, Write},
     path::{Path, PathBuf},
 };
@@ -25,6 +25,7 @@ const ONLINE: &str = "online.safetensors";
 const TARGET: &str = "target.safetensors";
 const OPTIMIZER: &str = "optimizer.safetensors";
 const STATE: &str = "state.json";
+const LOCK: &str = ".lock";
 const STATE_SUM: &str = "state.json.sha256";
 
 /// Why a checkpoint was not written or not read.
@@ -67,6 +68,9 @@ pub enum CheckpointError {
     /// The state does not fit the network or the settings.
     #[error("checkpoint: {0}")]
     Update(#[from] UpdateError),
+    /// Another learner saves in the folder.
+    #[error("another learner saves in {}: wait until it has ended, or choose another folder", .0.display())]
+    InUse(PathBuf),
     /// The number of checkpoints to keep is 0.
     #[error("at least one checkpoint must be kept")]
     KeepNone,
@@ -186,6 +190,21 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
         fs::remove_dir_all(old).map_err(io_error("remove", old))?;
     }
     Ok(path)
+}
+
+/// Keeps other learners from saving in `folder`, which is made, as long as the file is held.
+///
+/// # Errors
+/// Another learner saves there, or the file system refuses.
+pub fn lock(folder: &Path) -> Result<File, CheckpointError> {
+    fs::create_dir_all(folder).map_err(io_error("create", folder))?;
+    let path = folder.join(LOCK);
+    let file = File::create(&path).map_err(io_error("create", &path))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(CheckpointError::InUse(folder.to_owned())),
+        Err(TryLockError::Error(why)) => Err(io_error("lock", &path)(why)),
+    }
 }
 
 /// The checkpoints in `folder`, oldest first, as (updates, path). A folder that does not exist has none.

@@ -12,6 +12,7 @@ use driml_protocol::{Keys, Shutdown};
 
 use crate::{
     batch_source::{BatchSource, Next, Requests},
+    checkpoint,
     config::LearnerPart,
     learning::Learning,
     publish::Outlets,
@@ -54,11 +55,34 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         shared_memory: part.transport.shared_memory,
     };
     let folder = args.run_dir.join("checkpoints");
+    let _lock = checkpoint::lock(&folder)?;
     let mut learning = Learning::resume(part, &compute, &folder)?;
+    anyhow::ensure!(
+        learning.updates() >= shards.after_updates,
+        "the replay server goes on after {} updates, the newest checkpoint in {} has {}: start the replay server with \
+         --after-updates {}, or choose the folder of the run",
+        shards.after_updates,
+        folder.display(),
+        learning.updates(),
+        learning.updates()
+    );
+    if shards.is_new && learning.updates() > 0 {
+        let updates = learning.updates();
+        tracing::warn!(
+            "the replay server counts from the start, so the {updates} updates of the checkpoint come on top of the run's; to go \
+             on where it was, start the replay server with --after-updates {updates}"
+        );
+    }
     keep_settings(&args.run_dir, &shards.config_toml)?;
     let spec_hash = learning.spec_hash();
     let outlets = Outlets::open(&shards.sessions, &keys, spec_hash, shutdown)?;
     outlets.publish(learning.next_weights()?)?;
+    if learning.updates() > 0 {
+        outlets.with_status(|status| status.updates = learning.updates());
+        if let Some(affinity) = learning.affinity_update() {
+            outlets.send_affinity(affinity);
+        }
+    }
     let mut batches = BatchSource::start(&shards.sessions, &keys, spec_hash, requests, shutdown)?;
     tracing::info!(
         "learning on {} from batches of {} rows, run {spec_hash:016x}",

@@ -13,6 +13,10 @@ use zenoh::{Session, Wait};
 pub(crate) struct Shards {
     pub(crate) sessions: Vec<Session>,
     pub(crate) config_toml: String,
+    /// Updates after which the run goes on; 0 in a run from its start.
+    pub(crate) after_updates: u64,
+    /// Whether no shard has counted a transition yet.
+    pub(crate) is_new: bool,
 }
 
 impl Shards {
@@ -38,10 +42,17 @@ impl Shards {
             sessions.push(session);
             hellos.push(hello);
         }
-        let config_toml = one_run(connect, &hellos)?;
+        let Hello {
+            config_toml,
+            after_updates,
+            ..
+        } = one_run(connect, &hellos)?.clone();
+        let is_new = hellos.iter().all(|hello| hello.inserted_total == 0);
         Ok(Some(Self {
             sessions,
             config_toml,
+            after_updates,
+            is_new,
         }))
     }
 
@@ -56,8 +67,8 @@ impl Shards {
     }
 }
 
-/// The settings of the one run whose shards all these are.
-fn one_run(connect: &[String], hellos: &[Hello]) -> anyhow::Result<String> {
+/// What the shards say of the one run that they all belong to.
+fn one_run<'a>(connect: &[String], hellos: &'a [Hello]) -> anyhow::Result<&'a Hello> {
     let first = hellos
         .first()
         .context("no endpoint of a replay server was given")?;
@@ -67,6 +78,13 @@ fn one_run(connect: &[String], hellos: &[Hello]) -> anyhow::Result<String> {
             hello.config_toml == first.config_toml,
             "{endpoint} and {} are replay servers of runs with different settings: start both with the same",
             connect[0]
+        );
+        ensure!(
+            hello.after_updates == first.after_updates,
+            "{} and {endpoint} go on after {} and after {} updates: start both with the same --after-updates",
+            connect[0],
+            first.after_updates,
+            hello.after_updates
         );
         if let Some(earlier) = hellos[..at].iter().position(|it| it.shard.0 == shard) {
             anyhow::bail!(
@@ -81,7 +99,7 @@ fn one_run(connect: &[String], hellos: &[Hello]) -> anyhow::Result<String> {
         "the run's replay has {count} shards, {} endpoints were given: give --connect once for each shard",
         hellos.len()
     );
-    Ok(first.config_toml.clone())
+    Ok(first)
 }
 
 /// What is known of one shard.
@@ -201,6 +219,7 @@ mod tests {
         let hello = |config: &str, shard| Hello {
             config_toml: config.into(),
             inserted_total: 0,
+            after_updates: 0,
             shard,
         };
         let connect = ["a".to_owned(), "b".to_owned()];
@@ -210,6 +229,9 @@ mod tests {
         assert!(said(&[hello("x", (0, 3)), hello("x", (1, 3))]).contains("has 3 shards"));
         assert!(said(&[hello("x", (0, 2))]).contains("has 2 shards"));
         let whole = [hello("x", (1, 2)), hello("x", (0, 2))];
-        assert_eq!(one_run(&connect, &whole).unwrap(), "x");
+        assert_eq!(one_run(&connect, &whole).unwrap().config_toml, "x");
+        let mut resumed = whole.clone();
+        resumed[1].after_updates = 7;
+        assert!(said(&resumed).contains("after 0 and after 7 updates"));
     }
 }

@@ -10,6 +10,8 @@ pub struct Hello {
     pub config_toml: String,
     /// Transitions that the run has stored, for the exploration schedule.
     pub inserted_total: u64,
+    /// Updates after which the run goes on, if it was resumed; 0 in a run from its start.
+    pub after_updates: u64,
     /// Which of the replay's shards this is, from 0, and how many there are.
     pub shard: (u32, u32),
 }

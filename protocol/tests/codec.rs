@@ -184,6 +184,7 @@ fn samples() -> Vec<Sample> {
     let hello = Hello {
         config_toml: "[run]\nseed = 1\n".into(),
         inserted_total: 12,
+        after_updates: 3,
         shard: (1, 2),
     };
     let goodbye = Goodbye {
@@ -587,6 +588,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
     let hello = Hello {
         config_toml: "x".repeat(HEADER_BYTES_MAX),
         inserted_total: 0,
+        after_updates: 0,
         shard: (0, 1),
     };
     let refused = codec::seal(Kind::Hello, SPEC, &hello, &[]).unwrap_err();

@@ -19,6 +19,9 @@ struct Args {
     /// Which of the replay's shards this is
     #[arg(long, default_value_t = 0)]
     shard: u32,
+    /// Go on after so many updates: those of the learner's newest checkpoint
+    #[arg(long, default_value_t = 0)]
+    after_updates: u64,
     /// Prefix of the run's keys
     #[arg(long, default_value = "driml")]
     namespace: String,
@@ -44,6 +47,7 @@ fn run(args: Args) -> anyhow::Result<()> {
         listen,
         config,
         shard,
+        after_updates,
         namespace,
     } = args;
     let config_toml = std::fs::read_to_string(&config)
@@ -53,6 +57,7 @@ fn run(args: Args) -> anyhow::Result<()> {
         connect: Vec::new(),
         namespace,
         shard,
+        after_updates,
         config_toml,
     };
     driml_replay_server::run(args, &shutdown)

@@ -40,6 +40,16 @@ impl RateLimiter {
         }
     }
 
+    /// The same, in a run that goes on after so much was counted here and in the replay's other shards.
+    #[must_use]
+    pub fn going_on_after(self, here: Tally, elsewhere: Tally) -> Self {
+        Self {
+            here,
+            elsewhere,
+            ..self
+        }
+    }
+
     /// Transitions stored in all shards.
     pub const fn inserted_total(&self) -> u64 {
         self.here.inserted.saturating_add(self.elsewhere.inserted)

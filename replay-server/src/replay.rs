@@ -12,7 +12,7 @@ use crate::{
     actors::{Actors, Difference, Verdict},
     anchors::Anchors,
     assemble::Assembler,
-    config::{self, Config, ConfigError},
+    config::{self, Config, ConfigError, SHARDS_MAX},
     episodes::{Episodes, Window},
     frames::{
         CompressedFrames, Compression, Draft, Frames, PackedChunk, PackedStates, Packer,
@@ -60,6 +60,8 @@ pub struct Replay {
     ring: Ring,
     actors: Actors,
     requests: Requests,
+    /// What was counted before the run was resumed.
+    before: Tally,
     limiter: RateLimiter,
     episodes: Episodes,
     anchors: Anchors,
@@ -132,6 +134,7 @@ impl Replay {
             ring,
             actors: Actors::default(),
             requests: Requests::default(),
+            before: Tally::default(),
             limiter: RateLimiter::new(
                 config.replay_ratio,
                 config.warmup_transitions,
@@ -147,6 +150,32 @@ impl Replay {
             statistics: Statistics::new(spec.horizon.k_max(), spec.num_actions),
             starving: false,
         })
+    }
+
+    /// The same replay in a run that is resumed after `updates` of the learner, with nothing held any more.
+    ///
+    /// It counts on from the transitions that these updates used up. Then warmup_transitions of new ones come in before the
+    /// next row is sampled, as at the start of the run; so the run steps its worlds that many times more than it counts.
+    #[must_use]
+    pub fn going_on_after(mut self, updates: u64, shard: u32) -> Self {
+        let rows = updates.saturating_mul(u64::from(self.batch_rows));
+        let inserted = (rows as f64 / self.config.replay_ratio) as u64;
+        let (shards, shard) = (u64::from(self.config.shards), u64::from(shard));
+        let share = |total: u64| total / shards + u64::from(shard < total % shards);
+        self.before = Tally {
+            inserted: share(inserted),
+            rows_sampled: share(rows),
+        };
+        let elsewhere = Tally {
+            inserted: inserted - self.before.inserted,
+            rows_sampled: rows - self.before.rows_sampled,
+        };
+        self.limiter = self.limiter.going_on_after(self.before, elsewhere);
+        // Not the numbers of the run's start again.
+        self.rng.set_stream(
+            (RNG_STREAM + shard).wrapping_add(updates.wrapping_mul(u64::from(SHARDS_MAX))),
+        );
+        self
     }
 
     /// Compresses chunks for this replay; it can do so while the replay is in use elsewhere.
@@ -494,7 +523,7 @@ impl Replay {
     pub fn status(&self) -> ReplayStatus {
         let statistics = &self.statistics;
         ReplayStatus {
-            transitions_inserted: self.ring.inserted(),
+            transitions_inserted: self.limiter.tally().inserted,
             transitions_held: self.ring.inserted() - self.ring.oldest(),
             frame_bytes_held: self.ring.frames().bytes_held(),
             transitions_lost: statistics.transitions_lost,
@@ -527,9 +556,14 @@ impl Replay {
             self.ring.inserted(),
             "every transition stored has one action"
         );
+        assert_eq!(
+            self.before.inserted + stored,
+            self.limiter.tally().inserted,
+            "every transition stored is counted"
+        );
         let served: u64 = self.statistics.k_histogram.iter().sum();
         assert_eq!(
-            served,
+            self.before.rows_sampled + served,
             self.limiter.tally().rows_sampled,
             "every row served has one k"
         );

@@ -50,6 +50,8 @@ pub struct RunArgs {
     pub namespace: String,
     /// Which of the replay's shards this is, from 0.
     pub shard: u32,
+    /// Updates of the learner after which the run goes on; 0 starts it.
+    pub after_updates: u64,
     /// The run's resolved settings, which it hands to whoever joins.
     pub config_toml: String,
 }
@@ -64,7 +66,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     spec.validate()?;
     let config: Config = settings.table("replay")?;
     let batch_rows = batch_rows(&settings)?;
-    let replay = Replay::shard(&spec, &config, batch_rows, args.shard)?;
+    let mut replay = Replay::shard(&spec, &config, batch_rows, args.shard)?;
+    if args.after_updates > 0 {
+        replay = replay.going_on_after(args.after_updates, args.shard);
+    }
     let transport: TransportConfig = settings.table("transport")?;
     let pool = if transport.shared_memory {
         let bytes = replay.batch_header(batch_rows).planes_bytes();
@@ -81,6 +86,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         spec_hash: spec.hash(),
         num_actions: spec.num_actions,
         shard: (args.shard, config.shards),
+        after_updates: args.after_updates,
         config_toml: args.config_toml,
         pool,
         packer: replay.packer(),
@@ -135,6 +141,7 @@ struct Service {
     spec_hash: u64,
     num_actions: u32,
     shard: (u32, u32),
+    after_updates: u64,
     config_toml: String,
     /// Memory for chunks that arrive and batches that leave.
     pool: PlanesPool,
@@ -211,6 +218,7 @@ impl Service {
         let hello = Hello {
             config_toml: self.config_toml.clone(),
             inserted_total,
+            after_updates: self.after_updates,
             shard: self.shard,
         };
         self.reply(query, Kind::Hello, &hello);

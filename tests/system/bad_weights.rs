@@ -147,6 +147,7 @@ fn parts_of_another_protocol_version_do_not_join() {
     let hello = Hello {
         config_toml: String::new(),
         inserted_total: 0,
+        after_updates: 0,
         shard: (0, 1),
     };
     let mut newer = codec::encode(Kind::Hello, 0, &hello, &[]).unwrap();

@@ -15,6 +15,7 @@ mod lost_batches;
 mod parity;
 mod procgen;
 mod repo_rules;
+mod resume;
 
 use driml_tests::TestSystem;
 

@@ -1,5 +1,6 @@
 //! Whole runs as pieces of an experiment: `driml local` as child processes, a few at once, each in a folder of its own.
-//! A finished run is not run again; an unfinished one is moved aside and started anew. It knows no experiment.
+//! A finished run is not run again; an unfinished one is resumed, or moved aside and started anew if it cannot be. It knows no
+//! experiment.
 
 use std::{
     collections::VecDeque,
@@ -20,9 +21,11 @@ use nix::{
 use super::{Progress, Session, session::write_whole};
 use crate::{
     EXIT_USAGE,
+    config::Flags,
     error::usage,
     machine::Machine,
     record::{Outcome, Summary},
+    resume,
 };
 
 /// Times that a run is tried in one call. A run may lose contact with its parts on a machine that is busy with much else.
@@ -135,11 +138,10 @@ struct Running {
 impl Queue {
     /// The plan's run, if it is there, was made by this plan, and is whole and long enough.
     fn finished(&self, plan: &Plan) -> Option<Ran> {
-        let folder = self.root.join(&plan.name);
-        let made_by: Vec<String> = serde_json::from_slice(&fs::read(self.call(plan)).ok()?).ok()?;
-        if made_by != plan.args {
+        if !self.is_made_by(plan) {
             return None;
         }
+        let folder = self.root.join(&plan.name);
         last_row(&folder)?;
         let text = fs::read(folder.join("summary.json")).ok()?;
         let summary: Summary = serde_json::from_slice(&text).ok()?;
@@ -150,6 +152,13 @@ impl Queue {
             Outcome::Failed => false,
         };
         good.then_some(Ran { folder, summary })
+    }
+
+    /// Whether what lies in the plan's folder was begun by this very plan.
+    fn is_made_by(&self, plan: &Plan) -> bool {
+        let call = fs::read(self.call(plan)).ok();
+        let call = call.and_then(|text| serde_json::from_slice::<Vec<String>>(&text).ok());
+        call.is_some_and(|args| args == plan.args)
     }
 
     /// Starts and watches until nothing waits or runs.
@@ -252,7 +261,11 @@ impl Queue {
         self.wait_for_the_last(&log, &plan, progress)?;
         log.set_len(0).with_context(doing)?;
         let folder = self.root.join(&plan.name);
-        if let Some(aside) = move_aside(&folder)? {
+        let can_go_on = self.is_made_by(&plan)
+            && resume::find(&folder, &Flags::default(), &Machine::this()).is_ok();
+        if can_go_on {
+            progress.line(&format!("{} goes on from its checkpoint", folder.display()));
+        } else if let Some(aside) = move_aside(&folder)? {
             progress.line(&format!(
                 "{} was not finished, or is of another call: it is now {}, and the run starts anew",
                 folder.display(),
@@ -263,11 +276,14 @@ impl Queue {
         write_whole(&self.call(&plan), &call)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
+        command.args(["local", "--exit-with-parent"]);
+        if can_go_on {
+            command.arg("--resume").arg(&folder);
+        } else {
+            command.arg("--run-dir").arg(&folder);
+            command.args(self.threads()).args(&plan.args);
+        }
         command
-            .args(["local", "--exit-with-parent", "--run-dir"])
-            .arg(&folder)
-            .args(self.threads())
-            .args(&plan.args)
             .stdin(Stdio::null())
             .stdout(log.try_clone().with_context(doing)?)
             .stderr(log)

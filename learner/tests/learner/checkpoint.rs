@@ -8,7 +8,7 @@ use std::{
 
 use driml_learner::{
     AffinityEstimator, Alphabet, LearnedAffinity, LearnedSettings, Learner,
-    checkpoint::{CheckpointError, RunState, list, load_latest, save},
+    checkpoint::{CheckpointError, RunState, list, load_latest, lock, save},
 };
 use driml_model::{Compute, Parameters};
 use rand::SeedableRng;
@@ -244,4 +244,15 @@ fn another_run_s_checkpoint_is_refused() {
     )
     .expect_err("another run");
     assert!(matches!(error, CheckpointError::OtherRun { .. }), "{error}");
+}
+
+#[test]
+fn one_learner_saves_in_a_folder() {
+    let folder = Folder::new("lock");
+    let held = lock(&folder.0).unwrap();
+    let said = lock(&folder.0).unwrap_err().to_string();
+    assert!(said.contains("another learner saves in"), "{said}");
+    assert_eq!(list(&folder.0).unwrap(), []);
+    drop(held);
+    lock(&folder.0).unwrap();
 }

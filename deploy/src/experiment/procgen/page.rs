@@ -89,6 +89,7 @@ pub(super) fn page(results: &Results, aggregates: &[Aggregate], adaptive: bool) 
                     settings.seeds
                 )
             }),
+            resumed(results),
             Some("Interquartile mean, probability of improvement and their intervals: Agarwal et al. 2021; 2,000 resamples of seeds \
              within each game. Normalisation: (return - min) / (max - min) with Cobbe et al. 2020, appendix C, mode easy. It \
              is made for single levels, so only returns of an episode a level are normalised."
@@ -101,6 +102,18 @@ pub(super) fn page(results: &Results, aggregates: &[Aggregate], adaptive: bool) 
         data,
         smoke: results.smoke,
     }
+}
+
+/// That runs were interrupted and went on, if any were.
+fn resumed(results: &Results) -> Option<String> {
+    let resumed = |cell: &&Cell| cell.ran.summary.resumed_after_updates > 0;
+    let count = results.cells.iter().filter(resumed).count();
+    (count > 0).then(|| {
+        format!(
+            "{count} of {} runs were interrupted and went on from a checkpoint, with a replay that had to fill again.",
+            results.cells.len()
+        )
+    })
 }
 
 fn percent(share: f64) -> String {

@@ -1,0 +1,136 @@
+//! Interrupted runs that are resumed: by Ctrl-C, by the death of all their processes; and what cannot be resumed.
+
+use std::fs;
+
+use driml_tests::{Process, RunFolder, TestSystem};
+use nix::sys::signal::Signal;
+
+use crate::{LONG, SHORT, system};
+
+/// A run that has learned something and saved it.
+fn launched(system: &TestSystem) -> Process {
+    let process = system.start(&format!(
+        "local --agent driml-ada {LONG} --listen {} --run-dir run",
+        system.endpoint()
+    ));
+    let client = system.connect();
+    client.wait_for_learner("some updates", |learner| learner.updates > 200);
+    process
+}
+
+/// Updates of the newest checkpoint.
+fn saved(run: &RunFolder) -> u64 {
+    let newest = run.checkpoints().pop().unwrap();
+    let name = newest.file_name().unwrap().to_str().unwrap().to_owned();
+    name.strip_prefix("checkpoint-").unwrap().parse().unwrap()
+}
+
+/// Resumes `run` for 156 updates more than it has, and checks what it leaves.
+fn resumes(system: &TestSystem) {
+    let run = system.run_folder("run");
+    let updates = saved(&run);
+    // 2 for each update of 16 rows at replay ratio 8, and 16 whole chunks of 32, of which 200 are warm-up.
+    let frames = 2 * updates + 16 * 32;
+    let ended = system
+        .run(&format!("local --resume run --frames {frames}"))
+        .expect_code(0);
+    let from = format!("from its checkpoint after {updates} updates");
+    assert!(ended.stdout.contains(&from), "{}", ended.stdout);
+    let summary = run.check_finished();
+    assert_eq!(summary.resumed_after_updates, updates);
+    assert_eq!(summary.updates, updates + 156);
+    assert!(summary.episodes > 0);
+
+    let (header, rows) = run.metrics();
+    for name in ["seconds", "frames", "updates", "episodes"] {
+        let at = header.iter().position(|it| it == name).unwrap();
+        let column: Vec<f64> = rows.iter().map(|row| row[at].parse().unwrap()).collect();
+        assert!(column.is_sorted(), "{name}: {column:?}");
+    }
+    let log = run.log("learner");
+    assert!(
+        log.contains(&format!("resumed after {updates} updates"))
+            && log.matches("learning on cpu").count() >= 2,
+        "{log}"
+    );
+}
+
+#[test]
+fn an_interrupted_run_goes_on() {
+    let system = system();
+    let process = launched(&system);
+    system
+        .run("local --resume run")
+        .expect_code(64)
+        .expect_said("is still going on");
+    process.signal(Signal::SIGINT);
+    process
+        .wait()
+        .expect_code(130)
+        .expect_said("`driml local --resume run` goes on with it");
+    resumes(&system);
+    // And once more, as it is finished now and longer runs may be wished for.
+    resumes(&system);
+    system
+        .run("local --resume run")
+        .expect_code(64)
+        .expect_said("to train on, add --frames with more than these");
+}
+
+#[test]
+fn a_run_whose_processes_were_all_killed_goes_on() {
+    let system = system();
+    let process = launched(&system);
+    let parts = ["replay-server", "learner", "actor"].map(|part| system.find_part(part));
+    process.signal(Signal::SIGKILL);
+    parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
+    process.wait();
+    // A save may have been cut off; what it leaves is no checkpoint.
+    for entry in fs::read_dir(system.path("run/checkpoints")).unwrap() {
+        let path = entry.unwrap().path();
+        if path.extension().is_some() {
+            fs::remove_dir_all(path).unwrap();
+        }
+    }
+    resumes(&system);
+}
+
+#[test]
+fn what_cannot_be_resumed() {
+    let system = system();
+    let refused = |args: &str, words: &str| {
+        system.run(args).expect_code(64).expect_said(words);
+    };
+    refused(
+        "local --resume nowhere",
+        "--resume takes the folder of a run that was interrupted",
+    );
+    refused("local --resume run --agent c51", "cannot be used with");
+    let run = format!("local --agent c51 {SHORT} --run-dir run");
+    system.run(&run).expect_code(0);
+    refused(
+        "local --resume run",
+        "is finished, 540 updates for 1280 frames",
+    );
+    fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
+    refused("local --resume run --frames 2000", "there is no checkpoint");
+}
+
+#[test]
+fn a_replay_server_goes_on_after_no_more_than_was_learned() {
+    let system = system();
+    let flags = format!("--agent c51 {SHORT} --after-updates 50");
+    let _server = system.start_replay_server(&flags);
+    let connect = system.endpoint();
+    system
+        .run(&format!("learner --connect {connect} --run-dir elsewhere"))
+        .expect_code(1)
+        .expect_said(
+            "goes on after 50 updates, the newest checkpoint in elsewhere/checkpoints has 0",
+        );
+    let status = system.connect().replay().unwrap();
+    assert_eq!(
+        (status.rows_sampled, status.transitions_inserted),
+        (50 * 16, 100)
+    );
+}
