@@ -21,7 +21,7 @@ use crate::{
     interrupts::Interrupts,
     print,
     record::{Outcome, Recorder, Summary},
-    resume::Behind,
+    resume::{self, Behind},
     statuses::Statuses,
 };
 
@@ -114,10 +114,12 @@ pub(crate) fn run(
     ran.and(ended)?;
     print(&describe(&summary, run_dir))?;
     if outcome == Outcome::Interrupted {
-        eprintln!(
-            "`driml local --resume {}` goes on with it",
-            run_dir.display()
-        );
+        if resume::can_go_on(&config.world) {
+            eprintln!(
+                "`driml local --resume {}` goes on with it",
+                run_dir.display()
+            );
+        }
         Err(Interrupted.into())
     } else {
         Ok(())

@@ -219,7 +219,8 @@ impl Recorder {
         self.seconds_before + self.started.elapsed().as_secs_f64()
     }
 
-    /// Adds a row of metrics, in a resumed run once it is further than its last row. `rss_mib` is in the order of the processes given at the start; none for one that ended.
+    /// Adds a row of metrics, in a resumed run once it is further than its last row. `rss_mib` is in the order of the processes
+    /// given at the start; none for one that ended.
     ///
     /// # Errors
     /// A file system that refuses.
@@ -414,7 +415,8 @@ impl Rows {
         let found = reader.headers().with_context(reading)?;
         if !found.is_empty() && found != header {
             return Err(usage!(
-                "{} has other columns than this program writes: go on with the version of driml that began the run",
+                "{} has other columns than a run of several processes by this version of driml: go on with the version that began it; a \
+                 run in --lockstep is repeated, not resumed",
                 path.display()
             )
             .into());

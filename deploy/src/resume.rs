@@ -29,6 +29,11 @@ pub(crate) struct Behind {
     pub(crate) frames: u64,
 }
 
+/// Whether a run in this world can be resumed: a checkpoint holds nothing of a world's own progress.
+pub(crate) const fn can_go_on(world: &WorldConfig) -> bool {
+    !matches!(world, WorldConfig::MsPacman(world) if world.lethal_schedule.is_some())
+}
+
 /// The settings with which the run in `folder` goes on, and what it has behind it.
 ///
 /// # Errors
@@ -48,9 +53,7 @@ pub(crate) fn find(
     let config = resolve(&Source::File(name, text), flags, machine)?;
     // Whether somebody is at it is asked here, and again when the run starts.
     record::lock(folder)?;
-    if let WorldConfig::MsPacman(world) = &config.world
-        && world.lethal_schedule.is_some()
-    {
+    if !can_go_on(&config.world) {
         return Err(usage!(
             "the ghosts of the run in {} change as episodes pass, and a checkpoint does not hold how far they are: start it anew",
             folder.display()
