@@ -96,7 +96,7 @@ pub(crate) enum Fault {
     BootstrapFromNextState,
 }
 
-/// What a resumed run has settled: all but how long it is and where its learner computes.
+/// What a resumed run has settled.
 const RESUMED: [&str; 11] = [
     "env",
     "agent",
@@ -106,7 +106,7 @@ const RESUMED: [&str; 11] = [
     "replay_shards",
     "envs",
     "seed",
-    "sets",
+    "study",
     "run_dir",
     "lockstep",
 ];
@@ -118,7 +118,8 @@ pub(crate) struct LocalArgs {
     /// Where settings, metrics, checkpoints, logs and summary go [default: runs/WORLD-AGENT-seedS-TIME]
     #[arg(long, value_name = "DIR")]
     pub(crate) run_dir: Option<PathBuf>,
-    /// Go on with the interrupted run in this folder, from its newest checkpoint and with its own settings
+    /// Go on with the interrupted run in this folder, from its newest checkpoint and with its own settings, but for --frames,
+    /// --device and --set
     #[arg(long, value_name = "DIR", conflicts_with_all = RESUMED)]
     pub(crate) resume: Option<PathBuf>,
     /// What the learner computes on: cpu, cuda (the first GPU) or cuda:N [default: as the settings say, cpu]

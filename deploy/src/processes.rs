@@ -114,7 +114,7 @@ pub(crate) fn run(
     ran.and(ended)?;
     print(&describe(&summary, run_dir))?;
     if outcome == Outcome::Interrupted {
-        if resume::can_go_on(&config.world) {
+        if resume::can_go_on(&config.world, run_dir) {
             eprintln!(
                 "`driml local --resume {}` goes on with it",
                 run_dir.display()
@@ -301,7 +301,9 @@ impl Launch<'_> {
                     Err(e) => tracing::debug!("the {name} did not answer: {e:#}"),
                 }
             }
-            let (replay, learner) = (statuses.replay.clone(), statuses.learner.clone());
+            let (replay, mut learner) = (statuses.replay.clone(), statuses.learner.clone());
+            // Until the learner has answered, too.
+            learner.updates = learner.updates.max(self.behind.updates);
             let rss: Vec<_> = self.parts.iter_mut().map(Part::rss_mib).collect();
             recorder.record(&replay, &learner, &rss)?;
             self.display.show(&replay, &learner);

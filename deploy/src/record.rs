@@ -44,8 +44,8 @@ pub(crate) struct Summary {
     pub(crate) agent: String,
     /// The seed.
     pub(crate) seed: u64,
-    /// Updates that the run had behind it when it was resumed, the last time; 0 if it never was. What was lost, sent twice or
-    /// drawn is counted from there on, frames, updates, rows and episodes from the start.
+    /// Updates that the run had behind it when it was resumed, the last time; 0 if it never was. The histograms, the mean return
+    /// and what was lost or sent twice are of what came since, all else is of the whole run.
     #[serde(default)]
     pub(crate) resumed_after_updates: u64,
     /// Frames that trained: transitions stored.
@@ -62,7 +62,7 @@ pub(crate) struct Summary {
     pub(crate) rows_sampled: u64,
     /// Rows per transition, both counted from the end of the warm-up.
     pub(crate) replay_ratio: Option<f64>,
-    /// Episodes that ended.
+    /// Episodes that ended, in a resumed run those too in which the replay filled again.
     pub(crate) episodes: u64,
     /// Mean undiscounted return of the last 100 episodes.
     pub(crate) mean_return: Option<f64>,
@@ -106,6 +106,8 @@ pub(crate) struct Recorder {
     seconds_before: f64,
     frames_before: u64,
     episodes_before: u64,
+    /// Mean and standard deviation of k up to there.
+    k_before: Option<(f64, f64)>,
     folder: PathBuf,
     metrics: csv::Writer<File>,
     processes: Vec<String>,
@@ -163,7 +165,11 @@ impl Recorder {
         frames_max: u64,
     ) -> anyhow::Result<Self> {
         let lock = lock(folder)?;
-        let rows = Rows::read(&folder.join(METRICS), header(processes), behind, frames_max)?;
+        let head = header(processes);
+        let rows = match behind.updates {
+            0 => Rows::none(head),
+            _ => Rows::read(&folder.join(METRICS), head, behind, frames_max)?,
+        };
         match fs::remove_file(folder.join(SUMMARY)) {
             Err(e) if e.kind() != ErrorKind::NotFound => {
                 return Err(e).with_context(|| format!("removing the last {SUMMARY}"));
@@ -199,6 +205,7 @@ impl Recorder {
             seconds_before: rows.last("seconds").unwrap_or(0.0),
             frames_before: rows.last("frames").unwrap_or(0),
             episodes_before: rows.last("episodes").unwrap_or(0),
+            k_before: rows.last("mean_k").zip(rows.last("sd_k")),
             folder: folder.to_owned(),
             metrics: csv::Writer::from_writer(file),
             processes: processes.to_vec(),
@@ -213,6 +220,21 @@ impl Recorder {
     /// The settings' file, for parts that read it.
     pub(crate) fn config_path(&self) -> PathBuf {
         self.folder.join("config.toml")
+    }
+
+    /// Mean and standard deviation of k over all `updates` of the run, before it was resumed too.
+    fn k(&self, replay: &ReplayStatus, updates: u64) -> Option<(f64, f64)> {
+        let since = replay.mean_k().zip(replay.sd_k());
+        let (Some(before), Some(since)) = (self.k_before, since) else {
+            return since.or(self.k_before);
+        };
+        // All updates are of as many rows.
+        let share = self.behind.updates as f64 / updates.max(1) as f64;
+        let mixed = |before: f64, since: f64| share * before + (1.0 - share) * since;
+        let square = |(mean, sd): (f64, f64)| mean * mean + sd * sd;
+        let mean = mixed(before.0, since.0);
+        let variance = mixed(square(before), square(since)) - mean * mean;
+        Some((mean, variance.max(0.0).sqrt()))
     }
 
     fn seconds(&self) -> f64 {
@@ -241,6 +263,7 @@ impl Recorder {
             return Ok(());
         }
         let (frames_rate, updates_rate) = self.rates.per_second();
+        let k = self.k(replay, updates);
         let some = |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.6}"));
         // What has not been computed is left empty: a 0 would look like a loss.
         let computed = |value: f64| some((learner.updates > 0).then_some(value));
@@ -260,8 +283,8 @@ impl Recorder {
             computed(learner.total.into()),
             computed(learner.grad_norm),
             computed(learner.q_mean.into()),
-            some(replay.mean_k()),
-            some(replay.sd_k()),
+            some(k.map(|(mean, _)| mean)),
+            some(k.map(|(_, sd)| sd)),
             format!("{:.1}", replay.mean_age),
             learner.weights_version.to_string(),
             replay.affinity_version.to_string(),
@@ -310,7 +333,7 @@ impl Recorder {
             wall_seconds,
             frames_per_second: frames as f64 / wall_seconds,
             updates_per_second: updates as f64 / wall_seconds,
-            mean_k: replay.mean_k(),
+            mean_k: self.k(replay, updates).map(|(mean, _)| mean),
             k_histogram: replay.k_histogram.clone(),
             action_histogram: replay.action_histogram.clone(),
             weights_version: learner.weights_version,
@@ -330,6 +353,13 @@ impl Recorder {
     }
 }
 
+/// Whether the run in `folder` came to its end.
+pub(crate) fn is_finished(folder: &Path) -> bool {
+    let text = fs::read(folder.join(SUMMARY)).ok();
+    let summary = text.and_then(|text| serde_json::from_slice::<Summary>(&text).ok());
+    summary.is_some_and(|it| it.outcome == Outcome::Finished)
+}
+
 /// Keeps other launchers out of a run folder as long as the file is held.
 pub(crate) fn lock(folder: &Path) -> anyhow::Result<File> {
     let path = folder.join(".lock");
@@ -342,7 +372,14 @@ pub(crate) fn lock(folder: &Path) -> anyhow::Result<File> {
             folder.display()
         )
         .into()),
-        Err(TryLockError::Error(e)) => Err(e).with_context(doing),
+        Err(TryLockError::Error(e)) => {
+            // Not every file system of a cluster has locks, and runs were made without them before.
+            tracing::warn!(
+                "{} cannot be locked: {e}; start no other run there",
+                path.display()
+            );
+            Ok(file)
+        }
     }
 }
 
@@ -584,6 +621,7 @@ mod tests {
         let processes = ["replay-server".into()];
         let mut recorder = Recorder::create(&run, "[run]\n", &processes).unwrap();
         let (mut replay, mut learner) = statuses();
+        // Mean k is 1.5 before the run is resumed, and 2 since.
         for (frames, updates, episodes) in [(1_000, 0, 1), (2_000, 31, 7), (3_000, 62, 9)] {
             (replay.transitions_inserted, replay.episodes) = (frames, episodes);
             learner.updates = updates;
@@ -614,13 +652,15 @@ mod tests {
         learner.updates = 31;
         recorder.record(&replay, &learner, &[]).unwrap();
         (replay.transitions_inserted, replay.episodes) = (2_100, 2);
-        learner.updates = 32;
+        replay.k_histogram = vec![0, 0, 5];
+        learner.updates = 62;
         recorder.record(&replay, &learner, &[]).unwrap();
         let summary = recorder
             .finish(Outcome::Finished, &spec(), &replay, &learner)
             .unwrap();
         let counts = (summary.frames, summary.updates, summary.episodes);
-        assert_eq!(counts, (2_100, 32, 7 + 2));
+        assert_eq!(counts, (2_100, 62, 7 + 2));
+        assert_eq!(summary.mean_k, Some(1.75), "31 updates at 1.5, 31 at 2");
         assert_eq!(summary.resumed_after_updates, 31);
         let all = Behind {
             updates: 99,
@@ -635,6 +675,9 @@ mod tests {
         };
         assert_eq!(column("frames"), [1_000.0, 2_000.0, 2_100.0]);
         assert_eq!(column("episodes"), [1.0, 7.0, 9.0]);
+        assert_eq!(column("mean_k"), [1.5, 1.5, 1.75]);
+        // Squares: 2.5 and 4 are 3.25 in the mean, 1.75^2 is 3.0625.
+        assert_eq!(column("sd_k"), [0.5, 0.5, 0.433013]);
         assert!(column("seconds").is_sorted());
     }
 

@@ -12,13 +12,16 @@ use driml_learner::checkpoint::{self, CheckpointError};
 
 use crate::{
     config::{Flags, RunConfig, Source, resolve},
-    error::{Usage, usage},
+    error::usage,
     machine::Machine,
     record,
 };
 
 /// How long the learner of a launcher that was killed may take to save.
 const SAVING_MAX: Duration = Duration::from_secs(120);
+
+/// Where a run's checkpoints lie in its folder.
+const CHECKPOINTS: &str = "checkpoints";
 
 /// What a run has behind it when it starts: nothing, or what its newest checkpoint has learned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -29,15 +32,51 @@ pub(crate) struct Behind {
     pub(crate) frames: u64,
 }
 
-/// Whether a run in this world can be resumed: a checkpoint holds nothing of a world's own progress.
-pub(crate) const fn can_go_on(world: &WorldConfig) -> bool {
+/// Whether the run in `folder`, which is in this world, can be resumed: it has a checkpoint, which holds nothing of a world's own
+/// progress.
+pub(crate) fn can_go_on(world: &WorldConfig, folder: &Path) -> bool {
+    let saved = checkpoint::list(&folder.join(CHECKPOINTS));
+    keeps_nothing(world) && saved.is_ok_and(|all| !all.is_empty())
+}
+
+/// Whether the world's episodes do not depend on how many were played before.
+const fn keeps_nothing(world: &WorldConfig) -> bool {
     !matches!(world, WorldConfig::MsPacman(world) if world.lethal_schedule.is_some())
+}
+
+/// Waits until the learner of the run in `folder` has saved, if the run was ended.
+///
+/// # Errors
+/// The run is still going on, or its learner takes too long.
+pub(crate) fn wait_until_free(folder: &Path) -> anyhow::Result<()> {
+    record::lock(folder)?;
+    let checkpoints = folder.join(CHECKPOINTS);
+    let started = Instant::now();
+    let mut said = false;
+    while checkpoints.is_dir() {
+        match checkpoint::lock(&checkpoints) {
+            Err(CheckpointError::InUse(_)) if started.elapsed() < SAVING_MAX => {
+                if !std::mem::replace(&mut said, true) {
+                    eprintln!(
+                        "a learner still saves in {}: waiting",
+                        checkpoints.display()
+                    );
+                }
+                std::thread::sleep(Duration::from_millis(250));
+            }
+            locked => {
+                locked?;
+                break;
+            }
+        }
+    }
+    Ok(())
 }
 
 /// The settings with which the run in `folder` goes on, and what it has behind it.
 ///
 /// # Errors
-/// A folder that is no run's, settings that cannot work, no checkpoint, nothing left to do, a learner that still saves.
+/// A folder that is no run's, settings that cannot work, no checkpoint, nothing left to do, somebody who is at it.
 pub(crate) fn find(
     folder: &Path,
     flags: &Flags,
@@ -50,18 +89,31 @@ pub(crate) fn find(
             "reading the settings {name}: {e}; --resume takes the folder of a run that was interrupted"
         )
     })?;
-    let config = resolve(&Source::File(name, text), flags, machine)?;
-    // Whether somebody is at it is asked here, and again when the run starts.
-    record::lock(folder)?;
-    if !can_go_on(&config.world) {
+    // First, as a run that is still ending holds memory.
+    wait_until_free(folder)?;
+    let flags = Flags {
+        study: RunConfig::parse(&name, &text)?.replay.study,
+        ..flags.clone()
+    };
+    let config = resolve(&Source::File(name, text), &flags, machine)?;
+    if !keeps_nothing(&config.world) {
         return Err(usage!(
             "the ghosts of the run in {} change as episodes pass, and a checkpoint does not hold how far they are: start it anew",
             folder.display()
         )
         .into());
     }
-    let updates = newest(&folder.join("checkpoints"))?;
-    if updates >= config.updates() {
+    let checkpoints = folder.join(CHECKPOINTS);
+    let all = checkpoint::list(&checkpoints).context("looking for checkpoints")?;
+    let Some(&(updates, _)) = all.last() else {
+        return Err(usage!(
+            "there is no checkpoint in {}: start the run anew, in another folder",
+            checkpoints.display()
+        )
+        .into());
+    };
+    // One that has all its updates and did not come to its end does so now.
+    if updates >= config.updates() && record::is_finished(folder) {
         return Err(usage!(
             "the run in {} is finished, {updates} updates for {} frames: to train on, add --frames with more than these",
             folder.display(),
@@ -76,35 +128,4 @@ pub(crate) fn find(
     let frames =
         config.replay.warmup_transitions + (rows / config.replay.replay_ratio).ceil() as u64;
     Ok((config, Behind { updates, frames }))
-}
-
-/// Updates of the newest checkpoint in `folder`, when nobody saves there any more.
-fn newest(folder: &Path) -> anyhow::Result<u64> {
-    let none = || -> Usage {
-        usage!(
-            "there is no checkpoint in {}: start the run anew, in another folder",
-            folder.display()
-        )
-    };
-    if !folder.is_dir() {
-        return Err(none().into());
-    }
-    let started = Instant::now();
-    loop {
-        match checkpoint::lock(folder) {
-            Err(CheckpointError::InUse(_)) if started.elapsed() < SAVING_MAX => {
-                if started.elapsed() < Duration::from_secs(1) {
-                    eprintln!("a learner still saves in {}: waiting", folder.display());
-                }
-                std::thread::sleep(Duration::from_secs(1));
-            }
-            locked => {
-                locked?;
-                break;
-            }
-        }
-    }
-    let all = checkpoint::list(folder).context("looking for checkpoints")?;
-    let (updates, _) = all.last().ok_or_else(none)?;
-    Ok(*updates)
 }

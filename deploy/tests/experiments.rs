@@ -284,17 +284,12 @@ fn killed_and_resumed() {
         .unwrap();
     let run = root.path().join("x/runs/mspacman-c51-seed1");
     let deadline = Instant::now() + Duration::from_secs(60);
-    let saved = |run: &Path| {
-        let checkpoints = fs::read_dir(run.join("checkpoints"));
-        checkpoints.map_or(0, |all| {
-            all.filter(|it| {
-                let name = it.as_ref().unwrap().file_name();
-                name.to_str().unwrap().starts_with("checkpoint-")
-            })
-            .count()
-        })
+    let has_learned = || {
+        let text = fs::read_to_string(run.join("metrics.csv")).unwrap_or_default();
+        let mut updates = text.lines().skip(1).filter_map(|row| row.split(',').nth(2));
+        updates.any(|updates| updates != "0")
     };
-    while saved(&run) == 0 && Instant::now() < deadline {
+    while !has_learned() && Instant::now() < deadline {
         std::thread::sleep(Duration::from_millis(20));
     }
     child.kill().unwrap();

@@ -31,11 +31,11 @@ pub struct BatchRequest {
 /// Tells a request that repeats another from a new one: a batch that did not arrive must not count as sampled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RequestId {
-    /// Who asks: a random number, as an asker is told from all others by nothing else. It waits for one request at a time.
+    /// Who asks: a random number, which tells it from all others. It waits for one request at a time.
     pub asker: u64,
     /// How many requests of this asker were answered before.
     pub number: u64,
-    /// How often this one was sent before.
+    /// Which attempt at this one it is: a later one has a higher number.
     pub attempt: u64,
 }
 

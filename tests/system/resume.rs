@@ -112,6 +112,16 @@ fn what_cannot_be_resumed() {
         "local --resume run",
         "is finished, 540 updates for 1280 frames",
     );
+    // One that was cut off when all was learned: only its end is missing.
+    let summary = fs::read_to_string(system.path("run/summary.json")).unwrap();
+    let cut_off = summary.replace("\"finished\"", "\"failed\"");
+    fs::write(system.path("run/summary.json"), cut_off).unwrap();
+    system.run("local --resume run").expect_code(0);
+    let run = system.run_folder("run").summary();
+    assert_eq!(run.outcome, "finished");
+    // The last chunk of 32 is stored whole, which are 16 updates.
+    assert!((540..556).contains(&run.updates), "{run:#?}");
+
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
     refused("local --resume run --frames 2000", "there is no checkpoint");
 }

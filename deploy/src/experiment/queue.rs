@@ -128,6 +128,7 @@ struct Running {
     plan: Plan,
     /// Which try this is, from 1.
     tried: u32,
+    resumed: bool,
     child: Child,
     /// Of the plan's units.
     done: u64,
@@ -210,7 +211,11 @@ impl Queue {
                 None => at += 1,
                 Some(status) => {
                     let Running {
-                        plan, tried, done, ..
+                        plan,
+                        tried,
+                        resumed,
+                        done,
+                        ..
                     } = self.running.remove(at);
                     if self.finished(&plan).is_some() {
                         progress.advance(plan.units - done)?;
@@ -219,7 +224,7 @@ impl Queue {
                     let words = last_words(&self.log(&plan));
                     let name = &plan.name;
                     // Settings that cannot work will not work for the others either.
-                    if status.code() == Some(EXIT_USAGE.into()) {
+                    if status.code() == Some(EXIT_USAGE.into()) && !resumed {
                         return Err(usage!("the run {name} cannot be made:\n{words}").into());
                     }
                     if tried < TRIES {
@@ -261,11 +266,8 @@ impl Queue {
         self.wait_for_the_last(&log, &plan, progress)?;
         log.set_len(0).with_context(doing)?;
         let folder = self.root.join(&plan.name);
-        let can_go_on = self.is_made_by(&plan)
-            && resume::find(&folder, &Flags::default(), &Machine::this()).is_ok();
-        if can_go_on {
-            progress.line(&format!("{} goes on from its checkpoint", folder.display()));
-        } else if let Some(aside) = move_aside(&folder)? {
+        let resumed = folder.exists() && self.can_go_on(&plan, tried, progress)?;
+        if !resumed && let Some(aside) = move_aside(&folder)? {
             progress.line(&format!(
                 "{} was not finished, or is of another call: it is now {}, and the run starts anew",
                 folder.display(),
@@ -277,7 +279,7 @@ impl Queue {
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
         command.args(["local", "--exit-with-parent"]);
-        if can_go_on {
+        if resumed {
             command.arg("--resume").arg(&folder);
         } else {
             command.arg("--run-dir").arg(&folder);
@@ -293,10 +295,30 @@ impl Queue {
         Ok(Running {
             plan,
             tried,
+            resumed,
             child,
             done: 0,
             enough: false,
         })
+    }
+
+    /// Whether what lies in the plan's folder goes on: at the first try alone, as its checkpoint may be what fails.
+    fn can_go_on(&self, plan: &Plan, tried: u32, progress: &mut Progress) -> anyhow::Result<bool> {
+        let folder = self.root.join(&plan.name);
+        resume::wait_until_free(&folder)?;
+        if tried > 1 || !self.is_made_by(plan) {
+            return Ok(false);
+        }
+        match resume::find(&folder, &Flags::default(), &Machine::this()) {
+            Ok(_) => {
+                progress.line(&format!("{} goes on from its checkpoint", folder.display()));
+                Ok(true)
+            }
+            Err(e) => {
+                progress.line(&format!("{} cannot go on: {e:#}", folder.display()));
+                Ok(false)
+            }
+        }
     }
 
     /// The cores shared out among the runs at once, so that their learners do not get in each other's way.

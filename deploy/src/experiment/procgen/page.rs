@@ -110,7 +110,8 @@ fn resumed(results: &Results) -> Option<String> {
     let count = results.cells.iter().filter(resumed).count();
     (count > 0).then(|| {
         format!(
-            "{count} of {} runs were interrupted and went on from a checkpoint, with a replay that had to fill again.",
+            "{count} of {} runs were interrupted and went on from a checkpoint, with a replay that had to fill again; of these, the \
+             histogram of k and the shares of actions are of what came after.",
             results.cells.len()
         )
     })
