@@ -13,10 +13,14 @@ use driml_protocol::{LearnerStatus, ReplayStatus};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    display::{PAIRS, Rates},
+    display::Rates,
     error::{Usage, usage},
     resume::Behind,
 };
+
+mod metrics;
+
+use metrics::{Moment, Rows, header};
 
 const METRICS: &str = "metrics.csv";
 const SUMMARY: &str = "summary.json";
@@ -44,8 +48,8 @@ pub(crate) struct Summary {
     pub(crate) agent: String,
     /// The seed.
     pub(crate) seed: u64,
-    /// Updates that the run had behind it when it was resumed, the last time; 0 if it never was. The histograms, the mean return
-    /// and what was lost or sent twice are of what came since, all else is of the whole run.
+    /// Updates that the run had behind it when it was resumed, the last time; 0 if it never was. Frames, updates,
+    /// rows, episodes, seconds and mean k are of the whole run, all else is of what came since.
     #[serde(default)]
     pub(crate) resumed_after_updates: u64,
     /// Frames that trained: transitions stored.
@@ -149,7 +153,15 @@ impl Recorder {
             .with_context(|| format!("making the run folder {}", folder.display()))?;
         let lock = lock(folder)?;
         let head = header(processes);
-        Self::begin(folder, config_toml, processes, lock, Rows::none(head))
+        let rows = Rows::none(head);
+        Self::begin(
+            folder,
+            config_toml,
+            processes,
+            lock,
+            rows,
+            Behind::default(),
+        )
     }
 
     /// Goes on to `frames_max` frames in the folder of an interrupted run, which has so much `behind` it: the rows of metrics up
@@ -176,11 +188,7 @@ impl Recorder {
             }
             _ => {}
         }
-        let mut this = Self::begin(folder, config_toml, processes, lock, rows)?;
-        this.behind = behind;
-        this.rates = Rates::default();
-        this.rates.add(this.started, behind.frames, behind.updates);
-        Ok(this)
+        Self::begin(folder, config_toml, processes, lock, rows, behind)
     }
 
     fn begin(
@@ -189,6 +197,7 @@ impl Recorder {
         processes: &[String],
         lock: File,
         rows: Rows,
+        behind: Behind,
     ) -> anyhow::Result<Self> {
         let head = "# The resolved settings of this run; `driml local --config` with this file repeats it.\n\n";
         write_whole(
@@ -201,7 +210,7 @@ impl Recorder {
         let file = file.with_context(|| format!("opening {}", path.display()))?;
         let mut this = Self {
             _lock: lock,
-            behind: Behind::default(),
+            behind,
             seconds_before: rows.last("seconds").unwrap_or(0.0),
             frames_before: rows.last("frames").unwrap_or(0),
             episodes_before: rows.last("episodes").unwrap_or(0),
@@ -213,7 +222,7 @@ impl Recorder {
             started: Instant::now(),
             rates: Rates::default(),
         };
-        this.rates.add(this.started, 0, 0);
+        this.rates.add(this.started, behind.frames, behind.updates);
         Ok(this)
     }
 
@@ -262,39 +271,20 @@ impl Recorder {
         if resumed && (updates <= self.behind.updates || frames < self.frames_before) {
             return Ok(());
         }
-        let (frames_rate, updates_rate) = self.rates.per_second();
-        let k = self.k(replay, updates);
-        let some = |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.6}"));
-        // What has not been computed is left empty: a 0 would look like a loss.
-        let computed = |value: f64| some((learner.updates > 0).then_some(value));
-        let mut row = vec![
-            format!("{:.3}", self.seconds()),
-            replay.transitions_inserted.to_string(),
-            learner.updates.to_string(),
-            format!("{frames_rate:.2}"),
-            format!("{updates_rate:.3}"),
-            some(replay.replay_ratio()),
-            (self.episodes_before + replay.episodes).to_string(),
-            some(replay.mean_return),
-            computed(learner.c51_kl.into()),
-        ];
-        row.extend(learner.dim.map(|loss| some(loss.map(f64::from))));
-        row.extend([
-            computed(learner.total.into()),
-            computed(learner.grad_norm),
-            computed(learner.q_mean.into()),
-            some(k.map(|(mean, _)| mean)),
-            some(k.map(|(_, sd)| sd)),
-            format!("{:.1}", replay.mean_age),
-            learner.weights_version.to_string(),
-            replay.affinity_version.to_string(),
-            replay.actors.to_string(),
-            replay.waiting.to_string(),
-        ]);
-        let rss = (0..self.processes.len()).map(|i| rss_mib.get(i).copied().flatten());
-        row.extend(rss.map(|mib| mib.map_or(String::new(), |mib| format!("{mib:.1}"))));
+        let processes = 0..self.processes.len();
+        let moment = Moment {
+            seconds: self.seconds(),
+            rates: self.rates.per_second(),
+            episodes: self.episodes_before + replay.episodes,
+            k: self.k(replay, updates),
+            replay,
+            learner,
+            rss_mib: processes
+                .map(|i| rss_mib.get(i).copied().flatten())
+                .collect(),
+        };
         self.metrics
-            .write_record(&row)
+            .write_record(moment.row())
             .context("writing metrics.csv")?;
         self.metrics.flush().context("writing metrics.csv")
     }
@@ -383,119 +373,6 @@ pub(crate) fn lock(folder: &Path) -> anyhow::Result<File> {
     }
 }
 
-/// The columns of the metrics.
-fn header(processes: &[String]) -> Vec<String> {
-    let counts = [
-        "seconds",
-        "frames",
-        "updates",
-        "frames_per_second",
-        "updates_per_second",
-        "replay_ratio",
-        "episodes",
-        "mean_return",
-        "c51_kl",
-    ];
-    let rest = [
-        "total_loss",
-        "grad_norm",
-        "q_mean",
-        "mean_k",
-        "sd_k",
-        "mean_age",
-        "weights_version",
-        "affinity_version",
-        "actors",
-        "waiting",
-    ];
-    let dim = PAIRS.map(|pair| format!("dim_{pair}"));
-    let rss = processes
-        .iter()
-        .map(|name| format!("rss_mib_{}", name.replace('-', "_")));
-    let counts = counts.map(String::from).into_iter();
-    counts
-        .chain(dim)
-        .chain(rest.map(String::from))
-        .chain(rss)
-        .collect()
-}
-
-/// Rows of metrics that a run begins with.
-struct Rows {
-    header: Vec<String>,
-    rows: Vec<csv::StringRecord>,
-}
-
-impl Rows {
-    const fn none(header: Vec<String>) -> Self {
-        Self {
-            header,
-            rows: Vec::new(),
-        }
-    }
-
-    /// The rows of an interrupted run up to what it has `behind` it, of no more than `frames_max` frames.
-    fn read(
-        path: &Path,
-        header: Vec<String>,
-        behind: Behind,
-        frames_max: u64,
-    ) -> anyhow::Result<Self> {
-        let reading = || format!("reading {}", path.display());
-        let text = match fs::read(path) {
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(Self::none(header)),
-            read => read.with_context(reading)?,
-        };
-        // What follows the last line's end was cut off.
-        let whole = text.iter().rposition(|&byte| byte == b'\n');
-        let mut reader = csv::Reader::from_reader(&text[..whole.map_or(0, |end| end + 1)]);
-        let found = reader.headers().with_context(reading)?;
-        if !found.is_empty() && found != header {
-            return Err(usage!(
-                "{} has other columns than a run of several processes by this version of driml: go on with the version that began it; a \
-                 run in --lockstep is repeated, not resumed",
-                path.display()
-            )
-            .into());
-        }
-        let mut this = Self::none(header);
-        let rows: Vec<_> = reader
-            .records()
-            .collect::<Result<_, _>>()
-            .with_context(reading)?;
-        for row in rows {
-            let count = |name| this.value::<u64>(&row, name);
-            let (Some(updates), Some(frames)) = (count("updates"), count("frames")) else {
-                return Err(usage!("{}: {row:?} is no row of metrics", path.display()).into());
-            };
-            // Actors run ahead: without the second condition a run that now ends sooner would end before its rows.
-            if updates <= behind.updates && frames <= frames_max {
-                this.rows.push(row);
-            }
-        }
-        Ok(this)
-    }
-
-    fn value<T: std::str::FromStr>(&self, row: &csv::StringRecord, name: &str) -> Option<T> {
-        let column = self.header.iter().position(|it| it == name)?;
-        row.get(column)?.parse().ok()
-    }
-
-    /// What the last row has in the column `name`.
-    fn last<T: std::str::FromStr>(&self, name: &str) -> Option<T> {
-        self.value(self.rows.last()?, name)
-    }
-
-    fn to_csv(&self) -> anyhow::Result<Vec<u8>> {
-        let mut csv = csv::Writer::from_writer(Vec::new());
-        csv.write_record(&self.header)?;
-        for row in &self.rows {
-            csv.write_record(row)?;
-        }
-        Ok(csv.into_inner()?)
-    }
-}
-
 /// Writes a file beside its place and renames it into it.
 fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let doing = || format!("writing {}", path.display());
@@ -517,13 +394,13 @@ fn make_readable(file: &File) -> std::io::Result<()> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use driml_protocol::{Horizon, RunSpec, TimeoutRule, Waiting};
     use expect_test::expect;
 
     use super::*;
 
-    fn spec() -> RunSpec {
+    pub(crate) fn spec() -> RunSpec {
         RunSpec {
             world: "chain".into(),
             agent: "driml-ada".into(),

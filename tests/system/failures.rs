@@ -3,26 +3,15 @@
 
 use std::{fs, path::PathBuf};
 
-use driml_tests::{Process, TestSystem, wait_for};
+use driml_tests::wait_for;
 use nix::sys::signal::Signal;
 
-use crate::{LONG, system};
-
-/// A launched run that has learned something.
-fn launched(system: &TestSystem) -> Process {
-    let process = system.start(&format!(
-        "local --agent driml-ada {LONG} --listen {} --run-dir run",
-        system.endpoint()
-    ));
-    let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 100);
-    process
-}
+use crate::{launched, system};
 
 #[test]
 fn an_interrupt_saves_and_ends_all_parts() {
     let system = system();
-    let process = launched(&system);
+    let process = launched(&system, 100);
     process.signal(Signal::SIGINT);
     let ended = process
         .wait()
@@ -37,7 +26,7 @@ fn an_interrupt_saves_and_ends_all_parts() {
 #[test]
 fn a_second_interrupt_ends_at_once() {
     let system = system();
-    let mut process = launched(&system);
+    let mut process = launched(&system, 100);
     // A learner that does not answer any more, for which the first interrupt would wait for minutes.
     system.find_part("learner").signal(Signal::SIGSTOP);
     process.signal(Signal::SIGINT);
@@ -61,7 +50,7 @@ fn a_second_interrupt_ends_at_once() {
 /// Kills one part of a run; the launcher must say which, and end the others.
 fn dies(part: &str, name: &str) {
     let system = system();
-    let process = launched(&system);
+    let process = launched(&system, 100);
     system.find_part(part).signal(Signal::SIGKILL);
     process.wait().expect_code(1).expect_said(&format!(
         "error: {name} was ended by signal 9 SIGKILL (log: "
@@ -88,7 +77,7 @@ fn a_dead_replay_server_ends_the_run() {
 #[test]
 fn parts_end_with_their_launcher() {
     let system = system();
-    let process = launched(&system);
+    let process = launched(&system, 100);
     process.signal(Signal::SIGKILL);
     process.wait();
     wait_for("the end of all parts", || {
@@ -116,7 +105,7 @@ fn shared_memory_of(pid: i32) -> Vec<PathBuf> {
 #[test]
 fn shared_memory_of_killed_parts_is_removed() {
     let system = system();
-    let process = launched(&system);
+    let process = launched(&system, 100);
     let parts = ["replay-server", "learner", "actor"].map(|part| system.find_part(part));
     let files: Vec<_> = parts
         .iter()

@@ -66,8 +66,11 @@ fn c51_leaves_a_whole_run_folder() {
 #[test]
 fn driml_ada_with_two_actors_over_tcp() {
     let system = system();
+    // Long enough that the run is not over before its second actor has started.
+    let longer = SHORT.replace("--frames 1280", "--frames 5120");
+    assert_ne!(longer, SHORT);
     let flags = format!(
-        "{SHORT} --actors 2 --listen {} --run-dir run",
+        "{longer} --actors 2 --listen {} --run-dir run",
         free_tcp_endpoint()
     );
     system

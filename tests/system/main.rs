@@ -17,7 +17,7 @@ mod procgen;
 mod repo_rules;
 mod resume;
 
-use driml_tests::TestSystem;
+use driml_tests::{Process, TestSystem};
 
 /// A fresh system of the program that cargo has built for this test.
 fn system() -> TestSystem {
@@ -31,3 +31,14 @@ const SHORT: &str = "--env chain --preset smoke --frames 1280 --set replay.repla
 
 /// A run on the chain that nobody waits for: it is ended from outside, long before its last frame.
 const LONG: &str = "--env chain --preset smoke --frames 100000000 --set replay.replay_ratio=8";
+
+/// A launched run of `driml-ada` that has learned more than so many `updates`.
+fn launched(system: &TestSystem, updates: u64) -> Process {
+    let process = system.start(&format!(
+        "local --agent driml-ada {LONG} --listen {} --run-dir run",
+        system.endpoint()
+    ));
+    let client = system.connect();
+    client.wait_for_learner("some updates", |learner| learner.updates > updates);
+    process
+}

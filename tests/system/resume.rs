@@ -2,21 +2,10 @@
 
 use std::fs;
 
-use driml_tests::{Process, RunFolder, TestSystem};
+use driml_tests::{RunFolder, TestSystem};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, SHORT, system};
-
-/// A run that has learned something and saved it.
-fn launched(system: &TestSystem) -> Process {
-    let process = system.start(&format!(
-        "local --agent driml-ada {LONG} --listen {} --run-dir run",
-        system.endpoint()
-    ));
-    let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 200);
-    process
-}
+use crate::{SHORT, launched, system};
 
 /// Updates of the newest checkpoint.
 fn saved(run: &RunFolder) -> u64 {
@@ -58,7 +47,7 @@ fn resumes(system: &TestSystem) {
 #[test]
 fn an_interrupted_run_goes_on() {
     let system = system();
-    let process = launched(&system);
+    let process = launched(&system, 200);
     system
         .run("local --resume run")
         .expect_code(64)
@@ -80,7 +69,7 @@ fn an_interrupted_run_goes_on() {
 #[test]
 fn a_run_whose_processes_were_all_killed_goes_on() {
     let system = system();
-    let process = launched(&system);
+    let process = launched(&system, 200);
     let parts = ["replay-server", "learner", "actor"].map(|part| system.find_part(part));
     process.signal(Signal::SIGKILL);
     parts.iter().for_each(|part| part.signal(Signal::SIGKILL));

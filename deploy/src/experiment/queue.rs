@@ -436,10 +436,10 @@ fn tail(path: &Path, bytes: u64) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
-    use driml_protocol::{Horizon, LearnerStatus, ReplayStatus, RunSpec, TimeoutRule};
+    use driml_protocol::{LearnerStatus, ReplayStatus};
 
     use super::*;
-    use crate::record::Recorder;
+    use crate::record::{Recorder, tests::spec};
 
     #[test]
     fn the_last_whole_row_counts() {
@@ -482,23 +482,6 @@ mod tests {
         assert!(queue.finished(&plan(20)).is_none());
         fs::write(folder.join("metrics.csv"), "seconds,frames\n").unwrap();
         assert!(queue.finished(&plan(10)).is_none(), "its metrics are gone");
-    }
-
-    fn spec() -> RunSpec {
-        RunSpec {
-            world: "chain".into(),
-            agent: "c51".into(),
-            seed: 1,
-            frame_height: 12,
-            frame_width: 12,
-            frame_channels: 1,
-            frame_stack: 1,
-            num_actions: 3,
-            n_step: 7,
-            gamma: 0.99,
-            horizon: Horizon::None,
-            timeout: TimeoutRule::Terminal,
-        }
     }
 
     #[test]

@@ -6,18 +6,18 @@ use driml_protocol::{
     AffinityUpdate, Chunk, ChunkHeader, End, Goodbye, Horizon, InsertReply, Planes, RequestId,
     RunSpec, Waiting,
 };
-use driml_replay_server::{ACTORS_MAX, Config, Replay, STREAMS_MAX, Unready};
+use driml_replay_server::{ACTORS_MAX, Replay, STREAMS_MAX, Unready};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::history::{spec, unlimited};
 
-fn small_spec() -> RunSpec {
+pub(crate) fn small_spec() -> RunSpec {
     spec(3, 1, 1, Horizon::None)
 }
 
-fn header(actor: u32, epoch: u64, sequence: u64, first_transition: u64) -> ChunkHeader {
+pub(crate) fn header(actor: u32, epoch: u64, sequence: u64, first_transition: u64) -> ChunkHeader {
     ChunkHeader {
         actor,
         epoch,
@@ -31,13 +31,13 @@ fn header(actor: u32, epoch: u64, sequence: u64, first_transition: u64) -> Chunk
     }
 }
 
-fn insert(replay: &mut Replay, header: ChunkHeader) -> InsertReply {
+pub(crate) fn insert(replay: &mut Replay, header: ChunkHeader) -> InsertReply {
     let reply = replay.insert(&Chunk::zeroed(header));
     replay.check_valid();
     reply
 }
 
-fn stored(inserted_total: u64) -> InsertReply {
+pub(crate) fn stored(inserted_total: u64) -> InsertReply {
     InsertReply::Stored { inserted_total }
 }
 
@@ -441,66 +441,4 @@ fn batches_follow_from_the_seed() {
     assert_ne!(batches(1), batches(2));
     let [first, second] = batches(1);
     assert_ne!(first, second);
-}
-
-#[test]
-fn a_resumed_run_counts_on_and_fills_its_replay_first() {
-    let mut config = unlimited(1000);
-    (config.replay_ratio, config.warmup_transitions) = (4.0, 60);
-    (config.slack_transitions, config.transitions_max) = (12, Some(180));
-    let spec = small_spec();
-    // Updates of 8 rows, 2 transitions each: 60 + 2 * 30 = 120 of 180 transitions were in.
-    let mut replay = Replay::new(&spec, &config, 8)
-        .unwrap()
-        .going_on_after(30, 0);
-    let status = replay.status();
-    assert_eq!(
-        (status.transitions_inserted, status.rows_sampled),
-        (60, 240)
-    );
-    let (mut batches, mut sequence) = (0, 0);
-    loop {
-        let inserted = replay.inserted_total();
-        match replay.sample(8) {
-            Ok(_) => {
-                assert!(inserted > 120, "only what is new lets the learner go on");
-                batches += 1;
-                continue;
-            }
-            Err(Unready::Finished) => break,
-            Err(e) => assert!(matches!(e, Unready::Wait(_)), "{e:?}"),
-        }
-        let reply = insert(&mut replay, header(0, 1, sequence, 6 * sequence));
-        assert_eq!(reply, stored(inserted + 6));
-        sequence += 1;
-    }
-    assert_eq!(
-        sequence, 20,
-        "60 transitions to fill the replay, 60 to go on"
-    );
-    assert_eq!(batches, 30, "with those before, all of (180 - 60) * 4 / 8");
-    let status = replay.status();
-    assert_eq!(
-        (status.transitions_inserted, status.rows_sampled),
-        (180, 480)
-    );
-    assert_eq!((status.transitions_lost, status.transitions_held), (0, 120));
-}
-
-#[test]
-fn shards_share_what_a_resumed_run_has_behind_it() {
-    let config = Config {
-        shards: 3,
-        replay_ratio: 4.0,
-        ..unlimited(1000)
-    };
-    let spec = small_spec();
-    let behind = |shard| {
-        let replay = Replay::shard(&spec, &config, 8, shard).unwrap();
-        let replay = replay.going_on_after(100, shard);
-        assert_eq!(replay.inserted_total(), 200, "each knows of the others");
-        let status = replay.status();
-        (status.transitions_inserted, status.rows_sampled)
-    };
-    assert_eq!([0, 1, 2].map(behind), [(67, 267), (67, 267), (66, 266)]);
 }

@@ -11,3 +11,4 @@ mod history;
 mod horizon;
 mod law;
 mod rate_limiter;
+mod resume;
