@@ -374,7 +374,7 @@ pub(crate) fn lock(folder: &Path) -> anyhow::Result<File> {
 }
 
 /// Writes a file beside its place and renames it into it.
-fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let doing = || format!("writing {}", path.display());
     let folder = path.parent().unwrap_or(Path::new("."));
     let mut file = tempfile::NamedTempFile::new_in(folder).with_context(doing)?;

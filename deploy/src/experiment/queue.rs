@@ -18,13 +18,13 @@ use nix::{
     unistd::Pid,
 };
 
-use super::{Progress, Session, session::write_whole};
+use super::{Progress, Session};
 use crate::{
     EXIT_USAGE,
     config::Flags,
     error::usage,
     machine::Machine,
-    record::{Outcome, Summary},
+    record::{Outcome, Summary, write_whole},
     resume,
 };
 

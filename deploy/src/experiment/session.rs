@@ -3,7 +3,6 @@
 
 use std::{
     fs,
-    io::Write,
     path::{Path, PathBuf},
     time::Instant,
 };
@@ -18,6 +17,7 @@ use crate::{
     figure::Figure,
     interrupts::Interrupts,
     print,
+    record::write_whole,
 };
 
 /// Finished pieces, one file each, and the settings they were made with. Git does not keep it.
@@ -202,16 +202,6 @@ impl Session {
 fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
     let default = || Path::new("experiments").join(name);
     flags.out.clone().unwrap_or_else(default)
-}
-
-/// Writes a file beside its place and renames it into it.
-pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    let aside = path.with_extension("tmp");
-    let doing = || format!("writing {}", path.display());
-    let mut file = fs::File::create(&aside).with_context(doing)?;
-    file.write_all(bytes).with_context(doing)?;
-    file.sync_all().with_context(doing)?;
-    fs::rename(&aside, path).with_context(doing)
 }
 
 #[cfg(test)]
