@@ -60,6 +60,8 @@ pub struct ReplayStatus {
     pub messages_refused: u64,
     /// Rows served since the start.
     pub rows_sampled: u64,
+    /// Rows served to a learner that died before it saved what it learned from them; they do not count as sampled.
+    pub rows_unlearned: u64,
     /// Transitions stored before the first row could be sampled.
     pub warmup_transitions: u64,
     /// Episodes that ended.
@@ -81,6 +83,8 @@ pub struct ReplayStatus {
     pub actors_waited_s: f64,
     /// Actors that are connected.
     pub actors: u32,
+    /// Actors whose next chunk waits until the rate limiter lets it in.
+    pub actors_waiting: u32,
     /// Version of the affinity matrix in use; 0 is the uniform one.
     pub affinity_version: u64,
     /// All transitions are in.
@@ -120,6 +124,7 @@ impl ReplayStatus {
             sum.batches_retried += it.batches_retried;
             sum.messages_refused += it.messages_refused;
             sum.rows_sampled += it.rows_sampled;
+            sum.rows_unlearned += it.rows_unlearned;
             sum.episodes += it.episodes;
             add(&mut sum.k_histogram, &it.k_histogram);
             add(&mut sum.action_histogram, &it.action_histogram);
