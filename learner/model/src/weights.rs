@@ -9,7 +9,6 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::init::{RELU_GAIN, orthogonal};
 
 /// Parameters by name, as candle variables with PyTorch's names and shapes.
 ///
@@ -18,23 +17,24 @@ use crate::init::{RELU_GAIN, orthogonal};
 pub struct Parameters(BTreeMap<String, Var>);
 
 impl Parameters {
-    /// Initial parameters: orthogonal weights with gain sqrt(2), convolutions flattened to [out, in * k * k]; biases 0.
+    /// Initial parameters, drawn layer by layer in the order of [`ModelConfig::parameter_shapes`].
     ///
-    /// Drawn in the order of [`ModelConfig::parameter_shapes`].
+    /// Orthogonal with gain sqrt(2) and zero bias: torso, action embedding, Psi_3, Phi_3, and the skip matrices of Psi_4 and
+    /// Phi_4. Weight and bias uniform on +-1/sqrt(fan_in): the C51 head and the other layers of Psi_4 and Phi_4.
     ///
     /// # Errors
     /// An invalid configuration.
     pub fn init(config: &ModelConfig, rng: &mut ChaCha8Rng, device: &Device) -> Result<Self> {
         config.validate()?;
         let mut vars = BTreeMap::new();
-        for (name, shape) in config.parameter_shapes() {
-            let len: usize = shape.iter().product();
-            let values = match shape.as_slice() {
-                [_] => vec![0.0; len],
-                [rows, ..] => orthogonal(*rows, len / rows, RELU_GAIN, rng),
-                [] => unreachable!("parameters are vectors, matrices or kernels"),
-            };
-            vars.insert(name, Var::from_vec(values, shape, device)?);
+        for layer in config.layers() {
+            let (shape, law) = (&layer.weight, layer.initial);
+            let weight = Var::from_vec(law.weight(shape, rng), shape.as_slice(), device)?;
+            vars.insert(layer.weight_name(), weight);
+            if layer.bias {
+                let bias = Var::from_vec(law.bias(shape, rng), shape[0], device)?;
+                vars.insert(layer.bias_name(), bias);
+            }
         }
         Ok(Self(vars))
     }
