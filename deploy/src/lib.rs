@@ -22,6 +22,7 @@ mod local;
 mod lockstep;
 mod machine;
 mod overrides;
+mod panics;
 mod plan;
 mod plot;
 mod presets;
@@ -50,6 +51,7 @@ const EXIT_INTERRUPTED: u8 = 130;
 
 /// Runs the program: 0 when all went well, 64 for a call that cannot work, 130 when interrupted, 1 for all else.
 pub fn main() -> ExitCode {
+    panics::end_the_process();
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {

@@ -7,8 +7,9 @@ pub const VARIABLE: &str = "DRIML_TEST_PANIC";
 /// Panics if `DRIML_TEST_PANIC` names this point, in a debug build; else does nothing.
 ///
 /// Every thread that does a part's work passes one such point each time round its loop, named as the thread is. So a test can
-/// show for each of them that a panic ends the process (DESIGN, invariant 11) and is not swallowed with the thread.
+/// show for each of them that a panic ends the process and is not swallowed with the thread.
 #[inline]
+#[track_caller]
 pub fn point(name: &str) {
     #[cfg(debug_assertions)]
     {

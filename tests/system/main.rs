@@ -13,6 +13,7 @@ mod failures;
 mod local;
 mod lockstep;
 mod lost_batches;
+mod panics;
 mod parity;
 mod procgen;
 mod repo_rules;
