@@ -14,12 +14,13 @@ use std::{
 };
 
 use anyhow::Context;
+use driml_protocol::fault;
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
 };
 
-use crate::display::Screen;
+use crate::console::Screen;
 
 /// Last lines of a part's log that are kept to be shown if it fails.
 const TAIL_LINES_MAX: usize = 8;
@@ -54,8 +55,15 @@ pub(crate) fn suit_candle(command: &mut Command, threads: u32) {
         .envs(FOR_CANDLE);
 }
 
+/// Flags for a child that is to end when this process does. They name this process, as it may have died before the child looks
+/// who its parent is.
+pub(crate) fn exit_with_this_process() -> [String; 2] {
+    ["--exit-with-parent".into(), std::process::id().to_string()]
+}
+
 impl Part {
-    /// Starts this program with other arguments, in a process group of its own so that Ctrl-C does not reach it.
+    /// Starts this program with other arguments, in a process group of its own so that Ctrl-C does not reach it. It ends when
+    /// this process does.
     ///
     /// # Errors
     /// The log cannot be written, or the process not started.
@@ -74,6 +82,7 @@ impl Part {
         suit_candle(&mut command, threads);
         let mut child = command
             .args(args)
+            .args(exit_with_this_process())
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
@@ -224,7 +233,9 @@ struct Pump {
 
 impl Pump {
     fn run(&self, pipe: impl Read) {
+        let point = format!("log of {}", self.name);
         for line in BufReader::new(pipe).split(b'\n') {
+            fault::point(&point);
             let Ok(line) = line else { return };
             let line = String::from_utf8_lossy(&line).into_owned();
             if let Ok(mut file) = self.file.lock()

@@ -131,9 +131,9 @@ pub(crate) struct LocalArgs {
     /// Endpoint on which the parts meet [default: a unix socket in a fresh folder]
     #[arg(long, value_name = "ENDPOINT")]
     pub(crate) listen: Option<String>,
-    /// End as after Ctrl-C when the process that started this one ends
-    #[arg(long, hide = true)]
-    pub(crate) exit_with_parent: bool,
+    /// End as after Ctrl-C when the process that started this one, which has this number, ends
+    #[arg(long, value_name = "PID", hide = true)]
+    pub(crate) exit_with_parent: Option<u32>,
 }
 
 /// How a part reaches the run.
@@ -142,9 +142,9 @@ pub(crate) struct JoinFlags {
     /// Prefix of the run's keys
     #[arg(long, value_name = "NS", default_value = NAMESPACE)]
     pub(crate) namespace: String,
-    /// End when the process that started this one ends
-    #[arg(long, hide = true)]
-    pub(crate) exit_with_parent: bool,
+    /// End when the process that started this one, which has this number, ends
+    #[arg(long, value_name = "PID", hide = true)]
+    pub(crate) exit_with_parent: Option<u32>,
 }
 
 /// The prefix of a run's keys unless it is told otherwise.

@@ -16,8 +16,8 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     cli::{EvaluateArgs, Levels},
     config::RunConfig,
+    console::print,
     error::{Usage, usage},
-    print,
 };
 
 /// Probability of a random action. Source: section 2 of the project's specification, after rlpyt.

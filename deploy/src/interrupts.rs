@@ -1,17 +1,16 @@
-//! Counts how often a person has asked this process to stop: Ctrl-C, SIGTERM, a closed terminal.
+//! Counts how often a person has asked this process to stop: by Ctrl-C, by SIGTERM, or by closing the terminal or pipe.
 //! The first is a wish to drain, the second to end at once; the caller decides.
 
 use std::{
+    ops::ControlFlow,
     sync::{Arc, Condvar, Mutex},
     time::{Duration, Instant},
 };
 
-use tokio::signal::unix::{SignalKind, signal};
+use driml_protocol::end_signs::{self, EndSign};
 
 /// Signals closer together are one wish: tools such as `timeout` signal the process and its group.
 const ONE_WISH: Duration = Duration::from_millis(300);
-/// How often it is looked whether the parent lives.
-const PARENT_POLL: Duration = Duration::from_millis(500);
 
 /// A shared count of interrupts.
 #[derive(Clone, Debug, Default)]
@@ -20,54 +19,34 @@ pub(crate) struct Interrupts {
 }
 
 impl Interrupts {
-    /// Starts to listen for signals, for the rest of the process's life; the death of the parent counts too, if
-    /// `exit_with_parent`.
+    /// Starts to listen for signs that this process should end, for the rest of its life; the death of the process `parent` is
+    /// one.
     ///
     /// # Errors
-    /// The operating system gave no thread, runtime or signal handler.
-    pub(crate) fn listen(exit_with_parent: bool) -> std::io::Result<Self> {
+    /// As [`end_signs::listen`].
+    pub(crate) fn listen(parent: Option<u32>) -> std::io::Result<Self> {
         let this = Self::default();
-        let runtime = tokio::runtime::Builder::new_current_thread()
-            .enable_all()
-            .build()?;
-        let (mut interrupt, mut terminate, mut hangup) = {
-            let _inside = runtime.enter();
-            (
-                signal(SignalKind::interrupt())?,
-                signal(SignalKind::terminate())?,
-                signal(SignalKind::hangup())?,
-            )
-        };
         let counted = this.clone();
-        let parent = std::os::unix::process::parent_id();
-        let parent_died = async move {
-            while !exit_with_parent || std::os::unix::process::parent_id() == parent {
-                tokio::time::sleep(PARENT_POLL).await;
-            }
-        };
-        std::thread::Builder::new()
-            .name("interrupts".into())
-            .spawn(move || {
-                runtime.block_on(async {
-                    let mut last: Option<Instant> = None;
-                    let mut orphan = false;
-                    tokio::pin!(parent_died);
-                    loop {
-                        tokio::select! {
-                            () = &mut parent_died, if !orphan => orphan = true,
-                            _ = interrupt.recv() => {}
-                            _ = terminate.recv() => {}
-                            _ = hangup.recv() => {}
-                        }
-                        // Counted from the wish's first signal: whoever keeps pressing is heard.
-                        if last.is_none_or(|last| last.elapsed() > ONE_WISH) {
-                            counted.add();
-                            last = Some(Instant::now());
-                        }
-                    }
-                });
-            })?;
+        let mut last = None;
+        end_signs::listen("interrupts", parent, move |sign| {
+            counted.hear(sign, &mut last, Instant::now());
+            ControlFlow::Continue(())
+        })?;
         Ok(this)
+    }
+
+    /// Counts a sign that was heard at `now`. `last` is when the last wish began.
+    fn hear(&self, sign: EndSign, last: &mut Option<Instant>, now: Instant) {
+        let is_new = match sign {
+            // Counted from the wish's first signal: whoever keeps pressing is heard.
+            EndSign::Asked => last.is_none_or(|last| now - last > ONE_WISH),
+            // Nobody is there who could be in a hurry: a closed terminal sends SIGHUP, and the other signs follow.
+            EndSign::Abandoned => last.is_none(),
+        };
+        if is_new {
+            self.add();
+            *last = Some(now);
+        }
     }
 
     fn add(&self) {
@@ -119,5 +98,20 @@ mod tests {
             std::thread::yield_now();
         }
         assert!(waiter.join().unwrap() >= 1);
+    }
+
+    #[test]
+    fn a_closed_terminal_is_the_first_wish_and_never_the_second() {
+        let interrupts = Interrupts::default();
+        let (start, mut last) = (Instant::now(), None);
+        let mut hear = |sign, seconds| {
+            interrupts.hear(sign, &mut last, start + Duration::from_secs(seconds));
+            interrupts.count()
+        };
+        assert_eq!(hear(EndSign::Abandoned, 0), 1);
+        assert_eq!(hear(EndSign::Abandoned, 5), 1);
+        assert_eq!(hear(EndSign::Asked, 10), 2, "a second wish by hand");
+        assert_eq!(hear(EndSign::Asked, 10), 2, "the same wish");
+        assert_eq!(hear(EndSign::Abandoned, 20), 2);
     }
 }

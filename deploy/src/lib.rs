@@ -7,6 +7,7 @@ mod bench;
 mod child;
 mod cli;
 mod config;
+mod console;
 #[cfg(not(feature = "cuda"))]
 mod cuda;
 mod derived;
@@ -21,6 +22,7 @@ mod local;
 mod lockstep;
 mod machine;
 mod overrides;
+mod panics;
 mod plan;
 mod plot;
 mod presets;
@@ -29,19 +31,16 @@ mod record;
 mod resume;
 mod statuses;
 
-use std::{
-    io::{IsTerminal, Write},
-    process::ExitCode,
-};
+use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::Parser;
 use driml_learner::{DeviceName, Operations};
 use driml_protocol::{Keys, Shutdown};
-use tracing_subscriber::EnvFilter;
 
 use crate::{
     cli::{Cli, Command, JoinFlags, ParityArgs, ProcgenCommand, ReplayServerArgs},
+    console::print,
     error::{Interrupted, Usage, usage},
 };
 
@@ -52,6 +51,7 @@ const EXIT_INTERRUPTED: u8 = 130;
 
 /// Runs the program: 0 when all went well, 64 for a call that cannot work, 130 when interrupted, 1 for all else.
 pub fn main() -> ExitCode {
+    panics::end_the_process();
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {
@@ -64,12 +64,12 @@ pub fn main() -> ExitCode {
             };
         }
     };
-    log_to_stderr();
+    console::log_to_stderr();
     match run(cli.command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) if e.is::<Interrupted>() => ExitCode::from(EXIT_INTERRUPTED),
         Err(e) => {
-            eprintln!("error: {e:#}");
+            console::line(&format!("error: {}", console::describe(&e)));
             if e.is::<Usage>() {
                 ExitCode::from(EXIT_USAGE)
             } else {
@@ -77,28 +77,6 @@ pub fn main() -> ExitCode {
             }
         }
     }
-}
-
-/// `DRIML_LOG` says what is logged, in the form of `RUST_LOG`. zenoh warns of each try to reach a part that is not there
-/// yet or any more, which is ours to judge: so only its errors are logged, and of those neither what its session says of
-/// messages that come while it closes, as at the end of every run, nor that nobody wants an answer any more.
-fn log_to_stderr() {
-    let usual = "warn,driml=info,zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off";
-    let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
-    let filter = wanted.map_or_else(
-        || EnvFilter::new(usual),
-        |wanted| {
-            EnvFilter::try_new(&wanted).unwrap_or_else(|e| {
-                eprintln!("DRIML_LOG={wanted} is no filter ({e}), so it is left out; take for example debug");
-                EnvFilter::new(usual)
-            })
-        },
-    );
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal())
-        .init();
 }
 
 fn run(command: Command) -> anyhow::Result<()> {
@@ -142,7 +120,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Presets(args) => presets::print(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Procgen(ProcgenCommand::Install) => {
-            let engine = procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
+            let engine = procgen_sys::Engine::install(&mut console::line)?;
             print(&format!(
                 "procgen's engine is in {}\n",
                 engine.root().display()
@@ -224,15 +202,6 @@ fn check_endpoints(endpoints: &[String]) -> Result<(), Usage> {
             "{endpoint:?} is no endpoint: take tcp/HOST:PORT, tls/HOST:PORT or unixsock-stream/PATH"
         )),
         None => Ok(()),
-    }
-}
-
-/// Writes to stdout; a reader that has gone away is no error.
-fn print(text: &str) -> anyhow::Result<()> {
-    let mut out = std::io::stdout().lock();
-    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
-        Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(e).context("writing to stdout"),
-        _ => Ok(()),
     }
 }
 

@@ -14,10 +14,11 @@ use crate::{
     check_endpoints,
     cli::{Fault, LocalArgs, RunFlags},
     config::{self, Flags, RunConfig, Source},
+    console::{self, print},
     error::{Usage, usage},
     lockstep,
     machine::Machine,
-    plan, presets, print, processes, ready_for, record, resume,
+    plan, presets, processes, ready_for, record, resume,
 };
 
 const ENV: &str = "procgen:bigfish";
@@ -69,7 +70,7 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
         &machine,
     ))?;
     if matches!(config.world, WorldConfig::Procgen(_)) {
-        procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
+        procgen_sys::Engine::install(&mut console::line)?;
     }
     if args.lockstep {
         if shards > 1 {

@@ -14,9 +14,9 @@ use driml_replay_server::{Replay, Unready};
 
 use crate::{
     config::RunConfig,
-    display::{Display, Screen},
+    console::{Screen, print},
+    display::{Display, TEMPLATE},
     error::Interrupted,
-    print,
     processes::describe,
     record::{Outcome, Recorder},
     resume::Behind,
@@ -36,11 +36,11 @@ const LEARNER: u64 = 1;
 pub(crate) fn run(
     config: &RunConfig,
     run_dir: &Path,
-    exit_with_parent: bool,
+    exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(exit_with_parent).context("listening for signals")?;
     let mut recorder = Recorder::create(run_dir, &config.to_toml(), &[])?;
-    let screen = Screen::new(config.frames());
+    let screen = Screen::new(config.frames(), TEMPLATE);
     let mut parts = Parts::new(config)?;
     let mut display = Display::new(
         screen.clone(),

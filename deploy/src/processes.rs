@@ -8,7 +8,7 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Keys,
+    Keys, fault,
     session::{self, Endpoints},
 };
 
@@ -16,10 +16,10 @@ use crate::{
     child::Part,
     cli::NAMESPACE,
     config::RunConfig,
-    display::{Display, Screen, duration},
+    console::{self, Screen, print},
+    display::{Display, TEMPLATE, duration},
     error::{Interrupted, Usage},
     interrupts::Interrupts,
-    print,
     record::{Outcome, Recorder, Summary},
     resume::{self, Behind},
     statuses::Statuses,
@@ -55,7 +55,7 @@ pub(crate) fn run(
     run_dir: &Path,
     resumed: Option<Behind>,
     listen: Option<String>,
-    exit_with_parent: bool,
+    exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
     let servers = server_names(config.replay.shards);
@@ -86,7 +86,7 @@ pub(crate) fn run(
     if let Some(listen) = listen {
         endpoints[0] = listen;
     }
-    let screen = Screen::new(config.frames());
+    let screen = Screen::new(config.frames(), TEMPLATE);
     let display = Display::new(screen.clone(), config.frames(), config.updates(), behind);
     let mut launch = Launch {
         config,
@@ -115,10 +115,10 @@ pub(crate) fn run(
     print(&describe(&summary, run_dir))?;
     if outcome == Outcome::Interrupted {
         if resume::can_go_on(&config.world, run_dir) {
-            eprintln!(
+            console::line(&format!(
                 "`driml local --resume {}` goes on with it",
                 run_dir.display()
-            );
+            ));
         }
         Err(Interrupted.into())
     } else {
@@ -171,7 +171,6 @@ impl Launch<'_> {
                 .map(|&word| word.to_owned())
                 .collect::<Vec<_>>()
         };
-        let exit = "--exit-with-parent";
         for (shard, (name, endpoint)) in self.servers.iter().zip(&self.endpoints).enumerate() {
             let (shard, after) = (shard.to_string(), self.behind.updates.to_string());
             let mut args = part(&[
@@ -184,7 +183,6 @@ impl Launch<'_> {
                 &after,
                 "--config",
                 &config,
-                exit,
             ]);
             if let Some(study) = self.config.replay.study {
                 args.extend(part(&["--study", study.name()]));
@@ -204,7 +202,7 @@ impl Launch<'_> {
 
         let folder = self.run_dir.display().to_string();
         let device = self.config.local.learner_device.to_string();
-        let mut args = part(&["learner", "--run-dir", &folder, "--device", &device, exit]);
+        let mut args = part(&["learner", "--run-dir", &folder, "--device", &device]);
         for endpoint in &self.endpoints {
             args.extend(part(&["--connect", endpoint]));
         }
@@ -222,7 +220,6 @@ impl Launch<'_> {
                 &self.endpoints[id as usize % self.endpoints.len()],
                 "--id",
                 &id.to_string(),
-                exit,
             ]);
             self.parts.push(Part::start(
                 &format!("actor-{id}"),
@@ -246,7 +243,13 @@ impl Launch<'_> {
             // Opening may take seconds of its own, in which the replay server may end: so it is not waited for here.
             let endpoints = endpoints.clone();
             let (tell, told) = std::sync::mpsc::channel();
-            std::thread::spawn(move || drop(tell.send(session::open(&endpoints))));
+            let open = move || {
+                fault::point("connect");
+                // Nobody listens any more if the run has ended meanwhile.
+                let _ = tell.send(session::open(&endpoints));
+            };
+            let thread = std::thread::Builder::new().name("connect".into());
+            thread.spawn(open).context("starting a thread")?;
             let opened = loop {
                 self.check_alive()?;
                 if self.interrupts.count() > 0 {

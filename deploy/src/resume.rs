@@ -12,6 +12,7 @@ use driml_learner::checkpoint::{self, CheckpointError};
 
 use crate::{
     config::{Flags, RunConfig, Source, resolve},
+    console,
     error::usage,
     machine::Machine,
     record,
@@ -57,10 +58,10 @@ pub(crate) fn wait_until_free(folder: &Path) -> anyhow::Result<()> {
         match checkpoint::lock(&checkpoints) {
             Err(CheckpointError::InUse(_)) if started.elapsed() < SAVING_MAX => {
                 if !std::mem::replace(&mut said, true) {
-                    eprintln!(
+                    console::line(&format!(
                         "a learner still saves in {}: waiting",
                         checkpoints.display()
-                    );
+                    ));
                 }
                 std::thread::sleep(Duration::from_millis(250));
             }

@@ -1,7 +1,7 @@
 //! The project's update against updates computed elsewhere in float64, and the check against broken files.
 //! It makes no cases of its own; `learner` does.
 
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use std::{fs, path::PathBuf};
 

@@ -9,6 +9,7 @@ pub mod batch;
 pub mod codec;
 pub mod config;
 pub mod control;
+pub mod end_signs;
 pub mod fault;
 pub mod join;
 pub mod keys;

@@ -1,16 +1,14 @@
-//! How a process learns that it should stop: SIGINT, SIGTERM, or the death of the process that started it.
-//! It only raises a flag; draining and saving are each part's own.
+//! The flag by which the threads of a process learn that it should stop.
+//! Draining and saving are each part's own; what raises the flag from outside is in `end_signs`.
 
 use std::{
+    ops::ControlFlow,
     sync::{Arc, Condvar, Mutex},
     thread::JoinHandle,
     time::{Duration, Instant},
 };
 
-use tokio::signal::unix::{SignalKind, signal};
-
-/// How often a part looks whether its parent still lives.
-const PARENT_POLL: Duration = Duration::from_millis(500);
+use crate::end_signs;
 
 /// A flag that is raised once and never lowered; clones share it.
 #[derive(Clone, Debug, Default)]
@@ -52,41 +50,18 @@ impl Shutdown {
             .expect("no thread panics while holding the flag")
     }
 
-    /// A flag that SIGINT and SIGTERM raise and, if `exit_with_parent`, the death of this process's parent.
+    /// A flag that is raised at the first sign that this process should end: a signal, or that nobody watches it any more. The
+    /// death of the process `parent` is one.
     ///
     /// # Errors
-    /// The operating system gave no thread, runtime or signal handler.
-    pub fn on_signals(exit_with_parent: bool) -> std::io::Result<Self> {
+    /// As [`end_signs::listen`].
+    pub fn on_signals(parent: Option<u32>) -> std::io::Result<Self> {
         let shutdown = Self::default();
-        let runtime = tokio::runtime::Builder::new_current_thread()
-            .enable_all()
-            .build()?;
-        let (mut interrupt, mut terminate) = {
-            let _inside = runtime.enter();
-            (
-                signal(SignalKind::interrupt())?,
-                signal(SignalKind::terminate())?,
-            )
-        };
         let raised = shutdown.clone();
-        let parent = std::os::unix::process::parent_id();
-        let parent_died = async move {
-            while !exit_with_parent || std::os::unix::process::parent_id() == parent {
-                tokio::time::sleep(PARENT_POLL).await;
-            }
-        };
-        std::thread::Builder::new()
-            .name("signals".into())
-            .spawn(move || {
-                runtime.block_on(async {
-                    tokio::select! {
-                        _ = interrupt.recv() => {}
-                        _ = terminate.recv() => {}
-                        () = parent_died => {}
-                    }
-                });
-                raised.set();
-            })?;
+        end_signs::listen("signals", parent, move |_| {
+            raised.set();
+            ControlFlow::Break(())
+        })?;
         Ok(shutdown)
     }
 }

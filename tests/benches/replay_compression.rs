@@ -3,7 +3,12 @@
 //!
 //! The frames are those of 16 copies under a random policy, or under one that mostly runs to the right: what scrolls
 //! compresses worse.
-#![allow(missing_docs, clippy::unwrap_used, reason = "a bench")]
+#![allow(
+    missing_docs,
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    reason = "a bench"
+)]
 
 use std::{
     hint::black_box,

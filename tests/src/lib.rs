@@ -3,7 +3,8 @@
 
 #![allow(
     clippy::unwrap_used,
-    reason = "a harness fails by panicking in the test that uses it"
+    clippy::print_stdout,
+    reason = "a harness fails by panicking in the test that uses it, and says there what it knows"
 )]
 
 mod client;
@@ -45,17 +46,22 @@ pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// Whether `test`, which needs Procgen's engine, is to be skipped; a line on stderr then names it.
+/// Says on stderr that `test` is skipped, and why.
 ///
 /// The line does not go through `eprintln!`, whose output the test runner keeps to itself when a test passes.
+pub fn skip(test: &str, why: &str) {
+    let line = format!("skipped: {test} ({why})\n");
+    std::io::stderr()
+        .write_all(line.as_bytes())
+        .expect("stderr is there while tests run");
+}
+
+/// Whether `test`, which needs Procgen's engine, is to be skipped; a line on stderr then names it.
 pub fn skipped_offline(test: &str) -> bool {
     let offline =
         std::env::var_os("DRIML_OFFLINE").is_some_and(|value| !value.is_empty() && value != "0");
     if offline {
-        let line = format!("skipped: {test} (DRIML_OFFLINE=1)\n");
-        std::io::stderr()
-            .write_all(line.as_bytes())
-            .expect("stderr is there while tests run");
+        skip(test, "DRIML_OFFLINE=1");
     }
     offline
 }

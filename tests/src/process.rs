@@ -69,7 +69,8 @@ impl Output {
 }
 
 impl Process {
-    pub(crate) fn start(name: String, mut command: Command) -> Self {
+    /// Starts a command that a test has put together; `name` is for messages.
+    pub fn start(name: String, mut command: Command) -> Self {
         command
             .stdin(Stdio::null())
             .stdout(Stdio::piped())

@@ -71,14 +71,25 @@ impl TestSystem {
 
     /// Starts the program in the system's folder. Arguments are as in a shell, split at blanks.
     pub fn start(&self, args: &str) -> Process {
-        let args: Vec<_> = args.split_whitespace().collect();
+        Process::start(args.to_owned(), self.command(args))
+    }
+
+    /// [`Self::start`] with one more variable in the environment, which all parts of a run inherit.
+    pub fn start_with(&self, variable: &str, value: &str, args: &str) -> Process {
+        let mut command = self.command(args);
+        command.env(variable, value);
+        Process::start(format!("{variable}={value} {args}"), command)
+    }
+
+    /// How the program is started, for tests that do it in their own way.
+    pub fn command(&self, args: &str) -> Command {
         let mut command = Command::new(&self.program);
         command
-            .args(&args)
+            .args(args.split_whitespace())
             .current_dir(self.folder.path())
             .env(MARK, &self.mark)
             .env_remove("DRIML_LOG");
-        Process::start(args.join(" "), command)
+        command
     }
 
     /// Runs the program to its end.
@@ -88,7 +99,8 @@ impl TestSystem {
 
     /// Starts a part that would wait for signals for ever; it ends with this test, however that ends.
     pub fn start_part(&self, args: &str) -> Process {
-        self.start(&format!("{args} --exit-with-parent"))
+        let parent = std::process::id();
+        self.start(&format!("{args} --exit-with-parent {parent}"))
     }
 
     /// Starts a replay server on this system's endpoint, with the settings that `flags` ask for.

@@ -6,12 +6,14 @@
 mod bad_messages;
 mod bad_weights;
 mod by_hand;
+mod closed_terminal;
 mod doctor;
 mod evaluate;
 mod failures;
 mod local;
 mod lockstep;
 mod lost_batches;
+mod panics;
 mod parity;
 mod procgen;
 mod repo_rules;

@@ -1,6 +1,11 @@
 //! Steps of the Procgen world per second, with 32 copies: the ceiling of one actor.
 //! It measures no policy; actions are drawn beforehand.
-#![allow(missing_docs, clippy::unwrap_used, reason = "a bench")]
+#![allow(
+    missing_docs,
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    reason = "a bench"
+)]
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use driml_envs::{

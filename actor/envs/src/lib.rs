@@ -38,7 +38,7 @@
 //! Copy i of a world depends on the seed, i and its own actions only, not on how many copies there are. No numbers that
 //! affect learning have defaults here: settings are written in full, and unknown keys are rejected.
 
-#![cfg_attr(test, allow(clippy::unwrap_used))]
+#![cfg_attr(test, allow(clippy::unwrap_used, clippy::print_stdout))]
 
 mod config;
 mod copies;

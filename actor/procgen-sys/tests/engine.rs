@@ -1,6 +1,6 @@
 //! What the real engine does, call by call: these are the facts that `driml-envs` builds its worlds on.
 //! The engine is fetched into the cache folder once; with `DRIML_OFFLINE=1` every test here is skipped.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use std::sync::OnceLock;
 

@@ -5,7 +5,10 @@ use driml_envs::{StepEnd, make_world};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::bench::{effort::Effort, figures::Figure, settings};
+use crate::{
+    bench::{effort::Effort, figures::Figure, settings},
+    console,
+};
 
 const GAMES: [&str; 4] = ["bigfish", "coinrun", "maze", "starpilot"];
 /// Copies of the game.
@@ -20,7 +23,7 @@ const STEPS: usize = 64;
 /// # Errors
 /// An engine that cannot be had or fails.
 pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
-    procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
+    procgen_sys::Engine::install(&mut console::line)?;
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut figures = Vec::new();
     for game in GAMES {

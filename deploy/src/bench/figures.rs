@@ -7,7 +7,11 @@ use anyhow::Context;
 use driml_learner::DeviceName;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
-use crate::{bench::table, cli::BenchFlags, print};
+use crate::{
+    bench::table,
+    cli::BenchFlags,
+    console::{self, print},
+};
 
 /// One thing that was measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -24,7 +28,7 @@ impl Figure {
     /// A figure, which is told to whoever watches stderr.
     pub(super) fn found(what: impl Into<String>, value: f64, unit: &str) -> Self {
         let (what, unit) = (what.into(), unit.to_owned());
-        eprintln!("  {what}: {} {unit}", table::number(value));
+        console::line(&format!("  {what}: {} {unit}", table::number(value)));
         Self { what, value, unit }
     }
 }

@@ -9,7 +9,10 @@ use driml_protocol::{Chunk, ChunkHeader, End, PlanesPool};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::bench::{settings, taking_part::EPOCH};
+use crate::{
+    bench::{settings, taking_part::EPOCH},
+    console,
+};
 
 /// Copies of the game, each a stream of transitions.
 pub(super) const STREAMS: usize = 8;
@@ -31,7 +34,7 @@ impl Recording {
     /// # Errors
     /// An engine that cannot be had or fails.
     pub(super) fn play() -> anyhow::Result<Self> {
-        procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
+        procgen_sys::Engine::install(&mut console::line)?;
         let config = settings::of_run(settings::WORLD, "c51", "paper", &[])?;
         let mut world = make_world(&config.world, STREAMS, 1, 0)?;
         let frame_bytes = world.frame_shape().bytes();

@@ -28,7 +28,7 @@ use crate::{
     },
     child::Part,
     cli::NAMESPACE,
-    display::Screen,
+    console::Screen,
 };
 
 /// Settings that leave the limiter out of what is measured, and a replay that is soon full. `bench peers` gives Reverb a
@@ -99,7 +99,7 @@ struct Run {
 
 impl Run {
     fn start(endpoint: &str, shared_memory: bool, folder: &Path) -> anyhow::Result<Self> {
-        let words = ["replay-server", "--listen", endpoint, "--exit-with-parent"];
+        let words = ["replay-server", "--listen", endpoint];
         let run = ["--env", settings::WORLD, "--agent", AGENT];
         let transport = format!("transport.shared_memory={shared_memory}");
         let sets = SETTINGS.into_iter().chain([transport.as_str()]);

@@ -34,7 +34,7 @@ use crate::{
     child::Part,
     cli::{BenchScaleArgs, NAMESPACE},
     config::RunConfig,
-    display::Screen,
+    console::{self, Screen},
     statuses::Statuses,
 };
 
@@ -78,7 +78,7 @@ pub(super) fn run(args: &BenchScaleArgs, machine: MachineNote) -> anyhow::Result
     for shards in SHARDS {
         for &actors in actors.iter().filter(|&&actors| actors >= shards) {
             let load = measure(args, &recording, seconds, shards, actors)?;
-            eprintln!("  {}", load.words().join("  "));
+            console::line(&format!("  {}", load.words().join("  ")));
             loads.push(load);
         }
     }
@@ -320,7 +320,7 @@ impl Servers {
             let socket = folder.join(format!("{shard}.sock"));
             let endpoint = format!("unixsock-stream/{}", socket.display());
             let shard = shard.to_string();
-            let words = ["replay-server", "--listen", &endpoint, "--exit-with-parent"];
+            let words = ["replay-server", "--listen", &endpoint];
             let run = [
                 "--shard",
                 &shard,

@@ -16,6 +16,7 @@ use crate::{
     bench::{figures::Figure, settings},
     cli::{BenchSystemArgs, NAMESPACE},
     config::RunConfig,
+    console,
     statuses::Statuses,
 };
 
@@ -34,7 +35,7 @@ const AGENT: &str = "driml-ada";
 /// # Errors
 /// A run that failed, or was over before it could be looked at.
 pub(super) fn measure(args: &BenchSystemArgs) -> anyhow::Result<Vec<Figure>> {
-    procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
+    procgen_sys::Engine::install(&mut console::line)?;
     let config = settings::of_run(settings::WORLD, AGENT, "paper", &[])?;
     let frames = args.frames.unwrap_or(match args.flags.quick {
         true => FRAMES.1,

@@ -12,8 +12,8 @@ use anyhow::bail;
 
 use crate::{
     cli::DoctorArgs,
+    console::print,
     doctor::fact::{Fact, State},
-    print,
 };
 
 /// Prints the facts.

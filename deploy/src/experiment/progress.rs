@@ -1,14 +1,9 @@
 //! How far an experiment is and how long the rest will take: a bar on a terminal, a line now and then elsewhere.
 //! It also hears Ctrl-C, as it is asked after every unit of work.
 
-use std::{
-    io::IsTerminal,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-
-use crate::{error::Interrupted, interrupts::Interrupts};
+use crate::{console::Screen, error::Interrupted, interrupts::Interrupts};
 
 /// How often a line is written where there is no terminal.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
@@ -26,19 +21,13 @@ pub(super) struct Progress {
     started: Instant,
     shown: Instant,
     what: String,
-    bar: Option<ProgressBar>,
+    screen: Screen,
     interrupts: Interrupts,
 }
 
 impl Progress {
     /// Of `total` units; listens for interrupts from now on.
     pub(super) fn new(total: u64, interrupts: Interrupts) -> Self {
-        let bar = std::io::stderr().is_terminal().then(|| {
-            let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr());
-            let style = ProgressStyle::with_template(TEMPLATE);
-            bar.set_style(style.expect("the template is a constant, and a test makes one"));
-            bar
-        });
         Self {
             total,
             done: 0,
@@ -46,7 +35,7 @@ impl Progress {
             started: Instant::now(),
             shown: Instant::now(),
             what: String::new(),
-            bar,
+            screen: Screen::new(total, TEMPLATE),
             interrupts,
         }
     }
@@ -65,7 +54,7 @@ impl Progress {
     /// Counts work that was done in vain and has to be done again.
     pub(super) fn again(&mut self, units: u64) {
         self.total += units;
-        if let Some(bar) = &self.bar {
+        if let Some(bar) = self.screen.bar() {
             bar.set_length(self.total);
         }
     }
@@ -76,7 +65,7 @@ impl Progress {
     /// [`Interrupted`] if a person has asked to stop.
     pub(super) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
         self.done += units;
-        let period = if self.bar.is_some() {
+        let period = if self.screen.bar().is_some() {
             BAR_PERIOD
         } else {
             PLAIN_PERIOD
@@ -94,10 +83,7 @@ impl Progress {
 
     /// Writes a line above the bar.
     pub(super) fn line(&self, line: &str) {
-        match &self.bar {
-            Some(bar) => bar.suspend(|| eprintln!("{line}")),
-            None => eprintln!("{line}"),
-        }
+        self.screen.line(line);
     }
 
     /// How often a person has asked to stop.
@@ -107,9 +93,7 @@ impl Progress {
 
     /// Takes the bar away.
     pub(super) fn clear(&self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
+        self.screen.clear();
     }
 
     fn show(&self) {
@@ -118,14 +102,14 @@ impl Progress {
             None => "the time left is not known yet".to_owned(),
         };
         let line = format!("{}, {left}", self.what);
-        match &self.bar {
+        match self.screen.bar() {
             Some(bar) => {
                 bar.set_position(self.done.min(self.total));
                 bar.set_message(line);
             }
             None => {
                 let percent = 100 * self.done / self.total.max(1);
-                eprintln!("{percent:>3}%  {line}");
+                self.screen.line(&format!("{percent:>3}%  {line}"));
             }
         }
     }
@@ -160,7 +144,7 @@ mod tests {
         assert_eq!(progress.seconds_left(5.0), None);
         progress.advance(10).unwrap();
         assert_eq!(progress.seconds_left(5.0), Some(25.0));
-        assert!(ProgressStyle::with_template(TEMPLATE).is_ok());
+        assert!(indicatif::ProgressStyle::with_template(TEMPLATE).is_ok());
     }
 
     #[test]

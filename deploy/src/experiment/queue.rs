@@ -21,6 +21,7 @@ use nix::{
 use super::{Progress, Session};
 use crate::{
     EXIT_USAGE,
+    child::exit_with_this_process,
     config::Flags,
     error::usage,
     machine::Machine,
@@ -278,7 +279,7 @@ impl Queue {
         write_whole(&self.call(&plan), &call)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
-        command.args(["local", "--exit-with-parent"]);
+        command.arg("local").args(exit_with_this_process());
         if resumed {
             command.arg("--resume").arg(&folder);
         } else {

@@ -13,10 +13,10 @@ use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use super::{Page, Progress};
 use crate::{
     cli::ExperimentFlags,
+    console::{self, print},
     error::{Interrupted, usage},
     figure::Figure,
     interrupts::Interrupts,
-    print,
     record::write_whole,
 };
 
@@ -68,7 +68,7 @@ impl Session {
             }
             Err(_) => write_whole(&path, &settings)?,
         }
-        let interrupts = Interrupts::listen(false).context("listening for interrupts")?;
+        let interrupts = Interrupts::listen(None).context("listening for interrupts")?;
         Ok(Self {
             folder,
             progress: Progress::new(units, interrupts),
@@ -139,7 +139,7 @@ impl Session {
         let started = Instant::now();
         let result = make(&mut self.progress).inspect_err(|e| {
             if e.is::<Interrupted>() {
-                eprintln!("stopped; the same command goes on from the last whole piece");
+                console::line("stopped; the same command goes on from the last whole piece");
             }
         })?;
         let kept = Kept {

@@ -15,9 +15,9 @@ pub(crate) use self::{
 };
 use crate::{
     cli::{Band, PlotArgs},
+    console::print,
     error::usage,
     figure::{Axis, Chart, Figure, Format, Panel, Series},
-    print,
 };
 
 /// Width and height of a chart.

@@ -10,7 +10,7 @@ use super::{AGENTS, Agent, Layer, Only, PRESETS, Preset, agent, layers, preset, 
 use crate::{
     cli::PresetsArgs,
     config::{self, Flags, Source},
-    derived,
+    console, derived,
     error::{Usage, usage},
     machine::Machine,
 };
@@ -35,12 +35,12 @@ const BY_MACHINE: [&str; 5] = [
 /// Names that nothing has.
 pub(crate) fn print(args: &PresetsArgs) -> anyhow::Result<()> {
     if args.game.is_none() && args.agent.is_none() && args.preset.is_none() {
-        return crate::print(&menu()?);
+        return console::print(&menu()?);
     }
     let preset = preset(args.preset.as_deref().unwrap_or(PRESETS[0].name))?;
     let world = world(args.game.as_deref().unwrap_or(GAME)).map_err(|e| usage!("--game: {e}"))?;
     let agent = agent(args.agent.as_deref().unwrap_or(AGENT))?;
-    crate::print(&sourced(preset, world, agent)?)
+    console::print(&sourced(preset, world, agent)?)
 }
 
 /// A world by its name, or by its game's.

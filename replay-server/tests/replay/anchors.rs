@@ -137,10 +137,7 @@ fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
         header.first_transition += 20;
         let chunk = driml_protocol::Chunk::zeroed(header);
         if total < 60 {
-            assert_eq!(
-                replay.insert(&chunk),
-                wait(total)
-            );
+            assert_eq!(replay.insert(&chunk), wait(total));
             assert_eq!(
                 replay.sample(64),
                 Err(Unready::Wait(Waiting::LearnerWaitsForActors))

@@ -23,6 +23,7 @@ use crate::{
         table,
     },
     cli::{BenchPart, BenchPeersArgs},
+    console,
 };
 
 /// The load above which something else is running, which slows the two sides unequally.
@@ -110,10 +111,13 @@ pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
     }
     for round in 1..=rounds {
         for (part, (script, sides)) in &mut sides {
-            eprintln!("round {round} of {rounds}: {} of ours", part.name());
+            console::line(&format!(
+                "round {round} of {rounds}: {} of ours",
+                part.name()
+            ));
             sides.add_ours(alone::figures(*part, &args.flags, DeviceName::Cpu)?);
             if sides.absent.is_none() {
-                eprintln!("round {round} of {rounds}: {}", sides.peer);
+                console::line(&format!("round {round} of {rounds}: {}", sides.peer));
                 match script.run() {
                     Ok((peer, figures)) => sides.add_theirs(peer, figures),
                     Err(absent) => sides.skip(absent),
@@ -157,7 +161,7 @@ impl Sides {
 
     /// Goes on without the peer.
     fn skip(&mut self, Absent(why): Absent) {
-        eprintln!("skipped: {why}");
+        console::line(&format!("skipped: {why}"));
         self.absent = Some(why);
     }
 }

@@ -9,7 +9,7 @@ mod published;
 mod scores;
 mod screen;
 
-use std::{collections::BTreeMap, panic::resume_unwind, thread::ScopedJoinHandle};
+use std::{collections::BTreeMap, thread::ScopedJoinHandle};
 
 use driml_envs::WorldName;
 use serde::{Deserialize, Serialize};
@@ -20,6 +20,7 @@ use super::{
 };
 use crate::{
     cli::{Levels, ProcgenArgs},
+    console,
     error::{Usage, usage},
     evaluate::{Player, Who},
     plot, presets,
@@ -130,7 +131,7 @@ pub(super) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     let mut session = Session::open_queue(name, &args.flags, &common, units, report_only)?;
     let is_procgen = |world: &String| world.starts_with("procgen:");
     if !report_only && settings.worlds.iter().any(is_procgen) {
-        procgen_sys::Engine::install(&mut |line| eprintln!("{line}"))?;
+        procgen_sys::Engine::install(&mut console::line)?;
     }
     let runs: Vec<Plan> = plans.iter().map(|(_, plan)| plan.clone()).collect();
     let ran = queue::run_all(&mut session, &runs, settings.jobs, report_only)?;
@@ -216,9 +217,8 @@ fn played(ran: &Ran, who: Who, episodes: u32) -> anyhow::Result<Played> {
         let single = scope.spawn(|| on(Levels::TrainSingle));
         let unseen = scope.spawn(|| on(Levels::Unseen));
         let trained = on(Levels::Train)?.unwrap_or_default();
-        let join = |thread: ScopedJoinHandle<'_, _>| {
-            thread.join().unwrap_or_else(|panic| resume_unwind(panic))
-        };
+        let join =
+            |thread: ScopedJoinHandle<'_, _>| thread.join().expect("a panic has ended the process");
         Ok(Played {
             trained,
             single: join(single)?,

@@ -1,0 +1,219 @@
+//! A terminal or pipe that is closed in the middle of a run: the run drains, saves and ends as after Ctrl-C.
+//! What Ctrl-C does is in `failures`.
+
+use std::{
+    fs::{File, OpenOptions},
+    io::{BufRead, BufReader, Read, pipe},
+    os::{fd::AsFd, unix::fs::OpenOptionsExt},
+    process::{Child, Command, ExitStatus, Stdio},
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread::{self, JoinHandle},
+};
+
+use driml_tests::{Process, TestSystem, wait_for};
+use nix::{
+    fcntl::OFlag,
+    poll::{PollFd, PollFlags, poll},
+    pty::{grantpt, posix_openpt, ptsname_r, unlockpt},
+    sys::signal::Signal,
+};
+
+use crate::{LONG, launched, system};
+
+/// A terminal whose window a test can close. Until then what is written there is read, as a window does it.
+struct Window {
+    is_closed: Arc<AtomicBool>,
+    shown: Arc<Mutex<Vec<u8>>>,
+    reader: JoinHandle<()>,
+}
+
+impl Window {
+    /// A window, and the terminal in it for a process to write to.
+    fn open() -> (Self, File) {
+        // Not `openpty`: what it opens is inherited by every process that any test starts meanwhile.
+        let flags = OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC;
+        let mut master = posix_openpt(flags).unwrap();
+        grantpt(&master).unwrap();
+        unlockpt(&master).unwrap();
+        let path = ptsname_r(&master).unwrap();
+        let terminal = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .custom_flags(OFlag::O_NOCTTY.bits())
+            .open(path)
+            .unwrap();
+        let (is_closed, shown) = <(Arc<AtomicBool>, Arc<Mutex<Vec<u8>>>)>::default();
+        let (closed, sink) = (is_closed.clone(), shown.clone());
+        let reader = thread::spawn(move || {
+            while !closed.load(Ordering::Relaxed) {
+                let mut ready = [PollFd::new(master.as_fd(), PollFlags::POLLIN)];
+                if poll(&mut ready, 20_u8).unwrap() > 0 {
+                    let mut bytes = [0; 4096];
+                    let read = master.read(&mut bytes).unwrap();
+                    sink.lock().unwrap().extend_from_slice(&bytes[..read]);
+                }
+            }
+        });
+        let window = Self {
+            is_closed,
+            shown,
+            reader,
+        };
+        (window, terminal)
+    }
+
+    /// What was shown so far.
+    fn shown(&self) -> String {
+        String::from_utf8_lossy(&self.shown.lock().unwrap()).into_owned()
+    }
+
+    fn close(self) {
+        self.is_closed.store(true, Ordering::Relaxed);
+        self.reader.join().unwrap();
+    }
+}
+
+/// A run that writes all that it says to `output`.
+fn start(system: &TestSystem, output: impl Into<Stdio>, errors: impl Into<Stdio>) -> Child {
+    let run = format!(
+        "local --agent driml-ada {LONG} --listen {} --run-dir run",
+        system.endpoint()
+    );
+    let mut command = system.command(&run);
+    command.stdin(Stdio::null()).stdout(output).stderr(errors);
+    command.spawn().unwrap()
+}
+
+fn wait_until_it_learns(system: &TestSystem) {
+    let client = system.connect();
+    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+}
+
+fn end(child: &mut Child) -> ExitStatus {
+    wait_for("the launcher's end", || child.try_wait().unwrap())
+}
+
+/// What is left is what an interrupt leaves: all is saved, no process runs.
+fn check_saved(system: &TestSystem, ended: ExitStatus) {
+    assert_eq!(ended.code(), Some(130), "{ended}");
+    assert_eq!(system.survivors(), []);
+    let summary = system.run_folder("run").check("interrupted");
+    assert!(summary.updates > 100, "{summary:#?}");
+}
+
+#[test]
+fn a_closed_window_saves_the_run() {
+    let system = system();
+    let (window, terminal) = Window::open();
+    let mut child = start(&system, terminal.try_clone().unwrap(), terminal);
+    wait_until_it_learns(&system);
+    wait_for("the progress bar", || {
+        window.shown().contains("replay ratio 7").then_some(())
+    });
+    window.close();
+    check_saved(&system, end(&mut child));
+}
+
+#[test]
+fn a_pipe_closed_after_two_lines_saves_the_run() {
+    let system = system();
+    // `driml local ... 2>&1 | head -2`
+    let (reader, writer) = pipe().unwrap();
+    let mut child = start(&system, writer.try_clone().unwrap(), writer);
+    let mut lines = BufReader::new(reader).lines();
+    let head = [lines.next(), lines.next()];
+    assert!(head.iter().flatten().all(|line| line.is_ok()), "{head:?}");
+    wait_until_it_learns(&system);
+    drop(lines);
+    check_saved(&system, end(&mut child));
+}
+
+#[test]
+fn a_closed_pipe_saves_a_run_in_lockstep() {
+    let system = system();
+    let (reader, writer) = pipe().unwrap();
+    let run = format!("local --agent c51 {LONG} --lockstep --run-dir run");
+    let mut command = system.command(&run);
+    command.stdin(Stdio::null()).stdout(Stdio::null());
+    let mut child = command.stderr(writer).spawn().unwrap();
+    drop(command);
+    wait_for("a row of metrics with updates", || {
+        let text = std::fs::read_to_string(system.path("run/metrics.csv")).ok()?;
+        let updates = |row: &str| row.split(',').nth(2)?.parse().ok();
+        let updates: Option<u64> = text.lines().skip(1).filter_map(updates).max();
+        updates.filter(|&updates| updates > 100)
+    });
+    drop(reader);
+    check_saved(&system, end(&mut child));
+}
+
+/// A run of parts started by hand that has learned something: replay server, learner, actor.
+fn by_hand(system: &TestSystem) -> [Process; 3] {
+    let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
+    let parts = [server, system.start_learner("run"), system.start_actor(0)];
+    wait_until_it_learns(system);
+    parts
+}
+
+/// A closed ssh session.
+#[test]
+fn a_hangup_ends_parts_in_order() {
+    let system = system();
+    let [server, learner, actor] = by_hand(&system);
+    for (part, says) in [
+        (actor, "actor 0 leaves"),
+        (learner, "finished after"),
+        (server, "replay server stops"),
+    ] {
+        part.signal(Signal::SIGHUP);
+        part.wait().expect_code(0).expect_said(says);
+    }
+    assert!(!system.run_folder("run").checkpoints().is_empty());
+}
+
+#[test]
+fn a_hangup_ends_a_launched_run_once() {
+    let system = system();
+    let process = launched(&system, 100);
+    // The kernel and a shell may each send one.
+    process.signal(Signal::SIGHUP);
+    process.signal(Signal::SIGHUP);
+    process.wait().expect_code(130);
+    assert_eq!(system.survivors(), []);
+    system.run_folder("run").check("interrupted");
+}
+
+/// `nohup driml local ... &`, and the terminal is closed.
+#[test]
+fn a_run_that_is_to_ignore_hangups_does() {
+    let system = system();
+    let run = system.command(&format!(
+        "local --agent driml-ada {LONG} --listen {} --run-dir run",
+        system.endpoint()
+    ));
+    let mut command = Command::new("sh");
+    command.args(["-c", "trap '' HUP; exec \"$0\" \"$@\""]);
+    command.arg(run.get_program()).args(run.get_args());
+    command.current_dir(run.get_current_dir().unwrap());
+    for (name, value) in run.get_envs() {
+        match value {
+            Some(value) => command.env(name, value),
+            None => command.env_remove(name),
+        };
+    }
+    let process = Process::start("nohup driml local".into(), command);
+    let client = system.connect();
+    let before = client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    process.signal(Signal::SIGHUP);
+    for part in ["replay-server", "learner", "actor"] {
+        system.find_part(part).signal(Signal::SIGHUP);
+    }
+    client.wait_for_learner("more updates", |learner| {
+        learner.updates > before.updates + 500
+    });
+    process.stop().expect_code(130);
+    system.run_folder("run").check("interrupted");
+}

@@ -1,0 +1,114 @@
+//! A panic in any thread of any process: the process ends, the launcher says which part and thread it was, nothing is left.
+//! The panics are asked for with `DRIML_TEST_PANIC`, which debug builds have (`driml_protocol::fault`).
+
+use driml_protocol::fault;
+use driml_tests::{Ended, TestSystem};
+
+use crate::{LONG, system};
+
+/// The threads of the parts: the part as the launcher calls it, and the point that the thread passes.
+const THREADS: [(&str, &str); 19] = [
+    ("replay-server", "insert"),
+    ("replay-server", "claim"),
+    ("replay-server", "admit"),
+    ("replay-server", "request"),
+    ("replay-server", "sample"),
+    ("replay-server", "affinity"),
+    ("replay-server", "hello"),
+    ("replay-server", "join-actor"),
+    ("replay-server", "join-learner"),
+    ("replay-server", "goodbye"),
+    ("replay-server", "weights-upload"),
+    ("replay-server", "weights"),
+    ("replay-server", "status"),
+    ("learner", "batches"),
+    ("learner", "weights-sender"),
+    ("learner", "affinity-sender"),
+    ("learner", "learner-status"),
+    ("actor-0", "weights-watch"),
+    ("actor-0", "delivery"),
+];
+
+/// Runs with a panic at `point`, to the end.
+fn panicking(system: &TestSystem, point: &str) -> Ended {
+    let run = format!("local --agent driml-ada {LONG} --run-dir run");
+    let ended = system.start_with(fault::VARIABLE, point, &run).wait();
+    assert_eq!(system.survivors(), [], "{point}");
+    let said = format!("error: the thread {point}");
+    let line = ended.stderr.lines().find(|line| line.contains(&said));
+    let asked = format!(": {}={point}; this is a fault", fault::VARIABLE);
+    assert!(
+        line.is_some_and(|it| it.contains(" panicked at ") && it.contains(&asked)),
+        "{point}: {ended:#?}"
+    );
+    ended
+}
+
+/// A thread of a part that panics at `point`, after which the launcher names the part.
+fn ends_the_run(part: &str, point: &str) {
+    let system = system();
+    let ended = panicking(&system, point);
+    assert_eq!(ended.code, Some(1), "{point}: {ended:#?}");
+    for said in [
+        format!("{part}: error: the thread {point}"),
+        format!("error: {part} was ended by signal 6 SIGABRT (log: "),
+    ] {
+        assert!(ended.stderr.contains(&said), "{said:?} in {ended:#?}");
+    }
+    assert_eq!(system.run_folder("run").summary().outcome, "failed");
+}
+
+/// Only debug builds can be asked to panic; a line says that a test is skipped in others.
+fn skipped(test: &str) -> bool {
+    if !cfg!(debug_assertions) {
+        driml_tests::skip(test, "a release build");
+    }
+    !cfg!(debug_assertions)
+}
+
+#[test]
+fn a_panic_in_a_part_ends_it_and_the_launcher_names_it() {
+    if skipped("a_panic_in_a_part_ends_it_and_the_launcher_names_it") {
+        return;
+    }
+    for (part, point) in THREADS {
+        ends_the_run(part, point);
+    }
+}
+
+/// Every part has this thread, so any may be the first.
+#[test]
+fn a_panic_where_signals_are_heard_ends_a_part() {
+    if skipped("a_panic_where_signals_are_heard_ends_a_part") {
+        return;
+    }
+    let ended = panicking(&system(), "signals");
+    assert_eq!(ended.code, Some(1), "{ended:#?}");
+    assert!(
+        ended.stderr.contains("was ended by signal 6 SIGABRT"),
+        "{ended:#?}"
+    );
+}
+
+/// The launcher itself, after whose death the parts end by themselves.
+#[test]
+fn a_panic_in_the_launcher_ends_the_run() {
+    if skipped("a_panic_in_the_launcher_ends_the_run") {
+        return;
+    }
+    for point in ["interrupts", "connect", "log of learner"] {
+        let system = system();
+        let run = format!("local --agent driml-ada {LONG} --run-dir run");
+        let ended = system.start_with(fault::VARIABLE, point, &run).wait();
+        assert_eq!(
+            (ended.code, ended.signal),
+            (None, Some(6)),
+            "{point}: {ended:#?}"
+        );
+        let said = format!("error: the thread {point} panicked");
+        assert!(ended.stderr.contains(&said), "{point}: {ended:#?}");
+        driml_tests::wait_for("the end of all parts", || {
+            system.survivors().is_empty().then_some(())
+        });
+    }
+}
