@@ -72,6 +72,7 @@ fn the_default_run_is_the_papers() {
         epsilon_decay_frames = 100000
         epsilon_end = 0.01
         epsilon_start = 0.1
+        round_transitions_max = 1024
         steps_per_chunk = 16
         unreachable_max_ms = 60000
         world_threads = 0
