@@ -206,7 +206,7 @@ fn a_file_at_odds_with_itself_is_refused() {
     .assert_eq(&said("= 3".into()));
     expect!["x.toml: the settings lack run.world, a word: use a config.toml that driml wrote"]
         .assert_eq(&said(String::new()));
-    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `chunks_in_flight_max`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
+    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
 }
 
 #[test]
