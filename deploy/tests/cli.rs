@@ -188,7 +188,8 @@ fn parity_files_that_are_none() {
     .assert_eq(&in_folder(&["parity", "cut.safetensors"]));
     expect![[r#"
         error: cannot read none.safetensors: No such file or directory (os error 2)
-    "#]].assert_eq(&in_folder(&["parity", "none.safetensors"]));
+    "#]]
+    .assert_eq(&in_folder(&["parity", "none.safetensors"]));
 }
 
 #[test]

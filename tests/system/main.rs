@@ -7,6 +7,7 @@ mod bad_messages;
 mod bad_weights;
 mod by_hand;
 mod closed_terminal;
+mod company;
 mod doctor;
 mod evaluate;
 mod failures;
@@ -18,6 +19,7 @@ mod parity;
 mod procgen;
 mod repo_rules;
 mod resume;
+mod successors;
 
 use driml_tests::{Process, TestSystem};
 
