@@ -6,6 +6,7 @@
 mod bad_messages;
 mod bad_weights;
 mod by_hand;
+mod diverging;
 mod doctor;
 mod evaluate;
 mod failures;
