@@ -68,6 +68,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             actor: args.actor,
             epoch: new_epoch(),
             after_updates: hello.after_updates,
+            inserted_total_at_join: hello.inserted_total,
         },
         header.version,
         &weights,
