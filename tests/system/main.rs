@@ -8,6 +8,7 @@ mod bad_weights;
 mod by_hand;
 mod closed_terminal;
 mod company;
+mod diverging;
 mod doctor;
 mod evaluate;
 mod failures;
