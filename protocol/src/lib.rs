@@ -19,13 +19,14 @@ pub mod session;
 pub mod shutdown;
 pub mod transition;
 pub mod weights;
+pub mod whole_file;
 
 pub use affinity::AffinityUpdate;
 pub use batch::{Batch, BatchHeader, BatchReply, BatchRequest, NO_ACTION, RequestId, Tally};
 pub use codec::{CodecError, Kind};
 pub use control::{Goodbye, Hello};
 pub use keys::Keys;
-pub use metric::{LearnerStatus, ReplayStatus, Waiting};
+pub use metric::{LearnerStatus, ReplayStatus, Returns, Waiting};
 pub use planes::{Planes, PlanesPool};
 pub use run_spec::{Horizon, RunSpec, TimeoutRule};
 pub use shutdown::Shutdown;
@@ -33,4 +34,4 @@ pub use transition::{Chunk, ChunkHeader, End, InsertReply};
 pub use weights::{WeightsHeader, WeightsVersion};
 
 /// The version of every message in this crate; parts of different versions refuse each other.
-pub const PROTOCOL_VERSION: u16 = 2;
+pub const PROTOCOL_VERSION: u16 = 3;

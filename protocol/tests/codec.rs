@@ -7,7 +7,7 @@ use std::fmt::Debug;
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader, CodecError,
     End, Goodbye, Hello, Horizon, InsertReply, Kind, LearnerStatus, NO_ACTION, PROTOCOL_VERSION,
-    Planes, PlanesPool, ReplayStatus, RequestId, RunSpec, Tally, TimeoutRule, Waiting,
+    Planes, PlanesPool, ReplayStatus, RequestId, Returns, RunSpec, Tally, TimeoutRule, Waiting,
     WeightsHeader, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PLANES_BYTES_MAX, PREFIX_BYTES},
 };
@@ -165,7 +165,10 @@ fn samples() -> Vec<Sample> {
     ];
     let replay = ReplayStatus {
         transitions_inserted: 5,
-        mean_return: Some(-1.25),
+        returns: Returns {
+            known: 120,
+            newest: vec![-1.25, 3.0],
+        },
         k_histogram: vec![1, 2, 3],
         action_histogram: vec![0; 15],
         waiting: Waiting::WarmUp { have: 5, need: 9 },

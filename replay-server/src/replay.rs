@@ -534,7 +534,7 @@ impl Replay {
             rows_sampled: self.limiter.tally().rows_sampled,
             warmup_transitions: self.config.warmup_transitions,
             episodes: statistics.episodes,
-            mean_return: statistics.mean_return(),
+            returns: statistics.returns(),
             k_histogram: statistics.k_histogram.clone(),
             mean_age: statistics.mean_age,
             action_histogram: statistics.action_histogram.clone(),

@@ -28,7 +28,11 @@ fn resumes(system: &TestSystem) {
     let summary = run.check_finished();
     assert_eq!(summary.resumed_after_updates, updates);
     assert_eq!(summary.updates, updates + 156);
-    assert!(summary.episodes > 0);
+    // The replay is new and has seen few episodes since; the mean return is of 100 all the same.
+    assert!(
+        summary.episodes > 100 && summary.mean_return_of == 100,
+        "{summary:#?}"
+    );
 
     let (header, rows) = run.metrics();
     for name in ["seconds", "frames", "updates", "episodes"] {
