@@ -81,7 +81,6 @@ impl Collector {
                 life.actor,
                 life.epoch,
                 config.envs,
-                config.steps_per_chunk,
                 spec.frame_bytes() as u32,
             ),
             policy,
@@ -105,12 +104,12 @@ impl Collector {
         self.recorder.produced()
     }
 
-    /// Acts until one chunk is full. `frames` is the run's count so far, which fixes epsilon for the chunk.
+    /// Acts until one chunk of `steps` steps is full. `frames` is the run's count so far, which fixes epsilon for the chunk.
     ///
     /// # Errors
     /// The policy or the world failed.
-    pub fn collect(&mut self, frames: u64) -> anyhow::Result<Chunk> {
-        self.recorder.set_weights_version(self.weights_version);
+    pub fn collect(&mut self, frames: u64, steps: u32) -> anyhow::Result<Chunk> {
+        self.recorder.begin(self.weights_version, steps);
         let epsilon = schedule::epsilon(&self.settings.actor, frames);
         loop {
             let step = self.acting.step(&mut self.policy, epsilon)?;

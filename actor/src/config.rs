@@ -3,7 +3,9 @@
 
 use driml_protocol::{
     PlanesPool, RunSpec,
+    codec::PLANES_BYTES_MAX,
     config::{Settings, TransportConfig},
+    transition::TRANSITION_BYTES,
 };
 use serde::{Deserialize, Serialize};
 
@@ -15,6 +17,11 @@ pub struct Config {
     pub envs: u32,
     /// Steps of every copy in one chunk: how often an actor sends, and takes newer weights.
     pub steps_per_chunk: u32,
+    /// Transitions that one chunk of every actor of the run has together, at most: where there are many actors, chunks get
+    /// shorter than `steps_per_chunk`, so that no actor waits long to send what it has and to take newer weights. None: chunks
+    /// are always `steps_per_chunk` long.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub round_transitions_max: Option<u64>,
     /// Chunks waiting to be acknowledged; at this many the actor stops stepping until one is.
     pub chunks_in_flight_max: u32,
     /// Threads that step the copies; 0 steps them in the acting thread.
@@ -76,7 +83,34 @@ impl ActorSettings {
         this.spec.validate()?;
         this.model.validate()?;
         this.actor.validate()?;
+        this.check_chunk()?;
         Ok(this)
+    }
+
+    /// Checks that the longest chunk fits a message.
+    ///
+    /// # Errors
+    /// It does not; what to do.
+    pub fn check_chunk(&self) -> Result<(), ConfigError> {
+        let Config {
+            envs,
+            steps_per_chunk,
+            ..
+        } = self.actor;
+        let bytes = u64::from(envs) * u64::from(steps_per_chunk) * self.transition_bytes() as u64;
+        if bytes > PLANES_BYTES_MAX as u64 {
+            return Err(ConfigError {
+                key: "steps_per_chunk",
+                value: steps_per_chunk.to_string(),
+                why: "a chunk of so many steps of so many copies (actor.envs) is larger than a message may be, 512 MiB: use fewer",
+            });
+        }
+        Ok(())
+    }
+
+    /// Bytes of one transition in a chunk.
+    const fn transition_bytes(&self) -> usize {
+        self.spec.frame_bytes() + TRANSITION_BYTES
     }
 }
 
@@ -86,8 +120,7 @@ impl ActorSettings {
         let count = self.actor.chunks_in_flight_max as usize + 1;
         let transitions = self.actor.envs as usize * self.actor.steps_per_chunk as usize;
         if self.transport.shared_memory {
-            // A frame, an action, an end and a reward each.
-            PlanesPool::shared(count, count, transitions * (self.spec.frame_bytes() + 6))
+            PlanesPool::shared(count, count, transitions * self.transition_bytes())
         } else {
             PlanesPool::new(count)
         }
@@ -104,6 +137,16 @@ pub struct ConfigError {
 }
 
 impl Config {
+    /// Steps of the next chunk where so many actors are connected to the run.
+    pub fn chunk_steps(&self, actors: u32) -> u32 {
+        let Some(round) = self.round_transitions_max else {
+            return self.steps_per_chunk;
+        };
+        let transitions_a_step = u64::from(self.envs) * u64::from(actors.max(1));
+        let steps = (round / transitions_a_step).clamp(1, self.steps_per_chunk.into());
+        u32::try_from(steps).unwrap_or(self.steps_per_chunk)
+    }
+
     /// Checks every field's range.
     ///
     /// # Errors
@@ -152,5 +195,36 @@ impl Config {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn chunks_get_shorter_as_actors_get_many() {
+        let config = |envs, steps_per_chunk, round_transitions_max| Config {
+            envs,
+            steps_per_chunk,
+            round_transitions_max,
+            chunks_in_flight_max: 4,
+            world_threads: 0,
+            epsilon_start: 0.1,
+            epsilon_end: 0.01,
+            epsilon_decay_frames: 1,
+            ack_timeout_ms: 10_000,
+            unreachable_max_ms: 60_000,
+        };
+        let steps = |actors| config(16, 16, Some(1024)).chunk_steps(actors);
+        assert_eq!(
+            [0, 1, 4, 8, 16, 64, 4096].map(steps),
+            [16, 16, 16, 8, 4, 1, 1]
+        );
+        assert_eq!(
+            config(4096, 4096, Some(u64::MAX)).chunk_steps(u32::MAX),
+            4096
+        );
+        assert_eq!(config(16, 16, None).chunk_steps(4096), 16);
     }
 }

@@ -18,24 +18,16 @@ pub const fn end_on_the_wire(end: StepEnd) -> End {
 #[derive(Debug)]
 pub struct Recorder {
     pool: PlanesPool,
+    /// Of the chunk being filled, or of the next one.
     header: ChunkHeader,
-    chunk: Chunk,
+    /// None between two chunks.
+    chunk: Option<Chunk>,
     filled_steps: u32,
 }
 
 impl Recorder {
-    /// A recorder for `streams` copies whose chunks have `steps` steps each.
-    ///
-    /// # Panics
-    /// If a chunk would be larger than the address space.
-    pub fn new(
-        pool: PlanesPool,
-        actor: u32,
-        epoch: u64,
-        streams: u32,
-        steps: u32,
-        frame_bytes: u32,
-    ) -> Self {
+    /// A recorder for `streams` copies; how long its chunks are is for [`Recorder::begin`].
+    pub fn new(pool: PlanesPool, actor: u32, epoch: u64, streams: u32, frame_bytes: u32) -> Self {
         let header = ChunkHeader {
             actor,
             epoch,
@@ -44,25 +36,28 @@ impl Recorder {
             weights_version: 0,
             leaving: false,
             streams,
-            steps,
+            steps: 1,
             frame_bytes,
         };
         Self {
             header,
-            chunk: fresh(&pool, header),
+            chunk: None,
             pool,
             filled_steps: 0,
         }
     }
 
-    /// Stamps the chunk being filled with the weights that act in it; only before its first step.
-    pub fn set_weights_version(&mut self, version: u64) {
-        assert_eq!(
-            self.filled_steps, 0,
+    /// Says which weights act in the next chunk and how many steps it has; only before its first step.
+    ///
+    /// # Panics
+    /// If a chunk is being filled.
+    pub fn begin(&mut self, weights_version: u64, steps: u32) {
+        assert!(
+            self.chunk.is_none(),
             "one chunk, one version of the weights"
         );
-        self.header.weights_version = version;
-        self.chunk.header.weights_version = version;
+        self.header.weights_version = weights_version;
+        self.header.steps = steps;
     }
 
     /// Transitions recorded so far, including those of the chunk being filled.
@@ -80,11 +75,13 @@ impl Recorder {
         rewards: &[f32],
         ends: &[StepEnd],
     ) -> Option<Chunk> {
-        let frame_bytes = self.header.frame_bytes as usize;
+        let (pool, header) = (&self.pool, self.header);
+        let chunk = self.chunk.get_or_insert_with(|| fresh(pool, header));
+        let frame_bytes = header.frame_bytes as usize;
         for (stream, frame) in frames.chunks_exact(frame_bytes).enumerate() {
-            let row = stream * self.header.steps as usize + self.filled_steps as usize;
-            self.chunk.frame_mut(row).copy_from_slice(frame);
-            self.chunk.set(
+            let row = stream * header.steps as usize + self.filled_steps as usize;
+            chunk.frame_mut(row).copy_from_slice(frame);
+            chunk.set(
                 row,
                 actions[stream],
                 rewards[stream],
@@ -92,14 +89,13 @@ impl Recorder {
             );
         }
         self.filled_steps += 1;
-        (self.filled_steps == self.header.steps).then(|| self.next_chunk())
-    }
-
-    fn next_chunk(&mut self) -> Chunk {
+        if self.filled_steps < self.header.steps {
+            return None;
+        }
         self.header.first_transition = self.produced();
         self.header.sequence += 1;
         self.filled_steps = 0;
-        std::mem::replace(&mut self.chunk, fresh(&self.pool, self.header))
+        self.chunk.take()
     }
 }
 
@@ -116,12 +112,12 @@ mod tests {
 
     #[test]
     fn chunks_are_numbered_and_stream_major() {
-        let mut recorder = Recorder::new(PlanesPool::new(1), 7, 9, 2, 3, 1);
+        let mut recorder = Recorder::new(PlanesPool::new(1), 7, 9, 2, 1);
         let ends = [StepEnd::Running, StepEnd::Terminal];
         let mut chunks = Vec::new();
         for step in 0..7_u8 {
             if step % 3 == 0 {
-                recorder.set_weights_version(u64::from(step));
+                recorder.begin(u64::from(step), 3);
             }
             chunks.extend(recorder.record(&[step, 100 + step], &[step, step], &[0.5, -1.0], &ends));
         }

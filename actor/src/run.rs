@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use driml_protocol::{
-    Keys, Shutdown,
+    ActorJoin, Keys, Shutdown, join,
     session::{self, Endpoints},
 };
 use zenoh::Wait;
@@ -14,7 +14,7 @@ use crate::{
     collect::{Collector, Life},
     config::ActorSettings,
     delivery::{Delivery, DeliveryLimits},
-    weight_watch,
+    weights::WeightsSource,
 };
 
 /// How long an actor waits for a learner with weights.
@@ -43,7 +43,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         listen: Vec::new(),
         connect: args.connect,
     })?;
-    let Some(hello) = session::join(&session, &keys, shutdown)? else {
+    let Some(hello) = join::hello(&session, &keys, shutdown)? else {
         return Ok(());
     };
     let mut settings = ActorSettings::from_toml(&hello.config_toml)
@@ -51,51 +51,62 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     if let Some(envs) = args.envs {
         settings.actor.envs = envs;
         settings.actor.validate()?;
+        settings.check_chunk()?;
+    }
+    if settings.transport.shared_memory && !hello.shared_memory {
+        tracing::info!("chunks go through sockets: the replay server cannot read shared memory");
+        settings.transport.shared_memory = false;
     }
     let spec_hash = settings.spec.hash();
-    let first =
-        weight_watch::first_weights(&session, &keys, spec_hash, WEIGHTS_WAIT_MAX, shutdown)?;
-    let Some((header, weights)) = first else {
+    let join = ActorJoin {
+        actor: args.actor,
+        epoch: rand::random(),
+    };
+    // Before it joins, so that no other process can take its place from then on.
+    let alive = session
+        .liveliness()
+        .declare_token(keys.actor_alive(join.actor, join.epoch))
+        .wait()
+        .map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
+    let Some(welcome) = join::as_actor(&session, &keys, spec_hash, join, shutdown)? else {
+        return Ok(());
+    };
+    let source = WeightsSource {
+        session: session.clone(),
+        keys: keys.clone(),
+        spec_hash,
+    };
+    let Some((header, weights)) = source.first(WEIGHTS_WAIT_MAX, shutdown)? else {
         return Ok(());
     };
     let limits = DeliveryLimits::of(&settings.actor);
-    let envs = settings.actor.envs;
+    let config = settings.actor.clone();
     let pool = settings.chunk_memory();
     let mut collector = Collector::new(
         settings,
         pool.clone(),
         Life {
-            actor: args.actor,
-            epoch: new_epoch(),
+            actor: join.actor,
+            epoch: join.epoch,
             after_updates: hello.after_updates,
         },
         header.version,
         &weights,
     )?;
-    let newest = weight_watch::watch(
-        session.clone(),
-        keys.clone(),
-        spec_hash,
-        header.version,
-        shutdown.clone(),
-    )?;
-    let alive = session
-        .liveliness()
-        .declare_token(keys.actor_alive(args.actor))
-        .wait()
-        .map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
+    let newest = source.watch(header.version, shutdown.clone())?;
     let delivery = Delivery::start(
         session.clone(),
         keys,
         spec_hash,
-        hello.inserted_total,
+        welcome.inserted_total,
         limits,
         pool,
         shutdown.clone(),
     )?;
     tracing::info!(
-        "actor {} steps {envs} copies, run {spec_hash:016x}",
-        args.actor
+        "actor {} steps {} copies, run {spec_hash:016x}",
+        args.actor,
+        config.envs
     );
     while !shutdown.is_set() && !delivery.is_finished() {
         if let Some((header, weights)) = newest.take()
@@ -106,7 +117,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
                 header.version
             );
         }
-        let chunk = collector.collect(delivery.inserted_total())?;
+        let steps = config.chunk_steps(delivery.actors());
+        let chunk = collector.collect(delivery.inserted_total(), steps)?;
         if !delivery.send(chunk) {
             break;
         }
@@ -123,10 +135,4 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         .close()
         .wait()
         .map_err(|e| anyhow::anyhow!("closing the session: {e}"))
-}
-
-/// A number that no other life of this actor has: nanoseconds since 1970.
-fn new_epoch() -> u64 {
-    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
-    now.map_or(1, |since| since.as_nanos() as u64)
 }

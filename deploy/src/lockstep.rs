@@ -9,7 +9,7 @@ use std::{
 use anyhow::{Context, bail};
 use driml_actor::{ActorSettings, Collector, Life};
 use driml_learner::{LearnerPart, Learning};
-use driml_protocol::{Batch, Goodbye, InsertReply, LearnerStatus, PlanesPool, Shutdown};
+use driml_protocol::{ActorJoin, Batch, Goodbye, InsertReply, LearnerStatus, PlanesPool, Shutdown};
 use driml_replay_server::{Replay, Unready};
 
 use crate::{
@@ -26,6 +26,8 @@ use crate::{
 const POLL: Duration = Duration::from_secs(1);
 /// Every actor's epoch: an actor of this mode has one life, and its number influences nothing.
 const EPOCH: u64 = 1;
+/// The learner's number, which influences nothing either.
+const LEARNER: u64 = 1;
 
 /// Trains in this process, and leaves `run_dir`.
 ///
@@ -95,6 +97,7 @@ struct Parts {
     learning: Learning,
     status: LearnerStatus,
     batch_rows: u32,
+    steps_per_chunk: u32,
     unwanted: Vec<u64>,
     published: u64,
 }
@@ -105,7 +108,14 @@ impl Parts {
         let settings = ActorSettings::from_toml(&text)?;
         let part = LearnerPart::from_toml(&text)?;
         let batch_rows = part.learner.batch_rows;
-        let replay = Replay::new(&config.run, &config.replay, batch_rows)?;
+        let mut replay = Replay::new(&config.run, &config.replay, batch_rows)?;
+        for actor in 0..config.local.actors {
+            let join = ActorJoin {
+                actor,
+                epoch: EPOCH,
+            };
+            replay.join_actor(join).map_err(anyhow::Error::msg)?;
+        }
         let mut learning = Learning::new(part, &config.local.learner_device.open()?)?;
         let (header, weights) = learning.next_weights()?;
         let status = LearnerStatus {
@@ -138,6 +148,7 @@ impl Parts {
             learning,
             status,
             batch_rows,
+            steps_per_chunk: settings.actor.steps_per_chunk,
             published: 0,
         })
     }
@@ -146,7 +157,7 @@ impl Parts {
     fn round(&mut self) -> anyhow::Result<bool> {
         let id = self.next_actor;
         self.next_actor = (id + 1) % self.actors.len();
-        let chunk = self.actors[id].collect(self.replay.inserted_total())?;
+        let chunk = self.actors[id].collect(self.replay.inserted_total(), self.steps_per_chunk)?;
         loop {
             match self.replay.insert(&chunk) {
                 InsertReply::Stored { .. } => break,
@@ -180,7 +191,7 @@ impl Parts {
     fn learn(&mut self, batch: &Batch) -> anyhow::Result<()> {
         let report = self.learning.update(batch)?;
         self.learning.note(&report, &mut self.status);
-        if let Some(affinity) = self.learning.affinity_update() {
+        if let Some(affinity) = self.learning.affinity_update(LEARNER) {
             self.replay.set_affinity(&affinity)?;
         }
         if self.learning.publication_is_due() {

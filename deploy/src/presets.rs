@@ -113,7 +113,7 @@ pub(crate) const AGENTS: [Agent; 7] = [
     },
     Agent {
         name: "curl",
-        about: "two augmentations of the same state, the second one seen by the target network",
+        about: "two augmentations of the same state, the second one seen by a moving average of the network",
         layer: layer!("agent/curl"),
     },
 ];

@@ -7,7 +7,8 @@ use std::{hint::black_box, time::Duration};
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use driml_learner::{
-    AdamSettings, Augment, AugmentSettings, Batch, Lambda, Learner, LearnerSettings, Objective,
+    AdamSettings, Augment, AugmentSettings, Batch, CurlSettings, Lambda, Learner, LearnerSettings,
+    Objective,
 };
 use driml_model::{Compute, ConvLayer, DimParts, ModelConfig};
 use rand::{Rng, SeedableRng};
@@ -40,6 +41,7 @@ fn learner(objective: Objective, lambda: Lambda) -> Learner {
         },
         target_period_updates: 312,
         target_tau: 0.95,
+        curl: (objective == Objective::Curl).then_some(CurlSettings { key_tau: 0.001 }),
     };
     let mut model = ModelConfig {
         height: 64,

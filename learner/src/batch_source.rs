@@ -10,8 +10,10 @@ use std::{
 use anyhow::{Context, bail};
 use driml_protocol::{
     Batch, BatchHeader, BatchReply, BatchRequest, Keys, Kind, PlanesPool, ReplayStatus, RequestId,
-    Shutdown, Tally, codec,
+    Shutdown, Tally, codec, fault,
+    seldom::Seldom,
     session::{self, Asked, SessionError},
+    shared_memory::Trust,
     shutdown::join_within,
 };
 use rand::{Rng, SeedableRng};
@@ -32,12 +34,11 @@ const LOOK_AGAIN: Duration = Duration::from_millis(50);
 /// How long the threads may take to end.
 const THREADS_END_MAX: Duration = Duration::from_secs(2);
 
-/// After a batch in shared memory was lost, how many come through the socket before shared memory is tried again.
-const AVOID_COUNT: u32 = 64;
-
-/// What is asked for, and how.
+/// What is asked for, by whom, and how.
 #[derive(Clone, Copy, Debug)]
 pub struct Requests {
+    /// The learner that has joined the run.
+    pub learner: u64,
     /// Rows of a batch.
     pub rows: u32,
     /// Requests on their way at once, and threads that wait for them.
@@ -59,6 +60,7 @@ pub struct BatchSource {
     /// Threads that have not said that they are finished.
     fetching: u32,
     threads: Vec<JoinHandle<()>>,
+    shutdown: Shutdown,
 }
 
 /// What the learner gets when it asks for its next batch.
@@ -100,7 +102,8 @@ impl BatchSource {
                 spec_hash,
                 requests,
                 pool: pool.clone(),
-                by_socket: 0,
+                trust: Trust::default(),
+                said: Seldom::default(),
                 shutdown: shutdown.clone(),
             };
             let sender = sender.clone();
@@ -113,6 +116,7 @@ impl BatchSource {
             fetched,
             fetching: requests.in_flight,
             threads,
+            shutdown: shutdown.clone(),
         })
     }
 
@@ -135,7 +139,10 @@ impl BatchSource {
                 Ok(Fetched::Finished) => self.fetching -= 1,
                 Ok(Fetched::Failed(e)) => return Err(e),
                 Err(mpsc::RecvTimeoutError::Timeout) => return Ok(Next::NotYet),
-                Err(mpsc::RecvTimeoutError::Disconnected) => break,
+                Err(mpsc::RecvTimeoutError::Disconnected) if self.shutdown.is_set() => break,
+                Err(mpsc::RecvTimeoutError::Disconnected) => {
+                    bail!("the threads that fetch batches have ended")
+                }
             }
         }
         Ok(Next::Finished)
@@ -174,8 +181,9 @@ struct Fetcher {
     spec_hash: u64,
     requests: Requests,
     pool: PlanesPool,
-    /// Batches that are still to come through the socket.
-    by_socket: u32,
+    /// Whether batches may come through shared memory.
+    trust: Trust,
+    said: Seldom,
     shutdown: Shutdown,
 }
 
@@ -183,6 +191,7 @@ impl Fetcher {
     fn run(mut self, sender: &mpsc::SyncSender<Fetched>) {
         let mut answered = Instant::now();
         while !self.shutdown.is_set() {
+            fault::point("batches");
             let fetched = match self.fetch() {
                 Ok(None) => {
                     answered = Instant::now();
@@ -193,7 +202,9 @@ impl Fetcher {
                     e.context(format!("no batch and no answer for {UNREACHABLE_MAX:?}")),
                 ),
                 Err(e) => {
-                    tracing::warn!("asking for a batch again: {e:#}");
+                    if let Some(more) = self.said.due() {
+                        tracing::warn!("asking for a batch again: {e:#}{more}");
+                    }
                     self.shutdown.wait_timeout(RETRY_PAUSE);
                     continue;
                 }
@@ -219,6 +230,7 @@ impl Fetcher {
             Answer::Batch(batch) => Some(Fetched::Batch(batch)),
             Answer::Wait => None,
             Answer::Finished => Some(Fetched::Finished),
+            Answer::Refused(why) => Some(refused(&why)),
         })
     }
 
@@ -269,6 +281,7 @@ impl Fetcher {
                 }
                 Answer::Wait => {}
                 Answer::Finished => finished = true,
+                Answer::Refused(why) => return Ok(Some(refused(&why))),
             }
         }
         if let Some(e) = failed {
@@ -314,16 +327,17 @@ impl Fetcher {
 
     /// Asks a shard for `rows` rows.
     fn ask(
-        &self,
+        &mut self,
         shard: usize,
         id: RequestId,
         rows: u32,
         elsewhere: Option<Tally>,
     ) -> anyhow::Result<(Asked, bool)> {
         let request = BatchRequest {
+            learner: self.requests.learner,
             id,
             rows,
-            shared_memory: self.requests.shared_memory && self.by_socket == 0,
+            shared_memory: self.requests.shared_memory && self.trust.ask(),
             elsewhere,
         };
         let message = codec::encode(Kind::BatchRequest, self.spec_hash, &request, &[])?;
@@ -338,12 +352,16 @@ impl Fetcher {
     }
 
     fn answer(&mut self, (asked, shared_memory): (Asked, bool)) -> anyhow::Result<Answer> {
+        // Where this process may not map shared memory, the question seems to have been answered by nobody.
         let answer = asked.answer().inspect_err(|e| {
-            if shared_memory && matches!(e, SessionError::NoReply { .. }) {
-                self.by_socket = AVOID_COUNT;
+            let unheard = matches!(
+                e,
+                SessionError::NoReply { .. } | SessionError::Nobody { .. }
+            );
+            if shared_memory && unheard {
+                self.trust.lost();
             }
         })?;
-        self.by_socket = self.by_socket.saturating_sub(1);
         let (reply, planes) = codec::receive(
             answer.slices(),
             answer.len(),
@@ -353,10 +371,15 @@ impl Fetcher {
         )
         .context("a batch")?;
         Ok(match reply {
-            BatchReply::Batch(header) => Answer::Batch(Batch::from_planes(header, planes)?),
+            BatchReply::Batch(header) => {
+                if shared_memory {
+                    self.trust.worked();
+                }
+                Answer::Batch(Batch::from_planes(header, planes)?)
+            }
             BatchReply::Wait(_) => Answer::Wait,
             BatchReply::Finished => Answer::Finished,
-            BatchReply::Refused { why } => bail!("the replay server refuses: {why}"),
+            BatchReply::Refused { why } => Answer::Refused(why),
         })
     }
 }
@@ -366,4 +389,10 @@ enum Answer {
     Batch(Batch),
     Wait,
     Finished,
+    Refused(String),
+}
+
+/// The end of all fetching: what was refused once will be refused again.
+fn refused(why: &str) -> Fetched {
+    Fetched::Failed(anyhow::anyhow!("the replay server refuses: {why}"))
 }

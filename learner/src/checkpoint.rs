@@ -9,20 +9,23 @@ use std::{
 };
 
 use candle_core::Device;
-use driml_model::{Compute, ModelConfig, Parameters};
+use driml_model::{Compute, Encoder, ModelConfig, Parameters};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::{
     affinity::AffinityEstimator,
-    update::{Learner, LearnerSettings, UpdateError},
+    update::{Learner, LearnerSettings, NetworkParameters, UpdateError},
 };
 
-const FORMAT: u32 = 1;
+/// 2: CURL's key encoder has a file of its own. All else is as in 1.
+const FORMAT: u32 = 2;
 const PREFIX: &str = "checkpoint-";
 const ONLINE: &str = "online.safetensors";
 const TARGET: &str = "target.safetensors";
+/// CURL's key encoder; there for that objective alone.
+const KEY: &str = "key.safetensors";
 const OPTIMIZER: &str = "optimizer.safetensors";
 const STATE: &str = "state.json";
 const LOCK: &str = ".lock";
@@ -65,6 +68,12 @@ pub enum CheckpointError {
         /// Hash of this run.
         expected: String,
     },
+    /// The checkpoint was written before its agent was what it is now.
+    #[error(
+        "{} was saved by an earlier version, in which CURL's keys came from the target network; now a moving average of its \
+         own encodes them, which this checkpoint lacks: go on with the earlier version, or begin anew in another folder", .0.display()
+    )]
+    WithoutKeyEncoder(PathBuf),
     /// The state does not fit the network or the settings.
     #[error("checkpoint: {0}")]
     Update(#[from] UpdateError),
@@ -144,11 +153,15 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
     let moments = learner.adam.to_tensors()?;
     let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from);
     let mut sha256 = BTreeMap::new();
-    for (name, bytes) in [
+    let mut files = vec![
         (ONLINE, everything(learner.online())?),
         (TARGET, everything(learner.target())?),
         (OPTIMIZER, moments.map_err(UpdateError::from)?),
-    ] {
+    ];
+    if let Some(key) = learner.key() {
+        files.push((KEY, everything(key)?));
+    }
+    for (name, bytes) in files {
         write_durably(&aside.join(name), &bytes)?;
         sha256.insert(name.to_owned(), sha256_of(&bytes));
     }
@@ -284,11 +297,11 @@ pub fn load(
     }
     let state: StateFile =
         serde_json::from_slice(&text).map_err(|why| damaged(path, STATE, why.to_string()))?;
-    if state.format != FORMAT {
+    if !(1..=FORMAT).contains(&state.format) {
         return Err(damaged(
             path,
             STATE,
-            format!("its format is {}, not {FORMAT}", state.format),
+            format!("its format is {}, not 1 to {FORMAT}", state.format),
         ));
     }
     let expected = hex_of(run_spec_hash);
@@ -299,6 +312,9 @@ pub fn load(
             found,
             expected,
         });
+    }
+    if state.format == 1 && settings.curl.is_some() {
+        return Err(CheckpointError::WithoutKeyEncoder(path.to_owned()));
     }
     let tensors = |name: &str| {
         let bytes = read(&path.join(name))?;
@@ -313,16 +329,20 @@ pub fn load(
             ))
         }
     };
-    let parameters = |model: &ModelConfig, name: &str| {
-        let loaded = Parameters::load_safetensors(model, &tensors(name)?, &compute.device);
+    let parameters = |model: &ModelConfig, part: fn(&str) -> bool, name: &str| {
+        let loaded = Parameters::load_part(model, part, &tensors(name)?, &compute.device);
         loaded.map_err(|why| damaged(path, name, why.to_string()))
     };
-    let online = parameters(model, ONLINE)?;
-    let target = parameters(&settings.target_model(model), TARGET)?;
+    let key = || parameters(model, Encoder::has, KEY);
+    let networks = NetworkParameters {
+        online: parameters(model, |_| true, ONLINE)?,
+        target: parameters(&model.without_dim(), |_| true, TARGET)?,
+        key: settings.curl.map(|_| key()).transpose()?,
+    };
     let moments = candle_core::safetensors::load_buffer(&tensors(OPTIMIZER)?, &Device::Cpu)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
     let (model, settings) = (model.clone(), settings.clone());
-    let mut learner = Learner::from_parameters(model, settings, compute, online, target)?;
+    let mut learner = Learner::from_parameters(model, settings, compute, networks)?;
     learner
         .restore_progress(state.updates, state.adam_step, moments)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;

@@ -82,8 +82,6 @@ impl Learning {
 
     /// A learner that goes on from the newest checkpoint in `folder`; one at its start if there is none.
     ///
-    /// Its next weights get a version above all that were published since that checkpoint, so that actors take them.
-    ///
     /// # Errors
     /// Settings that cannot work, or a checkpoint that is damaged, of another run or of other settings.
     pub fn resume(part: LearnerPart, compute: &Compute, folder: &Path) -> anyhow::Result<Self> {
@@ -108,9 +106,7 @@ impl Learning {
             "the checkpoint in {} estimated the action affinity otherwise: resume with the settings it was made with, or choose another folder",
             folder.display()
         );
-        let published_since =
-            this.part.learner.checkpoint_period_updates / this.part.learner.publish_period_updates;
-        this.weights_version = restored.weights_version.saturating_add(published_since);
+        this.weights_version = restored.weights_version;
         this.learner = restored.learner;
         this.affinity = restored.affinity;
         this.rng = restored.rng;
@@ -193,9 +189,16 @@ impl Learning {
         status.q_mean = report.q_mean;
     }
 
-    /// The affinity matrix after the last update, if this agent has one.
-    pub fn affinity_update(&self) -> Option<AffinityUpdate> {
+    /// The next weights get a version above `version`: actors take what is newer than theirs, which may be those of a learner
+    /// that died after its last checkpoint.
+    pub fn publish_above(&mut self, version: u64) {
+        self.weights_version = self.weights_version.max(version);
+    }
+
+    /// The affinity matrix after the last update, if this agent has one, as `learner` sends it.
+    pub fn affinity_update(&self, learner: u64) -> Option<AffinityUpdate> {
         self.affinity.as_ref().map(|affinity| AffinityUpdate {
+            learner,
             version: self.learner.updates(),
             num_actions: affinity.num_actions() as u32,
             matrix: affinity.matrix().to_vec(),

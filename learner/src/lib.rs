@@ -14,8 +14,8 @@ pub mod gradients;
 mod learning;
 pub mod loss;
 pub mod optim;
+mod outlets;
 pub mod parity;
-mod publish;
 mod run;
 mod shards;
 pub mod target;
@@ -25,7 +25,7 @@ pub use affinity::{
     AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
 };
 pub use augment::{Augment, AugmentSettings};
-pub use auxiliary::{Objective, dim::Lambda};
+pub use auxiliary::{Objective, curl::CurlSettings, dim::Lambda};
 pub use batch::{Batch, NO_ACTION};
 pub use driml_model::{Compute, DeviceName, Operations};
 
@@ -33,4 +33,4 @@ pub use config::{AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKin
 pub use learning::{Learning, Weights};
 pub use optim::AdamSettings;
 pub use run::{RunArgs, run};
-pub use update::{Learner, LearnerSettings, UpdateError, UpdateReport};
+pub use update::{Learner, LearnerSettings, NetworkParameters, UpdateError, UpdateReport};

@@ -8,14 +8,14 @@ use std::{
 
 use anyhow::Context;
 use driml_model::DeviceName;
-use driml_protocol::{Keys, Shutdown};
+use driml_protocol::{BatchHeader, Keys, Shutdown, shared_memory};
 
 use crate::{
     batch_source::{BatchSource, Next, Requests},
     checkpoint,
     config::LearnerPart,
     learning::Learning,
-    publish::Outlets,
+    outlets::Outlets,
     shards::Shards,
 };
 
@@ -37,7 +37,8 @@ pub struct RunArgs {
     pub device: DeviceName,
 }
 
-/// Runs the learner until `shutdown`. When the run has no more batches it saves, and stays to answer questions.
+/// Runs the learner until `shutdown`. When the run has no more batches it saves, and stays to answer questions. Whatever ends it
+/// before, it saves what it has learned.
 ///
 /// # Errors
 /// A device that is not there, nobody to join, settings that cannot work, an update that failed, a disk that refuses.
@@ -49,47 +50,96 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     };
     let part = LearnerPart::from_toml(&shards.config_toml)
         .context("the settings that the replay server sent")?;
-    let requests = Requests {
-        rows: part.learner.batch_rows,
+    let folder = args.run_dir.join("checkpoints");
+    let _lock = checkpoint::lock(&folder)?;
+    let rows = part.learner.batch_rows;
+    let mut requests = Requests {
+        learner: rand::random(),
+        rows,
         in_flight: part.learner.batches_in_flight,
         shared_memory: part.transport.shared_memory,
     };
-    let folder = args.run_dir.join("checkpoints");
-    let _lock = checkpoint::lock(&folder)?;
-    let mut learning = Learning::resume(part, &compute, &folder)?;
-    anyhow::ensure!(
-        learning.updates() >= shards.after_updates,
-        "the replay server goes on after {} updates, the newest checkpoint in {} has {}: start the replay server with \
-         --after-updates {}, or choose the folder of the run",
-        shards.after_updates,
-        folder.display(),
-        learning.updates(),
-        learning.updates()
-    );
-    if shards.is_new && learning.updates() > 0 {
-        let updates = learning.updates();
-        tracing::warn!(
-            "the replay server counts from the start, so the {updates} updates of the checkpoint come on top of the run's; to go \
-             on where it was, start the replay server with --after-updates {updates}"
-        );
+    if requests.shared_memory
+        && let Err(why) =
+            shared_memory::check_lockable(BatchHeader::of(&part.spec, rows).pool_bytes())
+    {
+        tracing::warn!("batches come through sockets, which is slower: {why}");
+        requests.shared_memory = false;
     }
-    keep_settings(&args.run_dir, &shards.config_toml)?;
+    let mut learning = Learning::resume(part, &compute, &folder)?;
+    let updates = learning.updates();
+    let after_updates = shards.after_updates;
+    anyhow::ensure!(
+        updates >= after_updates,
+        "the replay server goes on after {after_updates} updates, the newest checkpoint in {} has {updates}: start the replay \
+         server with --after-updates {updates}, or choose the folder of the run",
+        folder.display(),
+    );
+    let counted = shards.updates_counted(rows);
+    anyhow::ensure!(
+        updates <= counted,
+        "the replay server has served the batches of {counted} updates, the newest checkpoint in {} has {updates}: to go on with \
+         that run, start the replay server with --after-updates {updates}; to begin another, choose another folder",
+        folder.display(),
+    );
     let spec_hash = learning.spec_hash();
-    let outlets = Outlets::open(&shards.sessions, &keys, spec_hash, shutdown)?;
-    outlets.publish(learning.next_weights()?)?;
-    if learning.updates() > 0 {
-        outlets.with_status(|status| status.updates = learning.updates());
-        if let Some(affinity) = learning.affinity_update() {
+    let learned = updates.saturating_mul(rows.into());
+    let part_in_run = shards.take_part((&keys, spec_hash), requests.learner, learned, shutdown)?;
+    let Some(membership) = part_in_run else {
+        return Ok(());
+    };
+    learning.publish_above(membership.weights_version);
+    keep_settings(&args.run_dir, &shards.config_toml)?;
+    let outlets = Outlets::open(
+        &shards.sessions,
+        (&keys, spec_hash),
+        requests.learner,
+        shutdown,
+    )?;
+    outlets.publish(learning.next_weights()?);
+    if updates > 0 {
+        outlets.with_status(|status| status.updates = updates);
+        if let Some(affinity) = learning.affinity_update(outlets.learner()) {
             outlets.send_affinity(affinity);
         }
     }
     let mut batches = BatchSource::start(&shards.sessions, &keys, spec_hash, requests, shutdown)?;
     tracing::info!(
-        "learning on {} from batches of {} rows, run {spec_hash:016x}",
+        "learning on {} from batches of {rows} rows, run {spec_hash:016x}",
         args.device,
-        requests.rows
     );
 
+    let mut saving = Saving::new(folder);
+    let learned = learn(&mut learning, &mut batches, &outlets, &mut saving, shutdown);
+    if let Err(e) = &learned {
+        tracing::error!("ends after {} updates: {e:#}", learning.updates());
+    }
+    let saved = saving.finish(&learning);
+    if learned.is_ok() && !learning.publication_is_due() {
+        outlets.publish(learning.next_weights()?);
+    }
+    learned.and(saved)?;
+    outlets.with_status(|status| status.finished = true);
+    tracing::info!("finished after {} updates", learning.updates());
+    shutdown.wait();
+    outlets.wait_until_heard(LAST_WORD_MAX);
+    drop(membership);
+    let closed = shards.close();
+    batches.end();
+    closed
+}
+
+/// Learns from batch after batch, until there are no more or `shutdown`.
+///
+/// # Errors
+/// The replay server was out of reach for too long or refuses, or an update failed; the learner is then as after the last update.
+fn learn(
+    learning: &mut Learning,
+    batches: &mut BatchSource,
+    outlets: &Outlets,
+    saving: &mut Saving,
+    shutdown: &Shutdown,
+) -> anyhow::Result<()> {
     let mut waiting_since = Instant::now();
     while !shutdown.is_set() {
         let batch = match batches.next(TICK)? {
@@ -99,11 +149,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         };
         let started = Instant::now();
         let report = learning.update(&batch)?;
-        if let Some(affinity) = learning.affinity_update() {
+        if let Some(affinity) = learning.affinity_update(outlets.learner()) {
             outlets.send_affinity(affinity);
         }
         if learning.publication_is_due() {
-            outlets.publish(learning.next_weights()?)?;
+            outlets.publish(learning.next_weights()?);
         }
         let ended = Instant::now();
         outlets.with_status(|status| {
@@ -113,22 +163,57 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         });
         waiting_since = ended;
         if learning.checkpoint_is_due() {
-            learning.save(&folder)?;
+            saving.save(learning);
         }
     }
-    if !learning.publication_is_due() {
-        outlets.publish(learning.next_weights()?)?;
+    Ok(())
+}
+
+/// Keeps checkpoints of one learner. A disk that refuses does not end the training: the next period tries again, and only what
+/// cannot be saved in the end is an error.
+struct Saving {
+    folder: PathBuf,
+    /// Updates in the newest checkpoint that was saved here.
+    saved: Option<u64>,
+    /// The first failure since then.
+    failed: Option<anyhow::Error>,
+}
+
+impl Saving {
+    const fn new(folder: PathBuf) -> Self {
+        Self {
+            folder,
+            saved: None,
+            failed: None,
+        }
     }
-    if !learning.checkpoint_is_due() || learning.updates() == 0 {
-        learning.save(&folder)?;
+
+    fn save(&mut self, learning: &Learning) {
+        match learning.save(&self.folder) {
+            Ok(()) => {
+                self.saved = Some(learning.updates());
+                self.failed = None;
+            }
+            Err(e) => {
+                tracing::warn!(
+                    "no checkpoint after {} updates, trying again at the next period: {e:#}",
+                    learning.updates()
+                );
+                self.failed.get_or_insert(e);
+            }
+        }
     }
-    outlets.with_status(|status| status.finished = true);
-    tracing::info!("finished after {} updates", learning.updates());
-    shutdown.wait();
-    outlets.wait_until_heard(LAST_WORD_MAX);
-    let closed = shards.close();
-    batches.end();
-    closed
+
+    /// Saves what is not saved yet.
+    ///
+    /// # Errors
+    /// The first failure since the last checkpoint that was saved.
+    fn finish(mut self, learning: &Learning) -> anyhow::Result<()> {
+        if self.saved != Some(learning.updates()) {
+            self.save(learning);
+        }
+        self.failed.map_or(Ok(()), Err)
+    }
 }
 
 /// Leaves the run's settings beside the checkpoints, for `driml evaluate`; a file that is there is the launcher's.

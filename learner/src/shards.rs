@@ -3,11 +3,11 @@
 
 use anyhow::{Context, ensure};
 use driml_protocol::{
-    Hello, Keys, Shutdown, Tally,
+    Hello, Keys, LearnerJoin, Shutdown, Tally, join,
     session::{self, Endpoints},
 };
 use rand::Rng;
-use zenoh::{Session, Wait};
+use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
 /// Sessions with all shards of a run, in the order of the endpoints, and what the run's settings are.
 pub(crate) struct Shards {
@@ -15,8 +15,15 @@ pub(crate) struct Shards {
     pub(crate) config_toml: String,
     /// Updates after which the run goes on; 0 in a run from its start.
     pub(crate) after_updates: u64,
-    /// Whether no shard has counted a transition yet.
-    pub(crate) is_new: bool,
+    /// Rows that each shard has served.
+    served: Vec<u64>,
+}
+
+/// The learner's part in a run, which ends when this is dropped.
+pub(crate) struct Membership {
+    /// Version of the newest weights that any shard has; 0 if none has any.
+    pub(crate) weights_version: u64,
+    _alive: Vec<LivelinessToken>,
 }
 
 impl Shards {
@@ -36,7 +43,7 @@ impl Shards {
                 listen: Vec::new(),
                 connect: vec![endpoint.clone()],
             })?;
-            let Some(hello) = session::join(&session, keys, shutdown)? else {
+            let Some(hello) = join::hello(&session, keys, shutdown)? else {
                 return Ok(None);
             };
             sessions.push(session);
@@ -47,13 +54,57 @@ impl Shards {
             after_updates,
             ..
         } = one_run(connect, &hellos)?.clone();
-        let is_new = hellos.iter().all(|hello| hello.inserted_total == 0);
+        let served = hellos.iter().map(|hello| hello.tally.rows_sampled);
         Ok(Some(Self {
+            served: served.collect(),
             sessions,
             config_toml,
             after_updates,
-            is_new,
         }))
+    }
+
+    /// Updates for which rows were served, of batches of `rows` rows.
+    pub(crate) fn updates_counted(&self, rows: u32) -> u64 {
+        self.served.iter().sum::<u64>() / u64::from(rows.max(1))
+    }
+
+    /// Takes part as the run's one learner, `learner`, that has learned from `rows` rows: what was served beyond them, to one
+    /// that died, does not count any more. `None` if told to stop before.
+    ///
+    /// # Errors
+    /// Another learner takes part, or a replay server refuses.
+    pub(crate) fn take_part(
+        &self,
+        (keys, spec_hash): (&Keys, u64),
+        learner: u64,
+        rows: u64,
+        shutdown: &Shutdown,
+    ) -> anyhow::Result<Option<Membership>> {
+        let mut membership = Membership {
+            weights_version: 0,
+            _alive: Vec::new(),
+        };
+        let learned = learned(&self.served, rows);
+        for (session, rows_sampled) in self.sessions.iter().zip(learned) {
+            // Before it joins, so that no other learner can take its place from then on.
+            let alive = session
+                .liveliness()
+                .declare_token(keys.learner_alive(learner))
+                .wait();
+            let alive = alive.map_err(|e| anyhow::anyhow!("declaring the learner alive: {e}"))?;
+            membership._alive.push(alive);
+            let join = LearnerJoin {
+                learner,
+                rows_sampled,
+            };
+            let joined = join::as_learner(session, keys, spec_hash, join, shutdown)?;
+            let Some(welcome) = joined else {
+                return Ok(None);
+            };
+            let newest = &mut membership.weights_version;
+            *newest = welcome.weights_version.max(*newest);
+        }
+        Ok(Some(membership))
     }
 
     /// Closes all sessions; the first error, if there is one.
@@ -100,6 +151,23 @@ fn one_run<'a>(connect: &[String], hellos: &'a [Hello]) -> anyhow::Result<&'a He
         hellos.len()
     );
     Ok(first)
+}
+
+/// How many of the rows that each shard has `served` were learned from, if `rows` were in all. Only the sum matters: the shards'
+/// limiters decide by it.
+fn learned(served: &[u64], rows: u64) -> Vec<u64> {
+    let mut unlearned = served.iter().sum::<u64>().saturating_sub(rows);
+    let mut learned = Vec::new();
+    for &served in served {
+        let here = unlearned.min(served);
+        unlearned -= here;
+        learned.push(served - here);
+    }
+    // More than were served: the replay server will say so.
+    if let Some(first) = learned.first_mut() {
+        *first += rows.saturating_sub(served.iter().sum());
+    }
+    learned
 }
 
 /// What is known of one shard.
@@ -195,6 +263,14 @@ mod tests {
     }
 
     #[test]
+    fn what_was_served_and_not_learned_is_taken_from_the_shards() {
+        assert_eq!(learned(&[10, 20, 30], 60), [10, 20, 30]);
+        assert_eq!(learned(&[10, 20, 30], 45), [0, 15, 30]);
+        assert_eq!(learned(&[10, 20, 30], 0), [0, 0, 0]);
+        assert_eq!(learned(&[10, 20], 31), [11, 20]);
+    }
+
+    #[test]
     fn a_shard_is_told_of_all_others_and_of_the_rest_of_its_batch() {
         let counts = [count(1, 10, 100), count(2, 20, 200), count(3, 30, 300)];
         let told = |this| elsewhere(&counts, &[5, 6, 7], this);
@@ -219,8 +295,10 @@ mod tests {
         let hello = |config: &str, shard| Hello {
             config_toml: config.into(),
             inserted_total: 0,
+            tally: Tally::default(),
             after_updates: 0,
             shard,
+            shared_memory: true,
         };
         let connect = ["a".to_owned(), "b".to_owned()];
         let said = |hellos: &[Hello]| one_run(&connect, hellos).unwrap_err().to_string();

@@ -1,10 +1,8 @@
-//! The target network: a slow copy of the online network's torso and C51 head, and of the head that encodes CURL's keys.
-//! It decides neither when it follows (`update` does) nor what is computed with it.
-
-use std::collections::HashMap;
+//! Slow copies of the online network, such as the target network: how they follow it.
+//! When they do is for `update` to say.
 
 use candle_core::{CpuStorage, InplaceOp2, Layout, bail};
-use driml_model::{ModelConfig, Operations, Parameters};
+use driml_model::{Operations, Parameters};
 
 use crate::{
     optim::{slice, slice_mut},
@@ -13,20 +11,6 @@ use crate::{
 
 /// Names of the parameters that only the auxiliary loss uses begin so.
 pub const AUXILIARY_PREFIX: &str = "dim.";
-
-/// A deep copy of what the target network of `model` has of `online`.
-///
-/// # Errors
-/// A parameter that is missing.
-pub fn copy_of(model: &ModelConfig, online: &Parameters) -> Result<Parameters, UpdateError> {
-    let mut tensors = HashMap::new();
-    for (name, _) in model.parameter_shapes() {
-        if let Some(var) = online.get(&name) {
-            tensors.insert(name, var.copy()?);
-        }
-    }
-    Ok(Parameters::from_tensors(model, tensors, &online.device())?)
-}
 
 /// Moves `target` towards `online`, in place: `target <- tau * online + (1 - tau) * target`.
 ///

@@ -12,7 +12,7 @@ use crate::{
     auxiliary::{
         Auxiliary, Objective,
         cpc::{self, Cpc},
-        curl::Curl,
+        curl::{Curl, CurlSettings, KeyEncoder},
         dim::{Dim, Lambda, PAIRS},
     },
     batch::Batch,
@@ -47,6 +47,8 @@ pub struct LearnerSettings {
     pub target_period_updates: u64,
     /// Share of the online network in a move of the target network, in (0, 1].
     pub target_tau: f64,
+    /// CURL's key encoder; there for that objective and for no other.
+    pub curl: Option<CurlSettings>,
 }
 
 impl LearnerSettings {
@@ -76,8 +78,11 @@ impl LearnerSettings {
         }
         self.lambda.validate()?;
         self.objective
-            .check(&self.lambda, self.condition_on_action)
+            .check(&self.lambda, self.condition_on_action, self.curl.as_ref())
             .map_err(UpdateError::Objective)?;
+        if let Some(curl) = &self.curl {
+            curl.validate()?;
+        }
         self.adam.validate()
     }
 
@@ -99,14 +104,6 @@ impl LearnerSettings {
     pub fn dim_parts(&self, num_actions: usize) -> DimParts {
         let action = self.condition_on_action && num_actions > 1;
         self.objective.heads(&self.lambda, action)
-    }
-
-    /// The target network for an online network of `model`: torso, C51 head, and the head that encodes CURL's keys.
-    pub fn target_model(&self, model: &ModelConfig) -> ModelConfig {
-        ModelConfig {
-            dim: self.objective.target_heads(),
-            ..model.clone()
-        }
     }
 }
 
@@ -173,7 +170,18 @@ pub struct Evaluation {
     pub gradients: Gradients,
 }
 
-/// The learner: online and target network, optimiser, count of updates.
+/// The parameters of all networks that a learner has.
+#[derive(Debug)]
+pub struct NetworkParameters {
+    /// The network that learns.
+    pub online: Parameters,
+    /// C51's target network: torso and head.
+    pub target: Parameters,
+    /// CURL's key encoder: torso and Psi_4; there for that objective and for no other.
+    pub key: Option<Parameters>,
+}
+
+/// The learner: online and target network, CURL's key encoder, optimiser, count of updates.
 #[derive(Debug)]
 pub struct Learner {
     model: ModelConfig,
@@ -184,12 +192,13 @@ pub struct Learner {
     pub(crate) target: Parameters,
     online_network: Network,
     target_network: Network,
+    key: Option<KeyEncoder>,
     pub(crate) adam: Adam,
     pub(crate) updates: u64,
 }
 
 impl Learner {
-    /// A learner with initial weights drawn from `rng`, the same on every device; the target network is a copy.
+    /// A learner with initial weights drawn from `rng`, the same on every device; the slow networks are copies.
     ///
     /// # Errors
     /// Settings out of their ranges, or a model whose heads are not those that the objective uses.
@@ -200,8 +209,13 @@ impl Learner {
         rng: &mut ChaCha8Rng,
     ) -> Result<Self, UpdateError> {
         let online = Parameters::init(&model, rng, &compute.device)?;
-        let target = target::copy_of(&settings.target_model(&model), &online)?;
-        Self::from_parameters(model, settings, compute, online, target)
+        let key = settings.curl.map(|_| KeyEncoder::copy_of(&online));
+        let parameters = NetworkParameters {
+            target: online.without_dim()?,
+            key: key.transpose()?,
+            online,
+        };
+        Self::from_parameters(model, settings, compute, parameters)
     }
 
     /// A learner with given weights, on the device of `compute`, before its first update.
@@ -212,10 +226,14 @@ impl Learner {
         model: ModelConfig,
         settings: LearnerSettings,
         compute: &Compute,
-        online: Parameters,
-        target: Parameters,
+        parameters: NetworkParameters,
     ) -> Result<Self, UpdateError> {
         settings.validate()?;
+        let NetworkParameters {
+            online,
+            target,
+            key,
+        } = parameters;
         let built = DimParts {
             action: model.dim.embeds_action(),
             ..model.dim
@@ -227,10 +245,21 @@ impl Learner {
             )));
         }
         let operations = compute.operations;
-        let slow = settings.target_model(&model);
+        let key = match (settings.curl, key) {
+            (None, None) => None,
+            (Some(curl), Some(key)) => Some(KeyEncoder::new(&model, curl, operations, key)?),
+            (wanted, _) => {
+                let there = if wanted.is_some() { "missing" } else { "there" };
+                let objective = settings.objective.name();
+                return Err(UpdateError::State(format!(
+                    "a key encoder is {there}, with objective = {objective}"
+                )));
+            }
+        };
         Ok(Self {
             online_network: Network::with_operations(&model, &online, operations)?,
-            target_network: Network::with_operations(&slow, &target, operations)?,
+            target_network: Network::with_operations(&model.without_dim(), &target, operations)?,
+            key,
             adam: Adam::new(settings.adam, &online, operations)?,
             compute: compute.clone(),
             auxiliary: settings.auxiliary(),
@@ -265,6 +294,11 @@ impl Learner {
     /// The target network's parameters.
     pub const fn target(&self) -> &Parameters {
         &self.target
+    }
+
+    /// The parameters of CURL's key encoder, if that is the objective.
+    pub fn key(&self) -> Option<&Parameters> {
+        self.key.as_ref().map(KeyEncoder::parameters)
     }
 
     /// What actors need, torso and head, as safetensors bytes.
@@ -381,14 +415,15 @@ impl Learner {
                 cpc.losses(online, anchors, later.as_ref(), &action, valid)
             }
             Auxiliary::Curl(curl) => {
-                let target = &self.target_network;
-                let key = target.features(&self.frames(batch.rows, batch.frames_k)?)?;
-                curl.losses((online, anchors), (target, &key), &action)
+                let encoder = self.key.as_ref();
+                let encoder = encoder.expect("a learner with this objective is made with one");
+                let keys = encoder.keys(&self.frames(batch.rows, batch.frames_k)?)?;
+                curl.losses(online, anchors, &keys, &action)
             }
         }
     }
 
-    /// Clips `gradients` and takes one step with them; moves the target network when it is its turn.
+    /// Clips `gradients` and takes one step with them; moves the slow networks whose turn it is.
     /// Returns their global norm before clipping.
     ///
     /// # Errors
@@ -401,6 +436,9 @@ impl Learner {
             clip_factor(norm, self.settings.max_grad_norm),
         )?;
         self.updates += 1;
+        if let Some(key) = &self.key {
+            key.follow(&self.online)?;
+        }
         if self
             .updates
             .is_multiple_of(self.settings.target_period_updates)

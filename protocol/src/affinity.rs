@@ -8,7 +8,9 @@ use crate::codec::CodecError;
 /// A, row by row: `matrix[i * n + j]` is the softmax over j of q(a_i, a_j); rows sum to 1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AffinityUpdate {
-    /// Counts up from 1; an older one than the newest seen is ignored.
+    /// Which learner sends it: that of its [`crate::LearnerJoin`].
+    pub learner: u64,
+    /// Counts up from 1; an older one than this learner's newest is ignored.
     pub version: u64,
     /// Raw actions of the world, the side of the matrix.
     pub num_actions: u32,

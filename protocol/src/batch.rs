@@ -4,9 +4,10 @@
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    Planes,
+    Planes, RunSpec,
     codec::{self, CodecError, Kind},
     metric::Waiting,
+    shared_memory,
 };
 
 /// Stands where a row has no next action: its transition ended the episode or the level.
@@ -14,10 +15,14 @@ pub const NO_ACTION: u8 = 255;
 
 /// Planes of a batch.
 const PLANES: usize = 9;
+/// Batches that a replay server keeps in shared memory: those that are assembled, on their way, and being copied by the learner.
+pub const POOL_BATCHES: usize = 6;
 
 /// The learner's request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BatchRequest {
+    /// Which learner asks: that of its [`crate::LearnerJoin`].
+    pub learner: u64,
     /// Which request this is.
     pub id: RequestId,
     /// Rows wanted, B.
@@ -109,6 +114,24 @@ pub struct BatchHeader {
 }
 
 impl BatchHeader {
+    /// A batch of `rows` rows of this run, before any row is written.
+    pub fn of(spec: &RunSpec, rows: u32) -> Self {
+        Self {
+            rows,
+            positives: spec.horizon.positives() as u32,
+            state_bytes: spec.state_bytes() as u32,
+            tally: Tally::default(),
+            held: 0,
+            mean_age: 0.0,
+            weights_versions: (0, u64::MAX),
+        }
+    }
+
+    /// Bytes of the shared memory in which a replay server keeps [`POOL_BATCHES`] such batches.
+    pub fn pool_bytes(&self) -> usize {
+        shared_memory::pool_bytes(POOL_BATCHES, self.planes_bytes())
+    }
+
     /// Bytes of the planes of such a batch.
     ///
     /// # Panics

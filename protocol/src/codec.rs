@@ -41,9 +41,9 @@ pub enum Kind {
     BatchReply = 4,
     /// The action-affinity matrix, learner to replay server.
     Affinity = 5,
-    /// Network weights, learner to actors.
+    /// A piece of the newest weights, replay server to actors.
     Weights = 6,
-    /// "Newer weights exist", learner to actors.
+    /// "Newer weights exist", replay server to actors.
     WeightsVersion = 7,
     /// An actor's last word.
     Goodbye = 8,
@@ -55,6 +55,18 @@ pub enum Kind {
     Hello = 11,
     /// "Understood"; carries nothing.
     Done = 12,
+    /// An actor that starts.
+    ActorJoin = 13,
+    /// A learner that starts.
+    LearnerJoin = 14,
+    /// The answer to a part that starts.
+    JoinReply = 15,
+    /// What became of a chunk, actor to replay server.
+    Claim = 16,
+    /// New weights, learner to replay server.
+    WeightsUpload = 17,
+    /// A request for a piece of the newest weights, actor to replay server.
+    WeightsRequest = 18,
 }
 
 /// Why bytes were refused. None of these is ever a panic.

@@ -77,6 +77,8 @@ pub struct ReplayStatus {
     pub messages_refused: u64,
     /// Rows served since the start.
     pub rows_sampled: u64,
+    /// Rows served to a learner that died before it saved what it learned from them; they do not count as sampled.
+    pub rows_unlearned: u64,
     /// Transitions stored before the first row could be sampled.
     pub warmup_transitions: u64,
     /// Episodes that ended.
@@ -98,6 +100,8 @@ pub struct ReplayStatus {
     pub actors_waited_s: f64,
     /// Actors that are connected.
     pub actors: u32,
+    /// Actors whose next chunk waits until the rate limiter lets it in.
+    pub actors_waiting: u32,
     /// Version of the affinity matrix in use; 0 is the uniform one.
     pub affinity_version: u64,
     /// All transitions are in.
@@ -127,6 +131,7 @@ impl ReplayStatus {
                 batches_retried,
                 messages_refused,
                 rows_sampled,
+                rows_unlearned,
                 // Every shard has the whole run's.
                 warmup_transitions: _,
                 episodes,
@@ -139,6 +144,7 @@ impl ReplayStatus {
                 learner_waited_s,
                 actors_waited_s,
                 actors,
+                actors_waiting,
                 affinity_version,
                 finished,
             } = it;
@@ -151,6 +157,7 @@ impl ReplayStatus {
             sum.batches_retried += batches_retried;
             sum.messages_refused += messages_refused;
             sum.rows_sampled += rows_sampled;
+            sum.rows_unlearned += rows_unlearned;
             sum.episodes += episodes;
             sum.returns.known += returns.known;
             sum.returns.newest.extend(&returns.newest);
@@ -159,6 +166,7 @@ impl ReplayStatus {
             sum.learner_waited_s += learner_waited_s;
             sum.actors_waited_s += actors_waited_s;
             sum.actors += actors;
+            sum.actors_waiting += actors_waiting;
             sum.affinity_version = sum.affinity_version.min(*affinity_version);
             // Each knows of the others what the learner told it; the one that knows of the end is right.
             sum.finished |= finished;
@@ -250,6 +258,7 @@ mod tests {
             batches_retried: 7 * n,
             messages_refused: 8 * n,
             rows_sampled: 9 * n,
+            rows_unlearned: 19 * n,
             warmup_transitions: 1_000,
             episodes: 10 * n,
             returns: Returns {
@@ -266,6 +275,7 @@ mod tests {
             learner_waited_s: 15.0 * n as f64,
             actors_waited_s: 16.0 * n as f64,
             actors: 17 * n as u32,
+            actors_waiting: 20 * n as u32,
             affinity_version: 18 * n,
             finished: n == 2,
         }

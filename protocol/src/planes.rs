@@ -7,10 +7,7 @@
 use std::{
     fmt,
     ops::{Deref, DerefMut},
-    sync::{
-        Arc, Mutex, PoisonError,
-        atomic::{AtomicU32, Ordering},
-    },
+    sync::{Arc, Mutex, PoisonError},
 };
 
 use zenoh::{
@@ -22,8 +19,8 @@ use zenoh::{
     },
 };
 
-/// After a message in shared memory was lost, how many go through the socket before shared memory is tried again.
-const AVOID_COUNT: u32 = 64;
+use crate::shared_memory::{self, Trust};
+
 /// Where the operating system keeps shared memory.
 const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
 
@@ -44,8 +41,7 @@ struct Pool {
 
 struct Shared {
     provider: ShmProvider<PosixShmProviderBackend>,
-    /// Messages that are still to go through the socket.
-    avoid: AtomicU32,
+    trust: Mutex<Trust>,
 }
 
 /// A source of [`Planes`]; clones are the same source.
@@ -61,12 +57,10 @@ impl PlanesPool {
     /// As [`PlanesPool::new`], with shared memory for `count` pieces of `bytes` each; where the machine does not grant it,
     /// a warning says so and everything works without.
     pub fn shared(spare_max: usize, count: usize, bytes: usize) -> Self {
-        // A quarter more, for what the allocator needs and leaves between pieces.
-        let total = count.saturating_mul(bytes) / 4 * 5 + (1 << 16);
-        let shared = match provider(total) {
+        let shared = match provider(shared_memory::pool_bytes(count, bytes)) {
             Ok(provider) => Some(Shared {
                 provider,
-                avoid: AtomicU32::new(0),
+                trust: Mutex::default(),
             }),
             Err(why) => {
                 tracing::warn!(
@@ -112,19 +106,26 @@ impl PlanesPool {
     /// Tells that a message in shared memory did not arrive: the next ones are made of own memory.
     pub fn avoid_shared_memory(&self) {
         if let Some(shared) = &self.0.shared {
-            shared.avoid.store(AVOID_COUNT, Ordering::Relaxed);
+            shared.trust().lost();
+        }
+    }
+
+    /// Tells that a message in shared memory has arrived.
+    pub fn shared_memory_works(&self) {
+        if let Some(shared) = &self.0.shared {
+            shared.trust().worked();
         }
     }
 }
 
 impl Shared {
+    fn trust(&self) -> std::sync::MutexGuard<'_, Trust> {
+        self.trust.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// Never waits: a receiver that died may keep its pieces for a while.
     fn take(&self, bytes: usize) -> Option<ZShmMut> {
-        let one_less = |left: u32| left.checked_sub(1);
-        let avoided = self
-            .avoid
-            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, one_less);
-        if avoided.is_ok() {
+        if !self.trust().ask() {
             return None;
         }
         let taken = self
@@ -150,6 +151,7 @@ fn provider(bytes: usize) -> Result<ShmProvider<PosixShmProviderBackend>, String
             "{SHARED_MEMORY_FOLDER} has {free} bytes free, {bytes} are needed (a container needs --shm-size)"
         ));
     }
+    shared_memory::check_lockable(bytes)?;
     ShmProviderBuilder::default_backend(bytes)
         .wait()
         .map_err(|e| e.to_string())
@@ -273,7 +275,9 @@ mod tests {
         assert!(pieces[0].are_shared() && pieces[1].are_shared() && !pieces[7].are_shared());
         drop(pieces);
         pool.avoid_shared_memory();
-        assert!((0..AVOID_COUNT).all(|_| !pool.take(1_000_000).are_shared()));
-        assert!(pool.take(1_000_000).are_shared());
+        assert!(!pool.take(1_000_000).are_shared());
+        while !pool.take(1_000_000).are_shared() {}
+        pool.avoid_shared_memory();
+        assert!((0..1_000).all(|_| !pool.take(1_000_000).are_shared()));
     }
 }

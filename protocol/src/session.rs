@@ -1,11 +1,9 @@
 //! Opening a zenoh session that suits large, acknowledged messages, and the two ways to talk over it.
 //! It does not scout, gossip or mesh: one part listens, the others connect and redial.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-
-use crate::{CodecError, Hello, Keys, Kind, Shutdown, codec};
 use zenoh::{
     Session, Wait,
     bytes::ZBytes,
@@ -61,28 +59,13 @@ pub enum SessionError {
     },
 }
 
-/// Why a part could not join a run.
-#[derive(Debug, thiserror::Error)]
-pub enum JoinError {
-    /// Nobody there.
-    #[error("no replay server answered within {} s: is it running, and is the endpoint right? ({last})", JOIN_MAX.as_secs())]
-    Nobody {
-        /// The last try's error.
-        last: SessionError,
-    },
-    /// An answer that cannot be read.
-    #[error("the replay server's greeting: {0}")]
-    Codec(#[from] CodecError),
-}
-
-/// How long a joining part waits for a replay server.
-const JOIN_MAX: Duration = Duration::from_secs(60);
-/// One try of that.
-const JOIN_TRY: Duration = Duration::from_secs(2);
-
 /// What zenoh answers in the place of somebody who does not.
 const TIMED_OUT: &str = "Timeout";
 
+/// How long one message may take to go out before its link is given up: below every time-out of a question, so that a peer that
+/// was frozen or vanished is gone before others miss an answer. It comes back, and asks again, once it is well. A message must
+/// be small enough for this: 3 MB need 3 Mbit/s.
+const STALLED_MAX: Duration = Duration::from_secs(8);
 /// Longest message accepted from a peer, bytes.
 const MESSAGE_BYTES_MAX: usize = 1 << 29;
 
@@ -107,6 +90,7 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
     };
     let router = !endpoints.listen.is_empty();
     let max = MESSAGE_BYTES_MAX.to_string();
+    let stalled_us = STALLED_MAX.as_micros().to_string();
     let settings: &[(&str, &str)] = &[
         ("mode", if router { "\"router\"" } else { "\"client\"" }),
         ("listen/endpoints", &list(&endpoints.listen)),
@@ -131,7 +115,7 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
         ("transport/link/tx/queue/size/data", "16"),
         (
             "transport/link/tx/queue/congestion_control/block/wait_before_close",
-            "3600000000",
+            &stalled_us,
         ),
         ("transport/link/rx/max_message_size", &max),
         ("transport/link/rx/buffer_size", "4194304"),
@@ -216,23 +200,37 @@ impl Asked {
     /// # Errors
     /// Nobody there (at once), no answer in time, or the answerer's own error. All may be tried again.
     pub fn answer(self) -> Result<ZBytes, SessionError> {
-        let Self {
-            key,
-            timeout,
-            replies,
-        } = self;
-        let Ok(reply) = replies.recv() else {
-            return Err(SessionError::Nobody { key });
-        };
+        let reply = self.replies.recv().ok();
+        self.read(reply)
+    }
+
+    /// Waits for the one answer, at most for `wait_max`; `None` if it has not come by then.
+    ///
+    /// # Errors
+    /// As [`Asked::answer`].
+    pub fn answer_within(&self, wait_max: Duration) -> Result<Option<ZBytes>, SessionError> {
+        match self.replies.recv_timeout(wait_max) {
+            Ok(None) => Ok(None),
+            Ok(reply) => self.read(reply).map(Some),
+            Err(_) => self.read(None).map(Some),
+        }
+    }
+
+    /// `reply` is none where nobody is there.
+    fn read(&self, reply: Option<Reply>) -> Result<ZBytes, SessionError> {
+        let key = || self.key.clone();
+        let reply = reply.ok_or_else(|| SessionError::Nobody { key: key() })?;
         reply
             .into_result()
             .map(|it| it.payload().clone())
             .map_err(|e| {
                 let why = e.payload().try_to_string().unwrap_or_default().into_owned();
-                let within_ms = timeout.as_millis();
                 match why.as_str() {
-                    TIMED_OUT => SessionError::NoReply { key, within_ms },
-                    _ => SessionError::Zenoh { key, why },
+                    TIMED_OUT => SessionError::NoReply {
+                        key: key(),
+                        within_ms: self.timeout.as_millis(),
+                    },
+                    _ => SessionError::Zenoh { key: key(), why },
                 }
             })
     }
@@ -256,37 +254,5 @@ pub fn ask(
 pub fn answer(query: &Query, payload: ZBytes) {
     if let Err(e) = query.reply(query.key_expr().clone(), payload).wait() {
         tracing::debug!("{}: the asker is gone: {e}", query.key_expr());
-    }
-}
-
-/// Asks the replay server for the run's settings, waiting for it if it is not there yet; `None` if told to stop before.
-///
-/// # Errors
-/// Nobody there within a minute, or another protocol version.
-pub fn join(
-    session: &Session,
-    keys: &Keys,
-    shutdown: &Shutdown,
-) -> Result<Option<Hello>, JoinError> {
-    let started = Instant::now();
-    loop {
-        match ask(
-            session,
-            &keys.hello(),
-            ZBytes::new(),
-            Priority::Data,
-            JOIN_TRY,
-        ) {
-            Ok(answer) => {
-                return Ok(Some(
-                    codec::decode(&answer.to_bytes(), Kind::Hello, None)?.0,
-                ));
-            }
-            Err(last) if started.elapsed() > JOIN_MAX => return Err(JoinError::Nobody { last }),
-            Err(e) => tracing::debug!("no replay server yet: {e}"),
-        }
-        if shutdown.wait_timeout(Duration::from_millis(200)) {
-            return Ok(None);
-        }
     }
 }

@@ -8,6 +8,9 @@ use crate::{
     codec::{self, CodecError, Kind},
 };
 
+/// Bytes of one transition in a chunk beside its frame: an action, an end and a reward.
+pub const TRANSITION_BYTES: usize = 1 + 1 + 4;
+
 /// What a step ended, if anything.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[repr(u8)]
@@ -72,7 +75,7 @@ impl ChunkHeader {
     /// Bytes of the planes of such a chunk; none if they are more than the address space.
     pub fn planes_bytes(&self) -> Option<usize> {
         self.transitions()
-            .checked_mul(self.frame_bytes as usize + 1 + 1 + 4)
+            .checked_mul(self.frame_bytes as usize + TRANSITION_BYTES)
     }
 }
 
@@ -235,18 +238,37 @@ impl Chunk {
     }
 }
 
-/// The replay server's answer to a chunk.
+/// Asks what became of a chunk that the replay server keeps until its limiter opens: the chunk's header without its planes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Claim {
+    /// Which actor.
+    pub actor: u32,
+    /// Which life of that actor.
+    pub epoch: u64,
+    /// Number of the chunk within the epoch.
+    pub sequence: u64,
+    /// The actor was told to stop: the rate limiter lets the chunk pass.
+    pub leaving: bool,
+}
+
+/// The replay server's answer to a chunk or a claim.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum InsertReply {
     /// Stored, now or by an earlier try: the actor may forget it.
     Stored {
         /// Transitions that the run has stored.
         inserted_total: u64,
+        /// Actors that are connected, by which they choose the length of their chunks.
+        actors: u32,
+        /// Whether the chunk had to wait for the rate limiter.
+        waited: bool,
     },
-    /// Not stored: the rate limiter has no room yet; send it again.
+    /// Not stored yet: the rate limiter has no room.
     Wait {
         /// Transitions that the run has stored.
         inserted_total: u64,
+        /// Whether the replay server keeps the chunk and will store it: then a [`Claim`] is enough, else it must be sent again.
+        kept: bool,
     },
     /// Not stored: chunks before it are missing; go on from this sequence number.
     OutOfOrder {

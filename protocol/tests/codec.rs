@@ -5,10 +5,11 @@
 use std::fmt::Debug;
 
 use driml_protocol::{
-    AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader, CodecError,
-    End, Goodbye, Hello, Horizon, InsertReply, Kind, LearnerStatus, NO_ACTION, PROTOCOL_VERSION,
-    Planes, PlanesPool, ReplayStatus, RequestId, Returns, RunSpec, Tally, TimeoutRule, Waiting,
-    WeightsHeader, WeightsVersion,
+    ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader,
+    Claim, CodecError, End, Goodbye, Hello, Horizon, InsertReply, JoinReply, Kind, LearnerJoin,
+    LearnerStatus, NO_ACTION, PROTOCOL_VERSION, Planes, PlanesPool, ReplayStatus, RequestId,
+    Returns, RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader, WeightsReply, WeightsRequest,
+    WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PLANES_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -52,7 +53,7 @@ fn reader<H: DeserializeOwned>(kind: Kind) -> fn(&[u8]) -> Result<(), CodecError
         };
     }
     readers!(Chunk InsertReply BatchRequest BatchReply Affinity Weights WeightsVersion Goodbye ReplayStatus
-        LearnerStatus Hello Done)
+        LearnerStatus Hello Done ActorJoin LearnerJoin JoinReply Claim WeightsUpload WeightsRequest)
 }
 
 fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
@@ -69,7 +70,7 @@ fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
 }
 
 fn read_weights(bytes: &[u8]) -> Result<(), CodecError> {
-    WeightsHeader::decode(bytes, SPEC).map(|_| ())
+    WeightsUpload::decode(bytes, SPEC).map(|_| ())
 }
 
 fn chunk() -> Chunk {
@@ -131,13 +132,11 @@ fn join((mut head, planes): (Vec<u8>, impl AsRef<[u8]>)) -> Vec<u8> {
 
 fn weights() -> Vec<u8> {
     let planes: Vec<u8> = (0..40).collect();
-    codec::encode(
-        Kind::Weights,
-        SPEC,
-        &WeightsHeader::new(4, 312, &planes),
-        &planes,
-    )
-    .unwrap()
+    let upload = WeightsUpload {
+        learner: 5,
+        weights: WeightsHeader::new(4, 312, &planes),
+    };
+    codec::encode(Kind::WeightsUpload, SPEC, &upload, &planes).unwrap()
 }
 
 /// One or more messages of every kind.
@@ -145,8 +144,13 @@ fn samples() -> Vec<Sample> {
     let replies = [
         InsertReply::Stored {
             inserted_total: 1 << 40,
+            actors: 64,
+            waited: true,
         },
-        InsertReply::Wait { inserted_total: 0 },
+        InsertReply::Wait {
+            inserted_total: 0,
+            kept: true,
+        },
         InsertReply::OutOfOrder { expected: 3 },
         InsertReply::Finished { inserted_total: 7 },
         InsertReply::Refused {
@@ -180,6 +184,7 @@ fn samples() -> Vec<Sample> {
         ..LearnerStatus::default()
     };
     let affinity = AffinityUpdate {
+        learner: 5,
         version: 2,
         num_actions: 3,
         matrix: [0.25, 0.5, 0.25].repeat(3),
@@ -187,8 +192,10 @@ fn samples() -> Vec<Sample> {
     let hello = Hello {
         config_toml: "[run]\nseed = 1\n".into(),
         inserted_total: 12,
+        tally: Tally::default(),
         after_updates: 3,
         shard: (1, 2),
+        shared_memory: true,
     };
     let goodbye = Goodbye {
         actor: 1,
@@ -199,6 +206,15 @@ fn samples() -> Vec<Sample> {
         .iter()
         .map(|r| Sample::of(Kind::InsertReply, r))
         .collect();
+    let joined = [
+        JoinReply::Welcome {
+            inserted_total: 3,
+            weights_version: 4,
+        },
+        JoinReply::Taken { why: "a".into() },
+        JoinReply::Refused { why: "b".into() },
+    ];
+    samples.extend(joined.map(|reply| Sample::of(Kind::JoinReply, &reply)));
     samples.extend(waits.map(|waiting| Sample::of(Kind::BatchReply, &BatchReply::Wait(waiting))));
     samples.extend([
         Sample::of(Kind::BatchReply, &BatchReply::Finished),
@@ -209,6 +225,7 @@ fn samples() -> Vec<Sample> {
         Sample::of(
             Kind::BatchRequest,
             &BatchRequest {
+                learner: 5,
                 id: RequestId::first(u64::MAX).again(),
                 rows: 256,
                 shared_memory: true,
@@ -222,6 +239,41 @@ fn samples() -> Vec<Sample> {
         Sample::of(Kind::ReplayStatus, &replay),
         Sample::of(Kind::LearnerStatus, &learner),
         Sample::of(Kind::Hello, &hello),
+        Sample::of(Kind::ActorJoin, &ActorJoin { actor: 1, epoch: 2 }),
+        Sample::of(
+            Kind::LearnerJoin,
+            &LearnerJoin {
+                learner: 5,
+                rows_sampled: 9,
+            },
+        ),
+        Sample::of(
+            Kind::Claim,
+            &Claim {
+                actor: 1,
+                epoch: 2,
+                sequence: 3,
+                leaving: true,
+            },
+        ),
+        Sample::of(Kind::WeightsRequest, &WeightsRequest::NewerThan(7)),
+        Sample::of(
+            Kind::WeightsRequest,
+            &WeightsRequest::Piece {
+                version: 8,
+                offset: 1 << 18,
+            },
+        ),
+        Sample::of(Kind::Weights, &WeightsReply::NoneNewer),
+        Sample::of(Kind::Weights, &WeightsReply::Gone),
+        Sample::of(
+            Kind::Weights,
+            &WeightsReply::Piece {
+                weights: WeightsHeader::new(8, 9, b"these"),
+                bytes: 5,
+                offset: 0,
+            },
+        ),
         Sample::of(Kind::Done, &()),
     ]);
     let with_planes = [
@@ -237,7 +289,7 @@ fn samples() -> Vec<Sample> {
             join(batch().seal(SPEC).unwrap()),
             read_batch,
         ),
-        ("weights", Kind::Weights, weights(), read_weights),
+        ("weights", Kind::WeightsUpload, weights(), read_weights),
     ];
     samples.extend(with_planes.map(|(name, kind, bytes, read)| Sample {
         name: name.into(),
@@ -318,9 +370,10 @@ fn chunk_batch_and_weights_come_back() {
     assert_eq!(back.bootstrap_discounts(), [0.0, 0.0, 0.5]);
 
     let bytes = weights();
-    let (header, planes) = WeightsHeader::decode(&bytes, SPEC).unwrap();
-    assert_eq!((header.version, header.updates, planes.len()), (4, 312, 40));
-    assert_eq!(header.sha256_hex().len(), 64);
+    let (upload, planes) = WeightsUpload::decode(&bytes, SPEC).unwrap();
+    let WeightsUpload { learner, weights } = upload;
+    assert_eq!((learner, weights.version, weights.updates), (5, 4, 312));
+    assert_eq!((planes.len(), weights.sha256_hex().len()), (40, 64));
 }
 
 /// However a message was cut on its way, what is received is what was sent, and in memory that held something else before.
@@ -591,8 +644,10 @@ fn huge_lengths_are_refused_without_taking_memory() {
     let hello = Hello {
         config_toml: "x".repeat(HEADER_BYTES_MAX),
         inserted_total: 0,
+        tally: Tally::default(),
         after_updates: 0,
         shard: (0, 1),
+        shared_memory: false,
     };
     let refused = codec::seal(Kind::Hello, SPEC, &hello, &[]).unwrap_err();
     assert!(
@@ -697,10 +752,13 @@ fn what_no_world_gives_is_refused() {
             decode(&|planes| planes[42 + 4..42 + 8].copy_from_slice(&reward.to_le_bytes()));
         assert!(refused.unwrap_err().to_string().contains("row 1"));
     }
-    let announced = WeightsHeader::new(1, 1, b"these");
-    let bytes = codec::encode(Kind::Weights, SPEC, &announced, b"those").unwrap();
+    let upload = WeightsUpload {
+        learner: 5,
+        weights: WeightsHeader::new(1, 1, b"these"),
+    };
+    let bytes = codec::encode(Kind::WeightsUpload, SPEC, &upload, b"those").unwrap();
     assert!(matches!(
-        WeightsHeader::decode(&bytes, SPEC),
+        WeightsUpload::decode(&bytes, SPEC),
         Err(CodecError::Header(_))
     ));
 }

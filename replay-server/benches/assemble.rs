@@ -5,7 +5,9 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use driml_protocol::{Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule};
+use driml_protocol::{
+    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
+};
 use driml_replay_server::{Compression, Config, Replay};
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -71,6 +73,7 @@ fn filled(frame_stack: u32) -> (Replay, Chunk) {
         transitions_max: None,
     };
     let mut replay = Replay::new(&spec(frame_stack), &config, ROWS).unwrap();
+    replay.join_actor(ActorJoin { actor: 0, epoch: 1 }).unwrap();
     let mut chunk = chunk(0);
     while replay.inserted_total() < CAPACITY + 1000 {
         insert_next(&mut replay, &mut chunk);

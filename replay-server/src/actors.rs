@@ -1,9 +1,9 @@
-//! Exactly once: which chunk each actor sends next, what it says it produced, and where its streams stand.
-//! It stores no transitions and answers nothing itself.
+//! Exactly once: which life of each actor counts, which chunk it sends next, what it says it produced, where its streams stand.
+//! It stores no transitions, answers nothing itself and does not know who is connected.
 
 use std::collections::{HashMap, VecDeque};
 
-use driml_protocol::{ChunkHeader, Goodbye};
+use driml_protocol::{ActorJoin, ChunkHeader, Claim, Goodbye};
 
 use crate::ring::Link;
 
@@ -11,8 +11,8 @@ use crate::ring::Link;
 pub const ACTORS_MAX: usize = 4096;
 /// Most streams of one actor; a chunk with more is refused.
 pub const STREAMS_MAX: u32 = 4096;
-/// Past epochs remembered for each actor; of the oldest, a late first chunk would be taken for a new start.
-const PAST_EPOCHS_MAX: usize = 64;
+/// Past lives remembered for each actor; what an older one still says is ignored.
+const PAST_LIVES_MAX: usize = 64;
 
 /// One copy of an actor's world.
 pub(crate) struct Stream {
@@ -22,31 +22,31 @@ pub(crate) struct Stream {
     pub(crate) episode_return: Option<f64>,
 }
 
-/// One life of an actor.
-pub(crate) struct Epoch {
+/// What is counted of one life of an actor.
+#[derive(Clone, Copy)]
+struct Count {
     epoch: u64,
-    expected: u64,
     /// Transitions it has produced by its own account, as far as heard.
     produced: u64,
     said_goodbye: bool,
-    pub(crate) streams: Vec<Stream>,
 }
 
-impl Epoch {
-    fn new(epoch: u64) -> Self {
-        Self {
-            epoch,
-            expected: 0,
-            produced: 0,
-            said_goodbye: false,
-            streams: Vec::new(),
+impl Count {
+    /// Takes the last word of this life and gives the difference that it reveals; a second one reveals nothing.
+    fn goodbye(&mut self, produced: u64) -> Difference {
+        if std::mem::replace(&mut self.said_goodbye, true) {
+            return Difference::default();
         }
+        Difference::between(produced, std::mem::replace(&mut self.produced, produced))
     }
 }
 
 struct Actor {
-    current: Epoch,
-    past: VecDeque<u64>,
+    current: Count,
+    /// Number of the chunk that comes next in the current life.
+    expected: u64,
+    streams: Vec<Stream>,
+    past: VecDeque<Count>,
 }
 
 /// What is to be done with a chunk.
@@ -80,125 +80,163 @@ impl Difference {
     }
 }
 
-/// All actors that were ever heard of.
+/// All actors that ever joined.
 #[derive(Default)]
 pub(crate) struct Actors {
     actors: HashMap<u32, Actor>,
 }
 
 impl Actors {
+    /// Makes `join.epoch` the life that counts of its actor; the same one may be named again.
+    ///
+    /// # Errors
+    /// One actor more than a run may have, or a life that another one has replaced; the reason, for a person.
+    pub(crate) fn join(&mut self, join: ActorJoin) -> Result<(), String> {
+        let ActorJoin { actor, epoch } = join;
+        let fresh = Count {
+            epoch,
+            produced: 0,
+            said_goodbye: false,
+        };
+        if let Some(known) = self.actors.get_mut(&actor) {
+            if known.current.epoch == epoch {
+                return Ok(());
+            }
+            if known.past.iter().any(|past| past.epoch == epoch) {
+                return Err(replaced(actor));
+            }
+            if known.past.len() == PAST_LIVES_MAX {
+                known.past.pop_front();
+            }
+            known.past.push_back(known.current);
+            (known.current, known.expected) = (fresh, 0);
+            known.streams.clear();
+            return Ok(());
+        }
+        if self.actors.len() >= ACTORS_MAX {
+            return Err(format!(
+                "actor {actor} is one more than the {ACTORS_MAX} that a run may have: use the numbers of actors that have ended"
+            ));
+        }
+        self.actors.insert(
+            actor,
+            Actor {
+                current: fresh,
+                expected: 0,
+                streams: Vec::new(),
+                past: VecDeque::new(),
+            },
+        );
+        Ok(())
+    }
+
+    /// The life of `actor` that counts; none before the first.
+    pub(crate) fn current_epoch(&self, actor: u32) -> Option<u64> {
+        self.actors.get(&actor).map(|it| it.current.epoch)
+    }
+
+    /// The actor, if this is the life of it that counts.
+    fn living(&self, actor: u32, epoch: u64) -> Result<&Actor, String> {
+        match self.actors.get(&actor) {
+            Some(known) if known.current.epoch == epoch => Ok(known),
+            Some(known) if known.past.iter().any(|past| past.epoch == epoch) => {
+                Err(replaced(actor))
+            }
+            _ => Err(format!(
+                "this replay server does not know this life of actor {actor}: it was started anew since the actor joined, \
+                 and what it held is gone; start the actor again"
+            )),
+        }
+    }
+
     /// Judges a chunk without changing anything.
     pub(crate) fn judge(&self, header: &ChunkHeader) -> Verdict {
+        let actor = match self.living(header.actor, header.epoch) {
+            Ok(actor) => actor,
+            Err(why) => return Verdict::Refused(why),
+        };
         if header.streams > STREAMS_MAX {
             return Verdict::Refused(format!(
                 "{} streams in one chunk; an actor has at most {STREAMS_MAX}",
                 header.streams
             ));
         }
-        let first = match header.sequence {
-            0 => Verdict::Next,
-            _ => Verdict::OutOfOrder { expected: 0 },
-        };
-        let Some(actor) = self.actors.get(&header.actor) else {
-            if self.actors.len() >= ACTORS_MAX {
-                return Verdict::Refused(format!(
-                    "actor {} is one more than the {ACTORS_MAX} that a run may have",
-                    header.actor
-                ));
-            }
-            return first;
-        };
-        let current = &actor.current;
-        if actor.past.contains(&header.epoch) {
-            return Verdict::Refused(format!(
-                "actor {} has started anew since epoch {:016x}: it now runs epoch {:016x}; two processes may share an actor number",
-                header.actor, header.epoch, current.epoch
-            ));
-        }
-        if header.epoch != current.epoch {
-            return first;
-        }
-        if header.sequence < current.expected {
+        if header.sequence < actor.expected {
             return Verdict::Retried;
         }
-        if current.said_goodbye {
+        if actor.current.said_goodbye {
             return Verdict::Refused(format!(
                 "actor {} said goodbye before this chunk",
                 header.actor
             ));
         }
-        if header.sequence > current.expected {
+        if header.sequence > actor.expected {
             return Verdict::OutOfOrder {
-                expected: current.expected,
+                expected: actor.expected,
             };
         }
-        if header.sequence > 0 && header.streams as usize != current.streams.len() {
+        if header.sequence > 0 && header.streams as usize != actor.streams.len() {
             return Verdict::Refused(format!(
                 "actor {} sends {} streams after {}; their number must not change before it starts anew",
                 header.actor,
                 header.streams,
-                current.streams.len()
+                actor.streams.len()
             ));
         }
         Verdict::Next
     }
 
+    /// Whether a chunk is stored.
+    ///
+    /// # Errors
+    /// It is of no life that counts; the reason, for a person.
+    pub(crate) fn is_stored(&self, claim: &Claim) -> Result<bool, String> {
+        let actor = self.living(claim.actor, claim.epoch)?;
+        Ok(claim.sequence < actor.expected)
+    }
+
     /// Counts a chunk that was judged `Next`; gives its streams, and how its own count of what came before differs.
     ///
-    /// A new epoch starts with fresh streams. Where the counts differ, the streams are cut: what follows does not continue
+    /// A new life starts with fresh streams. Where the counts differ, the streams are cut: what follows does not continue
     /// what was stored.
     pub(crate) fn accept(&mut self, header: &ChunkHeader) -> (&mut [Stream], Difference) {
-        let epoch = self.enter(header.actor, header.epoch);
-        let difference = Difference::between(header.first_transition, epoch.produced);
+        let actor = self
+            .actors
+            .get_mut(&header.actor)
+            .expect("a chunk of an actor that has not joined is never judged Next");
+        let difference = Difference::between(header.first_transition, actor.current.produced);
         if header.sequence == 0 {
             let start = || Stream {
                 link: Link::EpisodeStart,
                 episode_return: Some(0.0),
             };
-            epoch.streams.resize_with(header.streams as usize, start);
+            actor.streams.resize_with(header.streams as usize, start);
         }
         if difference != Difference::default() {
-            epoch.streams.fill_with(|| Stream {
+            actor.streams.fill_with(|| Stream {
                 link: Link::Lost,
                 episode_return: None,
             });
         }
-        epoch.expected = header.sequence + 1;
-        epoch.produced = header.first_transition + header.transitions() as u64;
-        (&mut epoch.streams, difference)
+        actor.expected = header.sequence + 1;
+        actor.current.produced = header.first_transition + header.transitions() as u64;
+        (&mut actor.streams, difference)
     }
 
-    /// Takes an actor's last word and gives the difference that it reveals; a second goodbye reveals nothing.
+    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second goodbye,
+    /// and that of a life that never joined, reveal nothing.
     pub(crate) fn goodbye(&mut self, goodbye: &Goodbye) -> Difference {
-        let known = self.actors.get(&goodbye.actor);
-        let past = known.is_some_and(|actor| actor.past.contains(&goodbye.epoch));
-        if past || (known.is_none() && self.actors.len() >= ACTORS_MAX) {
+        let Some(actor) = self.actors.get_mut(&goodbye.actor) else {
             return Difference::default();
-        }
-        let epoch = self.enter(goodbye.actor, goodbye.epoch);
-        if std::mem::replace(&mut epoch.said_goodbye, true) {
-            return Difference::default();
-        }
-        Difference::between(
-            goodbye.produced,
-            std::mem::replace(&mut epoch.produced, goodbye.produced),
-        )
-    }
-
-    /// The epoch, which becomes the actor's current one if it is new.
-    fn enter(&mut self, actor: u32, epoch: u64) -> &mut Epoch {
-        let fresh = || Actor {
-            current: Epoch::new(epoch),
-            past: VecDeque::new(),
         };
-        let actor = self.actors.entry(actor).or_insert_with(fresh);
-        if actor.current.epoch != epoch {
-            if actor.past.len() == PAST_EPOCHS_MAX {
-                actor.past.pop_front();
-            }
-            actor.past.push_back(actor.current.epoch);
-            actor.current = Epoch::new(epoch);
-        }
-        &mut actor.current
+        let mut lives = std::iter::once(&mut actor.current).chain(&mut actor.past);
+        let life = lives.find(|life| life.epoch == goodbye.epoch);
+        life.map_or_else(Difference::default, |life| life.goodbye(goodbye.produced))
     }
+}
+
+fn replaced(actor: u32) -> String {
+    format!(
+        "another process has joined as actor {actor} since this one did: give each actor a number of its own (--id)"
+    )
 }

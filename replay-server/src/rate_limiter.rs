@@ -118,10 +118,10 @@ impl RateLimiter {
         self.here.rows_sampled += u64::from(rows);
     }
 
-    /// Counts `rows` that were sampled and did not arrive as not sampled.
-    pub fn taken_back(&mut self, rows: u32) {
+    /// Counts `rows` that were sampled, and of which nothing was learned, as not sampled.
+    pub fn taken_back(&mut self, rows: u64) {
         let rows_sampled = &mut self.here.rows_sampled;
-        *rows_sampled = rows_sampled.saturating_sub(u64::from(rows));
+        *rows_sampled = rows_sampled.saturating_sub(rows);
     }
 
     /// What was counted here since the start.

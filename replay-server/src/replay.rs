@@ -1,9 +1,11 @@
 //! The replay server's core: chunks in, batches out, and its account of itself.
 //! It does no I/O, keeps no time and starts no thread: the service around it does.
 
+use std::borrow::Cow;
+
 use driml_protocol::{
-    AffinityUpdate, Batch, BatchHeader, BatchReply, Chunk, CodecError, Goodbye, InsertReply,
-    Planes, ReplayStatus, RequestId, RunSpec, Tally, Waiting,
+    ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, Chunk, Claim, CodecError, Goodbye,
+    InsertReply, Planes, ReplayStatus, RequestId, RunSpec, Tally, Waiting,
 };
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -185,44 +187,111 @@ impl Replay {
         }
     }
 
-    /// Stores a chunk: [`Replay::packer`] and [`Replay::insert_packed`] in one.
-    pub fn insert(&mut self, chunk: &Chunk) -> InsertReply {
-        self.insert_packed(&self.packer().pack(chunk))
+    /// Takes part from now on: chunks of this life of the actor are stored, those of an earlier one no longer.
+    ///
+    /// # Errors
+    /// Too many actors, or a life that another one has replaced; the reason, for a person.
+    pub fn join_actor(&mut self, join: ActorJoin) -> Result<(), String> {
+        self.actors.join(join)
     }
 
-    /// Stores a chunk that this replay's packer packed, whole, or says why not.
+    /// The life of `actor` whose chunks are stored; none before it joins.
+    pub fn actor_epoch(&self, actor: u32) -> Option<u64> {
+        self.actors.current_epoch(actor)
+    }
+
+    /// A learner takes over that has learned from `rows_sampled` rows of this replay. What was served beyond them, to one that
+    /// died before it saved what it learned, does not count as sampled any more; nor do versions of that one's affinity.
     ///
-    /// A retry is answered `Stored`, and the chunk of an actor that leaves is stored, whatever the limiter says; a chunk that
-    /// is not next is never stored.
+    /// # Errors
+    /// It has learned from more rows than were ever served here; what to do, for a person.
+    pub fn learner_starts(&mut self, rows_sampled: u64) -> Result<(), String> {
+        let served = self.limiter.tally().rows_sampled;
+        let Some(unlearned) = served.checked_sub(rows_sampled) else {
+            return Err(format!(
+                "the learner has learned from {rows_sampled} rows of a replay that has served {served}: start the replay server with \
+                 --after-updates, as the run goes on"
+            ));
+        };
+        self.limiter.taken_back(unlearned);
+        self.statistics.rows_unlearned += unlearned;
+        self.requests = Requests::default();
+        self.affinity.expect_another_source();
+        Ok(())
+    }
+
+    /// Stores a chunk: [`Replay::packer`] and [`Replay::insert_packed`] in one.
+    pub fn insert(&mut self, chunk: &Chunk) -> InsertReply {
+        self.insert_packed(&self.packer().pack(Cow::Borrowed(chunk)))
+    }
+
+    /// Stores a chunk that this replay's packer packed, whole, or says why not: [`Replay::settle`] and [`Replay::admit`] in one.
     pub fn insert_packed(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
-        let chunk = packed.chunk;
+        self.settle(packed).unwrap_or_else(|| self.admit(packed))
+    }
+
+    /// The answer to a chunk that is not to be stored, now or ever: it is stored already, is not the next of its actor, makes no
+    /// sense, or comes after the end of the run. `None`: it is for [`Replay::admit`].
+    ///
+    /// A retry is answered `Stored`, whatever the limiter says; a chunk that is not next is never stored.
+    pub fn settle(&mut self, packed: &PackedChunk<'_>) -> Option<InsertReply> {
+        let chunk = &*packed.chunk;
         let verdict = match self.unfit(chunk) {
             Some(why) => Verdict::Refused(why),
             None => self.actors.judge(&chunk.header),
         };
-        let inserted_total = self.inserted_total();
         match verdict {
             Verdict::Refused(why) => {
                 tracing::warn!("refused a chunk of actor {}: {why}", chunk.header.actor);
                 self.statistics.messages_refused += 1;
-                InsertReply::Refused { why }
+                Some(InsertReply::Refused { why })
             }
             Verdict::Retried => {
                 self.statistics.chunks_retried += 1;
-                InsertReply::Stored { inserted_total }
+                Some(self.stored())
             }
-            _ if self.limiter.all_in() => InsertReply::Finished { inserted_total },
-            Verdict::OutOfOrder { expected } => InsertReply::OutOfOrder { expected },
-            Verdict::Next
-                if !self.limiter.may_insert() && !self.starving && !chunk.header.leaving =>
-            {
-                InsertReply::Wait { inserted_total }
+            _ if self.limiter.all_in() => Some(InsertReply::Finished {
+                inserted_total: self.inserted_total(),
+            }),
+            Verdict::OutOfOrder { expected } => Some(InsertReply::OutOfOrder { expected }),
+            Verdict::Next => None,
+        }
+    }
+
+    /// Stores a chunk that [`Replay::settle`] has nothing to say of, if the limiter lets it pass or its actor leaves; else the
+    /// answer is to wait.
+    pub fn admit(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
+        let leaving = packed.chunk.header.leaving;
+        if self.limiter.may_insert() || self.starving || leaving {
+            self.store(packed);
+            self.stored()
+        } else {
+            InsertReply::Wait {
+                inserted_total: self.inserted_total(),
+                kept: false,
             }
-            Verdict::Next => {
-                self.store(packed);
-                InsertReply::Stored {
-                    inserted_total: self.inserted_total(),
-                }
+        }
+    }
+
+    fn stored(&self) -> InsertReply {
+        InsertReply::Stored {
+            inserted_total: self.inserted_total(),
+            actors: self.statistics.actors.saturating_mul(self.config.shards),
+            waited: false,
+        }
+    }
+
+    /// What became of a chunk: stored, not wanted any more, or never to be stored; none where it is still to come.
+    pub fn claim(&mut self, claim: &Claim) -> Option<InsertReply> {
+        match self.actors.is_stored(claim) {
+            Ok(true) => Some(self.stored()),
+            Ok(false) if self.limiter.all_in() => Some(InsertReply::Finished {
+                inserted_total: self.inserted_total(),
+            }),
+            Ok(false) => None,
+            Err(why) => {
+                self.statistics.messages_refused += 1;
+                Some(InsertReply::Refused { why })
             }
         }
     }
@@ -256,6 +325,16 @@ impl Replay {
                 header.sequence, header.first_transition
             ));
         }
+        let reward_max = f32::MAX / self.spec.n_step as f32;
+        if let Some(row) =
+            (0..chunk.header.transitions()).find(|&row| chunk.reward(row).abs() > reward_max)
+        {
+            return Some(format!(
+                "a reward of {:e}; returns of {} steps are float32, so a reward is at most {reward_max:e}: scale the world's rewards",
+                chunk.reward(row),
+                self.spec.n_step
+            ));
+        }
         let action = chunk
             .actions()
             .iter()
@@ -267,7 +346,7 @@ impl Replay {
     }
 
     fn store(&mut self, packed: &PackedChunk<'_>) {
-        let chunk = packed.chunk;
+        let chunk = &*packed.chunk;
         let header = chunk.header;
         let (streams, difference) = self.actors.accept(&header);
         let steps = header.steps as usize;
@@ -335,7 +414,7 @@ impl Replay {
             Standing::Open(lost) => {
                 if !lost.is_empty() {
                     tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
-                    self.limiter.taken_back(lost.len() as u32);
+                    self.limiter.taken_back(lost.len() as u64);
                     self.statistics.taken_back(&lost);
                 }
             }
@@ -425,13 +504,9 @@ impl Replay {
     /// What a batch of `rows` rows says of itself before any row is written.
     pub(crate) fn batch_header(&self, rows: u32) -> BatchHeader {
         BatchHeader {
-            rows,
-            positives: self.spec.horizon.positives() as u32,
-            state_bytes: self.spec.state_bytes() as u32,
             tally: self.limiter.tally(),
             held: self.ring.inserted() - self.ring.oldest(),
-            mean_age: 0.0,
-            weights_versions: (0, u64::MAX),
+            ..BatchHeader::of(&self.spec, rows)
         }
     }
 
@@ -447,7 +522,7 @@ impl Replay {
         Unready::Wait(Waiting::LearnerWaitsForActors)
     }
 
-    /// Takes a newer affinity matrix; one that is not newer is ignored.
+    /// Takes a newer affinity matrix; one that is not newer than this learner's last is ignored.
     ///
     /// # Errors
     /// A matrix of another size, or with an entry that is no probability; it counts as a refused message.
@@ -504,9 +579,29 @@ impl Replay {
         self.limiter.inserted_total()
     }
 
+    /// What was counted here since the start.
+    pub const fn tally(&self) -> Tally {
+        self.limiter.tally()
+    }
+
     /// Takes what the replay's other shards have counted.
-    pub fn heard(&mut self, elsewhere: Tally) {
+    ///
+    /// # Errors
+    /// More transitions than the run can ever have; the reason, for a person.
+    pub fn heard(&mut self, elsewhere: Tally) -> Result<(), String> {
+        let config = &self.config;
+        // Each shard takes what its limiter allows until it hears of the others, at most what it holds.
+        let most = |max: u64| max.saturating_add(config.capacity_transitions);
+        if let Some(most) = config.transitions_max.map(most)
+            && elsewhere.inserted > most
+        {
+            return Err(format!(
+                "the other shards are said to have stored {} transitions; this run has at most {most}",
+                elsewhere.inserted
+            ));
+        }
         self.limiter.heard(elsewhere);
+        Ok(())
     }
 
     /// Who waits for whom now, for batches of the size that the replay was made for.
@@ -532,6 +627,7 @@ impl Replay {
             batches_retried: statistics.batches_retried,
             messages_refused: statistics.messages_refused,
             rows_sampled: self.limiter.tally().rows_sampled,
+            rows_unlearned: statistics.rows_unlearned,
             warmup_transitions: self.config.warmup_transitions,
             episodes: statistics.episodes,
             returns: statistics.returns(),
@@ -542,6 +638,7 @@ impl Replay {
             learner_waited_s: statistics.learner_waited_s,
             actors_waited_s: statistics.actors_waited_s,
             actors: statistics.actors,
+            actors_waiting: 0,
             affinity_version: self.affinity.version(),
             finished: self.limiter.all_in(),
         }
@@ -564,7 +661,7 @@ impl Replay {
         let served: u64 = self.statistics.k_histogram.iter().sum();
         assert_eq!(
             self.before.rows_sampled + served,
-            self.limiter.tally().rows_sampled,
+            self.limiter.tally().rows_sampled + self.statistics.rows_unlearned,
             "every row served has one k"
         );
     }

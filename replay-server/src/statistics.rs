@@ -12,6 +12,8 @@ pub(crate) struct Statistics {
     pub(crate) transitions_duplicated: u64,
     pub(crate) chunks_retried: u64,
     pub(crate) batches_retried: u64,
+    /// Rows served to a learner that died before it saved what it learned from them.
+    pub(crate) rows_unlearned: u64,
     pub(crate) messages_refused: u64,
     pub(crate) episodes: u64,
     returns_known: u64,

@@ -20,7 +20,9 @@ use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_m
 use driml_envs::{
     DistributionMode, Environment, Game, ProcgenConfig, ProcgenEngine, ProcgenWorld, StepEnd,
 };
-use driml_protocol::{Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule};
+use driml_protocol::{
+    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
+};
 use driml_replay_server::{Compression, Config, Replay};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -59,7 +61,9 @@ fn replay(compression: Compression, frame_stack: u32) -> Replay {
         slack_transitions: 1 << 50,
         transitions_max: None,
     };
-    Replay::new(&spec, &config, ROWS).unwrap()
+    let mut replay = Replay::new(&spec, &config, ROWS).unwrap();
+    replay.join_actor(ActorJoin { actor: 0, epoch: 1 }).unwrap();
+    replay
 }
 
 /// Everything that 16 copies of a game show, as an actor would send it.

@@ -100,15 +100,15 @@ def masked_losses(p, config, t, k, action, valid):
     return pair_losses(p, config, [f[rows] for f in t], [f[rows] for f in k], chosen)
 
 
-def auxiliary_losses(online, target, config, case):
+def auxiliary_losses(online, key, config, case):
     """The losses of every pair that the objective knows, before their weights."""
     objective = config.get("objective", "dim")
     action = None if objective == "curl" else embedded(online, config, case["input.action"])
     if objective == "curl":
         query = psi(online, "psi4", features(online, config, case["input.view_query"])[1], None)
         with torch.no_grad():
-            key = psi(target, "psi4", features(target, config, case["input.view_key"])[1], None)
-        return {"4t4": info_nce((query @ key.T)[None], config)}
+            keys = psi(key, "psi4", features(key, config, case["input.view_key"])[1], None)
+        return {"4t4": info_nce((query @ keys.T)[None], config)}
     t = features(online, config, case["input.frames_t"])
     later, valid = case["input.frames_k"], case["input.positive_valid"]
     if objective != "cpc":
@@ -136,6 +136,7 @@ def update(case, config):
     """Everything that is expected of the update of a case, by name."""
     online = {n[7:]: t.double().requires_grad_() for n, t in case.items() if n.startswith("online.")}
     target = {n[7:]: t.double() for n, t in case.items() if n.startswith("target.")}
+    key = {n[4:]: t.double() for n, t in case.items() if n.startswith("key.")}
     rows = torch.arange(len(case["input.action"]))
     atoms = torch.linspace(config["v_min"], config["v_max"], config["atoms"], dtype=torch.float64)
     expect = {}
@@ -149,7 +150,7 @@ def update(case, config):
         )
     log_probs = distribution(online, config, features(online, config, case["input.frames_t"])[1])
     kl = (torch.xlogy(goal, goal) - goal * log_probs[rows, case["input.action"]]).sum(1).mean()
-    losses = auxiliary_losses(online, target, config, case)
+    losses = auxiliary_losses(online, key, config, case)
     total = kl + sum(config["lambda"][pair] * loss for pair, loss in losses.items() if config["lambda"][pair] > 0)
 
     expect["q_values_t"] = (log_probs.exp() @ atoms).detach()
@@ -170,6 +171,9 @@ def update(case, config):
         # The first step, with its corrections of the bias: m = g, v = g^2.
         g = g * factor
         expect[f"updated.{name}"] = p.detach() - adam["lr"] * g / (g.abs() + adam["eps"])
+    for name, slow in key.items():
+        tau = config["key_tau"]
+        expect[f"updated_key.{name}"] = tau * expect[f"updated.{name}"] + (1 - tau) * slow
     return {f"expect.{name}": value for name, value in expect.items()}
 
 
@@ -238,11 +242,15 @@ def make(seed, rows, height, width, objective, lambdas, positives=1, action=Fals
         return fine.clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1).reshape(*leading, height, width, 3).contiguous()
 
     online = parameters(config, heads, action, g, scale)
-    slow = heads if objective == "curl" else []
-    target = {n: t for n, t in online.items() if not n.startswith("dim.") or n.split(".")[1] in slow}
-    # An older online network.
-    target = {n: t + 0.1 * t.abs().mean() * torch.randn(t.shape, generator=g) for n, t in target.items()}
-    case = {f"online.{n}": t for n, t in online.items()} | {f"target.{n}": t.float() for n, t in target.items()}
+    def older(names):
+        """An older online network."""
+        named = {n: t for n, t in online.items() if n.startswith(names)}
+        return {n: (t + 0.1 * t.abs().mean() * torch.randn(t.shape, generator=g)).float() for n, t in named.items()}
+
+    case = {f"online.{n}": t for n, t in online.items()}
+    case |= {f"target.{n}": t for n, t in older(("torso.", "head.")).items()}
+    if objective == "curl":
+        case |= {f"key.{n}": t for n, t in older(("torso.", "dim.psi4.")).items()}
     case["input.frames_t"], case["input.frames_n"] = frames(rows), frames(rows)
     case["input.action"] = torch.randint(0, config["actions"], (rows,), generator=g)
     case["input.n_step_return"] = (4 * torch.randn(rows, generator=g)).float()
@@ -277,10 +285,11 @@ CASES = {
     ),
     "curl": dict(
         seed=14, rows=7, height=36, width=44, objective="curl", lambdas=[0.0, 0.0, 0.0, 1.0], heads=["psi4"],
+        key_tau=0.001,
     ),
     "curl_clipped": dict(
         seed=15, rows=9, height=44, width=36, objective="curl", lambdas=[0.0, 0.0, 0.0, 0.5], heads=["psi4"],
-        double_dqn=True, max_grad_norm=0.25, tanh_clip=5.0,
+        double_dqn=True, max_grad_norm=0.25, tanh_clip=5.0, key_tau=0.3,
     ),
 }  # fmt: skip
 

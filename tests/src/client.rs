@@ -4,8 +4,10 @@
 use std::time::{Duration, Instant};
 
 use driml_protocol::{
-    Chunk, InsertReply, Keys, Kind, LearnerStatus, ReplayStatus, RunSpec, Shutdown, codec,
+    ActorJoin, Chunk, InsertReply, Keys, Kind, LearnerJoin, LearnerStatus, ReplayStatus, RunSpec,
+    Shutdown, codec,
     config::Settings,
+    join,
     session::{self, Endpoints, SessionError},
 };
 use serde::de::DeserializeOwned;
@@ -45,7 +47,7 @@ impl Client {
             }
         };
         let keys = Keys::new(NAMESPACE).unwrap();
-        let hello = session::join(&session, &keys, &Shutdown::default())
+        let hello = join::hello(&session, &keys, &Shutdown::default())
             .unwrap()
             .expect("nobody tells this client to stop");
         let spec = Settings::parse(&hello.config_toml)
@@ -110,6 +112,29 @@ impl Client {
         wanted: impl Fn(&LearnerStatus) -> bool,
     ) -> LearnerStatus {
         wait_for(what, || self.learner().filter(&wanted))
+    }
+
+    /// Takes part as an actor; its chunks are of this `epoch`.
+    ///
+    /// # Panics
+    /// If the replay server does not take it.
+    pub fn join_as_actor(&self, actor: u32, epoch: u64) {
+        let join = ActorJoin { actor, epoch };
+        let never = Shutdown::default();
+        join::as_actor(&self.session, &self.keys, self.spec.hash(), join, &never).unwrap();
+    }
+
+    /// Takes part as the learner, which has learned from so many rows.
+    ///
+    /// # Panics
+    /// If the replay server does not take it.
+    pub fn join_as_learner(&self, learner: u64, rows_sampled: u64) {
+        let join = LearnerJoin {
+            learner,
+            rows_sampled,
+        };
+        let never = Shutdown::default();
+        join::as_learner(&self.session, &self.keys, self.spec.hash(), join, &never).unwrap();
     }
 
     /// Sends a chunk as an actor would.

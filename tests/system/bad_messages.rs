@@ -16,13 +16,28 @@ struct Served {
     system: TestSystem,
 }
 
+/// The life of actor 0 that sends chunks here, and the learner.
+const EPOCH: u64 = 9;
+const LEARNER: u64 = 5;
+
 fn served() -> Served {
     let system = system();
     let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
+    let client = system.connect();
+    client.join_as_actor(0, EPOCH);
+    client.join_as_learner(LEARNER, 0);
     Served {
-        client: system.connect(),
+        client,
         _server: server,
         system,
+    }
+}
+
+fn stored(inserted_total: u64) -> InsertReply {
+    InsertReply::Stored {
+        inserted_total,
+        actors: 0,
+        waited: false,
     }
 }
 
@@ -32,7 +47,7 @@ impl Served {
         let spec = &self.client.spec;
         let header = ChunkHeader {
             actor: 0,
-            epoch: 9,
+            epoch: EPOCH,
             sequence,
             first_transition: 6 * sequence,
             weights_version: 1,
@@ -85,7 +100,7 @@ impl Served {
         let retried = self.client.replay().unwrap().chunks_retried;
         for _ in 0..2 {
             let reply = self.client.insert(&self.chunk(sequence));
-            assert_eq!(reply, InsertReply::Stored { inserted_total });
+            assert_eq!(reply, stored(inserted_total));
         }
         let status = self.client.replay().unwrap();
         assert_eq!(status.transitions_inserted, inserted_total);
@@ -180,12 +195,12 @@ fn chunks_that_make_no_sense_in_this_run() {
     // Another life of the actor, and then a late message of the first.
     let mut second_life = served.chunk(0);
     second_life.header.epoch = 10;
-    assert_eq!(
-        served.client.insert(&second_life),
-        InsertReply::Stored { inserted_total: 18 }
-    );
+    let unknown = served.sealed(&second_life, served.client.spec.hash());
+    served.refused(unknown, "does not know this life of actor 0");
+    served.client.join_as_actor(0, 10);
+    assert_eq!(served.client.insert(&second_life), stored(18));
     let late = served.sealed(&served.chunk(2), served.client.spec.hash());
-    served.refused(late, "two processes may share an actor number");
+    served.refused(late, "give each actor a number of its own");
 }
 
 #[test]
@@ -202,6 +217,7 @@ fn everything_else_that_a_replay_server_takes() {
             Kind::BatchRequest,
             hash ^ 1,
             &BatchRequest {
+                learner: LEARNER,
                 id: RequestId::first(7),
                 rows: 16,
                 shared_memory: false,
@@ -223,6 +239,7 @@ fn everything_else_that_a_replay_server_takes() {
             Kind::BatchRequest,
             hash,
             &BatchRequest {
+                learner: LEARNER,
                 id: RequestId::first(7),
                 rows,
                 shared_memory: false,
@@ -247,6 +264,7 @@ fn everything_else_that_a_replay_server_takes() {
         produced: 1000,
     };
     let affinity = AffinityUpdate {
+        learner: LEARNER,
         version: 1,
         num_actions: 2,
         matrix: vec![0.5; 4],

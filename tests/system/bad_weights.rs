@@ -1,86 +1,60 @@
-//! Weights that an actor must not act with, and greetings that no part must follow: of other runs and versions, damaged.
-//! The learner, or the replay server, is played by the test itself.
-
-use std::sync::{Arc, Mutex};
+//! Weights that a replay server must not take and an actor must not act with, and greetings that no part must follow: of other
+//! runs and versions, of strangers, damaged. The learner, or the replay server, is played by the test itself.
 
 use driml_learner::{Compute, LearnerPart, Learning};
 use driml_protocol::{
-    Hello, Keys, Kind, PROTOCOL_VERSION, WeightsHeader, WeightsVersion, codec,
+    Hello, Keys, Kind, PROTOCOL_VERSION, Tally, WeightsHeader, WeightsUpload, WeightsVersion,
+    codec,
     session::{self, Endpoints},
 };
 use driml_tests::Client;
-use zenoh::{Wait, query::Queryable};
+use zenoh::Wait;
 
 use crate::system;
 
-/// A learner that offers what it is told to.
+/// The learner that this test plays.
+const LEARNER: u64 = 5;
+
+/// A learner of the run, and whoever else sends weights.
 struct FakeLearner<'a> {
     client: &'a Client,
-    offered: Arc<Mutex<Vec<u8>>>,
-    /// How often the weights were asked for.
-    asked: Arc<Mutex<u32>>,
-    _queryable: Queryable<()>,
 }
 
-impl<'a> FakeLearner<'a> {
-    fn new(client: &'a Client) -> Self {
-        let (offered, asked) = (
-            Arc::<Mutex<Vec<u8>>>::default(),
-            Arc::<Mutex<u32>>::default(),
-        );
-        let (held, count) = (offered.clone(), asked.clone());
-        let answer = move |query| {
-            *count.lock().unwrap() += 1;
-            session::answer(&query, held.lock().unwrap().clone().into());
-        };
-        let declared = client
-            .session
-            .declare_queryable(client.keys.weights())
-            .callback(answer);
-        Self {
-            client,
-            offered,
-            asked,
-            _queryable: declared.wait().unwrap(),
-        }
+impl FakeLearner<'_> {
+    fn upload(version: u64, safetensors: &[u8], spec_hash: u64, learner: u64) -> Vec<u8> {
+        let weights = WeightsHeader::new(version, 0, safetensors);
+        let upload = WeightsUpload { learner, weights };
+        codec::encode(Kind::WeightsUpload, spec_hash, &upload, safetensors).unwrap()
     }
 
-    fn asked(&self) -> u32 {
-        *self.asked.lock().unwrap()
-    }
-
-    /// Offers weights as a learner of the run with hash `spec_hash` would, and announces them.
-    fn offer(&self, version: u64, safetensors: &[u8], spec_hash: u64) {
-        let header = WeightsHeader::new(version, 0, safetensors);
-        self.offer_bytes(
-            version,
-            codec::encode(Kind::Weights, spec_hash, &header, safetensors).unwrap(),
-        );
-    }
-
-    fn offer_bytes(&self, version: u64, bytes: Vec<u8>) {
-        *self.offered.lock().unwrap() = bytes;
-        self.announce(version, self.client.spec.hash());
-    }
-
-    fn announce(&self, version: u64, spec_hash: u64) {
-        let announced = codec::encode(
-            Kind::WeightsVersion,
-            spec_hash,
-            &WeightsVersion { version },
-            &[],
-        )
-        .unwrap();
+    /// Sends weights that the replay server takes.
+    fn send(&self, version: u64, safetensors: &[u8]) {
+        let bytes = Self::upload(version, safetensors, self.client.spec.hash(), LEARNER);
         self.client
-            .session
-            .put(self.client.keys.weights_version(), announced)
-            .wait()
+            .ask(&self.client.keys.weights_upload(), bytes)
             .unwrap();
+    }
+
+    /// Sends bytes that the replay server refuses, and counts as refused.
+    fn refused(&self, bytes: Vec<u8>, why: &str) {
+        let counted = || self.client.replay().unwrap().messages_refused;
+        let before = counted();
+        let answer = self.client.ask(&self.client.keys.weights_upload(), bytes);
+        assert!(answer.is_err(), "{why}: {answer:?}");
+        assert_eq!(counted(), before + 1, "{why}");
+    }
+
+    /// Says that there are newer weights, as a stranger could.
+    fn announce(&self, version: u64, spec_hash: u64) {
+        let announced = WeightsVersion { version };
+        let bytes = codec::encode(Kind::WeightsVersion, spec_hash, &announced, &[]).unwrap();
+        let key = self.client.keys.weights_version();
+        self.client.session.put(key, bytes).wait().unwrap();
     }
 }
 
 #[test]
-fn an_actor_keeps_what_it_has() {
+fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     let system = system();
     // Inserts alone are watched here, so the warm-up is as long as the run.
     let flags = "--env chain --agent c51 --preset smoke --set replay.capacity_transitions=20000000 --frames 20000000";
@@ -93,47 +67,58 @@ fn an_actor_keeps_what_it_has() {
         .unwrap()
         .next_weights()
         .unwrap();
-    let learner = FakeLearner::new(&client);
+    let learner = FakeLearner { client: &client };
+    let upload = FakeLearner::upload;
 
     // Until there are weights that it may use, an actor asks again and steps nothing.
-    learner.offer(1, &good, hash ^ 1);
     let mut actor = system.start_actor(0);
-    driml_tests::wait_for("three questions for weights", || {
-        (learner.asked() >= 3).then_some(())
-    });
+    actor.wait_for_stderr("waiting for the learner's first weights");
+    learner.refused(upload(1, &good, hash, LEARNER), "it has not joined");
+    client.join_as_learner(LEARNER, 0);
+    learner.refused(upload(1, &good, hash ^ 1, LEARNER), "of another run");
     assert_eq!(client.replay().unwrap().transitions_inserted, 0);
-    learner.offer(1, &good, hash);
+    learner.send(1, &good);
     client.wait_for_replay("transitions", |replay| replay.transitions_inserted > 0);
 
     // Then it keeps them, whatever comes.
-    learner.offer(2, &good, hash ^ 1);
-    actor.wait_for_stderr(
-        "keeping weights 1, newer ones did not come: the message belongs to run spec",
-    );
-    let mut newer_protocol =
-        codec::encode(Kind::Weights, hash, &WeightsHeader::new(3, 0, &good), &good).unwrap();
+    let mut newer_protocol = upload(2, &good, hash, LEARNER);
     newer_protocol[4..6].copy_from_slice(&(PROTOCOL_VERSION + 1).to_le_bytes());
-    learner.offer_bytes(3, newer_protocol);
-    actor.wait_for_stderr(
-        "keeping weights 1, newer ones did not come: the sender speaks protocol version",
-    );
+    let mut damaged = upload(2, &good, hash, LEARNER);
+    *damaged.last_mut().unwrap() ^= 1;
+    for (bytes, why) in [
+        (newer_protocol, "of another protocol"),
+        (damaged, "damaged"),
+        (b"not weights".to_vec(), "no message"),
+        (upload(2, &good, hash, LEARNER ^ 1), "of a stranger"),
+        (
+            upload(1, &good[..40], hash, LEARNER),
+            "other weights of the same version",
+        ),
+        (
+            upload(1 << 60, &good, hash, LEARNER),
+            "no count of a learner's",
+        ),
+        (upload(0, &good, hash, LEARNER), "older"),
+    ] {
+        learner.refused(bytes, why);
+    }
     learner.announce(4, hash ^ 1);
     actor
         .wait_for_stderr("an announcement of weights was dropped: the message belongs to run spec");
-    learner.offer_bytes(5, b"not weights".to_vec());
-    actor.wait_for_stderr("keeping weights 1, newer ones did not come: the message has 11 bytes");
-    // Of the right run, but no network of this shape: seen only when they are to be used.
-    learner.offer(6, &good[..good.len() / 2], hash);
+    // Nothing newer is there, so nothing comes of it.
+    learner.announce(1 << 60, hash);
+    // Of the right learner, but no network of this shape: seen only when they are to be used.
+    learner.send(6, &good[..good.len() / 2]);
     actor.wait_for_stderr("weights 6 were refused, the old ones stay");
+    learner.send(7, &good);
 
     let before = client.replay().unwrap().transitions_inserted;
     client.wait_for_replay("more transitions", |replay| {
         replay.transitions_inserted > before + 1000
     });
-    drop(learner);
-    actor.stop().expect_code(0);
-    let replay = client.replay().unwrap();
-    assert_eq!((replay.transitions_lost, replay.messages_refused), (0, 0));
+    let said = actor.stop().expect_code(0).stderr;
+    assert!(!said.contains("newer ones did not come"), "{said}");
+    assert_eq!(client.replay().unwrap().transitions_lost, 0);
 }
 
 #[test]
@@ -147,8 +132,10 @@ fn parts_of_another_protocol_version_do_not_join() {
     let hello = Hello {
         config_toml: String::new(),
         inserted_total: 0,
+        tally: Tally::default(),
         after_updates: 0,
         shard: (0, 1),
+        shared_memory: false,
     };
     let mut newer = codec::encode(Kind::Hello, 0, &hello, &[]).unwrap();
     newer[4..6].copy_from_slice(&(PROTOCOL_VERSION + 1).to_le_bytes());

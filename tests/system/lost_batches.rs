@@ -11,8 +11,8 @@ use std::{
 
 use driml_learner::batch_source::{BatchSource, Next, Requests};
 use driml_protocol::{
-    BatchReply, BatchRequest, Chunk, ChunkHeader, Horizon, InsertReply, Keys, Kind, Planes,
-    RunSpec, Shutdown, TimeoutRule, codec,
+    ActorJoin, BatchReply, BatchRequest, Chunk, ChunkHeader, Horizon, InsertReply, Keys, Kind,
+    Planes, RunSpec, Shutdown, TimeoutRule, codec,
     session::{self, Endpoints},
 };
 use driml_replay_server::{Compression, Config, Replay};
@@ -63,6 +63,7 @@ fn config(shards: u32) -> Config {
 fn full(shard: u32, shards: u32) -> Replay {
     let spec = spec();
     let mut replay = Replay::shard(&spec, &config(shards), ROWS, shard).unwrap();
+    replay.join_actor(ActorJoin { actor: 0, epoch: 1 }).unwrap();
     for sequence in 0..TRANSITIONS / 8 / u64::from(shards) {
         let chunk = Chunk::zeroed(ChunkHeader {
             actor: 0,
@@ -89,7 +90,7 @@ fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
         codec::decode(&payload, Kind::BatchRequest, Some(hash)).unwrap();
     let mut replay = replay.lock().unwrap();
     if let Some(elsewhere) = request.elsewhere {
-        replay.heard(elsewhere);
+        replay.heard(elsewhere).unwrap();
     }
     let message = match replay.draw_for(request.id, request.rows, Planes::zeroed) {
         Ok(_) if drawn.fetch_add(1, Ordering::Relaxed).is_multiple_of(LOSES) => return,
@@ -142,6 +143,7 @@ fn every_batch_comes_once(shards: u32) {
         declared.push((server, batches, status));
     }
     let requests = Requests {
+        learner: 1,
         rows: ROWS,
         in_flight: 2,
         shared_memory: false,

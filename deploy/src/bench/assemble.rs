@@ -4,7 +4,7 @@
 use std::hint::black_box;
 
 use anyhow::{bail, ensure};
-use driml_protocol::{InsertReply, PlanesPool};
+use driml_protocol::{ActorJoin, InsertReply, PlanesPool};
 use driml_replay_server::Replay;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -15,6 +15,7 @@ use crate::bench::{
     recording::Recording,
     replay::{AGENT, CAPACITY, SETTINGS},
     settings,
+    taking_part::EPOCH,
 };
 
 /// Batches a second.
@@ -25,9 +26,14 @@ pub(super) fn measure(recording: &Recording, effort: &Effort) -> anyhow::Result<
     let config = settings::of_run(settings::WORLD, AGENT, "paper", &SETTINGS)?;
     let (rows, frame_bytes) = (config.learner.batch_rows, recording.frame_bytes());
     let mut replay = Replay::new(&config.run, &config.replay, rows)?;
+    let join = ActorJoin {
+        actor: 0,
+        epoch: EPOCH,
+    };
+    replay.join_actor(join).map_err(anyhow::Error::msg)?;
     for chunk in recording.chunks(0, (8, 32), PlanesPool::new(1)) {
         match replay.insert(&chunk) {
-            InsertReply::Stored { inserted_total } if inserted_total >= CAPACITY => break,
+            InsertReply::Stored { inserted_total, .. } if inserted_total >= CAPACITY => break,
             reply => ensure!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}"),
         }
     }

@@ -16,6 +16,7 @@ mod settings;
 mod stock;
 mod system;
 mod table;
+mod taking_part;
 
 use driml_learner::DeviceName;
 

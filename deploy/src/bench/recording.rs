@@ -9,7 +9,10 @@ use driml_protocol::{Chunk, ChunkHeader, End, PlanesPool};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{bench::settings, console};
+use crate::{
+    bench::{settings, taking_part::EPOCH},
+    console,
+};
 
 /// Copies of the game, each a stream of transitions.
 pub(super) const STREAMS: usize = 8;
@@ -86,7 +89,7 @@ impl Recording {
             pool,
             next: ChunkHeader {
                 actor,
-                epoch: 1,
+                epoch: EPOCH,
                 sequence: 0,
                 first_transition: 0,
                 weights_version: 1,

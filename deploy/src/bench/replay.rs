@@ -17,13 +17,15 @@ use driml_learner::{
     batch_source::{BatchSource, Next, Requests},
 };
 use driml_protocol::{
-    Keys, Shutdown,
+    Keys, Shutdown, join,
     session::{self, Endpoints},
 };
 use zenoh::{Session, Wait};
 
 use crate::{
-    bench::{assemble, effort::Effort, figures::Figure, recording::Recording, settings},
+    bench::{
+        assemble, effort::Effort, figures::Figure, recording::Recording, settings, taking_part,
+    },
     child::{Part, Surroundings},
     cli::NAMESPACE,
     console::Screen,
@@ -114,7 +116,7 @@ impl Run {
         let mut server = Part::start("replay-server", &args, 1, surroundings)?;
         let session = reach(endpoint, &mut server)?;
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
-        let hello = session::join(&session, &keys, &Shutdown::default())?
+        let hello = join::hello(&session, &keys, &Shutdown::default())?
             .context("nobody told this client to stop")?;
         Ok(Self {
             server,
@@ -135,17 +137,19 @@ impl Run {
         is_enough: impl Fn(u64, Instant) -> bool,
     ) -> anyhow::Result<f64> {
         let pool = self.actor.chunk_memory();
+        self.deliveries += 1;
+        let (spec_hash, actor) = (self.actor.spec.hash(), self.deliveries);
+        taking_part::join_as_actor(&self.session, &self.keys, spec_hash, actor)?;
         let delivery = Delivery::start(
             self.session.clone(),
             self.keys.clone(),
-            self.actor.spec.hash(),
+            spec_hash,
             0,
             DeliveryLimits::of(&self.actor.actor),
             pool.clone(),
             Shutdown::default(),
         )?;
-        self.deliveries += 1;
-        let mut chunks = recording.chunks(self.deliveries, chunk, pool);
+        let mut chunks = recording.chunks(actor, chunk, pool);
         let started = Instant::now();
         while !is_enough(chunks.transitions(), started) {
             let chunk = chunks.next().context("chunks have no end")?;
@@ -168,11 +172,13 @@ impl Run {
             transport,
             ..
         } = &self.learner;
+        taking_part::join_as_learner(&self.session, &self.keys, spec.hash())?;
         let mut source = BatchSource::start(
             std::slice::from_ref(&self.session),
             &self.keys,
             spec.hash(),
             Requests {
+                learner: taking_part::LEARNER,
                 rows: learner.batch_rows,
                 in_flight: learner.batches_in_flight,
                 shared_memory: transport.shared_memory,

@@ -29,7 +29,7 @@ use crate::{
         figures::{self, Figure, MachineNote},
         recording::Recording,
         replay::{AGENT, SETTINGS, reach},
-        settings, table,
+        settings, table, taking_part,
     },
     child::{Part, Surroundings},
     cli::{BenchScaleArgs, NAMESPACE},
@@ -234,6 +234,7 @@ fn act(
 ) -> anyhow::Result<()> {
     let settings = ActorSettings::from_toml(&config.to_toml())?;
     let pool = settings.chunk_memory();
+    taking_part::join_as_actor(&session, &keys, settings.spec.hash(), actor)?;
     let delivery = Delivery::start(
         session.clone(),
         keys,
@@ -277,7 +278,11 @@ fn learn(
         transport,
         ..
     } = LearnerPart::from_toml(&config.to_toml())?;
+    for session in &sessions {
+        taking_part::join_as_learner(session, &keys, spec.hash())?;
+    }
     let requests = Requests {
+        learner: taking_part::LEARNER,
         rows: learner.batch_rows,
         in_flight: learner.batches_in_flight,
         shared_memory: transport.shared_memory,

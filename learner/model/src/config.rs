@@ -4,6 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::error::{ModelError, Result};
+use crate::init::InitialLaw;
 
 /// Largest size of any one dimension; a configuration beyond it is rejected.
 const DIMENSION_MAX: usize = 1 << 16;
@@ -202,13 +203,29 @@ impl ModelConfig {
     /// Linear weights are [out, in], convolutions [out, in, k, k], biases [out]. The order is the order in which initial
     /// weights are drawn, so the torso's and the head's do not depend on which DIM heads exist.
     pub fn parameter_shapes(&self) -> Vec<(String, Vec<usize>)> {
-        let mut shapes = Vec::new();
-        let mut layer = |name: &str, weight: Vec<usize>, bias: bool| {
-            let out = weight[0];
-            shapes.push((format!("{name}.weight"), weight));
-            if bias {
-                shapes.push((format!("{name}.bias"), vec![out]));
-            }
+        let layers = self.layers().into_iter();
+        layers
+            .flat_map(|layer| {
+                let bias = (layer.bias_name(), vec![layer.weight[0]]);
+                let bias = layer.bias.then_some(bias);
+                [(layer.weight_name(), layer.weight)]
+                    .into_iter()
+                    .chain(bias)
+            })
+            .collect()
+    }
+
+    /// All layers in the order of [`ModelConfig::parameter_shapes`].
+    pub(crate) fn layers(&self) -> Vec<LayerShape> {
+        use InitialLaw::{Orthogonal, Uniform};
+        let mut layers = Vec::new();
+        let mut layer = |name: &str, weight: Vec<usize>, bias: bool, initial: InitialLaw| {
+            layers.push(LayerShape {
+                name: name.to_owned(),
+                weight,
+                bias,
+                initial,
+            });
         };
 
         let mut channels_in = self.channels;
@@ -217,6 +234,7 @@ impl ModelConfig {
                 &format!("torso.conv{}", index + 1),
                 vec![conv.out, channels_in, conv.kernel, conv.kernel],
                 true,
+                Orthogonal,
             );
             channels_in = conv.out;
         }
@@ -224,36 +242,75 @@ impl ModelConfig {
         let flat = local_height
             .saturating_mul(local_width)
             .saturating_mul(local_channels);
-        layer("torso.fc", vec![self.hidden, flat], true);
+        layer("torso.fc", vec![self.hidden, flat], true, Orthogonal);
         layer(
             "head",
             vec![self.num_actions.saturating_mul(self.atoms), self.hidden],
             true,
+            Uniform,
         );
 
-        let mut block = |name: &str, input: usize, hidden: usize, skip_bias: bool| {
-            layer(&format!("{name}.hidden"), vec![hidden, input], true);
-            layer(&format!("{name}.out"), vec![hidden, hidden], true);
-            layer(&format!("{name}.skip"), vec![hidden, input], skip_bias);
-        };
+        // A residual block; its skip matrix starts orthogonal whatever the law of its two other layers.
+        let mut block =
+            |name: &str, input: usize, hidden: usize, skip_bias: bool, initial: InitialLaw| {
+                layer(
+                    &format!("{name}.hidden"),
+                    vec![hidden, input],
+                    true,
+                    initial,
+                );
+                layer(&format!("{name}.out"), vec![hidden, hidden], true, initial);
+                let skip = format!("{name}.skip");
+                layer(&skip, vec![hidden, input], skip_bias, Orthogonal);
+            };
         let embed = if self.dim.embeds_action() {
             self.action_embed
         } else {
             0
         };
         if self.dim.embeds_action() {
-            block("dim.action", self.num_actions, self.action_embed, true);
+            let (actions, width) = (self.num_actions, self.action_embed);
+            block("dim.action", actions, width, true, Orthogonal);
         }
         let heads = [
-            (self.dim.psi3, "dim.psi3", local_channels + embed),
-            (self.dim.phi3, "dim.phi3", local_channels),
-            (self.dim.psi4, "dim.psi4", self.hidden + embed),
-            (self.dim.phi4, "dim.phi4", self.hidden),
+            (
+                self.dim.psi3,
+                "dim.psi3",
+                local_channels + embed,
+                Orthogonal,
+            ),
+            (self.dim.phi3, "dim.phi3", local_channels, Orthogonal),
+            (self.dim.psi4, "dim.psi4", self.hidden + embed, Uniform),
+            (self.dim.phi4, "dim.phi4", self.hidden, Uniform),
         ];
-        for (_, name, input) in heads.into_iter().filter(|&(exists, _, _)| exists) {
-            block(name, input, self.rkhs, false);
+        for (exists, name, input, initial) in heads {
+            if exists {
+                block(name, input, self.rkhs, false, initial);
+            }
         }
-        shapes
+        layers
+    }
+}
+
+/// A layer's name, the shapes of its parameters, and how they are drawn at the start of a run.
+///
+/// Source of the laws: the paper authors' code. A C51 head that starts orthogonal too gives first Q values twice as large,
+/// and with a target network that moves once in 312 updates these outlive 100,000 frames.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct LayerShape {
+    pub(crate) name: String,
+    pub(crate) weight: Vec<usize>,
+    pub(crate) bias: bool,
+    pub(crate) initial: InitialLaw,
+}
+
+impl LayerShape {
+    pub(crate) fn weight_name(&self) -> String {
+        format!("{}.weight", self.name)
+    }
+
+    pub(crate) fn bias_name(&self) -> String {
+        format!("{}.bias", self.name)
     }
 }
 

@@ -1,5 +1,5 @@
-//! Initial weights: orthogonal matrices from a seeded generator.
-//! Biases are 0 and drawn by nobody.
+//! Initial weights and biases, from a seeded generator: orthogonal matrices, or PyTorch's uniform law.
+//! Which layer is drawn in which way is fixed with the layer's shape, in `config`.
 //!
 //! The source of randomness is passed in and used in a fixed way, so the same seed gives the same weights on the same
 //! machine (the last bits depend on the C library's logarithm and cosine).
@@ -7,17 +7,58 @@
 use rand_chacha::{ChaCha8Rng, rand_core::RngCore};
 
 /// Gain for layers before a ReLU: sqrt(2).
-pub(crate) const RELU_GAIN: f64 = std::f64::consts::SQRT_2;
+const RELU_GAIN: f64 = std::f64::consts::SQRT_2;
 
 /// Partial sums of a dot product; that many are computed side by side.
 const LANES: usize = 8;
+
+/// How the initial weight and bias of a layer are drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum InitialLaw {
+    /// The weight orthogonal with gain sqrt(2), a convolution's flattened to [out, in * k * k]; the bias 0.
+    Orthogonal,
+    /// Weight and bias uniform on +-1/sqrt(fan_in), PyTorch's default for a linear layer.
+    Uniform,
+}
+
+impl InitialLaw {
+    /// A layer's first weight, row-major, of shape [out, in] or [out, in, k, k].
+    pub(crate) fn weight(self, shape: &[usize], rng: &mut ChaCha8Rng) -> Vec<f32> {
+        let (rows, fan_in) = (shape[0], fan_in(shape));
+        match self {
+            Self::Orthogonal => orthogonal(rows, fan_in, RELU_GAIN, rng),
+            Self::Uniform => uniform_within(fan_in, rows * fan_in, rng),
+        }
+    }
+
+    /// The first bias [out] of a layer whose weight has this shape.
+    pub(crate) fn bias(self, weight: &[usize], rng: &mut ChaCha8Rng) -> Vec<f32> {
+        match self {
+            Self::Orthogonal => vec![0.0; weight[0]],
+            Self::Uniform => uniform_within(fan_in(weight), weight[0], rng),
+        }
+    }
+}
+
+/// Inputs that one output of a layer sees.
+fn fan_in(weight: &[usize]) -> usize {
+    weight[1..].iter().product()
+}
+
+/// `len` numbers uniform on +-1/sqrt(fan_in).
+fn uniform_within(fan_in: usize, len: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    let bound = 1.0 / (fan_in as f64).sqrt();
+    (0..len)
+        .map(|_| ((2.0 * uniform(rng) - 1.0) * bound) as f32)
+        .collect()
+}
 
 /// A random matrix [rows, cols] whose shorter side's vectors are orthogonal and of length `gain`.
 ///
 /// W W^T = gain^2 I if rows <= cols, else W^T W = gain^2 I, uniformly distributed among such matrices: normal vectors made
 /// orthonormal one after the other, in f64 and twice, as once loses digits. Source: Saxe et al. 2014; PyTorch's
 /// `orthogonal_` gives the same distribution.
-pub(crate) fn orthogonal(rows: usize, cols: usize, gain: f64, rng: &mut ChaCha8Rng) -> Vec<f32> {
+fn orthogonal(rows: usize, cols: usize, gain: f64, rng: &mut ChaCha8Rng) -> Vec<f32> {
     let (count, len) = (rows.min(cols), rows.max(cols));
     let mut basis: Vec<Vec<f64>> = Vec::with_capacity(count);
     for _ in 0..count {
@@ -112,6 +153,50 @@ mod tests {
             let error = largest_error(rows, cols);
             assert!(error < 1e-5, "{rows}x{cols}: {error}");
         }
+    }
+
+    #[test]
+    fn uniform_weights_and_biases_have_the_bound_and_variance_of_fan_in() {
+        let mut rng = ChaCha8Rng::seed_from_u64(6);
+        for shape in [&[300, 100][..], &[40, 25, 2, 2]] {
+            let weight = InitialLaw::Uniform.weight(shape, &mut rng);
+            let bias: Vec<f32> = (0..40)
+                .flat_map(|_| InitialLaw::Uniform.bias(shape, &mut rng))
+                .collect();
+            assert_eq!(weight.len(), shape.iter().product::<usize>());
+            assert_eq!(bias.len(), 40 * shape[0]);
+            for values in [weight, bias] {
+                let largest = values.iter().fold(0f32, |max, value| max.max(value.abs()));
+                assert!(largest <= 0.1 && largest > 0.0995, "{largest}");
+                let len = values.len() as f64;
+                let moment = |power| {
+                    values
+                        .iter()
+                        .map(|&v| f64::from(v).powi(power))
+                        .sum::<f64>()
+                        / len
+                };
+                // The variance of U(-0.1, 0.1) is 0.01 / 3; five standard errors.
+                let error = (0.01f64 / 3.0 / len).sqrt();
+                assert!(moment(1).abs() < 5.0 * error, "mean {}", moment(1));
+                let spread = moment(2) / (0.01 / 3.0);
+                assert!(
+                    (spread - 1.0).abs() < 5.0 * (0.8 / len).sqrt(),
+                    "variance off by {spread}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn a_layer_that_starts_orthogonal_has_no_bias_and_draws_none() {
+        let (mut one, mut other) = (ChaCha8Rng::seed_from_u64(7), ChaCha8Rng::seed_from_u64(7));
+        assert_eq!(InitialLaw::Orthogonal.bias(&[5, 3], &mut one), [0.0; 5]);
+        assert_eq!(one.next_u64(), other.next_u64());
+        // A kernel is a matrix [out, in * k * k].
+        let kernel = InitialLaw::Orthogonal.weight(&[4, 3, 2, 2], &mut one);
+        let matrix = orthogonal(4, 12, RELU_GAIN, &mut other);
+        assert_eq!(kernel, matrix);
     }
 
     #[test]

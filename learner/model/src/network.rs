@@ -1,7 +1,7 @@
 //! The whole network with gradients, as the learner sees it.
 //! It owns no weights (it shares `Parameters`' storage) and computes no loss.
 
-use candle_core::{DType, Tensor};
+use candle_core::Tensor;
 
 use crate::c51_head::C51Head;
 use crate::compute::Operations;
@@ -26,7 +26,6 @@ pub struct Features {
 #[derive(Debug)]
 pub struct Network {
     operations: Operations,
-    input: [usize; 3],
     torso: Torso,
     head: C51Head,
     action: Option<ActionEmbedding>,
@@ -70,7 +69,6 @@ impl Network {
             .transpose()?;
         Ok(Self {
             operations,
-            input: [config.height, config.width, config.channels],
             torso: Torso::new(config, parameters, operations)?,
             head: C51Head::new(config, parameters, operations)?,
             action,
@@ -91,12 +89,6 @@ impl Network {
     /// # Errors
     /// Frames of another type or size.
     pub fn features(&self, frames: &Tensor) -> Result<Features> {
-        if frames.dtype() != DType::U8 || frames.dims().get(1..) != Some(&self.input[..]) {
-            let (dtype, shape, input) = (frames.dtype(), frames.shape(), self.input);
-            return Err(ModelError::Input(format!(
-                "frames {shape:?} of type {dtype:?}, wanted u8 [B, {input:?}]"
-            )));
-        }
         let (f3, f4) = self.torso.features(frames)?;
         Ok(Features { f3, f4 })
     }

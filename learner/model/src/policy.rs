@@ -165,7 +165,7 @@ struct Scratch {
 
 impl PolicyWeights {
     fn decode(config: &ModelConfig, safetensors: &[u8]) -> Result<Self> {
-        let mut parameters = decode(config, safetensors, is_dim)?;
+        let mut parameters = decode(config, |_| true, safetensors, is_dim)?;
         let mut take = |name: &str| {
             let (_, values) = parameters
                 .remove(name)

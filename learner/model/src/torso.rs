@@ -1,18 +1,20 @@
 //! The torso: frames to f3, the last convolution's map, and f4, the fully connected layer on it.
 //! It ends before f4's ReLU, because DIM sees f4 before it and the C51 head after it.
 
-use candle_core::{CpuStorage, CustomOp1, Layout, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp1, DType, Layout, Shape, Tensor};
 use rayon::prelude::*;
 
 use crate::compute::Operations;
 use crate::config::ModelConfig;
-use crate::error::Result;
+use crate::error::{ModelError, Result};
 use crate::linear::floats;
 use crate::weights::Parameters;
 
 #[derive(Debug)]
 pub(crate) struct Torso {
     operations: Operations,
+    /// Height, width and channels of a frame.
+    input: [usize; 3],
     /// Weight, bias and stride of each convolution.
     convolutions: Vec<(Tensor, Tensor, usize)>,
     fc_weight: Tensor,
@@ -35,14 +37,21 @@ impl Torso {
         });
         Ok(Self {
             operations,
+            input: [config.height, config.width, config.channels],
             convolutions: convolutions.collect::<Result<_>>()?,
             fc_weight: parameters.tensor("torso.fc", "weight")?,
             fc_bias: parameters.tensor("torso.fc", "bias")?,
         })
     }
 
-    /// f3 [B, h, w, c] after ReLU and f4 [B, hidden] before it, of `frames` [B, H, W, C].
+    /// f3 [B, h, w, c] after ReLU and f4 [B, hidden] before it, of `frames` [B, H, W, C] u8, which are scaled by 1/255.
     pub(crate) fn features(&self, frames: &Tensor) -> Result<(Tensor, Tensor)> {
+        if frames.dtype() != DType::U8 || frames.dims().get(1..) != Some(&self.input[..]) {
+            let (dtype, shape, input) = (frames.dtype(), frames.shape(), self.input);
+            return Err(ModelError::Input(format!(
+                "frames {shape:?} of type {dtype:?}, wanted u8 [B, {input:?}]"
+            )));
+        }
         let layers: Vec<_> = self
             .convolutions
             .iter()

@@ -9,7 +9,6 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::init::{RELU_GAIN, orthogonal};
 
 /// Parameters by name, as candle variables with PyTorch's names and shapes.
 ///
@@ -18,23 +17,24 @@ use crate::init::{RELU_GAIN, orthogonal};
 pub struct Parameters(BTreeMap<String, Var>);
 
 impl Parameters {
-    /// Initial parameters: orthogonal weights with gain sqrt(2), convolutions flattened to [out, in * k * k]; biases 0.
+    /// Initial parameters, drawn layer by layer in the order of [`ModelConfig::parameter_shapes`].
     ///
-    /// Drawn in the order of [`ModelConfig::parameter_shapes`].
+    /// Orthogonal with gain sqrt(2) and zero bias: torso, action embedding, Psi_3, Phi_3, and the skip matrices of Psi_4 and
+    /// Phi_4. Weight and bias uniform on +-1/sqrt(fan_in): the C51 head and the other layers of Psi_4 and Phi_4.
     ///
     /// # Errors
     /// An invalid configuration.
     pub fn init(config: &ModelConfig, rng: &mut ChaCha8Rng, device: &Device) -> Result<Self> {
         config.validate()?;
         let mut vars = BTreeMap::new();
-        for (name, shape) in config.parameter_shapes() {
-            let len: usize = shape.iter().product();
-            let values = match shape.as_slice() {
-                [_] => vec![0.0; len],
-                [rows, ..] => orthogonal(*rows, len / rows, RELU_GAIN, rng),
-                [] => unreachable!("parameters are vectors, matrices or kernels"),
-            };
-            vars.insert(name, Var::from_vec(values, shape, device)?);
+        for layer in config.layers() {
+            let (shape, law) = (&layer.weight, layer.initial);
+            let weight = Var::from_vec(law.weight(shape, rng), shape.as_slice(), device)?;
+            vars.insert(layer.weight_name(), weight);
+            if layer.bias {
+                let bias = Var::from_vec(law.bias(shape, rng), shape[0], device)?;
+                vars.insert(layer.bias_name(), bias);
+            }
         }
         Ok(Self(vars))
     }
@@ -46,12 +46,26 @@ impl Parameters {
     /// finite; an invalid configuration.
     pub fn from_tensors(
         config: &ModelConfig,
+        tensors: HashMap<String, Tensor>,
+        device: &Device,
+    ) -> Result<Self> {
+        Self::part_from_tensors(config, |_| true, tensors, device)
+    }
+
+    /// [`Parameters::from_tensors`] for a part of the network: its parameters whose names pass `part`.
+    ///
+    /// # Errors
+    /// As [`Parameters::from_tensors`].
+    pub fn part_from_tensors(
+        config: &ModelConfig,
+        part: impl Fn(&str) -> bool,
         mut tensors: HashMap<String, Tensor>,
         device: &Device,
     ) -> Result<Self> {
         config.validate()?;
         let mut vars = BTreeMap::new();
-        for (name, shape) in config.parameter_shapes() {
+        let shapes = config.parameter_shapes();
+        for (name, shape) in shapes.into_iter().filter(|(name, _)| part(name)) {
             let tensor = tensors
                 .remove(&name)
                 .ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
@@ -77,8 +91,21 @@ impl Parameters {
     /// # Errors
     /// Bytes that are not safetensors; otherwise as [`Parameters::from_tensors`].
     pub fn load_safetensors(config: &ModelConfig, bytes: &[u8], device: &Device) -> Result<Self> {
+        Self::load_part(config, |_| true, bytes, device)
+    }
+
+    /// [`Parameters::load_safetensors`] for a part of the network: its parameters whose names pass `part`.
+    ///
+    /// # Errors
+    /// As [`Parameters::load_safetensors`].
+    pub fn load_part(
+        config: &ModelConfig,
+        part: impl Fn(&str) -> bool,
+        bytes: &[u8],
+        device: &Device,
+    ) -> Result<Self> {
         let mut vars = BTreeMap::new();
-        for (name, (shape, values)) in decode(config, bytes, |_| false)? {
+        for (name, (shape, values)) in decode(config, part, bytes, |_| false)? {
             vars.insert(name, Var::from_vec(values, shape, device)?);
         }
         Ok(Self(vars))
@@ -136,7 +163,7 @@ impl Parameters {
     /// # Errors
     /// A failure to copy a variable.
     pub fn copy(&self) -> Result<Self> {
-        self.copy_where(|_| true)
+        self.copy_part(|_| true)
     }
 
     /// A deep copy without the DIM heads: what [`ModelConfig::without_dim`] describes, for a target network.
@@ -144,12 +171,16 @@ impl Parameters {
     /// # Errors
     /// A failure to copy a variable.
     pub fn without_dim(&self) -> Result<Self> {
-        self.copy_where(|name| !is_dim(name))
+        self.copy_part(|name| !is_dim(name))
     }
 
-    fn copy_where(&self, filter: impl Fn(&str) -> bool) -> Result<Self> {
+    /// A deep copy of the parameters whose names pass `part`.
+    ///
+    /// # Errors
+    /// A failure to copy a variable.
+    pub fn copy_part(&self, part: impl Fn(&str) -> bool) -> Result<Self> {
         let mut vars = BTreeMap::new();
-        for (name, var) in self.iter().filter(|(name, _)| filter(name)) {
+        for (name, var) in self.iter().filter(|(name, _)| part(name)) {
             vars.insert(
                 name.to_owned(),
                 Var::from_tensor(&var.as_detached_tensor().copy()?)?,
@@ -176,9 +207,11 @@ pub(crate) fn is_dim(name: &str) -> bool {
     name.starts_with("dim.")
 }
 
-/// Shapes and values of this configuration's parameters in a safetensors file; names that pass `ignore` may be there too.
+/// Shapes and values of this configuration's parameters that pass `part`, from a safetensors file; names that pass `ignore`
+/// may be there too.
 pub(crate) fn decode(
     config: &ModelConfig,
+    part: impl Fn(&str) -> bool,
     bytes: &[u8],
     ignore: impl Fn(&str) -> bool,
 ) -> Result<BTreeMap<String, Shaped>> {
@@ -186,7 +219,8 @@ pub(crate) fn decode(
     let file = SafeTensors::deserialize(bytes)?;
     let mut found: BTreeMap<&str, TensorView<'_>> = file.iter().collect();
     let mut parameters = BTreeMap::new();
-    for (name, shape) in config.parameter_shapes() {
+    let shapes = config.parameter_shapes();
+    for (name, shape) in shapes.into_iter().filter(|(name, _)| part(name)) {
         let view = found
             .remove(name.as_str())
             .ok_or_else(|| ModelError::parameter(&name, "is missing"))?;

@@ -6,7 +6,7 @@ pub mod curl;
 pub mod dim;
 
 use cpc::Cpc;
-use curl::Curl;
+use curl::{Curl, CurlSettings};
 use dim::{Dim, Lambda, PAIRS};
 use driml_model::DimParts;
 use serde::{Deserialize, Serialize};
@@ -40,7 +40,12 @@ impl Objective {
     ///
     /// # Errors
     /// What is at odds, and what to do.
-    pub fn check(self, lambda: &Lambda, condition_on_action: bool) -> Result<(), String> {
+    pub fn check(
+        self,
+        lambda: &Lambda,
+        condition_on_action: bool,
+        curl: Option<&CurlSettings>,
+    ) -> Result<(), String> {
         let name = self.name();
         let wanted = lambda.wanted();
         let weighted = PAIRS.iter().zip(wanted).find(|(_, wanted)| *wanted);
@@ -57,6 +62,12 @@ impl Objective {
             (Self::Curl, _) if condition_on_action => Err(format!(
                 "objective = {name} compares views of one state, which no action parts: set condition_on_action to false"
             )),
+            (Self::Curl, _) if curl.is_none() => Err(format!(
+                "objective = {name} encodes its keys by a moving average of the network, whose pace is missing (earlier versions had none): take the agent curl, or --set learner.update.curl.key_tau=0.001"
+            )),
+            (Self::None | Self::Dim | Self::Cpc, _) if curl.is_some() => Err(format!(
+                "objective = {name} has no keys to encode: take the table curl out of learner.update, or take the agent curl"
+            )),
             _ => Ok(()),
         }
     }
@@ -66,14 +77,6 @@ impl Objective {
         match self {
             Self::None => DimParts::NONE,
             Self::Dim | Self::Cpc => lambda.dim_parts(action),
-            Self::Curl => curl::HEADS,
-        }
-    }
-
-    /// The heads of which the target network keeps a slow copy.
-    pub const fn target_heads(self) -> DimParts {
-        match self {
-            Self::None | Self::Dim | Self::Cpc => DimParts::NONE,
             Self::Curl => curl::HEADS,
         }
     }

@@ -14,7 +14,7 @@ use safetensors::SafeTensors;
 use serde::Deserialize;
 
 use crate::{
-    auxiliary::{Objective, dim::Lambda},
+    auxiliary::{Objective, curl::CurlSettings, dim::Lambda},
     batch::{Batch, NO_ACTION},
     optim::AdamSettings,
     update::{LearnerSettings, UpdateError},
@@ -81,6 +81,8 @@ struct Config {
     tanh_clip: f64,
     max_grad_norm: f64,
     adam: AdamSettings,
+    /// Pace of CURL's key encoder; not there for other objectives.
+    key_tau: Option<f64>,
     model: Sizes,
 }
 
@@ -161,6 +163,7 @@ impl Case {
             // One update: the target network does not move.
             target_period_updates: u64::MAX,
             target_tau: 1.0,
+            curl: config.key_tau.map(|key_tau| CurlSettings { key_tau }),
         };
         let mut case = Self {
             rows: 0,

@@ -9,7 +9,7 @@ use std::{
 };
 
 use candle_core::{Device, Tensor};
-use driml_model::{Compute, DimParts, Features, Network, Parameters};
+use driml_model::{Compute, DimParts, Encoder, Features, ModelConfig, Network, Parameters};
 
 pub use case::ParityError;
 use case::{Case, all_parts};
@@ -18,11 +18,11 @@ use crate::{
     auxiliary::{
         Objective,
         cpc::{self, Cpc},
-        curl::Curl,
+        curl::{self, Curl},
         dim::{self, Dim, Dots, Lambda, PAIRS},
     },
     loss::info_nce::info_nce_loss,
-    update::Learner,
+    update::{Learner, NetworkParameters},
 };
 
 /// Values of s_t, in units of return, as a share of the support's width.
@@ -115,12 +115,15 @@ pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityRep
 fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError> {
     let sizes = case.model(DimParts::NONE);
     let model = case.model(case.settings.dim_parts(sizes.num_actions));
-    let slow = case.settings.target_model(&model);
+    let slow = model.without_dim();
     let device = &compute.device;
-    let online = Parameters::from_tensors(&model, case.parameters("online.", &model), device)?;
-    let target = Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?;
-    let settings = case.settings.clone();
-    let mut learner = Learner::from_parameters(model.clone(), settings, compute, online, target)?;
+    let parameters = NetworkParameters {
+        online: Parameters::from_tensors(&model, case.parameters("online.", &model), device)?,
+        target: Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?,
+        key: key_parameters(case, &model, compute)?,
+    };
+    let mut learner =
+        Learner::from_parameters(model.clone(), case.settings.clone(), compute, parameters)?;
 
     let mut lines = Vec::new();
     let pairs = forward_losses(case, compute)?;
@@ -205,44 +208,62 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
         worst.add("updated", name, largest(&got, &expected), UPDATED);
     }
     lines.extend(worst.lines);
+    let mut worst = Worst::default();
+    for (name, var) in learner.key().iter().flat_map(|key| key.iter()) {
+        let expected = case.expected(&format!("updated_key.{name}"), var.dims())?;
+        worst.add(
+            "updated_key",
+            name,
+            largest(&values(var)?, &expected),
+            UPDATED,
+        );
+    }
+    lines.extend(worst.lines);
     case.check_all_expectations_used()?;
     Ok(lines)
+}
+
+/// The parameters of the case's key encoder, if its objective has one.
+fn key_parameters(
+    case: &Case,
+    model: &ModelConfig,
+    compute: &Compute,
+) -> Result<Option<Parameters>, ParityError> {
+    if case.settings.curl.is_none() {
+        return Ok(None);
+    }
+    let named = case.parameters("key.", model);
+    let key = Parameters::part_from_tensors(model, Encoder::has, named, &compute.device)?;
+    Ok(Some(key))
 }
 
 /// The auxiliary losses of all pairs that the case speaks of, forward only and untouched by lambda, and whether the scores
 /// of each saturate.
 fn forward_losses(case: &Case, compute: &Compute) -> Result<[Option<(f32, bool)>; 4], ParityError> {
     let settings = &case.settings;
-    let curl = settings.objective == Objective::Curl;
-    let heads = if curl {
-        settings.objective.target_heads()
-    } else {
-        all_parts(settings.condition_on_action)
+    let heads = match settings.objective {
+        Objective::Curl => curl::HEADS,
+        _ => all_parts(settings.condition_on_action),
     };
     let model = case.model(heads);
-    let network = |prefix: &str| -> Result<Network, ParityError> {
-        let named = case.parameters(prefix, &model);
-        let parameters = Parameters::from_tensors(&model, named, &compute.device)?;
-        Ok(Network::with_operations(
-            &model,
-            &parameters,
-            compute.operations,
-        )?)
+    let named = case.parameters("online.", &model);
+    let parameters = Parameters::from_tensors(&model, named, &compute.device)?;
+    let online = Network::with_operations(&model, &parameters, compute.operations)?;
+    let states = |frames: &[u8]| -> Result<Tensor, ParityError> {
+        let ModelConfig {
+            height,
+            width,
+            channels,
+            ..
+        } = model;
+        let shape = (frames.len() / model.frame_len(), height, width, channels);
+        Ok(Tensor::from_slice(frames, shape, &compute.device)?)
     };
-    let online = network("online.")?;
-    let features = |network: &Network, frames: &[u8]| -> Result<Features, ParityError> {
-        let shape = (
-            frames.len() / model.frame_len(),
-            model.height,
-            model.width,
-            model.channels,
-        );
-        let frames = Tensor::from_slice(frames, shape, &compute.device)?;
-        Ok(network.features(&frames)?)
-    };
+    let features =
+        |frames: &[u8]| -> Result<Features, ParityError> { Ok(online.features(&states(frames)?)?) };
     let batch = case.batch();
     let valid = batch.positive_valid;
-    let anchors = features(&online, batch.anchors.unwrap_or(batch.frames_t))?;
+    let anchors = features(batch.anchors.unwrap_or(batch.frames_t))?;
     let action = Tensor::from_slice(batch.action, case.rows, &Device::Cpu)?;
     let every = Lambda {
         l3t3: 1.0,
@@ -266,7 +287,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<[Option<(f32, bool)>
     let mut losses = [None; 4];
     match settings.objective {
         Objective::None | Objective::Dim => {
-            let later = features(&online, batch.frames_k)?;
+            let later = features(batch.frames_k)?;
             let all = dim::dots(&online, &anchors, &later, &action, [true; 4])?;
             for (loss, dots) in losses.iter_mut().zip(all.iter().flatten()) {
                 let value = info_nce_loss(
@@ -279,7 +300,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<[Option<(f32, bool)>
             }
         }
         Objective::Cpc => {
-            let later = features(&online, &cpc::present(batch.frames_k, valid))?;
+            let later = features(&cpc::present(batch.frames_k, valid))?;
             let cpc = Cpc { pairs };
             let all = cpc.losses(&online, &anchors, Some(&later), &action, valid)?;
             for (loss, value) in losses.iter_mut().zip(all.iter().flatten()) {
@@ -294,12 +315,14 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<[Option<(f32, bool)>
             }
         }
         Objective::Curl => {
-            let target = network("target.")?;
-            let key = features(&target, batch.frames_k)?;
             let curl = Curl {
                 tanh_clip: settings.tanh_clip,
             };
-            let all = curl.losses((&online, &anchors), (&target, &key), &action)?;
+            let key = key_parameters(case, &model, compute)?;
+            let key = key.ok_or_else(|| ParityError::Config("key_tau is missing".to_owned()))?;
+            let encoder = Encoder::new(&model, &key, compute.operations)?;
+            let keys = encoder.encode(&states(batch.frames_k)?)?;
+            let all = curl.losses(&online, &anchors, &keys, &action)?;
             for (loss, value) in losses.iter_mut().zip(all) {
                 if let Some(value) = value {
                     *loss = Some((value.to_scalar()?, false));

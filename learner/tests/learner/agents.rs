@@ -1,31 +1,36 @@
 //! What holds of the agents beside C51 and DIM: CPC's offsets, CURL's two views, and what a learner of each keeps.
 //! The arithmetic's oracle is in `parity`.
 
-use std::fs;
+use std::{collections::BTreeMap, fs};
 
 use driml_learner::{
-    AffinityConfig, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner, LearnerPart,
-    LearnerSettings, Learning, Objective, UpdateError,
+    AffinityConfig, AugmentSettings, Batch, Config, CurlSettings, EstimatorKind, Lambda, Learner,
+    LearnerPart, LearnerSettings, Learning, NetworkParameters, Objective, UpdateError,
 };
-use driml_model::{Compute, DimParts, ModelConfig};
+use driml_model::{Compute, DimParts, ModelConfig, Parameters};
 use driml_protocol::{
     Batch as WireBatch, BatchHeader, Horizon, RunSpec, Tally, TimeoutRule, config::TransportConfig,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::made_up::{ALL_DIM, NO_DIM, Rows, model, settings};
+use crate::{
+    checkpoint::{Folder, change_state},
+    made_up::{ALL_DIM, NO_DIM, Rows, model, settings},
+};
 
 const GLOBAL: Lambda = Lambda {
     l4t4: 1.0,
     ..NO_DIM
 };
 const POSITIVES: usize = 3;
+const KEY_TAU: f64 = 0.25;
 
 fn of(objective: Objective, lambda: Lambda) -> (ModelConfig, LearnerSettings) {
     let settings = LearnerSettings {
         objective,
         condition_on_action: false,
+        curl: (objective == Objective::Curl).then_some(CurlSettings { key_tau: KEY_TAU }),
         ..settings(lambda)
     };
     let model = ModelConfig {
@@ -175,43 +180,128 @@ fn curl_compares_its_views_and_not_the_state() {
     assert_ne!(loss(&batch), before, "the key's view");
 }
 
+type Values = BTreeMap<String, Vec<f32>>;
+
+fn values(parameters: &Parameters) -> Values {
+    let flat = |var: &candle_core::Var| var.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let named = parameters.iter();
+    named
+        .map(|(name, var)| (name.to_owned(), flat(var)))
+        .collect()
+}
+
+/// The part of `values` whose names pass `part`.
+fn part_of(values: &Values, part: impl Fn(&str) -> bool) -> Values {
+    let named = values.iter().filter(|(name, _)| part(name));
+    named.map(|(name, v)| (name.clone(), v.clone())).collect()
+}
+
 #[test]
-fn the_target_network_keeps_a_copy_of_curl_s_head_and_of_no_other() {
+fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
     let rows = Rows::random(6, 8);
-    let names = |learner: &Learner| -> Vec<String> {
-        let named = learner.target().iter().map(|(name, _)| name.to_owned());
-        named.filter(|name| name.starts_with("dim.")).collect()
-    };
-    assert!(names(&learner(Objective::Cpc, GLOBAL)).is_empty());
     let mut learner = learner(Objective::Curl, GLOBAL);
-    let heads = names(&learner);
-    assert_eq!(heads.len(), 5, "{heads:?}");
-    assert!(heads.iter().all(|name| name.starts_with("dim.psi4.")));
-    let value = |learner: &Learner, online: bool| {
-        let of = if online {
-            learner.online()
-        } else {
-            learner.target()
-        };
-        let var = of.get("dim.psi4.out.weight").unwrap();
-        var.flatten_all().unwrap().to_vec1::<f32>().unwrap()
-    };
-    let start = value(&learner, false);
-    assert_eq!(start, value(&learner, true));
-    for _ in 0..2 {
+    let key = |learner: &Learner| values(learner.key().unwrap());
+    let encoder = |name: &str| name.starts_with("torso.") || name.starts_with("dim.psi4.");
+    let start = part_of(&values(learner.online()), encoder);
+    assert_eq!(key(&learner), start, "torso and psi_4, and nothing else");
+    let mut average = start.clone();
+    // The target network moves once, at the third.
+    for _ in 0..4 {
         learner.update(&curl(&rows)).unwrap();
+        let online = values(learner.online());
+        for (name, values) in &mut average {
+            for (value, online) in values.iter_mut().zip(&online[name]) {
+                *value =
+                    (KEY_TAU * f64::from(*online) + (1.0 - KEY_TAU) * f64::from(*value)) as f32;
+            }
+        }
+        for (name, found) in key(&learner) {
+            for (found, wanted) in found.iter().zip(&average[&name]) {
+                assert!((found - wanted).abs() < 1e-6, "{name}");
+            }
+        }
     }
-    assert_eq!(value(&learner, false), start, "its turn has not come");
-    learner.update(&curl(&rows)).unwrap();
-    let online = value(&learner, true);
-    for ((slow, online), start) in value(&learner, false).iter().zip(online).zip(start) {
-        assert!((slow - (0.95 * online + 0.05 * start)).abs() < 1e-6);
-    }
+    assert_ne!(average, start);
     // Actors get none of it.
     let acting = learner.model().without_dim();
     let weights = learner.weights().unwrap();
     let device = candle_core::Device::Cpu;
-    driml_model::Parameters::load_safetensors(&acting, &weights, &device).unwrap();
+    Parameters::load_safetensors(&acting, &weights, &device).unwrap();
+}
+
+/// So that a comparison of agents compares the auxiliary loss alone.
+#[test]
+fn c51_s_target_network_is_the_same_for_every_agent() {
+    let rows = Rows::random(6, 8);
+    for (objective, lambda) in [
+        (Objective::None, NO_DIM),
+        (Objective::Dim, GLOBAL),
+        (Objective::Cpc, GLOBAL),
+        (Objective::Curl, GLOBAL),
+    ] {
+        let mut learner = learner(objective, lambda);
+        assert_eq!(learner.key().is_some(), objective == Objective::Curl);
+        let online = |learner: &Learner| {
+            part_of(&values(learner.online()), |name| !name.starts_with("dim."))
+        };
+        let start = online(&learner);
+        assert_eq!(values(learner.target()), start, "{objective:?}");
+        let batch = match objective {
+            Objective::None => Batch {
+                positives: 0,
+                frames_k: &[],
+                positive_valid: &[],
+                ..rows.batch()
+            },
+            Objective::Curl => curl(&rows),
+            _ => rows.batch(),
+        };
+        for _ in 0..2 {
+            learner.update(&batch).unwrap();
+            assert_eq!(values(learner.target()), start, "its turn has not come");
+        }
+        learner.update(&batch).unwrap();
+        let online = online(&learner);
+        for (name, slow) in values(learner.target()) {
+            for ((slow, online), start) in slow.iter().zip(&online[&name]).zip(&start[&name]) {
+                assert!(
+                    (slow - (0.95 * online + 0.05 * start)).abs() < 1e-6,
+                    "{name}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn a_target_network_that_moves_leaves_curl_s_keys_where_they_are() {
+    let rows = Rows::random(8, 12);
+    let loss = |target_tau| {
+        let (model, mut settings) = of(Objective::Curl, GLOBAL);
+        (settings.target_period_updates, settings.target_tau) = (1, target_tau);
+        // So small a step that the key encoder stands still.
+        settings.adam.lr = 1e-30;
+        let rng = &mut ChaCha8Rng::seed_from_u64(1);
+        let mut parameters = Learner::new(model.clone(), settings.clone(), &Compute::CPU, rng)
+            .map(|learner| NetworkParameters {
+                online: learner.online().copy().unwrap(),
+                target: learner.target().copy().unwrap(),
+                key: learner.key().map(|key| key.copy().unwrap()),
+            })
+            .unwrap();
+        // A target network of another seed.
+        let rng = &mut ChaCha8Rng::seed_from_u64(2);
+        parameters.target =
+            Parameters::init(&model.without_dim(), rng, &Compute::CPU.device).unwrap();
+        let mut learner =
+            Learner::from_parameters(model, settings, &Compute::CPU, parameters).unwrap();
+        let first = learner.update(&curl(&rows)).unwrap();
+        let second = learner.update(&curl(&rows)).unwrap();
+        assert_ne!(first.c51_kl, second.c51_kl, "the target network has moved");
+        (first.dim, second.dim)
+    };
+    let (first, second) = loss(1.0);
+    assert_eq!(first, second);
 }
 
 #[test]
@@ -241,12 +331,14 @@ fn batches_that_an_agent_cannot_use_are_refused() {
 
 #[test]
 fn objectives_at_odds_with_their_settings_are_refused() {
+    let with = |objective, lambda, condition_on_action, key_tau: Option<f64>| LearnerSettings {
+        objective,
+        condition_on_action,
+        curl: key_tau.map(|key_tau| CurlSettings { key_tau }),
+        ..settings(lambda)
+    };
     let said = |objective, lambda, condition_on_action| {
-        let settings = LearnerSettings {
-            objective,
-            condition_on_action,
-            ..settings(lambda)
-        };
+        let settings = with(objective, lambda, condition_on_action, Some(0.1));
         settings.validate().unwrap_err().to_string()
     };
     assert!(said(Objective::None, GLOBAL, false).contains("but lambda.4t4 is above 0"));
@@ -255,6 +347,19 @@ fn objectives_at_odds_with_their_settings_are_refused() {
     }
     assert!(said(Objective::Curl, ALL_DIM, false).contains("lambda.4t4 alone"));
     assert!(said(Objective::Curl, GLOBAL, true).contains("condition_on_action"));
+    assert!(said(Objective::Dim, GLOBAL, true).contains("has no keys to encode"));
+    assert!(said(Objective::None, NO_DIM, true).contains("has no keys to encode"));
+    let curl = |key_tau| with(Objective::Curl, GLOBAL, false, key_tau).validate();
+    let missing = curl(None).unwrap_err().to_string();
+    assert!(
+        missing.contains("--set learner.update.curl.key_tau="),
+        "{missing}"
+    );
+    for out in [0.0, -0.1, 1.1, f64::NAN] {
+        let said = curl(Some(out)).unwrap_err().to_string();
+        assert!(said.starts_with(&format!("curl.key_tau = {out}")), "{said}");
+    }
+    curl(Some(1.0)).unwrap();
 }
 
 #[test]
@@ -405,11 +510,15 @@ fn an_augmenting_run_resumes_bit_for_bit() {
         let (mut a, mut b) = (folder.join("a"), folder.join("b"));
         straight.save(&a).unwrap();
         resumed.save(&b).unwrap();
-        for file in [
+        let mut files = vec![
             "online.safetensors",
             "target.safetensors",
             "optimizer.safetensors",
-        ] {
+        ];
+        if objective == Objective::Curl {
+            files.push("key.safetensors");
+        }
+        for file in files {
             let read = |folder: &mut std::path::PathBuf| {
                 fs::read(folder.join("checkpoint-000000000008").join(file)).unwrap()
             };
@@ -417,6 +526,32 @@ fn an_augmenting_run_resumes_bit_for_bit() {
         }
         fs::remove_dir_all(&folder).unwrap();
     }
+}
+
+/// A checkpoint whose keys came from the target network is not this agent's.
+#[test]
+fn a_curl_checkpoint_without_a_key_encoder_is_refused() {
+    let folder = Folder::new("old-curl");
+    let part = part(Objective::Curl, Some(STRONG));
+    let learning = Learning::new(part.clone(), &Compute::CPU).unwrap();
+    learning.save(&folder.0).unwrap();
+    let path = folder.0.join("checkpoint-000000000000");
+    change_state(&path, |state| state["format"] = 1.into());
+    let resume = || Learning::resume(part.clone(), &Compute::CPU, &folder.0).map(|_| ());
+    let said = resume().unwrap_err().to_string();
+    assert!(
+        said.contains("keys came from the target network") && said.contains("begin anew"),
+        "{said}"
+    );
+    // One of today's that lost the file is damaged.
+    change_state(&path, |state| state["format"] = 2.into());
+    resume().unwrap();
+    fs::remove_file(path.join("key.safetensors")).unwrap();
+    let said = resume().unwrap_err().to_string();
+    assert!(
+        said.contains("key.safetensors is damaged: it is missing"),
+        "{said}"
+    );
 }
 
 /// A refused batch leaves the generator where it was.

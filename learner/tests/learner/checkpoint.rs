@@ -13,16 +13,17 @@ use driml_learner::{
 use driml_model::{Compute, Parameters};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use sha2::{Digest, Sha256};
 
 use crate::made_up::{ACTIONS, ALL_DIM, Rows, STOCK, learner, learner_on, model, settings};
 
 const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
 /// A folder of this test's own, removed at its end.
-struct Folder(PathBuf);
+pub(crate) struct Folder(pub(crate) PathBuf);
 
 impl Folder {
-    fn new(name: &str) -> Self {
+    pub(crate) fn new(name: &str) -> Self {
         let path =
             std::env::temp_dir().join(format!("driml-checkpoint-{name}-{}", std::process::id()));
         let _ = fs::remove_dir_all(&path);
@@ -229,6 +230,50 @@ fn every_kind_of_damage_is_reported_with_its_file() {
         fs::write(&file, &whole).unwrap();
     }
     assert!(load(&folder.0).unwrap().is_some());
+}
+
+/// Writes state.json with `change` made to it, and its sum.
+pub(crate) fn change_state(path: &Path, change: impl Fn(&mut serde_json::Value)) {
+    let file = path.join("state.json");
+    let mut state = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
+    change(&mut state);
+    let text = serde_json::to_vec_pretty(&state).unwrap();
+    let sum: String = Sha256::digest(&text)
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect();
+    fs::write(&file, text).unwrap();
+    fs::write(
+        path.join("state.json.sha256"),
+        format!("{sum}  state.json\n"),
+    )
+    .unwrap();
+}
+
+#[test]
+fn a_checkpoint_of_the_first_format_is_read_bit_for_bit() {
+    let folder = Folder::new("first-format");
+    let mut run = Run::new();
+    run.updates(2);
+    let path = run.save(&folder.0, 1);
+    assert!(
+        !path.join("key.safetensors").exists(),
+        "DIM has no key encoder"
+    );
+    change_state(&path, |state| state["format"] = 1.into());
+    let mut old = Run::resume(&folder.0);
+    assert!(old.bytes() == run.bytes());
+    run.updates(2);
+    old.updates(2);
+    assert!(old.bytes() == run.bytes());
+    for unknown in [0, 3] {
+        change_state(&path, |state| state["format"] = unknown.into());
+        let said = load(&folder.0).unwrap_err().to_string();
+        assert!(
+            said.contains(&format!("its format is {unknown}, not 1 to 2")),
+            "{said}"
+        );
+    }
 }
 
 #[test]

@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
-use driml_learner::{Learner, UpdateError};
+use driml_learner::{Learner, NetworkParameters, UpdateError};
 use driml_model::{Compute, Parameters};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -42,14 +42,13 @@ fn changed(learner: &Learner, change: impl Fn(&str, &mut [f32])) -> Learner {
     let acting = model.without_dim();
     let target =
         Parameters::from_tensors(&acting, tensors(learner.target(), &|_, _| ()), &device).unwrap();
-    Learner::from_parameters(
-        model.clone(),
-        learner.settings().clone(),
-        &Compute::CPU,
+    let parameters = NetworkParameters {
         online,
         target,
-    )
-    .unwrap()
+        key: None,
+    };
+    let settings = learner.settings().clone();
+    Learner::from_parameters(model.clone(), settings, &Compute::CPU, parameters).unwrap()
 }
 
 #[test]

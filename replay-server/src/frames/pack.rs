@@ -1,6 +1,8 @@
 //! Compresses a chunk before it is stored, so that the replay is not locked meanwhile.
 //! It stores nothing and does not judge the chunk.
 
+use std::borrow::Cow;
+
 use driml_protocol::Chunk;
 use lz4_flex::block::{compress_into, compress_into_with_dict, get_maximum_output_size};
 
@@ -17,7 +19,7 @@ pub struct Packer {
 
 /// A chunk with its frames as the replay will keep them.
 pub struct PackedChunk<'a> {
-    pub(crate) chunk: &'a Chunk,
+    pub(crate) chunk: Cow<'a, Chunk>,
     /// With compression: of each stream.
     packed: Vec<PackedRun>,
 }
@@ -46,10 +48,10 @@ pub(crate) enum Run<'a> {
 
 impl Packer {
     /// Compresses the chunk's frames, or leaves them as they are.
-    pub fn pack<'a>(&self, chunk: &'a Chunk) -> PackedChunk<'a> {
+    pub fn pack<'a>(&self, chunk: Cow<'a, Chunk>) -> PackedChunk<'a> {
         let packed = match self.compression {
             Compression::None => Vec::new(),
-            Compression::Lz4 => runs(chunk)
+            Compression::Lz4 => runs(&chunk)
                 .map(|run| PackedRun::new(run, Layout::new(chunk.header.frame_bytes as usize)))
                 .collect(),
         };
@@ -58,10 +60,16 @@ impl Packer {
 }
 
 impl PackedChunk<'_> {
+    /// Bytes of memory that it takes, roughly.
+    pub(crate) fn bytes(&self) -> usize {
+        let packed: usize = self.packed.iter().map(|run| run.bytes.len()).sum();
+        self.chunk.header.planes_bytes().unwrap_or(usize::MAX) + packed
+    }
+
     /// The frames of each stream.
     pub(crate) fn runs(&self) -> impl Iterator<Item = Run<'_>> {
         let plain = self.packed.is_empty();
-        let plain = plain.then(|| runs(self.chunk).map(Run::Plain));
+        let plain = plain.then(|| runs(&self.chunk).map(Run::Plain));
         let packed = self.packed.iter().map(Run::Packed);
         plain.into_iter().flatten().chain(packed)
     }

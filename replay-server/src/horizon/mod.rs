@@ -39,6 +39,8 @@ pub fn draw_k(
 #[derive(Clone, Debug, PartialEq)]
 pub struct Affinity {
     version: u64,
+    /// Whether the next matrix is newer whatever its version: it comes from another learner.
+    from_another: bool,
     num_actions: u32,
     matrix: Vec<f32>,
 }
@@ -49,9 +51,15 @@ impl Affinity {
         let n = num_actions as usize;
         Self {
             version: 0,
+            from_another: false,
             num_actions,
             matrix: vec![1.0 / num_actions as f32; n * n],
         }
+    }
+
+    /// The matrices that come from now on are another learner's, which counts its versions from an earlier update.
+    pub fn expect_another_source(&mut self) {
+        self.from_another = true;
     }
 
     /// Takes a newer matrix; one that is not newer is ignored.
@@ -60,8 +68,9 @@ impl Affinity {
     /// A matrix of another size, or with an entry that is no probability.
     pub fn update(&mut self, update: &AffinityUpdate) -> Result<(), CodecError> {
         update.validate(self.num_actions)?;
-        if update.version > self.version {
+        if update.version > self.version || self.from_another {
             self.version = update.version;
+            self.from_another = false;
             self.matrix.copy_from_slice(&update.matrix);
         }
         Ok(())

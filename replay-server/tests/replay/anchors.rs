@@ -9,6 +9,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
+    exactly_once::{join, stored, wait},
     history::{History, identity, spec, unlimited},
     law::ChiSquare,
 };
@@ -22,8 +23,12 @@ struct Setup {
 impl Setup {
     fn new(config: &Config, frame_stack: u32) -> Self {
         let spec = spec(3, frame_stack, 4, Horizon::Uniform { k_max: 3 });
+        let mut replay = Replay::new(&spec, config, 64).unwrap();
+        for actor in 0..4 {
+            join(&mut replay, actor, 1);
+        }
         Self {
-            replay: Replay::new(&spec, config, 64).unwrap(),
+            replay,
             history: History::new(&spec, config.capacity_transitions),
             rng: ChaCha8Rng::seed_from_u64(3),
         }
@@ -113,6 +118,7 @@ fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
     };
     let spec = spec(3, 1, 4, Horizon::None);
     let mut replay = Replay::new(&spec, &config, 64).unwrap();
+    join(&mut replay, 0, 1);
     let mut header = ChunkHeader {
         actor: 0,
         epoch: 1,
@@ -124,24 +130,14 @@ fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
         steps: 1,
         frame_bytes: spec.frame_bytes() as u32,
     };
-    for stored in [20, 40, 60] {
+    for total in [20, 40, 60] {
         let chunk = driml_protocol::Chunk::zeroed(header);
-        assert_eq!(
-            replay.insert(&chunk),
-            InsertReply::Stored {
-                inserted_total: stored
-            }
-        );
+        assert_eq!(replay.insert(&chunk), stored(total));
         header.sequence += 1;
         header.first_transition += 20;
         let chunk = driml_protocol::Chunk::zeroed(header);
-        if stored < 60 {
-            assert_eq!(
-                replay.insert(&chunk),
-                InsertReply::Wait {
-                    inserted_total: stored
-                }
-            );
+        if total < 60 {
+            assert_eq!(replay.insert(&chunk), wait(total));
             assert_eq!(
                 replay.sample(64),
                 Err(Unready::Wait(Waiting::LearnerWaitsForActors))
@@ -151,7 +147,7 @@ fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
             assert_eq!(
                 replay.insert(&chunk),
                 InsertReply::Finished {
-                    inserted_total: stored
+                    inserted_total: total
                 }
             );
             let answer = replay.sample(64);

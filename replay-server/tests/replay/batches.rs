@@ -9,7 +9,10 @@ use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::history::{History, identity, spec, unlimited};
+use crate::{
+    exactly_once::{join, stored},
+    history::{History, identity, spec, unlimited},
+};
 
 /// Checks every row of `batch` against the reference.
 fn check_batch(batch: &Batch, history: &History) {
@@ -139,13 +142,15 @@ proptest! {
                 part: 0,
             };
             let actor = known.entry(number).or_insert_with(|| fresh(1));
+            join(&mut replay, number, actor.next.epoch);
             match rng.random_range(0..20) {
                 // The actor dies and starts anew; a straggler of its former life is refused.
                 0 => {
                     let old = actor.next;
                     *actor = fresh(old.epoch + 1);
+                    join(&mut replay, number, actor.next.epoch);
                     let chunk = history.next_chunk(actor.next, 0, &mut rng);
-                    let stored = InsertReply::Stored { inserted_total: history.inserted };
+                    let stored = stored(history.inserted);
                     prop_assert_eq!(replay.insert(&chunk), stored);
                     actor.next.sequence = 1;
                     actor.next.first_transition = u64::from(streams);
@@ -164,7 +169,7 @@ proptest! {
                         actor.part += 1;
                         lost += count;
                         let chunk = history.next_chunk(actor.next, actor.part, &mut rng);
-                        let stored = InsertReply::Stored { inserted_total: history.inserted };
+                        let stored = stored(history.inserted);
                         prop_assert_eq!(replay.insert(&chunk), stored);
                         actor.next.sequence += 1;
                         actor.next.first_transition += chunk.header.transitions() as u64;
@@ -174,7 +179,7 @@ proptest! {
                 2 if actor.next.sequence > 0 => {
                     let sequence = rng.random_range(0..actor.next.sequence);
                     let chunk = driml_protocol::Chunk::zeroed(ChunkHeader { sequence, ..actor.next });
-                    let stored = InsertReply::Stored { inserted_total: history.inserted };
+                    let stored = stored(history.inserted);
                     prop_assert_eq!(replay.insert(&chunk), stored);
                     retried += 1;
                 }
@@ -189,7 +194,7 @@ proptest! {
                     actor.next.steps = rng.random_range(1..6);
                     actor.next.weights_version += rng.random_range(0..2);
                     let chunk = history.next_chunk(actor.next, actor.part, &mut rng);
-                    let stored = InsertReply::Stored { inserted_total: history.inserted };
+                    let stored = stored(history.inserted);
                     prop_assert_eq!(replay.insert(&chunk), stored);
                     actor.next.sequence += 1;
                     actor.next.first_transition += chunk.header.transitions() as u64;

@@ -7,7 +7,10 @@ use proptest::prelude::*;
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::history::{spec, unlimited};
+use crate::{
+    exactly_once::join,
+    history::{spec, unlimited},
+};
 
 /// What frames show.
 #[derive(Clone, Copy, Debug)]
@@ -136,6 +139,8 @@ proptest! {
         }
         let mut plain = Replay::new(&spec, &unlimited(capacity), 16).unwrap();
         let mut packed = Replay::new(&spec, &lz4(capacity), 16).unwrap();
+        join(&mut plain, 0, 1);
+        join(&mut packed, 0, 1);
         let mut actor = Actor::new(&spec, streams, seed);
         let mut rng = ChaCha8Rng::seed_from_u64(!seed);
         let steps_max = (capacity / u64::from(streams)).min(21) as u32;
@@ -165,6 +170,7 @@ fn memory_follows_what_is_held() {
     let plain_bytes = CAPACITY * spec.frame_bytes() as u64;
     let overhead = (3 << 20) + 16 * spec.frame_bytes() as u64 + 64 * CAPACITY;
     let mut replay = Replay::new(&spec, &lz4(CAPACITY), 16).unwrap();
+    join(&mut replay, 0, 1);
     assert_eq!(
         replay.status().frame_bytes_held,
         0,
@@ -199,6 +205,7 @@ fn the_bytes_allowed_are_kept() {
         ..lz4(2000)
     };
     let mut replay = Replay::new(&spec, &config, 16).unwrap();
+    join(&mut replay, 0, 1);
     let mut actor = Actor::new(&spec, 2, 1);
     for round in 0..120 {
         let content = if round / 40 == 1 {

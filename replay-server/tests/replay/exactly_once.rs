@@ -3,8 +3,8 @@
 //! It does not look at rows.
 
 use driml_protocol::{
-    AffinityUpdate, Chunk, ChunkHeader, End, Goodbye, Horizon, InsertReply, Planes, RequestId,
-    RunSpec, Waiting,
+    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon, InsertReply,
+    Planes, RequestId, RunSpec, Waiting,
 };
 use driml_replay_server::{ACTORS_MAX, Replay, STREAMS_MAX, Unready};
 use proptest::prelude::*;
@@ -31,14 +31,33 @@ pub(crate) fn header(actor: u32, epoch: u64, sequence: u64, first_transition: u6
     }
 }
 
+pub(crate) fn join(replay: &mut Replay, actor: u32, epoch: u64) {
+    replay.join_actor(ActorJoin { actor, epoch }).unwrap();
+}
+
+/// Inserts a chunk; an actor that is new joins with it.
 pub(crate) fn insert(replay: &mut Replay, header: ChunkHeader) -> InsertReply {
+    if replay.actor_epoch(header.actor).is_none() {
+        join(replay, header.actor, header.epoch);
+    }
     let reply = replay.insert(&Chunk::zeroed(header));
     replay.check_valid();
     reply
 }
 
-pub(crate) fn stored(inserted_total: u64) -> InsertReply {
-    InsertReply::Stored { inserted_total }
+pub(crate) const fn stored(inserted_total: u64) -> InsertReply {
+    InsertReply::Stored {
+        inserted_total,
+        actors: 0,
+        waited: false,
+    }
+}
+
+pub(crate) const fn wait(inserted_total: u64) -> InsertReply {
+    InsertReply::Wait {
+        inserted_total,
+        kept: false,
+    }
 }
 
 fn is_refused(reply: &InsertReply) -> bool {
@@ -168,11 +187,19 @@ fn what_never_arrived_counts_as_lost_once() {
         12,
         "after the last chunk, heard twice"
     );
-    replay.goodbye(&Goodbye {
+    let nothing_arrived = Goodbye {
         actor: 1,
         epoch: 1,
         produced: 3,
-    });
+    };
+    replay.goodbye(&nothing_arrived);
+    assert_eq!(
+        replay.status().transitions_lost,
+        12,
+        "nobody that has joined"
+    );
+    join(&mut replay, 1, 1);
+    replay.goodbye(&nothing_arrived);
     assert_eq!(
         replay.status().transitions_lost,
         15,
@@ -193,16 +220,14 @@ fn what_was_stored_and_never_produced_counts_as_duplicated() {
         produced: 9,
     });
     assert_eq!(replay.status().transitions_duplicated, 3);
-    replay.goodbye(&Goodbye {
-        actor: 0,
-        epoch: 0,
-        produced: u64::MAX,
-    });
-    replay.goodbye(&Goodbye {
-        actor: 1,
-        epoch: 0,
-        produced: u64::MAX,
-    });
+    for actor in [1, 2] {
+        join(&mut replay, actor, 0);
+        replay.goodbye(&Goodbye {
+            actor,
+            epoch: 0,
+            produced: u64::MAX,
+        });
+    }
     assert_eq!(
         replay.status().transitions_lost,
         u64::MAX,
@@ -221,6 +246,18 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
     });
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     assert!(is_refused(&insert(&mut replay, header(0, 1, 1, 6))));
+    assert!(
+        is_refused(&insert(&mut replay, header(0, 2, 0, 0))),
+        "a life that has not joined"
+    );
+    // Nor does its goodbye make it one.
+    let goodbye = Goodbye {
+        actor: 0,
+        epoch: 2,
+        produced: 6,
+    };
+    replay.goodbye(&goodbye);
+    join(&mut replay, 0, 2);
     assert_eq!(
         insert(&mut replay, header(0, 2, 1, 6)),
         InsertReply::OutOfOrder { expected: 0 }
@@ -230,6 +267,11 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
         is_refused(&insert(&mut replay, header(0, 1, 0, 0))),
         "a past life"
     );
+    let back = ActorJoin { actor: 0, epoch: 1 };
+    assert!(
+        replay.join_actor(back).is_err(),
+        "and it does not come back"
+    );
     let status = replay.status();
     assert_eq!(
         (
@@ -237,8 +279,115 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
             status.messages_refused,
             status.transitions_lost
         ),
-        (1, 2, 0)
+        (1, 3, 0)
     );
+}
+
+#[test]
+fn what_a_replaced_life_could_not_deliver_counts_as_lost() {
+    let mut replay = Replay::new(&small_spec(), &unlimited(1000), 8).unwrap();
+    insert(&mut replay, header(0, 1, 0, 0));
+    join(&mut replay, 0, 2);
+    assert!(is_refused(&insert(&mut replay, header(0, 1, 1, 6))));
+    let last_word = Goodbye {
+        actor: 0,
+        epoch: 1,
+        produced: 18,
+    };
+    replay.goodbye(&last_word);
+    replay.goodbye(&last_word);
+    assert_eq!(replay.status().transitions_lost, 12);
+    assert_eq!(insert(&mut replay, header(0, 2, 0, 0)), stored(12));
+}
+
+#[test]
+fn a_claim_says_what_became_of_a_chunk() {
+    let mut config = unlimited(1000);
+    config.transitions_max = Some(12);
+    let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
+    let claim = |epoch, sequence| Claim {
+        actor: 0,
+        epoch,
+        sequence,
+        leaving: false,
+    };
+    let nobody = replay.claim(&claim(1, 0)).unwrap();
+    assert!(is_refused(&nobody), "{nobody:?}");
+    insert(&mut replay, header(0, 1, 0, 0));
+    assert_eq!(replay.claim(&claim(1, 0)), Some(stored(6)));
+    assert_eq!(replay.claim(&claim(1, 1)), None, "it is still to come");
+    insert(&mut replay, header(0, 1, 1, 6));
+    let finished = InsertReply::Finished { inserted_total: 12 };
+    assert_eq!(replay.claim(&claim(1, 2)), Some(finished));
+    assert_eq!(replay.claim(&claim(1, 1)), Some(stored(12)));
+    assert_eq!(replay.status().chunks_retried, 0, "nothing was sent twice");
+}
+
+#[test]
+fn rewards_whose_sum_is_no_float_are_refused() {
+    let spec = RunSpec {
+        n_step: 7,
+        ..small_spec()
+    };
+    let mut replay = Replay::new(&spec, &unlimited(1000), 8).unwrap();
+    join(&mut replay, 0, 1);
+    let with = |reward| {
+        let mut chunk = Chunk::zeroed(header(0, 1, 0, 0));
+        chunk.set(4, 0, reward, End::Running);
+        chunk
+    };
+    for reward in [3e38, -3e38, f32::MAX] {
+        match replay.insert(&with(reward)) {
+            InsertReply::Refused { why } => {
+                assert!(why.contains("scale the world's rewards"), "{why}")
+            }
+            reply => panic!("{reply:?} for {reward}"),
+        }
+    }
+    assert_eq!(replay.insert(&with(f32::MAX / 7.0)), stored(6));
+}
+
+/// A learner that died had learned from fewer rows than were served to it: they are served again to its successor.
+#[test]
+fn rows_that_nobody_learned_from_do_not_count() {
+    let mut config = unlimited(1000);
+    (config.replay_ratio, config.slack_transitions) = (4.0, 100);
+    config.transitions_max = Some(18);
+    let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
+    for sequence in 0..3 {
+        insert(&mut replay, header(0, 1, sequence, 6 * sequence));
+    }
+    replay.learner_starts(0).unwrap();
+    for _ in 0..9 {
+        replay.sample(8).unwrap();
+    }
+    assert_eq!(replay.sample(8), Err(Unready::Finished));
+    let affinity = |version, p| AffinityUpdate {
+        learner: 1,
+        version,
+        num_actions: 5,
+        matrix: vec![p; 25],
+    };
+    replay.set_affinity(&affinity(9, 0.5)).unwrap();
+    assert!(replay.learner_starts(73).is_err(), "more than were served");
+
+    replay.learner_starts(40).unwrap();
+    replay.check_valid();
+    let status = replay.status();
+    assert_eq!((status.rows_sampled, status.rows_unlearned), (40, 32));
+    replay.set_affinity(&affinity(6, 0.25)).unwrap();
+    assert_eq!(
+        replay.status().affinity_version,
+        6,
+        "the successor's counts"
+    );
+    replay.set_affinity(&affinity(5, 0.5)).unwrap();
+    assert_eq!(replay.status().affinity_version, 6, "an older one does not");
+    for _ in 0..4 {
+        replay.sample(8).unwrap();
+    }
+    assert_eq!(replay.sample(8), Err(Unready::Finished));
+    replay.check_valid();
 }
 
 #[test]
@@ -289,13 +438,21 @@ fn unfit_chunks_are_refused_with_a_reason() {
 fn actors_and_streams_are_bounded() {
     let mut replay = Replay::new(&small_spec(), &unlimited(1 << 15), 8).unwrap();
     for actor in 0..ACTORS_MAX as u32 {
+        join(&mut replay, actor, 1);
         assert!(matches!(
             replay.insert(&Chunk::zeroed(header(actor, 1, 0, 0))),
             InsertReply::Stored { .. }
         ));
     }
     let one_more = ACTORS_MAX as u32;
-    assert!(is_refused(&insert(&mut replay, header(one_more, 1, 0, 0))));
+    let join = ActorJoin {
+        actor: one_more,
+        epoch: 1,
+    };
+    assert!(replay.join_actor(join).is_err());
+    assert!(is_refused(
+        &replay.insert(&Chunk::zeroed(header(one_more, 1, 0, 0)))
+    ));
     replay.goodbye(&Goodbye {
         actor: one_more,
         epoch: 1,
@@ -310,7 +467,7 @@ fn actors_and_streams_are_bounded() {
     let wide = ChunkHeader {
         streams: STREAMS_MAX + 1,
         steps: 1,
-        ..header(0, 2, 0, 0)
+        ..header(0, 1, 1, 6)
     };
     assert!(is_refused(&insert(&mut replay, wide)));
 }
@@ -379,10 +536,7 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
     (config.replay_ratio, config.slack_transitions) = (4.0, 2);
     let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
-    assert_eq!(
-        insert(&mut replay, header(0, 1, 1, 6)),
-        InsertReply::Wait { inserted_total: 6 }
-    );
+    assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), wait(6));
     assert_eq!(
         insert(&mut replay, header(0, 1, 2, 12)),
         InsertReply::OutOfOrder { expected: 1 }
@@ -409,6 +563,7 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
     assert!(replay.set_replay_ratio(3.9).is_err(), "2 * 3.9 < 8");
     replay.set_replay_ratio(8.0).unwrap();
     let foreign = AffinityUpdate {
+        learner: 1,
         version: 1,
         num_actions: 4,
         matrix: vec![0.25; 16],
@@ -427,6 +582,7 @@ fn batches_follow_from_the_seed() {
             ..small_spec()
         };
         let mut replay = Replay::new(&spec, &unlimited(1000), 8).unwrap();
+        join(&mut replay, 0, 1);
         let mut chunk = Chunk::zeroed(ChunkHeader {
             steps: 100,
             ..header(0, 1, 0, 0)

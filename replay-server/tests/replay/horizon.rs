@@ -12,6 +12,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
+    exactly_once::join,
     history::{History, identity, spec, unlimited},
     law::ChiSquare,
 };
@@ -27,6 +28,7 @@ fn random_affinity(num_actions: u32, spread: f32, rng: &mut ChaCha8Rng) -> Affin
         matrix.extend(row.iter().map(|e| e / sum));
     }
     AffinityUpdate {
+        learner: 1,
         version: 1,
         num_actions,
         matrix,
@@ -102,6 +104,7 @@ fn uniform_follows_its_law() {
 #[test]
 fn certain_affinities_leave_no_choice() {
     let certain = AffinityUpdate {
+        learner: 1,
         version: 1,
         num_actions: 2,
         matrix: vec![0.0, 1.0, 1.0, 0.0],
@@ -123,6 +126,7 @@ fn certain_affinities_leave_no_choice() {
 #[test]
 fn every_rule_stays_within_k_max_and_the_episode() {
     let affinity = affinity(&AffinityUpdate {
+        learner: 1,
         version: 1,
         num_actions: 1,
         matrix: vec![1.0],
@@ -159,6 +163,7 @@ fn an_older_or_broken_affinity_is_not_taken() {
     let mut affinity = Affinity::uniform(2);
     assert_eq!((affinity.version(), affinity.get(0, 1)), (0, 0.5));
     let update = |version, matrix| AffinityUpdate {
+        learner: 1,
         version,
         num_actions: 2,
         matrix,
@@ -191,6 +196,7 @@ fn the_k_served_follow_the_law() {
     let spec = spec(3, 1, 2, Horizon::Nhg { k_max: 5 });
     let update = random_affinity(spec.num_actions, 2.0, &mut rng);
     let mut replay = Replay::new(&spec, &unlimited(150), 64).unwrap();
+    join(&mut replay, 0, 1);
     let mut history = History::new(&spec, 150);
     for sequence in 0..20 {
         let header = ChunkHeader {
@@ -216,6 +222,7 @@ fn the_k_served_follow_the_law() {
                 update
             }
             None => AffinityUpdate {
+                learner: 1,
                 version: 0,
                 num_actions: 5,
                 matrix: vec![0.2; 25],

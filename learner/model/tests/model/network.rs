@@ -4,7 +4,7 @@
 use candle_core::{DType, Device, Result, Tensor};
 use driml_model::{ConvLayer, DimParts, ModelConfig, ModelError, Network, Operations, Parameters};
 
-use crate::support::{assert_close, bits, frames, parameters, rng, small};
+use crate::support::{assert_close, bits, frames, parameters, rng, small, values};
 
 /// out(relu(hidden(x))) + skip(x) by candle's operations, x [rows, in].
 fn stock_block(parameters: &Parameters, name: &str, x: &Tensor) -> Result<Tensor> {
@@ -266,6 +266,47 @@ fn heads_that_are_left_out_are_not_there() {
             .parameter_shapes()
             .iter()
             .all(|(name, _)| !name.starts_with("dim.action"))
+    );
+}
+
+/// Of the size that a head with PyTorch's first weights gives; an orthogonal head of gain sqrt(2) gives twice that.
+///
+/// A logit's variance is then v = (|relu(f4)|^2 + 1) / (3 * hidden), and for small logits that of a Q value is
+/// v * mean(z^2) / atoms.
+#[test]
+fn the_first_q_values_are_small() {
+    let config = ModelConfig {
+        num_actions: 15,
+        atoms: 51,
+        v_min: -10.0,
+        v_max: 10.0,
+        hidden: 512,
+        dim: DimParts::NONE,
+        ..small()
+    };
+    let support = config.atoms_support();
+    let mean_square =
+        |values: &[f64]| values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64;
+    let support: Vec<f64> = support.into_iter().map(f64::from).collect();
+    let (mut found, mut expected) = (0.0, 0.0);
+    for seed in 0..8 {
+        let network = Network::new(&config, &parameters(&config, seed)).unwrap();
+        let f4 = network
+            .features(&frames(&config, 4, &mut rng(seed)))
+            .unwrap()
+            .f4;
+        let logits = network.logits(&f4).unwrap();
+        let relu = values(&f4.relu().unwrap());
+        let norm = relu.iter().map(|f| f * f).sum::<f64>() / 4.0;
+        let logit_variance = (norm + 1.0) / (3.0 * 512.0);
+        assert!(logit_variance < 0.5, "{logit_variance}: not small");
+        expected += logit_variance * mean_square(&support) / 51.0;
+        found += mean_square(&values(&network.q_values(&logits).unwrap()));
+    }
+    let ratio = found / expected;
+    assert!(
+        (0.6..1.6).contains(&ratio),
+        "Q^2 is {ratio} of what it should be"
     );
 }
 

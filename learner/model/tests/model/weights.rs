@@ -1,12 +1,12 @@
-//! Parameters: round trips, and an error instead of a panic for every kind of broken file.
-//! Orthogonality of the initial weights is tested where they are made.
+//! Parameters: how each starts, round trips, and an error instead of a panic for every kind of broken file.
+//! The two laws of initial weights are tested in themselves where they are drawn.
 
 use std::collections::HashMap;
 
 use candle_core::{DType, Device, Tensor};
 use driml_model::{ModelConfig, ModelError, Parameters, PolicyNetwork};
 
-use crate::support::{bits, bytes, parameters, rng, small};
+use crate::support::{bits, bytes, parameters, rng, small, values};
 
 fn tensors(parameters: &Parameters) -> HashMap<String, Tensor> {
     parameters
@@ -28,16 +28,71 @@ fn the_seed_decides_the_weights() {
     let first = parameters(&config, 5);
     assert_eq!(all_bits(&first), all_bits(&parameters(&config, 5)));
     assert_ne!(all_bits(&first), all_bits(&parameters(&config, 6)));
-    for (name, var) in first.iter() {
-        let zero = bits(var).iter().all(|&bits| bits == 0);
-        assert_eq!(zero, name.ends_with(".bias"), "{name}");
-    }
     let acting = parameters(&config.without_dim(), 5);
     assert_eq!(
         all_bits(&acting),
         all_bits(&first.without_dim().unwrap()),
         "heads do not change the torso's weights"
     );
+}
+
+/// The layers that start as PyTorch's linear layers do; all others start orthogonal with gain sqrt(2) and without a bias.
+const UNIFORM: [&str; 5] = [
+    "head",
+    "dim.psi4.hidden",
+    "dim.psi4.out",
+    "dim.phi4.hidden",
+    "dim.phi4.out",
+];
+
+#[test]
+fn every_layer_starts_as_its_law_says() {
+    let config = small();
+    let parameters = parameters(&config, 5);
+    let mut uniform = Vec::new();
+    for (name, shape) in config.parameter_shapes() {
+        let (layer, part) = name.rsplit_once('.').unwrap();
+        let weight = parameters.get(&format!("{layer}.weight")).unwrap();
+        let (rows, fan_in) = (weight.dims()[0], weight.elem_count() / weight.dims()[0]);
+        let values = values(parameters.get(&name).unwrap());
+        let largest = values
+            .iter()
+            .fold(0.0, |max: f64, value| max.max(value.abs()));
+        if UNIFORM.contains(&layer) {
+            let bound = 1.0 / (fan_in as f64).sqrt();
+            assert!(
+                largest <= bound + 1e-7 && largest > 0.7 * bound,
+                "{name}: {largest}"
+            );
+            let mean_square = values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64;
+            // That of the least parameter, 13 numbers, strays by a quarter.
+            let spread = mean_square / (bound * bound / 3.0);
+            assert!((0.3..2.0).contains(&spread), "{name}: {spread}");
+            uniform.push(name);
+        } else if part == "bias" {
+            assert_eq!(largest, 0.0, "{name}");
+        } else {
+            let matrix = weight.reshape((rows, fan_in)).unwrap();
+            let other = matrix.t().unwrap();
+            let gram = if rows <= fan_in {
+                matrix.matmul(&other)
+            } else {
+                other.matmul(&matrix)
+            };
+            let side = rows.min(fan_in);
+            for (at, value) in crate::support::values(&gram.unwrap())
+                .into_iter()
+                .enumerate()
+            {
+                let wanted = if at / side == at % side { 2.0 } else { 0.0 };
+                assert!(
+                    (value - wanted).abs() < 1e-5,
+                    "{name} {shape:?}: {value} at {at}"
+                );
+            }
+        }
+    }
+    assert_eq!(uniform.len(), 2 * UNIFORM.len());
 }
 
 #[test]

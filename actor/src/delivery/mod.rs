@@ -1,0 +1,168 @@
+//! Brings chunks to the replay server, each exactly once and in order, and says goodbye.
+//! It does not drop: a chunk leaves the line when the replay server says that it is stored or no longer wanted.
+
+mod courier;
+
+use std::{
+    sync::{
+        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering},
+        mpsc,
+    },
+    thread::JoinHandle,
+    time::Duration,
+};
+
+use driml_protocol::{Chunk, Keys, PlanesPool, Shutdown};
+use zenoh::Session;
+
+use crate::config::Config;
+use courier::Courier;
+
+/// Limits of one delivery.
+#[derive(Clone, Copy, Debug)]
+pub struct DeliveryLimits {
+    /// Chunks waiting to be acknowledged; at this many `send` waits.
+    pub chunks_in_flight_max: usize,
+    /// How long the replay server may be silent about a chunk that it was sent; a chunk that has to wait is answered meanwhile.
+    pub ack_timeout: Duration,
+    /// All tries for one chunk without any answer.
+    pub unreachable_max: Duration,
+}
+
+impl DeliveryLimits {
+    /// The limits that an actor's settings ask for.
+    pub const fn of(config: &Config) -> Self {
+        Self {
+            chunks_in_flight_max: config.chunks_in_flight_max as usize,
+            ack_timeout: Duration::from_millis(config.ack_timeout_ms),
+            unreachable_max: Duration::from_millis(config.unreachable_max_ms),
+        }
+    }
+}
+
+/// What the sending side and the thread tell each other beside the chunks.
+#[derive(Debug, Default)]
+struct Account {
+    inserted_total: AtomicU64,
+    actors: AtomicU32,
+    finished: AtomicBool,
+    /// The rate limiter makes chunks wait: more than one at a time would only grow old.
+    is_held: AtomicBool,
+    /// Chunks that were sent and are not yet settled.
+    waiting: Mutex<usize>,
+    settled: Condvar,
+}
+
+impl Account {
+    fn waiting(&self) -> MutexGuard<'_, usize> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn settle(&self) {
+        *self.waiting() -= 1;
+        self.settled.notify_all();
+    }
+
+    fn is_held(&self) -> bool {
+        self.is_held.load(Ordering::Relaxed)
+    }
+}
+
+/// A thread that delivers, and the queue to it.
+pub struct Delivery {
+    queue: mpsc::Sender<Chunk>,
+    limit: usize,
+    account: Arc<Account>,
+    thread: JoinHandle<anyhow::Result<u64>>,
+}
+
+impl Delivery {
+    /// Starts the thread. `inserted_total` is the run's count so far; `pool` is where the chunks' memory comes from. The actor
+    /// has joined the run with the epoch of its chunks.
+    ///
+    /// # Errors
+    /// The operating system gave no thread.
+    pub fn start(
+        session: Session,
+        keys: Keys,
+        spec_hash: u64,
+        inserted_total: u64,
+        limits: DeliveryLimits,
+        pool: PlanesPool,
+        shutdown: Shutdown,
+    ) -> std::io::Result<Self> {
+        let account = Arc::new(Account::default());
+        account
+            .inserted_total
+            .store(inserted_total, Ordering::Relaxed);
+        let (queue, chunks) = mpsc::channel();
+        let courier = Courier::new(
+            session,
+            (keys, spec_hash),
+            limits,
+            pool,
+            shutdown,
+            account.clone(),
+        );
+        let thread = std::thread::Builder::new()
+            .name("delivery".into())
+            .spawn(move || courier.run(&chunks))?;
+        Ok(Self {
+            queue,
+            limit: limits.chunks_in_flight_max,
+            account,
+            thread,
+        })
+    }
+
+    /// Transitions that the run has stored, as of the last answer.
+    pub fn inserted_total(&self) -> u64 {
+        self.account.inserted_total.load(Ordering::Relaxed)
+    }
+
+    /// Actors that are connected to the run, as of the last answer; 0 before the first.
+    pub fn actors(&self) -> u32 {
+        self.account.actors.load(Ordering::Relaxed)
+    }
+
+    /// The run has all the transitions it wants.
+    pub fn is_finished(&self) -> bool {
+        self.account.finished.load(Ordering::Relaxed)
+    }
+
+    /// Queues a chunk, waiting while too many are not acknowledged: one, where the rate limiter makes chunks wait. `false`: the
+    /// thread has ended; [`Self::finish`] says why.
+    pub fn send(&self, chunk: Chunk) -> bool {
+        let mut waiting = self.account.waiting();
+        loop {
+            let limit = if self.account.is_held() {
+                1
+            } else {
+                self.limit
+            };
+            if *waiting < limit || self.thread.is_finished() {
+                break;
+            }
+            // The time-out is for a thread that ended without a word.
+            (waiting, _) = self
+                .account
+                .settled
+                .wait_timeout(waiting, Duration::from_secs(1))
+                .unwrap_or_else(PoisonError::into_inner);
+        }
+        *waiting += 1;
+        self.queue.send(chunk).is_ok()
+    }
+
+    /// Waits for the last chunk and says goodbye; gives the number of transitions that were not wanted any more.
+    ///
+    /// # Errors
+    /// A chunk that could not be delivered.
+    pub fn finish(self) -> anyhow::Result<u64> {
+        drop(self.queue);
+        self.thread
+            .join()
+            .map_err(|_| anyhow::anyhow!("the delivery thread panicked"))?
+    }
+}

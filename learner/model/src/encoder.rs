@@ -1,0 +1,52 @@
+//! Torso and Psi_4 alone: what turns states into vectors that are compared with another network's, such as CURL's keys.
+//! It has no C51 head and sees no action.
+
+use candle_core::Tensor;
+
+use crate::compute::Operations;
+use crate::config::ModelConfig;
+use crate::dim_head::Head;
+use crate::error::Result;
+use crate::torso::Torso;
+use crate::weights::Parameters;
+
+/// The part of a network that encodes a state as psi_4(f4).
+///
+/// It shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes this encoder.
+#[derive(Debug)]
+pub struct Encoder {
+    torso: Torso,
+    psi4: Head,
+}
+
+impl Encoder {
+    /// Whether the network's parameter of this name is one of the encoder's.
+    pub fn has(name: &str) -> bool {
+        name.starts_with("torso.") || name.starts_with("dim.psi4.")
+    }
+
+    /// The encoder of a network of `config`, on `parameters`, which may hold more than it needs.
+    ///
+    /// # Errors
+    /// An invalid configuration, or a parameter that is missing.
+    pub fn new(
+        config: &ModelConfig,
+        parameters: &Parameters,
+        operations: Operations,
+    ) -> Result<Self> {
+        config.validate()?;
+        Ok(Self {
+            torso: Torso::new(config, parameters, operations)?,
+            psi4: Head::new("dim.psi4", config.hidden, parameters, operations)?,
+        })
+    }
+
+    /// psi_4(f4) [B, rkhs] of `frames` [B, H, W, C] u8, cut off from any graph.
+    ///
+    /// # Errors
+    /// Frames of another type or size.
+    pub fn encode(&self, frames: &Tensor) -> Result<Tensor> {
+        let (_, f4) = self.torso.features(frames)?;
+        Ok(self.psi4.forward(&f4.detach(), None)?.detach())
+    }
+}

@@ -1,0 +1,233 @@
+//! What the learner tells others: its newest weights, once a version, and its affinity to the replay server; its status to
+//! whoever asks. It computes none of it, and no update waits for any of it.
+
+use std::{
+    sync::{
+        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use driml_protocol::{
+    AffinityUpdate, Keys, Kind, LearnerStatus, Shutdown, WeightsUpload, answering::Answering,
+    codec, fault, seldom::Seldom, session,
+};
+use zenoh::{Session, bytes::ZBytes, qos::Priority, query::Queryable};
+
+use crate::learning::Weights;
+
+/// One delivery of the affinity matrix.
+const AFFINITY_TIMEOUT: Duration = Duration::from_secs(5);
+/// One delivery of weights.
+const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(10);
+/// Pause between two tries.
+const RETRY_PAUSE: Duration = Duration::from_millis(200);
+/// How often a thread that has nothing to send looks whether it should end.
+const TICK: Duration = Duration::from_millis(200);
+
+/// The learner's outlets; dropping it closes them.
+pub(crate) struct Outlets {
+    learner: u64,
+    status: Arc<Mutex<LearnerStatus>>,
+    heard: Arc<AtomicBool>,
+    weights: Arc<Newest<Weights>>,
+    affinity: Arc<Newest<AffinityUpdate>>,
+    _queryables: Vec<Queryable<()>>,
+}
+
+/// A slot that keeps the newest of its kind until it is sent.
+struct Newest<T> {
+    slot: Mutex<Option<T>>,
+    filled: Condvar,
+}
+
+impl<T> Default for Newest<T> {
+    fn default() -> Self {
+        Self {
+            slot: Mutex::default(),
+            filled: Condvar::new(),
+        }
+    }
+}
+
+impl<T> Newest<T> {
+    fn put(&self, value: T) {
+        *lock(&self.slot) = Some(value);
+        self.filled.notify_one();
+    }
+
+    /// Takes what is there, waiting for it for a while.
+    fn take(&self) -> Option<T> {
+        let slot = lock(&self.slot);
+        let (mut slot, _) = self
+            .filled
+            .wait_timeout_while(slot, TICK, |slot| slot.is_none())
+            .unwrap_or_else(PoisonError::into_inner);
+        slot.take()
+    }
+
+    fn is_filled(&self) -> bool {
+        lock(&self.slot).is_some()
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Outlets {
+    /// Declares the status in every session, and starts the threads that send weights and affinity as those of `learner`.
+    pub(crate) fn open(
+        sessions: &[Session],
+        (keys, spec_hash): (&Keys, u64),
+        learner: u64,
+        shutdown: &Shutdown,
+    ) -> anyhow::Result<Self> {
+        let status: Arc<Mutex<LearnerStatus>> = Arc::default();
+        let heard: Arc<AtomicBool> = Arc::default();
+        let (held, told) = (status.clone(), heard.clone());
+        let status_asked = Answering::start("status", 1, move |query| {
+            let status = lock(&held).clone();
+            match codec::encode(Kind::LearnerStatus, spec_hash, &status, &[]) {
+                Ok(bytes) => {
+                    session::answer(&query, bytes.into());
+                    told.store(status.finished, Ordering::Relaxed);
+                }
+                Err(e) => tracing::warn!("the learner's status was not sent: {e}"),
+            }
+        })?;
+        let mut queryables = Vec::new();
+        for session in sessions {
+            let declared = status_asked.declare(session, keys.learner_status());
+            queryables.push(
+                declared.map_err(|e| anyhow::anyhow!("declaring the learner's status: {e}"))?,
+            );
+        }
+        let this = Self {
+            learner,
+            status,
+            heard,
+            weights: Arc::default(),
+            affinity: Arc::default(),
+            _queryables: queryables,
+        };
+        let to_all = |key: String, timeout| Sender {
+            sessions: sessions.to_vec(),
+            key,
+            spec_hash,
+            timeout,
+            shutdown: shutdown.clone(),
+            said: Seldom::default(),
+        };
+        let (newest, mut sender) = (
+            this.weights.clone(),
+            to_all(keys.weights_upload(), WEIGHTS_TIMEOUT),
+        );
+        let send_weights = move || {
+            sender.run(&newest, "weights-upload", |(header, safetensors)| {
+                let upload = WeightsUpload {
+                    learner,
+                    weights: *header,
+                };
+                let head = codec::seal(Kind::WeightsUpload, spec_hash, &upload, safetensors)?;
+                Ok(session::join_planes(head, safetensors.clone().into()))
+            });
+        };
+        let (newest, mut sender) = (
+            this.affinity.clone(),
+            to_all(keys.affinity(), AFFINITY_TIMEOUT),
+        );
+        let send_affinity = move || {
+            sender.run(&newest, "affinity", |update| {
+                Ok(codec::encode(Kind::Affinity, spec_hash, update, &[])?.into())
+            });
+        };
+        let named = |name: &str| std::thread::Builder::new().name(name.into());
+        named("weights-upload").spawn(send_weights)?;
+        named("affinity").spawn(send_affinity)?;
+        Ok(this)
+    }
+
+    /// The number by which the replay server knows this learner.
+    pub(crate) const fn learner(&self) -> u64 {
+        self.learner
+    }
+
+    /// Hands the weights over to the replay server, which announces them and gives them to actors; those that were not sent yet
+    /// are replaced.
+    pub(crate) fn publish(&self, weights: Weights) {
+        let mut status = lock(&self.status);
+        status.weights_version = weights.0.version;
+        status.weights_sha256 = weights.0.sha256_hex();
+        drop(status);
+        self.weights.put(weights);
+    }
+
+    /// Hands over the newest affinity; one that was not sent yet is replaced.
+    pub(crate) fn send_affinity(&self, update: AffinityUpdate) {
+        self.affinity.put(update);
+    }
+
+    /// Waits until somebody has asked for the status since the learner finished, or for `wait_max`.
+    pub(crate) fn wait_until_heard(&self, wait_max: Duration) {
+        let started = Instant::now();
+        while !self.heard.load(Ordering::Relaxed) && started.elapsed() < wait_max {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// Changes the status that others see.
+    pub(crate) fn with_status(&self, change: impl FnOnce(&mut LearnerStatus)) {
+        change(&mut lock(&self.status));
+    }
+}
+
+/// Sends the newest of its kind to all replay servers, again until each has said that it has it or something newer is there.
+struct Sender {
+    sessions: Vec<Session>,
+    key: String,
+    spec_hash: u64,
+    timeout: Duration,
+    shutdown: Shutdown,
+    said: Seldom,
+}
+
+impl Sender {
+    /// `what` names what is sent, and the thread, which ends with the shutdown.
+    fn run<T>(
+        &mut self,
+        newest: &Newest<T>,
+        what: &'static str,
+        message: impl Fn(&T) -> anyhow::Result<ZBytes>,
+    ) {
+        while !self.shutdown.is_set() {
+            fault::point(what);
+            let Some(value) = newest.take() else { continue };
+            let message = match message(&value) {
+                Ok(message) => message,
+                Err(e) => {
+                    tracing::error!("{what} cannot be sent: {e:#}");
+                    continue;
+                }
+            };
+            for session in self.sessions.clone() {
+                while let Err(e) = self.send(&session, message.clone()) {
+                    if newest.is_filled() || self.shutdown.wait_timeout(RETRY_PAUSE) {
+                        break;
+                    }
+                    if let Some(more) = self.said.due() {
+                        tracing::warn!("{what} did not arrive, trying again: {e:#}{more}");
+                    }
+                }
+            }
+        }
+    }
+
+    fn send(&self, session: &Session, message: ZBytes) -> anyhow::Result<()> {
+        let priority = Priority::DataHigh;
+        let answer = session::ask(session, &self.key, message, priority, self.timeout)?;
+        codec::decode::<()>(&answer.to_bytes(), Kind::Done, Some(self.spec_hash))?;
+        Ok(())
+    }
+}

@@ -1,0 +1,167 @@
+//! Joining a run: fetching its settings, and taking part in it as an actor or as the learner.
+//! What a part does afterwards is its own; so is saying that it leaves.
+
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+use zenoh::{Session, bytes::ZBytes, qos::Priority};
+
+use crate::{
+    ActorJoin, CodecError, Hello, JoinReply, Keys, Kind, LearnerJoin, Shutdown, codec,
+    session::{self, SessionError},
+};
+
+/// How long a joining part waits for a replay server.
+const SERVER_MAX: Duration = Duration::from_secs(60);
+/// How long it waits for its predecessor to be gone: a session that was cut off counts as connected for its lease of 30 s.
+const TAKEN_MAX: Duration = Duration::from_secs(45);
+/// One try.
+const TRY_MAX: Duration = Duration::from_secs(2);
+/// Pause between two tries.
+const PAUSE: Duration = Duration::from_millis(200);
+
+/// Why a part could not join a run.
+#[derive(Debug, thiserror::Error)]
+pub enum JoinError {
+    /// Nobody there.
+    #[error("no replay server answered within {} s: is it running, and is the endpoint right? ({last})", SERVER_MAX.as_secs())]
+    Nobody {
+        /// The last try's error.
+        last: SessionError,
+    },
+    /// An answer that cannot be read.
+    #[error("the replay server's greeting: {0}")]
+    Codec(#[from] CodecError),
+    /// Another process plays the same part.
+    #[error("{why}, and has not ended within {} s", TAKEN_MAX.as_secs())]
+    Taken {
+        /// Who, and what to do.
+        why: String,
+    },
+    /// The replay server says no.
+    #[error("the replay server refuses: {why}")]
+    Refused {
+        /// The reason.
+        why: String,
+    },
+}
+
+/// What the replay server says to a part that it takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Welcome {
+    /// Transitions that the run has stored.
+    pub inserted_total: u64,
+    /// Version of the newest weights that the replay server has; 0 before the first.
+    pub weights_version: u64,
+}
+
+/// Asks the replay server for the run's settings, waiting for it if it is not there yet; `None` if told to stop before.
+///
+/// # Errors
+/// Nobody there within a minute, or another protocol version.
+pub fn hello(
+    session: &Session,
+    keys: &Keys,
+    shutdown: &Shutdown,
+) -> Result<Option<Hello>, JoinError> {
+    let started = Instant::now();
+    loop {
+        match ask(session, &keys.hello(), ZBytes::new()) {
+            Ok(answer) => {
+                return Ok(Some(
+                    codec::decode(&answer.to_bytes(), Kind::Hello, None)?.0,
+                ));
+            }
+            Err(last) if started.elapsed() > SERVER_MAX => return Err(JoinError::Nobody { last }),
+            Err(e) => tracing::debug!("no replay server yet: {e}"),
+        }
+        if shutdown.wait_timeout(PAUSE) {
+            return Ok(None);
+        }
+    }
+}
+
+/// Takes part as an actor; `None` if told to stop before.
+///
+/// # Errors
+/// Another process is this actor and stays; the replay server refuses, or does not answer for a minute.
+pub fn as_actor(
+    session: &Session,
+    keys: &Keys,
+    spec_hash: u64,
+    join: ActorJoin,
+    shutdown: &Shutdown,
+) -> Result<Option<Welcome>, JoinError> {
+    let key = keys.actor_join();
+    take_part(session, &key, (Kind::ActorJoin, spec_hash), &join, shutdown)
+}
+
+/// Takes part as the run's learner; `None` if told to stop before.
+///
+/// # Errors
+/// Another learner takes part and stays; the replay server refuses, or does not answer for a minute.
+pub fn as_learner(
+    session: &Session,
+    keys: &Keys,
+    spec_hash: u64,
+    join: LearnerJoin,
+    shutdown: &Shutdown,
+) -> Result<Option<Welcome>, JoinError> {
+    let key = keys.learner_join();
+    take_part(
+        session,
+        &key,
+        (Kind::LearnerJoin, spec_hash),
+        &join,
+        shutdown,
+    )
+}
+
+fn take_part(
+    session: &Session,
+    key: &str,
+    (kind, spec_hash): (Kind, u64),
+    join: &impl Serialize,
+    shutdown: &Shutdown,
+) -> Result<Option<Welcome>, JoinError> {
+    let message = codec::encode(kind, spec_hash, join, &[])?;
+    let started = Instant::now();
+    let mut said = false;
+    loop {
+        match ask(session, key, message.clone().into()) {
+            Ok(answer) => {
+                let bytes = answer.to_bytes();
+                match codec::decode(&bytes, Kind::JoinReply, Some(spec_hash))?.0 {
+                    JoinReply::Welcome {
+                        inserted_total,
+                        weights_version,
+                    } => {
+                        return Ok(Some(Welcome {
+                            inserted_total,
+                            weights_version,
+                        }));
+                    }
+                    JoinReply::Refused { why } => return Err(JoinError::Refused { why }),
+                    JoinReply::Taken { why } if started.elapsed() > TAKEN_MAX => {
+                        return Err(JoinError::Taken { why });
+                    }
+                    JoinReply::Taken { why } => {
+                        if !std::mem::replace(&mut said, true) {
+                            let max = TAKEN_MAX.as_secs();
+                            tracing::warn!("{why}; waiting up to {max} s for its end");
+                        }
+                    }
+                }
+            }
+            Err(last) if started.elapsed() > SERVER_MAX => return Err(JoinError::Nobody { last }),
+            Err(e) => tracing::debug!("the replay server did not answer: {e}"),
+        }
+        if shutdown.wait_timeout(PAUSE) {
+            return Ok(None);
+        }
+    }
+}
+
+fn ask(session: &Session, key: &str, payload: ZBytes) -> Result<ZBytes, SessionError> {
+    session::ask(session, key, payload, Priority::Data, TRY_MAX)
+}

@@ -1,0 +1,120 @@
+//! When messages may go through shared memory: what the system grants a process, and whether what was sent so arrives.
+//! It moves no bytes.
+
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
+
+/// After a message in shared memory was lost, how many go through the socket before shared memory is tried again.
+const AVOID_COUNT: u32 = 64;
+/// So many losses without a message that arrived between them, and shared memory is not tried again.
+const LOSSES_MAX: u32 = 2;
+/// Number of the capability by which a process may lock as much memory as it likes (`capabilities(7)`).
+const CAP_IPC_LOCK: u32 = 14;
+
+/// Whether shared memory is worth a try, by what became of the messages that went through it.
+#[derive(Debug, Default)]
+pub struct Trust {
+    /// Messages that are still to go through the socket.
+    avoid: u32,
+    losses_in_a_row: u32,
+}
+
+impl Trust {
+    /// Whether the next message may go through shared memory.
+    pub fn ask(&mut self) -> bool {
+        let may = self.avoid == 0;
+        if self.losses_in_a_row < LOSSES_MAX {
+            self.avoid = self.avoid.saturating_sub(1);
+        }
+        may
+    }
+
+    /// A message in shared memory was not answered. The next ones go through the socket; after a second loss in a row, all.
+    pub fn lost(&mut self) {
+        self.avoid = AVOID_COUNT;
+        self.losses_in_a_row += 1;
+        if self.losses_in_a_row == LOSSES_MAX {
+            tracing::warn!(
+                "messages in shared memory do not arrive, so all go through sockets from now on, which is slower; the other side may \
+                 not be allowed to lock memory: raise its `ulimit -l`, or --set transport.shared_memory=false"
+            );
+        }
+    }
+
+    /// A message in shared memory has arrived.
+    pub const fn worked(&mut self) {
+        self.losses_in_a_row = 0;
+    }
+}
+
+/// Bytes of shared memory for `count` pieces of `bytes` each, with a quarter more for what the allocator needs and leaves
+/// between pieces.
+pub const fn pool_bytes(count: usize, bytes: usize) -> usize {
+    count.saturating_mul(bytes) / 4 * 5 + (1 << 16)
+}
+
+/// Whether this process may lock `bytes` bytes, as zenoh does with the shared memory that it makes and that it reads.
+///
+/// # Errors
+/// It may not; what to do, for a person.
+pub fn check_lockable(bytes: usize) -> Result<(), String> {
+    match lockable_bytes() {
+        Some(most) if most < bytes as u64 => Err(format!(
+            "this process may lock {} KiB of memory, {} KiB are needed: raise `ulimit -l`",
+            most >> 10,
+            bytes >> 10
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// Bytes that this process may lock; none if there is no limit.
+pub fn lockable_bytes() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    if may_lock_all(&status) {
+        return None;
+    }
+    // A system without the limit refuses in its own words when memory is locked.
+    let (soft, hard) = getrlimit(Resource::RLIMIT_MEMLOCK).ok()?;
+    // What may be raised is.
+    let most = match setrlimit(Resource::RLIMIT_MEMLOCK, hard, hard) {
+        Ok(()) => hard,
+        Err(_) => soft,
+    };
+    (most != nix::sys::resource::RLIM_INFINITY).then_some(most)
+}
+
+/// Whether a process with this `/proc/PID/status` has [`CAP_IPC_LOCK`].
+fn may_lock_all(status: &str) -> bool {
+    let effective = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
+    let bits = effective.and_then(|it| u64::from_str_radix(it.trim(), 16).ok());
+    bits.is_some_and(|bits| bits >> CAP_IPC_LOCK & 1 == 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn after_a_loss_sockets_serve_for_a_while_and_after_two_in_a_row_for_ever() {
+        let mut trust = Trust::default();
+        assert!(trust.ask() && trust.ask());
+        trust.lost();
+        assert_eq!((0..AVOID_COUNT).filter(|_| trust.ask()).count(), 0);
+        assert!(trust.ask());
+        trust.worked();
+        trust.lost();
+        assert_eq!((0..AVOID_COUNT).filter(|_| trust.ask()).count(), 0);
+        assert!(trust.ask(), "one loss, as something arrived in between");
+        trust.lost();
+        assert_eq!((0..10 * AVOID_COUNT).filter(|_| trust.ask()).count(), 0);
+    }
+
+    #[test]
+    fn the_right_to_lock_all_memory_is_a_bit_of_the_effective_set() {
+        let status = |bits| format!("Name:\tx\nCapPrm:\t0000000000004000\nCapEff:\t{bits}\n");
+        assert!(may_lock_all(&status("0000000000004000")));
+        assert!(may_lock_all(&status("000001ffffffffff")));
+        assert!(!may_lock_all(&status("00000000a80425fb")));
+        assert!(!may_lock_all("Name:\tx\n"));
+    }
+}

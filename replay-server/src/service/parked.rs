@@ -1,0 +1,338 @@
+//! What has to wait until the rate limiter opens: one chunk an actor and one request an asker, with whoever asked.
+//! It neither stores, draws nor answers; `Q` is the question to be answered.
+
+use std::{
+    collections::{HashMap, VecDeque},
+    time::{Duration, Instant},
+};
+
+use driml_protocol::{BatchRequest, ChunkHeader, Claim};
+
+use crate::PackedChunk;
+
+/// Bytes of the chunks kept; whoever sends one more is told to send it again later.
+const CHUNK_BYTES_MAX: usize = 1 << 28;
+/// Requests kept; the one that has waited longest gives way to one more, and its asker asks again.
+const REQUESTS_MAX: usize = 1024;
+
+/// A chunk that is stored as soon as the limiter lets it pass.
+pub(super) struct ParkedChunk<Q> {
+    pub(super) chunk: PackedChunk<'static>,
+    /// Who waits for the answer; none between a `Wait` and the actor's claim.
+    pub(super) question: Option<Q>,
+    pub(super) arrived: Instant,
+    /// When the question came.
+    asked: Instant,
+}
+
+/// The chunks that wait, at most one an actor: the newest copy.
+pub(super) struct ParkedChunks<Q> {
+    by_actor: HashMap<u32, ParkedChunk<Q>>,
+    /// Actors in the order in which their chunks came, each once.
+    line: VecDeque<u32>,
+    bytes: usize,
+}
+
+impl<Q> Default for ParkedChunks<Q> {
+    fn default() -> Self {
+        Self {
+            by_actor: HashMap::new(),
+            line: VecDeque::new(),
+            bytes: 0,
+        }
+    }
+}
+
+impl<Q> ParkedChunks<Q> {
+    pub(super) fn len(&self) -> usize {
+        self.line.len()
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.line.is_empty()
+    }
+
+    /// Keeps a chunk in the place of an older one of its actor, or at the end of the line; gives the question back if there is
+    /// no room for it.
+    pub(super) fn park(
+        &mut self,
+        chunk: PackedChunk<'static>,
+        question: Q,
+        now: Instant,
+    ) -> Result<(), Q> {
+        let actor = chunk.chunk.header.actor;
+        let freed = self.by_actor.get(&actor).map_or(0, |old| old.chunk.bytes());
+        // One chunk of any size is kept, or an actor with large ones would send for ever.
+        if self.bytes > freed && self.bytes - freed + chunk.bytes() > CHUNK_BYTES_MAX {
+            return Err(question);
+        }
+        self.bytes = self.bytes - freed + chunk.bytes();
+        let mut parked = ParkedChunk {
+            chunk,
+            question: Some(question),
+            arrived: now,
+            asked: now,
+        };
+        match self.by_actor.get(&actor) {
+            Some(old) => parked.arrived = old.arrived,
+            None => self.line.push_back(actor),
+        }
+        self.by_actor.insert(actor, parked);
+        Ok(())
+    }
+
+    /// The parked chunk that `claim` is about.
+    pub(super) fn claimed(&mut self, claim: &Claim) -> Option<&mut ParkedChunk<Q>> {
+        self.by_actor.get_mut(&claim.actor).filter(|parked| {
+            let header = &parked.chunk.chunk.header;
+            (header.epoch, header.sequence) == (claim.epoch, claim.sequence)
+        })
+    }
+
+    /// Takes the older copy of a chunk that has been stored out of the line; a later chunk of its actor stays.
+    pub(super) fn take_copy(&mut self, stored: &ChunkHeader) -> Option<ParkedChunk<Q>> {
+        let parked = &self.by_actor.get(&stored.actor)?.chunk.chunk.header;
+        let is_copy = parked.epoch == stored.epoch && parked.sequence <= stored.sequence;
+        if is_copy {
+            self.take(stored.actor)
+        } else {
+            None
+        }
+    }
+
+    /// The chunk that has waited longest.
+    pub(super) fn first(&self) -> Option<&ParkedChunk<Q>> {
+        self.by_actor.get(self.line.front()?)
+    }
+
+    /// Takes an actor's chunk out of the line.
+    pub(super) fn take(&mut self, actor: u32) -> Option<ParkedChunk<Q>> {
+        let parked = self.by_actor.remove(&actor)?;
+        self.line.retain(|&it| it != actor);
+        self.bytes -= parked.chunk.bytes();
+        Some(parked)
+    }
+
+    /// Takes the chunk that has waited longest out of the line.
+    pub(super) fn take_first(&mut self) -> Option<ParkedChunk<Q>> {
+        let actor = self.line.pop_front()?;
+        let parked = self.by_actor.remove(&actor)?;
+        self.bytes -= parked.chunk.bytes();
+        Some(parked)
+    }
+
+    /// Takes the questions that have been held for `hold_max`; the chunks stay.
+    pub(super) fn overdue(&mut self, now: Instant, hold_max: Duration) -> Vec<Q> {
+        let late =
+            |parked: &&mut ParkedChunk<Q>| now.saturating_duration_since(parked.asked) >= hold_max;
+        let parked = self.by_actor.values_mut().filter(late);
+        parked.filter_map(|parked| parked.question.take()).collect()
+    }
+
+    /// How long until a question has been held for `hold_max`; none if nobody waits.
+    pub(super) fn due_in(&self, now: Instant, hold_max: Duration) -> Option<Duration> {
+        let held = self.by_actor.values().filter(|it| it.question.is_some());
+        let left = held.map(|it| hold_max.saturating_sub(now.saturating_duration_since(it.asked)));
+        left.min()
+    }
+}
+
+impl<Q> ParkedChunk<Q> {
+    /// Takes another question about the same chunk; nobody waits for the answer to the older one any more.
+    pub(super) fn ask(&mut self, question: Q, now: Instant) {
+        (self.question, self.asked) = (Some(question), now);
+    }
+}
+
+/// A request that is served as soon as the limiter allows it.
+pub(super) struct ParkedRequest<Q> {
+    pub(super) request: BatchRequest,
+    pub(super) question: Q,
+    pub(super) arrived: Instant,
+    /// How long it may wait.
+    pub(super) hold_max: Duration,
+}
+
+impl<Q> ParkedRequest<Q> {
+    pub(super) fn left(&self, now: Instant) -> Duration {
+        let held = now.saturating_duration_since(self.arrived);
+        self.hold_max.saturating_sub(held)
+    }
+}
+
+/// The requests that wait, at most one an asker: the newest attempt. The oldest is first.
+pub(super) struct ParkedRequests<Q>(VecDeque<ParkedRequest<Q>>);
+
+impl<Q> Default for ParkedRequests<Q> {
+    fn default() -> Self {
+        Self(VecDeque::new())
+    }
+}
+
+impl<Q> ParkedRequests<Q> {
+    /// Keeps a request in the place of an older one of its asker; nobody waits for the answer to that one any more.
+    pub(super) fn park(&mut self, parked: ParkedRequest<Q>) {
+        let id = parked.request.id;
+        self.0.retain(|it| it.request.id.asker != id.asker);
+        if self.0.len() == REQUESTS_MAX {
+            self.0.pop_front();
+        }
+        self.0.push_back(parked);
+    }
+
+    /// Forgets all but the requests of one learner.
+    pub(super) fn keep_only(&mut self, learner: u64) {
+        self.0.retain(|it| it.request.learner == learner);
+    }
+
+    pub(super) fn pop(&mut self) -> Option<ParkedRequest<Q>> {
+        self.0.pop_front()
+    }
+
+    /// Puts back what was popped and is not to be answered yet.
+    pub(super) fn put_back(&mut self, parked: impl IntoIterator<Item = ParkedRequest<Q>>) {
+        let newer = std::mem::take(&mut self.0);
+        self.0.extend(parked);
+        self.0.extend(newer);
+    }
+
+    /// How long until one has waited as long as it may.
+    pub(super) fn due_in(&self, now: Instant) -> Option<Duration> {
+        self.0.iter().map(|it| it.left(now)).min()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::borrow::Cow;
+
+    use driml_protocol::{Chunk, RequestId};
+
+    use super::*;
+    use crate::{Compression, Packer};
+
+    fn chunk(actor: u32, sequence: u64, steps: u32, frame_bytes: u32) -> PackedChunk<'static> {
+        let chunk = Chunk::zeroed(ChunkHeader {
+            actor,
+            epoch: 9,
+            sequence,
+            first_transition: 0,
+            weights_version: 0,
+            leaving: false,
+            streams: 1,
+            steps,
+            frame_bytes,
+        });
+        let packer = Packer {
+            compression: Compression::None,
+        };
+        packer.pack(Cow::Owned(chunk))
+    }
+
+    fn claim(actor: u32, sequence: u64) -> Claim {
+        Claim {
+            actor,
+            epoch: 9,
+            sequence,
+            leaving: false,
+        }
+    }
+
+    #[test]
+    fn one_chunk_an_actor_waits_in_the_order_of_arrival() {
+        let (mut parked, now) = (ParkedChunks::default(), Instant::now());
+        for (actor, question) in [(1, "a"), (2, "b"), (1, "a again")] {
+            parked.park(chunk(actor, 0, 1, 1), question, now).unwrap();
+        }
+        assert_eq!(parked.len(), 2);
+        assert_eq!(
+            parked.first().unwrap().question,
+            Some("a again"),
+            "its place is kept"
+        );
+        assert!(parked.claimed(&claim(1, 1)).is_none(), "another chunk");
+        assert!(parked.claimed(&claim(3, 0)).is_none(), "another actor");
+        assert!(parked.take_copy(&chunk(3, 0, 1, 1).chunk.header).is_none());
+        parked.park(chunk(4, 7, 1, 1), "d", now).unwrap();
+        assert!(
+            parked.take_copy(&chunk(4, 6, 1, 1).chunk.header).is_none(),
+            "a later one"
+        );
+        assert_eq!(
+            parked
+                .take_copy(&chunk(4, 7, 1, 1).chunk.header)
+                .unwrap()
+                .question,
+            Some("d")
+        );
+        parked.claimed(&claim(1, 0)).unwrap().ask("claimed", now);
+        assert_eq!(parked.take_first().unwrap().question, Some("claimed"));
+        assert_eq!(parked.take(2).unwrap().question, Some("b"));
+        assert!(parked.take(2).is_none() && parked.take_first().is_none() && parked.is_empty());
+        assert_eq!(parked.bytes, 0);
+    }
+
+    #[test]
+    fn a_question_is_held_for_a_while_and_its_chunk_for_longer() {
+        let (mut parked, start) = (ParkedChunks::default(), Instant::now());
+        let (hold, second) = (Duration::from_secs(2), Duration::from_secs(1));
+        assert_eq!(parked.due_in(start, hold), None);
+        parked.park(chunk(1, 0, 1, 1), "a", start).unwrap();
+        parked.park(chunk(2, 0, 1, 1), "b", start + second).unwrap();
+        assert_eq!(parked.due_in(start + second, hold), Some(second));
+        assert_eq!(parked.overdue(start + hold, hold), ["a"]);
+        assert_eq!(parked.overdue(start + hold, hold), [""; 0]);
+        assert_eq!(parked.due_in(start + hold, hold), Some(second));
+        parked
+            .claimed(&claim(1, 0))
+            .unwrap()
+            .ask("a again", start + hold);
+        assert_eq!(parked.overdue(start + 5 * second, hold).len(), 2);
+        assert_eq!(parked.len(), 2);
+    }
+
+    #[test]
+    fn the_bytes_kept_are_bounded_and_one_chunk_always_fits() {
+        let (mut parked, now) = (ParkedChunks::default(), Instant::now());
+        let third = CHUNK_BYTES_MAX as u32 / 3;
+        parked.park(chunk(1, 0, 4, third), "a", now).unwrap();
+        assert_eq!(parked.park(chunk(2, 0, 1, 1), "b", now), Err("b"));
+        // A smaller copy makes room.
+        parked.park(chunk(1, 0, 2, third), "a", now).unwrap();
+        parked.park(chunk(2, 0, 1, 1), "b", now).unwrap();
+        assert_eq!(parked.park(chunk(3, 0, 1, third), "c", now), Err("c"));
+        parked.take(1);
+        parked.park(chunk(3, 0, 1, third), "c", now).unwrap();
+    }
+
+    #[test]
+    fn one_request_an_asker_waits() {
+        let (mut parked, now) = (ParkedRequests::default(), Instant::now());
+        let request = |learner, asker, question| ParkedRequest {
+            request: BatchRequest {
+                learner,
+                id: RequestId::first(asker),
+                rows: 1,
+                shared_memory: false,
+                elsewhere: None,
+            },
+            question,
+            arrived: now,
+            hold_max: Duration::from_secs(asker),
+        };
+        for (learner, asker, question) in [(1, 1, "a"), (1, 2, "b"), (1, 1, "a again"), (2, 3, "c")]
+        {
+            parked.park(request(learner, asker, question));
+        }
+        assert_eq!(parked.due_in(now), Some(Duration::from_secs(1)));
+        parked.keep_only(1);
+        let first = parked.pop().unwrap();
+        assert_eq!(first.question, "b");
+        parked.put_back([first]);
+        let order: Vec<_> = std::iter::from_fn(|| parked.pop())
+            .map(|it| it.question)
+            .collect();
+        assert_eq!(order, ["b", "a again"]);
+        assert_eq!(parked.due_in(now), None);
+    }
+}
