@@ -232,7 +232,10 @@ mod tests {
 
     /// The actions of a life's first chunk.
     fn actions(settings: ActorSettings, life: Life) -> Vec<u8> {
-        let chunk = collector(settings, life).unwrap().collect(0, 8).unwrap();
+        let chunk = collector(settings, life)
+            .unwrap()
+            .collect(0, STEPS)
+            .unwrap();
         assert_eq!(chunk.actions().len(), (ENVS * STEPS) as usize);
         chunk.actions().to_vec()
     }

@@ -1,29 +1,21 @@
-//! One part of a run as a child process: started, watched, logged, asked to stop.
+//! One part of a run as a child process: started, watched, asked to stop.
 //! It does not know what the parts do or in which order they end.
 
 use std::{
-    collections::VecDeque,
-    fs::File,
-    io::{BufRead, BufReader, Read, Write},
     os::unix::process::{CommandExt, ExitStatusExt},
-    path::{Path, PathBuf},
+    path::Path,
     process::{Child, Command, ExitStatus, Stdio},
-    sync::{Arc, Mutex},
-    thread::JoinHandle,
     time::{Duration, Instant},
 };
 
 use anyhow::Context;
-use driml_protocol::fault;
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
 };
 
-use crate::console::Screen;
+use crate::{console::Screen, meeting::Meeting, part_log::PartLog};
 
-/// Last lines of a part's log that are kept to be shown if it fails.
-const TAIL_LINES_MAX: usize = 8;
 /// How often a part that should end is looked at.
 const POLL: Duration = Duration::from_millis(20);
 
@@ -32,12 +24,20 @@ const POLL: Duration = Duration::from_millis(20);
 pub(crate) struct Part {
     /// Its name: `replay-server`, `learner`, `actor-0`.
     pub(crate) name: String,
-    /// Where its output goes.
-    pub(crate) log: PathBuf,
     child: Child,
     end: Option<ExitStatus>,
-    tail: Arc<Mutex<VecDeque<String>>>,
-    pumps: Vec<JoinHandle<()>>,
+    log: PartLog,
+}
+
+/// What all parts of a run have in common when they start.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Surroundings<'a> {
+    /// The folder of their logs.
+    pub(crate) logs: &'a Path,
+    /// Where their warnings are shown.
+    pub(crate) screen: &'a Screen,
+    /// Where they meet, if it is to stay there as long as any of them lives.
+    pub(crate) meeting: Option<&'a Meeting>,
 }
 
 /// What suits candle in every part: its second pool spins while it waits, which costs more than it gives on busy cores, and
@@ -71,54 +71,44 @@ impl Part {
         name: &str,
         args: &[String],
         threads: u32,
-        logs: &Path,
-        screen: &Screen,
+        surroundings: Surroundings<'_>,
     ) -> anyhow::Result<Self> {
-        let log = logs.join(format!("{name}.log"));
+        let Surroundings {
+            logs,
+            screen,
+            meeting,
+        } = surroundings;
+        let mut log = PartLog::open(name, logs)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
-        let file = File::options().create(true).append(true).open(&log);
-        let file = file.with_context(|| format!("making {}", log.display()))?;
+        let starting = || format!("starting {name}");
+        let stdin = match meeting {
+            Some(meeting) => meeting.hold().with_context(starting)?.into(),
+            None => Stdio::null(),
+        };
         let mut command = Command::new(program);
         suit_candle(&mut command, threads);
         let mut child = command
             .args(args)
             .args(exit_with_this_process())
-            .stdin(Stdio::null())
+            .stdin(stdin)
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .process_group(0)
             .spawn()
-            .with_context(|| format!("starting {name}"))?;
-        let tail = Arc::new(Mutex::new(VecDeque::new()));
-        let file = Arc::new(Mutex::new(file));
+            .with_context(starting)?;
         let (out, err) = (child.stdout.take(), child.stderr.take());
-        let pipes: [Option<Box<dyn Read + Send>>; 2] = [
-            out.map(|pipe| Box::new(pipe) as _),
-            err.map(|pipe| Box::new(pipe) as _),
-        ];
-        let mut part = Self {
+        if let Some(pipe) = out {
+            log.follow(pipe, screen)?;
+        }
+        if let Some(pipe) = err {
+            log.follow(pipe, screen)?;
+        }
+        Ok(Self {
             name: name.into(),
-            log,
             child,
             end: None,
-            tail,
-            pumps: Vec::new(),
-        };
-        for pipe in pipes.into_iter().flatten() {
-            let pump = Pump {
-                name: name.into(),
-                file: file.clone(),
-                tail: part.tail.clone(),
-                screen: screen.clone(),
-            };
-            let thread = std::thread::Builder::new().name(format!("log of {name}"));
-            part.pumps.push(
-                thread
-                    .spawn(move || pump.run(pipe))
-                    .context("starting a thread")?,
-            );
-        }
-        Ok(part)
+            log,
+        })
     }
 
     /// The process's number.
@@ -165,8 +155,7 @@ impl Part {
             std::thread::sleep(POLL);
         }
         if self.end.is_some() {
-            // Nobody else holds the pipes' other ends, so these threads see their end too.
-            self.pumps.drain(..).for_each(|pump| drop(pump.join()));
+            self.log.finish();
         }
         self.end
     }
@@ -177,6 +166,11 @@ impl Part {
             return None;
         }
         rss_mib(&std::fs::read_to_string(format!("/proc/{}/status", self.pid())).ok()?)
+    }
+
+    /// Lines of its log that could not be written, for a person; none if all were.
+    pub(crate) fn missing_log_lines(&self) -> Option<String> {
+        self.log.missing()
     }
 
     /// How and with which last words it ended, for a person.
@@ -193,17 +187,18 @@ impl Part {
                 (None, None) => "ended".into(),
             },
         };
-        let tail = self
-            .tail
-            .lock()
-            .expect("no thread panics while holding the lines");
+        let tail = self.log.tail();
         let lines: String = tail.iter().map(|line| format!("\n  {line}")).collect();
         let last = if lines.is_empty() {
             String::new()
         } else {
             format!("; its last lines:{lines}")
         };
-        format!("{} {how} (log: {}){last}", self.name, self.log.display())
+        format!(
+            "{} {how} (log: {}){last}",
+            self.name,
+            self.log.path().display()
+        )
     }
 }
 
@@ -223,65 +218,9 @@ pub(crate) fn rss_mib(status: &str) -> Option<f64> {
     Some(kib / 1024.0)
 }
 
-/// Carries a part's output to its log, its warnings and errors to the screen too.
-struct Pump {
-    name: String,
-    file: Arc<Mutex<File>>,
-    tail: Arc<Mutex<VecDeque<String>>>,
-    screen: Screen,
-}
-
-impl Pump {
-    fn run(&self, pipe: impl Read) {
-        let point = format!("log of {}", self.name);
-        for line in BufReader::new(pipe).split(b'\n') {
-            fault::point(&point);
-            let Ok(line) = line else { return };
-            let line = String::from_utf8_lossy(&line).into_owned();
-            if let Ok(mut file) = self.file.lock()
-                && let Err(e) = writeln!(file, "{line}")
-            {
-                // A full disk must not stop the run: the line still reaches the screen below if it matters.
-                tracing::debug!("the log of {}: {e}", self.name);
-            }
-            if matters(&line) {
-                self.screen.line(&format!("{}: {line}", self.name));
-            }
-            if let Ok(mut tail) = self.tail.lock() {
-                if tail.len() == TAIL_LINES_MAX {
-                    tail.pop_front();
-                }
-                tail.push_back(line);
-            }
-        }
-    }
-}
-
-/// Whether a log line is a warning or worse: the level is the second word, after the time.
-fn matters(line: &str) -> bool {
-    let level = line.split_whitespace().nth(1);
-    matches!(level, Some("WARN" | "ERROR"))
-        || line.starts_with("error:")
-        || line.contains("panicked at")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn warnings_and_worse_reach_the_screen() {
-        assert!(matters(
-            "2026-01-01T00:00:00.1Z  WARN driml_actor: weights were refused"
-        ));
-        assert!(matters("2026-01-01T00:00:00.1Z ERROR driml_actor: gone"));
-        assert!(matters("error: nobody answers"));
-        assert!(matters("thread 'main' panicked at src/lib.rs:1:1:"));
-        assert!(!matters(
-            "2026-01-01T00:00:00.1Z  INFO driml_actor: ERROR is a word here"
-        ));
-        assert!(!matters(""));
-    }
 
     #[test]
     fn resident_memory_is_read_from_the_kernels_table() {

@@ -8,7 +8,7 @@ use std::{
 
 use driml_protocol::{LearnerStatus, ReplayStatus};
 
-use crate::{console::Screen, resume::Behind};
+use crate::{console::Screen, record::Episodes, resume::Behind};
 
 /// Rates are means over the last so much time.
 const RATE_WINDOW: Duration = Duration::from_secs(20);
@@ -75,11 +75,16 @@ impl Display {
     }
 
     /// Shows the state of the run.
-    pub(crate) fn show(&mut self, replay: &ReplayStatus, learner: &LearnerStatus) {
+    pub(crate) fn show(
+        &mut self,
+        replay: &ReplayStatus,
+        learner: &LearnerStatus,
+        episodes: Episodes,
+    ) {
         let now = Instant::now();
         self.rates
             .add(now, replay.transitions_inserted, learner.updates);
-        let parts = self.text(replay, learner);
+        let parts = self.text(replay, learner, episodes);
         match self.screen.bar() {
             Some(bar) => {
                 bar.set_position(replay.transitions_inserted.min(self.frames_max));
@@ -93,7 +98,12 @@ impl Display {
         }
     }
 
-    fn text(&self, replay: &ReplayStatus, learner: &LearnerStatus) -> [String; 2] {
+    fn text(
+        &self,
+        replay: &ReplayStatus,
+        learner: &LearnerStatus,
+        episodes: Episodes,
+    ) -> [String; 2] {
         let (frames_rate, updates_rate) = self.rates.per_second();
         let number = |value: Option<f64>, digits: usize| {
             value.map_or("-".into(), |value| format!("{value:.digits$}"))
@@ -126,8 +136,8 @@ impl Display {
             ),
             format!(
                 "return {} ({} episodes)  C51 {:.3}{}{k}  {}{}",
-                number(replay.mean_return, 2),
-                replay.episodes,
+                number(episodes.mean_return.map(|it| it.mean), 2),
+                episodes.count,
                 learner.c51_kl,
                 dim.collect::<String>(),
                 replay.waiting,
@@ -165,6 +175,7 @@ mod tests {
     use expect_test::expect;
 
     use super::*;
+    use crate::record::MeanReturn;
 
     #[test]
     fn the_view_says_what_a_person_wants_to_know() {
@@ -173,8 +184,6 @@ mod tests {
             transitions_inserted: 33_000,
             rows_sampled: 256_000,
             warmup_transitions: 1_000,
-            episodes: 45,
-            mean_return: Some(1.234),
             k_histogram: vec![0, 1, 1, 2],
             waiting: Waiting::ActorsWaitForLearner,
             ..ReplayStatus::default()
@@ -185,6 +194,13 @@ mod tests {
             dim: [None, None, None, Some(4.0)],
             ..LearnerStatus::default()
         };
+        let episodes = Episodes {
+            count: 45,
+            mean_return: Some(MeanReturn {
+                mean: 1.234,
+                of: 45,
+            }),
+        };
         let start = Instant::now();
         display.rates = Rates::default();
         display.rates.add(start, 31_400, 950);
@@ -194,13 +210,17 @@ mod tests {
         expect![[r#"
             frames 33000/200000 (160/s)  updates 1000/6218 (5.0/s)  replay ratio 8.00
             return 1.23 (45 episodes)  C51 0.123  DIM 4t4 4.000  mean k 2.25  actors wait for learner  17 min 23 s left"#]]
-        .assert_eq(&display.text(&replay, &learner).join("\n"));
+        .assert_eq(&display.text(&replay, &learner, episodes).join("\n"));
         expect![[r#"
             frames 0/200000 (160/s)  updates 0/6218 (5.0/s)  replay ratio -
             return - (0 episodes)  C51 0.000  nobody waits  20 min 50 s left"#]]
         .assert_eq(
             &display
-                .text(&ReplayStatus::default(), &LearnerStatus::default())
+                .text(
+                    &ReplayStatus::default(),
+                    &LearnerStatus::default(),
+                    Episodes::default(),
+                )
                 .join("\n"),
         );
     }

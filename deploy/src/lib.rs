@@ -21,14 +21,17 @@ mod interrupts;
 mod local;
 mod lockstep;
 mod machine;
+mod meeting;
 mod overrides;
 mod panics;
+mod part_log;
 mod plan;
 mod plot;
 mod presets;
 mod processes;
 mod record;
 mod resume;
+mod shared_memory;
 mod statuses;
 
 use std::process::ExitCode;
@@ -86,30 +89,26 @@ fn run(command: Command) -> anyhow::Result<()> {
             check_endpoints(&args.connect)?;
             let shutdown = join(&args.join)?;
             let (connect, namespace) = (args.connect, args.join.namespace);
-            driml_actor::run(
-                driml_actor::RunArgs {
-                    connect,
-                    namespace,
-                    actor: args.id,
-                    envs: args.envs,
-                },
-                &shutdown,
-            )
+            let run = driml_actor::RunArgs {
+                connect,
+                namespace,
+                actor: args.id,
+                envs: args.envs,
+            };
+            clean_up_after(driml_actor::run(run, &shutdown))
         }
         Command::Learner(args) => {
             check_endpoints(&args.connect)?;
             ready_for(args.on.device)?;
             let shutdown = join(&args.join)?;
             let (connect, namespace) = (args.connect, args.join.namespace);
-            driml_learner::run(
-                driml_learner::RunArgs {
-                    connect,
-                    namespace,
-                    run_dir: args.run_dir,
-                    device: args.on.device,
-                },
-                &shutdown,
-            )
+            let run = driml_learner::RunArgs {
+                connect,
+                namespace,
+                run_dir: args.run_dir,
+                device: args.on.device,
+            };
+            clean_up_after(driml_learner::run(run, &shutdown))
         }
         Command::ReplayServer(args) => replay_server(args),
         Command::Evaluate(args) => evaluate::run(&args),
@@ -145,7 +144,7 @@ fn replay_server(args: ReplayServerArgs) -> anyhow::Result<()> {
         after_updates: args.after_updates,
         config_toml: config.to_toml(),
     };
-    driml_replay_server::run(run, &shutdown)
+    clean_up_after(driml_replay_server::run(run, &shutdown))
 }
 
 fn parity(args: &ParityArgs) -> anyhow::Result<()> {
@@ -186,6 +185,13 @@ fn ready_for(device: DeviceName) -> anyhow::Result<()> {
 fn join(flags: &JoinFlags) -> anyhow::Result<Shutdown> {
     Keys::new(&flags.namespace).map_err(Usage)?;
     Shutdown::on_signals(flags.exit_with_parent).context("listening for signals")
+}
+
+/// What a part does when it has ended, well or not: nothing of it is left outside the run folder.
+fn clean_up_after(ran: anyhow::Result<()>) -> anyhow::Result<()> {
+    meeting::leave();
+    shared_memory::remove_own();
+    ran
 }
 
 /// Refuses what zenoh could not open.

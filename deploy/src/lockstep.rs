@@ -14,7 +14,7 @@ use driml_replay_server::{Replay, Unready};
 
 use crate::{
     config::RunConfig,
-    console::{Screen, print},
+    console::{self, Screen, print},
     display::{Display, TEMPLATE},
     error::Interrupted,
     processes::describe,
@@ -61,8 +61,9 @@ pub(crate) fn run(
         if shown.elapsed() >= POLL {
             shown = Instant::now();
             let replay = parts.replay.status();
-            display.show(&replay, &parts.status);
-            recorder.record(&replay, &parts.status, &[])?;
+            let said = recorder.record(std::slice::from_ref(&replay), &parts.status, &[]);
+            said.iter().for_each(|line| screen.line(line));
+            display.show(&replay, &parts.status, recorder.episodes(&replay));
         }
         if shutdown.is_set() {
             outcome = Outcome::Interrupted;
@@ -75,9 +76,12 @@ pub(crate) fn run(
     }
     screen.clear();
     let replay = parts.replay.status();
-    recorder.record(&replay, &parts.status, &[])?;
-    let summary = recorder.finish(outcome, &config.run, &replay, &parts.status)?;
+    recorder.record(std::slice::from_ref(&replay), &parts.status, &[]);
+    let missing = recorder.missing();
+    missing.iter().for_each(|line| console::line(line));
+    let summary = recorder.summarise(outcome, &config.run, &replay, &parts.status);
     print(&describe(&summary, run_dir))?;
+    summary.write(run_dir)?;
     if outcome == Outcome::Interrupted {
         Err(Interrupted.into())
     } else {

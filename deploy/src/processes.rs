@@ -13,13 +13,14 @@ use driml_protocol::{
 };
 
 use crate::{
-    child::Part,
+    child::{Part, Surroundings},
     cli::NAMESPACE,
     config::RunConfig,
     console::{self, Screen, print},
     display::{Display, TEMPLATE, duration},
     error::{Interrupted, Usage},
     interrupts::Interrupts,
+    meeting::Meeting,
     record::{Outcome, Recorder, Summary},
     resume::{self, Behind},
     statuses::Statuses,
@@ -73,16 +74,8 @@ pub(crate) fn run(
         None => Recorder::create(run_dir, &config.to_toml(), &names)?,
     };
     let behind = resumed.unwrap_or_default();
-    // A unix socket's path must be short, so it lies beside other temporary files and not in the run folder.
-    let meeting = tempfile::Builder::new()
-        .prefix("driml-")
-        .tempdir()
-        .context("making a folder for the socket")?;
-    let socket = |name: &String| {
-        let path = meeting.path().join(format!("{name}.sock"));
-        format!("unixsock-stream/{}", path.display())
-    };
-    let mut endpoints: Vec<_> = servers.iter().map(socket).collect();
+    let meeting = Meeting::create()?;
+    let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
     if let Some(listen) = listen {
         endpoints[0] = listen;
     }
@@ -94,6 +87,7 @@ pub(crate) fn run(
         behind,
         servers,
         endpoints,
+        meeting,
         screen,
         display,
         interrupts,
@@ -110,9 +104,22 @@ pub(crate) fn run(
         (Ok(Outcome::Interrupted), Ok(())) => Outcome::Interrupted,
         _ => Outcome::Failed,
     };
-    let summary = launch.conclude(&mut recorder, outcome)?;
-    ran.and(ended)?;
+    let (summary, written) = launch.conclude(&mut recorder, outcome);
+    if let Err(failed) = ran.and(ended) {
+        // It is what the run is remembered by; that the disk is full too is said before.
+        if let Err(e) = written {
+            console::line(&console::describe(&e));
+        }
+        return Err(failed);
+    }
     print(&describe(&summary, run_dir))?;
+    written.with_context(|| {
+        format!(
+            "the run is over and its checkpoint saved, but there is no summary of it: make room on the disk, then `driml local --resume {}` \
+             writes it",
+            run_dir.display()
+        )
+    })?;
     if outcome == Outcome::Interrupted {
         if resume::can_go_on(&config.world, run_dir) {
             console::line(&format!(
@@ -134,6 +141,7 @@ struct Launch<'a> {
     /// Names of the replay servers, one a shard, and where each listens.
     servers: Vec<String>,
     endpoints: Vec<String>,
+    meeting: Meeting,
     screen: Screen,
     display: Display,
     interrupts: Interrupts,
@@ -159,6 +167,14 @@ impl Launch<'_> {
     /// The first actor's place in `parts`.
     fn first_actor(&self) -> usize {
         self.servers.len() + 1
+    }
+
+    fn surroundings<'a>(&'a self, logs: &'a Path) -> Surroundings<'a> {
+        Surroundings {
+            logs,
+            screen: &self.screen,
+            meeting: Some(&self.meeting),
+        }
     }
 
     fn start_and_watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
@@ -187,7 +203,7 @@ impl Launch<'_> {
             if let Some(study) = self.config.replay.study {
                 args.extend(part(&["--study", study.name()]));
             }
-            let server = Part::start(name, &args, PART_THREADS, &logs, &self.screen)?;
+            let server = Part::start(name, &args, PART_THREADS, self.surroundings(&logs))?;
             self.parts.push(server);
         }
         let mut sessions = Vec::new();
@@ -210,8 +226,7 @@ impl Launch<'_> {
             "learner",
             &args,
             self.config.local.learner_threads,
-            &logs,
-            &self.screen,
+            self.surroundings(&logs),
         )?);
         for id in 0..self.config.local.actors {
             let args = part(&[
@@ -225,8 +240,7 @@ impl Launch<'_> {
                 &format!("actor-{id}"),
                 &args,
                 PART_THREADS,
-                &logs,
-                &self.screen,
+                self.surroundings(&logs),
             )?);
         }
         self.watch(recorder)
@@ -308,8 +322,11 @@ impl Launch<'_> {
             // Until the learner has answered, too.
             learner.updates = learner.updates.max(self.behind.updates);
             let rss: Vec<_> = self.parts.iter_mut().map(Part::rss_mib).collect();
-            recorder.record(&replay, &learner, &rss)?;
-            self.display.show(&replay, &learner);
+            for line in recorder.record(&statuses.shards, &learner, &rss) {
+                self.screen.line(&line);
+            }
+            self.display
+                .show(&replay, &learner, recorder.episodes(&replay));
             if replay.finished && learner.finished {
                 return Ok(Outcome::Finished);
             }
@@ -448,14 +465,23 @@ impl Launch<'_> {
         late
     }
 
-    fn conclude(&mut self, recorder: &mut Recorder, outcome: Outcome) -> anyhow::Result<Summary> {
-        let (replay, learner) = self
-            .statuses
-            .as_ref()
-            .map(|it| (it.replay.clone(), it.learner.clone()))
-            .unwrap_or_default();
-        recorder.record(&replay, &learner, &[])?;
-        recorder.finish(outcome, &self.config.run, &replay, &learner)
+    /// Writes the last row and the summary, says what could not be written before, and whether the summary could.
+    fn conclude(
+        &mut self,
+        recorder: &mut Recorder,
+        outcome: Outcome,
+    ) -> (Summary, anyhow::Result<()>) {
+        let (shards, replay, learner) = match &self.statuses {
+            Some(it) => (&it.shards[..], it.replay.clone(), it.learner.clone()),
+            None => Default::default(),
+        };
+        recorder.record(shards, &learner, &[]);
+        let logs = self.parts.iter().filter_map(Part::missing_log_lines);
+        let missing = recorder.missing().into_iter().chain(logs);
+        missing.for_each(|line| console::line(&line));
+        let summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);
+        let written = summary.write(self.run_dir);
+        (summary, written)
     }
 }
 
@@ -468,7 +494,7 @@ pub(crate) fn describe(summary: &Summary, run_dir: &Path) -> String {
         "interrupted"
     };
     format!(
-        "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, mean return {} over the last of {} episodes\n{}\n",
+        "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, mean return {} over the last {} of {} episodes\n{}\n",
         summary.frames,
         summary.updates,
         duration(Duration::from_secs_f64(summary.wall_seconds)),
@@ -476,6 +502,7 @@ pub(crate) fn describe(summary: &Summary, run_dir: &Path) -> String {
         summary.updates_per_second,
         number(summary.replay_ratio),
         number(summary.mean_return),
+        summary.mean_return_of,
         summary.episodes,
         run_dir.display()
     )

@@ -17,7 +17,9 @@ pub(crate) struct Statuses {
     sessions: Vec<Session>,
     keys: Keys,
     spec_hash: u64,
-    /// The replay servers' last answers, as of one.
+    /// Each replay server's last answer.
+    pub(crate) shards: Vec<ReplayStatus>,
+    /// The same, as of one.
     pub(crate) replay: ReplayStatus,
     /// The learner's last answer.
     pub(crate) learner: LearnerStatus,
@@ -30,6 +32,7 @@ impl Statuses {
             sessions,
             keys,
             spec_hash,
+            shards: Vec::new(),
             replay: ReplayStatus::default(),
             learner: LearnerStatus::default(),
         }
@@ -47,6 +50,7 @@ impl Statuses {
             .map(|session| self.ask(session, &key, Kind::ReplayStatus));
         let shards = answers.collect::<anyhow::Result<Vec<_>>>()?;
         self.replay = ReplayStatus::merged(&shards);
+        self.shards = shards;
         Ok(())
     }
 

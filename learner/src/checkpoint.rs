@@ -32,19 +32,21 @@ const LOCK: &str = ".lock";
 const STATE_SUM: &str = "state.json.sha256";
 /// Largest count in a state: no run comes near it, and what is added to counts cannot overflow.
 const COUNT_MAX: u64 = 1 << 53;
+/// What follows the name of a checkpoint while one of the same update takes its place.
+const REPLACED: &str = ".replaced.tmp";
 
 /// Why a checkpoint was not written or not read.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// The file system refused.
-    #[error("cannot {what} {path}: {source}")]
+    #[error("cannot {what} {path}: {why}")]
     Io {
         /// What was being done.
         what: &'static str,
         /// To what.
         path: PathBuf,
         /// The reason.
-        source: io::Error,
+        why: io::Error,
     },
     /// A file is not what was written.
     #[error(
@@ -154,21 +156,39 @@ impl StateFile {
 /// Writes `folder/checkpoint-<updates>` and removes all but the newest `keep` checkpoints.
 ///
 /// Every file is written aside, flushed to disk and renamed; so is the folder: a crash at any moment leaves the older
-/// checkpoints whole and at most a `.tmp` folder, which the next save of that name replaces.
+/// checkpoints whole and at most a `.tmp` folder, which the next save removes.
 ///
 /// # Errors
-/// A state that is not finite, or a failing file system; nothing older has then been removed.
+/// A state that is not finite, or a failing file system, such as a full disk; nothing older has then been removed, and nothing
+/// of the new one is left.
 pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf, CheckpointError> {
     if keep == 0 {
         return Err(CheckpointError::KeepNone);
     }
+    fs::create_dir_all(folder).map_err(io_error("create", folder))?;
+    tidy(folder)?;
+    let name = format!("{PREFIX}{:012}", state.learner.updates());
+    let (path, aside) = (folder.join(&name), folder.join(format!("{name}.tmp")));
+    let saved = write(&aside, state).and_then(|()| put_in_place(&aside, &path));
+    if let Err(error) = saved {
+        // It would keep a full disk full.
+        if let Err(e) = remove_if_there(&aside) {
+            tracing::warn!("a checkpoint was not saved, and a part of it stays: {e}");
+        }
+        return Err(error);
+    }
+    let all = list(folder)?;
+    for (_, old) in &all[..all.len().saturating_sub(keep)] {
+        fs::remove_dir_all(old).map_err(io_error("remove", old))?;
+    }
+    Ok(path)
+}
+
+/// Writes a checkpoint's files into the folder `aside`, which is made.
+fn write(aside: &Path, state: &RunState<'_>) -> Result<(), CheckpointError> {
     let learner = state.learner;
     let files = tensor_files(learner).map_err(CheckpointError::Unsound)?;
-    let name = format!("{PREFIX}{:012}", learner.updates());
-    let (path, aside) = (folder.join(&name), folder.join(format!("{name}.tmp")));
-    remove_if_there(&aside)?;
-    fs::create_dir_all(&aside).map_err(io_error("create", &aside))?;
-
+    fs::create_dir(aside).map_err(io_error("create", aside))?;
     let mut sha256 = BTreeMap::new();
     for (name, bytes) in files {
         write_durably(&aside.join(name), &bytes)?;
@@ -187,7 +207,7 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
     let text = serde_json::to_vec_pretty(&file).map_err(|why| CheckpointError::Io {
         what: "encode",
         path: aside.join(STATE),
-        source: why.into(),
+        why: why.into(),
     })?;
     write_durably(&aside.join(STATE), &text)?;
     // As `sha256sum --check` reads it.
@@ -195,23 +215,40 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
         &aside.join(STATE_SUM),
         format!("{}  {STATE}\n", sha256_of(&text)).as_bytes(),
     )?;
-    sync(&aside)?;
+    sync(aside)
+}
 
-    // A checkpoint of the same update, as at a stop right after a periodic save, gives way only once this one is whole.
-    let older = folder.join(format!("{name}.replaced.tmp"));
-    remove_if_there(&older)?;
+/// Gives a whole checkpoint its name. One of the same update, as at a stop right after a periodic save, gives way to it: between
+/// the two renames it is known by its other name.
+fn put_in_place(aside: &Path, path: &Path) -> Result<(), CheckpointError> {
+    let folder = path.parent().unwrap_or(Path::new("."));
+    let mut older = path.as_os_str().to_owned();
+    older.push(REPLACED);
+    let older = PathBuf::from(older);
     if path.exists() {
-        fs::rename(&path, &older).map_err(io_error("move", &path))?;
+        fs::rename(path, &older).map_err(io_error("move", path))?;
     }
-    fs::rename(&aside, &path).map_err(io_error("move", &aside))?;
+    fs::rename(aside, path).map_err(io_error("move", aside))?;
     sync(folder)?;
-    remove_if_there(&older)?;
+    remove_if_there(&older)
+}
 
-    let all = list(folder)?;
-    for (_, old) in &all[..all.len().saturating_sub(keep)] {
-        fs::remove_dir_all(old).map_err(io_error("remove", old))?;
+/// Removes what saves that were cut off have left, and gives a checkpoint that was to be replaced its name back.
+fn tidy(folder: &Path) -> Result<(), CheckpointError> {
+    for entry in fs::read_dir(folder).map_err(io_error("read", folder))? {
+        let path = entry.map_err(io_error("read", folder))?.path();
+        let name = path.file_name().and_then(|name| name.to_str());
+        let Some(name) = name.filter(|it| it.starts_with(PREFIX) && it.ends_with(".tmp")) else {
+            continue;
+        };
+        match name.strip_suffix(REPLACED).map(|name| folder.join(name)) {
+            Some(place) if !place.exists() => {
+                fs::rename(&path, place).map_err(io_error("move", &path))?;
+            }
+            _ => remove_if_there(&path)?,
+        }
     }
-    Ok(path)
+    Ok(())
 }
 
 /// The files of tensors and their names, all finite.
@@ -272,9 +309,15 @@ pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
         let Some(rest) = name.strip_prefix(PREFIX) else {
             continue;
         };
-        match rest.parse::<u64>() {
-            Ok(updates) => all.push((updates, path)),
-            Err(_) => {
+        // One that is being replaced counts as long as the new one does not have its name.
+        let replaced = rest.strip_suffix(REPLACED).map(|rest| {
+            let is_replaced = folder.join(format!("{PREFIX}{rest}")).exists();
+            (rest, is_replaced)
+        });
+        let (number, is_replaced) = replaced.unwrap_or((rest, false));
+        match number.parse::<u64>() {
+            Ok(updates) if !is_replaced => all.push((updates, path)),
+            _ => {
                 tracing::warn!(path = %path.display(), "left from an unfinished save; not a checkpoint")
             }
         }
@@ -386,10 +429,10 @@ fn io_error<'a>(
     what: &'static str,
     path: &'a Path,
 ) -> impl FnOnce(io::Error) -> CheckpointError + 'a {
-    move |source| CheckpointError::Io {
+    move |why| CheckpointError::Io {
         what,
         path: path.to_owned(),
-        source,
+        why,
     }
 }
 

@@ -22,13 +22,14 @@ pub mod shared_memory;
 pub mod shutdown;
 pub mod transition;
 pub mod weights;
+pub mod whole_file;
 
 pub use affinity::AffinityUpdate;
 pub use batch::{Batch, BatchHeader, BatchReply, BatchRequest, NO_ACTION, RequestId, Tally};
 pub use codec::{CodecError, Kind};
 pub use control::{ActorJoin, Goodbye, Hello, JoinReply, LearnerJoin};
 pub use keys::{Alive, Keys};
-pub use metric::{LearnerStatus, ReplayStatus, Waiting};
+pub use metric::{LearnerStatus, ReplayStatus, Returns, Waiting};
 pub use planes::{Planes, PlanesPool};
 pub use run_spec::{Horizon, RunSpec, TimeoutRule};
 pub use shutdown::Shutdown;

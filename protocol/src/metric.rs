@@ -37,7 +37,24 @@ impl std::fmt::Display for Waiting {
 }
 
 /// Episodes over which a mean return is taken.
-pub const RETURNS_OF: u64 = 100;
+pub const RETURNS_OF: usize = 100;
+
+/// Returns of the episodes that ended last.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Returns {
+    /// Episodes whose return is known, as all of them was seen, since the start.
+    pub known: u64,
+    /// Undiscounted returns of the newest of them, the oldest first; of one replay at most [`RETURNS_OF`].
+    pub newest: Vec<f64>,
+}
+
+impl Returns {
+    /// Mean of the newest returns; none before the first.
+    pub fn mean(&self) -> Option<f64> {
+        let sum: f64 = self.newest.iter().sum();
+        (!self.newest.is_empty()).then(|| sum / self.newest.len() as f64)
+    }
+}
 
 /// The replay server's account of itself.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -66,8 +83,8 @@ pub struct ReplayStatus {
     pub warmup_transitions: u64,
     /// Episodes that ended.
     pub episodes: u64,
-    /// Mean undiscounted return of the last 100 episodes; none before the first.
-    pub mean_return: Option<f64>,
+    /// Returns of the last 100 episodes.
+    pub returns: Returns,
     /// How often each k was served; index 0 counts rows without a positive. A row of several positives counts once, under
     /// its furthest.
     pub k_histogram: Vec<u64>,
@@ -92,54 +109,77 @@ pub struct ReplayStatus {
 }
 
 impl ReplayStatus {
-    /// The account of a replay of several shards from each shard's own; of the mean age and the mean return it is the mean,
-    /// weighted by rows and by episodes that count.
+    /// The account of a replay of several shards from each shard's own. The newest returns are those of all shards, shard after
+    /// shard; the mean age is weighted by rows.
     pub fn merged(shards: &[Self]) -> Self {
         let Some((first, others)) = shards.split_first() else {
             return Self::default();
         };
-        let weighted = |parts: &[(f64, f64)]| {
-            let weight: f64 = parts.iter().map(|(_, weight)| weight).sum();
-            let sum: f64 = parts.iter().map(|(value, weight)| value * weight).sum();
-            (weight > 0.0).then_some(sum / weight)
-        };
-        let returns: Vec<_> = shards
-            .iter()
-            .filter_map(|it| Some((it.mean_return?, it.episodes.min(RETURNS_OF) as f64)))
-            .collect();
-        let ages: Vec<_> = shards
-            .iter()
-            .map(|it| (it.mean_age, it.rows_sampled as f64))
-            .collect();
         let add = |sums: &mut Vec<u64>, counts: &[u64]| {
             sums.iter_mut().zip(counts).for_each(|(sum, n)| *sum += n);
         };
         let mut sum = first.clone();
         for it in others {
-            sum.transitions_inserted += it.transitions_inserted;
-            sum.transitions_held += it.transitions_held;
-            sum.transitions_lost += it.transitions_lost;
-            sum.transitions_duplicated += it.transitions_duplicated;
-            sum.chunks_retried += it.chunks_retried;
-            sum.batches_retried += it.batches_retried;
-            sum.messages_refused += it.messages_refused;
-            sum.rows_sampled += it.rows_sampled;
-            sum.rows_unlearned += it.rows_unlearned;
-            sum.episodes += it.episodes;
-            add(&mut sum.k_histogram, &it.k_histogram);
-            add(&mut sum.action_histogram, &it.action_histogram);
-            sum.learner_waited_s += it.learner_waited_s;
-            sum.actors_waited_s += it.actors_waited_s;
-            sum.actors += it.actors;
-            sum.affinity_version = sum.affinity_version.min(it.affinity_version);
+            // All by name, so that a new one is not forgotten.
+            let Self {
+                transitions_inserted,
+                transitions_held,
+                frame_bytes_held,
+                transitions_lost,
+                transitions_duplicated,
+                chunks_retried,
+                batches_retried,
+                messages_refused,
+                rows_sampled,
+                rows_unlearned,
+                // Every shard has the whole run's.
+                warmup_transitions: _,
+                episodes,
+                returns,
+                k_histogram,
+                // Weighted below.
+                mean_age: _,
+                action_histogram,
+                waiting,
+                learner_waited_s,
+                actors_waited_s,
+                actors,
+                actors_waiting,
+                affinity_version,
+                finished,
+            } = it;
+            sum.transitions_inserted += transitions_inserted;
+            sum.transitions_held += transitions_held;
+            sum.frame_bytes_held += frame_bytes_held;
+            sum.transitions_lost += transitions_lost;
+            sum.transitions_duplicated += transitions_duplicated;
+            sum.chunks_retried += chunks_retried;
+            sum.batches_retried += batches_retried;
+            sum.messages_refused += messages_refused;
+            sum.rows_sampled += rows_sampled;
+            sum.rows_unlearned += rows_unlearned;
+            sum.episodes += episodes;
+            sum.returns.known += returns.known;
+            sum.returns.newest.extend(&returns.newest);
+            add(&mut sum.k_histogram, k_histogram);
+            add(&mut sum.action_histogram, action_histogram);
+            sum.learner_waited_s += learner_waited_s;
+            sum.actors_waited_s += actors_waited_s;
+            sum.actors += actors;
+            sum.actors_waiting += actors_waiting;
+            sum.affinity_version = sum.affinity_version.min(*affinity_version);
             // Each knows of the others what the learner told it; the one that knows of the end is right.
-            sum.finished |= it.finished;
-            if it.waiting == Waiting::Finished || sum.waiting == Waiting::Nobody {
-                sum.waiting = it.waiting;
+            sum.finished |= finished;
+            if *waiting == Waiting::Finished || sum.waiting == Waiting::Nobody {
+                sum.waiting = *waiting;
             }
         }
-        sum.mean_return = weighted(&returns);
-        sum.mean_age = weighted(&ages).unwrap_or_default();
+        let ages = shards.iter();
+        let ages: f64 = ages.map(|it| it.mean_age * it.rows_sampled as f64).sum();
+        sum.mean_age = match sum.rows_sampled {
+            0 => 0.0,
+            rows => ages / rows as f64,
+        };
         sum
     }
 
@@ -200,4 +240,68 @@ pub struct LearnerStatus {
     pub waiting_s: f64,
     /// The last checkpoint is written and nothing is left to do.
     pub finished: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A status in which no field is zero or what it is by default.
+    fn full(n: u64) -> ReplayStatus {
+        ReplayStatus {
+            transitions_inserted: n,
+            transitions_held: 2 * n,
+            frame_bytes_held: 3 * n,
+            transitions_lost: 4 * n,
+            transitions_duplicated: 5 * n,
+            chunks_retried: 6 * n,
+            batches_retried: 7 * n,
+            messages_refused: 8 * n,
+            rows_sampled: 9 * n,
+            rows_unlearned: 19 * n,
+            warmup_transitions: 1_000,
+            episodes: 10 * n,
+            returns: Returns {
+                known: 11 * n,
+                newest: vec![n as f64; 2],
+            },
+            k_histogram: vec![n, 12 * n],
+            mean_age: 13.0 * n as f64,
+            action_histogram: vec![14 * n, n],
+            waiting: match n {
+                1 => Waiting::ActorsWaitForLearner,
+                _ => Waiting::Finished,
+            },
+            learner_waited_s: 15.0 * n as f64,
+            actors_waited_s: 16.0 * n as f64,
+            actors: 17 * n as u32,
+            actors_waiting: 20 * n as u32,
+            affinity_version: 18 * n,
+            finished: n == 2,
+        }
+    }
+
+    #[test]
+    fn every_field_of_every_shard_counts() {
+        assert_eq!(ReplayStatus::merged(&[]), ReplayStatus::default());
+        assert_eq!(ReplayStatus::merged(&[full(1)]), full(1));
+        let merged = ReplayStatus::merged(&[full(1), full(2)]);
+        let expected = ReplayStatus {
+            warmup_transitions: 1_000,
+            returns: Returns {
+                known: 33,
+                newest: vec![1.0, 1.0, 2.0, 2.0],
+            },
+            // 9 rows of age 13, 18 of age 26.
+            mean_age: (9.0 * 13.0 + 18.0 * 26.0) / 27.0,
+            waiting: Waiting::Finished,
+            // The shard that has the older matrix.
+            affinity_version: 18,
+            finished: true,
+            ..full(3)
+        };
+        assert_eq!(merged, expected);
+        assert_eq!(merged.returns.mean(), Some(1.5));
+        assert_eq!(Returns::default().mean(), None);
+    }
 }

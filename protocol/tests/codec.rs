@@ -8,7 +8,7 @@ use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader,
     Claim, CodecError, End, Goodbye, Hello, Horizon, InsertReply, JoinReply, Kind, LearnerJoin,
     LearnerStatus, NO_ACTION, PROTOCOL_VERSION, Planes, PlanesPool, ReplayStatus, RequestId,
-    RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader, WeightsReply, WeightsRequest,
+    Returns, RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader, WeightsReply, WeightsRequest,
     WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PLANES_BYTES_MAX, PREFIX_BYTES},
 };
@@ -169,7 +169,10 @@ fn samples() -> Vec<Sample> {
     ];
     let replay = ReplayStatus {
         transitions_inserted: 5,
-        mean_return: Some(-1.25),
+        returns: Returns {
+            known: 120,
+            newest: vec![-1.25, 3.0],
+        },
         k_histogram: vec![1, 2, 3],
         action_histogram: vec![0; 15],
         waiting: Waiting::WarmUp { have: 5, need: 9 },

@@ -630,7 +630,7 @@ impl Replay {
             rows_unlearned: statistics.rows_unlearned,
             warmup_transitions: self.config.warmup_transitions,
             episodes: statistics.episodes,
-            mean_return: statistics.mean_return(),
+            returns: statistics.returns(),
             k_histogram: statistics.k_histogram.clone(),
             mean_age: statistics.mean_age,
             action_histogram: statistics.action_histogram.clone(),

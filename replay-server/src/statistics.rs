@@ -3,8 +3,7 @@
 
 use std::collections::VecDeque;
 
-/// Episodes whose returns enter the mean.
-const RETURNS_MAX: usize = 100;
+use driml_protocol::{Returns, metric::RETURNS_OF};
 
 /// What the status reports beside the ring's and the limiter's own counts.
 #[derive(Default)]
@@ -17,6 +16,7 @@ pub(crate) struct Statistics {
     pub(crate) rows_unlearned: u64,
     pub(crate) messages_refused: u64,
     pub(crate) episodes: u64,
+    returns_known: u64,
     returns: VecDeque<f64>,
     pub(crate) k_histogram: Vec<u64>,
     pub(crate) mean_age: f64,
@@ -55,16 +55,19 @@ impl Statistics {
     pub(crate) fn episode_ended(&mut self, episode_return: Option<f64>) {
         self.episodes += 1;
         if let Some(episode_return) = episode_return {
-            if self.returns.len() == RETURNS_MAX {
+            self.returns_known += 1;
+            if self.returns.len() == RETURNS_OF {
                 self.returns.pop_front();
             }
             self.returns.push_back(episode_return);
         }
     }
 
-    /// Mean return of the last [`RETURNS_MAX`] episodes; none before the first.
-    pub(crate) fn mean_return(&self) -> Option<f64> {
-        let sum: f64 = self.returns.iter().sum();
-        (!self.returns.is_empty()).then(|| sum / self.returns.len() as f64)
+    /// Returns of the last [`RETURNS_OF`] episodes.
+    pub(crate) fn returns(&self) -> Returns {
+        Returns {
+            known: self.returns_known,
+            newest: self.returns.iter().copied().collect(),
+        }
     }
 }

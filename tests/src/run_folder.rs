@@ -28,6 +28,7 @@ pub struct Summary {
     pub replay_ratio: Option<f64>,
     pub episodes: u64,
     pub mean_return: Option<f64>,
+    pub mean_return_of: u64,
     pub wall_seconds: f64,
     pub frames_per_second: f64,
     pub updates_per_second: f64,
@@ -87,6 +88,47 @@ impl RunFolder {
             .map(|line| line.split(',').map(str::to_owned).collect());
         let header = rows.next().unwrap();
         (header, rows.collect())
+    }
+
+    /// Updates in the last whole row of the metrics so far; none before the first row.
+    pub fn updates_recorded(&self) -> Option<u64> {
+        let text = fs::read_to_string(self.path.join("metrics.csv")).ok()?;
+        let row = text.get(..text.rfind('\n')?)?.lines().skip(1).last()?;
+        row.split(',').nth(2)?.parse().ok()
+    }
+
+    /// The rows of `returns.csv`: frames, episode, return.
+    pub fn returns(&self) -> Vec<(u64, u64, f64)> {
+        let text = self.text("returns.csv");
+        let row = |line: &str| {
+            let cells: Vec<_> = line.split(',').collect();
+            let [frames, episode, value] = cells[..] else {
+                panic!("{line:?} is no row of returns");
+            };
+            let count = |cell: &str| cell.parse().unwrap();
+            (count(frames), count(episode), value.parse().unwrap())
+        };
+        text.lines().skip(1).map(row).collect()
+    }
+
+    /// Checks that the mean return is of the last 100 episodes, or of all if there were fewer, by the returns' own file.
+    #[track_caller]
+    fn check_returns(&self, summary: &Summary) {
+        let rows = self.returns();
+        assert!(
+            rows.is_sorted_by(|a, b| a.0 <= b.0 && a.1 < b.1),
+            "{rows:?}"
+        );
+        assert_eq!(summary.mean_return_of, summary.episodes.min(100));
+        let newest = &rows[rows.len() - summary.mean_return_of as usize..];
+        let sum: f64 = newest.iter().map(|(.., value)| value).sum();
+        let mean = (!newest.is_empty()).then(|| sum / newest.len() as f64);
+        match (mean, summary.mean_return) {
+            (Some(want), Some(have)) => assert!((want - have).abs() < 1e-9, "{want} {have}"),
+            (want, have) => assert_eq!(want, have),
+        }
+        let last = rows.last().map_or(0, |row| row.1);
+        assert_eq!(last, summary.episodes, "episodes have their numbers");
     }
 
     /// A part's log.
@@ -154,6 +196,8 @@ impl RunFolder {
             summary.wall_seconds > 0.0 && summary.frames_per_second > 0.0,
             "{said}"
         );
+
+        self.check_returns(&summary);
 
         let (header, rows) = self.metrics();
         assert!(

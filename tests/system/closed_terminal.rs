@@ -140,11 +140,9 @@ fn a_closed_pipe_saves_a_run_in_lockstep() {
     command.stdin(Stdio::null()).stdout(Stdio::null());
     let mut child = command.stderr(writer).spawn().unwrap();
     drop(command);
+    let run = system.run_folder("run");
     wait_for("a row of metrics with updates", || {
-        let text = std::fs::read_to_string(system.path("run/metrics.csv")).ok()?;
-        let updates = |row: &str| row.split(',').nth(2)?.parse().ok();
-        let updates: Option<u64> = text.lines().skip(1).filter_map(updates).max();
-        updates.filter(|&updates| updates > 100)
+        run.updates_recorded().filter(|&updates| updates > 100)
     });
     drop(reader);
     check_saved(&system, end(&mut child));

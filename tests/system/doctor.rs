@@ -11,6 +11,7 @@ fn the_doctor_names_what_the_machine_has_and_ends_as_it_says() {
         "vectors",
         "memory",
         "shared memory",
+        "locked memory",
         "disk",
         "Procgen",
         "CUDA driver",

@@ -1,12 +1,12 @@
 //! Runs that end before their time: Ctrl-C, a part that dies, a launcher that dies. No process is ever left.
 //! What a dead part's successor may do is in `by_hand`.
 
-use std::{fs, path::PathBuf};
+use std::process::Command;
 
 use driml_tests::wait_for;
 use nix::sys::signal::Signal;
 
-use crate::{launched, system};
+use crate::{SHORT, launched, system};
 
 #[test]
 fn an_interrupt_saves_and_ends_all_parts() {
@@ -89,31 +89,14 @@ fn parts_end_with_their_launcher() {
     );
 }
 
-/// The shared memory that a process has open.
-fn shared_memory_of(pid: i32) -> Vec<PathBuf> {
-    let maps = fs::read_to_string(format!("/proc/{pid}/maps")).unwrap();
-    let mut files: Vec<_> = maps
-        .lines()
-        .filter_map(|line| line.split_whitespace().nth(5))
-        .filter(|path| path.ends_with(".zenoh"))
-        .map(PathBuf::from)
-        .collect();
-    files.dedup();
-    files
-}
-
 #[test]
-fn shared_memory_of_killed_parts_is_removed() {
+fn a_part_whose_launcher_died_before_it_looked_ends() {
+    let mut launcher = Command::new("true").spawn().unwrap();
+    launcher.wait().unwrap();
     let system = system();
-    let process = launched(&system, 100);
-    let parts = ["replay-server", "learner", "actor"].map(|part| system.find_part(part));
-    let files: Vec<_> = parts
-        .iter()
-        .flat_map(|part| shared_memory_of(part.pid))
-        .collect();
-    assert!(files.len() > 1, "the parts share memory: {files:?}");
-    parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
-    process.wait().expect_code(1);
-    let left: Vec<_> = files.iter().filter(|file| file.exists()).collect();
-    assert!(left.is_empty(), "{left:?}");
+    let listen = format!("replay-server --listen {} {SHORT}", system.endpoint());
+    system
+        .run(&format!("{listen} --exit-with-parent {}", launcher.id()))
+        .expect_code(0)
+        .expect_said("replay server stops");
 }

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use driml_tests::{RunFolder, TestSystem};
+use driml_tests::{RunFolder, Summary, TestSystem};
 use nix::sys::signal::Signal;
 
 use crate::{SHORT, launched, system};
@@ -15,7 +15,7 @@ fn saved(run: &RunFolder) -> u64 {
 }
 
 /// Resumes `run` for 156 updates more than it has, and checks what it leaves.
-fn resumes(system: &TestSystem) {
+fn resumes(system: &TestSystem) -> Summary {
     let run = system.run_folder("run");
     let updates = saved(&run);
     // 2 for each update of 16 rows at replay ratio 8, and 16 whole chunks of 32, of which 200 are warm-up.
@@ -42,12 +42,14 @@ fn resumes(system: &TestSystem) {
             && log.matches("learning on cpu").count() >= 2,
         "{log}"
     );
+    summary
 }
 
 #[test]
 fn an_interrupted_run_goes_on() {
     let system = system();
-    let process = launched(&system, 200);
+    // 1,000 updates are 2,200 frames, in which more than 100 episodes end.
+    let process = launched(&system, 1_000);
     system
         .run("local --resume run")
         .expect_code(64)
@@ -57,9 +59,14 @@ fn an_interrupted_run_goes_on() {
         .wait()
         .expect_code(130)
         .expect_said("`driml local --resume run` goes on with it");
-    resumes(&system);
+    let before = system.run_folder("run").summary();
+    let summary = resumes(&system);
+    // A few tens of episodes ended since, the short ones first; the mean return is of 100 all the same.
+    let since = summary.episodes - before.episodes;
+    assert!((1..100).contains(&since), "{since} episodes since");
+    assert_eq!((before.mean_return_of, summary.mean_return_of), (100, 100));
     // And once more, as it is finished now and longer runs may be wished for.
-    resumes(&system);
+    assert_eq!(resumes(&system).mean_return_of, 100);
     system
         .run("local --resume run")
         .expect_code(64)

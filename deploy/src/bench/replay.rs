@@ -26,7 +26,7 @@ use crate::{
     bench::{
         assemble, effort::Effort, figures::Figure, recording::Recording, settings, taking_part,
     },
-    child::Part,
+    child::{Part, Surroundings},
     cli::NAMESPACE,
     console::Screen,
 };
@@ -108,7 +108,12 @@ impl Run {
             .chain(sets.flat_map(|set| ["--set", set]))
             .map(Into::into)
             .collect();
-        let mut server = Part::start("replay-server", &args, 1, folder, &Screen::plain())?;
+        let surroundings = Surroundings {
+            logs: folder,
+            screen: &Screen::plain(),
+            meeting: None,
+        };
+        let mut server = Part::start("replay-server", &args, 1, surroundings)?;
         let session = reach(endpoint, &mut server)?;
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
         let hello = join::hello(&session, &keys, &Shutdown::default())?

@@ -31,7 +31,7 @@ use crate::{
         replay::{AGENT, SETTINGS, reach},
         settings, table, taking_part,
     },
-    child::Part,
+    child::{Part, Surroundings},
     cli::{BenchScaleArgs, NAMESPACE},
     config::RunConfig,
     console::{self, Screen},
@@ -336,7 +336,12 @@ impl Servers {
                 .chain(sets.iter().flat_map(|set| ["--set", set.as_str()]))
                 .map(Into::into)
                 .collect();
-            let mut part = Part::start(&name, &args, 1, folder, &Screen::plain())?;
+            let surroundings = Surroundings {
+                logs: folder,
+                screen: &Screen::plain(),
+                meeting: None,
+            };
+            let mut part = Part::start(&name, &args, 1, surroundings)?;
             let session = reach(&endpoint, &mut part)?;
             if let Err(e) = session.close().wait() {
                 tracing::debug!("closing a session: {e}");

@@ -3,6 +3,7 @@
 
 use std::path::Path;
 
+use driml_protocol::shared_memory::lockable_bytes;
 use nix::sys::statvfs::statvfs;
 
 use super::fact::{Fact, State, gib};
@@ -39,6 +40,7 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
         vectors(Vectors::this()),
         memory(&machine),
         shared_memory(free(Path::new(SHARED_MEMORY_FOLDER))),
+        locked_memory(lockable_bytes()),
         disk(runs),
     ]
 }
@@ -141,6 +143,27 @@ fn shared_memory(free: Result<u64, String>) -> Fact {
     }
 }
 
+/// `limit` is how many bytes of shared memory a process may lock, as it has to; none if there is no limit.
+fn locked_memory(limit: Option<u64>) -> Fact {
+    let what = "locked memory";
+    match limit {
+        None => Fact::ok(what, "no limit (`ulimit -l`)"),
+        Some(limit) if limit >= SHARED_MEMORY_ENOUGH => {
+            Fact::ok(what, format!("{} MiB (`ulimit -l`)", limit >> 20))
+        }
+        Some(limit) => Fact::note(
+            what,
+            format!(
+                "`ulimit -l` allows {} KiB, a run with one actor locks up to {} MiB of shared memory: sockets serve instead, several times slower; to raise it, add \
+                 \"USER - memlock unlimited\" to /etc/security/limits.conf and log in again; a service needs LimitMEMLOCK=infinity, a \
+                 container --ulimit memlock=-1",
+                limit >> 10,
+                SHARED_MEMORY_ENOUGH >> 10
+            ),
+        ),
+    }
+}
+
 fn disk(runs: &Path) -> Fact {
     let runs = std::path::absolute(runs).unwrap_or_else(|_| runs.into());
     let there = runs.ancestors().find(|it| it.is_dir()).unwrap_or(&runs);
@@ -201,6 +224,15 @@ mod tests {
             shared_memory(Err("no such folder".into())).state,
             State::Note
         );
+        // The kernel's usual limit for an ordinary account.
+        let locked = locked_memory(Some(8 << 20));
+        assert_eq!(locked.state, State::Note);
+        assert!(
+            locked.text.contains("`ulimit -l` allows 8192 KiB"),
+            "{locked}"
+        );
+        assert_eq!(locked_memory(Some(1 << 30)).state, State::Ok);
+        assert_eq!(locked_memory(None).state, State::Ok);
         assert_eq!(cores(1).state, State::Note);
         assert_eq!(cores(2).state, State::Ok);
     }

@@ -472,10 +472,9 @@ mod tests {
         let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
         let folder = queue.root.join("run");
         let mut recorder = Recorder::create(&folder, "", &[]).unwrap();
-        recorder.record(&replay, &learner, &[]).unwrap();
-        recorder
-            .finish(Outcome::Finished, &spec(), &replay, &learner)
-            .unwrap();
+        recorder.record(std::slice::from_ref(&replay), &learner, &[]);
+        let summary = recorder.summarise(Outcome::Finished, &spec(), &replay, &learner);
+        summary.write(&folder).unwrap();
         assert!(queue.finished(&plan(10)).is_none(), "nobody knows its call");
         let call = serde_json::to_vec(&plan(10).args).unwrap();
         fs::write(queue.call(&plan(10)), call).unwrap();

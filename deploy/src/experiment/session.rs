@@ -27,6 +27,9 @@ const SETTINGS: &str = "settings.json";
 /// A finished piece as it is kept.
 #[derive(Serialize, Deserialize)]
 struct Kept<T> {
+    /// Of what it was made, such as the hash of weights; empty if of the settings alone.
+    #[serde(default)]
+    of: String,
     seconds: f64,
     result: T,
 }
@@ -125,12 +128,26 @@ impl Session {
         units: u64,
         make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
+        self.piece_of("", key, units, make)
+    }
+
+    /// [`Session::piece`] that was made of something which may have changed since, and then is made anew: `of` names it.
+    ///
+    /// # Errors
+    /// As for [`Session::piece`].
+    pub(super) fn piece_of<T: Serialize + DeserializeOwned>(
+        &mut self,
+        of: &str,
+        key: &str,
+        units: u64,
+        make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
         let path = self.folder.join(PIECES).join(format!("{key}.json"));
         let found: Option<Kept<T>> = fs::read(&path)
             .ok()
             .and_then(|text| serde_json::from_slice(&text).ok());
         // A piece that cannot be read is made again.
-        if let Some(kept) = found {
+        if let Some(kept) = found.filter(|kept| kept.of == of) {
             self.progress.find(units);
             self.seconds += kept.seconds;
             return Ok(kept.result);
@@ -143,6 +160,7 @@ impl Session {
             }
         })?;
         let kept = Kept {
+            of: of.into(),
             seconds: started.elapsed().as_secs_f64(),
             result,
         };
@@ -235,6 +253,12 @@ mod tests {
         fs::write(folder.path().join("walk/pieces/one.json"), "{\"seconds\":").unwrap();
         assert_eq!(open("a").unwrap().piece("one", 2, |_| Ok(9)).unwrap(), 9);
         assert!(open("b").unwrap_err().is::<Usage>());
+        // What it was made of has changed.
+        let mut of = |of: &str, made: u32| session.piece_of(of, "played", 1, |_| Ok(made)).unwrap();
+        assert_eq!(
+            (of("x", 1), of("x", 2), of("y", 3), of("y", 4)),
+            (1, 1, 3, 3)
+        );
         assert!(report().is_ok());
     }
 }

@@ -6,6 +6,7 @@ use std::{fs, io::ErrorKind, path::Path};
 use anyhow::Context;
 use driml_protocol::{LearnerStatus, ReplayStatus};
 
+use super::Episodes;
 use crate::{display::PAIRS, error::usage, resume::Behind};
 
 /// The columns of the metrics.
@@ -19,6 +20,7 @@ pub(super) fn header(processes: &[String]) -> Vec<String> {
         "replay_ratio",
         "episodes",
         "mean_return",
+        "mean_return_of",
         "c51_kl",
     ];
     let rest = [
@@ -51,8 +53,7 @@ pub(super) struct Moment<'a> {
     pub(super) seconds: f64,
     /// Frames and updates a second.
     pub(super) rates: (f64, f64),
-    /// Episodes that ended.
-    pub(super) episodes: u64,
+    pub(super) episodes: Episodes,
     /// Mean and standard deviation of k.
     pub(super) k: Option<(f64, f64)>,
     pub(super) replay: &'a ReplayStatus,
@@ -65,6 +66,7 @@ impl Moment<'_> {
     /// The cells, in the order of [`header`].
     pub(super) fn row(&self) -> Vec<String> {
         let (replay, learner) = (self.replay, self.learner);
+        let mean_return = self.episodes.mean_return;
         let some = |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.6}"));
         // What has not been computed is left empty: a 0 would look like a loss.
         let computed = |value: f64| some((learner.updates > 0).then_some(value));
@@ -75,8 +77,9 @@ impl Moment<'_> {
             format!("{:.2}", self.rates.0),
             format!("{:.3}", self.rates.1),
             some(replay.replay_ratio()),
-            self.episodes.to_string(),
-            some(replay.mean_return),
+            self.episodes.count.to_string(),
+            some(mean_return.map(|it| it.mean)),
+            mean_return.map_or(0, |it| it.of).to_string(),
             computed(learner.c51_kl.into()),
         ];
         row.extend(learner.dim.map(|loss| some(loss.map(f64::from))));
@@ -100,7 +103,7 @@ impl Moment<'_> {
 
 /// Rows of metrics that a run begins with.
 pub(super) struct Rows {
-    header: Vec<String>,
+    pub(super) header: Vec<String>,
     pub(super) rows: Vec<csv::StringRecord>,
 }
 
@@ -166,14 +169,5 @@ impl Rows {
     /// What the last row has in the column `name`.
     pub(super) fn last<T: std::str::FromStr>(&self, name: &str) -> Option<T> {
         self.value(self.rows.last()?, name)
-    }
-
-    pub(super) fn to_csv(&self) -> anyhow::Result<Vec<u8>> {
-        let mut csv = csv::Writer::from_writer(Vec::new());
-        csv.write_record(&self.header)?;
-        for row in &self.rows {
-            csv.write_record(row)?;
-        }
-        Ok(csv.into_inner()?)
     }
 }

@@ -201,6 +201,56 @@ fn the_newest_are_kept_and_an_unfinished_save_is_no_checkpoint() {
 }
 
 #[test]
+fn what_a_cut_off_save_left_is_gone_after_the_next() {
+    let folder = Folder::new("cut-off");
+    let mut run = Run::new();
+    run.updates(1);
+    run.save(&folder.0, 3);
+    for name in ["checkpoint-000000000009.tmp", "checkpoint-000000000001.tmp"] {
+        fs::create_dir(folder.0.join(name)).unwrap();
+        fs::write(folder.0.join(name).join("online.safetensors"), "half").unwrap();
+    }
+    run.updates(1);
+    run.save(&folder.0, 3);
+    let mut names: Vec<_> = fs::read_dir(&folder.0)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    names.sort();
+    assert_eq!(
+        names,
+        ["checkpoint-000000000001", "checkpoint-000000000002"]
+    );
+}
+
+#[test]
+fn a_checkpoint_is_there_while_it_is_replaced() {
+    let folder = Folder::new("replaced");
+    let mut run = Run::new();
+    run.updates(1);
+    let path = run.save(&folder.0, 3);
+    let updates = || -> Vec<u64> {
+        let all = list(&folder.0).unwrap();
+        all.iter().map(|(updates, _)| *updates).collect()
+    };
+    // A crash between the two renames.
+    let replaced = folder.0.join("checkpoint-000000000001.replaced.tmp");
+    fs::rename(&path, &replaced).unwrap();
+    assert_eq!(updates(), [1]);
+    assert_eq!(Run::resume(&folder.0).bytes(), run.bytes());
+    // The next save gives it its name back.
+    run.updates(1);
+    run.save(&folder.0, 3);
+    assert_eq!(updates(), [1, 2]);
+    assert!(path.exists() && !replaced.exists());
+    // And a crash after them.
+    fs::create_dir(&replaced).unwrap();
+    assert_eq!(updates(), [1, 2]);
+    run.save(&folder.0, 3);
+    assert!(!replaced.exists());
+}
+
+#[test]
 fn every_kind_of_damage_is_reported_with_its_file() {
     let folder = Folder::new("damage");
     let mut run = Run::new();

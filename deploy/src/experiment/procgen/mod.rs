@@ -148,17 +148,19 @@ pub(super) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
             results.missing.push(plan.name);
             continue;
         };
-        let mut play = |key: &str, who| {
+        let mut play = |of: &str, key: &str, who| {
             let episodes = results.settings.episodes;
-            session.piece(key, play_units, |progress| {
+            session.piece_of(of, key, play_units, |progress| {
                 let played = played(&ran, who, episodes)?;
                 progress.advance(play_units)?;
                 Ok(played)
             })
         };
-        let played = play(&format!("{}-played", plan.name), Who::Agent)?;
+        // A run may have been made anew, or gone on, since it was played.
+        let weights = &ran.summary.weights_sha256;
+        let played = play(weights, &format!("{}-played", plan.name), Who::Agent)?;
         if !results.random.contains_key(&spot.world) {
-            let random = play(&format!("{}-random", short(&spot.world)), Who::Random)?;
+            let random = play("", &format!("{}-random", short(&spot.world)), Who::Random)?;
             results.random.insert(spot.world.clone(), random);
         }
         results.cells.push(Cell {

@@ -1,0 +1,187 @@
+//! What a part says: carried to its log file, its warnings and errors to the screen too, its last lines kept for the end.
+//! A full disk costs lines of the log, never the run.
+
+use std::{
+    collections::VecDeque,
+    fs::File,
+    io::{self, BufRead, BufReader, Read, Write},
+    path::{Path, PathBuf},
+    sync::{Arc, Mutex, MutexGuard},
+    thread::JoinHandle,
+};
+
+use anyhow::Context;
+use driml_protocol::fault;
+
+use crate::console::Screen;
+
+/// Last lines that are kept to be shown if the part fails.
+const TAIL_LINES_MAX: usize = 8;
+
+/// A part's log, and the threads that write it.
+#[derive(Debug)]
+pub(crate) struct PartLog {
+    name: String,
+    path: PathBuf,
+    kept: Arc<Mutex<Kept>>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+/// What the threads share.
+#[derive(Debug)]
+struct Kept {
+    file: File,
+    tail: VecDeque<String>,
+    /// Lines that could not be written.
+    lost: u64,
+    /// The first error.
+    failed: Option<io::Error>,
+}
+
+impl PartLog {
+    /// Opens the log of the part `name` in the folder `logs`, to go on at its end.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(crate) fn open(name: &str, logs: &Path) -> anyhow::Result<Self> {
+        let path = logs.join(format!("{name}.log"));
+        let file = File::options().create(true).append(true).open(&path);
+        let file = file.with_context(|| format!("making {}", path.display()))?;
+        let kept = Kept {
+            file,
+            tail: VecDeque::new(),
+            lost: 0,
+            failed: None,
+        };
+        Ok(Self {
+            name: name.into(),
+            path,
+            kept: Arc::new(Mutex::new(kept)),
+            threads: Vec::new(),
+        })
+    }
+
+    /// Carries what comes through `pipe`, on a thread of its own, until its other end is closed.
+    ///
+    /// # Errors
+    /// The operating system gave no thread.
+    pub(crate) fn follow(
+        &mut self,
+        pipe: impl Read + Send + 'static,
+        screen: &Screen,
+    ) -> anyhow::Result<()> {
+        let (name, kept, screen) = (self.name.clone(), self.kept.clone(), screen.clone());
+        let carry = move || {
+            let point = format!("log of {name}");
+            for line in BufReader::new(pipe).split(b'\n') {
+                fault::point(&point);
+                let Ok(line) = line else { return };
+                let line = String::from_utf8_lossy(&line).into_owned();
+                let shown = matters(&line).then(|| format!("{name}: {line}"));
+                let said = lock(&kept).add(line);
+                let said = said
+                    .map(|e| format!("the log of {name} cannot be written: {e}; the run goes on"));
+                for line in shown.into_iter().chain(said) {
+                    screen.line(&line);
+                }
+            }
+        };
+        let thread = std::thread::Builder::new().name(format!("log of {}", self.name));
+        let thread = thread.spawn(carry).context("starting a thread")?;
+        self.threads.push(thread);
+        Ok(())
+    }
+
+    /// Where it is.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The last lines.
+    pub(crate) fn tail(&self) -> Vec<String> {
+        lock(&self.kept).tail.iter().cloned().collect()
+    }
+
+    /// How many lines could not be written, and why; none if all were.
+    pub(crate) fn missing(&self) -> Option<String> {
+        let kept = lock(&self.kept);
+        let error = kept.failed.as_ref()?;
+        Some(format!(
+            "{} lines of the log of {} are lost: {error}",
+            kept.lost, self.name
+        ))
+    }
+
+    /// Waits until all that the part said is carried. The part has ended, and nobody else holds the pipes' other ends.
+    pub(crate) fn finish(&mut self) {
+        for thread in self.threads.drain(..) {
+            thread.join().expect("a panic has ended the process");
+        }
+    }
+}
+
+fn lock(kept: &Mutex<Kept>) -> MutexGuard<'_, Kept> {
+    kept.lock().expect("a panic has ended the process")
+}
+
+impl Kept {
+    /// Keeps a line. Gives the error the first time that one cannot be written; later ones are tried all the same.
+    fn add(&mut self, line: String) -> Option<String> {
+        let written = self.file.write_all(format!("{line}\n").as_bytes());
+        if self.tail.len() == TAIL_LINES_MAX {
+            self.tail.pop_front();
+        }
+        self.tail.push_back(line);
+        let error = written.err()?;
+        self.lost += 1;
+        let first = self.failed.is_none().then(|| error.to_string());
+        self.failed.get_or_insert(error);
+        first
+    }
+}
+
+/// Whether a log line is a warning or worse: the level is the second word, after the time.
+fn matters(line: &str) -> bool {
+    let level = line.split_whitespace().nth(1);
+    matches!(level, Some("WARN" | "ERROR")) || line.starts_with("error:")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn warnings_and_worse_reach_the_screen() {
+        assert!(matters(
+            "2026-01-01T00:00:00.1Z  WARN driml_actor: weights were refused"
+        ));
+        assert!(matters("2026-01-01T00:00:00.1Z ERROR driml_actor: gone"));
+        assert!(matters("error: nobody answers"));
+        assert!(!matters(
+            "2026-01-01T00:00:00.1Z  INFO driml_actor: ERROR is a word here"
+        ));
+        assert!(!matters(""));
+    }
+
+    #[test]
+    fn a_log_keeps_its_last_lines_and_counts_those_that_it_lost() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = PartLog::open("actor-0", folder.path()).unwrap();
+        let lines: String = (0..10).map(|n| format!("line {n}\n")).collect();
+        let screen = Screen::plain();
+        log.follow(io::Cursor::new(lines.clone()), &screen).unwrap();
+        log.finish();
+        assert_eq!(std::fs::read_to_string(log.path()).unwrap(), lines);
+        assert_eq!((log.tail().len(), log.tail()[7].as_str()), (8, "line 9"));
+        assert_eq!(log.missing(), None);
+
+        lock(&log.kept).file = File::options().append(true).open("/dev/full").unwrap();
+        let add = |line: &str| lock(&log.kept).add(line.into());
+        assert!(add("one").unwrap().starts_with("No space left"));
+        assert_eq!(add("two"), None, "it is said once");
+        let missing = log.missing().unwrap();
+        let said = "2 lines of the log of actor-0 are lost: No space left";
+        assert!(missing.starts_with(said), "{missing}");
+        assert_eq!(log.tail()[7], "two");
+    }
+}

@@ -1,0 +1,123 @@
+//! `summary.json`: how a run ended and what it counted, in one object.
+//! It computes nothing; the recorder fills it in.
+
+use std::{fs, path::Path};
+
+use anyhow::Context;
+use driml_protocol::whole_file;
+use serde::{Deserialize, Serialize};
+
+const FILE: &str = "summary.json";
+
+/// How a run ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum Outcome {
+    /// All frames are in, their updates done and the last checkpoint written.
+    Finished,
+    /// A person ended it; what was done is saved.
+    Interrupted,
+    /// A part failed.
+    Failed,
+}
+
+/// `summary.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Summary {
+    /// How the run ended.
+    pub(crate) outcome: Outcome,
+    /// The world.
+    pub(crate) world: String,
+    /// The agent.
+    pub(crate) agent: String,
+    /// The seed.
+    pub(crate) seed: u64,
+    /// Updates that the run had behind it when it was resumed, the last time; 0 if it never was. Frames, updates,
+    /// rows, episodes, mean return, seconds and mean k are of the whole run, all else is of what came since.
+    #[serde(default)]
+    pub(crate) resumed_after_updates: u64,
+    /// Frames that trained: transitions stored.
+    pub(crate) frames: u64,
+    /// Updates done.
+    pub(crate) updates: u64,
+    /// Transitions stored.
+    pub(crate) transitions_inserted: u64,
+    /// Transitions that actors produced and that never arrived.
+    pub(crate) transitions_lost: u64,
+    /// Transitions stored twice.
+    pub(crate) transitions_duplicated: u64,
+    /// Rows served to the learner.
+    pub(crate) rows_sampled: u64,
+    /// Rows per transition, both counted from the end of the warm-up.
+    pub(crate) replay_ratio: Option<f64>,
+    /// Episodes that ended, in a resumed run those too in which the replay filled again.
+    pub(crate) episodes: u64,
+    /// Mean undiscounted return of the last 100 training episodes, also over a resumption.
+    pub(crate) mean_return: Option<f64>,
+    /// Of how many episodes that is: of fewer than 100 only if there were fewer. Older runs do not say.
+    #[serde(default)]
+    pub(crate) mean_return_of: u64,
+    /// From the start of the first part to the end of the run.
+    pub(crate) wall_seconds: f64,
+    /// Frames over wall seconds.
+    pub(crate) frames_per_second: f64,
+    /// Updates over wall seconds.
+    pub(crate) updates_per_second: f64,
+    /// Mean k of the rows served with a positive; of several positives the furthest counts.
+    pub(crate) mean_k: Option<f64>,
+    /// How often each k was served; index 0 counts rows without a positive.
+    pub(crate) k_histogram: Vec<u64>,
+    /// How often each action was taken; older runs do not say.
+    #[serde(default)]
+    pub(crate) action_histogram: Vec<u64>,
+    /// Version of the last weights.
+    pub(crate) weights_version: u64,
+    /// SHA-256 of the last weights, hexadecimal.
+    pub(crate) weights_sha256: String,
+    /// Chunks recognised as a retry of a stored one.
+    pub(crate) chunks_retried: u64,
+    /// Batches that did not reach the learner and were asked for again; older runs do not say.
+    #[serde(default)]
+    pub(crate) batches_retried: u64,
+    /// Memory that the frames in the replay took at the end, MiB.
+    pub(crate) replay_frame_mib: u64,
+    /// Messages refused as malformed or foreign.
+    pub(crate) messages_refused: u64,
+    /// Highest resident memory of each process, MiB.
+    pub(crate) rss_mib_max: serde_json::Map<String, serde_json::Value>,
+}
+
+impl Summary {
+    /// Writes it into the run folder, whole or not at all.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(crate) fn write(&self, folder: &Path) -> anyhow::Result<()> {
+        let path = folder.join(FILE);
+        let doing = || format!("writing {}", path.display());
+        let mut text = serde_json::to_vec_pretty(self).with_context(doing)?;
+        text.push(b'\n');
+        whole_file::write(&path, &text).with_context(doing)
+    }
+
+    /// Removes the one of an earlier time from the run folder, if there is one.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn remove(folder: &Path) -> anyhow::Result<()> {
+        let path = folder.join(FILE);
+        match fs::remove_file(&path) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                Err(e).with_context(|| format!("removing {}", path.display()))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Whether the run in `folder` came to its end.
+pub(crate) fn is_finished(folder: &Path) -> bool {
+    let text = fs::read(folder.join(FILE)).ok();
+    let summary = text.and_then(|text| serde_json::from_slice::<Summary>(&text).ok());
+    summary.is_some_and(|it| it.outcome == Outcome::Finished)
+}

@@ -1,0 +1,123 @@
+//! What a run leaves outside its folder, in the temporary folder and in shared memory: nothing, however it ended; or until the
+//! next run starts, if all its processes were killed.
+
+use std::{fs, path::PathBuf};
+
+use driml_tests::{Process, Survivor, TestSystem, wait_for};
+use nix::sys::signal::Signal;
+
+use crate::{LONG, SHORT, launched, system};
+
+/// The parts of a run.
+const PARTS: [&str; 3] = ["replay-server", "learner", "actor"];
+
+/// A run that has learned something, whose temporary folder is `tmp` in the system's; and its parts.
+fn started(system: &TestSystem) -> (Process, [Survivor; 3]) {
+    let temporary = system.path("tmp");
+    fs::create_dir_all(&temporary).unwrap();
+    let run = format!("local --agent driml-ada {LONG} --run-dir run");
+    let process = system.start_with("TMPDIR", temporary.to_str().unwrap(), &run);
+    let run = system.run_folder("run");
+    wait_for("a row of metrics with updates", || {
+        run.updates_recorded().filter(|&updates| updates > 100)
+    });
+    (process, PARTS.map(|part| system.find_part(part)))
+}
+
+fn temporary(system: &TestSystem) -> Vec<PathBuf> {
+    let entries = fs::read_dir(system.path("tmp")).unwrap();
+    entries.map(|entry| entry.unwrap().path()).collect()
+}
+
+fn wait_until_all_have_ended(system: &TestSystem) {
+    wait_for("the end of all parts", || {
+        system.survivors().is_empty().then_some(())
+    });
+}
+
+#[test]
+fn a_killed_launcher_leaves_nothing() {
+    let system = system();
+    let (process, parts) = started(&system);
+    let segments = all_shared_memory_of(&parts);
+    assert_eq!(temporary(&system).len(), 1);
+    process.signal(Signal::SIGKILL);
+    process.wait();
+    wait_until_all_have_ended(&system);
+    assert_eq!(temporary(&system), [] as [PathBuf; 0]);
+    check_gone(&segments);
+}
+
+#[test]
+fn the_next_run_sweeps_what_killed_processes_left() {
+    let system = system();
+    let (process, parts) = started(&system);
+    let segments = all_shared_memory_of(&parts);
+    process.signal(Signal::SIGKILL);
+    parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
+    process.wait();
+    wait_until_all_have_ended(&system);
+    assert_eq!(temporary(&system).len(), 1, "nobody could remove it");
+    let temporary_folder = system.path("tmp");
+    let next = format!("local --agent c51 {SHORT} --run-dir next");
+    system
+        .start_with("TMPDIR", temporary_folder.to_str().unwrap(), &next)
+        .wait()
+        .expect_code(0);
+    assert_eq!(temporary(&system), [] as [PathBuf; 0]);
+    check_gone(&segments);
+}
+
+#[test]
+fn parts_started_by_hand_leave_no_shared_memory() {
+    let system = system();
+    let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
+    let learner = system.start_learner("run");
+    let actor = system.start_actor(0);
+    let client = system.connect();
+    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    let segments = all_shared_memory_of(&PARTS.map(|part| system.find_part(part)));
+    // A client may hold what it has seen.
+    drop(client);
+    for part in [actor, learner, server] {
+        part.stop().expect_code(0);
+    }
+    check_gone(&segments);
+}
+
+/// The shared memory that a process has open.
+fn shared_memory_of(pid: i32) -> Vec<PathBuf> {
+    let maps = fs::read_to_string(format!("/proc/{pid}/maps")).unwrap();
+    let mut files: Vec<_> = maps
+        .lines()
+        .filter_map(|line| line.split_whitespace().nth(5))
+        .filter(|path| path.ends_with(".zenoh"))
+        .map(PathBuf::from)
+        .collect();
+    files.dedup();
+    files
+}
+
+#[test]
+fn shared_memory_of_killed_parts_is_removed() {
+    let system = system();
+    let process = launched(&system, 100);
+    let parts = PARTS.map(|part| system.find_part(part));
+    let segments = all_shared_memory_of(&parts);
+    parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
+    process.wait().expect_code(1);
+    check_gone(&segments);
+}
+
+/// The shared memory that the parts have open.
+fn all_shared_memory_of(parts: &[Survivor]) -> Vec<PathBuf> {
+    let files = parts.iter().flat_map(|part| shared_memory_of(part.pid));
+    let files: Vec<_> = files.collect();
+    assert!(files.len() > 1, "the parts share memory: {files:?}");
+    files
+}
+
+fn check_gone(files: &[PathBuf]) {
+    let left: Vec<&PathBuf> = files.iter().filter(|file| file.exists()).collect();
+    assert!(left.is_empty(), "{left:?}");
+}
