@@ -112,7 +112,7 @@ fn what_nobody_uses_is_not_there() {
 fn settings_that_cannot_work_are_answered_with_what_to_do() {
     let said = |agent: &str, set: &str| with("procgen:bigfish", agent, &[set]).unwrap_err();
     expect![[r#"there is no setting "learner.update.adam.learning_rate"; [learner.update.adam] has beta1, beta2, eps, lr"#]].assert_eq(&said("driml-ada", "learner.update.adam.learning_rate=1"));
-    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_rows, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
+    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_rows, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
     expect![[r#"there is no setting "world.num_level" (did you mean "world.num_levels"?); [world] has center_agent, distribution_mode, num_levels, paint_vel_info, restrict_themes, start_level, use_backgrounds, use_sequential_levels"#]].assert_eq(&said("driml-ada", "world.num_level=5"));
     expect!["model.height cannot be set by hand: it follows from input.height"]
         .assert_eq(&said("driml-ada", "model.height=84"));
@@ -196,7 +196,7 @@ fn a_ladder_of_epsilons_is_for_the_actors_of_the_run() {
         .assert_eq(&of(&["actor.epsilon_ladder={base=4.0,alpha=7.0}", "local.actors=2"]).unwrap_err());
     expect!["in the settings' [actor] table: missing field `alpha`"]
         .assert_eq(&of(&["actor.epsilon_ladder={base=0.4}", "local.actors=2"]).unwrap_err());
-    expect![[r#"there is no setting "actor.epsilon_ladder.rungs"; [actor] has ack_timeout_ms, chunks_in_flight_max, envs, epsilon_decay_frames, epsilon_end, epsilon_start, steps_per_chunk, unreachable_max_ms, world_threads"#]]
+    expect![[r#"there is no setting "actor.epsilon_ladder.rungs"; [actor] has ack_timeout_ms, chunks_in_flight_max, envs, epsilon_decay_frames, epsilon_end, epsilon_start, round_transitions_max, steps_per_chunk, unreachable_max_ms, world_threads"#]]
         .assert_eq(&of(&["actor.epsilon_ladder.rungs=3"]).unwrap_err());
 }
 
