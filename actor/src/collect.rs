@@ -20,19 +20,17 @@ pub struct Life {
     pub epoch: u64,
     /// Updates after which the run goes on: a resumed run does not play the episodes of its start again.
     pub after_updates: u64,
-    /// Transitions that the run had when this life joined: one that follows a dead one does not play its episodes again.
-    /// 0 for those that are there at the run's start.
-    pub inserted_total_at_join: u64,
+    /// Lives of this actor before this one: one that follows a dead one does not play its episodes again.
+    pub earlier_lives: u32,
 }
 
 impl Life {
-    /// The seed of one of its generators. Lives that differ in number, `after_updates` or `inserted_total_at_join` have
-    /// others.
+    /// The seed of one of its generators. Lives that differ in `actor`, `after_updates` or `earlier_lives` have others.
     fn seed(&self, spec: &RunSpec, used_for: &str) -> [u8; 32] {
         let index = u64::from(self.actor) | self.after_updates << u32::BITS;
-        match self.inserted_total_at_join {
+        match self.earlier_lives {
             0 => spec.seed_for(used_for, index),
-            inserted => spec.seed_for(&format!("{used_for} from {inserted}"), index),
+            lives => spec.seed_for(&format!("{used_for} after {lives} lives"), index),
         }
     }
 }
@@ -155,7 +153,7 @@ mod tests {
         actor: 3,
         epoch: 1,
         after_updates: 0,
-        inserted_total_at_join: 0,
+        earlier_lives: 0,
     };
 
     fn settings(epsilon: f64) -> ActorSettings {
@@ -245,8 +243,8 @@ mod tests {
         let random = |life| actions(settings(1.0), life);
         let first = random(FIRST);
         assert_eq!(random(Life { epoch: 2, ..FIRST }), first);
-        let at = |inserted_total_at_join| Life {
-            inserted_total_at_join,
+        let at = |earlier_lives| Life {
+            earlier_lives,
             ..FIRST
         };
         let lives = [

@@ -20,6 +20,9 @@ use crate::{
 /// How long an actor waits for a learner with weights.
 const WEIGHTS_WAIT_MAX: Duration = Duration::from_secs(120);
 
+/// How long an actor that the rate limiter holds back waits for newer weights before its next chunk.
+const FRESH_WEIGHTS_MAX: Duration = Duration::from_millis(200);
+
 /// What an actor is told at its start; everything else comes from the replay server.
 #[derive(Clone, Debug)]
 pub struct RunArgs {
@@ -89,7 +92,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             actor: join.actor,
             epoch: join.epoch,
             after_updates: hello.after_updates,
-            inserted_total_at_join: hello.inserted_total,
+            earlier_lives: welcome.earlier_lives,
         },
         header.version,
         &weights,
@@ -110,7 +113,12 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         config.envs
     );
     while !shutdown.is_set() && !delivery.is_finished() {
-        if let Some((header, weights)) = newest.take()
+        // One that waits has the time to act with what is newest; one that others wait for goes on.
+        let wait_max = match delivery.is_held() {
+            true => FRESH_WEIGHTS_MAX,
+            false => Duration::ZERO,
+        };
+        if let Some((header, weights)) = newest.take_within(wait_max)
             && let Err(e) = collector.set_weights(header.version, &weights)
         {
             tracing::warn!(

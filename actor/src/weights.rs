@@ -3,19 +3,19 @@
 
 use std::{
     collections::VecDeque,
-    sync::{Arc, Mutex, PoisonError},
+    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Keys, Kind, Shutdown, WeightsHeader, WeightsReply, WeightsRequest, WeightsVersion, codec,
-    fault,
+    CodecError, Keys, Kind, Shutdown, WeightsHeader, WeightsReply, WeightsRequest, WeightsVersion,
+    codec, fault,
     seldom::Seldom,
     session::{self, Asked},
     weights::{Assembly, PIECE_BYTES},
 };
-use zenoh::{Session, Wait, bytes::ZBytes, handlers::RingChannel, qos::Priority};
+use zenoh::{Session, Wait, bytes::ZBytes, qos::Priority, sample::Sample};
 
 /// One piece.
 const PIECE_TIMEOUT: Duration = Duration::from_secs(10);
@@ -23,8 +23,8 @@ const PIECE_TIMEOUT: Duration = Duration::from_secs(10);
 const PIECES_IN_FLIGHT: usize = 4;
 /// How often to look for a new version although none was announced, in case the announcement was lost.
 const PULL_ANYWAY: Duration = Duration::from_secs(10);
-/// How long to sleep between looks for an announcement.
-const TICK: Duration = Duration::from_millis(20);
+/// How often a thread that has nothing to pull looks whether it should end.
+const TICK: Duration = Duration::from_millis(200);
 /// Pause between two questions for the first weights.
 const PAUSE: Duration = Duration::from_millis(200);
 /// How long the first weights may take before a person hears that they are waited for.
@@ -33,23 +33,89 @@ const SILENT_MAX: Duration = Duration::from_secs(5);
 /// Weights as they came: what they say of themselves, and a safetensors file.
 pub(crate) type Weights = (WeightsHeader, Vec<u8>);
 
-/// The newest weights, taken at most once.
-#[derive(Clone, Debug, Default)]
+/// The newest weights, taken at most once. They are pulled at most once for each time that they are asked for.
+#[derive(Clone, Debug)]
 pub(crate) struct Newest {
-    slot: Arc<Mutex<Option<Weights>>>,
+    shared: Arc<(Mutex<State>, Condvar)>,
+}
+
+#[derive(Debug)]
+struct State {
+    /// Version of the newest weights that were heard of.
+    announced: u64,
+    /// Version of the last ones that were pulled.
+    pulled: u64,
+    slot: Option<Weights>,
+    /// The actor has asked since the last pull.
+    is_wanted: bool,
 }
 
 impl Newest {
-    /// Takes the newest weights, if they came since the last call.
-    pub(crate) fn take(&self) -> Option<Weights> {
-        self.slot
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .take()
+    /// Nothing yet, where weights of `version` are in use.
+    fn after(version: u64) -> Self {
+        let state = State {
+            announced: version,
+            pulled: version,
+            slot: None,
+            is_wanted: true,
+        };
+        Self {
+            shared: Arc::new((Mutex::new(state), Condvar::new())),
+        }
     }
 
-    fn put(&self, weights: Weights) {
-        *self.slot.lock().unwrap_or_else(PoisonError::into_inner) = Some(weights);
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.shared.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes the newest weights, if they came since the last call, and asks for newer ones; those that were announced are waited
+    /// for, at most for `wait_max`.
+    pub(crate) fn take_within(&self, wait_max: Duration) -> Option<Weights> {
+        let mut state = self.state();
+        state.is_wanted = true;
+        self.shared.1.notify_all();
+        let changed = &self.shared.1;
+        let coming = |state: &mut State| state.announced > state.pulled;
+        let (mut state, _) = changed
+            .wait_timeout_while(state, wait_max, coming)
+            .unwrap_or_else(PoisonError::into_inner);
+        state.slot.take()
+    }
+
+    /// Takes note of newer weights.
+    fn announce(&self, version: u64) {
+        let mut state = self.state();
+        state.announced = state.announced.max(version);
+        self.shared.1.notify_all();
+    }
+
+    /// Waits until newer weights are to be pulled, at most for `wait_max`; the version that they are to be newer than.
+    fn wait_until_wanted(&self, wait_max: Duration) -> Option<u64> {
+        let idle = |state: &mut State| !(state.is_wanted && state.announced > state.pulled);
+        let (mut state, waited) = self
+            .shared
+            .1
+            .wait_timeout_while(self.state(), wait_max, idle)
+            .unwrap_or_else(PoisonError::into_inner);
+        if waited.timed_out() {
+            return None;
+        }
+        state.is_wanted = false;
+        Some(state.pulled)
+    }
+
+    /// Puts what a pull gave in its place.
+    fn put(&self, weights: Option<Weights>) {
+        let mut state = self.state();
+        match weights {
+            Some(weights) => {
+                state.pulled = weights.0.version;
+                state.slot = Some(weights);
+            }
+            // Whoever announced them did not have them.
+            None => state.announced = state.pulled,
+        }
+        self.shared.1.notify_all();
     }
 }
 
@@ -103,36 +169,41 @@ impl WeightsSource {
     /// # Errors
     /// No subscription, or no thread.
     pub(crate) fn watch(self, version: u64, shutdown: Shutdown) -> anyhow::Result<Newest> {
-        let newest = Newest::default();
-        let slot = newest.clone();
-        let announced = self
+        let newest = Newest::after(version);
+        let (slot, spec_hash) = (newest.clone(), self.spec_hash);
+        let hear = move |sample: Sample| match announced(&sample.payload().to_bytes(), spec_hash) {
+            Ok(version) => slot.announce(version),
+            Err(e) => tracing::warn!("an announcement of weights was dropped: {e}"),
+        };
+        let announcements = self
             .session
             .declare_subscriber(self.keys.weights_version())
-            .with(RingChannel::new(1))
+            .callback(hear)
             .wait()
             .map_err(|e| anyhow::anyhow!("listening for new weights: {e}"))?;
+        let slot = newest.clone();
         let work = move || {
-            let (mut version, mut pulled) = (version, Instant::now());
-            while !shutdown.wait_timeout(TICK) {
+            // For as long as the thread lives.
+            let _announcements = announcements;
+            let mut looked = Instant::now();
+            while !shutdown.is_set() {
                 fault::point("weights-watch");
-                let newer = match announced.try_recv() {
-                    Ok(Some(sample)) => self.is_newer(&sample.payload().to_bytes(), version),
-                    _ => pulled.elapsed() > PULL_ANYWAY,
-                };
-                if !newer {
+                let wanted = slot.wait_until_wanted(TICK);
+                let Some(version) = wanted.or_else(|| {
+                    // An announcement may have been lost.
+                    let look = looked.elapsed() > PULL_ANYWAY;
+                    look.then(|| slot.state().pulled)
+                }) else {
                     continue;
-                }
-                pulled = Instant::now();
+                };
+                looked = Instant::now();
                 match self.pull(version) {
-                    Ok(Some(weights)) => {
-                        version = weights.0.version;
-                        slot.put(weights);
-                    }
-                    Ok(None) => {}
+                    Ok(weights) => slot.put(weights),
                     // The actor leaves: its session closes under this thread.
                     Err(_) if self.session.is_closed() => return,
                     Err(e) => {
                         tracing::warn!("keeping weights {version}, newer ones did not come: {e:#}");
+                        slot.put(None);
                     }
                 }
             }
@@ -141,17 +212,6 @@ impl WeightsSource {
             .name("weights-watch".into())
             .spawn(work)?;
         Ok(newest)
-    }
-
-    fn is_newer(&self, announcement: &[u8], version: u64) -> bool {
-        let kind = Kind::WeightsVersion;
-        match codec::decode::<WeightsVersion>(announcement, kind, Some(self.spec_hash)) {
-            Ok((announced, _)) => announced.version > version,
-            Err(e) => {
-                tracing::warn!("an announcement of weights was dropped: {e}");
-                false
-            }
-        }
     }
 
     /// The newest weights, piece by piece; none if they are not newer than `version`.
@@ -217,5 +277,54 @@ impl WeightsSource {
 
     fn read<'a>(&self, answer: &'a [u8]) -> anyhow::Result<(WeightsReply, &'a [u8])> {
         Ok(codec::decode(answer, Kind::Weights, Some(self.spec_hash))?)
+    }
+}
+
+/// Version of the weights that a message announces.
+fn announced(message: &[u8], spec_hash: u64) -> Result<u64, CodecError> {
+    let (announced, _): (WeightsVersion, _) =
+        codec::decode(message, Kind::WeightsVersion, Some(spec_hash))?;
+    Ok(announced.version)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn weights(version: u64) -> Option<Weights> {
+        Some((WeightsHeader::new(version, 0, &[]), Vec::new()))
+    }
+
+    #[test]
+    fn weights_are_pulled_once_for_each_time_they_are_asked_for() {
+        let newest = Newest::after(1);
+        let wanted = || newest.wait_until_wanted(Duration::ZERO);
+        assert_eq!(wanted(), None, "nothing newer was heard of");
+        newest.announce(2);
+        assert_eq!(wanted(), Some(1));
+        newest.put(weights(2));
+        newest.announce(3);
+        assert_eq!(wanted(), None, "the last ones were not taken yet");
+        assert_eq!(newest.take_within(Duration::ZERO).unwrap().0.version, 2);
+        assert_eq!(wanted(), Some(2));
+        // A stranger's announcement: nothing newer is there, and nobody waits for it.
+        newest.announce(1 << 60);
+        newest.put(None);
+        assert!(newest.take_within(Duration::from_secs(3600)).is_none());
+        assert_eq!(wanted(), None);
+    }
+
+    #[test]
+    fn weights_that_are_coming_are_waited_for() {
+        let newest = Newest::after(1);
+        newest.announce(2);
+        let watcher = newest.clone();
+        let pull = std::thread::spawn(move || {
+            while watcher.wait_until_wanted(Duration::from_secs(1)).is_none() {}
+            watcher.put(weights(2));
+        });
+        let taken = newest.take_within(Duration::from_secs(3600));
+        assert_eq!(taken.unwrap().0.version, 2);
+        pull.join().unwrap();
     }
 }

@@ -49,6 +49,8 @@ pub enum JoinReply {
         inserted_total: u64,
         /// Version of the newest weights that the replay server has; 0 before the first.
         weights_version: u64,
+        /// Lives of this actor that were there before this one; 0 for a learner.
+        earlier_lives: u32,
     },
     /// Another process plays this part and is connected: ask again, it may be about to end.
     Taken {

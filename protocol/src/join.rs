@@ -53,6 +53,8 @@ pub struct Welcome {
     pub inserted_total: u64,
     /// Version of the newest weights that the replay server has; 0 before the first.
     pub weights_version: u64,
+    /// Lives of this actor that were there before this one; 0 for a learner.
+    pub earlier_lives: u32,
 }
 
 /// Asks the replay server for the run's settings, waiting for it if it is not there yet; `None` if told to stop before.
@@ -135,10 +137,12 @@ fn take_part(
                     JoinReply::Welcome {
                         inserted_total,
                         weights_version,
+                        earlier_lives,
                     } => {
                         return Ok(Some(Welcome {
                             inserted_total,
                             weights_version,
+                            earlier_lives,
                         }));
                     }
                     JoinReply::Refused { why } => return Err(JoinError::Refused { why }),

@@ -210,6 +210,7 @@ fn samples() -> Vec<Sample> {
         JoinReply::Welcome {
             inserted_total: 3,
             weights_version: 4,
+            earlier_lives: 5,
         },
         JoinReply::Taken { why: "a".into() },
         JoinReply::Refused { why: "b".into() },

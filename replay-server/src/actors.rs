@@ -47,6 +47,8 @@ struct Actor {
     expected: u64,
     streams: Vec<Stream>,
     past: VecDeque<Count>,
+    /// Lives before the current one, forgotten ones too.
+    earlier_lives: u32,
 }
 
 /// What is to be done with a chunk.
@@ -109,6 +111,7 @@ impl Actors {
                 known.past.pop_front();
             }
             known.past.push_back(known.current);
+            known.earlier_lives = known.earlier_lives.saturating_add(1);
             (known.current, known.expected) = (fresh, 0);
             known.streams.clear();
             return Ok(());
@@ -125,9 +128,15 @@ impl Actors {
                 expected: 0,
                 streams: Vec::new(),
                 past: VecDeque::new(),
+                earlier_lives: 0,
             },
         );
         Ok(())
+    }
+
+    /// Lives of `actor` before the one that counts.
+    pub(crate) fn earlier_lives(&self, actor: u32) -> u32 {
+        self.actors.get(&actor).map_or(0, |it| it.earlier_lives)
     }
 
     /// The life of `actor` that counts; none before the first.

@@ -187,12 +187,14 @@ impl Replay {
         }
     }
 
-    /// Takes part from now on: chunks of this life of the actor are stored, those of an earlier one no longer.
+    /// Takes part from now on: chunks of this life of the actor are stored, those of an earlier one no longer. Gives the number
+    /// of earlier ones.
     ///
     /// # Errors
     /// Too many actors, or a life that another one has replaced; the reason, for a person.
-    pub fn join_actor(&mut self, join: ActorJoin) -> Result<(), String> {
-        self.actors.join(join)
+    pub fn join_actor(&mut self, join: ActorJoin) -> Result<u32, String> {
+        self.actors.join(join)?;
+        Ok(self.actors.earlier_lives(join.actor))
     }
 
     /// The life of `actor` whose chunks are stored; none before it joins.

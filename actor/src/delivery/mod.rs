@@ -126,6 +126,11 @@ impl Delivery {
         self.account.actors.load(Ordering::Relaxed)
     }
 
+    /// The rate limiter makes this actor's chunks wait.
+    pub fn is_held(&self) -> bool {
+        self.account.is_held()
+    }
+
     /// The run has all the transitions it wants.
     pub fn is_finished(&self) -> bool {
         self.account.finished.load(Ordering::Relaxed)

@@ -89,12 +89,13 @@ impl Service {
         }
     }
 
-    /// Answers a part that joins; `inserted_total` where it is taken.
-    fn welcome(&self, query: &Query, joined: Result<u64, Rejection>) {
+    /// Answers a part that joins: how many lives it had before, or why it is not taken.
+    fn welcome(&self, query: &Query, joined: Result<u32, Rejection>) {
         let reply = match joined {
-            Ok(inserted_total) => JoinReply::Welcome {
-                inserted_total,
+            Ok(earlier_lives) => JoinReply::Welcome {
+                inserted_total: self.state().replay.inserted_total(),
                 weights_version: self.weights().version(),
+                earlier_lives,
             },
             Err(Rejection::Taken(why)) => JoinReply::Taken { why },
             Err(Rejection::Refused(why)) => {
@@ -121,8 +122,8 @@ impl State {
         self.replay.set_actors(actors);
     }
 
-    /// Gives the run's count of transitions if the actor is taken.
-    fn join_actor(&mut self, join: ActorJoin) -> Result<u64, Rejection> {
+    /// Takes an actor that may take part; gives the number of its earlier lives.
+    fn join_actor(&mut self, join: ActorJoin) -> Result<u32, Rejection> {
         let ActorJoin { actor, epoch } = join;
         let other = self
             .replay
@@ -138,16 +139,16 @@ impl State {
                 "another process is actor {actor} of this run: give each actor a number of its own (--id)"
             )));
         }
-        self.replay.join_actor(join).map_err(Rejection::Refused)?;
+        let earlier_lives = self.replay.join_actor(join).map_err(Rejection::Refused)?;
         self.count_actors();
         if other.is_some() {
             // A chunk that was left behind.
             self.chunks.take(actor);
         }
-        Ok(self.replay.inserted_total())
+        Ok(earlier_lives)
     }
 
-    fn join_learner(&mut self, join: LearnerJoin) -> Result<u64, Rejection> {
+    fn join_learner(&mut self, join: LearnerJoin) -> Result<u32, Rejection> {
         let LearnerJoin {
             learner,
             rows_sampled,
@@ -166,6 +167,6 @@ impl State {
             self.members.learner = Some(learner);
             self.requests.keep_only(learner);
         }
-        Ok(self.replay.inserted_total())
+        Ok(0)
     }
 }

@@ -267,6 +267,8 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
         is_refused(&insert(&mut replay, header(0, 1, 0, 0))),
         "a past life"
     );
+    let again = replay.join_actor(ActorJoin { actor: 0, epoch: 2 });
+    assert_eq!(again, Ok(1), "one life before it");
     let back = ActorJoin { actor: 0, epoch: 1 };
     assert!(
         replay.join_actor(back).is_err(),
