@@ -2,12 +2,13 @@
 //! The processes and the lockstep mode run this same code; it neither sends nor waits.
 
 use anyhow::Context;
-use driml_protocol::{Chunk, PlanesPool};
+use driml_protocol::{Chunk, PlanesPool, RunSpec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    acting::Acting, config::ActorSettings, policy::NetworkPolicy, recorder::Recorder, schedule,
+    acting::Acting, config::ActorSettings, policy::NetworkPolicy, recorder::Recorder,
+    schedule::Schedule,
 };
 
 /// Which actor this is, and which life of it.
@@ -19,11 +20,26 @@ pub struct Life {
     pub epoch: u64,
     /// Updates after which the run goes on: a resumed run does not play the episodes of its start again.
     pub after_updates: u64,
+    /// Transitions that the run had when this life joined: one that follows a dead one does not play its episodes again.
+    /// 0 for those that are there at the run's start.
+    pub inserted_total_at_join: u64,
+}
+
+impl Life {
+    /// The seed of one of its generators. Lives that differ in number, `after_updates` or `inserted_total_at_join` have
+    /// others.
+    fn seed(&self, spec: &RunSpec, used_for: &str) -> [u8; 32] {
+        let index = u64::from(self.actor) | self.after_updates << u32::BITS;
+        match self.inserted_total_at_join {
+            0 => spec.seed_for(used_for, index),
+            inserted => spec.seed_for(&format!("{used_for} from {inserted}"), index),
+        }
+    }
 }
 
 /// An actor that collects.
 pub struct Collector {
-    settings: ActorSettings,
+    schedule: Schedule,
     acting: Acting,
     recorder: Recorder,
     policy: NetworkPolicy,
@@ -34,7 +50,8 @@ impl Collector {
     /// Makes the world and the policy with its first weights; chunks lie in memory of `pool`.
     ///
     /// # Errors
-    /// A world that cannot be made or does not fit the run spec, or weights that do not fit the model.
+    /// An actor beyond the ladder of epsilons, a world that cannot be made or does not fit the run spec, weights that do not fit
+    /// the model.
     pub fn new(
         settings: ActorSettings,
         pool: PlanesPool,
@@ -44,8 +61,8 @@ impl Collector {
     ) -> anyhow::Result<Self> {
         let spec = &settings.spec;
         let config = &settings.actor;
-        let stream = u64::from(life.actor) | life.after_updates << u32::BITS;
-        let world_seed = spec.seed_for("world", stream);
+        let schedule = Schedule::new(config, life.actor)?;
+        let world_seed = life.seed(spec, "world");
         let world = driml_envs::make_world(
             &settings.world,
             config.envs as usize,
@@ -72,7 +89,7 @@ impl Collector {
              write the run's settings anew with `driml local`",
             spec.world
         );
-        let rng = ChaCha8Rng::from_seed(spec.seed_for("exploration", stream));
+        let rng = ChaCha8Rng::from_seed(life.seed(spec, "exploration"));
         let policy = NetworkPolicy::new(&settings.model, (shape.height, shape.width), safetensors)?;
         Ok(Self {
             acting: Acting::new(world, spec.frame_stack as usize, rng)?,
@@ -85,7 +102,7 @@ impl Collector {
             ),
             policy,
             weights_version,
-            settings,
+            schedule,
         })
     }
 
@@ -110,7 +127,7 @@ impl Collector {
     /// The policy or the world failed.
     pub fn collect(&mut self, frames: u64, steps: u32) -> anyhow::Result<Chunk> {
         self.recorder.begin(self.weights_version, steps);
-        let epsilon = schedule::epsilon(&self.settings.actor, frames);
+        let epsilon = self.schedule.epsilon(frames);
         loop {
             let step = self.acting.step(&mut self.policy, epsilon)?;
             if let Some(chunk) =
@@ -120,5 +137,170 @@ impl Collector {
                 return Ok(chunk);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_envs::{ChainConfig, WorldConfig};
+    use driml_model::{Compute, ConvLayer, DimParts, ModelConfig, Parameters};
+    use driml_protocol::{Horizon, TimeoutRule, config::TransportConfig};
+
+    use super::*;
+    use crate::config::{Config, EpsilonLadder, InputSize};
+
+    const ENVS: u32 = 32;
+    const STEPS: u32 = 32;
+    const FIRST: Life = Life {
+        actor: 3,
+        epoch: 1,
+        after_updates: 0,
+        inserted_total_at_join: 0,
+    };
+
+    fn settings(epsilon: f64) -> ActorSettings {
+        ActorSettings {
+            spec: RunSpec {
+                world: "chain".into(),
+                agent: "c51".into(),
+                seed: 5,
+                frame_height: 12,
+                frame_width: 12,
+                frame_channels: 1,
+                frame_stack: 1,
+                num_actions: 3,
+                n_step: 1,
+                gamma: 0.9,
+                horizon: Horizon::None,
+                timeout: TimeoutRule::Terminal,
+            },
+            world: WorldConfig::Chain(ChainConfig {
+                cells: 8,
+                height: 12,
+                width: 12,
+                step_limit: 30,
+                reward_left: 0.1,
+                reward_right: 1.0,
+            }),
+            input: InputSize {
+                height: 12,
+                width: 12,
+            },
+            model: ModelConfig {
+                height: 12,
+                width: 12,
+                channels: 1,
+                num_actions: 3,
+                atoms: 5,
+                v_min: -1.0,
+                v_max: 1.0,
+                conv: vec![ConvLayer {
+                    out: 2,
+                    kernel: 4,
+                    stride: 4,
+                }],
+                hidden: 4,
+                rkhs: 4,
+                action_embed: 4,
+                dim: DimParts::NONE,
+            },
+            actor: Config {
+                envs: ENVS,
+                steps_per_chunk: STEPS,
+                round_transitions_max: None,
+                chunks_in_flight_max: 1,
+                world_threads: 0,
+                epsilon_start: epsilon,
+                epsilon_end: epsilon,
+                epsilon_decay_frames: 0,
+                epsilon_ladder: None,
+                ack_timeout_ms: 1000,
+                unreachable_max_ms: 1000,
+            },
+            transport: TransportConfig {
+                shared_memory: false,
+            },
+        }
+    }
+
+    fn collector(settings: ActorSettings, life: Life) -> anyhow::Result<Collector> {
+        let rng = &mut ChaCha8Rng::seed_from_u64(1);
+        let weights = Parameters::init(&settings.model, rng, &Compute::CPU.device).unwrap();
+        let weights = weights.to_safetensors(|_| true).unwrap();
+        Collector::new(settings, PlanesPool::new(1), life, 1, &weights)
+    }
+
+    /// The actions of a life's first chunk.
+    fn actions(settings: ActorSettings, life: Life) -> Vec<u8> {
+        let chunk = collector(settings, life)
+            .unwrap()
+            .collect(0, STEPS)
+            .unwrap();
+        assert_eq!(chunk.actions().len(), (ENVS * STEPS) as usize);
+        chunk.actions().to_vec()
+    }
+
+    #[test]
+    fn a_restarted_actor_does_not_repeat_its_own_random_numbers() {
+        let random = |life| actions(settings(1.0), life);
+        let first = random(FIRST);
+        assert_eq!(random(Life { epoch: 2, ..FIRST }), first);
+        let at = |inserted_total_at_join| Life {
+            inserted_total_at_join,
+            ..FIRST
+        };
+        let lives = [
+            FIRST,
+            at(1),
+            at(2),
+            Life { actor: 2, ..FIRST },
+            Life {
+                after_updates: 7,
+                ..FIRST
+            },
+            Life {
+                after_updates: 7,
+                ..at(1)
+            },
+        ];
+        let spec = settings(1.0).spec;
+        let mut seen = Vec::new();
+        for life in lives {
+            let new = (
+                random(life),
+                life.seed(&spec, "world"),
+                life.seed(&spec, "exploration"),
+            );
+            assert_ne!(new.1, new.2);
+            let repeats = |old: &(Vec<u8>, [u8; 32], [u8; 32])| {
+                old.0 == new.0 || old.1 == new.1 || old.2 == new.2
+            };
+            assert!(!seen.iter().any(repeats), "{life:?}");
+            seen.push(new);
+        }
+        // The first life has the seeds that it has always had.
+        assert_eq!(FIRST.seed(&spec, "world"), spec.seed_for("world", 3));
+    }
+
+    #[test]
+    fn an_actor_explores_by_its_own_rung_of_the_ladder() {
+        let greedy = actions(settings(0.0), FIRST);
+        let ladder = |base, actors| {
+            let mut settings = settings(0.0);
+            settings.actor.epsilon_ladder = Some(EpsilonLadder {
+                base,
+                alpha: 1.0,
+                actors,
+            });
+            settings
+        };
+        assert_ne!(actions(ladder(0.999, 8), FIRST), greedy);
+        assert_eq!(actions(ladder(1e-12, 8), FIRST), greedy);
+        let said = collector(ladder(0.5, 3), FIRST).map(|_| ()).unwrap_err();
+        assert!(
+            said.to_string()
+                .contains("--set actor.epsilon_ladder.actors=4"),
+            "{said}"
+        );
     }
 }

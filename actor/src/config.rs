@@ -9,6 +9,9 @@ use driml_protocol::{
 };
 use serde::{Deserialize, Serialize};
 
+/// Most actors on a ladder of epsilons; settings beyond it are refused.
+const ACTORS_MAX: u32 = 65_536;
+
 /// The `[actor]` table.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -32,10 +35,26 @@ pub struct Config {
     pub epsilon_end: f64,
     /// Frames of the whole run, all actors together, over which epsilon falls linearly.
     pub epsilon_decay_frames: u64,
+    /// Fixed epsilons, one an actor, instead of the one that falls; not there: it falls.
+    pub epsilon_ladder: Option<EpsilonLadder>,
     /// How long one try to deliver a chunk may take, milliseconds; then it is tried again.
     pub ack_timeout_ms: u64,
     /// How long the replay server or learner may be out of reach, milliseconds, before the actor gives up.
     pub unreachable_max_ms: u64,
+}
+
+/// Fixed epsilons, from rung to rung smaller: actor i of N explores with `base^(1 + alpha * i / (N - 1))` for the whole run.
+///
+/// Source: Horgan et al. 2018 (Ape-X), with base 0.4 and alpha 7.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EpsilonLadder {
+    /// Epsilon of actor 0, above 0 and below 1.
+    pub base: f64,
+    /// How far down the ladder goes, at least 0: the last actor's epsilon is `base^(1 + alpha)`.
+    pub alpha: f64,
+    /// Actors on the ladder, N, at least 2; `local.actors` where a person does not say it.
+    pub actors: u32,
 }
 
 /// The `[input]` table: the size at which the network sees a frame.
@@ -186,6 +205,9 @@ impl Config {
                 );
             }
         }
+        if let Some(ladder) = &self.epsilon_ladder {
+            ladder.validate()?;
+        }
         for (key, ms) in [
             ("ack_timeout_ms", self.ack_timeout_ms),
             ("unreachable_max_ms", self.unreachable_max_ms),
@@ -193,6 +215,39 @@ impl Config {
             if !(100..=86_400_000).contains(&ms) {
                 return bad(key, ms.to_string(), "a wait lasts 100 ms to one day");
             }
+        }
+        Ok(())
+    }
+}
+
+impl EpsilonLadder {
+    fn validate(&self) -> Result<(), ConfigError> {
+        let Self {
+            base,
+            alpha,
+            actors,
+        } = *self;
+        let bad = |key, value: String, why| Err(ConfigError { key, value, why });
+        if !(base > 0.0 && base < 1.0) {
+            return bad(
+                "epsilon_ladder.base",
+                base.to_string(),
+                "the first actor's probability lies between 0 and 1, without the two",
+            );
+        }
+        if !(alpha >= 0.0 && alpha.is_finite()) {
+            return bad(
+                "epsilon_ladder.alpha",
+                alpha.to_string(),
+                "epsilons fall from actor to actor, so it is a number of at least 0",
+            );
+        }
+        if !(2..=ACTORS_MAX).contains(&actors) {
+            return bad(
+                "epsilon_ladder.actors",
+                actors.to_string(),
+                "a ladder is for 2 to 65536 actors: give --actors, or set it where actors are started by hand",
+            );
         }
         Ok(())
     }
@@ -213,6 +268,7 @@ mod tests {
             epsilon_start: 0.1,
             epsilon_end: 0.01,
             epsilon_decay_frames: 1,
+            epsilon_ladder: None,
             ack_timeout_ms: 10_000,
             unreachable_max_ms: 60_000,
         };

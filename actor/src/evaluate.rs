@@ -51,3 +51,123 @@ pub fn episode_returns(
     );
     Ok(returns)
 }
+
+#[cfg(test)]
+mod tests {
+    use driml_envs::{EnvError, FrameShape};
+    use rand::SeedableRng;
+
+    use super::*;
+
+    /// A world whose copies play what is written down for each, over and over.
+    struct Scripted {
+        scripts: Vec<Vec<(f32, StepEnd)>>,
+        step: usize,
+    }
+
+    impl Environment for Scripted {
+        fn frame_shape(&self) -> FrameShape {
+            FrameShape {
+                height: 1,
+                width: 1,
+                channels: 1,
+            }
+        }
+
+        fn num_actions(&self) -> usize {
+            1
+        }
+
+        fn num_envs(&self) -> usize {
+            self.scripts.len()
+        }
+
+        fn observe(&mut self, frames: &mut [u8]) {
+            frames.fill(0);
+        }
+
+        fn step(
+            &mut self,
+            _actions: &[u8],
+            rewards: &mut [f32],
+            ends: &mut [StepEnd],
+        ) -> Result<(), EnvError> {
+            for (copy, script) in self.scripts.iter().enumerate() {
+                (rewards[copy], ends[copy]) = script[self.step % script.len()];
+            }
+            self.step += 1;
+            Ok(())
+        }
+    }
+
+    /// Writes down the epsilons it is given.
+    #[derive(Default)]
+    struct Tape(Vec<f64>);
+
+    impl Policy for Tape {
+        fn act(
+            &mut self,
+            _states: &[u8],
+            epsilon: f64,
+            _rng: &mut ChaCha8Rng,
+            actions: &mut [u8],
+        ) -> anyhow::Result<()> {
+            self.0.push(epsilon);
+            actions.fill(0);
+            Ok(())
+        }
+    }
+
+    fn play(
+        scripts: &[&[(f32, StepEnd)]],
+        episodes: usize,
+        steps_max: u64,
+    ) -> anyhow::Result<Vec<f64>> {
+        let scripts = scripts.iter().map(|script| script.to_vec()).collect();
+        let world = Box::new(Scripted { scripts, step: 0 });
+        let (mut policy, rng) = (Tape::default(), ChaCha8Rng::seed_from_u64(1));
+        let returns = episode_returns(world, 1, &mut policy, 0.25, episodes, steps_max, rng);
+        assert!(policy.0.iter().all(|&epsilon| epsilon == 0.25));
+        returns
+    }
+
+    const SHORT: &[(f32, StepEnd)] = &[(1.0, StepEnd::Terminal)];
+    const LONG: &[(f32, StepEnd)] = &[
+        (10.0, StepEnd::Running),
+        (20.0, StepEnd::LevelChange),
+        (30.0, StepEnd::Running),
+        (40.0, StepEnd::Terminal),
+    ];
+
+    #[test]
+    fn a_level_change_does_not_end_an_episode_and_a_time_out_does() {
+        let cut_off: &[_] = &[(2.0, StepEnd::Running), (3.0, StepEnd::TimedOut)];
+        assert_eq!(play(&[LONG], 2, 100).unwrap(), [100.0, 100.0]);
+        assert_eq!(play(&[cut_off], 2, 100).unwrap(), [5.0, 5.0]);
+    }
+
+    /// Taken as they end, the first four episodes would all be the short copy's.
+    #[test]
+    fn every_copy_plays_its_share_of_the_episodes() {
+        assert_eq!(
+            play(&[SHORT, LONG], 4, 100).unwrap(),
+            [1.0, 1.0, 100.0, 100.0]
+        );
+        // What is left over goes to the first copies.
+        assert_eq!(play(&[SHORT, LONG], 3, 100).unwrap(), [1.0, 1.0, 100.0]);
+        assert_eq!(play(&[LONG, SHORT], 3, 100).unwrap(), [1.0, 100.0, 100.0]);
+        assert_eq!(play(&[SHORT, LONG], 1, 100).unwrap(), [1.0]);
+    }
+
+    #[test]
+    fn episodes_that_do_not_end_are_an_error() {
+        assert_eq!(play(&[LONG], 1, 4).unwrap(), [100.0]);
+        let said = play(&[LONG], 2, 7).unwrap_err().to_string();
+        assert_eq!(
+            said,
+            "only 1 of 2 episodes ended within 7 steps of each copy: ask for fewer"
+        );
+        let endless: &[_] = &[(1.0, StepEnd::LevelChange)];
+        assert!(play(&[endless], 1, 50).is_err());
+    }
+}

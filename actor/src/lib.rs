@@ -15,5 +15,5 @@ pub mod schedule;
 mod weights;
 
 pub use collect::{Collector, Life};
-pub use config::{ActorSettings, Config, ConfigError, InputSize};
+pub use config::{ActorSettings, Config, ConfigError, EpsilonLadder, InputSize};
 pub use run::{RunArgs, run};

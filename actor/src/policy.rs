@@ -111,3 +111,83 @@ impl Policy for NetworkPolicy {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use driml_model::{Compute, ConvLayer, DimParts, Parameters};
+    use rand::SeedableRng;
+
+    use super::*;
+
+    const ACTIONS: usize = 5;
+    const STATES: usize = 4000;
+
+    fn policy() -> NetworkPolicy {
+        let model = ModelConfig {
+            height: 4,
+            width: 4,
+            channels: 1,
+            num_actions: ACTIONS,
+            atoms: 5,
+            v_min: -1.0,
+            v_max: 1.0,
+            conv: vec![ConvLayer {
+                out: 2,
+                kernel: 2,
+                stride: 2,
+            }],
+            hidden: 4,
+            rkhs: 4,
+            action_embed: 4,
+            dim: DimParts::NONE,
+        };
+        let rng = &mut ChaCha8Rng::seed_from_u64(1);
+        let weights = Parameters::init(&model, rng, &Compute::CPU.device).unwrap();
+        let weights = weights.to_safetensors(|_| true).unwrap();
+        NetworkPolicy::new(&model, (4, 4), &weights).unwrap()
+    }
+
+    /// How often each action is chosen in `STATES` equal states.
+    fn counts(policy: &mut dyn Policy, epsilon: f64) -> [usize; ACTIONS] {
+        let rng = &mut ChaCha8Rng::seed_from_u64(2);
+        let mut actions = vec![0; STATES];
+        policy
+            .act(&[9; 16 * STATES], epsilon, rng, &mut actions)
+            .unwrap();
+        let mut counts = [0; ACTIONS];
+        actions
+            .iter()
+            .for_each(|&action| counts[usize::from(action)] += 1);
+        counts
+    }
+
+    /// Chi-square against these shares, four degrees of freedom: above 18.5 once in a thousand.
+    fn check_shares(counts: [usize; ACTIONS], shares: [f64; ACTIONS]) {
+        let squares = counts.iter().zip(shares).map(|(&count, share)| {
+            let expected = share * STATES as f64;
+            (count as f64 - expected).powi(2) / expected
+        });
+        let chi_square: f64 = squares.sum();
+        assert!(chi_square < 18.5, "{counts:?}, not {shares:?}");
+    }
+
+    #[test]
+    fn each_action_is_random_with_probability_epsilon_and_else_greedy() {
+        let mut policy = policy();
+        let greedy = counts(&mut policy, 0.0);
+        let best = greedy.iter().position(|&count| count > 0).unwrap();
+        assert_eq!(greedy[best], STATES);
+        for epsilon in [0.1, 0.5, 1.0] {
+            // Chance may choose the greedy action too.
+            let mut shares = [epsilon / ACTIONS as f64; ACTIONS];
+            shares[best] += 1.0 - epsilon;
+            check_shares(counts(&mut policy, epsilon), shares);
+        }
+    }
+
+    #[test]
+    fn the_random_policy_knows_no_epsilon() {
+        let shares = [0.2; ACTIONS];
+        check_shares(counts(&mut RandomPolicy::new(ACTIONS as u8), 0.0), shares);
+    }
+}

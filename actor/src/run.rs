@@ -89,6 +89,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             actor: join.actor,
             epoch: join.epoch,
             after_updates: hello.after_updates,
+            inserted_total_at_join: hello.inserted_total,
         },
         header.version,
         &weights,

@@ -1,15 +1,189 @@
-//! How the probability of a random action falls over the run.
+//! With which probability an actor acts at random: one that falls over the run, or a fixed one of its own.
 //! It does not count frames: the caller says how many the run has.
 
-use crate::Config;
+use crate::config::{Config, EpsilonLadder};
 
-/// Epsilon after `frames` frames of the run: linear from `epsilon_start` to `epsilon_end`, then constant.
-///
-/// Source: table of parameters in the paper's appendix.
-pub fn epsilon(config: &Config, frames: u64) -> f64 {
-    if frames >= config.epsilon_decay_frames {
-        return config.epsilon_end;
+/// One actor's epsilon over the run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Schedule {
+    /// Linear over the frames of the whole run, then constant. Source: table of parameters in the paper's appendix.
+    Falling {
+        /// At the run's first frame.
+        start: f64,
+        /// From `decay_frames` on.
+        end: f64,
+        /// Frames of all actors together.
+        decay_frames: u64,
+    },
+    /// The same throughout. Source: Horgan et al. 2018.
+    Fixed(f64),
+}
+
+/// An actor for which the ladder has no epsilon.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "actor {actor} is beyond the {actors} of actor.epsilon_ladder.actors, whose numbers begin at 0: start it with another --id, or the \
+     replay server with --set actor.epsilon_ladder.actors={}", u64::from(*actor) + 1
+)]
+pub struct BeyondLadder {
+    actor: u32,
+    actors: u32,
+}
+
+impl Schedule {
+    /// The schedule of actor number `actor`.
+    ///
+    /// # Errors
+    /// A ladder that has fewer epsilons.
+    pub fn new(config: &Config, actor: u32) -> Result<Self, BeyondLadder> {
+        match &config.epsilon_ladder {
+            Some(ladder) => ladder_epsilon(ladder, actor).map(Self::Fixed),
+            None => Ok(Self::Falling {
+                start: config.epsilon_start,
+                end: config.epsilon_end,
+                decay_frames: config.epsilon_decay_frames,
+            }),
+        }
     }
-    let progress = frames as f64 / config.epsilon_decay_frames as f64;
-    config.epsilon_start + (config.epsilon_end - config.epsilon_start) * progress
+
+    /// Epsilon after `frames` frames of the run.
+    pub fn epsilon(&self, frames: u64) -> f64 {
+        match *self {
+            Self::Fixed(epsilon) => epsilon,
+            Self::Falling {
+                end, decay_frames, ..
+            } if frames >= decay_frames => end,
+            Self::Falling {
+                start,
+                end,
+                decay_frames,
+            } => start + (end - start) * (frames as f64 / decay_frames as f64),
+        }
+    }
+}
+
+/// `base^(1 + alpha * i / (N - 1))` for actor i of N.
+fn ladder_epsilon(ladder: &EpsilonLadder, actor: u32) -> Result<f64, BeyondLadder> {
+    let EpsilonLadder {
+        base,
+        alpha,
+        actors,
+    } = *ladder;
+    if actor >= actors {
+        return Err(BeyondLadder { actor, actors });
+    }
+    let down = f64::from(actor) / f64::from(actors - 1);
+    Ok(base.powf(1.0 + alpha * down))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CONFIG: Config = Config {
+        envs: 1,
+        steps_per_chunk: 1,
+        round_transitions_max: None,
+        chunks_in_flight_max: 1,
+        world_threads: 0,
+        epsilon_start: 0.1,
+        epsilon_end: 0.01,
+        epsilon_decay_frames: 100_000,
+        epsilon_ladder: None,
+        ack_timeout_ms: 1000,
+        unreachable_max_ms: 1000,
+    };
+
+    fn with_ladder(actors: u32) -> Config {
+        Config {
+            epsilon_ladder: Some(EpsilonLadder {
+                base: 0.4,
+                alpha: 7.0,
+                actors,
+            }),
+            ..CONFIG
+        }
+    }
+
+    #[test]
+    fn epsilon_falls_along_a_line_over_the_run_s_frames_and_stays() {
+        for actor in [0, 5] {
+            let schedule = Schedule::new(&CONFIG, actor).unwrap();
+            for (frames, epsilon) in [
+                (0, 0.1),
+                (1, 0.1 - 0.09e-5),
+                (25_000, 0.0775),
+                (50_000, 0.055),
+                (99_999, 0.01 + 0.09e-5),
+                (100_000, 0.01),
+                (u64::MAX, 0.01),
+            ] {
+                let found = schedule.epsilon(frames);
+                assert!((found - epsilon).abs() < 1e-12, "{frames}: {found}");
+            }
+        }
+        let at_once = Config {
+            epsilon_decay_frames: 0,
+            ..CONFIG
+        };
+        assert_eq!(Schedule::new(&at_once, 0).unwrap().epsilon(0), 0.01);
+    }
+
+    /// Closed form: with alpha 7, eight actors have the powers 1, 2, .., 8 of 0.4.
+    #[test]
+    fn each_actor_has_its_rung_of_the_ladder_for_the_whole_run() {
+        for actor in 0..8 {
+            let schedule = Schedule::new(&with_ladder(8), actor).unwrap();
+            let wanted = 0.4f64.powi(actor as i32 + 1);
+            for frames in [0, 1, 100_000, u64::MAX] {
+                let found = schedule.epsilon(frames);
+                assert!((found - wanted).abs() < 1e-12, "{actor}: {found}");
+            }
+        }
+        // The ends are the same whatever the number of actors.
+        for actors in [2, 3, 360] {
+            let epsilon = |actor| {
+                Schedule::new(&with_ladder(actors), actor)
+                    .unwrap()
+                    .epsilon(7)
+            };
+            assert!((epsilon(0) - 0.4).abs() < 1e-12);
+            assert!((epsilon(actors - 1) - 0.4f64.powi(8)).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn an_actor_beyond_the_ladder_is_told_what_to_do() {
+        let said = Schedule::new(&with_ladder(8), 9).unwrap_err().to_string();
+        assert_eq!(
+            said,
+            "actor 9 is beyond the 8 of actor.epsilon_ladder.actors, whose numbers begin at 0: start it with another --id, or \
+             the replay server with --set actor.epsilon_ladder.actors=10"
+        );
+        assert!(Schedule::new(&with_ladder(8), u32::MAX).is_err());
+    }
+
+    #[test]
+    fn ladders_that_cannot_work_are_refused() {
+        let said = |change: fn(&mut EpsilonLadder)| {
+            let mut config = with_ladder(8);
+            change(config.epsilon_ladder.as_mut().unwrap());
+            config.validate().unwrap_err().to_string()
+        };
+        with_ladder(2).validate().unwrap();
+        for (said, key) in [
+            (said(|ladder| ladder.base = 0.0), "base = 0 "),
+            (said(|ladder| ladder.base = 1.0), "base = 1 "),
+            (said(|ladder| ladder.base = f64::NAN), "base = NaN "),
+            (said(|ladder| ladder.alpha = -1.0), "alpha = -1 "),
+            (said(|ladder| ladder.alpha = f64::INFINITY), "alpha = inf "),
+            (said(|ladder| ladder.actors = 1), "actors = 1 "),
+            (said(|ladder| ladder.actors = 65_537), "actors = 65537 "),
+        ] {
+            assert!(
+                said.starts_with(&format!("actor.epsilon_ladder.{key}")),
+                "{said}"
+            );
+        }
+    }
 }

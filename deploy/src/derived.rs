@@ -108,7 +108,19 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         put(table, path, value);
     }
     visible_actions(table, world, num_actions);
+    ladder(table);
     Ok(())
+}
+
+/// Fills in for how many actors the ladder of epsilons is, where there is one and nobody says it.
+fn ladder(table: &mut Table) {
+    let asked = find(table, "actor.epsilon_ladder").is_some_and(Value::is_table);
+    if asked
+        && find(table, "actor.epsilon_ladder.actors").is_none()
+        && let Some(actors) = find(table, "local.actors").cloned()
+    {
+        put(table, "actor.epsilon_ladder.actors", actors);
+    }
 }
 
 /// Fills in what each action amounts to in the world, where that is asked for and not given.

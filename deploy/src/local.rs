@@ -53,6 +53,7 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
         )
         .into());
     }
+    check_ladder(&config)?;
     let run_dir = match args.resume {
         Some(folder) => folder,
         None => {
@@ -88,6 +89,18 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
             args.listen,
             args.exit_with_parent,
         )
+    }
+}
+
+/// Where this program starts all actors, the ladder of epsilons is theirs, no rung empty.
+fn check_ladder(config: &RunConfig) -> Result<(), Usage> {
+    let actors = config.local.actors;
+    match &config.actor.epsilon_ladder {
+        Some(ladder) if ladder.actors != actors => Err(usage!(
+            "actor.epsilon_ladder is for {} actors, but {actors} are started: --set actor.epsilon_ladder.actors={actors}",
+            ladder.actors
+        )),
+        _ => Ok(()),
     }
 }
 

@@ -128,6 +128,7 @@ impl Parts {
                 actor,
                 epoch: EPOCH,
                 after_updates: 0,
+                inserted_total_at_join: 0,
             };
             Collector::new(
                 settings.clone(),

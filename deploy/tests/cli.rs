@@ -187,8 +187,9 @@ fn parity_files_that_are_none() {
     "#]]
     .assert_eq(&in_folder(&["parity", "cut.safetensors"]));
     expect![[r#"
-        error: cannot read none.safetensors: No such file or directory (os error 2): No such file or directory (os error 2)
-    "#]].assert_eq(&in_folder(&["parity", "none.safetensors"]));
+        error: cannot read none.safetensors: No such file or directory (os error 2)
+    "#]]
+    .assert_eq(&in_folder(&["parity", "none.safetensors"]));
 }
 
 #[test]

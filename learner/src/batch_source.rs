@@ -26,8 +26,6 @@ use crate::shards::{self, Count};
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
 /// Pause between two tries when the replay server is out of reach.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
-/// How long the replay server may be out of reach before the learner gives up.
-const UNREACHABLE_MAX: Duration = Duration::from_secs(60);
 
 /// Pause before shards that hold nothing are asked again.
 const LOOK_AGAIN: Duration = Duration::from_millis(50);
@@ -45,6 +43,8 @@ pub struct Requests {
     pub in_flight: u32,
     /// Whether batches may come through shared memory.
     pub shared_memory: bool,
+    /// How long the replay server may be out of reach before the learner gives up.
+    pub unreachable_max: Duration,
 }
 
 /// What a fetching thread says.
@@ -198,9 +198,10 @@ impl Fetcher {
                     continue;
                 }
                 Ok(Some(fetched)) => fetched,
-                Err(e) if answered.elapsed() > UNREACHABLE_MAX => Fetched::Failed(
-                    e.context(format!("no batch and no answer for {UNREACHABLE_MAX:?}")),
-                ),
+                Err(e) if answered.elapsed() > self.requests.unreachable_max => {
+                    let max = self.requests.unreachable_max;
+                    Fetched::Failed(e.context(format!("no batch and no answer for {max:?}")))
+                }
                 Err(e) => {
                     if let Some(more) = self.said.due() {
                         tracing::warn!("asking for a batch again: {e:#}{more}");

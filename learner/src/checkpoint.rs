@@ -30,6 +30,8 @@ const OPTIMIZER: &str = "optimizer.safetensors";
 const STATE: &str = "state.json";
 const LOCK: &str = ".lock";
 const STATE_SUM: &str = "state.json.sha256";
+/// Largest count in a state: no run comes near it, and what is added to counts cannot overflow.
+const COUNT_MAX: u64 = 1 << 53;
 /// What follows the name of a checkpoint while one of the same update takes its place.
 const REPLACED: &str = ".replaced.tmp";
 
@@ -76,6 +78,9 @@ pub enum CheckpointError {
          own encodes them, which this checkpoint lacks: go on with the earlier version, or begin anew in another folder", .0.display()
     )]
     WithoutKeyEncoder(PathBuf),
+    /// The learner's state is not one to go on from.
+    #[error("nothing is saved, and the newest checkpoint stays the newest: {0}")]
+    Unsound(UpdateError),
     /// The state does not fit the network or the settings.
     #[error("checkpoint: {0}")]
     Update(#[from] UpdateError),
@@ -130,13 +135,32 @@ struct StateFile {
     sha256: BTreeMap<String, String>,
 }
 
+impl StateFile {
+    /// Checks what its types do not hold: a file may be right by its sum and still not be one that a learner wrote.
+    fn check_valid(&self) -> Result<(), String> {
+        for (name, count) in [
+            ("updates", self.updates),
+            ("adam_step", self.adam_step),
+            ("weights_version", self.weights_version),
+        ] {
+            if count > COUNT_MAX {
+                return Err(format!("{name} is {count}, more than {COUNT_MAX}"));
+            }
+        }
+        let valid = self.affinity.as_ref().map(AffinityEstimator::check_valid);
+        valid.transpose().map_err(|why| why.to_string())?;
+        Ok(())
+    }
+}
+
 /// Writes `folder/checkpoint-<updates>` and removes all but the newest `keep` checkpoints.
 ///
 /// Every file is written aside, flushed to disk and renamed; so is the folder: a crash at any moment leaves the older
 /// checkpoints whole and at most a `.tmp` folder, which the next save removes.
 ///
 /// # Errors
-/// A failing file system, such as a full disk; nothing older has then been removed, and nothing of the new one is left.
+/// A state that is not finite, or a failing file system, such as a full disk; nothing older has then been removed, and nothing
+/// of the new one is left.
 pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf, CheckpointError> {
     if keep == 0 {
         return Err(CheckpointError::KeepNone);
@@ -163,23 +187,9 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
 /// Writes a checkpoint's files into the folder `aside`, which is made.
 fn write(aside: &Path, state: &RunState<'_>) -> Result<(), CheckpointError> {
     let learner = state.learner;
+    let files = tensor_files(learner).map_err(CheckpointError::Unsound)?;
     fs::create_dir(aside).map_err(io_error("create", aside))?;
-    let everything = |parameters: &Parameters| {
-        parameters
-            .to_safetensors(|_| true)
-            .map_err(UpdateError::from)
-    };
-    let moments = learner.adam.to_tensors()?;
-    let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from);
     let mut sha256 = BTreeMap::new();
-    let mut files = vec![
-        (ONLINE, everything(learner.online())?),
-        (TARGET, everything(learner.target())?),
-        (OPTIMIZER, moments.map_err(UpdateError::from)?),
-    ];
-    if let Some(key) = learner.key() {
-        files.push((KEY, everything(key)?));
-    }
     for (name, bytes) in files {
         write_durably(&aside.join(name), &bytes)?;
         sha256.insert(name.to_owned(), sha256_of(&bytes));
@@ -239,6 +249,22 @@ fn tidy(folder: &Path) -> Result<(), CheckpointError> {
         }
     }
     Ok(())
+}
+
+/// The files of tensors and their names, all finite.
+fn tensor_files(learner: &Learner) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
+    let everything = |parameters: &Parameters| parameters.to_safetensors(|_| true);
+    let moments = learner.adam.to_tensors()?;
+    let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from)?;
+    let mut files = vec![
+        (ONLINE, everything(learner.online())?),
+        (TARGET, everything(learner.target())?),
+        (OPTIMIZER, moments),
+    ];
+    if let Some(key) = learner.key() {
+        files.push((KEY, everything(key)?));
+    }
+    Ok(files)
 }
 
 /// Keeps other learners from saving in `folder`, which is made, as long as the file is held.
@@ -358,6 +384,9 @@ pub fn load(
     if state.format == 1 && settings.curl.is_some() {
         return Err(CheckpointError::WithoutKeyEncoder(path.to_owned()));
     }
+    state
+        .check_valid()
+        .map_err(|why| damaged(path, STATE, why))?;
     let tensors = |name: &str| {
         let bytes = read(&path.join(name))?;
         if state.sha256.get(name) == Some(&sha256_of(&bytes)) {

@@ -33,12 +33,20 @@ pub struct Config {
     pub checkpoint_period_updates: u64,
     /// Checkpoints kept; older ones are removed.
     pub checkpoints_kept: u32,
+    /// How long the replay server may be out of reach, milliseconds, before the learner saves and gives up. Settings of earlier
+    /// versions do not have it: a minute.
+    #[serde(default = "a_minute_ms")]
+    pub unreachable_max_ms: u64,
     /// Losses, optimiser and target network.
     pub update: LearnerSettings,
     /// What is done to the states that the auxiliary objective sees; nothing if it is not there.
     pub augment: Option<AugmentSettings>,
     /// Action affinity.
     pub affinity: AffinityConfig,
+}
+
+const fn a_minute_ms() -> u64 {
+    60_000
 }
 
 /// How A is estimated.
@@ -167,6 +175,7 @@ impl Config {
                 u64::from(self.checkpoints_kept),
                 1_000_000,
             ),
+            ("unreachable_max_ms", self.unreachable_max_ms, 86_400_000),
         ] {
             if value == 0 || value > max {
                 let why = format!("it must lie between 1 and {max}");

@@ -128,10 +128,11 @@ impl Learning {
         self.learner.updates()
     }
 
-    /// Learns from one batch: the network, then the affinity.
+    /// Learns from one batch: the network and the affinity.
     ///
     /// # Errors
-    /// A batch that does not fit, or arithmetic that left the finite numbers; the learner is then as it was.
+    /// A batch that does not fit, or arithmetic that left the finite numbers; all is then as it was, except after
+    /// [`UpdateError::Diverged`](crate::UpdateError::Diverged), when neither weights nor a checkpoint can be had any more.
     pub fn update(&mut self, batch: &WireBatch) -> anyhow::Result<UpdateReport> {
         let mut frames = [batch.frames_t(), batch.frames_k(), batch.frames_n()];
         if let Some(enlarge) = &self.enlarge {
@@ -171,11 +172,13 @@ impl Learning {
             bootstrap_discount: &discounts,
             positive_valid: valid,
         };
-        let report = self.learner.update(&batch)?;
-        self.rng = rng;
-        if let Some(affinity) = &mut self.affinity {
-            affinity.observe(&batch.action_pairs(), &mut self.rng)?;
+        self.learner.check(&batch)?;
+        let mut affinity = self.affinity.clone();
+        if let Some(affinity) = &mut affinity {
+            affinity.observe(&batch.action_pairs(), &mut rng)?;
         }
+        let report = self.learner.update(&batch)?;
+        (self.rng, self.affinity) = (rng, affinity);
         Ok(report)
     }
 

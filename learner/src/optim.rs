@@ -3,7 +3,10 @@
 
 use std::{
     collections::{BTreeMap, HashMap},
-    sync::Mutex,
+    sync::{
+        Mutex,
+        atomic::{AtomicBool, Ordering},
+    },
 };
 
 use candle_core::{CpuStorage, Device, InplaceOp2, Layout, Tensor, Var, bail};
@@ -134,31 +137,24 @@ impl Adam {
     /// Source: PyTorch's `Adam` without weight decay.
     ///
     /// # Errors
-    /// A gradient whose shape or type is not its parameter's.
+    /// A gradient whose shape or type is not its parameter's; a step size beyond the finite numbers, before anything has
+    /// changed; [`UpdateError::Diverged`] for a parameter or moment that the step took beyond them. The last is found out on the
+    /// CPU alone, where it costs nothing; on other devices no such parameter passes [`Parameters::to_safetensors`].
     pub fn step(
         &mut self,
         parameters: &Parameters,
         gradients: &Gradients,
         factor: f64,
     ) -> Result<(), UpdateError> {
-        self.step += 1;
-        let AdamSettings {
-            lr,
-            beta1,
-            beta2,
-            eps,
-        } = self.settings;
-        let t = i32::try_from(self.step).unwrap_or(i32::MAX);
-        let rule = Rule {
-            factor: factor as f32,
-            beta1: beta1 as f32,
-            rest1: (1.0 - beta1) as f32,
-            beta2: beta2 as f32,
-            rest2: (1.0 - beta2) as f32,
-            step_size: (lr / (1.0 - beta1.powi(t))) as f32,
-            root_scale: (1.0 / (1.0 - beta2.powi(t)).sqrt()) as f32,
-            eps: eps as f32,
-        };
+        let step = self.step + 1;
+        let lr = self.settings.lr;
+        let rule = Rule::new(self.settings, step, factor);
+        if !rule.step_size.is_finite() {
+            return Err(UpdateError::NonFinite {
+                what: format!("a step of Adam with lr = {lr:e}"),
+            });
+        }
+        self.step = step;
         for (name, (_, moments)) in &mut self.moments {
             let (Some(var), Some(gradient)) = (parameters.get(name), gradients.get(name)) else {
                 continue;
@@ -166,7 +162,17 @@ impl Adam {
             match moments {
                 Moments::Fused { m, v } => {
                     let moments = Mutex::new((m.as_mut_slice(), v.as_mut_slice()));
-                    var.inplace_op2(gradient, &Step { rule, moments })?;
+                    let all_finite = AtomicBool::new(true);
+                    let step = Step {
+                        rule,
+                        moments,
+                        all_finite,
+                    };
+                    var.inplace_op2(gradient, &step)?;
+                    if !step.all_finite.into_inner() {
+                        let name = name.clone();
+                        return Err(UpdateError::Diverged { name, lr });
+                    }
                 }
                 Moments::Tensors { m, v } => rule.apply_to_tensors(var, gradient, m, v)?,
             }
@@ -177,11 +183,17 @@ impl Adam {
     /// The moments as tensors: `m.<name>` and `v.<name>`, in the parameters' shapes.
     ///
     /// # Errors
-    /// A failing allocation.
+    /// A failing allocation, or a moment that is not finite.
     pub fn to_tensors(&self) -> Result<HashMap<String, Tensor>, UpdateError> {
         let mut tensors = HashMap::new();
         for (name, (shape, moments)) in &self.moments {
             for (which, tensor) in ["m", "v"].into_iter().zip(moments.tensors(shape)?) {
+                let values = tensor.flatten_all()?.to_vec1::<f32>()?;
+                if !values.iter().all(|value| value.is_finite()) {
+                    return Err(UpdateError::State(format!(
+                        "the moment {which}.{name} is not finite"
+                    )));
+                }
                 tensors.insert(format!("{which}.{name}"), tensor);
             }
         }
@@ -240,13 +252,41 @@ struct Rule {
 }
 
 impl Rule {
-    fn apply(&self, p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32]) {
+    /// The numbers of step number `step`, counted from 1, on gradients times `factor`.
+    fn new(settings: AdamSettings, step: u64, factor: f64) -> Self {
+        let AdamSettings {
+            lr,
+            beta1,
+            beta2,
+            eps,
+        } = settings;
+        let t = i32::try_from(step).unwrap_or(i32::MAX);
+        Self {
+            factor: factor as f32,
+            beta1: beta1 as f32,
+            rest1: (1.0 - beta1) as f32,
+            beta2: beta2 as f32,
+            rest2: (1.0 - beta2) as f32,
+            step_size: (lr / (1.0 - beta1.powi(t))) as f32,
+            root_scale: (1.0 / (1.0 - beta2.powi(t)).sqrt()) as f32,
+            eps: eps as f32,
+        }
+    }
+
+    /// Takes the step on one stretch; says whether its parameters and second moments are finite after it. (So are then the
+    /// first moments, as a mean is no larger than the root of the mean square.)
+    #[allow(clippy::eq_op, reason = "x - x tells finite numbers from others")]
+    fn apply(&self, p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32]) -> bool {
+        // x - x is 0 for a finite x, else NaN. Collecting bits, unlike a test in the loop, costs nothing measurable.
+        let mut not_finite = 0;
         for (((p, &g), m), v) in p.iter_mut().zip(g).zip(m).zip(v) {
             let g = g * self.factor;
             *m = self.beta1 * *m + self.rest1 * g;
             *v = self.beta2 * *v + self.rest2 * g * g;
             *p -= self.step_size * *m / (v.sqrt() * self.root_scale + self.eps);
+            not_finite |= ((*p - *p) + (*v - *v)).to_bits();
         }
+        not_finite == 0
     }
 
     /// The same on tensors.
@@ -270,6 +310,8 @@ struct Step<'a> {
     rule: Rule,
     /// Uncontended: candle hands operations out by shared reference only.
     moments: Mutex<(&'a mut [f32], &'a mut [f32])>,
+    /// Whether all parameters and moments are finite after the step.
+    all_finite: AtomicBool,
 }
 
 impl InplaceOp2 for Step<'_> {
@@ -303,7 +345,11 @@ impl InplaceOp2 for Step<'_> {
             .par_chunks_mut(CHUNK)
             .zip(gradient.par_chunks(CHUNK))
             .zip(m.par_chunks_mut(CHUNK).zip(v.par_chunks_mut(CHUNK)))
-            .for_each(|((p, g), (m, v))| self.rule.apply(p, g, m, v));
+            .for_each(|((p, g), (m, v))| {
+                if !self.rule.apply(p, g, m, v) {
+                    self.all_finite.store(false, Ordering::Relaxed);
+                }
+            });
         Ok(())
     }
 }
@@ -330,5 +376,46 @@ pub(crate) fn slice_mut<'a>(
             "a tensor of shape {:?} is not contiguous f32",
             layout.shape()
         ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SETTINGS: AdamSettings = AdamSettings {
+        lr: 1.0,
+        beta1: 0.9,
+        beta2: 0.999,
+        eps: 1e-8,
+    };
+
+    /// Whether a step is fine at this parameter and gradient, in the last of so many elements.
+    fn fine(settings: AdamSettings, elements: usize, parameter: f32, gradient: f32) -> bool {
+        let rule = Rule::new(settings, 1, 1.0);
+        let (mut p, mut g) = (vec![0.5; elements], vec![0.1; elements]);
+        (p[elements - 1], g[elements - 1]) = (parameter, gradient);
+        let (mut m, mut v) = (vec![0.0; elements], vec![0.0; elements]);
+        rule.apply(&mut p, &g, &mut m, &mut v)
+    }
+
+    #[test]
+    fn a_step_beyond_the_finite_numbers_is_noticed_wherever_it_is() {
+        for elements in [1, 2, 7, 16, 33] {
+            assert!(fine(SETTINGS, elements, 3e38, 1.0));
+            let far = AdamSettings {
+                lr: 1e37,
+                ..SETTINGS
+            };
+            assert!(fine(far, elements, 3e38, 1.0), "towards 0");
+            assert!(
+                !fine(far, elements, 3.4e38, -1.0),
+                "past the largest number"
+            );
+            assert!(!fine(SETTINGS, elements, f32::NAN, 1.0));
+            assert!(!fine(SETTINGS, elements, f32::NEG_INFINITY, 1.0));
+            // The square of the gradient is not finite: the parameter would stand still for good.
+            assert!(!fine(SETTINGS, elements, 0.0, 1e30));
+        }
     }
 }

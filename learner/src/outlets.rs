@@ -87,7 +87,7 @@ impl Outlets {
         let status: Arc<Mutex<LearnerStatus>> = Arc::default();
         let heard: Arc<AtomicBool> = Arc::default();
         let (held, told) = (status.clone(), heard.clone());
-        let status_asked = Answering::start("status", 1, move |query| {
+        let status_asked = Answering::start("learner-status", 1, move |query| {
             let status = lock(&held).clone();
             match codec::encode(Kind::LearnerStatus, spec_hash, &status, &[]) {
                 Ok(bytes) => {
@@ -112,7 +112,8 @@ impl Outlets {
             affinity: Arc::default(),
             _queryables: queryables,
         };
-        let to_all = |key: String, timeout| Sender {
+        let to_all = |what, key: String, timeout| Sender {
+            what,
             sessions: sessions.to_vec(),
             key,
             spec_hash,
@@ -120,32 +121,19 @@ impl Outlets {
             shutdown: shutdown.clone(),
             said: Seldom::default(),
         };
-        let (newest, mut sender) = (
-            this.weights.clone(),
-            to_all(keys.weights_upload(), WEIGHTS_TIMEOUT),
-        );
-        let send_weights = move || {
-            sender.run(&newest, "weights-upload", |(header, safetensors)| {
-                let upload = WeightsUpload {
-                    learner,
-                    weights: *header,
-                };
-                let head = codec::seal(Kind::WeightsUpload, spec_hash, &upload, safetensors)?;
-                Ok(session::join_planes(head, safetensors.clone().into()))
-            });
-        };
-        let (newest, mut sender) = (
-            this.affinity.clone(),
-            to_all(keys.affinity(), AFFINITY_TIMEOUT),
-        );
-        let send_affinity = move || {
-            sender.run(&newest, "affinity", |update| {
-                Ok(codec::encode(Kind::Affinity, spec_hash, update, &[])?.into())
-            });
-        };
-        let named = |name: &str| std::thread::Builder::new().name(name.into());
-        named("weights-upload").spawn(send_weights)?;
-        named("affinity").spawn(send_affinity)?;
+        let weights = to_all("weights", keys.weights_upload(), WEIGHTS_TIMEOUT);
+        weights.start(this.weights.clone(), move |(header, safetensors)| {
+            let upload = WeightsUpload {
+                learner,
+                weights: *header,
+            };
+            let head = codec::seal(Kind::WeightsUpload, spec_hash, &upload, safetensors)?;
+            Ok(session::join_planes(head, safetensors.clone().into()))
+        })?;
+        let affinity = to_all("affinity", keys.affinity(), AFFINITY_TIMEOUT);
+        affinity.start(this.affinity.clone(), move |update| {
+            Ok(codec::encode(Kind::Affinity, spec_hash, update, &[])?.into())
+        })?;
         Ok(this)
     }
 
@@ -185,6 +173,7 @@ impl Outlets {
 
 /// Sends the newest of its kind to all replay servers, again until each has said that it has it or something newer is there.
 struct Sender {
+    what: &'static str,
     sessions: Vec<Session>,
     key: String,
     spec_hash: u64,
@@ -194,31 +183,38 @@ struct Sender {
 }
 
 impl Sender {
-    /// `what` names what is sent, and the thread, which ends with the shutdown.
-    fn run<T>(
-        &mut self,
-        newest: &Newest<T>,
-        what: &'static str,
-        message: impl Fn(&T) -> anyhow::Result<ZBytes>,
-    ) {
-        while !self.shutdown.is_set() {
-            fault::point(what);
-            let Some(value) = newest.take() else { continue };
-            let message = match message(&value) {
-                Ok(message) => message,
-                Err(e) => {
-                    tracing::error!("{what} cannot be sent: {e:#}");
-                    continue;
+    /// Starts a thread that sends until the shutdown; `message` makes the bytes of what is sent.
+    fn start<T: Send + 'static>(
+        mut self,
+        newest: Arc<Newest<T>>,
+        message: impl Fn(&T) -> anyhow::Result<ZBytes> + Send + 'static,
+    ) -> std::io::Result<()> {
+        let name = format!("{}-sender", self.what);
+        let thread = std::thread::Builder::new().name(name.clone());
+        thread.spawn(move || {
+            while !self.shutdown.is_set() {
+                fault::point(&name);
+                let Some(value) = newest.take() else { continue };
+                match message(&value) {
+                    Ok(message) => self.send_to_all(&message, || newest.is_filled()),
+                    Err(e) => tracing::error!("the {} cannot be sent: {e:#}", self.what),
                 }
-            };
-            for session in self.sessions.clone() {
-                while let Err(e) = self.send(&session, message.clone()) {
-                    if newest.is_filled() || self.shutdown.wait_timeout(RETRY_PAUSE) {
-                        break;
-                    }
-                    if let Some(more) = self.said.due() {
-                        tracing::warn!("{what} did not arrive, trying again: {e:#}{more}");
-                    }
+            }
+        })?;
+        Ok(())
+    }
+
+    fn send_to_all(&mut self, message: &ZBytes, is_old: impl Fn() -> bool) {
+        for session in &self.sessions {
+            while let Err(e) = self.send(session, message.clone()) {
+                if is_old() || self.shutdown.wait_timeout(RETRY_PAUSE) {
+                    break;
+                }
+                if let Some(more) = self.said.due() {
+                    tracing::warn!(
+                        "the {} did not arrive, trying again: {e:#}{more}",
+                        self.what
+                    );
                 }
             }
         }

@@ -58,6 +58,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         rows,
         in_flight: part.learner.batches_in_flight,
         shared_memory: part.transport.shared_memory,
+        unreachable_max: Duration::from_millis(part.learner.unreachable_max_ms),
     };
     if requests.shared_memory
         && let Err(why) =

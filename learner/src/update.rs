@@ -107,7 +107,8 @@ impl LearnerSettings {
     }
 }
 
-/// Why an update, or the making of a learner, did not happen. Parameters are then as they were before.
+/// Why an update, or the making of a learner, did not happen. But for [`UpdateError::Diverged`] parameters are then as they
+/// were before.
 #[derive(Debug, thiserror::Error)]
 pub enum UpdateError {
     /// The batch is not one of this network's, or holds values that no world gives.
@@ -127,6 +128,17 @@ pub enum UpdateError {
     NonFinite {
         /// The first quantity in which it showed.
         what: String,
+    },
+    /// The step itself left the finite numbers: this learner cannot go on, nor be published or saved.
+    #[error(
+        "the update took {name} beyond the finite numbers; the learner cannot go on from here: go on from the newest checkpoint with \
+         a learner.update.adam.lr below {lr:e}"
+    )]
+    Diverged {
+        /// The first parameter in which it showed.
+        name: String,
+        /// The learning rate.
+        lr: f64,
     },
     /// The model refused.
     #[error(transparent)]
@@ -304,7 +316,7 @@ impl Learner {
     /// What actors need, torso and head, as safetensors bytes.
     ///
     /// # Errors
-    /// A failing serialisation.
+    /// A weight that is not finite; a failing serialisation.
     pub fn weights(&self) -> Result<Vec<u8>, UpdateError> {
         Ok(self
             .online
@@ -314,7 +326,8 @@ impl Learner {
     /// Learns from one batch.
     ///
     /// # Errors
-    /// A batch that does not fit, or losses or gradients that are not finite: nothing has then changed.
+    /// A batch that does not fit, or losses or gradients that are not finite: nothing has then changed. A step beyond the
+    /// finite numbers, [`UpdateError::Diverged`]: the learner is then good for nothing, and can be neither published nor saved.
     pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
         let evaluation = self.evaluate(batch)?;
         let grad_norm = self.apply(&evaluation.gradients)?;
@@ -333,12 +346,20 @@ impl Learner {
         })
     }
 
+    /// Checks that `batch` is one of this network's and objective's.
+    ///
+    /// # Errors
+    /// [`UpdateError::Batch`] with what is wrong with it.
+    pub(crate) fn check(&self, batch: &Batch<'_>) -> Result<(), UpdateError> {
+        batch.validate(&self.model, &self.auxiliary)
+    }
+
     /// Losses and gradients of one batch at the present parameters.
     ///
     /// # Errors
     /// A batch that does not fit, or losses that are not finite.
     pub fn evaluate(&self, batch: &Batch<'_>) -> Result<Evaluation, UpdateError> {
-        batch.validate(&self.model, &self.auxiliary)?;
+        self.check(batch)?;
         let (next_greedy_action, target_projection) = self.make_target(batch)?;
 
         let features_t = self
@@ -427,7 +448,7 @@ impl Learner {
     /// Returns their global norm before clipping.
     ///
     /// # Errors
-    /// Gradients that are not finite: nothing has then changed.
+    /// As [`Learner::update`].
     pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
         let norm = gradients.norm(self.compute.operations)?;
         self.adam.step(

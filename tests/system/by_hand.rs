@@ -59,7 +59,10 @@ fn parts_that_are_told_to_stop_lose_nothing() {
     let system = system();
     let mut server = system.start_replay_server(&format!("--agent c51 {LONG}"));
     let mut learner = system.start_learner("run");
-    let actors = [system.start_actor(0), system.start_actor(1)];
+    let mut actors = [system.start_actor(0), system.start_actor(1)];
+    for actor in &mut actors {
+        actor.wait_for_stderr("steps 4 copies");
+    }
     let client = system.connect();
     client.wait_for_learner("some updates", |learner| learner.updates > 100);
     client.wait_for_replay("both actors", |replay| replay.actors == 2);

@@ -147,6 +147,7 @@ fn every_batch_comes_once(shards: u32) {
         rows: ROWS,
         in_flight: 2,
         shared_memory: false,
+        unreachable_max: Duration::from_secs(60),
     };
     let stop = Shutdown::default();
     let mut source = BatchSource::start(&sessions, &keys, hash, requests, &stop).unwrap();

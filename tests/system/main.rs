@@ -7,7 +7,9 @@ mod bad_messages;
 mod bad_weights;
 mod by_hand;
 mod closed_terminal;
+mod company;
 mod disk_full;
+mod diverging;
 mod doctor;
 mod evaluate;
 mod failures;
@@ -20,6 +22,7 @@ mod parity;
 mod procgen;
 mod repo_rules;
 mod resume;
+mod successors;
 
 use driml_tests::{Process, TestSystem};
 

@@ -7,19 +7,26 @@ use driml_tests::{Ended, TestSystem};
 use crate::{LONG, system};
 
 /// The threads of the parts: the part as the launcher calls it, and the point that the thread passes.
-const THREADS: &[(&str, &str)] = &[
-    ("replay-server", "affinity"),
-    ("replay-server", "claim"),
-    ("replay-server", "goodbye"),
-    ("replay-server", "hello"),
+const THREADS: [(&str, &str); 19] = [
     ("replay-server", "insert"),
+    ("replay-server", "claim"),
+    ("replay-server", "admit"),
+    ("replay-server", "request"),
+    ("replay-server", "sample"),
+    ("replay-server", "affinity"),
+    ("replay-server", "hello"),
     ("replay-server", "join-actor"),
     ("replay-server", "join-learner"),
-    ("replay-server", "request"),
-    ("replay-server", "status"),
+    ("replay-server", "goodbye"),
+    ("replay-server", "weights-upload"),
     ("replay-server", "weights"),
+    ("replay-server", "status"),
     ("learner", "batches"),
+    ("learner", "weights-sender"),
+    ("learner", "affinity-sender"),
+    ("learner", "learner-status"),
     ("actor-0", "weights-watch"),
+    ("actor-0", "delivery"),
 ];
 
 /// Runs with a panic at `point`, to the end.
@@ -65,22 +72,6 @@ fn a_panic_in_a_part_ends_it_and_the_launcher_names_it() {
         return;
     }
     for (part, point) in THREADS {
-        ends_the_run(part, point);
-    }
-}
-
-/// These threads do not pass a point yet.
-#[test]
-#[ignore = "to be moved into the test above with the calls of fault::point"]
-fn threads_that_pass_no_point_yet() {
-    for (part, point) in [
-        ("replay-server", "admit"),
-        ("replay-server", "sample"),
-        // These two need names that no thread of the replay server has.
-        ("learner", "send-affinity"),
-        ("learner", "send-weights"),
-        ("actor-0", "delivery"),
-    ] {
         ends_the_run(part, point);
     }
 }

@@ -11,6 +11,7 @@ use std::{
 use anyhow::{Context, bail};
 use driml_protocol::{
     Chunk, ChunkHeader, Claim, Goodbye, InsertReply, Keys, Kind, PlanesPool, Shutdown, codec,
+    fault,
     seldom::Seldom,
     session::{self, Asked, SessionError},
 };
@@ -103,6 +104,7 @@ impl Courier {
         let mut unwanted = 0;
         let mut outcome = Ok(());
         while let Some(header) = self.first_in_line(chunks) {
+            fault::point("delivery");
             let transitions = header.transitions() as u64;
             // After a failure the rest is only counted, so that the goodbye tells the truth.
             let fate = match outcome {

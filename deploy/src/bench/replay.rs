@@ -182,6 +182,7 @@ impl Run {
                 rows: learner.batch_rows,
                 in_flight: learner.batches_in_flight,
                 shared_memory: transport.shared_memory,
+                unreachable_max: ANSWER_MAX,
             },
             &shutdown,
         )?;

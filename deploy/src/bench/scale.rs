@@ -286,6 +286,7 @@ fn learn(
         rows: learner.batch_rows,
         in_flight: learner.batches_in_flight,
         shared_memory: transport.shared_memory,
+        unreachable_max: ANSWER_MAX,
     };
     let mut source = BatchSource::start(&sessions, &keys, spec.hash(), requests, stop)?;
     let mut due = Instant::now();

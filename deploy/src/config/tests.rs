@@ -72,6 +72,7 @@ fn the_default_run_is_the_papers() {
         epsilon_decay_frames = 100000
         epsilon_end = 0.01
         epsilon_start = 0.1
+        round_transitions_max = 1024
         steps_per_chunk = 16
         unreachable_max_ms = 60000
         world_threads = 0
@@ -180,6 +181,26 @@ fn optional_settings_can_be_set_though_no_preset_has_them() {
 }
 
 #[test]
+fn a_ladder_of_epsilons_is_for_the_actors_of_the_run() {
+    let ladder = "actor.epsilon_ladder={base=0.4,alpha=7}";
+    let of = |sets: &[&str]| with("mspacman", "c51", sets).map(|it| it.actor.epsilon_ladder);
+    assert_eq!(of(&[]).unwrap(), None);
+    let actors = |sets: &[&str]| of(sets).unwrap().unwrap().actors;
+    assert_eq!(actors(&[ladder, "local.actors=3"]), 3);
+    assert_eq!(actors(&["local.actors=3", ladder]), 3);
+    // For actors that are started by hand.
+    assert_eq!(actors(&[ladder, "actor.epsilon_ladder.actors=64"]), 64);
+    expect!["actor.epsilon_ladder.actors = 1 cannot work: a ladder is for 2 to 65536 actors: give --actors, or set it where actors are started by hand"]
+        .assert_eq(&of(&[ladder, "local.actors=1"]).unwrap_err());
+    expect!["actor.epsilon_ladder.base = 4 cannot work: the first actor's probability lies between 0 and 1, without the two"]
+        .assert_eq(&of(&["actor.epsilon_ladder={base=4.0,alpha=7.0}", "local.actors=2"]).unwrap_err());
+    expect!["in the settings' [actor] table: missing field `alpha`"]
+        .assert_eq(&of(&["actor.epsilon_ladder={base=0.4}", "local.actors=2"]).unwrap_err());
+    expect![[r#"there is no setting "actor.epsilon_ladder.rungs"; [actor] has ack_timeout_ms, chunks_in_flight_max, envs, epsilon_decay_frames, epsilon_end, epsilon_start, steps_per_chunk, unreachable_max_ms, world_threads"#]]
+        .assert_eq(&of(&["actor.epsilon_ladder.rungs=3"]).unwrap_err());
+}
+
+#[test]
 fn a_file_at_odds_with_itself_is_refused() {
     let text = with("mspacman", "c51", &[]).unwrap().to_toml();
     let said = |text: String| {
@@ -205,7 +226,7 @@ fn a_file_at_odds_with_itself_is_refused() {
     .assert_eq(&said("= 3".into()));
     expect!["x.toml: the settings lack run.world, a word: use a config.toml that driml wrote"]
         .assert_eq(&said(String::new()));
-    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `chunks_in_flight_max`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
+    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
 }
 
 #[test]

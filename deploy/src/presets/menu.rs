@@ -87,6 +87,8 @@ fn menu() -> Result<String, Usage> {
             lambdas(&fix),
         );
     }
+    text += "\noff in every preset\n";
+    text += "--set 'actor.epsilon_ladder={base=0.4,alpha=7}'  fixed epsilons from actor to actor smaller, as Ape-X has them\n";
     text += "\nEvery setting of one of them with its source: driml presets --game bigfish --agent driml-fix\n";
     Ok(text)
 }

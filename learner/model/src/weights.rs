@@ -114,11 +114,12 @@ impl Parameters {
     /// The parameters whose name passes `filter`, as a safetensors file. Equal parameters give equal bytes.
     ///
     /// # Errors
-    /// A failure to read a variable or to serialise.
+    /// A parameter that is not finite, which no reader would take; a failure to read a variable or to serialise.
     pub fn to_safetensors(&self, filter: impl Fn(&str) -> bool) -> Result<Vec<u8>> {
         let mut tensors = Vec::new();
         for (name, var) in self.iter().filter(|(name, _)| filter(name)) {
             let values = var.flatten_all()?.to_vec1::<f32>()?;
+            check_finite(name, &values)?;
             let bytes: Vec<u8> = values
                 .iter()
                 .flat_map(|value| value.to_le_bytes())

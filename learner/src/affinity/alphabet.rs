@@ -69,6 +69,28 @@ impl Alphabet {
         self.index.len()
     }
 
+    /// Checks what holds of every alphabet that [`Alphabet::new`] makes; a saved one may be anything.
+    pub(super) fn check_valid(&self) -> Result<(), AffinityError> {
+        let n = self.index.len();
+        let used = |visible: usize| {
+            self.index
+                .iter()
+                .any(|&index| usize::from(index) == visible)
+        };
+        let below = self
+            .index
+            .iter()
+            .all(|&index| usize::from(index) < self.len);
+        if (1..=255).contains(&n) && (1..=n).contains(&self.len) && below && (0..self.len).all(used)
+        {
+            return Ok(());
+        }
+        Err(AffinityError(format!(
+            "an alphabet of {} visible actions over the raw ones {:?}",
+            self.len, self.index
+        )))
+    }
+
     /// Pairs of raw actions as pairs of dense indices.
     pub(super) fn map_pairs(&self, pairs: &[(u8, u8)]) -> Result<Vec<(u8, u8)>, AffinityError> {
         let index = |action: u8| {

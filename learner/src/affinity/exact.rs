@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{AffinityError, Alphabet, bits, row_softmax};
+use super::{AffinityError, Alphabet, bits, check_array, check_probabilities, row_softmax};
 
 /// The counts' numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -28,18 +28,25 @@ pub struct ExactAffinity {
     matrix: Vec<f32>,
 }
 
+impl ExactSettings {
+    fn check_valid(&self) -> Result<(), AffinityError> {
+        let Self { decay, smoothing } = *self;
+        if decay > 0.0 && decay <= 1.0 && smoothing > 0.0 && smoothing.is_finite() {
+            return Ok(());
+        }
+        Err(AffinityError(format!(
+            "a decay of {decay} and a smoothing of {smoothing}"
+        )))
+    }
+}
+
 impl ExactAffinity {
     /// No counts yet: A is uniform over the alphabet.
     ///
     /// # Errors
     /// A setting out of its range.
     pub fn new(alphabet: Alphabet, settings: ExactSettings) -> Result<Self, AffinityError> {
-        let ExactSettings { decay, smoothing } = settings;
-        if !(decay > 0.0 && decay <= 1.0 && smoothing > 0.0 && smoothing.is_finite()) {
-            return Err(AffinityError(format!(
-                "a decay of {decay} and a smoothing of {smoothing}"
-            )));
-        }
+        settings.check_valid()?;
         let m = alphabet.len();
         let mut exact = Self {
             counts: vec![0.0; m * m],
@@ -54,6 +61,17 @@ impl ExactAffinity {
     /// Whether both estimate in the same way over the same actions.
     pub(super) fn has_settings_of(&self, other: &Self) -> bool {
         self.alphabet == other.alphabet && self.settings == other.settings
+    }
+
+    pub(super) fn check_valid(&self) -> Result<(), AffinityError> {
+        self.alphabet.check_valid()?;
+        self.settings.check_valid()?;
+        let (m, n) = (self.alphabet.len(), self.alphabet.num_actions());
+        check_array("counts", &self.counts, m * m)?;
+        if let Some(at) = self.counts.iter().position(|&count| count < 0.0) {
+            return Err(AffinityError(format!("counts is below 0 at index {at}")));
+        }
+        check_probabilities("matrix", &self.matrix, n * n)
     }
 
     pub(super) const fn alphabet(&self) -> &Alphabet {

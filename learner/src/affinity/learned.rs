@@ -5,13 +5,13 @@ use rand::{Rng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{AffinityError, Alphabet, bits, row_softmax};
+use super::{AffinityError, Alphabet, bits, check_array, check_probabilities, row_softmax};
 
 /// The estimator's numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LearnedSettings {
-    /// Hidden units, at least 1.
+    /// Hidden units, 1 to 4,096.
     pub hidden: usize,
     /// Adam's learning rate, above 0.
     pub lr: f64,
@@ -46,6 +46,32 @@ pub struct LearnedAffinity {
     matrix: Vec<f32>,
 }
 
+/// Most hidden units; settings beyond it are refused.
+const HIDDEN_MAX: usize = 4096;
+
+impl LearnedSettings {
+    fn check_valid(&self) -> Result<(), AffinityError> {
+        let Self {
+            hidden,
+            lr,
+            beta1,
+            beta2,
+            eps,
+            keep,
+        } = *self;
+        let above_0 = |x: f64| x > 0.0 && x.is_finite();
+        let share = |x: f64| (0.0..1.0).contains(&x);
+        if (1..=HIDDEN_MAX).contains(&hidden)
+            && above_0(lr)
+            && above_0(eps)
+            && [beta1, beta2, keep].into_iter().all(share)
+        {
+            return Ok(());
+        }
+        Err(AffinityError(format!("settings out of range: {self:?}")))
+    }
+}
+
 impl LearnedAffinity {
     /// A network drawn from `rng` with q = 0 everywhere: A is uniform over the alphabet.
     ///
@@ -56,28 +82,10 @@ impl LearnedAffinity {
         settings: LearnedSettings,
         rng: &mut ChaCha8Rng,
     ) -> Result<Self, AffinityError> {
-        let LearnedSettings {
-            hidden,
-            lr,
-            beta1,
-            beta2,
-            eps,
-            keep,
-        } = settings;
-        let share = |x: f64| (0.0..1.0).contains(&x);
-        let fine = hidden > 0
-            && lr > 0.0
-            && lr.is_finite()
-            && eps > 0.0
-            && eps.is_finite()
-            && [beta1, beta2, keep].into_iter().all(share);
-        if !fine {
-            return Err(AffinityError(format!(
-                "settings out of range: {settings:?}"
-            )));
-        }
+        settings.check_valid()?;
+        let hidden = settings.hidden;
         let m = alphabet.len();
-        let mut parameters = vec![0.0; (2 * m + 2) * hidden + 1];
+        let mut parameters = vec![0.0; parameter_count(m, hidden)];
         // The first layer as PyTorch draws it, U(+-1/sqrt(inputs)); the last one stays 0, so that q starts at 0.
         let bound = 1.0 / ((2 * m) as f64).sqrt();
         let first_layer = (2 * m + 1) * hidden;
@@ -101,6 +109,22 @@ impl LearnedAffinity {
     /// Whether both estimate in the same way over the same actions.
     pub(super) fn has_settings_of(&self, other: &Self) -> bool {
         self.alphabet == other.alphabet && self.settings == other.settings
+    }
+
+    pub(super) fn check_valid(&self) -> Result<(), AffinityError> {
+        self.alphabet.check_valid()?;
+        self.settings.check_valid()?;
+        let (m, n) = (self.alphabet.len(), self.alphabet.num_actions());
+        let count = parameter_count(m, self.settings.hidden);
+        check_array("parameters", &self.parameters, count)?;
+        check_array("first_moments", &self.first_moments, count)?;
+        check_array("second_moments", &self.second_moments, count)?;
+        if let Some(at) = self.second_moments.iter().position(|&moment| moment < 0.0) {
+            let why = format!("second_moments is below 0 at index {at}");
+            return Err(AffinityError(why));
+        }
+        check_probabilities("smoothed", &self.smoothed, m * m)?;
+        check_probabilities("matrix", &self.matrix, n * n)
     }
 
     pub(super) const fn alphabet(&self) -> &Alphabet {
@@ -220,6 +244,11 @@ impl LearnedAffinity {
             *p -= lr * (*m / rest1) / ((*v / rest2).sqrt() + eps);
         }
     }
+}
+
+/// Parameters of the network over m visible actions.
+const fn parameter_count(m: usize, hidden: usize) -> usize {
+    (2 * m + 2) * hidden + 1
 }
 
 fn sigmoid(x: f64) -> f64 {

@@ -32,15 +32,29 @@ impl AffinityEstimator {
     /// Learns from one batch's pairs of raw actions, none of which crosses an episode's end. No pairs: no change.
     ///
     /// # Errors
-    /// An action that the alphabet does not have: nothing has then changed.
+    /// An action that the alphabet does not have: nothing has then changed. Numbers that are no longer finite: the estimate is
+    /// then good for nothing.
     pub fn observe(
         &mut self,
         pairs: &[(u8, u8)],
         rng: &mut ChaCha8Rng,
     ) -> Result<(), AffinityError> {
         match self {
-            Self::Learned(learned) => learned.observe(pairs, rng),
-            Self::Exact(exact) => exact.observe(pairs),
+            Self::Learned(learned) => learned.observe(pairs, rng)?,
+            Self::Exact(exact) => exact.observe(pairs)?,
+        }
+        self.check_valid()
+    }
+
+    /// Checks what holds of every estimate that came from [`AffinityEstimator::observe`]; a saved one may be anything.
+    ///
+    /// # Errors
+    /// Settings out of their ranges, an array of another length than they ask for, numbers that are not finite, entries of A that
+    /// are no probabilities.
+    pub fn check_valid(&self) -> Result<(), AffinityError> {
+        match self {
+            Self::Learned(learned) => learned.check_valid(),
+            Self::Exact(exact) => exact.check_valid(),
         }
     }
 
@@ -68,6 +82,40 @@ impl AffinityEstimator {
             Self::Learned(learned) => learned.alphabet().num_actions(),
             Self::Exact(exact) => exact.alphabet().num_actions(),
         }
+    }
+}
+
+/// Checks the length of an array by name, and that its numbers are finite.
+fn check_array<T: Copy + Into<f64>>(
+    name: &str,
+    array: &[T],
+    len: usize,
+) -> Result<(), AffinityError> {
+    if array.len() != len {
+        let found = array.len();
+        return Err(AffinityError(format!(
+            "{name} has {found} numbers, not {len}"
+        )));
+    }
+    match array.iter().position(|&value| !value.into().is_finite()) {
+        Some(at) => Err(AffinityError(format!("{name} is not finite at index {at}"))),
+        None => Ok(()),
+    }
+}
+
+/// [`check_array`] for probabilities.
+fn check_probabilities<T: Copy + Into<f64>>(
+    name: &str,
+    array: &[T],
+    len: usize,
+) -> Result<(), AffinityError> {
+    check_array(name, array, len)?;
+    let probability = |&value: &T| (0.0..=1.0 + 1e-6).contains(&value.into());
+    match array.iter().position(|value| !probability(value)) {
+        Some(at) => Err(AffinityError(format!(
+            "{name} is no probability at index {at}"
+        ))),
+        None => Ok(()),
     }
 }
 

@@ -403,6 +403,7 @@ fn part(objective: Objective, augment: Option<AugmentSettings>) -> LearnerPart {
             publish_period_updates: 2,
             checkpoint_period_updates: 2,
             checkpoints_kept: 1,
+            unreachable_max_ms: 60_000,
             update,
             augment,
             affinity: AffinityConfig {

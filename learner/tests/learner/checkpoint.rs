@@ -7,7 +7,8 @@ use std::{
 };
 
 use driml_learner::{
-    AffinityEstimator, Alphabet, LearnedAffinity, LearnedSettings, Learner,
+    AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
+    Learner,
     checkpoint::{CheckpointError, RunState, list, load_latest, lock, save},
 };
 use driml_model::{Compute, Parameters};
@@ -15,7 +16,10 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
 
-use crate::made_up::{ACTIONS, ALL_DIM, Rows, STOCK, learner, learner_on, model, settings};
+use crate::{
+    made_up::{ACTIONS, ALL_DIM, Rows, STOCK, learner, learner_on, model, settings},
+    update::diverged,
+};
 
 const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
@@ -323,6 +327,137 @@ fn a_checkpoint_of_the_first_format_is_read_bit_for_bit() {
             said.contains(&format!("its format is {unknown}, not 1 to 2")),
             "{said}"
         );
+    }
+}
+
+/// With one checkpoint kept, a save of what cannot be gone on from would remove the last good one.
+#[test]
+fn a_state_that_is_not_finite_is_not_saved() {
+    for compute in [&Compute::CPU, &STOCK] {
+        let folder = Folder::new("not-finite");
+        let mut run = Run::new();
+        run.save(&folder.0, 1);
+        for name in ["head.bias", "dim.psi4.out.weight"] {
+            run.learner = diverged(compute, name).0;
+            let state = RunState {
+                learner: &run.learner,
+                affinity: None,
+                rng: &run.rng,
+                weights_version: 8,
+                run_spec_hash: SPEC,
+            };
+            let said = save(&folder.0, &state, 1).unwrap_err().to_string();
+            assert!(
+                said.starts_with("nothing is saved") && said.contains(name),
+                "{said}"
+            );
+            let left: Vec<_> = fs::read_dir(&folder.0).unwrap().collect();
+            assert_eq!(left.len(), 1, "{left:?}");
+            assert_eq!(load(&folder.0).unwrap().unwrap().learner.updates(), 0);
+        }
+    }
+}
+
+/// Files whose sum is right, as somebody may write them who wants the learner to fall over.
+#[test]
+fn arrays_and_counts_that_no_learner_wrote_are_damage() {
+    let exact = ExactSettings {
+        decay: 0.99,
+        smoothing: 1.0,
+    };
+    let exact = ExactAffinity::new(Alphabet::raw(ACTIONS).unwrap(), exact).unwrap();
+    let mut run = Run::new();
+    let learned = run.affinity.clone();
+    let refused = |run: &Run, change: &dyn Fn(&mut serde_json::Value), said: &str| {
+        let folder = Folder::new("arrays");
+        let path = run.save(&folder.0, 1);
+        load(&folder.0).unwrap().unwrap();
+        change_state(&path, change);
+        let error = load(&folder.0).map(|_| ()).unwrap_err();
+        assert!(matches!(error, CheckpointError::Damaged { .. }), "{error}");
+        let text = error.to_string();
+        assert!(
+            text.contains("state.json") && text.contains(said),
+            "{said}: {text}"
+        );
+    };
+    let array = |state: &mut serde_json::Value, name: &str| -> Vec<serde_json::Value> {
+        state["affinity"][name].as_array().unwrap().clone()
+    };
+    let kinds: [(AffinityEstimator, &[&str]); 2] = [
+        (
+            learned,
+            &[
+                "parameters",
+                "first_moments",
+                "second_moments",
+                "smoothed",
+                "matrix",
+            ],
+        ),
+        (AffinityEstimator::Exact(exact), &["counts", "matrix"]),
+    ];
+    for (affinity, arrays) in kinds {
+        run.affinity = affinity;
+        run.updates(1);
+        for name in arrays {
+            let change = |change: fn(&mut Vec<serde_json::Value>)| {
+                move |state: &mut serde_json::Value| {
+                    let mut values = array(state, name);
+                    change(&mut values);
+                    state["affinity"][*name] = values.into();
+                }
+            };
+            refused(&run, &change(|values| values.truncate(1)), name);
+            refused(&run, &change(|values| values.clear()), name);
+            refused(&run, &change(|values| values.push(0.into())), name);
+            // NaN in 64 bits; in 32 too many bits to be read at all.
+            let nan = change(|values| values[0] = f64::NAN.to_bits().into());
+            refused(
+                &run,
+                &nan,
+                if *name == "matrix" {
+                    "state.json"
+                } else {
+                    name
+                },
+            );
+            let nan = change(|values| values[0] = f32::NAN.to_bits().into());
+            if *name == "matrix" {
+                refused(&run, &nan, name);
+            }
+        }
+        for (raw, len) in [
+            (vec![], 0),
+            (vec![9, 9], 1),
+            (vec![0, 2], 3),
+            (vec![0; 300], 1),
+        ] {
+            let change = |state: &mut serde_json::Value| {
+                state["affinity"]["alphabet"]["index"] = raw.clone().into();
+                state["affinity"]["alphabet"]["len"] = len.into();
+            };
+            refused(&run, &change, "alphabet");
+        }
+    }
+    let huge = |state: &mut serde_json::Value| state["affinity"]["settings"]["decay"] = 2.into();
+    refused(&run, &huge, "a decay of 2");
+    run.affinity = Run::new().affinity;
+    for (key, value) in [("hidden", u64::MAX), ("lr", 0), ("keep", 1)] {
+        let change =
+            |state: &mut serde_json::Value| state["affinity"]["settings"][key] = value.into();
+        refused(&run, &change, "settings out of range");
+    }
+    for key in ["updates", "adam_step", "weights_version"] {
+        let change = |state: &mut serde_json::Value| state[key] = u64::MAX.into();
+        refused(&run, &change, key);
+    }
+    for (key, value) in [
+        ("seed", serde_json::json!([1, 2])),
+        ("word_pos", (-1).into()),
+    ] {
+        let change = |state: &mut serde_json::Value| state["rng"][key] = value.clone();
+        refused(&run, &change, "state.json");
     }
 }
 

@@ -317,6 +317,62 @@ fn arithmetic_that_is_not_finite_is_an_error_that_changes_nothing() {
     }
 }
 
+/// A learner whose step size is `lr`.
+fn fast(compute: &Compute, lr: f64) -> Learner {
+    let mut settings = settings(ALL_DIM);
+    settings.adam.lr = lr;
+    let rng = &mut ChaCha8Rng::seed_from_u64(1);
+    Learner::new(model(ALL_DIM), settings, compute, rng).unwrap()
+}
+
+#[test]
+fn a_step_size_beyond_the_finite_numbers_is_an_error_that_changes_nothing() {
+    for compute in [&Compute::CPU, &STOCK] {
+        let mut learner = fast(compute, 1e38);
+        let before = values(learner.online());
+        let error = learner.update(&Rows::random(6, 30).batch()).unwrap_err();
+        let said = "a step of Adam with lr = 1e38 is not finite";
+        assert!(error.to_string().contains(said), "{error}");
+        assert_eq!(values(learner.online()), before);
+        assert_eq!(learner.updates(), 0);
+        learner.weights().unwrap();
+    }
+}
+
+/// A learner whose parameter `name` a step has just taken beyond the finite numbers, and what that step said.
+pub(crate) fn diverged(compute: &Compute, name: &str) -> (Learner, Result<f64, UpdateError>) {
+    let mut learner = fast(compute, 3e37);
+    let evaluation = learner.evaluate(&Rows::random(6, 31).batch()).unwrap();
+    let gradient = evaluation.gradients.get(name).unwrap();
+    // As large as numbers get, and where the next step goes on.
+    let direction = gradient.sign().unwrap().affine(-f64::from(f32::MAX), 0.0);
+    let var = learner.online().get(name).unwrap();
+    var.set(&direction.unwrap()).unwrap();
+    let said = learner.apply(&evaluation.gradients);
+    (learner, said)
+}
+
+#[test]
+fn parameters_that_a_step_took_beyond_the_finite_numbers_are_not_published() {
+    for name in ["torso.conv1.weight", "torso.fc.bias", "head.weight"] {
+        let (learner, said) = diverged(&Compute::CPU, name);
+        let said = said.unwrap_err();
+        assert!(matches!(said, UpdateError::Diverged { .. }), "{said}");
+        let said = said.to_string();
+        assert!(
+            said.contains(name) && said.contains("newest checkpoint"),
+            "{said}"
+        );
+        let said = learner.weights().unwrap_err().to_string();
+        assert!(said.contains(name) && said.contains("inf"), "{said}");
+        // Elsewhere than on the CPU it shows when the weights are asked for.
+        let (learner, said) = diverged(&STOCK, name);
+        said.unwrap();
+        let said = learner.weights().unwrap_err().to_string();
+        assert!(said.contains(name) && said.contains("inf"), "{said}");
+    }
+}
+
 #[test]
 fn a_model_whose_heads_the_lambdas_do_not_use_is_refused() {
     let mut rng = rand_chacha::rand_core::SeedableRng::seed_from_u64(23);
@@ -370,13 +426,17 @@ fn candle_s_own_operations_learn_the_same() {
 fn with_candle_s_own_operations_bad_arithmetic_changes_nothing_either() {
     let mut learner = learner_on(&STOCK, ALL_DIM, 1);
     let var = learner.online().get("head.bias").unwrap();
-    let values = vec![f32::NAN; var.elem_count()];
-    var.set(&Tensor::from_vec(values, var.dims(), &Device::Cpu).unwrap())
-        .unwrap();
-    let before = learner.weights().unwrap();
+    let poison = Tensor::full(f32::NAN, var.dims(), &Device::Cpu).unwrap();
+    var.set(&poison).unwrap();
+    let all_bits = |learner: &Learner| -> HashMap<String, Vec<u32>> {
+        let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect();
+        let all = values(learner.online()).into_iter();
+        all.map(|(name, values)| (name, bits(values))).collect()
+    };
+    let before = all_bits(&learner);
     let error = learner.update(&Rows::random(4, 1).batch()).unwrap_err();
     assert!(matches!(error, UpdateError::NonFinite { .. }), "{error}");
-    assert!(before == learner.weights().unwrap() && learner.updates() == 0);
+    assert!(before == all_bits(&learner) && learner.updates() == 0);
 }
 
 #[test]

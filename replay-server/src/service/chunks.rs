@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{Chunk, Claim, InsertReply, Kind};
+use driml_protocol::{Chunk, Claim, InsertReply, Kind, fault};
 use zenoh::{bytes::ZBytes, query::Query};
 
 use super::{Service, State};
@@ -101,6 +101,7 @@ impl Service {
     /// whole work until the end of the process.
     pub(super) fn admit_parked(&self) {
         while !self.shutdown.is_set() {
+            fault::point("admit");
             let mut answers = Answers::new();
             let mut state = self.state();
             let now = Instant::now();

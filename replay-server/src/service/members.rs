@@ -7,6 +7,7 @@ use driml_protocol::{ActorJoin, Alive, Hello, JoinReply, Kind, LearnerJoin};
 use zenoh::{query::Query, sample::SampleKind};
 
 use super::{Service, State};
+use crate::Replay;
 
 /// What is known of the parts of the run.
 #[derive(Default)]
@@ -26,11 +27,13 @@ impl Members {
         }
     }
 
-    fn actors(&self) -> u32 {
-        let actors = self.connected.iter();
-        actors
-            .filter(|who| matches!(who, Alive::Actor { .. }))
-            .count() as u32
+    /// Actors that are connected and have joined.
+    fn actors(&self, replay: &Replay) -> u32 {
+        let takes_part = |who: &&Alive| match **who {
+            Alive::Actor { actor, epoch } => replay.actor_epoch(actor) == Some(epoch),
+            Alive::Learner(_) => false,
+        };
+        self.connected.iter().filter(takes_part).count() as u32
     }
 
     /// Whether `learner` is the one that is served.
@@ -53,8 +56,7 @@ impl Service {
     pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {
         let mut state = self.state();
         state.members.note(who, kind == SampleKind::Put);
-        let actors = state.members.actors();
-        state.replay.set_actors(actors);
+        state.count_actors();
     }
 
     pub(super) fn hello(&self, query: Query) {
@@ -114,6 +116,11 @@ enum Rejection {
 }
 
 impl State {
+    fn count_actors(&mut self) {
+        let actors = self.members.actors(&self.replay);
+        self.replay.set_actors(actors);
+    }
+
     /// Gives the run's count of transitions if the actor is taken.
     fn join_actor(&mut self, join: ActorJoin) -> Result<u64, Rejection> {
         let ActorJoin { actor, epoch } = join;
@@ -132,6 +139,7 @@ impl State {
             )));
         }
         self.replay.join_actor(join).map_err(Rejection::Refused)?;
+        self.count_actors();
         if other.is_some() {
             // A chunk that was left behind.
             self.chunks.take(actor);

@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use driml_protocol::{BatchReply, BatchRequest, Kind, Planes, session};
+use driml_protocol::{BatchReply, BatchRequest, Kind, Planes, fault, session};
 use zenoh::query::Query;
 
 use super::{Service, State, parked::ParkedRequest};
@@ -62,6 +62,7 @@ impl Service {
     /// Serves parked requests as the limiter allows them. The thread's whole work until the end of the process.
     pub(super) fn serve_parked(&self) {
         while !self.shutdown.is_set() {
+            fault::point("sample");
             let mut state = self.state();
             let now = Instant::now();
             let Some((parked, drawn)) = state.next_answer(now, |bytes, shared| match shared {

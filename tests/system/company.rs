@@ -1,0 +1,272 @@
+//! Many parts at once: actors at a closed limiter, a client that stands still, two processes that play one part.
+//! What one server and one actor promise each other is in `by_hand`; how parts die is in `failures`.
+
+use std::{
+    collections::BTreeMap,
+    time::{Duration, Instant},
+};
+
+use driml_actor::delivery::{Delivery, DeliveryLimits};
+use driml_protocol::{
+    Chunk, ChunkHeader, Keys, PlanesPool, Shutdown,
+    session::{self, Endpoints},
+};
+use driml_tests::{Client, Summary, TestSystem};
+use nix::sys::signal::Signal;
+use zenoh::Wait;
+
+use crate::{LONG, SHORT, system};
+
+/// The limits that an actor has with the paper's settings.
+const LIMITS: DeliveryLimits = DeliveryLimits {
+    chunks_in_flight_max: 4,
+    ack_timeout: Duration::from_secs(10),
+    unreachable_max: Duration::from_secs(60),
+};
+
+/// Nothing was lost, stored twice or sent twice.
+fn check_quiet(summary: &Summary) {
+    assert_eq!(
+        (summary.transitions_lost, summary.transitions_duplicated),
+        (0, 0)
+    );
+    assert_eq!(summary.chunks_retried, 0, "{summary:#?}");
+}
+
+/// The learner is so slow, by a replay ratio of 64, that every actor waits nearly all of the time.
+#[test]
+fn twenty_four_actors_wait_for_one_learner() {
+    let system = system();
+    let longer = SHORT.replace("--frames 1280", "--frames 6000");
+    assert_ne!(longer, SHORT);
+    let ended = system
+        .run(&format!(
+            "local --agent c51 {longer} --actors 24 --set replay.replay_ratio=64 --run-dir run"
+        ))
+        .expect_code(0);
+    check_quiet(&system.run_folder("run").check_finished());
+    assert!(!ended.stderr.contains("WARN"), "{}", ended.stderr);
+}
+
+/// Ctrl-C while all wait: what they have is let in.
+#[test]
+fn actors_that_wait_deliver_what_they_have_when_they_are_told_to_stop() {
+    let system = system();
+    let process = system.start(&format!(
+        "local --agent c51 {LONG} --actors 32 --set replay.replay_ratio=512 --set replay.warmup_transitions=2000 \
+         --listen {} --run-dir run",
+        system.endpoint()
+    ));
+    let client = system.connect();
+    client.wait_for_replay("32 actors that wait", |replay| replay.actors_waiting == 32);
+    drop(client);
+    process.signal(Signal::SIGINT);
+    process.wait().expect_code(130);
+    check_quiet(&system.run_folder("run").check("interrupted"));
+    assert_eq!(system.survivors(), []);
+}
+
+/// An actor without a world: chunks of chain frames through the real delivery.
+struct SyntheticActor {
+    delivery: Delivery,
+    session: zenoh::Session,
+    next: ChunkHeader,
+    stop: Shutdown,
+}
+
+impl SyntheticActor {
+    fn join(system: &TestSystem, client: &Client, actor: u32, limits: DeliveryLimits) -> Self {
+        let session = session::open(&Endpoints {
+            listen: Vec::new(),
+            connect: vec![system.endpoint()],
+        })
+        .unwrap();
+        client.join_as_actor(actor, 1);
+        let stop = Shutdown::default();
+        let delivery = Delivery::start(
+            session.clone(),
+            Keys::new("driml").unwrap(),
+            client.spec.hash(),
+            0,
+            limits,
+            PlanesPool::new(8),
+            stop.clone(),
+        )
+        .unwrap();
+        let next = ChunkHeader {
+            actor,
+            epoch: 1,
+            sequence: 0,
+            first_transition: 0,
+            weights_version: 0,
+            leaving: false,
+            streams: 4,
+            steps: 8,
+            frame_bytes: client.spec.frame_bytes() as u32,
+        };
+        Self {
+            delivery,
+            session,
+            next,
+            stop,
+        }
+    }
+
+    /// Sends one chunk more; waits as an actor does.
+    fn send(&mut self) {
+        let chunk = Chunk::zeroed(self.next);
+        self.next.sequence += 1;
+        self.next.first_transition += chunk.header.transitions() as u64;
+        assert!(self.delivery.send(chunk));
+    }
+
+    /// Delivers what it has, although nobody makes room, and leaves.
+    fn leave(self) {
+        self.stop.set();
+        assert_eq!(self.delivery.finish().unwrap(), 0);
+        self.session.close().wait().unwrap();
+    }
+}
+
+/// A limiter that never opens, as where the learner is gone, and time-outs that are long past before the test is: an actor that
+/// waits knows that it waits.
+#[test]
+fn an_actor_waits_for_as_long_as_it_must() {
+    let system = system();
+    let _server = system.start_replay_server(&format!("--agent c51 {LONG}"));
+    let client = system.connect();
+    let short = DeliveryLimits {
+        unreachable_max: Duration::from_secs(3),
+        ..LIMITS
+    };
+    let mut actors: Vec<_> = (0..16)
+        .map(|actor| SyntheticActor::join(&system, &client, actor, short))
+        .collect();
+    // As many as are let in without a learner, and then one that waits for each actor.
+    let room = 200 + 256;
+    let mut waiting = BTreeMap::new();
+    let started = Instant::now();
+    for round in 0.. {
+        let actor = &mut actors[round % 16];
+        actor.send();
+        waiting.insert(round % 16, actor.next.sequence);
+        if client.replay().unwrap().actors_waiting == 16 {
+            break;
+        }
+        assert!(round < 200, "{:?}", client.replay());
+    }
+    let before = client.replay().unwrap();
+    assert!(before.transitions_inserted <= room + 32, "{before:#?}");
+    driml_tests::wait_for("twice the time that an actor bears silence", || {
+        (started.elapsed() > 2 * short.unreachable_max).then_some(())
+    });
+    let status = client.replay().unwrap();
+    assert_eq!(
+        (status.actors_waiting, status.chunks_retried),
+        (16, 0),
+        "{status:#?}"
+    );
+    assert_eq!(status.transitions_inserted, before.transitions_inserted);
+    let sent: u64 = actors.iter().map(|it| it.next.first_transition).sum();
+    std::thread::scope(|scope| {
+        for actor in actors {
+            scope.spawn(|| actor.leave());
+        }
+    });
+    let status = client.replay().unwrap();
+    assert_eq!(status.transitions_inserted, sent, "{status:#?}");
+    assert_eq!((status.transitions_lost, status.messages_refused), (0, 0));
+}
+
+/// A model whose weights are 5 MB, sent to the actors after each update: whoever is frozen is likely in the middle of a pull.
+const LARGE: &str = "--set model.hidden=4096 --set learner.publish_period_updates=1";
+
+/// An actor that is stopped in the middle of whatever it does holds up the others for seconds, and goes on when it is let go.
+#[test]
+fn a_frozen_actor_does_not_stop_the_others() {
+    let system = system();
+    let _server = system.start_replay_server(&format!("--agent c51 {LONG} {LARGE}"));
+    let mut learner = system.start_learner("run");
+    let mut healthy = system.start_actor(0);
+    let mut frozen = system.start_actor(1);
+    let client = system.connect();
+    for freeze in 0..2 {
+        client.wait_for_replay("both actors", |replay| replay.actors == 2);
+        let version = client
+            .wait_for_learner("weights", |it| it.updates > 0)
+            .weights_version;
+        client.wait_for_learner("weights to pull", |it| it.weights_version > version + 5);
+        frozen.signal(Signal::SIGSTOP);
+        // Longer than it takes until the link is given up.
+        let started = Instant::now();
+        let (mut rows, mut grew, mut standstill) = (0, started, Duration::ZERO);
+        driml_tests::wait_for("the time that the actor is frozen", || {
+            let now = client.replay().unwrap().rows_sampled;
+            standstill = standstill.max(grew.elapsed());
+            if now > rows {
+                (rows, grew) = (now, Instant::now());
+            }
+            (started.elapsed() > Duration::from_secs(14)).then_some(())
+        });
+        assert!(
+            standstill < Duration::from_secs(15) && grew > started + Duration::from_secs(1),
+            "freeze {freeze}: nothing for {standstill:?}"
+        );
+        assert!(learner.is_running() && healthy.is_running() && frozen.is_running());
+        frozen.signal(Signal::SIGCONT);
+        let others = client.replay().unwrap().transitions_inserted;
+        client.wait_for_replay("more transitions", |replay| {
+            replay.transitions_inserted > others + 500
+        });
+    }
+    for actor in [healthy, frozen] {
+        actor.stop().expect_code(0).expect_said("leaves: ");
+    }
+    let status = client.replay().unwrap();
+    assert_eq!(
+        (status.transitions_lost, status.transitions_duplicated),
+        (0, 0)
+    );
+    learner.stop().expect_code(0);
+}
+
+#[test]
+fn a_second_process_with_an_actor_s_number_waits_for_the_first_one_s_end() {
+    let system = system();
+    let _server = system.start_replay_server(&format!("--agent c51 {LONG}"));
+    let learner = system.start_learner("run");
+    let first = system.start_actor(3);
+    let client = system.connect();
+    client.wait_for_replay("transitions", |replay| replay.transitions_inserted > 0);
+    let mut second = system.start_actor(3);
+    second.wait_for_stderr(
+        "another process is actor 3 of this run: give each actor a number of its own",
+    );
+    let before = client.replay().unwrap();
+    client.wait_for_replay("more of the first", |replay| {
+        replay.transitions_inserted > before.transitions_inserted
+    });
+    first.stop().expect_code(0).expect_said("leaves: ");
+    second.wait_for_stderr("actor 3 steps 4 copies");
+    second.stop().expect_code(0);
+    let status = client.replay().unwrap();
+    assert_eq!((status.transitions_lost, status.messages_refused), (0, 0));
+    learner.stop().expect_code(0);
+}
+
+#[test]
+fn a_second_learner_gets_nothing_while_the_first_is_there() {
+    let system = system();
+    let _server = system.start_replay_server(&format!("--agent c51 {LONG}"));
+    let first = system.start_learner("first");
+    let actor = system.start_actor(0);
+    let client = system.connect();
+    client.wait_for_learner("updates", |learner| learner.updates > 10);
+    let mut second = system.start_learner("second");
+    second.wait_for_stderr("another learner takes part in this run, which has one alone");
+    second.stop().expect_code(0);
+    assert!(system.run_folder("second").checkpoints().is_empty());
+    actor.stop().expect_code(0);
+    first.stop().expect_code(0);
+    assert_eq!(client.replay().unwrap().messages_refused, 0);
+}

@@ -1,0 +1,56 @@
+//! A run whose arithmetic leaves the finite numbers: it fails, says so, and leaves nothing that cannot be gone on from.
+//! What an update refuses is the learner's own test.
+
+use std::fs;
+
+use driml_tests::RunFolder;
+use safetensors::SafeTensors;
+
+use crate::{SHORT, system};
+
+/// Every number in the checkpoints' files of tensors.
+fn check_finite(run: &RunFolder) {
+    if !run.path().join("checkpoints").exists() {
+        return;
+    }
+    for checkpoint in run.checkpoints() {
+        for file in fs::read_dir(checkpoint).unwrap() {
+            let path = file.unwrap().path();
+            if path.extension().is_none_or(|it| it != "safetensors") {
+                continue;
+            }
+            let bytes = fs::read(&path).unwrap();
+            for (name, tensor) in SafeTensors::deserialize(&bytes).unwrap().iter() {
+                let (numbers, _) = tensor.data().as_chunks::<4>();
+                let finite = numbers.iter().all(|&it| f32::from_le_bytes(it).is_finite());
+                assert!(finite, "{name} in {}", path.display());
+            }
+        }
+    }
+}
+
+#[test]
+fn parameters_that_are_not_finite_are_neither_saved_nor_acted_with() {
+    let at_once =
+        "--set learner.checkpoint_period_updates=1 --set learner.publish_period_updates=1";
+    for (lr, said) in [
+        // The first step is too large for a number; those of the second are so large that the loss after the first is not one.
+        ("1e38", "a step of Adam with lr = 1e38 is not finite"),
+        ("1e37", "is not finite; the update is not taken"),
+    ] {
+        let system = system();
+        system
+            .run(&format!(
+                "local --agent driml-fix {SHORT} {at_once} --set learner.update.adam.lr={lr} --run-dir run"
+            ))
+            .expect_code(1);
+        assert_eq!(system.survivors(), []);
+        let run = system.run_folder("run");
+        assert_eq!(run.summary().outcome, "failed");
+        let log = run.log("learner");
+        assert!(log.contains(said), "{lr}:\n{log}");
+        let log = run.log("actor-0");
+        assert!(!log.contains("were refused"), "{lr}:\n{log}");
+        check_finite(&run);
+    }
+}
