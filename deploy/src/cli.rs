@@ -210,7 +210,7 @@ pub(crate) struct ReplayServerArgs {
 /// Which levels to play.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Levels {
-    /// Those trained on, in the order of the training
+    /// Those trained on, as in the training: where an episode went on through completed levels, it does
     Train,
     /// Those trained on, drawn at random, each an episode of its own (Procgen)
     TrainSingle,

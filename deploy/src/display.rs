@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{LearnerStatus, ReplayStatus};
+use driml_protocol::{LearnerStatus, ReplayStatus, Waiting};
 
 use crate::{console::Screen, record::Episodes, resume::Behind};
 
@@ -140,10 +140,20 @@ impl Display {
                 episodes.count,
                 learner.c51_kl,
                 dim.collect::<String>(),
-                replay.waiting,
+                waiting(replay),
                 left.map_or(String::new(), |left| format!("  {} left", duration(left))),
             ),
         ]
+    }
+}
+
+/// Who waits for whom, and how many actors do.
+fn waiting(replay: &ReplayStatus) -> String {
+    match (replay.waiting, replay.actors_waiting) {
+        (Waiting::ActorsWaitForLearner, waiting @ 1..) => {
+            format!("{waiting} of {} actors wait for learner", replay.actors)
+        }
+        (waiting, _) => waiting.to_string(),
     }
 }
 
@@ -171,7 +181,6 @@ pub(crate) fn duration(time: Duration) -> String {
 
 #[cfg(test)]
 mod tests {
-    use driml_protocol::Waiting;
     use expect_test::expect;
 
     use super::*;
@@ -186,6 +195,8 @@ mod tests {
             warmup_transitions: 1_000,
             k_histogram: vec![0, 1, 1, 2],
             waiting: Waiting::ActorsWaitForLearner,
+            actors: 24,
+            actors_waiting: 23,
             ..ReplayStatus::default()
         };
         let learner = LearnerStatus {
@@ -209,7 +220,7 @@ mod tests {
             .add(start + Duration::from_secs(10), 33_000, 1000);
         expect![[r#"
             frames 33000/200000 (160/s)  updates 1000/6218 (5.0/s)  replay ratio 8.00
-            return 1.23 (45 episodes)  C51 0.123  DIM 4t4 4.000  mean k 2.25  actors wait for learner  17 min 23 s left"#]]
+            return 1.23 (45 episodes)  C51 0.123  DIM 4t4 4.000  mean k 2.25  23 of 24 actors wait for learner  17 min 23 s left"#]]
         .assert_eq(&display.text(&replay, &learner, episodes).join("\n"));
         expect![[r#"
             frames 0/200000 (160/s)  updates 0/6218 (5.0/s)  replay ratio -

@@ -28,6 +28,8 @@ const COPIES_MAX: usize = 32;
 const STEPS_A_ROUND_MAX: u64 = 20_000;
 /// Levels to draw unseen ones from, right after those trained on.
 const UNSEEN_LEVELS: u32 = 100_000;
+/// The stream of the exploring policy's generator. A world seeded alike gives its copies streams that count from 0.
+const POLICY_STREAM: u64 = u64::MAX;
 
 /// Plays, and prints mean and standard deviation.
 ///
@@ -153,10 +155,17 @@ impl Player {
             EPSILON,
             episodes,
             rounds * STEPS_A_ROUND_MAX,
-            ChaCha8Rng::seed_from_u64(seed),
+            policy_rng(seed),
         )
         .with_context(|| format!("playing {}", spec.world))
     }
+}
+
+/// What the policy explores with: other numbers than those of any copy of the world, which has the same seed.
+fn policy_rng(seed: u64) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(POLICY_STREAM);
+    rng
 }
 
 /// The world with the levels asked for.
@@ -199,7 +208,90 @@ fn mean_and_deviation(values: &[f64]) -> (f64, f64) {
 
 #[cfg(test)]
 mod tests {
+    use driml_envs::{ChainConfig, ProcgenConfig};
+    use rand::Rng;
+
     use super::*;
+
+    #[test]
+    fn an_evaluation_hardly_explores() {
+        // Source: section 2 of the project's specification.
+        assert_eq!(EPSILON, 0.001);
+    }
+
+    #[test]
+    fn exploration_and_the_world_do_not_share_random_numbers() {
+        for seed in [0, 1, u64::MAX] {
+            let first = policy_rng(seed).random::<u64>();
+            // The streams of a world's copies: two for each.
+            for stream in 0..2 * COPIES_MAX as u64 {
+                let mut copy = ChaCha8Rng::seed_from_u64(seed);
+                copy.set_stream(stream);
+                assert_ne!(copy.random::<u64>(), first, "stream {stream}");
+            }
+        }
+    }
+
+    fn procgen(start_level: u32, num_levels: u32) -> WorldConfig {
+        WorldConfig::Procgen(ProcgenConfig {
+            game: "coinrun".parse().unwrap(),
+            distribution_mode: "easy".parse().unwrap(),
+            num_levels,
+            start_level,
+            use_sequential_levels: true,
+            paint_vel_info: true,
+            use_backgrounds: true,
+            center_agent: true,
+            restrict_themes: false,
+        })
+    }
+
+    /// The levels of a world, and whether an episode goes on from one to the next.
+    fn levels_of(world: &WorldConfig, which: Levels) -> (std::ops::Range<u32>, bool) {
+        match levels(world, which).unwrap() {
+            WorldConfig::Procgen(it) => {
+                let levels = it.start_level..it.start_level + it.num_levels;
+                (levels, it.use_sequential_levels)
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn unseen_levels_are_none_of_those_trained_on() {
+        for (start, count) in [(0, 500), (70, 1), (1000, 200)] {
+            let world = procgen(start, count);
+            let (train, goes_on) = levels_of(&world, Levels::Train);
+            assert_eq!((train.clone(), goes_on), (start..start + count, true));
+            let (single, goes_on) = levels_of(&world, Levels::TrainSingle);
+            assert_eq!((single, goes_on), (train.clone(), false));
+            let (unseen, goes_on) = levels_of(&world, Levels::Unseen);
+            assert!(
+                unseen.start >= train.end && unseen.len() == 100_000,
+                "{unseen:?}"
+            );
+            assert!(!goes_on);
+        }
+    }
+
+    #[test]
+    fn levels_that_a_world_does_not_have_are_refused() {
+        let all = levels(&procgen(0, 0), Levels::Unseen).unwrap_err();
+        assert!(all.to_string().contains("none is unseen"), "{all}");
+        let chain = WorldConfig::Chain(ChainConfig {
+            cells: 8,
+            height: 12,
+            width: 12,
+            step_limit: 30,
+            reward_left: 0.1,
+            reward_right: 1.0,
+        });
+        assert!(levels(&chain, Levels::Train).is_ok());
+        for which in [Levels::TrainSingle, Levels::Unseen] {
+            let said = levels(&chain, which).unwrap_err().to_string();
+            assert!(said.contains("has no levels"), "{said}");
+        }
+    }
 
     #[test]
     fn the_deviation_is_the_samples() {

@@ -2,6 +2,8 @@
 //! It checks no value: `config` does, once everything is in place.
 
 mod menu;
+#[cfg(test)]
+mod pinned;
 
 use driml_envs::WorldName;
 use serde::Deserialize;
@@ -57,7 +59,7 @@ pub(crate) const PRESETS: [Preset; 4] = [
     },
     Preset {
         name: "split",
-        about: "`paper` with 500 Procgen levels in random order to train on, and unseen ones to test on",
+        about: "`paper` with each of the 500 Procgen levels an episode of its own, and unseen ones to test on",
         layers: &[layer!("variant/split")],
         families: &["procgen"],
     },

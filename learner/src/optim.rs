@@ -9,7 +9,7 @@ use std::{
     },
 };
 
-use candle_core::{CpuStorage, Device, InplaceOp2, Layout, Tensor, Var, bail};
+use candle_core::{CpuStorage, DType, Device, InplaceOp2, Layout, Tensor, Var, bail};
 use driml_model::{Operations, Parameters};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -203,7 +203,7 @@ impl Adam {
     /// Puts back what [`Adam::to_tensors`] gave after `step` steps, bit for bit, on `device`.
     ///
     /// # Errors
-    /// A moment that is missing, of another shape, or of no parameter of this optimiser.
+    /// A moment that is missing, of another shape or type, not finite, or of no parameter of this optimiser.
     pub fn restore(
         &mut self,
         step: u64,
@@ -221,6 +221,22 @@ impl Adam {
                     let found = tensor.dims();
                     return Err(UpdateError::State(format!(
                         "the moment {name} is {found:?}, not {shape:?}"
+                    )));
+                }
+                let values = match tensor.dtype() {
+                    DType::F32 => tensor.flatten_all()?.to_vec1::<f32>()?,
+                    other => {
+                        return Err(UpdateError::State(format!(
+                            "the moment {name} has type {other:?}, not F32"
+                        )));
+                    }
+                };
+                // Of squares there is no negative mean.
+                let least = if which == "v" { 0.0 } else { f32::MIN };
+                if let Some(at) = values.iter().position(|v| !(least..=f32::MAX).contains(v)) {
+                    let value = values[at];
+                    return Err(UpdateError::State(format!(
+                        "the moment {name} is {value} at index {at}"
                     )));
                 }
                 Ok(tensor.to_device(device)?)

@@ -73,14 +73,17 @@ fn driml_ada_with_two_actors_over_tcp() {
         "{longer} --actors 2 --listen {} --run-dir run",
         free_tcp_endpoint()
     );
+    // All three actions amount to one, so the learner's A is 1 everywhere and k goes as far as it may. Without the learner the
+    // replay server's A is 1/3 everywhere: then the mean of k is at most 1 + 1/3 + .. + 1/81.
+    let alphabet = "--set learner.affinity.alphabet=visible --set learner.affinity.visible=[0,0,0]";
     system
-        .run(&format!("local --agent driml-ada {flags}"))
+        .run(&format!("local --agent driml-ada {alphabet} {flags}"))
         .expect_code(0);
     let run = system.run_folder("run");
     let summary = run.check_finished();
     assert_eq!(summary.replay_ratio, Some(8.0));
     let mean_k = summary.mean_k.expect("driml-ada draws positives");
-    assert!(1.0 < mean_k && mean_k < 5.0, "{mean_k}");
+    assert!(mean_k > 3.0, "{mean_k}");
     for part in ["actor-0", "actor-1"] {
         let log = run.log(part);
         assert!(
@@ -140,11 +143,35 @@ fn cpc_and_curl_get_what_they_need_and_no_more() {
         let (header, rows) = run.metrics();
         let loss = header.iter().position(|it| it == "dim_4t4").unwrap();
         let last = rows.last().unwrap()[loss].parse::<f64>().unwrap();
-        assert!(last > 0.0 && last < 16f64.ln() + 1.0, "{agent}: {last}");
+        assert!(last > 0.0, "{agent}: {last}");
         let ended = system
             .run(&format!("evaluate --run {agent} --episodes 3"))
             .expect_code(0);
         assert!(ended.stdout.contains(agent), "{}", ended.stdout);
+    }
+}
+
+/// Anchors and positives still belong together after actor, server, wire and learner: what was learned tells the positive from
+/// the other rows'. Positives of other rows can be learned no better than ln B, which is where every loss begins.
+#[test]
+fn what_is_learned_tells_the_positive_from_other_rows() {
+    // Found, over five seeds each: 2.2 to 2.4 and 2.7 to 2.8; with the positives of other rows 4.0 to 4.1, and ln B is 4.16.
+    // Not `cpc`: five steps on, the chain's end is so often past that few rows are left to tell apart.
+    for agent in ["driml-fix", "curl"] {
+        let system = system();
+        let longer = SHORT.replace("replay_ratio=8", "replay_ratio=32");
+        assert_ne!(longer, SHORT);
+        system
+            .run(&format!(
+                "local --agent {agent} {longer} --set learner.batch_rows=64 --run-dir run"
+            ))
+            .expect_code(0);
+        let run = system.run_folder("run");
+        assert_eq!(run.check_finished().updates, 540);
+        let (header, rows) = run.metrics();
+        let loss = header.iter().position(|it| it == "dim_4t4").unwrap();
+        let last: f64 = rows.last().unwrap()[loss].parse().unwrap();
+        assert!(last > 0.0 && last < 0.75 * 64f64.ln(), "{agent}: {last}");
     }
 }
 

@@ -212,7 +212,7 @@ fn note_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, Strin
 }
 
 /// The path of each setting in a preset file and the comment beside or above it.
-fn comments(text: &str) -> Vec<(String, String)> {
+pub(super) fn comments(text: &str) -> Vec<(String, String)> {
     let mut found: Vec<(String, String)> = Vec::new();
     let (mut table, mut above) = (String::new(), String::new());
     for line in text.lines() {

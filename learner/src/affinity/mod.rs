@@ -226,6 +226,129 @@ mod tests {
         }
     }
 
+    /// The preset's numbers (`deploy/presets/agent/driml-ada.toml`) on a source as skewed as a game's.
+    const PRESET: LearnedSettings = LearnedSettings {
+        hidden: 32,
+        lr: 2e-3,
+        beta1: 0.9,
+        beta2: 0.999,
+        eps: 1e-8,
+        keep: 0.9,
+    };
+    const ACTIONS: usize = 15;
+    const K_MAX: usize = 5;
+
+    /// A source that repeats its action with probability 0.3, and else draws action j with a probability in proportion to
+    /// 0.7^j: from the one of them to the 15th a factor of 150.
+    struct Skewed {
+        marginal: Vec<f64>,
+    }
+
+    impl Skewed {
+        const REPEATS: f64 = 0.3;
+
+        fn new() -> Self {
+            let weights: Vec<f64> = (0..ACTIONS as i32).map(|j| 0.7f64.powi(j)).collect();
+            let sum: f64 = weights.iter().sum();
+            Self {
+                marginal: weights.into_iter().map(|weight| weight / sum).collect(),
+            }
+        }
+
+        fn transition(&self, from: usize, to: usize) -> f64 {
+            let repeats = if from == to { Self::REPEATS } else { 0.0 };
+            repeats + (1.0 - Self::REPEATS) * self.marginal[to]
+        }
+
+        fn draw(&self, rng: &mut ChaCha8Rng) -> usize {
+            let mut left = rng.random::<f64>();
+            let drawn = self.marginal.iter().position(|p| {
+                left -= p;
+                left < 0.0
+            });
+            drawn.unwrap_or(ACTIONS - 1)
+        }
+
+        /// Pairs as a batch has them, each from another place in the replay.
+        fn pairs(&self, count: usize, rng: &mut ChaCha8Rng) -> Vec<(u8, u8)> {
+            let mut pair = || {
+                let from = self.draw(rng);
+                let repeats = rng.random_bool(Self::REPEATS);
+                let to = if repeats { from } else { self.draw(rng) };
+                (from as u8, to as u8)
+            };
+            (0..count).map(|_| pair()).collect()
+        }
+
+        /// P(k > i) for i = 1, .., K_MAX - 1 with this A, over the source's own sequences of actions.
+        fn beyond(&self, matrix: &[f32]) -> Vec<f64> {
+            let mut alive = self.marginal.clone();
+            let step = |alive: &[f64], to: usize| -> f64 {
+                let from = alive.iter().enumerate();
+                from.map(|(from, p)| {
+                    p * self.transition(from, to) * f64::from(matrix[from * ACTIONS + to])
+                })
+                .sum()
+            };
+            let mut next = || {
+                alive = (0..ACTIONS).map(|to| step(&alive, to)).collect();
+                alive.iter().sum()
+            };
+            (1..K_MAX).map(|_| next()).collect()
+        }
+    }
+
+    /// Total variation between the laws of k of which these are the tails.
+    fn distance(a: &[f64], b: &[f64]) -> f64 {
+        let law = |tails: &[f64]| -> Vec<f64> {
+            let from = [&[1.0], tails].concat();
+            let to = [tails, &[0.0]].concat();
+            from.iter().zip(to).map(|(from, to)| from - to).collect()
+        };
+        let each = law(a).into_iter().zip(law(b));
+        each.map(|(a, b)| (a - b).abs()).sum::<f64>() / 2.0
+    }
+
+    /// The learned estimate starts uniform, where k is hardly ever above 1, and is slow: what k does within the first 1,500
+    /// updates says nothing of the agent.
+    #[test]
+    fn with_the_preset_s_numbers_learned_and_exact_come_to_the_same_law_of_k() {
+        let source = Skewed::new();
+        for (batch, seed) in [(256, 4), (256, 5), (64, 4), (64, 5)] {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let alphabet = Alphabet::raw(ACTIONS).unwrap();
+            let exact = ExactSettings {
+                decay: 0.999,
+                smoothing: 1.0,
+            };
+            let exact = ExactAffinity::new(alphabet.clone(), exact).unwrap();
+            let learned = LearnedAffinity::new(alphabet, PRESET, &mut rng).unwrap();
+            let mut exact = AffinityEstimator::Exact(exact);
+            let mut learned = AffinityEstimator::Learned(learned);
+            let mut apart = |updates: u64| {
+                for _ in 0..updates {
+                    let pairs = source.pairs(batch, &mut rng);
+                    exact.observe(&pairs, &mut rng).unwrap();
+                    learned.observe(&pairs, &mut rng).unwrap();
+                }
+                distance(
+                    &source.beyond(learned.matrix()),
+                    &source.beyond(exact.matrix()),
+                )
+            };
+            let after_100 = apart(100);
+            assert!(
+                after_100 > 0.045,
+                "seed {seed}: {after_100} apart after 100 of {batch}"
+            );
+            let after_1500 = apart(1400);
+            assert!(
+                after_1500 < 0.02,
+                "seed {seed}: {after_1500} apart after 1500 of {batch}"
+            );
+        }
+    }
+
     #[test]
     fn an_unknown_action_is_an_error_and_no_pairs_change_nothing() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);

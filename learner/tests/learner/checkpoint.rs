@@ -6,6 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
+use candle_core::{Device, Tensor};
 use driml_learner::{
     AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
     Learner,
@@ -286,16 +287,18 @@ fn every_kind_of_damage_is_reported_with_its_file() {
     assert!(load(&folder.0).unwrap().is_some());
 }
 
+fn sha256(bytes: &[u8]) -> String {
+    let digest = Sha256::digest(bytes);
+    digest.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
 /// Writes state.json with `change` made to it, and its sum.
 pub(crate) fn change_state(path: &Path, change: impl Fn(&mut serde_json::Value)) {
     let file = path.join("state.json");
     let mut state = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
     change(&mut state);
     let text = serde_json::to_vec_pretty(&state).unwrap();
-    let sum: String = Sha256::digest(&text)
-        .iter()
-        .map(|byte| format!("{byte:02x}"))
-        .collect();
+    let sum = sha256(&text);
     fs::write(&file, text).unwrap();
     fs::write(
         path.join("state.json.sha256"),
@@ -458,6 +461,38 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
     ] {
         let change = |state: &mut serde_json::Value| state["rng"][key] = value.clone();
         refused(&run, &change, "state.json");
+    }
+}
+
+#[test]
+fn moments_that_no_optimiser_has_are_damage() {
+    let folder = Folder::new("moments");
+    let mut run = Run::new();
+    run.updates(1);
+    let path = run.save(&folder.0, 1);
+    let file = path.join("optimizer.safetensors");
+    let whole = fs::read(&file).unwrap();
+    for (name, number) in [
+        ("m.head.bias", f32::NAN),
+        ("m.head.bias", f32::INFINITY),
+        ("v.head.bias", f32::NAN),
+        ("v.head.bias", -1.0),
+    ] {
+        let mut tensors = candle_core::safetensors::load_buffer(&whole, &Device::Cpu).unwrap();
+        let moment = &tensors[name];
+        let poisoned = Tensor::full(number, moment.dims(), &Device::Cpu).unwrap();
+        tensors.insert(name.to_owned(), poisoned);
+        let bytes = safetensors::serialize(&tensors, None).unwrap();
+        fs::write(&file, &bytes).unwrap();
+        change_state(&path, |state| {
+            state["sha256"]["optimizer.safetensors"] = sha256(&bytes).into();
+        });
+        let said = load(&folder.0).map(|_| ()).unwrap_err().to_string();
+        let wanted = format!("the moment {name} is {number} at index 0");
+        assert!(
+            said.contains("optimizer.safetensors") && said.contains(&wanted),
+            "{said}"
+        );
     }
 }
 

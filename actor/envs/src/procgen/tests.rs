@@ -216,6 +216,45 @@ fn completed_levels_are_followed_by_levels_of_the_set() {
     }
 }
 
+/// There is no order of levels: what follows a level is drawn.
+#[test]
+fn the_same_level_is_followed_by_different_ones() {
+    let Some(engine) = engine("the_same_level_is_followed_by_different_ones") else {
+        return;
+    };
+    let config = ProcgenConfig {
+        start_level: 30,
+        num_levels: 3,
+        ..config(Game::Maze)
+    };
+    let followers = |seed: u64| {
+        let mut world = ProcgenWorld::with_engine(engine, &config, 16, seed, 0).unwrap();
+        let mut rng = ChaCha8Rng::seed_from_u64(2);
+        let mut followers = std::collections::BTreeMap::<i32, Vec<i32>>::new();
+        for _ in 0..1000 {
+            let before = world.levels().to_vec();
+            let (_, _, ends) = step(&mut world, &draw(&mut rng, 16));
+            for ((before, after), end) in before.into_iter().zip(world.levels().to_vec()).zip(ends)
+            {
+                if end == StepEnd::LevelChange {
+                    followers.entry(before).or_default().push(after);
+                }
+            }
+        }
+        followers
+    };
+    let (one, other) = (followers(3), followers(4));
+    assert_ne!(one, other);
+    let (level, after) = one.iter().max_by_key(|(_, after)| after.len()).unwrap();
+    assert!(after.len() >= 10, "{one:?}");
+    for next in 30..33 {
+        assert!(
+            after.contains(&next),
+            "{level} is never followed by {next}: {after:?}"
+        );
+    }
+}
+
 /// A redrawn copy is where a fresh one of that level is, and goes on as it does, in every game.
 #[test]
 fn a_redrawn_level_is_the_level_itself() {

@@ -362,7 +362,9 @@ fn actions(results: &Results) -> Table {
     }
     let header = ["game", "mean k", "movement", "no-op", "special"];
     Table {
-        caption: "DRIML-ada: mean k over the whole run, and shares of its actions by what they amount to in the game.".into(),
+        caption: "DRIML-ada: mean k over the whole run, and shares of its actions by what they amount to in the game. The learned \
+                  affinity starts uniform, where the mean k of 15 actions is 1.07, and takes some 1,500 updates to what the exact one \
+                  (`learner.affinity.estimator=exact`) has at once: that k rises until then says nothing of the agent.".into(),
         header: header.map(String::from).to_vec(),
         rows,
     }

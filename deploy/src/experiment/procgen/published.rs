@@ -116,6 +116,35 @@ mod tests {
         }
     }
 
+    /// Cobbe et al. 2020, appendix C, table of normalisation constants, columns "easy", line by line.
+    #[test]
+    fn the_ranges_are_the_published_ones() {
+        let published = [
+            ("coinrun", 5.0, 10.0),
+            ("starpilot", 2.5, 64.0),
+            ("caveflyer", 3.5, 12.0),
+            ("dodgeball", 1.5, 19.0),
+            ("fruitbot", -1.5, 32.4),
+            ("chaser", 0.5, 13.0),
+            ("miner", 1.5, 13.0),
+            ("jumper", 3.0, 10.0),
+            ("leaper", 3.0, 10.0),
+            ("maze", 5.0, 10.0),
+            ("bigfish", 1.0, 40.0),
+            ("heist", 3.5, 10.0),
+            ("climber", 2.0, 12.6),
+            ("plunder", 4.5, 30.0),
+            ("ninja", 3.5, 10.0),
+            ("bossfight", 0.5, 13.0),
+        ];
+        let mut found = Game::ALL.map(|game| (game.name(), range(game)));
+        let mut wanted = published.map(|(name, min, max)| (name, (min, max)));
+        found.sort_by_key(|(name, _)| *name);
+        wanted.sort_by_key(|(name, _)| *name);
+        assert_eq!(found, wanted);
+        assert_eq!(normalised("procgen:fruitbot", 15.45), Some(0.5));
+    }
+
     #[test]
     fn every_game_is_in_both_tables() {
         for game in Game::ALL {
