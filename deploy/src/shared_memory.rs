@@ -26,10 +26,28 @@ pub(crate) fn remove_own() {
                 inode: file.ino(),
             };
             is_held_by_alone(&locks, &file, std::process::id())
-        }) {
+        }) && !is_mapped_elsewhere(&path)
+        {
             remove(&path);
         }
     }
+}
+
+/// Whether another process has the file in its memory. The table of locks alone does not tell: it is read in pieces, and as others
+/// lock and unlock meanwhile, lines are skipped.
+fn is_mapped_elsewhere(path: &Path) -> bool {
+    let own = std::process::id().to_string();
+    let processes = fs::read_dir("/proc").into_iter().flatten().flatten();
+    let others = processes.filter(|it| {
+        let name = it.file_name();
+        let name = name.to_string_lossy();
+        name.bytes().all(|byte| byte.is_ascii_digit()) && name != own
+    });
+    let path = path.to_string_lossy();
+    let maps = |it: fs::DirEntry| fs::read_to_string(it.path().join("maps")).ok();
+    others
+        .filter_map(maps)
+        .any(|maps| maps.lines().any(|line| line.ends_with(&*path)))
 }
 
 fn remove(path: &Path) {

@@ -1,8 +1,8 @@
 //! Puts the engine into the cache folder and knows whether it lies there whole.
 //! It does not load it, and fetches nothing with `DRIML_OFFLINE=1`.
 //!
-//! Layout: `<cache>/procgen-0.10.7/{libenv.so, assets/, LICENSE, installed.txt}`. `installed.txt` is written last and
-//! names the library's hash and the number and bytes of the pictures, so that a damaged folder is recognised.
+//! Layout: `<cache>/procgen-0.10.7/{libenv.so, assets/, LICENSE, installed.txt}`; `installed.txt` is written last. What makes it
+//! whole is for `check`.
 //! A folder is made beside its place and renamed into it, one process at a time, so that all that race succeed.
 
 use std::fs::{self, File, TryLockError};
@@ -12,8 +12,9 @@ use std::time::{Duration, Instant};
 
 use crate::WITHOUT_ENGINE;
 use crate::cache::Cache;
+use crate::check::{self, Hashes, MARKER, PINNED};
 use crate::library::{self, LoadError};
-use crate::wheel::{self, LIBENV_SHA256, VERSION, WHEEL_NAME, WHEEL_SHA256};
+use crate::wheel::{self, VERSION, WHEEL_NAME, WHEEL_SHA256};
 
 /// How long to wait for another process that fetches or installs; then this one does it for itself.
 const WAIT_MAX: Duration = Duration::from_secs(120);
@@ -48,6 +49,18 @@ pub enum InstallError {
         root: PathBuf,
         /// What is wrong with it.
         reason: String,
+    },
+    /// Somebody else could put other code in its place.
+    #[error(
+        "procgen's engine is code that would run as you, and others can change {path}: {why}. Make it yours alone \
+         (`chown -R \"$(id -u)\" {path}` as root, `chmod -R go-w {path}`), or set DRIML_CACHE to a folder that is {WITHOUT_ENGINE}",
+        path = .path.display()
+    )]
+    Shared {
+        /// The file or folder.
+        path: PathBuf,
+        /// Who can change it.
+        why: String,
     },
     /// It would have to be fetched, which `DRIML_OFFLINE=1` forbids.
     #[error("DRIML_OFFLINE=1 forbids fetching procgen's engine, and {reason}: {to_install} {WITHOUT_ENGINE}", to_install = to_install(.root))]
@@ -171,7 +184,7 @@ impl Engine {
     /// A wrong hash, an unreadable file, a full disk, or a machine that cannot run it.
     pub fn install_from_wheel(wheel: &Path) -> Result<Engine, InstallError> {
         library::check_machine()?;
-        Engine::unpack_into(&Cache::from_env()?, wheel, WHEEL_SHA256, LIBENV_SHA256)
+        Engine::unpack_into(&Cache::from_env()?, wheel, WHEEL_SHA256, PINNED)
     }
 
     /// The folder that holds everything.
@@ -195,7 +208,8 @@ impl Engine {
 
     fn locate_in(cache: &Cache) -> Result<Engine, InstallError> {
         library::check_machine()?;
-        Engine::whole(Engine::root_in(cache), LIBENV_SHA256)
+        check::check_private(&cache.folder)?;
+        Engine::whole(Engine::root_in(cache), PINNED)
     }
 
     fn source_in(
@@ -237,13 +251,12 @@ impl Engine {
                 provided.display(),
                 root.display()
             ));
-            return Engine::unpack_into(cache, &provided, WHEEL_SHA256, LIBENV_SHA256);
+            return Engine::unpack_into(cache, &provided, WHEEL_SHA256, PINNED);
         }
         if cache.offline {
             return Err(InstallError::Offline { root, reason });
         }
-        fs::create_dir_all(&cache.folder)
-            .map_err(|error| InstallError::io("making", &cache.folder, error))?;
+        wheel::make_folder(&cache.folder)?;
         let _turn = wait_for_turn(cache, "fetch.lock", WAIT_MAX);
         if let Ok(engine) = Engine::locate_in(cache) {
             return Ok(engine);
@@ -261,7 +274,7 @@ impl Engine {
             "procgen's engine: unpacking into {}",
             root.display()
         ));
-        Engine::unpack_into(cache, &wheel, WHEEL_SHA256, LIBENV_SHA256)
+        Engine::unpack_into(cache, &wheel, WHEEL_SHA256, PINNED)
     }
 
     /// Checks and unpacks the wheel beside its place, then renames it into it.
@@ -269,26 +282,26 @@ impl Engine {
         cache: &Cache,
         wheel: &Path,
         wheel_hash: &str,
-        library_hash: &str,
+        hashes: Hashes<'_>,
     ) -> Result<Engine, InstallError> {
+        check::check_private(&cache.folder)?;
         wheel::check_hash(wheel, wheel_hash)?;
-        fs::create_dir_all(&cache.folder)
-            .map_err(|error| InstallError::io("making", &cache.folder, error))?;
+        wheel::make_folder(&cache.folder)?;
         let folder = tempfile::Builder::new()
             .prefix("unpack-")
             .tempdir_in(&cache.folder);
         let folder =
             folder.map_err(|error| InstallError::io("making a folder in", &cache.folder, error))?;
         let fresh = folder.path().join("fresh");
-        fs::create_dir(&fresh).map_err(|error| InstallError::io("making", &fresh, error))?;
+        wheel::make_folder(&fresh)?;
         wheel::unpack(wheel, &fresh)?;
-        let marker = marker(&fresh)?;
-        fs::write(fresh.join("installed.txt"), marker)
+        let text = format!("procgen {VERSION} from {WHEEL_NAME}\n");
+        wheel::write(&mut text.as_bytes(), &fresh.join(MARKER))
             .map_err(|error| InstallError::io("writing", &fresh, error))?;
 
         let root = Engine::root_in(cache);
         let _turn = wait_for_turn(cache, "install.lock", WAIT_MAX);
-        if let Ok(engine) = Engine::whole(root.clone(), library_hash) {
+        if let Ok(engine) = Engine::whole(root.clone(), hashes) {
             return Ok(engine);
         }
         if root.exists() {
@@ -297,36 +310,19 @@ impl Engine {
                 .map_err(|error| InstallError::io("moving away the damaged", &root, error))?;
         }
         match fs::rename(&fresh, &root) {
-            Ok(()) => Engine::whole(root, library_hash),
+            Ok(()) => Engine::whole(root, hashes),
             // Where files cannot be locked, somebody may have been faster: theirs is as good, if it is whole.
-            Err(error) => Engine::whole(root.clone(), library_hash)
+            Err(error) => Engine::whole(root.clone(), hashes)
                 .map_err(|_| InstallError::io("renaming into place", &root, error)),
         }
     }
 
-    /// The engine in `root`, if nothing of it is missing or changed.
-    fn whole(root: PathBuf, library_hash: &str) -> Result<Engine, InstallError> {
+    /// The engine in `root`, if it is whole and nobody else can change it.
+    fn whole(root: PathBuf, hashes: Hashes<'_>) -> Result<Engine, InstallError> {
         if !root.exists() {
             return Err(InstallError::Missing { root });
         }
-        let damaged = |reason: &str| InstallError::Damaged {
-            root: root.clone(),
-            reason: reason.to_owned(),
-        };
-        let expected = fs::read_to_string(root.join("installed.txt"));
-        let expected = expected.map_err(|_| damaged("installed.txt cannot be read"))?;
-        let actual = marker(&root).map_err(|error| match error {
-            InstallError::Io { path, source, .. } => {
-                damaged(&format!("{}: {source}", path.display()))
-            }
-            other => other,
-        })?;
-        if !actual.contains(library_hash) {
-            return Err(damaged("libenv.so has another SHA-256 than the pinned one"));
-        }
-        if expected != actual {
-            return Err(damaged("pictures are missing or changed"));
-        }
+        check::check(&root, hashes)?;
         Ok(Engine { root })
     }
 }
@@ -347,37 +343,6 @@ fn wait_for_turn(cache: &Cache, name: &str, limit: Duration) -> Option<File> {
             Err(_) => return None,
         }
     }
-}
-
-/// What `installed.txt` says of the folder `root`.
-fn marker(root: &Path) -> Result<String, InstallError> {
-    let library = root.join("libenv.so");
-    let hash =
-        wheel::sha256(&library).map_err(|error| InstallError::io("reading", &library, error))?;
-    let assets = root.join("assets");
-    let (files, bytes) =
-        count(&assets).map_err(|error| InstallError::io("reading", &assets, error))?;
-    Ok(format!(
-        "procgen {VERSION}\nlibenv.so sha256 {hash}\nassets {files} files {bytes} bytes\n"
-    ))
-}
-
-/// Files and bytes below a folder.
-fn count(folder: &Path) -> io::Result<(u64, u64)> {
-    let (mut files, mut bytes) = (0, 0);
-    for entry in fs::read_dir(folder)? {
-        let entry = entry?;
-        let data = entry.metadata()?;
-        if data.is_dir() {
-            let (more_files, more_bytes) = count(&entry.path())?;
-            files += more_files;
-            bytes += more_bytes;
-        } else {
-            files += 1;
-            bytes += data.len();
-        }
-    }
-    Ok((files, bytes))
 }
 
 #[cfg(test)]

@@ -4,12 +4,13 @@
 //! The engine is the published wheel of procgen 0.10.7 (MIT licence, <https://github.com/openai/procgen>).
 //! It is a C++ library that ends the whole process on a bad option, so everything is checked here first.
 
-// The engine is a C library: calling it and owning the memory it writes to cannot be done in safe Rust.
-// This is the only crate of the workspace that may use `unsafe`.
+// The engine is a C library: calling it and owning the memory it writes to cannot be done in safe Rust. The other `unsafe` of the
+// workspace is in `learner/model/src/gemm.rs`.
 #![allow(unsafe_code)]
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 mod cache;
+mod check;
 mod ffi;
 mod game;
 mod install;

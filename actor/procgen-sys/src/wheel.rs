@@ -1,8 +1,9 @@
 //! The pinned wheel: fetching it with pip, checking its hash, unpacking what the engine needs of it.
 //! It decides nothing about where things end up; `install` does.
 
-use std::fs::{self, File};
+use std::fs::{self, DirBuilder, File};
 use std::io::{self, Read, Write};
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
@@ -23,6 +24,10 @@ pub const WHEEL_SHA256: &str = "4b594d14e42f0f2166e59a9e294477b906eb99c90c3343b5
 
 /// SHA-256 of `libenv.so` in that wheel.
 pub const LIBENV_SHA256: &str = "f44786431a902e9ae1a32cd44f4aa650f4bdad893240a322e49e6098d6a7a2ea";
+
+/// SHA-256 of the pictures in that wheel: of what `sha256sum` prints for all files below `assets`, sorted by path.
+pub(crate) const ASSETS_SHA256: &str =
+    "ed5159a184ce933cc95f3506040819ba0a1e985c7450239dec2360a1cda744d4";
 
 const LIBENV_ENTRY: &str = "procgen/data/prebuilt/libenv.so";
 const ASSETS_ENTRY: &str = "procgen/data/assets/";
@@ -159,14 +164,15 @@ pub(crate) fn sha256(path: &Path) -> io::Result<String> {
     loop {
         let count = file.read(&mut block)?;
         if count == 0 {
-            return Ok(hasher
-                .finalize()
-                .iter()
-                .map(|byte| format!("{byte:02x}"))
-                .collect());
+            return Ok(hex(&hasher.finalize()));
         }
         hasher.update(&block[..count]);
     }
+}
+
+/// Bytes in lower-case hexadecimal.
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Checks that the wheel is the pinned one.
@@ -221,8 +227,7 @@ pub(crate) fn unpack(wheel: &Path, to: &Path) -> Result<(), InstallError> {
             continue;
         };
         if entry.is_dir() {
-            fs::create_dir_all(&target)
-                .map_err(|error| InstallError::io("making", &target, error))?;
+            make_folder(&target)?;
             continue;
         }
         if !entry.is_file() {
@@ -231,7 +236,7 @@ pub(crate) fn unpack(wheel: &Path, to: &Path) -> Result<(), InstallError> {
             )));
         }
         let parent = target.parent().unwrap_or(to);
-        fs::create_dir_all(parent).map_err(|error| InstallError::io("making", parent, error))?;
+        make_folder(parent)?;
         write(&mut entry, &target).map_err(|error| InstallError::io("writing", &target, error))?;
     }
     if found {
@@ -241,8 +246,16 @@ pub(crate) fn unpack(wheel: &Path, to: &Path) -> Result<(), InstallError> {
     }
 }
 
-fn write(from: &mut impl Read, to: &Path) -> io::Result<()> {
-    let mut file = File::create_new(to)?;
+/// Makes a folder, and those above it, in which nobody else can change anything, whatever the umask says.
+pub(crate) fn make_folder(path: &Path) -> Result<(), InstallError> {
+    let made = DirBuilder::new().recursive(true).mode(0o755).create(path);
+    made.map_err(|error| InstallError::io("making", path, error))
+}
+
+/// Writes a new file, which nobody else can change.
+pub(crate) fn write(from: &mut impl Read, to: &Path) -> io::Result<()> {
+    let mut options = File::options();
+    let mut file = options.write(true).create_new(true).mode(0o644).open(to)?;
     io::copy(from, &mut file)?;
     file.flush()
 }

@@ -22,6 +22,14 @@ pub(crate) fn spec() -> RunSpec {
     }
 }
 
+/// What a run leaves that did nothing.
+pub(crate) fn summary() -> Summary {
+    let folder = tempfile::tempdir().unwrap();
+    let recorder = Recorder::create(folder.path(), "", &[]).unwrap();
+    let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
+    recorder.summarise(Outcome::Finished, &spec(), &replay, &learner)
+}
+
 fn statuses() -> (ReplayStatus, LearnerStatus) {
     let replay = ReplayStatus {
         transitions_inserted: 2_000,

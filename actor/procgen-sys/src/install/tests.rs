@@ -12,8 +12,14 @@ fn cache(folder: &Path, offline: bool) -> Cache {
     }
 }
 
-/// A wheel with a made-up library, its hash and the library's.
-fn made_up(folder: &Path) -> (PathBuf, String, String) {
+/// SHA-256 of the made-up library, and of the made-up pictures: of what `sha256sum a.png b/c.png` prints.
+const HASHES: Hashes<'static> = Hashes {
+    library: "a2100e1d73fedddfd22587d2ef8b33dd37a9f6480032176d4e0c80b3923f48e1",
+    assets: "2266d954cab8fca2911929fbd7f12a0b1e6bd8ce4efaff10e3abbf1ff1a29c57",
+};
+
+/// A wheel with a made-up engine, and its hash.
+fn made_up(folder: &Path) -> (PathBuf, String) {
     let path = folder.join("made-up.whl");
     let mut writer = zip::ZipWriter::new(File::create(&path).unwrap());
     for name in [
@@ -28,9 +34,7 @@ fn made_up(folder: &Path) -> (PathBuf, String, String) {
     }
     writer.finish().unwrap();
     let hash = wheel::sha256(&path).unwrap();
-    let library = folder.join("library");
-    fs::write(&library, "procgen/data/prebuilt/libenv.so").unwrap();
-    (path, hash, wheel::sha256(&library).unwrap())
+    (path, hash)
 }
 
 /// Names of what lies in the cache folder, sorted.
@@ -46,17 +50,17 @@ fn left(cache: &Cache) -> Vec<String> {
 fn damage_is_recognised_and_repaired() {
     let folder = tempfile::tempdir().unwrap();
     let cache = cache(folder.path(), true);
-    let (wheel, hash, library) = made_up(folder.path());
-    let install = || Engine::unpack_into(&cache, &wheel, &hash, &library);
+    let (wheel, hash) = made_up(folder.path());
+    let install = || Engine::unpack_into(&cache, &wheel, &hash, HASHES);
     let reason = |root: &Path| {
-        Engine::whole(root.to_owned(), &library)
+        Engine::whole(root.to_owned(), HASHES)
             .unwrap_err()
             .to_string()
     };
 
     let root = install().unwrap().root;
     assert_eq!(
-        Engine::whole(root.clone(), &library).unwrap().library(),
+        Engine::whole(root.clone(), HASHES).unwrap().library(),
         root.join("libenv.so")
     );
     fs::write(root.join("libenv.so"), "other").unwrap();
@@ -66,12 +70,20 @@ fn damage_is_recognised_and_repaired() {
         reason(&root)
     );
     install().unwrap();
-    fs::remove_file(root.join("assets/b/c.png")).unwrap();
-    assert!(
-        reason(&root).contains("pictures are missing"),
-        "{}",
-        reason(&root)
-    );
+    // As many bytes as before.
+    for damage in [Some("procgen/data/assets/b/d.png"), None] {
+        let picture = root.join("assets/b/c.png");
+        match damage {
+            Some(bytes) => fs::write(picture, bytes).unwrap(),
+            None => fs::remove_file(picture).unwrap(),
+        }
+        let said = reason(&root);
+        assert!(said.contains("pictures are missing or changed"), "{said}");
+        install().unwrap();
+    }
+    fs::write(root.join("assets/more.png"), "").unwrap();
+    let said = reason(&root);
+    assert!(said.contains("pictures are missing or changed"), "{said}");
     install().unwrap();
     fs::remove_file(root.join("installed.txt")).unwrap();
     assert!(reason(&root).contains("installed.txt"), "{}", reason(&root));
@@ -88,20 +100,56 @@ fn damage_is_recognised_and_repaired() {
 }
 
 #[test]
+fn a_cache_that_others_can_change_is_refused() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = tempfile::tempdir().unwrap();
+    let cache = cache(folder.path(), true);
+    let (wheel, hash) = made_up(folder.path());
+    let install = || Engine::unpack_into(&cache, &wheel, &hash, HASHES);
+    let root = install().unwrap().root;
+    let find = || {
+        check::check_private(&cache.folder)?;
+        Engine::whole(root.clone(), HASHES)
+    };
+    for path in [
+        &cache.folder,
+        &root,
+        &root.join("libenv.so"),
+        &root.join("assets/b"),
+        &root.join("assets/b/c.png"),
+    ] {
+        let mode = fs::metadata(path).unwrap().permissions();
+        assert_eq!(mode.mode() & 0o022, 0, "as unpacked: {}", path.display());
+        let shared = fs::Permissions::from_mode(mode.mode() | 0o020);
+        fs::set_permissions(path, shared).unwrap();
+        let error = find().unwrap_err();
+        let InstallError::Shared { path: found, .. } = &error else {
+            panic!("{error}");
+        };
+        assert_eq!(found, path);
+        fs::set_permissions(path, mode).unwrap();
+    }
+    assert!(find().is_ok());
+    // Nothing is put into a folder of others either.
+    fs::set_permissions(&cache.folder, fs::Permissions::from_mode(0o777)).unwrap();
+    assert!(matches!(install(), Err(InstallError::Shared { .. })));
+}
+
+#[test]
 fn installers_that_race_all_succeed() {
     let folder = tempfile::tempdir().unwrap();
     let cache = cache(folder.path(), true);
-    let (wheel, hash, library) = made_up(folder.path());
+    let (wheel, hash) = made_up(folder.path());
     for damaged in [false, true] {
         if damaged {
             fs::remove_file(Engine::root_in(&cache).join("installed.txt")).unwrap();
         }
         std::thread::scope(|scope| {
-            let install = || Engine::unpack_into(&cache, &wheel, &hash, &library).unwrap();
+            let install = || Engine::unpack_into(&cache, &wheel, &hash, HASHES).unwrap();
             let threads: Vec<_> = (0..8).map(|_| scope.spawn(install)).collect();
             for thread in threads {
                 let engine = thread.join().unwrap();
-                Engine::whole(engine.root, &library).unwrap();
+                Engine::whole(engine.root, HASHES).unwrap();
             }
         });
         assert_eq!(
@@ -144,7 +192,7 @@ fn a_provided_wheel_is_used_and_its_hash_checked() {
     let folder = tempfile::tempdir().unwrap();
     let cache = cache(folder.path(), true);
     fs::create_dir_all(&cache.folder).unwrap();
-    let (wheel, hash, _) = made_up(folder.path());
+    let (wheel, hash) = made_up(folder.path());
     fs::copy(wheel, cache.folder.join(WHEEL_NAME)).unwrap();
     let fetch = |_: &Path| -> Result<PathBuf, InstallError> { panic!("fetched") };
     let mut lines = Vec::new();

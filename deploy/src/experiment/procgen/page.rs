@@ -2,13 +2,17 @@
 //! Every number is made here from the runs.
 
 use driml_envs::WorldName;
+use driml_protocol::metric::RETURNS_OF;
 
 use super::{
     Cell, Kind, Results, k, published,
     scores::{Aggregate, baseline},
     short,
 };
-use crate::experiment::{Page, aggregate, page::Table, statistics::Spread};
+use crate::{
+    experiment::{Page, aggregate, page::Table, statistics::Spread},
+    record::Summary,
+};
 
 /// Frames of the paper's runs.
 const PAPER_FRAMES: f64 = 50e6;
@@ -106,13 +110,26 @@ pub(super) fn page(results: &Results, aggregates: &[Aggregate], adaptive: bool) 
 
 /// That runs were interrupted and went on, if any were.
 fn resumed(results: &Results) -> Option<String> {
-    let resumed = |cell: &&Cell| cell.ran.summary.resumed_after_updates > 0;
-    let count = results.cells.iter().filter(resumed).count();
+    let summaries = results.cells.iter().map(|cell| &cell.ran.summary);
+    said_of_resumed(&summaries.collect::<Vec<_>>())
+}
+
+fn said_of_resumed(all: &[&Summary]) -> Option<String> {
+    let resumed = all.iter().filter(|it| it.resumed_after_updates > 0);
+    let count = resumed.clone().count();
+    // What an older version played before the interruption was not kept.
+    let short = resumed.filter(|it| it.mean_return_of < it.episodes.min(RETURNS_OF as u64));
+    let short = match short.count() {
+        0 => String::new(),
+        short => format!(
+            " The training return of {short} of them is of fewer than the last {RETURNS_OF} episodes, those since."
+        ),
+    };
     (count > 0).then(|| {
         format!(
             "{count} of {} runs were interrupted and went on from a checkpoint, with a replay that had to fill again; of these, the \
-             histogram of k and the shares of actions are of what came after.",
-            results.cells.len()
+             histogram of k and the shares of actions are of what came after.{short}",
+            all.len()
         )
     })
 }
@@ -236,7 +253,8 @@ fn table_1(results: &Results) -> Table {
                 .collect(),
         );
     }
-    let mut caption = "Training return, mean of the last 100 episodes: mean ± standard deviation over seeds; in brackets the \
+    let mut caption = "Training return, mean of the last 100 episodes (of all, in a run that had fewer): mean ± standard deviation over \
+                       seeds; in brackets the \
                        paper's (table 1; for driml-noact-k1 and -k5 its ablation) after 50 million frames."
         .to_owned();
     if let Some(row) = norm_scores(results) {
@@ -355,6 +373,26 @@ fn actions(results: &Results) -> Table {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_page_says_which_returns_are_of_fewer_episodes() {
+        let summary = |resumed: u64, episodes: u64, of: u64| Summary {
+            resumed_after_updates: resumed,
+            episodes,
+            mean_return_of: of,
+            ..crate::record::tests::summary()
+        };
+        let said = |all: &[Summary]| said_of_resumed(&all.iter().collect::<Vec<_>>());
+        assert_eq!(said(&[summary(0, 500, 0)]), None, "never interrupted");
+        let good = said(&[summary(9, 500, 100), summary(9, 30, 30)]).unwrap();
+        assert!(good.starts_with("2 of 2 runs were interrupted"), "{good}");
+        assert!(!good.contains("fewer than"), "{good}");
+        let old = said(&[summary(9, 500, 3), summary(9, 500, 100)]).unwrap();
+        assert!(
+            old.contains("training return of 1 of them is of fewer than the last 100"),
+            "{old}"
+        );
+    }
 
     #[test]
     fn small_shares_keep_two_digits() {

@@ -100,7 +100,11 @@ fn screen(results: &Results, cell: &Cell) -> anyhow::Result<Option<Screened>> {
 /// The frames after which the mean return of the last 100 training episodes stayed above the random policy's mean by
 /// `ERRORS` standard errors of a mean of so many of its episodes, to the end of the run.
 fn soonest(run: &Run, random: &Spread) -> anyhow::Result<Option<f64>> {
-    let (returns, episodes) = (run.values("mean_return")?, run.values("episodes")?);
+    let returns = run.values("mean_return")?;
+    // Of how many episodes it is; runs of older versions, which cannot be resumed by this one, only have the count of all.
+    let episodes = run
+        .values("mean_return_of")
+        .or_else(|_| run.values("episodes"))?;
     let mut since = None;
     // Once known, the return is in every row: the last rows of both belong together.
     for (row, episodes) in returns.iter().rev().zip(episodes.iter().rev()) {
@@ -251,5 +255,10 @@ mod tests {
         assert_eq!(read(rows), Some(300.0));
         assert_eq!(read("1,100,100,0.9\n2,200,100,0.5\n"), None);
         assert_eq!(read("1,100,5,9\n"), None, "too few episodes");
+        // 30 episodes, though the run has had 200: three standard errors are 0.32.
+        let text = "seconds,frames,episodes,mean_return,mean_return_of\n1,100,200,0.8,30\n2,200,210,0.9,40\n";
+        std::fs::write(folder.path().join("metrics.csv"), text).unwrap();
+        let found = soonest(&Run::read(folder.path()).unwrap(), &random).unwrap();
+        assert_eq!(found, Some(200.0));
     }
 }
