@@ -12,7 +12,7 @@ pub mod policy;
 pub mod recorder;
 mod run;
 pub mod schedule;
-mod weights;
+pub mod weights;
 
 pub use collect::{Collector, Life};
 pub use config::{ActorSettings, Config, ConfigError, EpsilonLadder, InputSize};

@@ -20,9 +20,6 @@ use crate::{
 /// How long an actor waits for a learner with weights.
 const WEIGHTS_WAIT_MAX: Duration = Duration::from_secs(120);
 
-/// How long an actor that the rate limiter holds back waits for newer weights before its next chunk.
-const FRESH_WEIGHTS_MAX: Duration = Duration::from_millis(200);
-
 /// What an actor is told at its start; everything else comes from the replay server.
 #[derive(Clone, Debug)]
 pub struct RunArgs {
@@ -113,12 +110,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         config.envs
     );
     while !shutdown.is_set() && !delivery.is_finished() {
-        // One that waits has the time to act with what is newest; one that others wait for goes on.
-        let wait_max = match delivery.is_held() {
-            true => FRESH_WEIGHTS_MAX,
-            false => Duration::ZERO,
-        };
-        if let Some((header, weights)) = newest.take_within(wait_max)
+        let newer = newest.take_within(delivery.fresh_weights_max());
+        if let Some((header, weights)) = newer
             && let Err(e) = collector.set_weights(header.version, &weights)
         {
             tracing::warn!(

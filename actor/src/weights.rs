@@ -31,11 +31,11 @@ const PAUSE: Duration = Duration::from_millis(200);
 const SILENT_MAX: Duration = Duration::from_secs(5);
 
 /// Weights as they came: what they say of themselves, and a safetensors file.
-pub(crate) type Weights = (WeightsHeader, Vec<u8>);
+pub type Weights = (WeightsHeader, Vec<u8>);
 
 /// The newest weights, taken at most once. They are pulled at most once for each time that they are asked for.
 #[derive(Clone, Debug)]
-pub(crate) struct Newest {
+pub struct Newest {
     shared: Arc<(Mutex<State>, Condvar)>,
 }
 
@@ -70,7 +70,7 @@ impl Newest {
 
     /// Takes the newest weights, if they came since the last call, and asks for newer ones; those that were announced are waited
     /// for, at most for `wait_max`.
-    pub(crate) fn take_within(&self, wait_max: Duration) -> Option<Weights> {
+    pub fn take_within(&self, wait_max: Duration) -> Option<Weights> {
         let mut state = self.state();
         state.is_wanted = true;
         self.shared.1.notify_all();
@@ -121,10 +121,13 @@ impl Newest {
 
 /// Where weights come from.
 #[derive(Clone, Debug)]
-pub(crate) struct WeightsSource {
-    pub(crate) session: Session,
-    pub(crate) keys: Keys,
-    pub(crate) spec_hash: u64,
+pub struct WeightsSource {
+    /// A session with the replay server.
+    pub session: Session,
+    /// The run's keys.
+    pub keys: Keys,
+    /// Hash of the run spec.
+    pub spec_hash: u64,
 }
 
 impl WeightsSource {
@@ -132,7 +135,7 @@ impl WeightsSource {
     ///
     /// # Errors
     /// No weights within `wait_max`.
-    pub(crate) fn first(
+    pub fn first(
         &self,
         wait_max: Duration,
         shutdown: &Shutdown,
@@ -168,7 +171,7 @@ impl WeightsSource {
     ///
     /// # Errors
     /// No subscription, or no thread.
-    pub(crate) fn watch(self, version: u64, shutdown: Shutdown) -> anyhow::Result<Newest> {
+    pub fn watch(self, version: u64, shutdown: Shutdown) -> anyhow::Result<Newest> {
         let newest = Newest::after(version);
         let (slot, spec_hash) = (newest.clone(), self.spec_hash);
         let hear = move |sample: Sample| match announced(&sample.payload().to_bytes(), spec_hash) {

@@ -405,7 +405,7 @@ pub(crate) enum BenchCommand {
     Env(BenchFlags),
     /// A short run with real processes: its speed, how long the learner computes and waits, its memory
     System(BenchSystemArgs),
-    /// Replay servers under 1 to 64 actors and a learner, all synthetic and paced: what they store, serve and cost
+    /// More and more actors, synthetic and real: what is stored and served, how long each waits, how old the weights are
     Scale(BenchScaleArgs),
     /// All of these but the run, in turn with PyTorch, Reverb and gym3 doing the same work
     Peers(BenchPeersArgs),
@@ -445,12 +445,29 @@ pub(crate) struct BenchSystemArgs {
     pub(crate) flags: BenchFlags,
 }
 
+/// What is scaled.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum ScaleCase {
+    /// Paced synthetic actors and a limiter that never closes
+    Open,
+    /// Synthetic actors at a limiter that is closed most of the time
+    Closed,
+    /// Whole runs on Procgen
+    Processes,
+}
+
 #[derive(Clone, Debug, Args)]
 pub(crate) struct BenchScaleArgs {
-    /// Transitions a second that each actor offers
+    /// What to measure; may be given several times [default: all]
+    #[arg(long, value_name = "CASE", value_enum)]
+    pub(crate) case: Vec<ScaleCase>,
+    /// Numbers of actors, such as 1,8,32 [default: by case]
+    #[arg(long, value_name = "N,..", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub(crate) actors: Vec<u32>,
+    /// Transitions a second that each actor of the case `open` offers
     #[arg(long, value_name = "N", default_value_t = 1000.0, value_parser = rate)]
     pub(crate) actor_rate: f64,
-    /// Batches a second that the learner asks for
+    /// Batches a second that a synthetic learner asks for
     #[arg(long, value_name = "N", default_value_t = 20.0, value_parser = rate)]
     pub(crate) batch_rate: f64,
     /// Seconds for which each number of actors is watched

@@ -248,6 +248,7 @@ impl Recorder {
             transitions_lost: replay.transitions_lost,
             transitions_duplicated: replay.transitions_duplicated,
             rows_sampled: replay.rows_sampled,
+            rows_unlearned: replay.rows_unlearned,
             replay_ratio: replay.replay_ratio(),
             episodes: episodes.count,
             mean_return: episodes.mean_return.map(|it| it.mean),
@@ -264,6 +265,9 @@ impl Recorder {
             batches_retried: replay.batches_retried,
             replay_frame_mib: replay.frame_bytes_held.div_ceil(1 << 20),
             messages_refused: replay.messages_refused,
+            insert_ms: replay.insert_ms,
+            weights_behind_s: replay.weights_behind_s,
+            weights_behind_updates: replay.weights_behind_updates,
             rss_mib_max: rss
                 .map(|(name, mib)| (name.clone(), mib.map(f64::round).into()))
                 .collect(),

@@ -29,7 +29,7 @@ pub use batch::{Batch, BatchHeader, BatchReply, BatchRequest, NO_ACTION, Request
 pub use codec::{CodecError, Kind};
 pub use control::{ActorJoin, Goodbye, Hello, JoinReply, LearnerJoin};
 pub use keys::{Alive, Keys};
-pub use metric::{LearnerStatus, ReplayStatus, Returns, Waiting};
+pub use metric::{LearnerStatus, Quantiles, ReplayStatus, Returns, Waiting};
 pub use planes::{Planes, PlanesPool};
 pub use run_spec::{Horizon, RunSpec, TimeoutRule};
 pub use shutdown::Shutdown;

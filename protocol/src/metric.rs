@@ -56,6 +56,31 @@ impl Returns {
     }
 }
 
+/// How a quantity was distributed since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Quantiles {
+    /// The median.
+    pub p50: f64,
+    /// What 99% do not exceed.
+    pub p99: f64,
+    /// The largest.
+    pub max: f64,
+}
+
+impl Quantiles {
+    /// The worse of each of two, where there are two.
+    fn worst(one: Option<Self>, other: Option<Self>) -> Option<Self> {
+        let (Some(one), Some(other)) = (one, other) else {
+            return one.or(other);
+        };
+        Some(Self {
+            p50: one.p50.max(other.p50),
+            p99: one.p99.max(other.p99),
+            max: one.max.max(other.max),
+        })
+    }
+}
+
 /// The replay server's account of itself.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ReplayStatus {
@@ -100,8 +125,18 @@ pub struct ReplayStatus {
     pub actors_waited_s: f64,
     /// Actors that are connected.
     pub actors: u32,
+    /// Actors of which a chunk has come.
+    pub actors_acting: u32,
     /// Actors whose next chunk waits until the rate limiter lets it in.
     pub actors_waiting: u32,
+    /// Milliseconds from a question about a chunk to its answer, be it only that the chunk waits.
+    pub answer_ms: Option<Quantiles>,
+    /// Milliseconds from a chunk's arrival until it was stored.
+    pub insert_ms: Option<Quantiles>,
+    /// Seconds for which newer weights had been there when a chunk was stored; 0 where the newest ones had acted.
+    pub weights_behind_s: Option<Quantiles>,
+    /// Updates by which the weights that acted were behind the newest ones when their chunk was stored.
+    pub weights_behind_updates: Option<Quantiles>,
     /// Version of the affinity matrix in use; 0 is the uniform one.
     pub affinity_version: u64,
     /// All transitions are in.
@@ -144,7 +179,12 @@ impl ReplayStatus {
                 learner_waited_s,
                 actors_waited_s,
                 actors,
+                actors_acting,
                 actors_waiting,
+                answer_ms,
+                insert_ms,
+                weights_behind_s,
+                weights_behind_updates,
                 affinity_version,
                 finished,
             } = it;
@@ -166,7 +206,13 @@ impl ReplayStatus {
             sum.learner_waited_s += learner_waited_s;
             sum.actors_waited_s += actors_waited_s;
             sum.actors += actors;
+            sum.actors_acting += actors_acting;
             sum.actors_waiting += actors_waiting;
+            sum.answer_ms = Quantiles::worst(sum.answer_ms, *answer_ms);
+            sum.insert_ms = Quantiles::worst(sum.insert_ms, *insert_ms);
+            sum.weights_behind_s = Quantiles::worst(sum.weights_behind_s, *weights_behind_s);
+            sum.weights_behind_updates =
+                Quantiles::worst(sum.weights_behind_updates, *weights_behind_updates);
             sum.affinity_version = sum.affinity_version.min(*affinity_version);
             // Each knows of the others what the learner told it; the one that knows of the end is right.
             sum.finished |= finished;
@@ -248,6 +294,12 @@ mod tests {
 
     /// A status in which no field is zero or what it is by default.
     fn full(n: u64) -> ReplayStatus {
+        let quantiles = |what: u64| {
+            // The first shard's median is the worse one, the second's are the others.
+            let p50 = if n == 1 { 9_000.0 } else { 8_000.0 };
+            let (p99, max) = ((what * n) as f64, (2 * what * n) as f64);
+            (n < 3).then_some(Quantiles { p50, p99, max })
+        };
         ReplayStatus {
             transitions_inserted: n,
             transitions_held: 2 * n,
@@ -275,7 +327,12 @@ mod tests {
             learner_waited_s: 15.0 * n as f64,
             actors_waited_s: 16.0 * n as f64,
             actors: 17 * n as u32,
+            actors_acting: 21 * n as u32,
             actors_waiting: 20 * n as u32,
+            answer_ms: quantiles(22),
+            insert_ms: quantiles(23),
+            weights_behind_s: quantiles(24),
+            weights_behind_updates: quantiles(25),
             affinity_version: 18 * n,
             finished: n == 2,
         }
@@ -286,6 +343,13 @@ mod tests {
         assert_eq!(ReplayStatus::merged(&[]), ReplayStatus::default());
         assert_eq!(ReplayStatus::merged(&[full(1)]), full(1));
         let merged = ReplayStatus::merged(&[full(1), full(2)]);
+        let worst = |what: u64| {
+            Some(Quantiles {
+                p50: 9_000.0,
+                p99: (2 * what) as f64,
+                max: (4 * what) as f64,
+            })
+        };
         let expected = ReplayStatus {
             warmup_transitions: 1_000,
             returns: Returns {
@@ -297,6 +361,10 @@ mod tests {
             waiting: Waiting::Finished,
             // The shard that has the older matrix.
             affinity_version: 18,
+            answer_ms: worst(22),
+            insert_ms: worst(23),
+            weights_behind_s: worst(24),
+            weights_behind_updates: worst(25),
             finished: true,
             ..full(3)
         };

@@ -640,7 +640,13 @@ impl Replay {
             learner_waited_s: statistics.learner_waited_s,
             actors_waited_s: statistics.actors_waited_s,
             actors: statistics.actors,
+            // These are known to the service alone.
+            actors_acting: 0,
             actors_waiting: 0,
+            answer_ms: None,
+            insert_ms: None,
+            weights_behind_s: None,
+            weights_behind_updates: None,
             affinity_version: self.affinity.version(),
             finished: self.limiter.all_in(),
         }

@@ -19,6 +19,9 @@ use zenoh::Session;
 use crate::config::Config;
 use courier::Courier;
 
+/// How long an actor whose chunks wait may wait for newer weights.
+const FRESH_WEIGHTS_MAX: Duration = Duration::from_millis(200);
+
 /// Limits of one delivery.
 #[derive(Clone, Copy, Debug)]
 pub struct DeliveryLimits {
@@ -126,9 +129,13 @@ impl Delivery {
         self.account.actors.load(Ordering::Relaxed)
     }
 
-    /// The rate limiter makes this actor's chunks wait.
-    pub fn is_held(&self) -> bool {
-        self.account.is_held()
+    /// How long the actor has time to wait for newer weights before it begins its next chunk: where the rate limiter makes its
+    /// chunks wait, it loses nothing by acting with the newest.
+    pub fn fresh_weights_max(&self) -> Duration {
+        match self.account.is_held() {
+            true => FRESH_WEIGHTS_MAX,
+            false => Duration::ZERO,
+        }
     }
 
     /// The run has all the transitions it wants.

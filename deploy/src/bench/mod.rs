@@ -6,6 +6,7 @@ mod assemble;
 mod effort;
 mod env;
 mod figures;
+mod launched;
 mod learner;
 mod peers;
 mod policy;

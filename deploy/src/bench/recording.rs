@@ -114,31 +114,44 @@ impl Chunks<'_> {
     pub(super) const fn transitions(&self) -> u64 {
         self.next.first_transition
     }
+
+    /// Chunks say from now on that weights of `version` acted.
+    pub(super) const fn act_with(&mut self, version: u64) {
+        self.next.weights_version = version;
+    }
+
+    /// The next chunk, of so many steps.
+    pub(super) fn next_of(&mut self, steps: u32) -> Chunk {
+        self.next.steps = steps;
+        let Recording {
+            frame_bytes,
+            frames,
+            steps: recorded,
+        } = self.recording;
+        let bytes = self.next.planes_bytes();
+        let bytes = bytes.expect("a chunk of a bench is far below the address space");
+        let mut chunk = Chunk::in_memory(self.next, self.pool.take(bytes));
+        let (streams, steps) = (self.next.streams as usize, steps as usize);
+        let first_step = self.next.first_transition as usize / streams;
+        for row in 0..streams * steps {
+            let step = first_step + row % steps;
+            let from = step % STEPS * STREAMS + row / steps;
+            let frame = &frames[from * frame_bytes..(from + 1) * frame_bytes];
+            chunk.frame_mut(row).copy_from_slice(frame);
+            let (action, reward, end) = recorded[from];
+            chunk.set(row, action, reward, end);
+        }
+        self.next.sequence += 1;
+        self.next.first_transition += chunk.header.transitions() as u64;
+        chunk
+    }
 }
 
 impl Iterator for Chunks<'_> {
     type Item = Chunk;
 
     fn next(&mut self) -> Option<Chunk> {
-        let Recording {
-            frame_bytes,
-            frames,
-            steps,
-        } = self.recording;
-        let bytes = self.next.planes_bytes()?;
-        let mut chunk = Chunk::in_memory(self.next, self.pool.take(bytes));
-        let (streams, chunk_steps) = (self.next.streams as usize, self.next.steps as usize);
-        for row in 0..streams * chunk_steps {
-            let step = self.next.sequence as usize * chunk_steps + row % chunk_steps;
-            let from = step % STEPS * STREAMS + row / chunk_steps;
-            let frame = &frames[from * frame_bytes..(from + 1) * frame_bytes];
-            chunk.frame_mut(row).copy_from_slice(frame);
-            let (action, reward, end) = steps[from];
-            chunk.set(row, action, reward, end);
-        }
-        self.next.sequence += 1;
-        self.next.first_transition += chunk.header.transitions() as u64;
-        Some(chunk)
+        Some(self.next_of(self.next.steps))
     }
 }
 

@@ -139,7 +139,7 @@ impl Run {
         let pool = self.actor.chunk_memory();
         self.deliveries += 1;
         let (spec_hash, actor) = (self.actor.spec.hash(), self.deliveries);
-        taking_part::join_as_actor(&self.session, &self.keys, spec_hash, actor)?;
+        let alive = taking_part::join_as_actor(&self.session, &self.keys, spec_hash, actor)?;
         let delivery = Delivery::start(
             self.session.clone(),
             self.keys.clone(),
@@ -158,6 +158,7 @@ impl Run {
             }
         }
         let unwanted = delivery.finish()?;
+        drop(alive);
         let seconds = started.elapsed().as_secs_f64();
         ensure!(unwanted == 0, "{unwanted} transitions were not wanted");
         Ok(chunks.transitions() as f64 / seconds)
@@ -172,7 +173,7 @@ impl Run {
             transport,
             ..
         } = &self.learner;
-        taking_part::join_as_learner(&self.session, &self.keys, spec.hash())?;
+        let _alive = taking_part::join_as_learner(&self.session, &self.keys, spec.hash())?;
         let mut source = BatchSource::start(
             std::slice::from_ref(&self.session),
             &self.keys,

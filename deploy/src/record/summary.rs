@@ -4,7 +4,7 @@
 use std::{fs, path::Path};
 
 use anyhow::Context;
-use driml_protocol::whole_file;
+use driml_protocol::{Quantiles, whole_file};
 use serde::{Deserialize, Serialize};
 
 const FILE: &str = "summary.json";
@@ -52,6 +52,10 @@ pub(crate) struct Summary {
     pub(crate) replay_ratio: Option<f64>,
     /// Episodes that ended, in a resumed run those too in which the replay filled again.
     pub(crate) episodes: u64,
+    /// Rows served to a learner that died before it saved what it learned from them; they do not count as served. Older runs do
+    /// not say.
+    #[serde(default)]
+    pub(crate) rows_unlearned: u64,
     /// Mean undiscounted return of the last 100 training episodes, also over a resumption.
     pub(crate) mean_return: Option<f64>,
     /// Of how many episodes that is: of fewer than 100 only if there were fewer. Older runs do not say.
@@ -83,6 +87,16 @@ pub(crate) struct Summary {
     pub(crate) replay_frame_mib: u64,
     /// Messages refused as malformed or foreign.
     pub(crate) messages_refused: u64,
+    /// Milliseconds from a chunk's arrival at the replay server until it was stored, waiting at the rate limiter included. Older
+    /// runs do not say, nor does lockstep.
+    #[serde(default)]
+    pub(crate) insert_ms: Option<Quantiles>,
+    /// Seconds for which newer weights had been there when what older ones chose was stored; as above.
+    #[serde(default)]
+    pub(crate) weights_behind_s: Option<Quantiles>,
+    /// Updates by which the weights that acted were behind then; as above.
+    #[serde(default)]
+    pub(crate) weights_behind_updates: Option<Quantiles>,
     /// Highest resident memory of each process, MiB.
     pub(crate) rss_mib_max: serde_json::Map<String, serde_json::Value>,
 }
@@ -98,6 +112,17 @@ impl Summary {
         let mut text = serde_json::to_vec_pretty(self).with_context(doing)?;
         text.push(b'\n');
         whole_file::write(&path, &text).with_context(doing)
+    }
+
+    /// Reads that of the run in `folder`.
+    ///
+    /// # Errors
+    /// There is none, or it is not one.
+    pub(crate) fn read(folder: &Path) -> anyhow::Result<Self> {
+        let path = folder.join(FILE);
+        let doing = || format!("reading {}", path.display());
+        let text = fs::read(&path).with_context(doing)?;
+        serde_json::from_slice(&text).with_context(doing)
     }
 
     /// Removes the one of an earlier time from the run folder, if there is one.
@@ -117,7 +142,5 @@ impl Summary {
 
 /// Whether the run in `folder` came to its end.
 pub(crate) fn is_finished(folder: &Path) -> bool {
-    let text = fs::read(folder.join(FILE)).ok();
-    let summary = text.and_then(|text| serde_json::from_slice::<Summary>(&text).ok());
-    summary.is_some_and(|it| it.outcome == Outcome::Finished)
+    Summary::read(folder).is_ok_and(|it| it.outcome == Outcome::Finished)
 }

@@ -9,16 +9,18 @@ use std::{
 use driml_protocol::{Chunk, Claim, InsertReply, Kind, fault};
 use zenoh::{bytes::ZBytes, query::Query};
 
-use super::{Service, State};
+use super::{Question, Service, State, parked::ParkedChunk};
+use crate::PackedChunk;
 
 /// How long the thread sleeps when nothing is parked; it is woken when something is.
 const IDLE: Duration = Duration::from_secs(60);
 
 /// Answers that are to be sent once the lock is free.
-type Answers = Vec<(Query, InsertReply)>;
+type Answers = Vec<(Question, InsertReply)>;
 
 impl Service {
     pub(super) fn insert(&self, query: Query) {
+        let arrived = Instant::now();
         let none = ZBytes::new();
         let payload = query.payload().unwrap_or(&none);
         let (pieces, len) = (payload.slices(), payload.len());
@@ -32,67 +34,17 @@ impl Service {
             }
         };
         let packed = self.packer.pack(Cow::Owned(chunk));
-        let header = packed.chunk.header;
-        let mut state = self.state();
-        let State { replay, chunks, .. } = &mut *state;
-        let reply = match replay.settle(&packed) {
-            Some(reply) => reply,
-            // Those that came before go first.
-            None if !chunks.is_empty() && !header.leaving => InsertReply::Wait {
-                inserted_total: replay.inserted_total(),
-                kept: false,
-            },
-            None => replay.admit(&packed),
-        };
-        let mut answers = Answers::new();
-        match reply {
-            InsertReply::Wait { .. } => {
-                if let Err(query) = chunks.park(packed, query, Instant::now()) {
-                    answers.push((query, reply));
-                }
-            }
-            reply => {
-                if matches!(reply, InsertReply::Stored { .. })
-                    && let Some(older) = chunks.take_copy(&header)
-                {
-                    answers.extend(older.question.map(|query| (query, reply.clone())));
-                }
-                answers.push((query, reply));
-            }
-        }
-        drop(state);
+        let answers = self.state().take_chunk(packed, Question { query, arrived });
         self.changed.notify_all();
         self.answer_all(answers);
     }
 
     pub(super) fn claim(&self, query: Query) {
+        let arrived = Instant::now();
         let Some(claim) = self.read::<Claim>(&query, Kind::Claim) else {
             return;
         };
-        let mut state = self.state();
-        let State { replay, chunks, .. } = &mut *state;
-        if let Some(reply) = replay.claim(&claim) {
-            drop(state);
-            return self.reply(&query, Kind::InsertReply, &reply);
-        }
-        let Some(parked) = chunks.claimed(&claim) else {
-            let wait = InsertReply::Wait {
-                inserted_total: replay.inserted_total(),
-                kept: false,
-            };
-            drop(state);
-            return self.reply(&query, Kind::InsertReply, &wait);
-        };
-        parked.ask(query, Instant::now());
-        let mut answers = Answers::new();
-        if claim.leaving {
-            parked.chunk.chunk.to_mut().header.leaving = true;
-            if let Some(parked) = chunks.take(claim.actor) {
-                let reply = after_waiting(replay.insert_packed(&parked.chunk));
-                answers.extend(parked.question.map(|query| (query, reply)));
-            }
-        }
-        drop(state);
+        let answers = self.state().take_claim(&claim, Question { query, arrived });
         self.changed.notify_all();
         self.answer_all(answers);
     }
@@ -102,16 +54,15 @@ impl Service {
     pub(super) fn admit_parked(&self) {
         while !self.shutdown.is_set() {
             fault::point("admit");
-            let mut answers = Answers::new();
             let mut state = self.state();
             let now = Instant::now();
-            state.admit(now, &mut answers);
-            for query in state.chunks.overdue(now, self.hold_max) {
+            let mut answers = state.admit(now);
+            for question in state.chunks.overdue(now, self.hold_max) {
                 let wait = InsertReply::Wait {
                     inserted_total: state.replay.inserted_total(),
                     kept: true,
                 };
-                answers.push((query, wait));
+                answers.push((question, wait));
             }
             if answers.is_empty() {
                 let due_in = state.chunks.due_in(now, self.hold_max).unwrap_or(IDLE);
@@ -125,27 +76,122 @@ impl Service {
     }
 
     fn answer_all(&self, answers: Answers) {
-        for (query, reply) in answers {
+        for (Question { query, arrived }, reply) in answers {
             self.reply(&query, Kind::InsertReply, &reply);
+            self.state().timings.answered(arrived.elapsed());
         }
     }
 }
 
 impl State {
+    /// Stores a chunk, or parks it until it may be stored.
+    fn take_chunk(&mut self, packed: PackedChunk<'static>, question: Question) -> Answers {
+        let header = packed.chunk.header;
+        let Question { arrived, .. } = question;
+        let Self {
+            replay,
+            chunks,
+            members,
+            timings,
+            ..
+        } = self;
+        let reply = match replay.settle(&packed) {
+            Some(reply) => reply,
+            // Those that came before go first.
+            None if !chunks.is_empty() && !header.leaving => InsertReply::Wait {
+                inserted_total: replay.inserted_total(),
+                kept: false,
+            },
+            None => match replay.admit(&packed) {
+                stored @ InsertReply::Stored { .. } => {
+                    let now = Instant::now();
+                    timings.stored(header.weights_version, now - arrived, now);
+                    stored
+                }
+                reply => reply,
+            },
+        };
+        let mut answers = Answers::new();
+        match reply {
+            InsertReply::Wait { .. } => {
+                members.note_acting(header.actor);
+                if let Err(question) = chunks.park(packed, question, arrived) {
+                    answers.push((question, reply));
+                }
+            }
+            reply => {
+                if matches!(reply, InsertReply::Stored { .. }) {
+                    members.note_acting(header.actor);
+                    let older = chunks.take_copy(&header).and_then(|it| it.question);
+                    answers.extend(older.map(|question| (question, reply.clone())));
+                }
+                answers.push((question, reply));
+            }
+        }
+        answers
+    }
+
+    /// Says what became of a chunk, or notes who asks about a parked one; that of an actor that leaves is stored.
+    fn take_claim(&mut self, claim: &Claim, question: Question) -> Answers {
+        if let Some(reply) = self.replay.claim(claim) {
+            return vec![(question, reply)];
+        }
+        let Some(parked) = self.chunks.claimed(claim) else {
+            let wait = InsertReply::Wait {
+                inserted_total: self.replay.inserted_total(),
+                kept: false,
+            };
+            return vec![(question, wait)];
+        };
+        let asked = question.arrived;
+        parked.ask(question, asked);
+        if !claim.leaving {
+            return Answers::new();
+        }
+        parked.chunk.chunk.to_mut().header.leaving = true;
+        let parked = self.chunks.take(claim.actor);
+        parked
+            .and_then(|parked| {
+                let reply = self.replay.insert_packed(&parked.chunk);
+                self.leave_line(parked, reply)
+            })
+            .into_iter()
+            .collect()
+    }
+
     /// Deals with the parked chunks from the first on, up to one that still has to wait.
-    fn admit(&mut self, now: Instant, answers: &mut Answers) {
+    fn admit(&mut self, now: Instant) -> Answers {
+        let mut answers = Answers::new();
         while let Some(parked) = self.chunks.first() {
             // Its actor may have started anew meanwhile, or the run may have ended.
             let reply = self.replay.insert_packed(&parked.chunk);
             if matches!(reply, InsertReply::Wait { .. }) {
-                return;
+                break;
             }
+            let Some(parked) = self.chunks.take_first() else {
+                break;
+            };
             let waited = now.saturating_duration_since(parked.arrived);
             self.replay.note_actors_waited(waited.as_secs_f64());
-            let parked = self.chunks.take_first();
-            let question = parked.and_then(|parked| parked.question);
-            answers.extend(question.map(|query| (query, after_waiting(reply))));
+            answers.extend(self.leave_line(parked, reply));
         }
+        answers
+    }
+
+    /// The answer about a chunk that is parked no more.
+    fn leave_line(
+        &mut self,
+        parked: ParkedChunk<Question>,
+        reply: InsertReply,
+    ) -> Option<(Question, InsertReply)> {
+        if matches!(reply, InsertReply::Stored { .. }) {
+            let version = parked.chunk.chunk.header.weights_version;
+            let now = Instant::now();
+            let waited = now.saturating_duration_since(parked.arrived);
+            self.timings.stored(version, waited, now);
+        }
+        let reply = after_waiting(reply);
+        parked.question.map(|question| (question, reply))
     }
 }
 

@@ -13,6 +13,8 @@ use crate::Replay;
 #[derive(Default)]
 pub(super) struct Members {
     connected: HashSet<Alive>,
+    /// Actors of which a chunk has come.
+    acting: HashSet<u32>,
     /// The learner that is served.
     learner: Option<u64>,
 }
@@ -34,6 +36,16 @@ impl Members {
             Alive::Learner(_) => false,
         };
         self.connected.iter().filter(takes_part).count() as u32
+    }
+
+    /// A chunk of an actor has come.
+    pub(super) fn note_acting(&mut self, actor: u32) {
+        self.acting.insert(actor);
+    }
+
+    /// Actors of which a chunk has come, those that have ended too.
+    pub(super) fn actors_acting(&self) -> u32 {
+        self.acting.len() as u32
     }
 
     /// Whether `learner` is the one that is served.

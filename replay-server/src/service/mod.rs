@@ -8,12 +8,13 @@ mod chunks;
 mod members;
 mod parked;
 mod requests;
+mod timings;
 mod weights;
 
 use std::{
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
     thread::JoinHandle,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use anyhow::Context;
@@ -38,6 +39,7 @@ use zenoh::{
 use crate::{Config, Packer, Replay};
 use members::Members;
 use parked::{ParkedChunks, ParkedRequests};
+use timings::Timings;
 use weights::WeightsStore;
 
 /// Threads that make batches: one assembles while another's reply is being sent.
@@ -125,6 +127,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             members: Members::default(),
             chunks: ParkedChunks::default(),
             requests: ParkedRequests::default(),
+            timings: Timings::default(),
         }),
         changed: Condvar::new(),
         weights: Mutex::default(),
@@ -198,8 +201,15 @@ struct Service {
 struct State {
     replay: Replay,
     members: Members,
-    chunks: ParkedChunks<Query>,
+    chunks: ParkedChunks<Question>,
     requests: ParkedRequests<Query>,
+    timings: Timings,
+}
+
+/// Who asks about a chunk, and since when.
+struct Question {
+    query: Query,
+    arrived: Instant,
 }
 
 /// The threads that answer.
@@ -358,7 +368,12 @@ impl Service {
     fn status(&self, query: Query) {
         let state = self.state();
         let mut status = state.replay.status();
+        status.actors_acting = state.members.actors_acting();
         status.actors_waiting = state.chunks.len() as u32;
+        status.answer_ms = state.timings.answer_ms();
+        status.insert_ms = state.timings.insert_ms();
+        status.weights_behind_s = state.timings.weights_behind_s();
+        status.weights_behind_updates = state.timings.weights_behind_updates();
         drop(state);
         self.reply(&query, Kind::ReplayStatus, &status);
     }

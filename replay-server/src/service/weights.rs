@@ -4,6 +4,7 @@
 use std::{
     collections::VecDeque,
     sync::{Arc, MutexGuard, PoisonError},
+    time::Instant,
 };
 
 use driml_protocol::{
@@ -102,6 +103,8 @@ impl Service {
         match allowed.and_then(|()| self.weights().put(weights, safetensors)) {
             Ok(is_new) => {
                 if is_new {
+                    let now = Instant::now();
+                    self.state().timings.weights_came(&weights, now);
                     self.announce(weights.version);
                 }
                 self.reply(&query, Kind::Done, &());

@@ -1,0 +1,151 @@
+//! How long chunks wait and how old the weights are that acted, as distributions in fixed memory.
+//! It measures nothing by itself: whoever knows a time tells it.
+
+use std::{
+    collections::VecDeque,
+    time::{Duration, Instant},
+};
+
+use driml_protocol::{Quantiles, WeightsHeader};
+use hdrhistogram::Histogram;
+
+/// Decimal digits to which quantiles are right.
+const DIGITS: u8 = 2;
+/// Versions of weights whose times are remembered; what acted with older ones counts as behind by the oldest of them.
+const VERSIONS_MAX: usize = 4096;
+
+/// Distributions since the start.
+pub(super) struct Timings {
+    answers: Times,
+    inserts: Times,
+    behind: Times,
+    behind_updates: Histogram<u64>,
+    /// Versions of the weights that came, the updates behind them, and when: oldest first.
+    versions: VecDeque<(u64, u64, Instant)>,
+}
+
+/// A distribution of times, in microseconds.
+struct Times(Histogram<u64>);
+
+fn empty() -> Histogram<u64> {
+    Histogram::new(DIGITS).expect("two digits are within what a histogram can have")
+}
+
+fn quantiles(histogram: &Histogram<u64>, unit: f64) -> Option<Quantiles> {
+    let at = |quantile| histogram.value_at_quantile(quantile) as f64 / unit;
+    (!histogram.is_empty()).then(|| Quantiles {
+        p50: at(0.5),
+        p99: at(0.99),
+        max: at(1.0),
+    })
+}
+
+impl Times {
+    fn add(&mut self, time: Duration) {
+        let micros = u64::try_from(time.as_micros()).unwrap_or(u64::MAX);
+        self.0.saturating_record(micros);
+    }
+}
+
+impl Default for Timings {
+    fn default() -> Self {
+        Self {
+            answers: Times(empty()),
+            inserts: Times(empty()),
+            behind: Times(empty()),
+            behind_updates: empty(),
+            versions: VecDeque::new(),
+        }
+    }
+}
+
+impl Timings {
+    /// A question about a chunk was answered after so long.
+    pub(super) fn answered(&mut self, after: Duration) {
+        self.answers.add(after);
+    }
+
+    /// A chunk that weights of `version` chose was stored `after` its arrival.
+    pub(super) fn stored(&mut self, version: u64, after: Duration, now: Instant) {
+        self.inserts.add(after);
+        let Some(&(_, newest_updates, _)) = self.versions.back() else {
+            return;
+        };
+        let newer = self.versions.partition_point(|&(it, ..)| it <= version);
+        let replaced = self.versions.get(newer);
+        let behind = replaced.map_or(Duration::ZERO, |&(_, _, at)| {
+            now.saturating_duration_since(at)
+        });
+        self.behind.add(behind);
+        let acted = self.versions.get(newer.saturating_sub(1));
+        let updates = acted.map_or(0, |&(_, updates, _)| newest_updates.saturating_sub(updates));
+        self.behind_updates.saturating_record(updates);
+    }
+
+    /// New weights came.
+    pub(super) fn weights_came(&mut self, weights: &WeightsHeader, now: Instant) {
+        if self.versions.len() == VERSIONS_MAX {
+            self.versions.pop_front();
+        }
+        self.versions
+            .push_back((weights.version, weights.updates, now));
+    }
+
+    /// Milliseconds from a question about a chunk to its answer.
+    pub(super) fn answer_ms(&self) -> Option<Quantiles> {
+        quantiles(&self.answers.0, 1e3)
+    }
+
+    /// Milliseconds from a chunk's arrival until it was stored.
+    pub(super) fn insert_ms(&self) -> Option<Quantiles> {
+        quantiles(&self.inserts.0, 1e3)
+    }
+
+    /// Seconds for which newer weights had been there when a chunk was stored.
+    pub(super) fn weights_behind_s(&self) -> Option<Quantiles> {
+        quantiles(&self.behind.0, 1e6)
+    }
+
+    /// Updates by which the weights that acted were behind.
+    pub(super) fn weights_behind_updates(&self) -> Option<Quantiles> {
+        quantiles(&self.behind_updates, 1.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn weights_are_behind_from_when_newer_ones_came() {
+        let (mut timings, start) = (Timings::default(), Instant::now());
+        let at = |seconds| start + Duration::from_secs(seconds);
+        timings.stored(1, Duration::from_millis(7), start);
+        assert_eq!(timings.weights_behind_s(), None, "no weights came here");
+        for version in 1..=3 {
+            let weights = WeightsHeader::new(version, 8 * version, &[]);
+            timings.weights_came(&weights, at(10 * version));
+        }
+        for _ in 0..99 {
+            timings.stored(3, Duration::from_millis(5), at(35));
+        }
+        timings.stored(1, Duration::from_millis(500), at(35));
+        let behind = timings.weights_behind_s().unwrap();
+        assert_eq!(behind.p50, 0.0, "the newest");
+        // Version 2 came 15 seconds before.
+        assert!((14.8..15.2).contains(&behind.max), "{behind:?}");
+        let updates = timings.weights_behind_updates().unwrap();
+        assert_eq!((updates.p50, updates.max), (0.0, 16.0));
+        let inserts = timings.insert_ms().unwrap();
+        assert!(
+            (4.9..5.1).contains(&inserts.p50) && inserts.max > 495.0,
+            "{inserts:?}"
+        );
+        timings.stored(9, Duration::ZERO, at(36));
+        assert_eq!(
+            timings.weights_behind_updates().unwrap().p50,
+            0.0,
+            "newer than all"
+        );
+    }
+}
