@@ -11,6 +11,8 @@ use hdrhistogram::Histogram;
 
 /// Decimal digits to which quantiles are right.
 const DIGITS: u8 = 2;
+/// Largest value that is told from larger ones: in microseconds 12 days.
+const VALUE_MAX: u64 = 1 << 40;
 /// Versions of weights whose times are remembered; what acted with older ones counts as behind by the oldest of them.
 const VERSIONS_MAX: usize = 4096;
 
@@ -28,7 +30,8 @@ pub(super) struct Timings {
 struct Times(Histogram<u64>);
 
 fn empty() -> Histogram<u64> {
-    Histogram::new(DIGITS).expect("two digits are within what a histogram can have")
+    Histogram::new_with_bounds(1, VALUE_MAX, DIGITS)
+        .expect("bounds and digits that a histogram can have")
 }
 
 fn quantiles(histogram: &Histogram<u64>, unit: f64) -> Option<Quantiles> {
