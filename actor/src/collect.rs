@@ -218,6 +218,7 @@ mod tests {
             transport: TransportConfig {
                 shared_memory: false,
             },
+            actors_planned: 1,
         }
     }
 

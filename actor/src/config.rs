@@ -82,6 +82,14 @@ pub struct ActorSettings {
     pub actor: Config,
     /// How messages travel.
     pub transport: TransportConfig,
+    /// Actors that a launcher starts; 1 where none does.
+    pub actors_planned: u32,
+}
+
+/// What an actor needs to know of the `[local]` table, which is the launcher's.
+#[derive(Deserialize)]
+struct Planned {
+    actors: u32,
 }
 
 impl ActorSettings {
@@ -98,6 +106,7 @@ impl ActorSettings {
             model: settings.table("model")?,
             actor: settings.table("actor")?,
             transport: settings.table("transport")?,
+            actors_planned: settings.table("local").map_or(1, |it: Planned| it.actors),
         };
         this.spec.validate()?;
         this.model.validate()?;

@@ -81,6 +81,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     };
     let limits = DeliveryLimits::of(&settings.actor);
     let config = settings.actor.clone();
+    let actors_planned = settings.actors_planned;
     let pool = settings.chunk_memory();
     let mut collector = Collector::new(
         settings,
@@ -119,7 +120,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
                 header.version
             );
         }
-        let steps = config.chunk_steps(delivery.actors());
+        // At the start not all are connected yet.
+        let steps = config.chunk_steps(delivery.actors().max(actors_planned));
         let chunk = collector.collect(delivery.inserted_total(), steps)?;
         if !delivery.send(chunk) {
             break;

@@ -14,7 +14,7 @@ use toml::{Table, Value};
 use crate::{
     derived::{self, derive},
     error::{Usage, usage},
-    machine::Machine,
+    machine::{self, Machine},
     overrides::Override,
     presets::{self, Preset},
 };
@@ -194,22 +194,33 @@ fn fit_memory(
     derive(&mut derived)?;
     let run: RunSpec = read(&derived, "run")?;
     let replay: driml_replay_server::Config = read(&derived, "replay")?;
+    let local: LocalConfig = read(&derived, "local")?;
+    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
+    let actors = machine::actors_bytes(local.actors, &run.world);
+    if machine.beside_actors(actors) == 0 {
+        return Err(usage!(
+            "{} actors of {} take about {:.1} GiB, and {:.1} GiB are free: use fewer --actors, with more --envs each",
+            local.actors,
+            run.world,
+            gib(actors),
+            gib(machine.memory_bytes)
+        ));
+    }
     if replay.compression != Compression::None {
-        return fit_compressed(table, &run, &replay, machine);
+        return fit_compressed(table, &run, &replay, (machine, actors));
     }
     let bytes_each = replay_bytes_each(&run);
-    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
     let fits = |bytes: u64| bytes / bytes_each;
     let free = gib(machine.memory_bytes);
     let asked = replay.capacity_transitions;
-    if capacity_set && asked > fits(machine.replay_bytes_max()) {
+    if capacity_set && asked > fits(machine.replay_bytes_max(actors)) {
         return Err(usage!(
             "replay.capacity_transitions = {asked} needs {:.1} GiB, and {free:.1} GiB are free: --set replay.capacity_transitions={}",
             gib(asked.saturating_mul(bytes_each)),
-            fits(machine.replay_bytes())
+            fits(machine.replay_bytes(actors))
         ));
     }
-    let capacity = fits(machine.replay_bytes());
+    let capacity = fits(machine.replay_bytes(actors));
     if capacity_set || asked <= capacity {
         return Ok(None);
     }
@@ -220,7 +231,8 @@ fn fit_memory(
         .is_none_or(|frames| frames > capacity);
     Ok(matters.then(|| {
         format!(
-            "the replay holds the newest {capacity} transitions instead of {asked}: {free:.1} GiB of memory are free, and half is taken"
+            "the replay holds the newest {capacity} transitions instead of {asked}: {free:.1} GiB of memory are free, and it takes half, or what {} actors and the learner leave",
+            local.actors
         )
     }))
 }
@@ -232,23 +244,23 @@ fn fit_compressed(
     table: &mut Table,
     run: &RunSpec,
     replay: &driml_replay_server::Config,
-    machine: &Machine,
+    (machine, actors): (&Machine, u64),
 ) -> Result<Option<String>, Usage> {
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
     let free = gib(machine.memory_bytes);
     let asked = replay.capacity_transitions;
     let fields = asked.saturating_mul(COMPRESSED_FIELDS_BYTES);
     let frames = asked.saturating_mul(run.frame_bytes() as u64);
-    let bytes = machine.replay_bytes().saturating_sub(fields);
-    if fields > machine.replay_bytes() / 2 {
+    let bytes = machine.replay_bytes(actors).saturating_sub(fields);
+    if fields > machine.replay_bytes(actors) / 2 {
         return Err(usage!(
             "replay.capacity_transitions = {asked} needs {:.1} GiB beside the frames, and {free:.1} GiB are free: --set replay.capacity_transitions={}",
             gib(fields),
-            machine.replay_bytes() / 2 / COMPRESSED_FIELDS_BYTES
+            machine.replay_bytes(actors) / 2 / COMPRESSED_FIELDS_BYTES
         ));
     }
     match replay.compressed_bytes_max {
-        Some(max) if max.min(frames) > machine.replay_bytes_max() => Err(usage!(
+        Some(max) if max.min(frames) > machine.replay_bytes_max(actors) => Err(usage!(
             "replay.compressed_bytes_max = {max} is {:.1} GiB, and {free:.1} GiB are free: --set replay.compressed_bytes_max={bytes}",
             gib(max)
         )),

@@ -39,7 +39,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use clap::Parser;
 use driml_learner::{DeviceName, Operations};
-use driml_protocol::{Keys, Shutdown};
+use driml_protocol::{Keys, Shutdown, session};
 
 use crate::{
     cli::{Cli, Command, JoinFlags, ParityArgs, ProcgenCommand, ReplayServerArgs},
@@ -184,6 +184,9 @@ fn ready_for(device: DeviceName) -> anyhow::Result<()> {
 /// Checks how a part reaches the run, and starts to listen for signals.
 fn join(flags: &JoinFlags) -> anyhow::Result<Shutdown> {
     Keys::new(&flags.namespace).map_err(Usage)?;
+    if flags.exit_with_parent.is_none() {
+        session::sweep_shared_memory();
+    }
     Shutdown::on_signals(flags.exit_with_parent).context("listening for signals")
 }
 

@@ -95,6 +95,7 @@ pub(crate) fn run(
         statuses: None,
     };
 
+    session::sweep_shared_memory();
     let ran = launch.start_and_watch(&mut recorder);
     let ended = launch.end(&ran);
     session::sweep_shared_memory();

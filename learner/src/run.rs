@@ -8,7 +8,7 @@ use std::{
 
 use anyhow::Context;
 use driml_model::DeviceName;
-use driml_protocol::{BatchHeader, Keys, Shutdown, shared_memory};
+use driml_protocol::{BatchHeader, Keys, Shutdown, shared_memory, whole_file};
 
 use crate::{
     batch_source::{BatchSource, Next, Requests},
@@ -224,6 +224,6 @@ fn keep_settings(run_dir: &Path, config_toml: &str) -> anyhow::Result<()> {
         return Ok(());
     }
     std::fs::create_dir_all(run_dir)
-        .and_then(|()| std::fs::write(&path, config_toml))
+        .and_then(|()| whole_file::write(&path, config_toml.as_bytes()))
         .with_context(|| format!("writing {}", path.display()))
 }

@@ -35,6 +35,15 @@ pub enum SessionError {
         /// What zenoh said.
         why: String,
     },
+    /// Nobody listens where the session was to connect.
+    #[error(
+        "nobody listens on {}, after {} s: is the replay server running, and is the endpoint right?",
+        .connect.join(", "), CONNECT_MAX.as_secs()
+    )]
+    NobodyListens {
+        /// Endpoints to connect to.
+        connect: Vec<String>,
+    },
     /// Nobody is there who could answer.
     #[error("{key}: nobody is there to answer")]
     Nobody {
@@ -61,11 +70,15 @@ pub enum SessionError {
 
 /// What zenoh answers in the place of somebody who does not.
 const TIMED_OUT: &str = "Timeout";
+/// What zenoh says where no endpoint could be connected to.
+const NOBODY_LISTENS: &str = "Unable to connect to any of";
 
 /// How long one message may take to go out before its link is given up: below every time-out of a question, so that a peer that
 /// was frozen or vanished is gone before others miss an answer. It comes back, and asks again, once it is well. A message must
 /// be small enough for this: 3 MB need 3 Mbit/s.
 const STALLED_MAX: Duration = Duration::from_secs(8);
+/// How long a client tries to connect.
+const CONNECT_MAX: Duration = Duration::from_secs(10);
 /// Longest message accepted from a peer, bytes.
 const MESSAGE_BYTES_MAX: usize = 1 << 29;
 
@@ -77,7 +90,8 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
     let fail = |why: String| SessionError::Open {
         listen: endpoints.listen.clone(),
         connect: endpoints.connect.clone(),
-        why,
+        // zenoh adds where in its own sources it failed.
+        why: why.split(" at /").next().unwrap_or_default().to_owned(),
     };
     let list = |list: &[String]| -> String {
         format!(
@@ -91,11 +105,15 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
     let router = !endpoints.listen.is_empty();
     let max = MESSAGE_BYTES_MAX.to_string();
     let stalled_us = STALLED_MAX.as_micros().to_string();
+    let connect_ms = CONNECT_MAX.as_millis().to_string();
     let settings: &[(&str, &str)] = &[
         ("mode", if router { "\"router\"" } else { "\"client\"" }),
         ("listen/endpoints", &list(&endpoints.listen)),
         ("connect/endpoints", &list(&endpoints.connect)),
-        ("connect/timeout_ms", if router { "-1" } else { "10000" }),
+        (
+            "connect/timeout_ms",
+            if router { "-1" } else { &connect_ms },
+        ),
         (
             "connect/exit_on_failure",
             if router { "false" } else { "true" },
@@ -135,14 +153,19 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
         }
         zenoh::open(config).wait().map_err(|e| e.to_string())
     };
-    sweep_shared_memory();
     open_with("true").or_else(|why| {
+        // Without shared memory nobody would be there either.
+        if why.contains(NOBODY_LISTENS) {
+            let connect = endpoints.connect.clone();
+            return Err(SessionError::NobodyListens { connect });
+        }
         tracing::debug!("trying again without shared memory: {why}");
         open_with("false").map_err(fail)
     })
 }
 
-/// Removes the shared memory of processes that ended without doing so, as killed ones do; that of living ones stays.
+/// Removes the shared memory of processes that ended without doing so, as killed ones do; that of living ones stays. For whoever
+/// starts a run, or joins one by hand: many parts that start at once need not all look.
 pub fn sweep_shared_memory() {
     zenoh::shm::cleanup_orphaned_shm_segments();
 }

@@ -99,6 +99,8 @@ impl Delivery {
         account
             .inserted_total
             .store(inserted_total, Ordering::Relaxed);
+        // Until a chunk was let in at once: many actors that start together must not run ahead of the learner together.
+        account.is_held.store(true, Ordering::Relaxed);
         let (queue, chunks) = mpsc::channel();
         let courier = Courier::new(
             session,

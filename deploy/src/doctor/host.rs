@@ -100,7 +100,7 @@ fn vectors(found: Option<Vectors>) -> Fact {
 }
 
 fn memory(machine: &Machine) -> Fact {
-    let (free, replay) = (machine.memory_bytes, machine.replay_bytes());
+    let (free, replay) = (machine.memory_bytes, machine.replay_bytes(0));
     let text = format!(
         "{} free; a replay sized by the machine takes {}, {:.2} million of Procgen's frames",
         gib(free),

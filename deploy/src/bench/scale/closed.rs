@@ -101,6 +101,7 @@ fn watch(args: &BenchScaleArgs, recording: &Recording, actors: u32) -> anyhow::R
                 recording,
                 config: &config,
                 actor,
+                actors,
                 streams,
                 pace: Pace::Unpaced,
             };

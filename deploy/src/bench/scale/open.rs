@@ -126,6 +126,7 @@ fn watch(
                 recording,
                 config: &config,
                 actor,
+                actors,
                 streams: CHUNK.0,
                 pace: Pace::Every {
                     steps: CHUNK.1,

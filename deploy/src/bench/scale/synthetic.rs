@@ -47,6 +47,8 @@ pub(super) struct Actor<'a> {
     pub(super) recording: &'a Recording,
     pub(super) config: &'a RunConfig,
     pub(super) actor: u32,
+    /// Actors of the run.
+    pub(super) actors: u32,
     pub(super) streams: u32,
     pub(super) pace: Pace,
 }
@@ -95,7 +97,9 @@ impl Actor<'_> {
                     if let Some((weights, _)) = newest.take_within(delivery.fresh_weights_max()) {
                         chunks.act_with(weights.version);
                     }
-                    settings.actor.chunk_steps(delivery.actors())
+                    settings
+                        .actor
+                        .chunk_steps(delivery.actors().max(self.actors))
                 }
             };
             if !delivery.send(chunks.next_of(steps)) {
