@@ -231,8 +231,7 @@ fn fit_memory(
         .is_none_or(|frames| frames > capacity);
     Ok(matters.then(|| {
         format!(
-            "the replay holds the newest {capacity} transitions instead of {asked}: {free:.1} GiB of memory are free, and it takes half, or what {} actors and the learner leave",
-            local.actors
+            "the replay holds the newest {capacity} transitions instead of {asked}: {free:.1} GiB of memory are free, and it takes half, or what actors and learner leave"
         )
     }))
 }
