@@ -1,10 +1,7 @@
 //! Many parts at once: actors at a closed limiter, a client that stands still, two processes that play one part.
 //! What one server and one actor promise each other is in `by_hand`; how parts die is in `failures`.
 
-use std::{
-    collections::BTreeMap,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use driml_actor::delivery::{Delivery, DeliveryLimits};
 use driml_protocol::{
@@ -16,13 +13,6 @@ use nix::sys::signal::Signal;
 use zenoh::Wait;
 
 use crate::{LONG, SHORT, system};
-
-/// The limits that an actor has with the paper's settings.
-const LIMITS: DeliveryLimits = DeliveryLimits {
-    chunks_in_flight_max: 4,
-    ack_timeout: Duration::from_secs(10),
-    unreachable_max: Duration::from_secs(60),
-};
 
 /// Nothing was lost, stored twice or sent twice.
 fn check_quiet(summary: &Summary) {
@@ -71,18 +61,22 @@ struct SyntheticActor {
     delivery: Delivery,
     session: zenoh::Session,
     next: ChunkHeader,
-    stop: Shutdown,
 }
 
 impl SyntheticActor {
-    fn join(system: &TestSystem, client: &Client, actor: u32, limits: DeliveryLimits) -> Self {
+    fn join(
+        system: &TestSystem,
+        client: &Client,
+        actor: u32,
+        limits: DeliveryLimits,
+        stop: &Shutdown,
+    ) -> Self {
         let session = session::open(&Endpoints {
             listen: Vec::new(),
             connect: vec![system.endpoint()],
         })
         .unwrap();
         client.join_as_actor(actor, 1);
-        let stop = Shutdown::default();
         let delivery = Delivery::start(
             session.clone(),
             Keys::new("driml").unwrap(),
@@ -108,23 +102,21 @@ impl SyntheticActor {
             delivery,
             session,
             next,
-            stop,
         }
     }
 
-    /// Sends one chunk more; waits as an actor does.
-    fn send(&mut self) {
-        let chunk = Chunk::zeroed(self.next);
-        self.next.sequence += 1;
-        self.next.first_transition += chunk.header.transitions() as u64;
-        assert!(self.delivery.send(chunk));
-    }
-
-    /// Delivers what it has, although nobody makes room, and leaves.
-    fn leave(self) {
-        self.stop.set();
+    /// Sends chunk after chunk, as fast as it may, until it is told to stop; then delivers what it has, although nobody makes
+    /// room. Gives the number of its transitions.
+    fn run(mut self, stop: &Shutdown) -> u64 {
+        while !stop.is_set() {
+            let chunk = Chunk::zeroed(self.next);
+            self.next.sequence += 1;
+            self.next.first_transition += chunk.header.transitions() as u64;
+            assert!(self.delivery.send(chunk));
+        }
         assert_eq!(self.delivery.finish().unwrap(), 0);
         self.session.close().wait().unwrap();
+        self.next.first_transition
     }
 }
 
@@ -135,46 +127,35 @@ fn an_actor_waits_for_as_long_as_it_must() {
     let system = system();
     let _server = system.start_replay_server(&format!("--agent c51 {LONG}"));
     let client = system.connect();
-    let short = DeliveryLimits {
-        unreachable_max: Duration::from_secs(3),
-        ..LIMITS
+    let (patience, stop) = (Duration::from_secs(3), Shutdown::default());
+    let limits = DeliveryLimits {
+        chunks_in_flight_max: 4,
+        ack_timeout: Duration::from_secs(10),
+        unreachable_max: patience,
     };
-    let mut actors: Vec<_> = (0..16)
-        .map(|actor| SyntheticActor::join(&system, &client, actor, short))
+    let actors: Vec<_> = (0..16)
+        .map(|actor| SyntheticActor::join(&system, &client, actor, limits, &stop))
         .collect();
-    // As many as are let in without a learner, and then one that waits for each actor.
-    let room = 200 + 256;
-    let mut waiting = BTreeMap::new();
-    let started = Instant::now();
-    for round in 0.. {
-        let actor = &mut actors[round % 16];
-        actor.send();
-        waiting.insert(round % 16, actor.next.sequence);
-        if client.replay().unwrap().actors_waiting == 16 {
-            break;
-        }
-        assert!(round < 200, "{:?}", client.replay());
-    }
-    let before = client.replay().unwrap();
-    assert!(before.transitions_inserted <= room + 32, "{before:#?}");
-    driml_tests::wait_for("twice the time that an actor bears silence", || {
-        (started.elapsed() > 2 * short.unreachable_max).then_some(())
+    let produced: u64 = std::thread::scope(|scope| {
+        let runs: Vec<_> = actors
+            .into_iter()
+            .map(|actor| scope.spawn(|| actor.run(&stop)))
+            .collect();
+        let before = client.wait_for_replay("16 that wait", |replay| replay.actors_waiting == 16);
+        // The warm-up, what may run ahead of a learner, and the chunk that overshoots.
+        assert!(before.transitions_inserted <= 200 + 256 + 32, "{before:#?}");
+        let started = Instant::now();
+        driml_tests::wait_for("twice the time that an actor bears silence", || {
+            (started.elapsed() > 2 * patience).then_some(())
+        });
+        let after = client.replay().unwrap();
+        assert_eq!((after.actors_waiting, after.chunks_retried), (16, 0));
+        assert_eq!(after.transitions_inserted, before.transitions_inserted);
+        stop.set();
+        runs.into_iter().map(|run| run.join().unwrap()).sum()
     });
     let status = client.replay().unwrap();
-    assert_eq!(
-        (status.actors_waiting, status.chunks_retried),
-        (16, 0),
-        "{status:#?}"
-    );
-    assert_eq!(status.transitions_inserted, before.transitions_inserted);
-    let sent: u64 = actors.iter().map(|it| it.next.first_transition).sum();
-    std::thread::scope(|scope| {
-        for actor in actors {
-            scope.spawn(|| actor.leave());
-        }
-    });
-    let status = client.replay().unwrap();
-    assert_eq!(status.transitions_inserted, sent, "{status:#?}");
+    assert_eq!(status.transitions_inserted, produced, "{status:#?}");
     assert_eq!((status.transitions_lost, status.messages_refused), (0, 0));
 }
 
