@@ -143,10 +143,12 @@ impl ActorSettings {
 }
 
 impl ActorSettings {
-    /// Memory for the chunks of one actor: one that is filled, and those that are not acknowledged.
+    /// Memory for the chunks of one actor: one that is filled, and those that are not acknowledged. Shared memory is for chunks
+    /// as long as they are with the actors that are planned; longer ones lie in the process's own.
     pub fn chunk_memory(&self) -> PlanesPool {
         let count = self.actor.chunks_in_flight_max as usize + 1;
-        let transitions = self.actor.envs as usize * self.actor.steps_per_chunk as usize;
+        let steps = self.actor.chunk_steps(self.actors_planned);
+        let transitions = self.actor.envs as usize * steps as usize;
         if self.transport.shared_memory {
             PlanesPool::shared(count, count, transitions * self.transition_bytes())
         } else {

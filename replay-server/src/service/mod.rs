@@ -168,8 +168,12 @@ fn number(settings: &Settings, table: &'static str, key: &str) -> anyhow::Result
 fn chunk_pools_bytes(settings: &Settings, spec: &RunSpec) -> anyhow::Result<usize> {
     let actor = |key| anyhow::Ok(number(settings, "actor", key)? as usize);
     let actors = number(settings, "local", "actors").unwrap_or(1) as usize;
-    let chunk =
-        actor("envs")? * actor("steps_per_chunk")? * (spec.frame_bytes() + TRANSITION_BYTES);
+    let a_step = actor("envs")?;
+    // As actors reckon how long their chunks are.
+    let round_steps = actor("round_transitions_max").map(|it| it / (a_step * actors).max(1));
+    let steps = round_steps.unwrap_or(usize::MAX).max(1);
+    let steps = steps.min(actor("steps_per_chunk")?);
+    let chunk = a_step * steps * (spec.frame_bytes() + TRANSITION_BYTES);
     let pool = shared_memory::pool_bytes(actor("chunks_in_flight_max")? + 1, chunk);
     Ok(actors.saturating_mul(pool))
 }

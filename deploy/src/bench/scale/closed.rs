@@ -7,7 +7,7 @@ use driml_protocol::{Quantiles, Shutdown};
 
 use super::{
     Table, actors, seconds,
-    servers::{Servers, Watched},
+    servers::{self, Servers, Watched},
     synthetic::{self, Actor, Learner, Pace},
 };
 use crate::{
@@ -115,7 +115,7 @@ fn watch(args: &BenchScaleArgs, recording: &Recording, actors: u32) -> anyhow::R
         synthetic::join(clients)?;
         // The last word on what was lost or sent twice comes after the goodbyes.
         let mut watched = watched?;
-        statuses.ask_replay()?;
+        servers::ask(&mut statuses)?;
         watched.replay.chunks_retried = statuses.replay.chunks_retried;
         watched.replay.transitions_lost = statuses.replay.transitions_lost;
         Ok(watched)

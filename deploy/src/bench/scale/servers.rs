@@ -27,6 +27,8 @@ use crate::{
     statuses::Statuses,
 };
 
+/// How often a server is asked that does not answer.
+const ASKED_MAX: u32 = 10;
 /// How long a server may take to end.
 const END_MAX: Duration = Duration::from_secs(30);
 
@@ -118,7 +120,7 @@ impl Servers {
         seconds: f64,
     ) -> anyhow::Result<Watched> {
         let mut moment = |servers: &mut Self| -> anyhow::Result<(Instant, u64, u64, f64)> {
-            statuses.ask_replay()?;
+            ask(statuses)?;
             let stored = statuses.replay.transitions_inserted;
             let served = batches.load(Ordering::Relaxed);
             Ok((Instant::now(), stored, served, servers.processor_seconds()?))
@@ -160,6 +162,19 @@ impl Servers {
             part.wait_until(Instant::now() + END_MAX, || false);
         }
     }
+}
+
+/// Asks the servers how they are. Where hundreds of clients in this process receive at once, that may take a while.
+///
+/// # Errors
+/// None of several questions was answered.
+pub(super) fn ask(statuses: &mut Statuses) -> anyhow::Result<()> {
+    for _ in 1..ASKED_MAX {
+        if statuses.ask_replay().is_ok() {
+            return Ok(());
+        }
+    }
+    statuses.ask_replay()
 }
 
 /// Clock ticks in user and system mode, from `/proc/PID/stat`.

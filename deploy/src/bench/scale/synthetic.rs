@@ -64,7 +64,6 @@ impl Actor<'_> {
         let spec_hash = settings.spec.hash();
         let pool = settings.chunk_memory();
         let alive = taking_part::join_as_actor(&session, &keys, spec_hash, self.actor)?;
-        let leave = Shutdown::default();
         let delivery = Delivery::start(
             session.clone(),
             keys.clone(),
@@ -72,7 +71,7 @@ impl Actor<'_> {
             0,
             DeliveryLimits::of(&settings.actor),
             pool.clone(),
-            leave.clone(),
+            stop.clone(),
         )?;
         let mut chunks = self.recording.chunks(self.actor, (self.streams, 1), pool);
         let source = WeightsSource {
@@ -106,7 +105,6 @@ impl Actor<'_> {
                 break;
             }
         }
-        leave.set();
         delivery.finish()?;
         drop(alive);
         session
