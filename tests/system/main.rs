@@ -17,6 +17,7 @@ mod leftovers;
 mod local;
 mod lockstep;
 mod lost_batches;
+mod lost_chunks;
 mod panics;
 mod parity;
 mod procgen;
