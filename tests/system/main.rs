@@ -6,6 +6,7 @@
 mod bad_messages;
 mod bad_weights;
 mod by_hand;
+mod circles;
 mod closed_terminal;
 mod company;
 mod disk_full;
