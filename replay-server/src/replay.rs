@@ -540,22 +540,6 @@ impl Replay {
         self.count(goodbye.actor, difference);
     }
 
-    /// Changes the replay ratio from now on; what was allowed before stays allowed.
-    ///
-    /// # Errors
-    /// A ratio that [`Config::validate`] refuses.
-    pub fn set_replay_ratio(&mut self, replay_ratio: f64) -> Result<(), ConfigError> {
-        let config = Config {
-            replay_ratio,
-            transitions_max: None,
-            ..self.config.clone()
-        };
-        config.validate(&self.spec, self.batch_rows)?;
-        self.config.replay_ratio = replay_ratio;
-        self.limiter.set_replay_ratio(replay_ratio);
-        Ok(())
-    }
-
     /// Counts a message that could not be read.
     pub fn note_refused_message(&mut self) {
         self.statistics.messages_refused += 1;
