@@ -10,7 +10,7 @@ use driml_protocol::{Chunk, Claim, InsertReply, Kind, fault};
 use zenoh::{bytes::ZBytes, query::Query};
 
 use super::{Question, Service, State, parked::ParkedChunk};
-use crate::PackedChunk;
+use crate::storage::frame_store::PackedChunk;
 
 /// How long the thread sleeps when nothing is parked; it is woken when something is.
 const IDLE: Duration = Duration::from_secs(60);

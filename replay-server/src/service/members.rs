@@ -7,7 +7,7 @@ use driml_protocol::{ActorJoin, Alive, Hello, JoinReply, Kind, LearnerJoin};
 use zenoh::{query::Query, sample::SampleKind};
 
 use super::{Service, State};
-use crate::Replay;
+use crate::replay::Replay;
 
 /// What is known of the parts of the run.
 #[derive(Default)]

@@ -36,7 +36,7 @@ use zenoh::{
     query::{Query, Queryable},
 };
 
-use crate::{Config, Packer, Replay};
+use crate::{config::Config, replay::Replay, storage::frame_store::Packer};
 use members::Members;
 use parked::{ParkedChunks, ParkedRequests};
 use timings::Timings;

@@ -7,7 +7,10 @@ use driml_protocol::{BatchReply, BatchRequest, Kind, Planes, fault, session};
 use zenoh::query::Query;
 
 use super::{Service, State, parked::ParkedRequest};
-use crate::{Draft, Replay, Unready};
+use crate::{
+    replay::{Replay, Unready},
+    sampling::packed_batch::Draft,
+};
 
 /// How long a request waits before it is told to come back: far below every learner's time-out.
 const HOLD_MAX: Duration = Duration::from_secs(1);

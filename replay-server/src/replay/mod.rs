@@ -11,20 +11,24 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    actors::{Actors, Difference, Verdict},
-    anchors::Anchors,
-    assemble::Assembler,
-    config::{self, Config, ConfigError, SHARDS_MAX},
-    episodes::{Episodes, Window},
-    frames::{
-        CompressedFrames, Compression, Draft, Frames, PackedChunk, PackedStates, Packer,
-        PlainFrames,
+    config::{self, Compression, Config, ConfigError, SHARDS_MAX},
+    ledger::{
+        actors::{Actors, Difference, Verdict},
+        requests::{Requests, Standing},
+        statistics::Statistics,
     },
-    horizon::Affinity,
     rate_limiter::RateLimiter,
-    requests::{Requests, Standing},
-    ring::{Ring, Step},
-    statistics::Statistics,
+    sampling::{
+        anchors::Anchors,
+        assemble::Assembler,
+        episodes::{Episodes, Window},
+        horizon::Affinity,
+        packed_batch::{Draft, PackedStates},
+    },
+    storage::{
+        frame_store::{CompressedFrames, Frames, PackedChunk, Packer, PlainFrames},
+        ring::{Ring, Step},
+    },
 };
 
 /// The replay server's own stream of the run's seed, so that no other part draws the same numbers.

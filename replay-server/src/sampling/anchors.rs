@@ -3,10 +3,8 @@
 
 use rand::Rng;
 
-use crate::{
-    episodes::{Episodes, Window},
-    ring::Ring,
-};
+use super::episodes::{Episodes, Window};
+use crate::storage::ring::Ring;
 
 /// Draws that may hit an invalid transition before all valid ones are listed instead; either way the law is uniform.
 const TRIES_MAX: u32 = 64;

@@ -5,7 +5,7 @@ use std::collections::{HashMap, VecDeque};
 
 use driml_protocol::{ActorJoin, ChunkHeader, Claim, Goodbye};
 
-use crate::ring::Link;
+use crate::storage::ring::Link;
 
 /// Most actors a run may ever have; a further one is refused, the known ones go on.
 pub const ACTORS_MAX: usize = 4096;

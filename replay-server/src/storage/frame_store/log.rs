@@ -3,8 +3,10 @@
 
 use std::{collections::VecDeque, ops::Range};
 
-/// Size of a segment: what a log holds beyond its contents is at most three of them.
-pub(crate) const SEGMENT_BYTES: usize = 1 << 20;
+/// Size of a segment.
+const SEGMENT_BYTES: usize = 1 << 20;
+/// Most that a log holds beyond its contents: three segments.
+pub(crate) const OVERHEAD_BYTES_MAX: u64 = 3 * SEGMENT_BYTES as u64;
 
 /// A queue of bytes; every byte has a place, counted since the start.
 #[derive(Default)]
@@ -110,7 +112,7 @@ mod tests {
                 log.copy(log.start()..list.len() as u64, &mut held);
                 prop_assert_eq!(log.len(), held.len() as u64);
                 prop_assert!(held == list[log.start() as usize..]);
-                prop_assert!(log.bytes_held() <= log.len() + 3 * SEGMENT_BYTES as u64);
+                prop_assert!(log.bytes_held() <= log.len() + OVERHEAD_BYTES_MAX);
             }
         }
     }

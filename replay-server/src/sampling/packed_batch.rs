@@ -6,10 +6,12 @@ use std::ops::Range;
 use driml_protocol::Batch;
 use lz4_flex::block::{decompress_into, decompress_into_with_dict};
 
-use super::compressed::{CompressedFrames, Part};
-use crate::{
+use super::{
     assemble::RowStates,
     episodes::{Episodes, Stack},
+};
+use crate::storage::{
+    frame_store::compressed::{CompressedFrames, Part},
     ring::Ring,
 };
 

@@ -5,12 +5,9 @@ use std::{collections::VecDeque, ops::Range};
 
 use super::{
     layout::{Layout, PartEnds},
-    log::{Log, SEGMENT_BYTES},
+    log::{Log, OVERHEAD_BYTES_MAX},
     pack::PackedRun,
 };
-
-/// What the log may hold beyond its contents.
-pub(crate) const OVERHEAD_BYTES_MAX: u64 = 3 * SEGMENT_BYTES as u64;
 
 /// Consecutive transitions of one stream, and where their frames are.
 struct Block {

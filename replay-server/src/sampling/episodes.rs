@@ -5,7 +5,7 @@ use driml_protocol::{End, RunSpec, TimeoutRule};
 
 use crate::{
     config,
-    ring::{Previous, Ring, Step},
+    storage::ring::{Previous, Ring, Step},
 };
 
 /// An anchor t and what follows it: s_t, .., s_{t+m}, where m is the reach or the episode ends at s_{t+m}. Never empty.

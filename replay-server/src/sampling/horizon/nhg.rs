@@ -3,7 +3,7 @@
 
 use rand::Rng;
 
-use super::Affinity;
+use super::affinity::Affinity;
 
 /// Walks i = 1..H along `actions` and stops at the first b = 0, b ~ Bernoulli(A_i), A_i = A[a_{t+i-1}, a_{t+i}].
 ///

@@ -1,33 +1,16 @@
 //! How the frames of the transitions held are kept: plain, or compressed without loss.
 //! It knows neither links, episodes nor stacks, and it never stores a frame twice.
 
-mod compressed;
+pub(crate) mod compressed;
 mod layout;
-mod log;
+pub(crate) mod log;
 mod pack;
 mod plain;
-mod unpack;
 
-use serde::{Deserialize, Serialize};
-
-pub(crate) use compressed::{CompressedFrames, OVERHEAD_BYTES_MAX};
+pub(crate) use compressed::CompressedFrames;
 pub(crate) use pack::Run;
 pub use pack::{PackedChunk, Packer};
 pub(crate) use plain::PlainFrames;
-pub use unpack::Draft;
-pub(crate) use unpack::PackedStates;
-
-/// How frames are kept in memory. Batches are the same, bit for bit, whatever it is.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Compression {
-    /// As they came: the least work.
-    #[default]
-    None,
-    /// Consecutive frames of one stream together, by LZ4: a fifth of the memory or less on many Procgen games, not on all, and
-    /// more work a chunk and a batch.
-    Lz4,
-}
 
 /// The frames of all transitions held.
 pub(crate) enum Frames {

@@ -1,9 +1,9 @@
 //! The transitions held: every frame once, with links along its episode.
-//! It does not know actors, sampling or stacks; how frames are kept is `frames`' business.
+//! It does not know actors, sampling or stacks; how frames are kept is `frame_store`'s business.
 
 use driml_protocol::End;
 
-use crate::frames::{Frames, Run};
+use super::frame_store::{Frames, Run};
 
 /// How a transition hangs together with what its stream stored before; `after` is the index of the one just before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -253,7 +253,7 @@ mod tests {
     use rand::{Rng, SeedableRng};
 
     use super::*;
-    use crate::frames::{Frames, PlainFrames};
+    use crate::storage::frame_store::{Frames, PlainFrames};
 
     fn plain(capacity: u64, frame_bytes: usize) -> Result<Ring, u64> {
         Ring::new(

@@ -6,11 +6,11 @@ use driml_protocol::{
 };
 use rand::Rng;
 
-use crate::{
-    config::Study,
+use super::{
     episodes::Window,
     horizon::{self, Affinity},
 };
+use crate::config::Study;
 
 /// The states of a row, as indices in the ring.
 #[derive(Clone, Copy)]

@@ -6,10 +6,8 @@ use std::borrow::Cow;
 use driml_protocol::Chunk;
 use lz4_flex::block::{compress_into, compress_into_with_dict, get_maximum_output_size};
 
-use super::{
-    Compression,
-    layout::{Layout, PartEnds},
-};
+use super::layout::{Layout, PartEnds};
+use crate::config::Compression;
 
 /// Prepares chunks for one replay.
 #[derive(Clone, Copy, Debug)]
