@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use driml_protocol::Batch;
+use driml_protocol::{Batch, batch::BatchRowsMut};
 use lz4_flex::block::{decompress_into, decompress_into_with_dict};
 
 use super::{
@@ -11,7 +11,10 @@ use super::{
     episodes::{Episodes, Stack},
 };
 use crate::storage::{
-    frame_store::compressed::{CompressedFrames, Part},
+    frame_store::{
+        Frames,
+        compressed::{CompressedFrames, Part},
+    },
     ring::Ring,
 };
 
@@ -73,10 +76,31 @@ impl PackedStates {
         }
     }
 
-    /// Takes what the next row needs; a part that several of its states share is taken once.
-    pub(crate) fn add_row(
+    /// Writes the states of the next row, number `row`, where frames are plain; takes what is needed to write them later where
+    /// they are compressed.
+    pub(crate) fn write_or_take_row(
         &mut self,
-        (ring, frames, episodes): (&Ring, &CompressedFrames, &Episodes),
+        ring: &Ring,
+        episodes: &Episodes,
+        states: RowStates,
+        rows: &mut BatchRowsMut<'_>,
+        row: usize,
+    ) {
+        match ring.frames() {
+            Frames::Plain(frames) => states.write(rows, row, |index, out| {
+                let stack = episodes.stack(ring, index);
+                stack.write(self.pixel_bytes, out, |index| frames.frame(index));
+            }),
+            Frames::Compressed(frames) => self.take_row(ring, frames, episodes, states),
+        }
+    }
+
+    /// Takes what the next row needs; a part that several of its states share is taken once.
+    fn take_row(
+        &mut self,
+        ring: &Ring,
+        frames: &CompressedFrames,
+        episodes: &Episodes,
         states: RowStates,
     ) {
         let (first_stack, first_part) = (self.stacks.len(), self.parts.len());

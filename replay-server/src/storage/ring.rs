@@ -253,13 +253,11 @@ mod tests {
     use rand::{Rng, SeedableRng};
 
     use super::*;
-    use crate::storage::frame_store::{Frames, PlainFrames};
+    use crate::{config::Compression, storage::frame_store::Frames};
 
     fn plain(capacity: u64, frame_bytes: usize) -> Result<Ring, u64> {
-        Ring::new(
-            capacity,
-            Frames::Plain(PlainFrames::new(capacity, frame_bytes)?),
-        )
+        let frames = Frames::new(Compression::None, capacity, frame_bytes, None)?;
+        Ring::new(capacity, frames)
     }
 
     proptest! {

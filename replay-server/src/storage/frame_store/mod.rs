@@ -7,10 +7,11 @@ pub(crate) mod log;
 mod pack;
 mod plain;
 
-pub(crate) use compressed::CompressedFrames;
+use crate::config::Compression;
+use compressed::CompressedFrames;
 pub(crate) use pack::Run;
 pub use pack::{PackedChunk, Packer};
-pub(crate) use plain::PlainFrames;
+use plain::PlainFrames;
 
 /// The frames of all transitions held.
 pub(crate) enum Frames {
@@ -19,6 +20,25 @@ pub(crate) enum Frames {
 }
 
 impl Frames {
+    /// Room for the frames of `capacity` transitions; compressed ones take `bytes_max` bytes at most, if there is a limit.
+    ///
+    /// # Errors
+    /// The system refuses to reserve that much memory: the bytes asked for.
+    pub(crate) fn new(
+        compression: Compression,
+        capacity: u64,
+        frame_bytes: usize,
+        bytes_max: Option<u64>,
+    ) -> Result<Self, u64> {
+        match compression {
+            Compression::None => PlainFrames::new(capacity, frame_bytes).map(Self::Plain),
+            Compression::Lz4 => Ok(Self::Compressed(CompressedFrames::new(
+                frame_bytes,
+                bytes_max,
+            ))),
+        }
+    }
+
     /// Stores the frames of the next transitions; those before `oldest` are no longer wanted. Gives the oldest that is held.
     pub(crate) fn push(&mut self, run: Run<'_>, oldest: u64) -> u64 {
         match (self, run) {
