@@ -17,7 +17,7 @@ use driml_protocol::{
 };
 use zenoh::{Session, bytes::ZBytes, qos::Priority};
 
-use super::{Account, DeliveryLimits};
+use super::state::{Account, DeliveryLimits};
 
 /// After `Shutdown`, how long the chunks at hand may take to be stored.
 const DRAIN_MAX: Duration = Duration::from_secs(20);
