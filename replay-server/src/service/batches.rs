@@ -6,7 +6,10 @@ use std::time::{Duration, Instant};
 use driml_protocol::{BatchReply, BatchRequest, Kind, Planes, fault, session};
 use zenoh::query::Query;
 
-use super::{Service, State, parked::ParkedRequest};
+use super::{
+    parked::ParkedRequest,
+    server::{Service, State},
+};
 use crate::{
     replay::{Replay, Unready},
     sampling::packed_batch::Draft,

@@ -9,7 +9,10 @@ use std::{
 use driml_protocol::{Chunk, Claim, InsertReply, Kind, fault};
 use zenoh::{bytes::ZBytes, query::Query};
 
-use super::{Question, Service, State, parked::ParkedChunk};
+use super::{
+    parked::ParkedChunk,
+    server::{Question, Service, State},
+};
 use crate::storage::frame_store::PackedChunk;
 
 /// How long the thread sleeps when nothing is parked; it is woken when something is.

@@ -1,28 +1,17 @@
-//! The replay server as a process: zenoh around the core, who takes part, and the last word to everyone.
-//! What is stored, sampled and allowed is the core's; here is only who asks and when the answer goes out.
-//!
-//! No thread that answers waits for the limiter: a chunk or a request that is too early is parked, and a thread that does
-//! nothing else deals with it when the limiter opens. Compressing and unpacking frames is done outside the lock on the core.
-
-mod chunks;
-mod members;
-mod parked;
-mod requests;
-mod timings;
-mod weights;
+//! Starts the replay server and ends it: settings, session, everything that it answers, and the threads that do.
+//! What an answer is, is in the files named for the messages.
 
 use std::{
-    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Condvar, Mutex},
     thread::JoinHandle,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use anyhow::Context;
 use driml_protocol::{
-    AffinityUpdate, BatchHeader, CodecError, Goodbye, Keys, Kind, PlanesPool, RunSpec, Shutdown,
+    BatchHeader, Keys, PlanesPool, RunSpec, Shutdown,
     answering::Answering,
     batch::POOL_BATCHES,
-    codec,
     config::{Settings, TransportConfig},
     session::{self, Endpoints},
     shared_memory,
@@ -36,11 +25,13 @@ use zenoh::{
     query::{Query, Queryable},
 };
 
-use crate::{config::Config, replay::Replay, storage::frame_store::Packer};
-use members::Members;
-use parked::{ParkedChunks, ParkedRequests};
-use timings::Timings;
-use weights::WeightsStore;
+use super::{
+    members::Members,
+    parked::{ParkedChunks, ParkedRequests},
+    server::{Service, State},
+    timings::Timings,
+};
+use crate::{config::Config, replay::Replay};
 
 /// Threads that make batches: one assembles while another's reply is being sent.
 const BATCH_THREADS: usize = 2;
@@ -178,44 +169,6 @@ fn chunk_pools_bytes(settings: &Settings, spec: &RunSpec) -> anyhow::Result<usiz
     Ok(actors.saturating_mul(pool))
 }
 
-/// What all threads share.
-struct Service {
-    spec_hash: u64,
-    num_actions: u32,
-    shard: (u32, u32),
-    after_updates: u64,
-    config_toml: String,
-    /// Whether chunks may come through shared memory.
-    shared_memory: bool,
-    /// How long a question about a chunk is held before it is answered `Wait`: far below the actors' time-out, so that an actor
-    /// can tell a server that makes it wait from one that is silent.
-    hold_max: Duration,
-    /// Memory for chunks that arrive and batches that leave.
-    pool: PlanesPool,
-    packer: Packer,
-    state: Mutex<State>,
-    /// Something was stored, sampled or parked: whoever waits for the limiter looks again.
-    changed: Condvar,
-    weights: Mutex<WeightsStore>,
-    announcements: Publisher<'static>,
-    shutdown: Shutdown,
-}
-
-/// What changes, under one lock.
-struct State {
-    replay: Replay,
-    members: Members,
-    chunks: ParkedChunks<Question>,
-    requests: ParkedRequests<Query>,
-    timings: Timings,
-}
-
-/// Who asks about a chunk, and since when.
-struct Question {
-    query: Query,
-    arrived: Instant,
-}
-
 /// The threads that answer.
 type Threads = Vec<JoinHandle<()>>;
 
@@ -293,10 +246,6 @@ fn watch_members(
 }
 
 impl Service {
-    fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     /// Starts the threads that deal with what was parked; they end after `shutdown`.
     fn start_working(self: Arc<Self>) -> std::io::Result<Threads> {
         let work = |name: &str, work: fn(&Self)| {
@@ -310,87 +259,5 @@ impl Service {
             threads.push(work(&format!("sample-{i}"), Self::serve_parked)?);
         }
         Ok(threads)
-    }
-
-    fn reply<H: serde::Serialize>(&self, query: &Query, kind: Kind, header: &H) {
-        match codec::encode(kind, self.spec_hash, header, &[]) {
-            Ok(bytes) => session::answer(query, bytes.into()),
-            Err(e) => tracing::error!("a reply of kind {kind:?} was not sent: {e}"),
-        }
-    }
-
-    /// Counts and logs a message that cannot be read.
-    fn refuse(&self, what: &str, e: &CodecError) {
-        tracing::warn!("{what} was refused: {e}");
-        self.state().replay.note_refused_message();
-    }
-
-    /// Decodes a small message, or counts it as refused.
-    fn read<H: serde::de::DeserializeOwned>(&self, query: &Query, kind: Kind) -> Option<H> {
-        let payload = query
-            .payload()
-            .map(|payload| payload.to_bytes())
-            .unwrap_or_default();
-        match codec::decode(&payload, kind, Some(self.spec_hash)) {
-            Ok((header, _)) => Some(header),
-            Err(e) => {
-                self.refuse(&format!("a message of kind {kind:?}"), &e);
-                None
-            }
-        }
-    }
-
-    fn goodbye(&self, query: Query) {
-        if let Some(goodbye) = self.read::<Goodbye>(&query, Kind::Goodbye) {
-            self.state().replay.goodbye(&goodbye);
-            self.reply(&query, Kind::Done, &());
-        }
-    }
-
-    fn affinity(&self, query: Query) {
-        let Some(update) = self.read::<AffinityUpdate>(&query, Kind::Affinity) else {
-            return;
-        };
-        let mut state = self.state();
-        let set = match state.members.check_learner(update.learner) {
-            Ok(()) => state
-                .replay
-                .set_affinity(&update)
-                .map_err(|e| e.to_string()),
-            Err(why) => {
-                state.replay.note_refused_message();
-                Err(why)
-            }
-        };
-        drop(state);
-        match set {
-            Ok(()) => self.reply(&query, Kind::Done, &()),
-            Err(why) => tracing::warn!("an affinity matrix was refused: {why}"),
-        }
-    }
-
-    fn status(&self, query: Query) {
-        let state = self.state();
-        let mut status = state.replay.status();
-        status.actors_acting = state.members.actors_acting();
-        status.actors_waiting = state.chunks.len() as u32;
-        status.answer_ms = state.timings.answer_ms();
-        status.insert_ms = state.timings.insert_ms();
-        status.weights_behind_s = state.timings.weights_behind_s();
-        status.weights_behind_updates = state.timings.weights_behind_updates();
-        drop(state);
-        self.reply(&query, Kind::ReplayStatus, &status);
-    }
-
-    /// Waits until something has changed, or for `wait_max`.
-    fn wait<'a>(
-        &'a self,
-        state: MutexGuard<'a, State>,
-        wait_max: Duration,
-    ) -> MutexGuard<'a, State> {
-        self.changed
-            .wait_timeout(state, wait_max)
-            .unwrap_or_else(PoisonError::into_inner)
-            .0
     }
 }

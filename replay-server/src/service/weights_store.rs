@@ -1,18 +1,12 @@
-//! The newest weights: taken from the learner once a version, announced, and given to actors in pieces.
-//! It does not read them.
+//! The newest weights and the older ones that actors still pull, whole, as they came.
+//! It neither reads nor sends them.
 
 use std::{
-    sync::{Arc, MutexGuard, PoisonError},
+    sync::Arc,
     time::{Duration, Instant},
 };
 
-use driml_protocol::{
-    Kind, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec,
-    session, weights::PIECE_BYTES,
-};
-use zenoh::{Wait, bytes::ZBytes, query::Query};
-
-use super::Service;
+use driml_protocol::{WeightsHeader, WeightsReply, WeightsRequest, weights::PIECE_BYTES};
 
 /// Versions that are kept while actors pull them. When so many are being pulled, whoever begins gets the newest of these: many
 /// actors that pull slowly are served to the end, with weights that are a little older.
@@ -23,9 +17,9 @@ const KEPT_FOR: Duration = Duration::from_secs(5);
 const VERSION_STEP_MAX: u64 = 1 << 20;
 
 /// Weights as they came.
-struct Weights {
-    header: WeightsHeader,
-    safetensors: Vec<u8>,
+pub(super) struct Weights {
+    pub(super) header: WeightsHeader,
+    pub(super) safetensors: Vec<u8>,
 }
 
 /// The newest weights, and older ones that are being pulled.
@@ -46,7 +40,11 @@ impl WeightsStore {
     ///
     /// # Errors
     /// A version that cannot follow the newest one; the reason, for a person.
-    fn put(&mut self, header: WeightsHeader, safetensors: &[u8]) -> Result<bool, String> {
+    pub(super) fn put(
+        &mut self,
+        header: WeightsHeader,
+        safetensors: &[u8],
+    ) -> Result<bool, String> {
         let newest = self.version();
         if self.newest.as_ref().is_some_and(|it| it.header == header) {
             return Ok(false);
@@ -62,7 +60,7 @@ impl WeightsStore {
     }
 
     /// The weights that `request` asks for, and where the piece starts.
-    fn find(
+    pub(super) fn find(
         &mut self,
         request: WeightsRequest,
         now: Instant,
@@ -107,81 +105,6 @@ impl WeightsStore {
         }
         self.pulled.push((newest.clone(), now));
         Ok(newest.header.version)
-    }
-}
-
-impl Service {
-    pub(super) fn weights(&self) -> MutexGuard<'_, WeightsStore> {
-        self.weights.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    pub(super) fn take_weights(&self, query: Query) {
-        let payload = query.payload().map(|payload| payload.to_bytes());
-        let payload = payload.unwrap_or_default();
-        let (upload, safetensors) = match WeightsUpload::decode(&payload, self.spec_hash) {
-            Ok(read) => read,
-            Err(e) => return self.refuse("an upload of weights", &e),
-        };
-        let WeightsUpload { learner, weights } = upload;
-        let allowed = self.state().members.check_learner(learner);
-        match allowed.and_then(|()| self.weights().put(weights, safetensors)) {
-            Ok(is_new) => {
-                if is_new {
-                    let now = Instant::now();
-                    self.state().timings.weights_came(&weights, now);
-                    self.announce(weights.version);
-                }
-                self.reply(&query, Kind::Done, &());
-            }
-            Err(why) => {
-                tracing::warn!("weights were refused: {why}");
-                self.state().replay.note_refused_message();
-            }
-        }
-    }
-
-    fn announce(&self, version: u64) {
-        let announced = codec::encode(
-            Kind::WeightsVersion,
-            self.spec_hash,
-            &WeightsVersion { version },
-            &[],
-        );
-        let put = announced.map_err(|e| e.to_string()).and_then(|bytes| {
-            self.announcements
-                .put(bytes)
-                .wait()
-                .map_err(|e| e.to_string())
-        });
-        if let Err(why) = put {
-            tracing::warn!("weights {version} were not announced: {why}");
-        }
-    }
-
-    pub(super) fn give_weights(&self, query: Query) {
-        let Some(request) = self.read::<WeightsRequest>(&query, Kind::WeightsRequest) else {
-            return;
-        };
-        let found = self.weights().find(request, Instant::now());
-        let (reply, piece) = match &found {
-            Ok((weights, offset)) => {
-                let rest = &weights.safetensors[*offset..];
-                let reply = WeightsReply::Piece {
-                    weights: weights.header,
-                    bytes: weights.safetensors.len() as u64,
-                    offset: *offset as u64,
-                };
-                (reply, &rest[..rest.len().min(PIECE_BYTES)])
-            }
-            Err(reply) => (*reply, &[][..]),
-        };
-        match codec::seal(Kind::Weights, self.spec_hash, &reply, piece) {
-            Ok(head) => {
-                let piece = ZBytes::from(piece.to_vec());
-                session::answer(&query, session::join_planes(head, piece));
-            }
-            Err(e) => tracing::error!("weights were not sent: {e}"),
-        }
     }
 }
 
