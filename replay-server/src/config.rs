@@ -1,10 +1,7 @@
 //! What can be set about the replay server, and the checks that keep a run from stalling.
 //! It does not hold the rules of the return or of k: those are the run spec's, shared by every part.
 
-use driml_protocol::{
-    codec::PLANES_BYTES_MAX,
-    run_spec::{RunSpec, RunSpecError},
-};
+use driml_protocol::{RunSpec, RunSpecError, codec::PLANES_BYTES_MAX};
 use serde::{Deserialize, Serialize};
 
 use crate::storage::frame_store::log::OVERHEAD_BYTES_MAX;

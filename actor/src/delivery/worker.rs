@@ -10,9 +10,8 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Chunk, ChunkHeader, Claim, Goodbye, InsertReply, Keys, Kind, PlanesPool, Shutdown, codec,
-    fault,
-    seldom::Seldom,
+    Chunk, ChunkHeader, Claim, Goodbye, InsertReply, Keys, Kind, PlanesPool, Seldom, Shutdown,
+    codec, fault,
     session::{self, Asked, SessionError},
 };
 use zenoh::{Session, bytes::ZBytes, qos::Priority};

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use driml_protocol::{Returns, metric::RETURNS_OF};
+use driml_protocol::{RETURNS_OF, Returns};
 
 /// What the status reports beside the ring's and the limiter's own counts.
 #[derive(Default)]

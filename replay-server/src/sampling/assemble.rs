@@ -1,9 +1,7 @@
 //! Makes one row of a batch: a_t, a_{t+1}, the n-step return, and which transitions' states are s_t, s_{t+n} and s_{t+k}, with
 //! each k drawn here. It does not choose the anchor and reads no frame.
 
-use driml_protocol::{
-    End, Horizon, NO_ACTION, RunSpec, TimeoutRule, batch::BatchRowsMut, run_spec::POSITIVES_MAX,
-};
+use driml_protocol::{BatchRowsMut, End, Horizon, NO_ACTION, POSITIVES_MAX, RunSpec, TimeoutRule};
 use rand::Rng;
 
 use super::{

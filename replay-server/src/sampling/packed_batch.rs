@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use driml_protocol::{Batch, batch::BatchRowsMut};
+use driml_protocol::{Batch, BatchRowsMut};
 use lz4_flex::block::{decompress_into, decompress_into_with_dict};
 
 use super::{

@@ -9,14 +9,11 @@ use std::{
 
 use anyhow::Context;
 use driml_protocol::{
-    BatchHeader, Keys, PlanesPool, RunSpec, Shutdown,
-    answering::Answering,
-    batch::POOL_BATCHES,
+    Answering, BatchHeader, Keys, POOL_BATCHES, PlanesPool, RunSpec, Shutdown, TRANSITION_BYTES,
     config::{Settings, TransportConfig},
+    join_within,
     session::{self, Endpoints},
     shared_memory,
-    shutdown::join_within,
-    transition::TRANSITION_BYTES,
 };
 use zenoh::{
     Session, Wait,

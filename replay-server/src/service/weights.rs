@@ -7,8 +7,7 @@ use std::{
 };
 
 use driml_protocol::{
-    Kind, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec, session,
-    weights::PIECE_BYTES,
+    Kind, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec, session,
 };
 use zenoh::{Wait, bytes::ZBytes, query::Query};
 

@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{WeightsHeader, WeightsReply, WeightsRequest, weights::PIECE_BYTES};
+use driml_protocol::{PIECE_BYTES, WeightsHeader, WeightsReply, WeightsRequest};
 
 /// Versions that are kept while actors pull them. When so many are being pulled, whoever begins gets the newest of these: many
 /// actors that pull slowly are served to the end, with weights that are a little older.

@@ -2,7 +2,7 @@
 //! Every number is made here from the runs.
 
 use driml_envs::WorldName;
-use driml_protocol::metric::RETURNS_OF;
+use driml_protocol::RETURNS_OF;
 
 use super::{
     Cell, Kind, Results, k, published,

@@ -19,7 +19,7 @@ use zenoh::{
     query::{Query, Queryable},
 };
 
-use crate::fault;
+use crate::process::fault;
 
 /// Questions that wait for a thread; whoever asks one more hears at once that nobody answers, and asks again.
 const WAITING_MAX: usize = 4096;

@@ -19,7 +19,7 @@ use zenoh::{
     },
 };
 
-use crate::shared_memory::{self, Trust};
+use super::shared_memory::{self, Trust};
 
 /// Where the operating system keeps shared memory.
 const SHARED_MEMORY_FOLDER: &str = "/dev/shm";

@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::end_signs;
+use super::end_signs;
 
 /// A flag that is raised once and never lowered; clones share it.
 #[derive(Clone, Debug, Default)]

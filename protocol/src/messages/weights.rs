@@ -6,7 +6,7 @@
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::codec::{self, CodecError, Kind, PLANES_BYTES_MAX};
+use crate::wire::codec::{self, CodecError, Kind, PLANES_BYTES_MAX};
 
 /// Bytes of weights in one message to an actor; the last piece has fewer.
 pub const PIECE_BYTES: usize = 1 << 18;
@@ -32,7 +32,7 @@ pub struct WeightsHeader {
 /// New weights on their way to the replay server; the planes are a safetensors file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WeightsUpload {
-    /// Which learner sends them: that of its [`crate::LearnerJoin`].
+    /// Which learner sends them: that of its [`LearnerJoin`](crate::LearnerJoin).
     pub learner: u64,
     /// What they say of themselves.
     pub weights: WeightsHeader,

@@ -14,7 +14,10 @@
 
 use serde::{Serialize, de::DeserializeOwned};
 
-use crate::{PROTOCOL_VERSION, Planes, PlanesPool};
+use super::buffers::{Planes, PlanesPool};
+
+/// The version of every message in this crate; parts of different versions refuse each other.
+pub const PROTOCOL_VERSION: u16 = 3;
 
 const MAGIC: [u8; 4] = *b"DRML";
 /// Length of the fixed prefix, bytes.

@@ -14,7 +14,7 @@ use nix::{
 };
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-use crate::fault;
+use super::fault;
 
 /// How often it is looked whether parent and stderr are still there.
 const LOOK: Duration = Duration::from_millis(500);

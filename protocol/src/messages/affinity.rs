@@ -3,12 +3,12 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::codec::CodecError;
+use crate::wire::codec::CodecError;
 
 /// A, row by row: `matrix[i * n + j]` is the softmax over j of q(a_i, a_j); rows sum to 1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AffinityUpdate {
-    /// Which learner sends it: that of its [`crate::LearnerJoin`].
+    /// Which learner sends it: that of its [`LearnerJoin`](crate::LearnerJoin).
     pub learner: u64,
     /// Counts up from 1; an older one than this learner's newest is ignored.
     pub version: u64,
