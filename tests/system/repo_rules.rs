@@ -327,7 +327,7 @@ fn dangerous_words_stay_where_they_are_needed() {
             "unsafe_code",
             &["actor/procgen-sys/", "learner/model/src/gemm.rs"],
         ),
-        ("bincode", &["protocol/src/codec.rs"]),
+        ("bincode", &["protocol/src/wire/codec.rs"]),
         // A panic ends the process: nothing of the program may count on catching one.
         ("catch_unwind", &["replay-server/tests/"]),
     ];

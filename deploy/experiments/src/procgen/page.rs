@@ -3,7 +3,7 @@
 
 use driml_envs::WorldName;
 use driml_launch::record::Summary;
-use driml_protocol::metric::RETURNS_OF;
+use driml_protocol::RETURNS_OF;
 
 use super::{
     Cell, Kind, Results, k, published,

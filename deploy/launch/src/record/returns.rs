@@ -9,7 +9,7 @@ use std::{collections::VecDeque, fs, io::ErrorKind, path::Path};
 
 use anyhow::Context;
 use driml_machine::error::usage;
-use driml_protocol::{ReplayStatus, Returns, metric::RETURNS_OF};
+use driml_protocol::{RETURNS_OF, ReplayStatus, Returns};
 
 use super::table::Table;
 
