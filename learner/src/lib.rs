@@ -10,6 +10,7 @@ pub mod batch;
 pub mod batch_source;
 pub mod checkpoint;
 mod config;
+mod error;
 pub mod gradients;
 mod learning;
 pub mod loss;
@@ -19,6 +20,7 @@ pub mod parity;
 mod run;
 mod shards;
 pub mod target;
+mod tensors;
 pub mod update;
 
 pub use affinity::{
@@ -30,7 +32,8 @@ pub use batch::{Batch, NO_ACTION};
 pub use driml_model::{Compute, DeviceName, Operations};
 
 pub use config::{AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart};
+pub use error::UpdateError;
 pub use learning::{Learning, Weights};
 pub use optim::AdamSettings;
 pub use run::{RunArgs, run};
-pub use update::{Learner, LearnerSettings, NetworkParameters, UpdateError, UpdateReport};
+pub use update::{Learner, LearnerSettings, NetworkParameters, UpdateReport};

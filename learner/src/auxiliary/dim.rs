@@ -6,8 +6,8 @@ use driml_model::{DimParts, Features, Network};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    loss::info_nce::{Scores, info_nce_loss},
-    update::UpdateError,
+    error::UpdateError,
+    loss::{info_nce::info_nce_loss, scores::Scores},
 };
 
 /// The pairs NtM in the order of every array of four here: features N of (s_t, a_t) against features M of s_{t+k}.

@@ -16,8 +16,9 @@ use serde::Deserialize;
 use crate::{
     auxiliary::{Objective, curl::CurlSettings, dim::Lambda},
     batch::{Batch, NO_ACTION},
+    error::UpdateError,
     optim::AdamSettings,
-    update::{LearnerSettings, UpdateError},
+    update::LearnerSettings,
 };
 
 /// Why a case could not be checked.
