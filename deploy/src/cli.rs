@@ -189,7 +189,8 @@ pub(crate) struct LearnerArgs {
 
 #[derive(Debug, Args)]
 pub(crate) struct ReplayServerArgs {
-    /// Endpoint to listen on, such as tcp/0.0.0.0:7447; may be given several times
+    /// Endpoint to listen on, such as tcp/127.0.0.1:7447; may be given several times. Whoever reaches it can take part in the
+    /// run and change what is learned: an address that others reach, such as tcp/0.0.0.0:7447, belongs in a trusted network
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) listen: Vec<String>,
     /// Router to connect to as well

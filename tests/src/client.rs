@@ -13,7 +13,7 @@ use driml_protocol::{
 use serde::de::DeserializeOwned;
 use zenoh::{Session, Wait, qos::Priority};
 
-use crate::wait_for;
+use crate::waiting::wait_for;
 
 /// The prefix of a run's keys unless a part is told otherwise.
 const NAMESPACE: &str = "driml";

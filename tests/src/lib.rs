@@ -11,40 +11,15 @@ mod client;
 mod process;
 mod run_folder;
 mod system;
+mod waiting;
 
 pub use client::Client;
 pub use process::{Ended, Process};
 pub use run_folder::{RunFolder, Summary};
 pub use system::{Survivor, TestSystem};
+pub use waiting::{DEADLINE, wait_for};
 
-use std::{
-    io::Write,
-    thread,
-    time::{Duration, Instant},
-};
-
-/// How long any one wait may take. Far more than a busy machine of two cores needs, and short of a CI job's limit.
-pub const DEADLINE: Duration = Duration::from_secs(180);
-/// Between two looks at a condition.
-const LOOK_AGAIN: Duration = Duration::from_millis(10);
-
-/// Waits until `look` gives something.
-///
-/// # Panics
-/// At the [`DEADLINE`], saying what was waited for.
-pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
-    let started = Instant::now();
-    loop {
-        if let Some(seen) = look() {
-            return seen;
-        }
-        assert!(
-            started.elapsed() < DEADLINE,
-            "waited {DEADLINE:?} for: {what}"
-        );
-        thread::sleep(LOOK_AGAIN);
-    }
-}
+use std::io::Write;
 
 /// Says on stderr that `test` is skipped, and why.
 ///

@@ -14,7 +14,7 @@ use nix::{
     unistd::Pid,
 };
 
-use crate::wait_for;
+use crate::waiting::wait_for;
 
 /// A started process. Dropping it kills it.
 #[derive(Debug)]

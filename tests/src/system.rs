@@ -14,7 +14,12 @@ use nix::{
     unistd::Pid,
 };
 
-use crate::{Client, DEADLINE, Ended, Process, RunFolder, wait_for};
+use crate::{
+    client::Client,
+    process::{Ended, Process},
+    run_folder::RunFolder,
+    waiting::{DEADLINE, wait_for},
+};
 
 /// The variable that marks each process of a system. Children inherit it, so that those of a killed launcher are found too.
 const MARK: &str = "DRIML_TEST_SYSTEM";

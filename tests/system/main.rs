@@ -6,6 +6,7 @@
 mod bad_messages;
 mod bad_weights;
 mod by_hand;
+mod circles;
 mod closed_terminal;
 mod company;
 mod disk_full;
@@ -17,6 +18,7 @@ mod leftovers;
 mod local;
 mod lockstep;
 mod lost_batches;
+mod lost_chunks;
 mod panics;
 mod parity;
 mod procgen;

@@ -40,11 +40,16 @@ const ARROWS: &[(&str, &str, &[&str])] = &[
     ("driml-tests", "tests", ALL),
 ];
 
-fn root() -> PathBuf {
+pub(crate) fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
         .parent()
         .expect("this package lies in the workspace")
         .into()
+}
+
+/// Where the packages of ours lie.
+pub(crate) fn folders_of_crates() -> impl Iterator<Item = &'static str> {
+    ARROWS.iter().map(|(_, folder, _)| *folder)
 }
 
 /// Packages of ours by name: their folder, and the packages of ours that they depend on in any way.

@@ -21,6 +21,8 @@ use super::{Account, DeliveryLimits};
 
 /// After `Shutdown`, how long the chunks at hand may take to be stored.
 const DRAIN_MAX: Duration = Duration::from_secs(20);
+/// After `Shutdown`, how long the replay server may be silent about one of them before it is sent again: several tries must fit.
+const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(4);
 /// Pause between two tries when the replay server is out of reach or has no room.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// How often a thread that waits for an answer looks whether the actor is to stop.
@@ -157,6 +159,10 @@ impl Courier {
                 is_kept: false,
             });
         }
+        if self.shutdown.is_set() {
+            // Copying costs nobody anything now, and a message that is lost costs the time that is left.
+            self.copy_out_of_shared_memory();
+        }
         self.outgoing.front().map(|first| first.header)
     }
 
@@ -284,6 +290,10 @@ impl Courier {
         if self.outgoing[0].in_shared_memory {
             self.pool.avoid_shared_memory();
         }
+        self.copy_out_of_shared_memory();
+    }
+
+    fn copy_out_of_shared_memory(&mut self) {
         for it in self.outgoing.iter_mut().filter(|it| it.in_shared_memory) {
             it.planes = ZBytes::from(it.planes.to_bytes().into_owned());
             it.in_shared_memory = false;
@@ -292,7 +302,10 @@ impl Courier {
 
     fn send_window(&mut self) -> Result<(), SessionError> {
         let leaving = self.shutdown.is_set();
-        let timeout = self.limits.ack_timeout;
+        let timeout = match leaving {
+            true => self.limits.ack_timeout.min(DRAIN_ACK_TIMEOUT),
+            false => self.limits.ack_timeout,
+        };
         for it in self.outgoing.iter_mut().take(self.window) {
             if it.asked.is_some() {
                 continue;

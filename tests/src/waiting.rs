@@ -1,0 +1,29 @@
+//! Waiting for what another process does: by looking, with a deadline.
+
+use std::{
+    thread,
+    time::{Duration, Instant},
+};
+
+/// How long any one wait may take. Far more than a busy machine of two cores needs, and short of a CI job's limit.
+pub const DEADLINE: Duration = Duration::from_secs(180);
+/// Between two looks at a condition.
+const LOOK_AGAIN: Duration = Duration::from_millis(10);
+
+/// Waits until `look` gives something.
+///
+/// # Panics
+/// At the [`DEADLINE`], saying what was waited for.
+pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
+    let started = Instant::now();
+    loop {
+        if let Some(seen) = look() {
+            return seen;
+        }
+        assert!(
+            started.elapsed() < DEADLINE,
+            "waited {DEADLINE:?} for: {what}"
+        );
+        thread::sleep(LOOK_AGAIN);
+    }
+}

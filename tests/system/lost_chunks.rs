@@ -1,0 +1,241 @@
+//! Chunks, and answers about chunks, that get lost between the actors and the replay server: each transition is stored once.
+//! The replay server is played by the test, around the real replay; the actors' side is the real one.
+
+use std::{
+    collections::BTreeSet,
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicU32, Ordering},
+    },
+    time::Duration,
+};
+
+use driml_actor::delivery::{Delivery, DeliveryLimits};
+use driml_protocol::{
+    ActorJoin, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon, InsertReply, Keys, Kind,
+    PlanesPool, RequestId, RunSpec, Shutdown, TimeoutRule, codec,
+    session::{self, Endpoints},
+};
+use driml_replay_server::{Compression, Config, Replay};
+use zenoh::{
+    Session, Wait,
+    query::{Query, Queryable},
+};
+
+/// Actors, and chunks of each.
+const ACTORS: u32 = 3;
+const CHUNKS: u64 = 32;
+/// Transitions of one chunk.
+const STEPS: u32 = 4;
+const TRANSITIONS: u64 = ACTORS as u64 * CHUNKS * STEPS as u64;
+/// How often each transition is sampled, on average: that one is never drawn has a probability of exp(-64).
+const SAMPLED: u64 = 64;
+const ROWS: u32 = 64;
+
+fn spec() -> RunSpec {
+    RunSpec {
+        world: "chain".into(),
+        agent: "c51".into(),
+        seed: 1,
+        frame_height: 4,
+        frame_width: 4,
+        frame_channels: 1,
+        frame_stack: 1,
+        num_actions: 3,
+        n_step: 1,
+        gamma: 0.99,
+        horizon: Horizon::None,
+        timeout: TimeoutRule::Terminal,
+    }
+}
+
+/// What the network does to messages about chunks.
+#[derive(Clone, Copy)]
+enum Loses {
+    /// Of each five, one does not arrive, and the answer to another one does not.
+    TwoOfFive,
+    /// The first few do not arrive, the others do.
+    First(u32),
+}
+
+/// A replay server behind a network that loses messages.
+struct Server {
+    replay: Mutex<Replay>,
+    loses: Loses,
+    messages: AtomicU32,
+    /// What is never answered; a query that is dropped would tell the actor so at once.
+    lost: Mutex<Vec<Query>>,
+}
+
+impl Server {
+    fn new(loses: Loses) -> Arc<Self> {
+        let config = Config {
+            capacity_transitions: 2 * TRANSITIONS,
+            shards: 1,
+            compression: Compression::None,
+            compressed_bytes_max: None,
+            replay_ratio: SAMPLED as f64,
+            warmup_transitions: 0,
+            slack_transitions: 2 * TRANSITIONS,
+            transitions_max: None,
+            study: None,
+        };
+        let mut replay = Replay::new(&spec(), &config, ROWS).unwrap();
+        for actor in 0..ACTORS {
+            replay.join_actor(ActorJoin { actor, epoch: 1 }).unwrap();
+        }
+        Arc::new(Self {
+            replay: Mutex::new(replay),
+            loses,
+            messages: AtomicU32::new(0),
+            lost: Mutex::default(),
+        })
+    }
+
+    /// Answers about chunks, and hears goodbyes, as a replay server does, but for what is lost.
+    fn declare(self: &Arc<Self>, session: &Session, keys: &Keys) -> Vec<Queryable<()>> {
+        let declare = |key, answer: fn(&Self, &[u8]) -> Option<Vec<u8>>| {
+            let server = self.clone();
+            let answer = move |query: Query| {
+                let payload = query.payload().unwrap().to_bytes();
+                match answer(&server, &payload) {
+                    Some(reply) => session::answer(&query, reply.into()),
+                    None => server.lost.lock().unwrap().push(query),
+                }
+            };
+            session.declare_queryable(key).callback(answer).wait()
+        };
+        let goodbye = |server: &Self, payload: &[u8]| {
+            let hash = spec().hash();
+            let goodbye = codec::decode::<Goodbye>(payload, Kind::Goodbye, Some(hash));
+            server.replay.lock().unwrap().goodbye(&goodbye.unwrap().0);
+            Some(codec::encode(Kind::Done, hash, &(), &[]).unwrap())
+        };
+        let insert = |server: &Self, payload: &[u8]| {
+            let chunk = Chunk::decode(payload, spec().hash(), 3).unwrap();
+            server.lossy(|replay| replay.insert(&chunk))
+        };
+        let claim = |server: &Self, payload: &[u8]| {
+            let claim = codec::decode::<Claim>(payload, Kind::Claim, Some(spec().hash()));
+            let claim = claim.unwrap().0;
+            server.lossy(|replay| replay.claim(&claim).expect("nothing is parked here"))
+        };
+        [
+            declare(keys.ingest(), insert),
+            declare(keys.claim(), claim),
+            declare(keys.goodbye(), goodbye),
+        ]
+        .map(Result::unwrap)
+        .into()
+    }
+
+    fn lossy(&self, judge: impl FnOnce(&mut Replay) -> InsertReply) -> Option<Vec<u8>> {
+        let message = self.messages.fetch_add(1, Ordering::Relaxed);
+        let (arrives, is_answered) = match self.loses {
+            Loses::TwoOfFive => (message % 5 != 1, message % 5 != 3),
+            Loses::First(count) => (message >= count, true),
+        };
+        let reply = arrives.then(|| judge(&mut self.replay.lock().unwrap()))?;
+        is_answered.then(|| codec::encode(Kind::InsertReply, spec().hash(), &reply, &[]).unwrap())
+    }
+
+    /// Checks that the replay holds the numbers 0 to `TRANSITIONS`, each once.
+    fn check_numbers(&self) {
+        let mut replay = self.replay.lock().unwrap();
+        replay.check_valid();
+        let status = replay.status();
+        assert_eq!(status.transitions_inserted, TRANSITIONS, "{status:#?}");
+        assert_eq!(
+            (status.transitions_lost, status.transitions_duplicated),
+            (0, 0)
+        );
+        let mut numbers = BTreeSet::new();
+        let mut request = RequestId::first(1);
+        for _ in 0..TRANSITIONS * SAMPLED / u64::from(ROWS) {
+            let draft = replay.draw_for(request, ROWS, driml_protocol::Planes::zeroed);
+            let batch = draft.unwrap().unpack();
+            numbers.extend(batch.n_step_returns().into_iter().map(|it| it as u64));
+            request = request.next();
+        }
+        // As many are stored as there are numbers: if each number is there, none is there twice.
+        assert_eq!(numbers, (0..TRANSITIONS).collect());
+    }
+}
+
+/// Sends one actor's chunks, whose rewards number the transitions of all actors.
+fn deliver(actor: u32, delivery: &Delivery) {
+    for sequence in 0..CHUNKS {
+        let first_transition = sequence * u64::from(STEPS);
+        let mut chunk = Chunk::zeroed(ChunkHeader {
+            actor,
+            epoch: 1,
+            sequence,
+            first_transition,
+            weights_version: 1,
+            leaving: false,
+            streams: 1,
+            steps: STEPS,
+            frame_bytes: spec().frame_bytes() as u32,
+        });
+        for row in 0..STEPS as usize {
+            let number =
+                u64::from(actor) * CHUNKS * u64::from(STEPS) + first_transition + row as u64;
+            // Each is an episode of its own, so that its return is its own number.
+            chunk.set(row, 0, number as f32, End::Terminal);
+        }
+        assert!(delivery.send(chunk));
+    }
+}
+
+/// Delivers the chunks of `ACTORS` actors to `server`, which are about to leave or not.
+fn deliver_all(server: &Arc<Server>, ack_timeout: Duration, leaving: bool) {
+    let folder = tempfile::tempdir().unwrap();
+    let endpoint = format!("unixsock-stream/{}/server.sock", folder.path().display());
+    let open = |listen, connect| session::open(&Endpoints { listen, connect }).unwrap();
+    let listening = open(vec![endpoint.clone()], vec![]);
+    let keys = Keys::new("lossy").unwrap();
+    let declared = server.declare(&listening, &keys);
+    std::thread::scope(|scope| {
+        for actor in 0..ACTORS {
+            let (session, keys) = (open(vec![], vec![endpoint.clone()]), keys.clone());
+            scope.spawn(move || {
+                let stop = Shutdown::default();
+                let limits = DeliveryLimits {
+                    chunks_in_flight_max: CHUNKS as usize,
+                    ack_timeout,
+                    unreachable_max: Duration::from_secs(60),
+                };
+                let pool = PlanesPool::new(4);
+                let delivery =
+                    Delivery::start(session, keys, spec().hash(), 0, limits, pool, stop.clone())
+                        .unwrap();
+                if leaving {
+                    stop.set();
+                }
+                deliver(actor, &delivery);
+                assert_eq!(delivery.finish().unwrap(), 0);
+            });
+        }
+    });
+    drop(declared);
+}
+
+#[test]
+fn chunks_and_answers_that_get_lost_leave_each_transition_stored_once() {
+    let server = Server::new(Loses::TwoOfFive);
+    deliver_all(&server, Duration::from_millis(100), false);
+    server.check_numbers();
+    let retried = server.replay.lock().unwrap().status().chunks_retried;
+    assert!(
+        retried > 10,
+        "answers were to get lost: {retried} chunks came again"
+    );
+}
+
+/// The time in which an actor that leaves must deliver is not spent on one message that was lost.
+#[test]
+fn an_actor_that_leaves_does_not_wait_for_long_before_it_sends_again() {
+    let server = Server::new(Loses::First(3 * ACTORS));
+    deliver_all(&server, Duration::from_secs(15), true);
+    server.check_numbers();
+}
