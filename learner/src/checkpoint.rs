@@ -16,8 +16,9 @@ use sha2::{Digest, Sha256};
 
 use crate::{
     affinity::AffinityEstimator,
+    agent::{Learner, NetworkParameters},
     error::UpdateError,
-    update::{Learner, LearnerSettings, NetworkParameters},
+    settings::LearnerSettings,
 };
 
 /// 2: CURL's key encoder has a file of its own. All else is as in 1.

@@ -14,8 +14,8 @@ use serde::{Deserialize, Serialize};
 use super::dim::{self, Dots};
 use crate::{
     error::UpdateError,
-    loss::{info_nce::info_nce_loss, scores::Scores},
-    target,
+    losses::{info_nce::info_nce_loss, scores::Scores},
+    optimiser::target,
 };
 
 /// The one head; the key encoder has its copy.

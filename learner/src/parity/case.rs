@@ -17,8 +17,8 @@ use crate::{
     auxiliary::{Objective, curl::CurlSettings, dim::Lambda},
     batch::{Batch, NO_ACTION},
     error::UpdateError,
-    optim::AdamSettings,
-    update::LearnerSettings,
+    optimiser::adam::AdamSettings,
+    settings::LearnerSettings,
 };
 
 /// Why a case could not be checked.

@@ -14,9 +14,9 @@ use driml_model::{Operations, Parameters};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::gradients::Gradients;
 use crate::{
     error::UpdateError,
-    gradients::Gradients,
     tensors::{slice, slice_mut},
 };
 
