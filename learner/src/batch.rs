@@ -3,7 +3,7 @@
 
 use driml_model::ModelConfig;
 
-use crate::{auxiliary::Auxiliary, update::UpdateError};
+use crate::{auxiliary::Auxiliary, error::UpdateError};
 
 /// Stands in `next_action` where a row has none: its transition ended the episode or the level.
 pub const NO_ACTION: u8 = 255;

@@ -16,7 +16,9 @@ use sha2::{Digest, Sha256};
 
 use crate::{
     affinity::AffinityEstimator,
-    update::{Learner, LearnerSettings, NetworkParameters, UpdateError},
+    agent::{Learner, NetworkParameters},
+    error::UpdateError,
+    settings::LearnerSettings,
 };
 
 /// 2: CURL's key encoder has a file of its own. All else is as in 1.

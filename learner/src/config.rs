@@ -16,7 +16,7 @@ use crate::{
     },
     augment::AugmentSettings,
     auxiliary::Objective,
-    update::LearnerSettings,
+    settings::LearnerSettings,
 };
 
 /// The `[learner]` table.

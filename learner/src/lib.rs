@@ -4,22 +4,20 @@
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 pub mod affinity;
+mod agent;
 pub mod augment;
 pub mod auxiliary;
 pub mod batch;
-pub mod batch_source;
 pub mod checkpoint;
 mod config;
-pub mod gradients;
-mod learning;
-pub mod loss;
-pub mod optim;
-mod outlets;
+mod error;
+mod learner;
+pub mod losses;
+pub mod optimiser;
 pub mod parity;
-mod run;
-mod shards;
-pub mod target;
-pub mod update;
+pub mod remote;
+mod settings;
+mod tensors;
 
 pub use affinity::{
     AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
@@ -29,8 +27,10 @@ pub use auxiliary::{Objective, curl::CurlSettings, dim::Lambda};
 pub use batch::{Batch, NO_ACTION};
 pub use driml_model::{Compute, DeviceName, Operations};
 
+pub use agent::{Evaluation, Learner, NetworkParameters, UpdateReport};
 pub use config::{AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart};
-pub use learning::{Learning, Weights};
-pub use optim::AdamSettings;
-pub use run::{RunArgs, run};
-pub use update::{Learner, LearnerSettings, NetworkParameters, UpdateError, UpdateReport};
+pub use error::UpdateError;
+pub use learner::{Learning, Weights};
+pub use optimiser::adam::AdamSettings;
+pub use remote::run::{RunArgs, run};
+pub use settings::LearnerSettings;

@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-use driml_learner::batch_source::{BatchSource, Next, Requests};
+use driml_learner::remote::batch_source::{BatchSource, Next, Requests};
 use driml_protocol::{
     ActorJoin, BatchReply, BatchRequest, Chunk, ChunkHeader, Horizon, InsertReply, Keys, Kind,
     Planes, RunSpec, Shutdown, TimeoutRule, codec,

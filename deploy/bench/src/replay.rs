@@ -19,7 +19,7 @@ use driml_launch::{
 };
 use driml_learner::{
     LearnerPart,
-    batch_source::{BatchSource, Next, Requests},
+    remote::batch_source::{BatchSource, Next, Requests},
 };
 use driml_protocol::{
     Keys, Shutdown, join,

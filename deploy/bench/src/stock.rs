@@ -9,7 +9,7 @@ use candle_nn::{
     AdamW, Optimizer, ParamsAdamW,
     ops::{log_softmax, softmax},
 };
-use driml_learner::{Batch, Learner, LearnerSettings, loss::projection::project};
+use driml_learner::{Batch, Learner, LearnerSettings, losses::projection::project};
 use driml_model::{ModelConfig, Parameters};
 
 /// Online and target network and the optimiser.

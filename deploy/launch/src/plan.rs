@@ -36,15 +36,10 @@ fn row_flops(model: &ModelConfig) -> RowFlops {
         head: 0.0,
         dim: 0.0,
     };
-    let (mut height, mut width) = (model.height, model.width);
-    let mut channels = model.channels;
-    for layer in &model.conv {
-        height = (height - layer.kernel) / layer.stride + 1;
-        width = (width - layer.kernel) / layer.stride + 1;
-        flops.local +=
-            2.0 * (height * width * layer.out * channels * layer.kernel * layer.kernel) as f64;
-        channels = layer.out;
+    for layer in model.conv_shapes() {
+        flops.local += 2.0 * (layer.locations() * layer.weight_len()) as f64;
     }
+    let (height, width, _) = model.local_shape();
     for (name, shape) in model.parameter_shapes() {
         if shape.len() != 2 {
             continue;

@@ -7,7 +7,7 @@ use candle_core::Tensor;
 use driml_model::{Features, Network};
 
 use super::dim::{Dim, Dots, Vectors};
-use crate::{loss::info_nce::info_nce_loss, update::UpdateError};
+use crate::{error::UpdateError, losses::info_nce::info_nce_loss};
 
 /// The CPC objective's settings: those of the pairs of levels.
 #[derive(Clone, Copy, Debug, PartialEq)]

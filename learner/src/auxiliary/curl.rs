@@ -13,9 +13,9 @@ use serde::{Deserialize, Serialize};
 
 use super::dim::{self, Dots};
 use crate::{
-    loss::info_nce::{Scores, info_nce_loss},
-    target,
-    update::UpdateError,
+    error::UpdateError,
+    losses::{info_nce::info_nce_loss, scores::Scores},
+    optimiser::target,
 };
 
 /// The one head; the key encoder has its copy.

@@ -6,8 +6,8 @@ use driml_model::{DimParts, Features, Network};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    loss::info_nce::{Scores, info_nce_loss},
-    update::UpdateError,
+    error::UpdateError,
+    losses::{info_nce::info_nce_loss, scores::Scores},
 };
 
 /// The pairs NtM in the order of every array of four here: features N of (s_t, a_t) against features M of s_{t+k}.
@@ -83,7 +83,7 @@ impl Dim {
     /// Losses of the pairs with a weight above 0, each a scalar, before their weights.
     ///
     /// `features_t` of s_t, `features_k` of s_{t+k}, `action` [B], `valid` [B]: a row with 0 is neither anchor nor
-    /// candidate. Source: Mazoure et al. 2020, section 4; InfoNCE, scale and clip are `loss::info_nce`'s.
+    /// candidate. Source: Mazoure et al. 2020, section 4; InfoNCE, scale and clip are `losses::info_nce`'s.
     ///
     /// # Errors
     /// A head that such a pair needs and `network` lacks.

@@ -16,8 +16,9 @@ use serde::Deserialize;
 use crate::{
     auxiliary::{Objective, curl::CurlSettings, dim::Lambda},
     batch::{Batch, NO_ACTION},
-    optim::AdamSettings,
-    update::{LearnerSettings, UpdateError},
+    error::UpdateError,
+    optimiser::adam::AdamSettings,
+    settings::LearnerSettings,
 };
 
 /// Why a case could not be checked.

@@ -15,14 +15,14 @@ pub use case::ParityError;
 use case::{Case, all_parts};
 
 use crate::{
+    agent::{Learner, NetworkParameters},
     auxiliary::{
         Objective,
         cpc::{self, Cpc},
         curl::{self, Curl},
         dim::{self, Dim, Dots, Lambda, PAIRS},
     },
-    loss::info_nce::info_nce_loss,
-    update::{Learner, NetworkParameters},
+    losses::info_nce::info_nce_loss,
 };
 
 /// Values of s_t, in units of return, as a share of the support's width.

@@ -14,7 +14,7 @@ use driml_actor::{
 };
 use driml_learner::{
     LearnerPart,
-    batch_source::{BatchSource, Next, Requests},
+    remote::batch_source::{BatchSource, Next, Requests},
 };
 use driml_protocol::{Keys, Shutdown};
 use driml_settings::config::RunConfig;

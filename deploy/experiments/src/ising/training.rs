@@ -6,8 +6,10 @@ use driml_envs::{Environment, IsingConfig, IsingWorld, StepEnd};
 use driml_learner::{
     LearnerSettings,
     auxiliary::dim::{Dim, dots},
-    gradients::{Gradients, clip_factor},
-    optim::Adam,
+    optimiser::{
+        adam::Adam,
+        gradients::{Gradients, clip_factor},
+    },
 };
 use driml_model::{ModelConfig, Network, Operations, Parameters};
 use rand::{Rng, SeedableRng};

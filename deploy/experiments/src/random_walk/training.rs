@@ -5,8 +5,10 @@ use candle_core::{Device, Tensor};
 use driml_learner::{
     Lambda,
     auxiliary::dim::{Dim, dots},
-    gradients::{Gradients, clip_factor},
-    optim::Adam,
+    optimiser::{
+        adam::Adam,
+        gradients::{Gradients, clip_factor},
+    },
 };
 use driml_model::{ConvLayer, Features, ModelConfig, Network, Operations, Parameters};
 use rand::{Rng, SeedableRng};

@@ -1,5 +1,5 @@
 //! One learner process: join, learn from batch after batch, publish, save, until told to stop.
-//! The learning itself is `learning`, which knows no network.
+//! The learning itself is `learner`, which knows no network.
 
 use std::{
     path::{Path, PathBuf},
@@ -10,14 +10,12 @@ use anyhow::Context;
 use driml_model::DeviceName;
 use driml_protocol::{BatchHeader, Keys, Shutdown, shared_memory, whole_file};
 
-use crate::{
+use super::{
     batch_source::{BatchSource, Next, Requests},
-    checkpoint,
-    config::LearnerPart,
-    learning::Learning,
-    outlets::Outlets,
+    publish::Outlets,
     shards::Shards,
 };
+use crate::{checkpoint, config::LearnerPart, learner::Learning};
 
 /// How long a learner that was told to stop stays to be asked for its last status.
 const LAST_WORD_MAX: Duration = Duration::from_secs(3);

@@ -1,12 +1,10 @@
 //! The C51 loss: KL divergence of the prediction for the taken action from a projected target.
 //! It does not make the target (`projection` does) and sends no gradient into it.
 
-use std::sync::Mutex;
-
-use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Tensor, bail};
 use driml_model::Operations;
 
-use super::stock;
+use super::{scalar_op::scalar_op, stock};
 
 /// Mean over rows of `KL(target || softmax(logits of the taken action))`, and its gradient.
 ///
@@ -88,7 +86,7 @@ pub fn kl_loss(
     target: Vec<f32>,
     operations: Operations,
 ) -> Result<Tensor> {
-    let (rows, _, atoms) = logits.dims3()?;
+    let (rows, num_actions, atoms) = logits.dims3()?;
     if rows != action.len() || target.len() != rows * atoms {
         bail!(
             "logits of {rows} rows and {atoms} atoms meet {} actions and a target of {} values",
@@ -99,67 +97,10 @@ pub fn kl_loss(
     if operations == Operations::Stock {
         return stock::kl_loss(logits, action, target);
     }
-    let op = Kl {
-        action: action.to_vec(),
-        target,
-        gradient: Mutex::new(None),
-    };
-    logits.contiguous()?.apply_op1(op)
-}
-
-struct Kl {
-    action: Vec<u8>,
-    target: Vec<f32>,
-    /// Made with the value, taken by the backward pass.
-    gradient: Mutex<Option<Vec<f32>>>,
-}
-
-impl CustomOp1 for Kl {
-    fn name(&self) -> &'static str {
-        "c51-kl"
-    }
-
-    fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let Some((start, end)) = layout.contiguous_offsets() else {
-            bail!("c51-kl wants contiguous logits");
-        };
-        let logits = &storage.as_slice::<f32>()?[start..end];
-        let num_actions = layout.shape().dims3()?.1;
-        let mut gradient = vec![0f32; logits.len()];
-        let loss = kl(
-            logits,
-            &self.action,
-            num_actions,
-            &self.target,
-            &mut gradient,
-        );
-        *self
-            .gradient
-            .lock()
-            .expect("nothing panics while it holds this lock") = Some(gradient);
-        Ok((CpuStorage::F32(vec![loss as f32]), Shape::from(())))
-    }
-
-    fn bwd(&self, arg: &Tensor, _: &Tensor, grad_res: &Tensor) -> Result<Option<Tensor>> {
-        let stored = self
-            .gradient
-            .lock()
-            .expect("nothing panics while it holds this lock")
-            .take();
-        let Some(gradient) = stored else {
-            bail!("c51-kl has one backward pass");
-        };
-        scaled(gradient, arg, grad_res).map(Some)
-    }
-}
-
-/// `gradient` times the scalar `grad_res`, in the shape of `arg`.
-pub(crate) fn scaled(mut gradient: Vec<f32>, arg: &Tensor, grad_res: &Tensor) -> Result<Tensor> {
-    let factor = grad_res.to_scalar::<f32>()?;
-    if factor != 1.0 {
-        gradient.iter_mut().for_each(|g| *g *= factor);
-    }
-    Tensor::from_vec(gradient, arg.shape(), arg.device())
+    let action = action.to_vec();
+    scalar_op("c51-kl", logits, move |logits, gradient| {
+        kl(logits, &action, num_actions, &target, gradient)
+    })
 }
 
 #[cfg(test)]

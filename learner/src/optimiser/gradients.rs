@@ -7,7 +7,7 @@ use candle_core::{DType, Storage, Tensor, backprop::GradStore, bail};
 use driml_model::{Operations, Parameters};
 use rayon::prelude::*;
 
-use crate::{optim::slice, update::UpdateError};
+use crate::{error::UpdateError, tensors::slice};
 
 /// Elements a thread sums at a time.
 const CHUNK: usize = 1 << 14;

@@ -5,8 +5,8 @@ use candle_core::{CpuStorage, InplaceOp2, Layout, bail};
 use driml_model::{Operations, Parameters};
 
 use crate::{
-    optim::{slice, slice_mut},
-    update::UpdateError,
+    error::UpdateError,
+    tensors::{slice, slice_mut},
 };
 
 /// Names of the parameters that only the auxiliary loss uses begin so.

@@ -18,7 +18,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use zenoh::{Session, bytes::ZBytes, qos::Priority};
 
-use crate::shards::{self, Count};
+use super::shards::{self, Count};
 
 /// One request; the replay server answers within a second, if only to say that there is nothing yet.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);

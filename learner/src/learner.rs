@@ -11,12 +11,12 @@ use rayon::prelude::*;
 
 use crate::{
     affinity::AffinityEstimator,
+    agent::{Learner, UpdateReport},
     augment::Augment,
     auxiliary::Objective,
     batch::Batch,
     checkpoint::{self, RunState},
     config::LearnerPart,
-    update::{Learner, UpdateReport},
 };
 
 /// Weights as they travel: what they say of themselves, and a safetensors file.

@@ -15,7 +15,7 @@ use driml_protocol::{
 };
 use zenoh::{Session, bytes::ZBytes, qos::Priority, query::Queryable};
 
-use crate::learning::Weights;
+use crate::learner::Weights;
 
 /// One delivery of the affinity matrix.
 const AFFINITY_TIMEOUT: Duration = Duration::from_secs(5);

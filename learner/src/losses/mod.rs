@@ -4,4 +4,6 @@
 pub mod c51;
 pub mod info_nce;
 pub mod projection;
+mod scalar_op;
+pub mod scores;
 mod stock;

@@ -1,49 +1,11 @@
 //! The InfoNCE loss over a matrix of scores, with the soft clip of the scores folded in.
 //! It does not compute the scores, and does not know which features they compare.
 
-use std::sync::Mutex;
-
-use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Tensor, bail};
 use driml_model::Operations;
 use rayon::prelude::*;
 
-use super::{c51::scaled, stock};
-
-/// How dot products become scores.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Scores {
-    /// Factor on the dot products: `1 / sqrt(rkhs)`.
-    pub scale: f64,
-    /// Bound c of the soft clip `c * tanh(x / c)`, in units of score, above 0.
-    pub tanh_clip: f64,
-}
-
-impl Scores {
-    /// Scores of dot products of vectors of `rkhs` numbers.
-    pub fn new(rkhs: usize, tanh_clip: f64) -> Self {
-        Self {
-            scale: 1.0 / (rkhs as f64).sqrt(),
-            tanh_clip,
-        }
-    }
-
-    /// The clipped score of a dot product.
-    pub fn score(&self, dot: f32) -> f64 {
-        self.clip(dot).0
-    }
-
-    /// The clipped score of a dot product, and its derivative by the dot product.
-    ///
-    /// With `e = exp(-2 |x| / c)`: `tanh = (1 - e) / (1 + e)` and its slope `4 e / (1 + e)^2`, which, unlike
-    /// `1 - tanh^2`, keeps its precision where the score saturates.
-    fn clip(&self, dot: f32) -> (f64, f64) {
-        let x = f64::from(dot) * self.scale;
-        let e = (-2.0 * x.abs() / self.tanh_clip).exp();
-        let sum = 1.0 + e;
-        let tanh = ((1.0 - e) / sum).copysign(x);
-        (self.tanh_clip * tanh, self.scale * 4.0 * e / (sum * sum))
-    }
-}
+use super::{scalar_op::scalar_op, scores::Scores, stock};
 
 /// InfoNCE of every valid row against every valid row of its batch, at each location, and its gradient.
 ///
@@ -145,51 +107,10 @@ pub fn info_nce_loss(
     if operations == Operations::Stock {
         return stock::info_nce_loss(dots, valid, scores);
     }
-    let op = InfoNce {
-        valid: valid.to_vec(),
-        scores,
-        gradient: Mutex::new(None),
-    };
-    dots.contiguous()?.apply_op1(op)
-}
-
-struct InfoNce {
-    valid: Vec<u8>,
-    scores: Scores,
-    /// Made with the value, taken by the backward pass.
-    gradient: Mutex<Option<Vec<f32>>>,
-}
-
-impl CustomOp1 for InfoNce {
-    fn name(&self) -> &'static str {
-        "info-nce"
-    }
-
-    fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let Some((start, end)) = layout.contiguous_offsets() else {
-            bail!("info-nce wants contiguous scores");
-        };
-        let dots = &storage.as_slice::<f32>()?[start..end];
-        let mut gradient = vec![0f32; dots.len()];
-        let loss = info_nce(dots, &self.valid, self.scores, &mut gradient);
-        *self
-            .gradient
-            .lock()
-            .expect("nothing panics while it holds this lock") = Some(gradient);
-        Ok((CpuStorage::F32(vec![loss as f32]), Shape::from(())))
-    }
-
-    fn bwd(&self, arg: &Tensor, _: &Tensor, grad_res: &Tensor) -> Result<Option<Tensor>> {
-        let stored = self
-            .gradient
-            .lock()
-            .expect("nothing panics while it holds this lock")
-            .take();
-        let Some(gradient) = stored else {
-            bail!("info-nce has one backward pass");
-        };
-        scaled(gradient, arg, grad_res).map(Some)
-    }
+    let valid = valid.to_vec();
+    scalar_op("info-nce", dots, move |dots, gradient| {
+        info_nce(dots, &valid, scores, gradient)
+    })
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@
 use candle_core::{D, DType, Result, Tensor};
 use candle_nn::ops::log_softmax;
 
-use super::info_nce::Scores;
+use super::scores::Scores;
 
 /// As [`super::c51::kl_loss`].
 pub(super) fn kl_loss(logits: &Tensor, action: &[u8], target: Vec<f32>) -> Result<Tensor> {

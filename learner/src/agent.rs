@@ -6,147 +6,22 @@ use std::{borrow::Cow, collections::HashMap};
 use candle_core::{Device, Tensor};
 use driml_model::{Compute, DimParts, Features, ModelConfig, Network, Parameters};
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
 
 use crate::{
-    auxiliary::{
-        Auxiliary, Objective,
-        cpc::{self, Cpc},
-        curl::{Curl, CurlSettings, KeyEncoder},
-        dim::{Dim, Lambda, PAIRS},
-    },
+    auxiliary::{Auxiliary, cpc, curl::KeyEncoder, dim::PAIRS},
     batch::Batch,
-    gradients::{Gradients, clip_factor},
-    loss::{
+    error::UpdateError,
+    losses::{
         c51::{kl_loss, softmax},
         projection::project,
     },
-    optim::{Adam, AdamSettings},
-    target,
+    optimiser::{
+        adam::Adam,
+        gradients::{Gradients, clip_factor},
+        target,
+    },
+    settings::LearnerSettings,
 };
-
-/// Everything that one update depends on beside the network's sizes. No field has a default.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct LearnerSettings {
-    /// Choose the action in s_{t+n} by the online network instead of the target network.
-    pub double_dqn: bool,
-    /// The auxiliary objective.
-    pub objective: Objective,
-    /// Whether Psi is given a_t, in a world where there is something to decide.
-    pub condition_on_action: bool,
-    /// Weights of the auxiliary losses, by pair of levels; all 0 for an agent without any.
-    pub lambda: Lambda,
-    /// Bound c of the auxiliary scores' soft clip `c * tanh(x / c)`, above 0.
-    pub tanh_clip: f64,
-    /// Global 2-norm to which gradients are clipped, above 0.
-    pub max_grad_norm: f64,
-    /// The optimiser's numbers.
-    pub adam: AdamSettings,
-    /// The target network moves once in so many updates, at least 1.
-    pub target_period_updates: u64,
-    /// Share of the online network in a move of the target network, in (0, 1].
-    pub target_tau: f64,
-    /// CURL's key encoder; there for that objective and for no other.
-    pub curl: Option<CurlSettings>,
-}
-
-impl LearnerSettings {
-    /// Checks the ranges.
-    ///
-    /// # Errors
-    /// The first setting out of its range, with its value.
-    pub fn validate(&self) -> Result<(), UpdateError> {
-        let above_0 = |x: f64| x > 0.0 && x.is_finite();
-        for (name, value, fine) in [
-            ("tanh_clip", self.tanh_clip, above_0(self.tanh_clip)),
-            (
-                "max_grad_norm",
-                self.max_grad_norm,
-                above_0(self.max_grad_norm),
-            ),
-            (
-                "target_tau",
-                self.target_tau,
-                above_0(self.target_tau) && self.target_tau <= 1.0,
-            ),
-            ("target_period_updates", 0.0, self.target_period_updates > 0),
-        ] {
-            if !fine {
-                return Err(UpdateError::Settings(format!("{name} = {value}")));
-            }
-        }
-        self.lambda.validate()?;
-        self.objective
-            .check(&self.lambda, self.condition_on_action, self.curl.as_ref())
-            .map_err(UpdateError::Objective)?;
-        if let Some(curl) = &self.curl {
-            curl.validate()?;
-        }
-        self.adam.validate()
-    }
-
-    /// The auxiliary objective.
-    pub fn auxiliary(&self) -> Auxiliary {
-        let Self {
-            lambda, tanh_clip, ..
-        } = *self;
-        let pairs = Dim { lambda, tanh_clip };
-        match self.objective {
-            Objective::None => Auxiliary::None,
-            Objective::Dim => Auxiliary::Dim(pairs),
-            Objective::Cpc => Auxiliary::Cpc(Cpc { pairs }),
-            Objective::Curl => Auxiliary::Curl(Curl { tanh_clip }),
-        }
-    }
-
-    /// The heads that the online network needs in a world of `num_actions` actions.
-    pub fn dim_parts(&self, num_actions: usize) -> DimParts {
-        let action = self.condition_on_action && num_actions > 1;
-        self.objective.heads(&self.lambda, action)
-    }
-}
-
-/// Why an update, or the making of a learner, did not happen. But for [`UpdateError::Diverged`] parameters are then as they
-/// were before.
-#[derive(Debug, thiserror::Error)]
-pub enum UpdateError {
-    /// The batch is not one of this network's, or holds values that no world gives.
-    #[error("this batch cannot be learned from: {0}")]
-    Batch(String),
-    /// A setting out of its range.
-    #[error("{0}: that cannot work; start from a preset")]
-    Settings(String),
-    /// Settings of the auxiliary objective that are at odds with each other.
-    #[error("{0}")]
-    Objective(String),
-    /// State that does not fit the network, as from another run's checkpoint.
-    #[error("learner state does not fit: {0}")]
-    State(String),
-    /// The arithmetic left the finite numbers.
-    #[error("{what} is not finite; the update is not taken")]
-    NonFinite {
-        /// The first quantity in which it showed.
-        what: String,
-    },
-    /// The step itself left the finite numbers: this learner cannot go on, nor be published or saved.
-    #[error(
-        "the update took {name} beyond the finite numbers; the learner cannot go on from here: go on from the newest checkpoint with \
-         a learner.update.adam.lr below {lr:e}"
-    )]
-    Diverged {
-        /// The first parameter in which it showed.
-        name: String,
-        /// The learning rate.
-        lr: f64,
-    },
-    /// The model refused.
-    #[error(transparent)]
-    Model(#[from] driml_model::ModelError),
-    /// The tensor library refused.
-    #[error(transparent)]
-    Tensor(#[from] candle_core::Error),
-}
 
 /// What one update did, for a person to watch.
 #[derive(Clone, Debug, PartialEq)]
