@@ -33,12 +33,7 @@ pub struct Behind {
 /// progress.
 pub fn can_go_on(world: &WorldConfig, folder: &Path) -> bool {
     let saved = checkpoint::list(&folder.join(CHECKPOINTS));
-    keeps_nothing(world) && saved.is_ok_and(|all| !all.is_empty())
-}
-
-/// Whether the world's episodes do not depend on how many were played before.
-const fn keeps_nothing(world: &WorldConfig) -> bool {
-    !matches!(world, WorldConfig::MsPacman(world) if world.lethal_schedule.is_some())
+    world.is_resumable() && saved.is_ok_and(|all| !all.is_empty())
 }
 
 /// Waits until the learner of the run in `folder` has saved, if the run was ended.
@@ -93,7 +88,7 @@ pub fn find(
         ..flags.clone()
     };
     let config = resolve(&Source::File(name, text), &flags, machine)?;
-    if !keeps_nothing(&config.world) {
+    if !config.world.is_resumable() {
         return Err(usage!(
             "the ghosts of the run in {} change as episodes pass, and a checkpoint does not hold how far they are: start it anew",
             folder.display()

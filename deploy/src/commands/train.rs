@@ -7,7 +7,6 @@ use std::{
 };
 
 use clap::Args;
-use driml_envs::WorldConfig;
 use driml_launch::{
     console::{self, print},
     endpoint::check_endpoints,
@@ -111,9 +110,7 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
         behind.unwrap_or_default(),
         &machine,
     ))?;
-    if matches!(config.world, WorldConfig::Procgen(_)) {
-        procgen_sys::Engine::install(&mut console::line)?;
-    }
+    config.world.install(&mut console::line)?;
     if args.lockstep {
         if shards > 1 {
             return Err(usage!(

@@ -67,7 +67,7 @@ fn action_names(folder: &Path, side: usize) -> Vec<String> {
     let config = std::fs::read_to_string(&path)
         .ok()
         .and_then(|text| RunConfig::parse("config.toml", &text).ok());
-    let names = config.map(|config| driml_envs::action_names(&config.world));
+    let names = config.map(|config| config.world.action_names());
     match names {
         Some(names) if names.len() == side => names.iter().map(|&name| name.to_owned()).collect(),
         _ => (0..side).map(|action| action.to_string()).collect(),

@@ -45,15 +45,14 @@ pub(super) fn kinds(world: WorldName, summary: &Summary) -> [f64; 3] {
 
 /// 0 a movement, 1 no-op, 2 special.
 fn kind(world: WorldName, action: usize) -> usize {
-    match world {
-        WorldName::Procgen(game) => match visible_actions(game).get(action) {
+    match world.variant().and_then(|(_, game)| game.parse().ok()) {
+        Some(game) => match visible_actions(game).get(action) {
             Some(4) => 1,
             Some(0..9) => 0,
             _ => 2,
         },
-        // Ms. PacMan's first action is its no-op, Ising's its only one; the chain has none.
-        WorldName::MsPacman | WorldName::Ising => usize::from(action == 0),
-        WorldName::Chain => 0,
+        // Every other world's first action is its no-op.
+        None => usize::from(action == 0),
     }
 }
 
@@ -92,6 +91,6 @@ mod tests {
             [3, 4, 9, 14].map(|action| kind(world, action)),
             [0, 1, 2, 2]
         );
-        assert_eq!(kind(WorldName::MsPacman, 0), 1);
+        assert_eq!(kind("mspacman".parse().unwrap(), 0), 1);
     }
 }
