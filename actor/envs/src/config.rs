@@ -6,6 +6,7 @@ use std::str::FromStr;
 
 use procgen_sys::Game;
 use serde::{Deserialize, Serialize};
+use strsim::levenshtein;
 
 use crate::{ChainConfig, EnvError, IsingConfig, PacmanConfig, ProcgenConfig};
 
@@ -125,29 +126,14 @@ fn nearest(text: &str) -> Option<WorldName> {
     let letters = |text: &str| -> String { text.chars().filter(|c| c.is_alphanumeric()).collect() };
     let text = letters(&text.to_lowercase());
     let distance = |name: WorldName| {
-        let full = edits(&text, &letters(&name.to_string()));
+        let full = levenshtein(&text, &letters(&name.to_string()));
         match name {
-            WorldName::Procgen(game) => full.min(edits(&text, game.name())),
+            WorldName::Procgen(game) => full.min(levenshtein(&text, game.name())),
             _ => full,
         }
     };
     let name = WorldName::all().min_by_key(|&name| distance(name))?;
     (distance(name) <= 3).then_some(name)
-}
-
-/// The number of letters to insert, remove or change to turn `a` into `b` (Levenshtein's distance).
-fn edits(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, letter) in a.chars().enumerate() {
-        let mut diagonal = std::mem::replace(&mut row[0], i + 1);
-        for (j, &other) in b.iter().enumerate() {
-            let change = diagonal + usize::from(letter != other);
-            diagonal = row[j + 1];
-            row[j + 1] = change.min(row[j] + 1).min(diagonal + 1);
-        }
-    }
-    row[b.len()]
 }
 
 #[cfg(test)]
