@@ -6,6 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use driml_machine::units::duration;
 use driml_protocol::{LearnerStatus, ReplayStatus, Waiting};
 
 use crate::{console::Screen, record::Episodes, resume::Behind};
@@ -163,17 +164,6 @@ fn time_left(frames: (u64, f64), updates: (u64, f64)) -> Option<Duration> {
     Duration::try_from_secs_f64(longer).ok()
 }
 
-/// A time for a person: two units at most.
-pub fn duration(time: Duration) -> String {
-    let seconds = time.as_secs();
-    match seconds {
-        0..60 => format!("{seconds} s"),
-        60..3600 => format!("{} min {} s", seconds / 60, seconds % 60),
-        3600..86_400 => format!("{} h {} min", seconds / 3600, seconds % 3600 / 60),
-        _ => format!("{} d {} h", seconds / 86_400, seconds % 86_400 / 3600),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use expect_test::expect;
@@ -247,9 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn times_have_two_units_at_most() {
-        let texts = [5, 65, 3_660, 90_000].map(|seconds| duration(Duration::from_secs(seconds)));
-        assert_eq!(texts, ["5 s", "1 min 5 s", "1 h 1 min", "1 d 1 h"]);
+    fn no_time_is_left_to_guess_while_nothing_happens() {
         assert_eq!(time_left((10, 0.0), (0, 0.0)), None);
     }
 

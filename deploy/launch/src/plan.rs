@@ -4,11 +4,11 @@
 use std::{path::Path, time::Duration};
 
 use driml_learner::{DeviceName, Objective};
-use driml_machine::resources::Machine;
+use driml_machine::{resources::Machine, units::duration};
 use driml_model::ModelConfig;
 use driml_settings::config::{COMPRESSED_FIELDS_BYTES, RunConfig, replay_bytes_each};
 
-use crate::{display::duration, resume::Behind};
+use crate::resume::Behind;
 
 /// Arithmetic that a core sustains over a whole run, learner and actors together, in GFLOP/s.
 ///

@@ -7,7 +7,10 @@ use std::{
 };
 
 use anyhow::{Context, bail};
-use driml_machine::error::{Interrupted, Usage};
+use driml_machine::{
+    error::{Interrupted, Usage},
+    units::duration,
+};
 use driml_protocol::{
     Keys, fault,
     session::{self, Endpoints},
@@ -17,7 +20,7 @@ use driml_settings::config::RunConfig;
 use crate::{
     child::{Part, Surroundings},
     console::{self, Screen, print},
-    display::{Display, TEMPLATE, duration},
+    display::{Display, TEMPLATE},
     endpoint::NAMESPACE,
     interrupts::Interrupts,
     meeting::Meeting,
