@@ -8,7 +8,8 @@ use driml_envs::WorldConfig;
 use driml_launch::{
     console::{self, print},
     endpoint::check_endpoints,
-    lockstep, plan, processes, record, resume,
+    lockstep, plan, processes, resume,
+    run_folder::RunFolder,
 };
 use driml_learner::DeviceName;
 use driml_machine::{
@@ -73,7 +74,8 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
     }
     let (config, from, behind) = match &args.resume {
         Some(folder) => {
-            let (config, behind) = resume::find(folder, &flags(&args.run), &machine)?;
+            let (config, behind) =
+                resume::find(&RunFolder::new(folder), &flags(&args.run), &machine)?;
             let from = format!("its checkpoint after {} updates", behind.updates);
             (config, from, Some(behind))
         }
@@ -93,10 +95,11 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
     }
     check_ladder(&config)?;
     let run_dir = match args.resume {
-        Some(folder) => folder,
+        Some(folder) => RunFolder::new(folder),
         None => {
             let run_dir = args.run_dir.unwrap_or_else(|| default_run_dir(&config.run));
-            record::check_free(&run_dir)?;
+            let run_dir = RunFolder::new(run_dir);
+            run_dir.check_free()?;
             run_dir
         }
     };
