@@ -4,6 +4,8 @@
 use std::fmt;
 use std::str::FromStr;
 
+use strsim::levenshtein;
+
 /// One of Procgen's games.
 #[derive(
     Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, serde::Serialize, serde::Deserialize,
@@ -162,8 +164,8 @@ impl fmt::Display for ParseGameError {
         let name = self.name.to_lowercase();
         let nearest = Game::ALL
             .into_iter()
-            .min_by_key(|game| strsim::levenshtein(&name, game.name()));
-        if let Some(game) = nearest.filter(|game| strsim::levenshtein(&name, game.name()) <= 3) {
+            .min_by_key(|game| levenshtein(&name, game.name()));
+        if let Some(game) = nearest.filter(|game| levenshtein(&name, game.name()) <= 3) {
             write!(f, "; did you mean \"{game}\"?")?;
         }
         write!(f, " (the games: {})", Game::NAMES.join(", "))

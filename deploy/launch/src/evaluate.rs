@@ -1,8 +1,6 @@
 //! Whole episodes with a run's newest checkpoint, and a random policy's beside them.
 //! It trains nothing and changes nothing in the run folder.
 
-use std::path::Path;
-
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_actor::{
@@ -15,6 +13,8 @@ use driml_machine::error::{Usage, usage};
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+
+use crate::run_folder::RunFolder;
 
 /// Probability of a random action. Source: section 2 of the project's specification, after rlpyt.
 const EPSILON: f64 = 0.001;
@@ -60,8 +60,8 @@ impl Player {
     ///
     /// # Errors
     /// A folder that is no run's or has no checkpoint, a damaged checkpoint.
-    pub fn load(folder: &Path) -> anyhow::Result<Self> {
-        let path = folder.join("config.toml");
+    pub fn load(folder: &RunFolder) -> anyhow::Result<Self> {
+        let path = folder.config();
         let text = std::fs::read_to_string(&path).map_err(|e| {
             usage!(
                 "{} is not the folder of a run: reading {}: {e}",
@@ -71,7 +71,7 @@ impl Player {
         })?;
         let config = RunConfig::parse(&path.display().to_string(), &text)?;
         let restored = checkpoint::load_latest(
-            &folder.join("checkpoints"),
+            &folder.checkpoints(),
             &config.model,
             &config.learner.update,
             &Compute::CPU,

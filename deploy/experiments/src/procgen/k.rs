@@ -2,7 +2,7 @@
 //! It reads the run's metrics and summary alone.
 
 use driml_envs::{WorldName, visible_actions};
-use driml_launch::record::Summary;
+use driml_launch::run_folder::Summary;
 
 use crate::plot::Run;
 
@@ -58,6 +58,8 @@ fn kind(world: WorldName, action: usize) -> usize {
 
 #[cfg(test)]
 mod tests {
+    use driml_launch::run_folder::RunFolder;
+
     use super::*;
 
     #[test]
@@ -71,7 +73,7 @@ mod tests {
             text += &format!("1,{},{updates},{mean}\n", updates * 32);
         }
         std::fs::write(folder.path().join("metrics.csv"), text).unwrap();
-        let points = windowed(&Run::read(folder.path()).unwrap()).unwrap();
+        let points = windowed(&Run::read(&RunFolder::new(folder.path())).unwrap()).unwrap();
         assert_eq!(points.len(), 10);
         for (frames, k) in points {
             let expected = if frames <= 3_200.0 { 1.0 } else { 3.0 };
