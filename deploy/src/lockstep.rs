@@ -39,7 +39,12 @@ pub(crate) fn run(
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(exit_with_parent).context("listening for signals")?;
-    let mut recorder = Recorder::create(run_dir, &config.to_toml(), &[])?;
+    let mut recorder = Recorder::create(
+        run_dir,
+        &config.to_toml(),
+        config.learner.update.objective.losses(),
+        &[],
+    )?;
     let screen = Screen::new(config.frames(), TEMPLATE);
     let mut parts = Parts::new(config)?;
     let mut display = Display::new(

@@ -49,6 +49,7 @@ pub(crate) struct Recorder {
     folder: PathBuf,
     metrics: Table,
     returns: TrainingReturns,
+    losses: &'static [&'static str],
     processes: Vec<String>,
     rss_max: Vec<Option<f64>>,
     started: Instant,
@@ -74,13 +75,15 @@ pub(crate) fn check_free(folder: &Path) -> Result<(), Usage> {
 }
 
 impl Recorder {
-    /// Makes the folder and writes the settings; the clock starts. `processes` are those whose memory is recorded.
+    /// Makes the folder and writes the settings; the clock starts. `losses` are the agent's auxiliary losses,
+    /// `processes` those whose memory is recorded.
     ///
     /// # Errors
     /// A folder in which something lies, or a file system that refuses.
     pub(crate) fn create(
         folder: &Path,
         config_toml: &str,
+        losses: &'static [&'static str],
         processes: &[String],
     ) -> anyhow::Result<Self> {
         check_free(folder)?;
@@ -88,9 +91,17 @@ impl Recorder {
             .with_context(|| format!("making the run folder {}", folder.display()))?;
         let lock = lock(folder)?;
         write_settings(folder, config_toml)?;
-        let rows = Rows::none(header(processes));
+        let rows = Rows::none(header(losses, processes));
         let returns = TrainingReturns::create(folder)?;
-        Self::begin(folder, processes, lock, rows, returns, Behind::default())
+        Self::begin(
+            folder,
+            losses,
+            processes,
+            lock,
+            rows,
+            returns,
+            Behind::default(),
+        )
     }
 
     /// Goes on to `frames_max` frames in the folder of an interrupted run, which has so much `behind` it: the rows of metrics up
@@ -101,12 +112,13 @@ impl Recorder {
     pub(crate) fn go_on(
         folder: &Path,
         config_toml: &str,
+        losses: &'static [&'static str],
         processes: &[String],
         behind: Behind,
         frames_max: u64,
     ) -> anyhow::Result<Self> {
         let lock = lock(folder)?;
-        let head = header(processes);
+        let head = header(losses, processes);
         let rows = match behind.updates {
             0 => Rows::none(head),
             _ => Rows::read(&folder.join(METRICS), head, behind, frames_max)?,
@@ -114,11 +126,12 @@ impl Recorder {
         let returns = TrainingReturns::go_on(folder, rows.last("frames").unwrap_or(0))?;
         Summary::remove(folder)?;
         write_settings(folder, config_toml)?;
-        Self::begin(folder, processes, lock, rows, returns, behind)
+        Self::begin(folder, losses, processes, lock, rows, returns, behind)
     }
 
     fn begin(
         folder: &Path,
+        losses: &'static [&'static str],
         processes: &[String],
         lock: File,
         rows: Rows,
@@ -135,6 +148,7 @@ impl Recorder {
             folder: folder.to_owned(),
             metrics: Table::create(&folder.join(METRICS), &rows.header, &rows.rows)?,
             returns,
+            losses,
             processes: processes.to_vec(),
             rss_max: vec![None; processes.len()],
             started: Instant::now(),
@@ -200,6 +214,7 @@ impl Recorder {
             k: self.k(replay, updates),
             replay,
             learner,
+            losses: self.losses,
             rss_mib: processes
                 .map(|i| rss_mib.get(i).copied().flatten())
                 .collect(),

@@ -383,7 +383,8 @@ pub fn load(
             expected,
         });
     }
-    if state.format == 1 && settings.curl.is_some() {
+    let has_key = settings.auxiliary()?.key_tau().is_some();
+    if state.format == 1 && has_key {
         return Err(CheckpointError::WithoutKeyEncoder(path.to_owned()));
     }
     state
@@ -406,11 +407,11 @@ pub fn load(
         let loaded = Parameters::load_part(model, part, &tensors(name)?, &compute.device);
         loaded.map_err(|why| damaged(path, name, why.to_string()))
     };
-    let key = || parameters(model, Encoder::has, KEY);
+    let key = has_key.then(|| parameters(model, Encoder::has, KEY));
     let networks = NetworkParameters {
         online: parameters(model, |_| true, ONLINE)?,
         target: parameters(&model.without_dim(), |_| true, TARGET)?,
-        key: settings.curl.map(|_| key()).transpose()?,
+        key: key.transpose()?,
     };
     let moments = candle_core::safetensors::load_buffer(&tensors(OPTIMIZER)?, &Device::Cpu)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;

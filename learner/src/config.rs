@@ -15,7 +15,7 @@ use crate::{
         LearnedSettings,
     },
     augment::AugmentSettings,
-    auxiliary::Objective,
+    auxiliary::positives::Positives,
     settings::LearnerSettings,
 };
 
@@ -202,12 +202,17 @@ impl Config {
                 why: why.into(),
             })
         };
-        match (self.update.objective, self.augment) {
-            (Objective::Curl, None) => bad(
+        let objective = self.update.objective;
+        match (objective.positives(), self.augment) {
+            (Positives::OtherView, None) => bad(
                 "(missing)",
-                "CURL compares two augmentations of a state: take the agent curl, or set all of learner.augment",
+                &format!(
+                    "{} compares two augmentations of a state: take the agent {}, or set all of learner.augment",
+                    objective.name().to_uppercase(),
+                    objective.name()
+                ),
             ),
-            (Objective::None, Some(_)) => bad(
+            (Positives::None, Some(_)) => bad(
                 "(there)",
                 "nothing but an auxiliary objective sees augmented states, and this agent has none",
             ),

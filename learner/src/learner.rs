@@ -13,7 +13,7 @@ use crate::{
     affinity::AffinityEstimator,
     agent::{Learner, UpdateReport},
     augment::Augment,
-    auxiliary::Objective,
+    auxiliary::positives::Positives,
     batch::Batch,
     checkpoint::{self, RunState},
     config::LearnerPart,
@@ -148,7 +148,7 @@ impl Learning {
         let mut rng = self.rng.clone();
         let all_valid;
         if let Some(augment) = &mut self.augment {
-            if self.part.learner.update.objective == Objective::Curl {
+            if self.part.learner.update.objective.positives() == Positives::OtherView {
                 // Two views of the same state; every row has them.
                 all_valid = vec![1; batch.rows()];
                 (frames_k, positives, valid) = (frames_t, 1, all_valid.as_slice());
@@ -186,7 +186,8 @@ impl Learning {
     pub fn note(&self, report: &UpdateReport, status: &mut LearnerStatus) {
         status.updates = self.updates();
         status.c51_kl = report.c51_kl;
-        status.dim = report.dim;
+        let losses = report.losses.iter();
+        status.losses = losses.map(|&(name, loss)| (name.into(), loss)).collect();
         status.total = report.total;
         status.grad_norm = report.grad_norm;
         status.q_mean = report.q_mean;

@@ -23,7 +23,7 @@ pub use affinity::{
     AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
 };
 pub use augment::{Augment, AugmentSettings};
-pub use auxiliary::{Objective, curl::CurlSettings, dim::Lambda};
+pub use auxiliary::{Objective, positives::Positives, settings::Lambda};
 pub use batch::{Batch, NO_ACTION};
 pub use driml_model::{Compute, DeviceName, Operations};
 

@@ -7,10 +7,10 @@ use anyhow::Context;
 use driml_protocol::{LearnerStatus, ReplayStatus};
 
 use super::Episodes;
-use crate::{display::PAIRS, error::usage, resume::Behind};
+use crate::{error::usage, resume::Behind};
 
-/// The columns of the metrics.
-pub(super) fn header(processes: &[String]) -> Vec<String> {
+/// The columns of the metrics: the auxiliary `losses` stand between C51's and the total.
+pub(super) fn header(losses: &[&str], processes: &[String]) -> Vec<String> {
     let counts = [
         "seconds",
         "frames",
@@ -35,13 +35,12 @@ pub(super) fn header(processes: &[String]) -> Vec<String> {
         "actors",
         "waiting",
     ];
-    let dim = PAIRS.map(|pair| format!("dim_{pair}"));
     let rss = processes
         .iter()
         .map(|name| format!("rss_mib_{}", name.replace('-', "_")));
     let counts = counts.map(String::from).into_iter();
     counts
-        .chain(dim)
+        .chain(losses.iter().map(ToString::to_string))
         .chain(rest.map(String::from))
         .chain(rss)
         .collect()
@@ -58,6 +57,8 @@ pub(super) struct Moment<'a> {
     pub(super) k: Option<(f64, f64)>,
     pub(super) replay: &'a ReplayStatus,
     pub(super) learner: &'a LearnerStatus,
+    /// The names of the agent's auxiliary losses.
+    pub(super) losses: &'a [&'static str],
     /// Resident memory of each process, MiB; none for one that ended.
     pub(super) rss_mib: Vec<Option<f64>>,
 }
@@ -82,7 +83,8 @@ impl Moment<'_> {
             mean_return.map_or(0, |it| it.of).to_string(),
             computed(learner.c51_kl.into()),
         ];
-        row.extend(learner.dim.map(|loss| some(loss.map(f64::from))));
+        let losses = self.losses.iter().map(|name| learner.loss(name));
+        row.extend(losses.map(|loss| some(loss.map(f64::from))));
         row.extend([
             computed(learner.total.into()),
             computed(learner.grad_norm),

@@ -25,10 +25,13 @@ pub(crate) fn spec() -> RunSpec {
 /// What a run leaves that did nothing.
 pub(crate) fn summary() -> Summary {
     let folder = tempfile::tempdir().unwrap();
-    let recorder = Recorder::create(folder.path(), "", &[]).unwrap();
+    let recorder = Recorder::create(folder.path(), "", &[], &[]).unwrap();
     let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
     recorder.summarise(Outcome::Finished, &spec(), &replay, &learner)
 }
+
+/// What DIM reports.
+const LOSSES: [&str; 4] = ["dim_3t3", "dim_3t4", "dim_4t3", "dim_4t4"];
 
 fn statuses() -> (ReplayStatus, LearnerStatus) {
     let replay = ReplayStatus {
@@ -46,7 +49,7 @@ fn statuses() -> (ReplayStatus, LearnerStatus) {
     };
     let learner = LearnerStatus {
         updates: 31,
-        dim: [None, None, None, Some(2.0)],
+        losses: vec![("dim_4t4".into(), 2.0)],
         weights_version: 4,
         weights_sha256: "abcd".into(),
         finished: true,
@@ -59,8 +62,13 @@ fn statuses() -> (ReplayStatus, LearnerStatus) {
 fn a_run_leaves_settings_metrics_and_a_summary() {
     let folder = tempfile::tempdir().unwrap();
     let run = folder.path().join("run");
-    let mut recorder =
-        Recorder::create(&run, "[run]\n", &["replay-server".into(), "actor-0".into()]).unwrap();
+    let mut recorder = Recorder::create(
+        &run,
+        "[run]\n",
+        &LOSSES,
+        &["replay-server".into(), "actor-0".into()],
+    )
+    .unwrap();
     let (replay, learner) = statuses();
     let nothing = ReplayStatus::default();
     let mut record = |replay: &ReplayStatus, learner: &LearnerStatus, rss: &[Option<f64>]| {
@@ -114,7 +122,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     let folder = tempfile::tempdir().unwrap();
     let run = folder.path().join("run");
     let processes = ["replay-server".into()];
-    let mut recorder = Recorder::create(&run, "[run]\n", &processes).unwrap();
+    let mut recorder = Recorder::create(&run, "[run]\n", &LOSSES, &processes).unwrap();
     let (mut replay, mut learner) = statuses();
     // Mean k is 1.5 before the run is resumed, and 2 since.
     for (frames, updates, episodes) in [(1_000, 0, 1), (2_000, 31, 7), (3_000, 62, 9)] {
@@ -126,7 +134,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
         updates: 31,
         frames: 2_000,
     };
-    let said = Recorder::go_on(&run, "", &processes, behind, 9_999).unwrap_err();
+    let said = Recorder::go_on(&run, "", &LOSSES, &processes, behind, 9_999).unwrap_err();
     assert!(said.to_string().contains("is still going on"), "{said}");
     let summary = recorder.summarise(Outcome::Interrupted, &spec(), &replay, &learner);
     summary.write(&run).unwrap();
@@ -137,9 +145,10 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     fs::write(&path, format!("{text}9.0,40")).unwrap();
 
     let other = ["replay-server".into(), "actor-0".into()];
-    let said = Recorder::go_on(&run, "", &other, behind, 9_999).unwrap_err();
+    let said = Recorder::go_on(&run, "", &LOSSES, &other, behind, 9_999).unwrap_err();
     assert!(said.to_string().contains("has other columns"), "{said}");
-    let mut recorder = Recorder::go_on(&run, "[new]\n", &processes, behind, 9_999).unwrap();
+    let mut recorder =
+        Recorder::go_on(&run, "[new]\n", &LOSSES, &processes, behind, 9_999).unwrap();
     assert!(!run.join("summary.json").exists());
     // While the replay fills again nothing is new.
     (replay.transitions_inserted, replay.episodes) = (1_500, 1);
@@ -158,7 +167,8 @@ fn a_resumed_run_goes_on_in_its_metrics() {
         updates: 99,
         ..behind
     };
-    let read = |frames_max| Rows::read(&path, header(&processes), all, frames_max).unwrap();
+    let read =
+        |frames_max| Rows::read(&path, header(&LOSSES, &processes), all, frames_max).unwrap();
     assert_eq!(read(2_050).rows.len(), 2);
     let rows = read(9_999);
     let column = |name| -> Vec<f64> {

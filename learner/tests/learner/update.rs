@@ -133,7 +133,7 @@ fn without_dim_no_positives_are_needed_and_no_heads_are_built() {
     let mut batch = rows.batch();
     (batch.positives, batch.frames_k, batch.positive_valid) = (0, &[], &[]);
     let report = learner.update(&batch).unwrap();
-    assert_eq!(report.dim, [None; 4]);
+    assert_eq!(report.losses, []);
     assert_eq!(report.total, report.c51_kl);
 }
 
@@ -144,7 +144,8 @@ fn one_valid_positive_or_none_gives_dim_losses_of_zero() {
         rows.positive_valid = (0..7).map(|row| u8::from(row < valid)).collect();
         let with_dim = learner(ALL_DIM, 8);
         let evaluation = with_dim.evaluate(&rows.batch()).unwrap();
-        assert_eq!(evaluation.dim, [Some(0.0); 4]);
+        let losses = ["dim_3t3", "dim_3t4", "dim_4t3", "dim_4t4"].map(|name| (name, 0.0));
+        assert_eq!(evaluation.losses, losses);
         assert_eq!(evaluation.total, evaluation.c51_kl);
         for (name, _) in with_dim
             .online()
@@ -194,7 +195,7 @@ fn rows_without_a_positive_are_out_of_dim_altogether() {
         rows.frames[1][row * row_bytes..(row + 1) * row_bytes].fill(200);
     }
     let after = learner.evaluate(&rows.batch()).unwrap();
-    assert_eq!(before.dim, after.dim);
+    assert_eq!(before.losses, after.losses);
 }
 
 #[test]
