@@ -8,7 +8,7 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_actor::{ActorSettings, Collector, Life};
-use driml_learner::{LearnerPart, Learning};
+use driml_learner::{Learner, LearnerPart};
 use driml_protocol::{ActorJoin, Batch, Goodbye, InsertReply, LearnerStatus, PlanesPool, Shutdown};
 use driml_replay_server::{Replay, Unready};
 
@@ -59,9 +59,9 @@ pub(crate) fn run(
     let mut outcome = Outcome::Finished;
     let mut saved = u64::MAX;
     while parts.round()? {
-        if parts.learning.checkpoint_is_due() && parts.learning.updates() != saved {
-            saved = parts.learning.updates();
-            parts.learning.save(&folder)?;
+        if parts.learner.checkpoint_is_due() && parts.learner.updates() != saved {
+            saved = parts.learner.updates();
+            parts.learner.save(&folder)?;
         }
         if shown.elapsed() >= POLL {
             shown = Instant::now();
@@ -76,8 +76,8 @@ pub(crate) fn run(
         }
     }
     parts.end()?;
-    if parts.learning.updates() != saved {
-        parts.learning.save(&folder)?;
+    if parts.learner.updates() != saved {
+        parts.learner.save(&folder)?;
     }
     screen.clear();
     let replay = parts.replay.status();
@@ -99,7 +99,7 @@ struct Parts {
     actors: Vec<Collector>,
     next_actor: usize,
     replay: Replay,
-    learning: Learning,
+    learner: Learner,
     status: LearnerStatus,
     batch_rows: u32,
     steps_per_chunk: u32,
@@ -121,8 +121,8 @@ impl Parts {
             };
             replay.join_actor(join).map_err(anyhow::Error::msg)?;
         }
-        let mut learning = Learning::new(part, &config.local.learner_device.open()?)?;
-        let (header, weights) = learning.next_weights()?;
+        let mut learner = Learner::new(part, &config.local.learner_device.open()?)?;
+        let (header, weights) = learner.next_weights()?;
         let status = LearnerStatus {
             weights_version: header.version,
             weights_sha256: header.sha256_hex(),
@@ -151,7 +151,7 @@ impl Parts {
             actors,
             next_actor: 0,
             replay,
-            learning,
+            learner,
             status,
             batch_rows,
             steps_per_chunk: settings.actor.steps_per_chunk,
@@ -195,23 +195,23 @@ impl Parts {
     }
 
     fn learn(&mut self, batch: &Batch) -> anyhow::Result<()> {
-        let report = self.learning.update(batch)?;
-        self.learning.note(&report, &mut self.status);
-        if let Some(affinity) = self.learning.affinity_update(LEARNER) {
+        let report = self.learner.update(batch)?;
+        self.learner.note(&report, &mut self.status);
+        if let Some(affinity) = self.learner.affinity_update(LEARNER) {
             self.replay.set_affinity(&affinity)?;
         }
-        if self.learning.publication_is_due() {
+        if self.learner.publication_is_due() {
             self.publish()?;
         }
         Ok(())
     }
 
     fn publish(&mut self) -> anyhow::Result<()> {
-        let (header, weights) = self.learning.next_weights()?;
+        let (header, weights) = self.learner.next_weights()?;
         for actor in &mut self.actors {
             actor.set_weights(header.version, &weights)?;
         }
-        self.published = self.learning.updates();
+        self.published = self.learner.updates();
         self.status.weights_version = header.version;
         self.status.weights_sha256 = header.sha256_hex();
         Ok(())
@@ -219,7 +219,7 @@ impl Parts {
 
     /// The last weights and everyone's last word.
     fn end(&mut self) -> anyhow::Result<()> {
-        if self.published != self.learning.updates() {
+        if self.published != self.learner.updates() {
             self.publish()?;
         }
         for (id, (actor, unwanted)) in self.actors.iter().zip(&self.unwanted).enumerate() {

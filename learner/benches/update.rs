@@ -7,7 +7,7 @@ use std::{hint::black_box, time::Duration};
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use driml_learner::{
-    AdamSettings, Augment, AugmentSettings, Batch, Lambda, Learner, LearnerSettings, Objective,
+    AdamSettings, Agent, Augment, AugmentSettings, Batch, Lambda, LearnerSettings, Objective,
     auxiliary::{cpc, curl, dim},
 };
 use driml_model::{Compute, ConvLayer, DimParts, ModelConfig};
@@ -20,7 +20,7 @@ const STATE_BYTES: usize = 64 * 64 * 3;
 /// Positives a row of the agent cpc.
 const CPC: usize = 5;
 
-fn learner(objective: Objective, lambda: Lambda) -> Learner {
+fn agent(objective: Objective, lambda: Lambda) -> Agent {
     let layer = |out, kernel, stride| ConvLayer {
         out,
         kernel,
@@ -63,7 +63,7 @@ fn learner(objective: Objective, lambda: Lambda) -> Learner {
         dim: DimParts::NONE,
     };
     model.dim = settings.dim_parts(ACTIONS);
-    Learner::new(
+    Agent::new(
         model,
         settings,
         &Compute::CPU,
@@ -105,7 +105,7 @@ fn updates(criterion: &mut Criterion) {
         ("cpc", Objective::of(&cpc::CPC), 0.0, 1.0, CPC, false),
         ("curl", Objective::of(&curl::CURL), 0.0, 1.0, 1, true),
     ] {
-        let mut learner = learner(
+        let mut agent = agent(
             objective,
             Lambda {
                 l3t3,
@@ -131,7 +131,7 @@ fn updates(criterion: &mut Criterion) {
             },
         };
         group.bench_function(name, |bencher| {
-            bencher.iter(|| black_box(learner.update(&batch).expect("a good batch")));
+            bencher.iter(|| black_box(agent.update(&batch).expect("a good batch")));
         });
     }
     group.finish();

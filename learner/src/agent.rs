@@ -74,7 +74,7 @@ pub struct NetworkParameters {
 
 /// The learner: online and target network, CURL's key encoder, optimiser, count of updates.
 #[derive(Debug)]
-pub struct Learner {
+pub struct Agent {
     model: ModelConfig,
     settings: LearnerSettings,
     compute: Compute,
@@ -88,7 +88,7 @@ pub struct Learner {
     pub(crate) updates: u64,
 }
 
-impl Learner {
+impl Agent {
     /// A learner with initial weights drawn from `rng`, the same on every device; the slow networks are copies.
     ///
     /// # Errors
@@ -113,7 +113,7 @@ impl Learner {
     /// A learner with given weights, on the device of `compute`, before its first update.
     ///
     /// # Errors
-    /// As [`Learner::new`], and parameters that do not fit the model.
+    /// As [`Agent::new`], and parameters that do not fit the model.
     pub fn from_parameters(
         model: ModelConfig,
         settings: LearnerSettings,
@@ -288,7 +288,7 @@ impl Learner {
     /// Returns their global norm before clipping.
     ///
     /// # Errors
-    /// As [`Learner::update`].
+    /// As [`Agent::update`].
     pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
         let norm = gradients.norm(self.compute.operations)?;
         self.adam.step(
@@ -359,7 +359,7 @@ impl Learner {
         states(&self.model, bytes, &self.compute.device)
     }
 
-    /// Puts back a state that [`Learner::online`], [`Learner::target`] and [`Adam`] had after `updates` updates.
+    /// Puts back a state that [`Agent::online`], [`Agent::target`] and [`Adam`] had after `updates` updates.
     pub(crate) fn restore_progress(
         &mut self,
         updates: u64,

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use crate::{
     affinity::AffinityEstimator,
-    agent::{Learner, UpdateReport},
+    agent::{Agent, UpdateReport},
     augment::Augment,
     auxiliary::positives::Positives,
     batch::Batch,
@@ -23,10 +23,10 @@ use crate::{
 pub type Weights = (WeightsHeader, Vec<u8>);
 
 /// Everything that a learner changes while it learns.
-pub struct Learning {
+pub struct Learner {
     part: LearnerPart,
     spec_hash: u64,
-    learner: Learner,
+    agent: Agent,
     affinity: Option<AffinityEstimator>,
     rng: ChaCha8Rng,
     enlarge: Option<Enlarge>,
@@ -38,7 +38,7 @@ pub struct Learning {
     weights_version: u64,
 }
 
-impl Learning {
+impl Learner {
     /// A learner at its start, all generators derived from the run's seed.
     ///
     /// # Errors
@@ -47,7 +47,7 @@ impl Learning {
         let spec = &part.spec;
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
         let mut rng = ChaCha8Rng::from_seed(spec.seed_for("learner", 0));
-        let learner = Learner::new(
+        let agent = Agent::new(
             part.model.clone(),
             part.learner.update.clone(),
             compute,
@@ -68,7 +68,7 @@ impl Learning {
         });
         Ok(Self {
             spec_hash: spec.hash(),
-            learner,
+            agent,
             affinity,
             rng,
             enlarge,
@@ -107,7 +107,7 @@ impl Learning {
             folder.display()
         );
         this.weights_version = restored.weights_version;
-        this.learner = restored.learner;
+        this.agent = restored.agent;
         this.affinity = restored.affinity;
         this.rng = restored.rng;
         tracing::info!(
@@ -125,7 +125,7 @@ impl Learning {
 
     /// Updates taken.
     pub const fn updates(&self) -> u64 {
-        self.learner.updates()
+        self.agent.updates()
     }
 
     /// Learns from one batch: the network and the affinity.
@@ -172,12 +172,12 @@ impl Learning {
             bootstrap_discount: &discounts,
             positive_valid: valid,
         };
-        self.learner.check(&batch)?;
+        self.agent.check(&batch)?;
         let mut affinity = self.affinity.clone();
         if let Some(affinity) = &mut affinity {
             affinity.observe(&batch.action_pairs(), &mut rng)?;
         }
-        let report = self.learner.update(&batch)?;
+        let report = self.agent.update(&batch)?;
         (self.rng, self.affinity) = (rng, affinity);
         Ok(report)
     }
@@ -203,7 +203,7 @@ impl Learning {
     pub fn affinity_update(&self, learner: u64) -> Option<AffinityUpdate> {
         self.affinity.as_ref().map(|affinity| AffinityUpdate {
             learner,
-            version: self.learner.updates(),
+            version: self.agent.updates(),
             num_actions: affinity.num_actions() as u32,
             matrix: affinity.matrix().to_vec(),
         })
@@ -211,7 +211,7 @@ impl Learning {
 
     /// Whether the actors are due newer weights after this many updates.
     pub const fn publication_is_due(&self) -> bool {
-        self.learner
+        self.agent
             .updates()
             .is_multiple_of(self.part.learner.publish_period_updates)
     }
@@ -229,7 +229,7 @@ impl Learning {
     /// # Errors
     /// The tensor library failed.
     pub fn next_weights(&mut self) -> anyhow::Result<Weights> {
-        let safetensors = self.learner.weights()?;
+        let safetensors = self.agent.weights()?;
         self.weights_version += 1;
         let header = WeightsHeader::new(self.weights_version, self.updates(), &safetensors);
         Ok((header, safetensors))
@@ -241,7 +241,7 @@ impl Learning {
     /// The file system refused; older checkpoints are untouched.
     pub fn save(&self, folder: &Path) -> anyhow::Result<()> {
         let state = RunState {
-            learner: &self.learner,
+            agent: &self.agent,
             affinity: self.affinity.as_ref(),
             rng: &self.rng,
             weights_version: self.weights_version,

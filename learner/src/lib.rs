@@ -27,10 +27,10 @@ pub use auxiliary::{Objective, positives::Positives, settings::Lambda};
 pub use batch::{Batch, NO_ACTION};
 pub use driml_model::{Compute, DeviceName, Operations};
 
-pub use agent::{Evaluation, Learner, NetworkParameters, UpdateReport};
+pub use agent::{Agent, Evaluation, NetworkParameters, UpdateReport};
 pub use config::{AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart};
 pub use error::UpdateError;
-pub use learner::{Learning, Weights};
+pub use learner::{Learner, Weights};
 pub use optimiser::adam::AdamSettings;
 pub use remote::run::{RunArgs, run};
 pub use settings::LearnerSettings;

@@ -15,7 +15,7 @@ use case::Case;
 pub use case::ParityError;
 
 use crate::{
-    agent::{Learner, NetworkParameters},
+    agent::{Agent, NetworkParameters},
     auxiliary::{
         Objective,
         dim::DIM,
@@ -124,12 +124,12 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
         target: Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?,
         key: key_parameters(case, &model, compute)?,
     };
-    let mut learner =
-        Learner::from_parameters(model.clone(), case.settings.clone(), compute, parameters)?;
+    let mut agent =
+        Agent::from_parameters(model.clone(), case.settings.clone(), compute, parameters)?;
 
     let mut lines = Vec::new();
     let forward = forward_losses(case, compute)?;
-    let evaluation = learner.evaluate(&case.batch())?;
+    let evaluation = agent.evaluate(&case.batch())?;
 
     let width = f64::from(model.v_max - model.v_min);
     let (rows, num_actions, atoms) = (case.rows, model.num_actions, model.atoms);
@@ -190,7 +190,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
         worst.add("grad", name, difference, tolerance);
     }
     lines.extend(worst.lines);
-    let got = learner.apply(&evaluation.gradients)?;
+    let got = agent.apply(&evaluation.gradients)?;
     lines.push(line(
         "grad_norm",
         (got - global_norm).abs(),
@@ -202,7 +202,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
         let expected = case.expected(&format!("updated.{name}"), tensor.dims())?;
         // What no lambda uses is not built, so it stays as the file gives it.
         let got = values(
-            learner
+            agent
                 .online()
                 .get(name)
                 .map_or(tensor, |var| var.as_tensor()),
@@ -211,7 +211,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
     }
     lines.extend(worst.lines);
     let mut worst = Worst::default();
-    for (name, var) in learner.key().iter().flat_map(|key| key.iter()) {
+    for (name, var) in agent.key().iter().flat_map(|key| key.iter()) {
         let expected = case.expected(&format!("updated_key.{name}"), var.dims())?;
         worst.add(
             "updated_key",

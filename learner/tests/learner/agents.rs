@@ -4,8 +4,8 @@
 use std::{collections::BTreeMap, fs};
 
 use driml_learner::{
-    AffinityConfig, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner, LearnerPart,
-    LearnerSettings, Learning, NetworkParameters, Objective, UpdateError,
+    AffinityConfig, Agent, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner,
+    LearnerPart, LearnerSettings, NetworkParameters, Objective, UpdateError,
 };
 use driml_model::{Compute, DimParts, ModelConfig, Parameters};
 use driml_protocol::{
@@ -58,9 +58,9 @@ fn of(objective: Objective, lambda: Lambda) -> (ModelConfig, LearnerSettings) {
     (model, settings)
 }
 
-fn learner(objective: Objective, lambda: Lambda) -> Learner {
+fn agent(objective: Objective, lambda: Lambda) -> Agent {
     let (model, settings) = of(objective, lambda);
-    Learner::new(
+    Agent::new(
         model,
         settings,
         &Compute::CPU,
@@ -94,8 +94,8 @@ fn curl(rows: &Rows) -> Batch<'_> {
 #[test]
 fn cpc_with_one_offset_is_dim() {
     let rows = Rows::random(7, 2);
-    let one = learner(CPC, ALL_DIM).evaluate(&rows.batch());
-    let dim = learner(DIM, ALL_DIM).evaluate(&rows.batch());
+    let one = agent(CPC, ALL_DIM).evaluate(&rows.batch());
+    let dim = agent(DIM, ALL_DIM).evaluate(&rows.batch());
     let (one, dim) = (one.unwrap(), dim.unwrap());
     assert_eq!((one.losses.len(), dim.losses.len()), (4, 4));
     for ((cpc, a), (dim, b)) in one.losses.iter().zip(&dim.losses) {
@@ -110,8 +110,8 @@ fn cpc_is_the_mean_over_its_offsets() {
     let rows = Rows::random(6, 3);
     let frames_k = later(&rows);
     let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 0], [0, 0, 0, 1, 0, 0]].concat();
-    let learner = learner(CPC, ALL_DIM);
-    let all = learner.evaluate(&cpc(&rows, &frames_k, &valid)).unwrap();
+    let agent = agent(CPC, ALL_DIM);
+    let all = agent.evaluate(&cpc(&rows, &frames_k, &valid)).unwrap();
     let mut sums = [0.0; 4];
     for (frames, valid) in rows.frames.iter().zip(valid.chunks(6)) {
         let batch = Batch {
@@ -120,7 +120,7 @@ fn cpc_is_the_mean_over_its_offsets() {
             positive_valid: valid,
             ..rows.batch()
         };
-        let one = learner.evaluate(&batch).unwrap();
+        let one = agent.evaluate(&batch).unwrap();
         assert_eq!(one.losses.len(), 4);
         for (sum, (_, loss)) in sums.iter_mut().zip(one.losses) {
             *sum += loss;
@@ -137,13 +137,13 @@ fn positives_that_are_missing_change_nothing() {
     let rows = Rows::random(6, 4);
     let mut frames_k = later(&rows);
     let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]].concat();
-    let learner = learner(CPC, ALL_DIM);
-    let before = learner.evaluate(&cpc(&rows, &frames_k, &valid)).unwrap();
+    let agent = agent(CPC, ALL_DIM);
+    let before = agent.evaluate(&cpc(&rows, &frames_k, &valid)).unwrap();
     let bytes = frames_k.len() / valid.len();
     for at in (0..valid.len()).filter(|&at| valid[at] == 0) {
         frames_k[at * bytes..(at + 1) * bytes].fill(99);
     }
-    let after = learner.evaluate(&cpc(&rows, &frames_k, &valid)).unwrap();
+    let after = agent.evaluate(&cpc(&rows, &frames_k, &valid)).unwrap();
     assert_eq!((before.losses, before.total), (after.losses, after.total));
 }
 
@@ -154,8 +154,8 @@ fn without_any_positive_cpc_learns_the_return() {
     for there in 0..2 {
         let mut valid = [0; 5 * POSITIVES];
         valid[..there].fill(1);
-        let mut learner = learner(CPC, GLOBAL);
-        let report = learner.update(&cpc(&rows, &frames_k, &valid)).unwrap();
+        let mut agent = agent(CPC, GLOBAL);
+        let report = agent.update(&cpc(&rows, &frames_k, &valid)).unwrap();
         assert_eq!(report.losses, [("cpc_4t4", 0.0)]);
         assert_eq!(report.total, report.c51_kl);
     }
@@ -166,12 +166,12 @@ fn cpc_and_curl_bring_their_losses_down() {
     let rows = Rows::random(16, 6);
     let (frames_k, valid) = (later(&rows), [1; 16 * POSITIVES]);
     for (objective, batch) in [(CPC, cpc(&rows, &frames_k, &valid)), (CURL, curl(&rows))] {
-        let mut learner = learner(objective, GLOBAL);
-        let first = only(&learner.update(&batch).unwrap().losses);
+        let mut agent = agent(objective, GLOBAL);
+        let first = only(&agent.update(&batch).unwrap().losses);
         for _ in 0..80 {
-            learner.update(&batch).unwrap();
+            agent.update(&batch).unwrap();
         }
-        let last = only(&learner.update(&batch).unwrap().losses);
+        let last = only(&agent.update(&batch).unwrap().losses);
         assert!(last < 0.7 * first, "{objective:?}: {first} to {last}");
     }
 }
@@ -179,8 +179,8 @@ fn cpc_and_curl_bring_their_losses_down() {
 #[test]
 fn curl_compares_its_views_and_not_the_state() {
     let rows = Rows::random(8, 7);
-    let learner = learner(CURL, GLOBAL);
-    let loss = |batch: &Batch<'_>| only(&learner.evaluate(batch).unwrap().losses);
+    let agent = agent(CURL, GLOBAL);
+    let loss = |batch: &Batch<'_>| only(&agent.evaluate(batch).unwrap().losses);
     let before = loss(&curl(&rows));
     let mut other = rows.clone();
     other.frames[0].fill(3);
@@ -218,23 +218,23 @@ fn part_of(values: &Values, part: impl Fn(&str) -> bool) -> Values {
 #[test]
 fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
     let rows = Rows::random(6, 8);
-    let mut learner = learner(CURL, GLOBAL);
-    let key = |learner: &Learner| values(learner.key().unwrap());
+    let mut agent = agent(CURL, GLOBAL);
+    let key = |agent: &Agent| values(agent.key().unwrap());
     let encoder = |name: &str| name.starts_with("torso.") || name.starts_with("dim.psi4.");
-    let start = part_of(&values(learner.online()), encoder);
-    assert_eq!(key(&learner), start, "torso and psi_4, and nothing else");
+    let start = part_of(&values(agent.online()), encoder);
+    assert_eq!(key(&agent), start, "torso and psi_4, and nothing else");
     let mut average = start.clone();
     // The target network moves once, at the third.
     for _ in 0..4 {
-        learner.update(&curl(&rows)).unwrap();
-        let online = values(learner.online());
+        agent.update(&curl(&rows)).unwrap();
+        let online = values(agent.online());
         for (name, values) in &mut average {
             for (value, online) in values.iter_mut().zip(&online[name]) {
                 *value =
                     (KEY_TAU * f64::from(*online) + (1.0 - KEY_TAU) * f64::from(*value)) as f32;
             }
         }
-        for (name, found) in key(&learner) {
+        for (name, found) in key(&agent) {
             for (found, wanted) in found.iter().zip(&average[&name]) {
                 assert!((found - wanted).abs() < 1e-6, "{name}");
             }
@@ -242,8 +242,8 @@ fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
     }
     assert_ne!(average, start);
     // Actors get none of it.
-    let acting = learner.model().without_dim();
-    let weights = learner.weights().unwrap();
+    let acting = agent.model().without_dim();
+    let weights = agent.weights().unwrap();
     let device = candle_core::Device::Cpu;
     Parameters::load_safetensors(&acting, &weights, &device).unwrap();
 }
@@ -258,13 +258,12 @@ fn c51_s_target_network_is_the_same_for_every_agent() {
         (CPC, GLOBAL),
         (CURL, GLOBAL),
     ] {
-        let mut learner = learner(objective, lambda);
-        assert_eq!(learner.key().is_some(), objective == CURL);
-        let online = |learner: &Learner| {
-            part_of(&values(learner.online()), |name| !name.starts_with("dim."))
-        };
-        let start = online(&learner);
-        assert_eq!(values(learner.target()), start, "{objective:?}");
+        let mut agent = agent(objective, lambda);
+        assert_eq!(agent.key().is_some(), objective == CURL);
+        let online =
+            |agent: &Agent| part_of(&values(agent.online()), |name| !name.starts_with("dim."));
+        let start = online(&agent);
+        assert_eq!(values(agent.target()), start, "{objective:?}");
         let batch = match objective.name() {
             "none" => Batch {
                 positives: 0,
@@ -276,12 +275,12 @@ fn c51_s_target_network_is_the_same_for_every_agent() {
             _ => rows.batch(),
         };
         for _ in 0..2 {
-            learner.update(&batch).unwrap();
-            assert_eq!(values(learner.target()), start, "its turn has not come");
+            agent.update(&batch).unwrap();
+            assert_eq!(values(agent.target()), start, "its turn has not come");
         }
-        learner.update(&batch).unwrap();
-        let online = online(&learner);
-        for (name, slow) in values(learner.target()) {
+        agent.update(&batch).unwrap();
+        let online = online(&agent);
+        for (name, slow) in values(agent.target()) {
             for ((slow, online), start) in slow.iter().zip(&online[&name]).zip(&start[&name]) {
                 assert!(
                     (slow - (0.95 * online + 0.05 * start)).abs() < 1e-6,
@@ -301,21 +300,20 @@ fn a_target_network_that_moves_leaves_curl_s_keys_where_they_are() {
         // So small a step that the key encoder stands still.
         settings.adam.lr = 1e-30;
         let rng = &mut ChaCha8Rng::seed_from_u64(1);
-        let mut parameters = Learner::new(model.clone(), settings.clone(), &Compute::CPU, rng)
-            .map(|learner| NetworkParameters {
-                online: learner.online().copy().unwrap(),
-                target: learner.target().copy().unwrap(),
-                key: learner.key().map(|key| key.copy().unwrap()),
+        let mut parameters = Agent::new(model.clone(), settings.clone(), &Compute::CPU, rng)
+            .map(|agent| NetworkParameters {
+                online: agent.online().copy().unwrap(),
+                target: agent.target().copy().unwrap(),
+                key: agent.key().map(|key| key.copy().unwrap()),
             })
             .unwrap();
         // A target network of another seed.
         let rng = &mut ChaCha8Rng::seed_from_u64(2);
         parameters.target =
             Parameters::init(&model.without_dim(), rng, &Compute::CPU.device).unwrap();
-        let mut learner =
-            Learner::from_parameters(model, settings, &Compute::CPU, parameters).unwrap();
-        let first = learner.update(&curl(&rows)).unwrap();
-        let second = learner.update(&curl(&rows)).unwrap();
+        let mut agent = Agent::from_parameters(model, settings, &Compute::CPU, parameters).unwrap();
+        let first = agent.update(&curl(&rows)).unwrap();
+        let second = agent.update(&curl(&rows)).unwrap();
         assert_ne!(first.c51_kl, second.c51_kl, "the target network has moved");
         (first.losses, second.losses)
     };
@@ -328,7 +326,7 @@ fn batches_that_an_agent_cannot_use_are_refused() {
     let rows = Rows::random(5, 9);
     let (frames_k, valid) = (later(&rows), [1; 5 * POSITIVES]);
     let said = |objective, batch: &Batch<'_>| {
-        let error = learner(objective, GLOBAL).evaluate(batch).unwrap_err();
+        let error = agent(objective, GLOBAL).evaluate(batch).unwrap_err();
         assert!(matches!(error, UpdateError::Batch(_)));
         error.to_string()
     };
@@ -384,11 +382,11 @@ fn objectives_at_odds_with_their_settings_are_refused() {
 #[test]
 fn a_psi_that_is_not_given_the_action_does_not_see_it() {
     let mut rows = Rows::random(6, 10);
-    let learner = learner(DIM, ALL_DIM);
-    assert!(!learner.model().dim.action);
-    let before = learner.evaluate(&rows.batch()).unwrap().losses;
+    let agent = agent(DIM, ALL_DIM);
+    assert!(!agent.model().dim.action);
+    let before = agent.evaluate(&rows.batch()).unwrap().losses;
     rows.action.rotate_left(1);
-    assert_eq!(learner.evaluate(&rows.batch()).unwrap().losses, before);
+    assert_eq!(agent.evaluate(&rows.batch()).unwrap().losses, before);
 }
 
 const STATE: usize = 20 * 24 * 2;
@@ -489,7 +487,7 @@ fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
         let report = |augment| {
             let part = part(objective, augment);
             let batch = served(&part, 1);
-            Learning::new(part, &Compute::CPU)
+            Learner::new(part, &Compute::CPU)
                 .unwrap()
                 .update(&batch)
                 .unwrap()
@@ -517,17 +515,17 @@ fn an_augmenting_run_resumes_bit_for_bit() {
         ));
         let _ = fs::remove_dir_all(&folder);
         let part = part(objective, Some(STRONG));
-        let learn = |learning: &mut Learning, updates: std::ops::Range<u64>| {
+        let learn = |learner: &mut Learner, updates: std::ops::Range<u64>| {
             for seed in updates {
-                learning.update(&served(&part, seed)).unwrap();
+                learner.update(&served(&part, seed)).unwrap();
             }
         };
-        let mut straight = Learning::new(part.clone(), &Compute::CPU).unwrap();
+        let mut straight = Learner::new(part.clone(), &Compute::CPU).unwrap();
         learn(&mut straight, 0..8);
-        let mut half = Learning::new(part.clone(), &Compute::CPU).unwrap();
+        let mut half = Learner::new(part.clone(), &Compute::CPU).unwrap();
         learn(&mut half, 0..4);
         half.save(&folder).unwrap();
-        let mut resumed = Learning::resume(part.clone(), &Compute::CPU, &folder).unwrap();
+        let mut resumed = Learner::resume(part.clone(), &Compute::CPU, &folder).unwrap();
         assert_eq!(resumed.updates(), 4);
         learn(&mut resumed, 4..8);
         let (mut a, mut b) = (folder.join("a"), folder.join("b"));
@@ -556,11 +554,11 @@ fn an_augmenting_run_resumes_bit_for_bit() {
 fn a_curl_checkpoint_without_a_key_encoder_is_refused() {
     let folder = Folder::new("old-curl");
     let part = part(CURL, Some(STRONG));
-    let learning = Learning::new(part.clone(), &Compute::CPU).unwrap();
-    learning.save(&folder.0).unwrap();
+    let learner = Learner::new(part.clone(), &Compute::CPU).unwrap();
+    learner.save(&folder.0).unwrap();
     let path = folder.0.join("checkpoint-000000000000");
     change_state(&path, |state| state["format"] = 1.into());
-    let resume = || Learning::resume(part.clone(), &Compute::CPU, &folder.0).map(|_| ());
+    let resume = || Learner::resume(part.clone(), &Compute::CPU, &folder.0).map(|_| ());
     let said = resume().unwrap_err().to_string();
     assert!(
         said.contains("keys came from the target network") && said.contains("begin anew"),
@@ -584,12 +582,12 @@ fn a_refused_batch_draws_nothing() {
     let good = served(&part, 1);
     let mut bad = served(&part, 2);
     bad.rows_mut().set(0, 77, 0, 0.0, 0.9);
-    let mut learning = Learning::new(part.clone(), &Compute::CPU).unwrap();
-    assert!(learning.update(&bad).is_err());
-    let after = learning.update(&good).unwrap();
+    let mut learner = Learner::new(part.clone(), &Compute::CPU).unwrap();
+    assert!(learner.update(&bad).is_err());
+    let after = learner.update(&good).unwrap();
     assert_eq!(
         after,
-        Learning::new(part, &Compute::CPU)
+        Learner::new(part, &Compute::CPU)
             .unwrap()
             .update(&good)
             .unwrap()

@@ -2,7 +2,7 @@
 //! Nothing here is measured or asserted.
 
 use driml_learner::{
-    AdamSettings, Batch, Lambda, Learner, LearnerSettings, NO_ACTION, Objective,
+    AdamSettings, Agent, Batch, Lambda, LearnerSettings, NO_ACTION, Objective,
     auxiliary::{cpc, curl, dim},
 };
 use driml_model::{Compute, ConvLayer, ModelConfig, Operations};
@@ -73,13 +73,13 @@ pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
     }
 }
 
-pub(crate) fn learner(lambda: Lambda, seed: u64) -> Learner {
-    learner_on(&Compute::CPU, lambda, seed)
+pub(crate) fn agent(lambda: Lambda, seed: u64) -> Agent {
+    agent_on(&Compute::CPU, lambda, seed)
 }
 
-pub(crate) fn learner_on(compute: &Compute, lambda: Lambda, seed: u64) -> Learner {
+pub(crate) fn agent_on(compute: &Compute, lambda: Lambda, seed: u64) -> Agent {
     let rng = &mut ChaCha8Rng::seed_from_u64(seed);
-    Learner::new(model(lambda), settings(lambda), compute, rng).unwrap()
+    Agent::new(model(lambda), settings(lambda), compute, rng).unwrap()
 }
 
 /// The operations of a GPU, on the CPU.
