@@ -1,7 +1,7 @@
 //! A learner's work without its network connections: batch in, report out, weights and affinity on demand.
 //! The processes and the lockstep mode run this same code; it neither asks for batches nor sends anything.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use driml_model::{Compute, Enlarge};
 use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, WeightsHeader};
@@ -10,17 +10,44 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use crate::{
-    affinity::AffinityEstimator,
+    affinity::{AffinityError, AffinityEstimator},
     agent::{Agent, UpdateReport},
     augment::Augment,
     auxiliary::positives::Positives,
     batch::Batch,
-    checkpoint::{self, RunState},
-    config::LearnerPart,
+    checkpoint::{self, CheckpointError, RunState},
+    config::{ConfigError, LearnerPart},
+    error::UpdateError,
 };
 
 /// Weights as they travel: what they say of themselves, and a safetensors file.
 pub type Weights = (WeightsHeader, Vec<u8>);
+
+/// Why a learner could not be made, learn or be saved.
+#[derive(Debug, thiserror::Error)]
+pub enum LearnerError {
+    /// The update was not taken.
+    #[error(transparent)]
+    Update(#[from] UpdateError),
+    /// The pairs of actions do not fit the affinity's alphabet, or the estimate left the finite numbers.
+    #[error(transparent)]
+    Affinity(#[from] AffinityError),
+    /// Settings of the learner that cannot work.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// Sizes that no network can have.
+    #[error(transparent)]
+    Model(#[from] driml_model::ModelError),
+    /// A checkpoint was not written or not read.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// The checkpoint's affinity is estimated in another way than this run's.
+    #[error(
+        "the checkpoint in {} estimated the action affinity otherwise: resume with the settings it was made with, or choose another folder",
+        .0.display()
+    )]
+    OtherAffinity(PathBuf),
+}
 
 /// Everything that a learner changes while it learns.
 pub struct Learner {
@@ -43,7 +70,7 @@ impl Learner {
     ///
     /// # Errors
     /// Settings that cannot work.
-    pub fn new(part: LearnerPart, compute: &Compute) -> anyhow::Result<Self> {
+    pub fn new(part: LearnerPart, compute: &Compute) -> Result<Self, LearnerError> {
         let spec = &part.spec;
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
         let mut rng = ChaCha8Rng::from_seed(spec.seed_for("learner", 0));
@@ -84,7 +111,11 @@ impl Learner {
     ///
     /// # Errors
     /// Settings that cannot work, or a checkpoint that is damaged, of another run or of other settings.
-    pub fn resume(part: LearnerPart, compute: &Compute, folder: &Path) -> anyhow::Result<Self> {
+    pub fn resume(
+        part: LearnerPart,
+        compute: &Compute,
+        folder: &Path,
+    ) -> Result<Self, LearnerError> {
         let mut this = Self::new(part, compute)?;
         let restored = checkpoint::load_latest(
             folder,
@@ -101,11 +132,9 @@ impl Learner {
             (None, None) => true,
             _ => false,
         };
-        anyhow::ensure!(
-            same_affinity,
-            "the checkpoint in {} estimated the action affinity otherwise: resume with the settings it was made with, or choose another folder",
-            folder.display()
-        );
+        if !same_affinity {
+            return Err(LearnerError::OtherAffinity(folder.to_owned()));
+        }
         this.weights_version = restored.weights_version;
         this.agent = restored.agent;
         this.affinity = restored.affinity;
@@ -133,7 +162,7 @@ impl Learner {
     /// # Errors
     /// A batch that does not fit, or arithmetic that left the finite numbers; all is then as it was, except after
     /// [`UpdateError::Diverged`](crate::UpdateError::Diverged), when neither weights nor a checkpoint can be had any more.
-    pub fn update(&mut self, batch: &WireBatch) -> anyhow::Result<UpdateReport> {
+    pub fn update(&mut self, batch: &WireBatch) -> Result<UpdateReport, LearnerError> {
         let mut frames = [batch.frames_t(), batch.frames_k(), batch.frames_n()];
         if let Some(enlarge) = &self.enlarge {
             for (states, larger) in frames.iter_mut().zip(&mut self.enlarged) {
@@ -228,7 +257,7 @@ impl Learner {
     ///
     /// # Errors
     /// The tensor library failed.
-    pub fn next_weights(&mut self) -> anyhow::Result<Weights> {
+    pub fn next_weights(&mut self) -> Result<Weights, LearnerError> {
         let safetensors = self.agent.weights()?;
         self.weights_version += 1;
         let header = WeightsHeader::new(self.weights_version, self.updates(), &safetensors);
@@ -239,7 +268,7 @@ impl Learner {
     ///
     /// # Errors
     /// The file system refused; older checkpoints are untouched.
-    pub fn save(&self, folder: &Path) -> anyhow::Result<()> {
+    pub fn save(&self, folder: &Path) -> Result<(), LearnerError> {
         let state = RunState {
             agent: &self.agent,
             affinity: self.affinity.as_ref(),

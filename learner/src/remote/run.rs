@@ -15,7 +15,11 @@ use super::{
     publish::Outlets,
     shards::Shards,
 };
-use crate::{checkpoint, config::LearnerPart, learner::Learner};
+use crate::{
+    checkpoint,
+    config::LearnerPart,
+    learner::{Learner, LearnerError},
+};
 
 /// How long a learner that was told to stop stays to be asked for its last status.
 const LAST_WORD_MAX: Duration = Duration::from_secs(3);
@@ -117,7 +121,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     if learned.is_ok() && !learner.publication_is_due() {
         outlets.publish(learner.next_weights()?);
     }
-    learned.and(saved)?;
+    learned.and(saved.map_err(Into::into))?;
     outlets.with_status(|status| status.finished = true);
     tracing::info!("finished after {} updates", learner.updates());
     shutdown.wait();
@@ -175,7 +179,7 @@ struct Saving {
     /// Updates in the newest checkpoint that was saved here.
     saved: Option<u64>,
     /// The first failure since then.
-    failed: Option<anyhow::Error>,
+    failed: Option<LearnerError>,
 }
 
 impl Saving {
@@ -207,7 +211,7 @@ impl Saving {
     ///
     /// # Errors
     /// The first failure since the last checkpoint that was saved.
-    fn finish(mut self, learner: &Learner) -> anyhow::Result<()> {
+    fn finish(mut self, learner: &Learner) -> Result<(), LearnerError> {
         if self.saved != Some(learner.updates()) {
             self.save(learner);
         }
