@@ -2,10 +2,9 @@
 //! It fills in no number: presets do, with their sources.
 
 use driml_protocol::{
-    PlanesPool, RunSpec,
+    PlanesPool, RunSpec, TRANSITION_BYTES,
     codec::PLANES_BYTES_MAX,
     config::{Settings, TransportConfig},
-    transition::TRANSITION_BYTES,
 };
 use serde::{Deserialize, Serialize};
 

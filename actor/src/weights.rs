@@ -9,11 +9,9 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    CodecError, Keys, Kind, Shutdown, WeightsHeader, WeightsReply, WeightsRequest, WeightsVersion,
-    codec, fault,
-    seldom::Seldom,
+    Assembly, CodecError, Keys, Kind, PIECE_BYTES, Seldom, Shutdown, WeightsHeader, WeightsReply,
+    WeightsRequest, WeightsVersion, codec, fault,
     session::{self, Asked},
-    weights::{Assembly, PIECE_BYTES},
 };
 use zenoh::{Session, Wait, bytes::ZBytes, qos::Priority, sample::Sample};
 

@@ -3,9 +3,8 @@
 
 use driml_model::ModelConfig;
 use driml_protocol::{
-    RunSpec,
+    RunSpec, RunSpecError,
     config::{Settings, TransportConfig},
-    run_spec::RunSpecError,
 };
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};

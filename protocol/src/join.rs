@@ -7,8 +7,16 @@ use serde::Serialize;
 use zenoh::{Session, bytes::ZBytes, qos::Priority};
 
 use crate::{
-    ActorJoin, CodecError, Hello, JoinReply, Keys, Kind, LearnerJoin, Shutdown, codec,
+    messages::{
+        hello::Hello,
+        join::{ActorJoin, JoinReply, LearnerJoin},
+    },
+    process::shutdown::Shutdown,
     session::{self, SessionError},
+    wire::{
+        codec::{self, CodecError, Kind},
+        keys::Keys,
+    },
 };
 
 /// How long a joining part waits for a replay server.

@@ -3,38 +3,42 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
-pub mod affinity;
-pub mod answering;
-pub mod batch;
-pub mod codec;
 pub mod config;
-pub mod control;
-pub mod end_signs;
-pub mod fault;
 pub mod join;
-pub mod keys;
-pub mod metric;
-pub mod planes;
-pub mod run_spec;
-pub mod seldom;
 pub mod session;
-pub mod shared_memory;
-pub mod shutdown;
-pub mod transition;
-pub mod weights;
-pub mod whole_file;
 
-pub use affinity::AffinityUpdate;
-pub use batch::{Batch, BatchHeader, BatchReply, BatchRequest, NO_ACTION, RequestId, Tally};
-pub use codec::{CodecError, Kind};
-pub use control::{ActorJoin, Goodbye, Hello, JoinReply, LearnerJoin};
-pub use keys::{Alive, Keys};
-pub use metric::{LearnerStatus, Quantiles, ReplayStatus, Returns, Waiting};
-pub use planes::{Planes, PlanesPool};
-pub use run_spec::{Horizon, RunSpec, TimeoutRule};
-pub use shutdown::Shutdown;
-pub use transition::{Chunk, ChunkHeader, Claim, End, InsertReply};
-pub use weights::{WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion};
+mod messages;
+mod process;
+mod query_workers;
+mod run_spec;
+mod wire;
 
-/// The version of every message in this crate; parts of different versions refuse each other.
-pub const PROTOCOL_VERSION: u16 = 3;
+pub use messages::{
+    affinity::AffinityUpdate,
+    batch::{Batch, BatchHeader, BatchReply, BatchRowsMut, NO_ACTION, POOL_BATCHES},
+    batch_request::{BatchRequest, RequestId, Tally},
+    chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES},
+    goodbye::Goodbye,
+    hello::Hello,
+    insert_reply::{Claim, InsertReply},
+    join::{ActorJoin, JoinReply, LearnerJoin},
+    status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
+    weights::{
+        Assembly, PIECE_BYTES, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
+        WeightsVersion,
+    },
+};
+pub use process::{
+    end_signs, fault,
+    seldom::Seldom,
+    shutdown::{Shutdown, join_within},
+    whole_file,
+};
+pub use query_workers::Answering;
+pub use run_spec::{Horizon, POSITIVES_MAX, RunSpec, RunSpecError, TimeoutRule};
+pub use wire::{
+    buffers::{Planes, PlanesPool},
+    codec::{self, CodecError, Kind, PROTOCOL_VERSION},
+    keys::{Alive, Keys},
+    shared_memory,
+};

@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::codec;
+use crate::wire::codec;
 
 /// Version of the fields below, for their hash. It is not the protocol's: messages may change while checkpoints stay good.
 const FIELDS: u16 = 1;

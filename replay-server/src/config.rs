@@ -1,13 +1,10 @@
 //! What can be set about the replay server, and the checks that keep a run from stalling.
 //! It does not hold the rules of the return or of k: those are the run spec's, shared by every part.
 
-use driml_protocol::{
-    codec::PLANES_BYTES_MAX,
-    run_spec::{RunSpec, RunSpecError},
-};
+use driml_protocol::{RunSpec, RunSpecError, codec::PLANES_BYTES_MAX};
 use serde::{Deserialize, Serialize};
 
-use crate::frames::{Compression, OVERHEAD_BYTES_MAX};
+use crate::storage::frame_store::log::OVERHEAD_BYTES_MAX;
 
 /// Most shards of one replay.
 pub const SHARDS_MAX: u32 = 256;
@@ -27,6 +24,18 @@ impl Study {
             Self::BootstrapFromNextState => "bootstrap-from-next-state",
         }
     }
+}
+
+/// How frames are kept in memory. Batches are the same, bit for bit, whatever it is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Compression {
+    /// As they came: the least work.
+    #[default]
+    None,
+    /// Consecutive frames of one stream together, by LZ4: a fifth of the memory or less on many Procgen games, not on all, and
+    /// more work a chunk and a batch.
+    Lz4,
 }
 
 /// The replay server's settings.

@@ -4,22 +4,17 @@
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 pub mod config;
-pub mod horizon;
 pub mod rate_limiter;
 pub mod replay;
 
-mod actors;
-mod anchors;
-mod assemble;
-mod episodes;
-mod frames;
-mod requests;
-mod ring;
+mod ledger;
+mod sampling;
 mod service;
-mod statistics;
+mod storage;
 
-pub use actors::{ACTORS_MAX, STREAMS_MAX};
-pub use config::{Config, ConfigError, Study};
-pub use frames::{Compression, Draft, PackedChunk, Packer};
+pub use config::{Compression, Config, ConfigError, Study};
+pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use replay::{Replay, Unready};
+pub use sampling::{horizon, packed_batch::Draft};
 pub use service::{RunArgs, run};
+pub use storage::frame_store::{PackedChunk, Packer};

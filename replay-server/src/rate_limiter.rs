@@ -8,6 +8,8 @@ use driml_protocol::{Tally, Waiting};
 /// Its one quantity is the credit, in rows: replay ratio * transitions after the warm-up - rows sampled. A batch of B rows
 /// needs a credit of B; inserts wait while the credit is above slack * replay ratio. With slack * replay ratio >= B at least
 /// one side can always go on. Source: the rate limiter of Reverb (Cassirer et al. 2021), with the ratio counted exactly.
+///
+/// `replay_ratio` is rlpyt's word for Reverb's `samples_per_insert`: rows sampled per transition inserted, not updates per step.
 #[derive(Clone, Debug)]
 pub struct RateLimiter {
     replay_ratio: f64,
@@ -17,8 +19,6 @@ pub struct RateLimiter {
     here: Tally,
     /// What the replay's other shards have counted, as far as heard.
     elsewhere: Tally,
-    /// Where the present ratio began to count: transitions after the warm-up, and the rows allowed by then.
-    since: (u64, f64),
 }
 
 impl RateLimiter {
@@ -36,7 +36,6 @@ impl RateLimiter {
             transitions_max,
             here: Tally::default(),
             elsewhere: Tally::default(),
-            since: (0, 0.0),
         }
     }
 
@@ -72,8 +71,7 @@ impl RateLimiter {
 
     /// Rows allowed so far, whether sampled or not.
     fn rows_allowed(&self) -> f64 {
-        let (since, rows) = self.since;
-        rows + self.replay_ratio * (self.after_warmup() - since) as f64
+        self.replay_ratio * self.after_warmup() as f64
     }
 
     fn credit(&self) -> f64 {
@@ -127,12 +125,6 @@ impl RateLimiter {
     /// What was counted here since the start.
     pub const fn tally(&self) -> Tally {
         self.here
-    }
-
-    /// Changes the replay ratio from now on; rows allowed before stay allowed. The caller has validated it.
-    pub fn set_replay_ratio(&mut self, replay_ratio: f64) {
-        self.since = (self.after_warmup(), self.rows_allowed());
-        self.replay_ratio = replay_ratio;
     }
 
     /// Who waits, for batches of `rows`.

@@ -18,7 +18,6 @@ const NOT_YET: &[&str] = &[
     "protocol",
     "actor",
     "actor/envs",
-    "actor/procgen-sys",
     "replay-server",
     "learner",
     "learner/model",

@@ -4,7 +4,7 @@
 use std::ffi::OsString;
 use std::path::PathBuf;
 
-use crate::install::InstallError;
+use crate::error::InstallError;
 
 /// The cache folder and whether fetching is allowed.
 #[derive(Clone, Debug, PartialEq, Eq)]

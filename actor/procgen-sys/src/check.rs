@@ -9,8 +9,9 @@ use std::path::Path;
 use nix::unistd::geteuid;
 use sha2::{Digest, Sha256};
 
-use crate::install::InstallError;
-use crate::wheel::{self, ASSETS_SHA256, LIBENV_SHA256};
+use crate::error::InstallError;
+use crate::release::{ASSETS_SHA256, LIBENV_SHA256};
+use crate::wheel;
 
 /// The hashes that an engine has to have.
 #[derive(Clone, Copy, Debug)]

@@ -6,15 +6,15 @@
 //! A folder is made beside its place and renamed into it, one process at a time, so that all that race succeed.
 
 use std::fs::{self, File, TryLockError};
-use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use crate::WITHOUT_ENGINE;
 use crate::cache::Cache;
 use crate::check::{self, Hashes, MARKER, PINNED};
-use crate::library::{self, LoadError};
-use crate::wheel::{self, VERSION, WHEEL_NAME, WHEEL_SHA256};
+use crate::error::{InstallError, LoadError};
+use crate::library;
+use crate::release::{VERSION, WHEEL_NAME, WHEEL_SHA256};
+use crate::wheel;
 
 /// How long to wait for another process that fetches or installs; then this one does it for itself.
 const WAIT_MAX: Duration = Duration::from_secs(120);
@@ -23,123 +23,6 @@ const WAIT_MAX: Duration = Duration::from_secs(120);
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Engine {
     root: PathBuf,
-}
-
-/// Why the engine is not there and could not be put there.
-#[derive(Debug, thiserror::Error)]
-pub enum InstallError {
-    /// The engine cannot run on this machine at all.
-    #[error(transparent)]
-    Machine(#[from] LoadError),
-    /// No variable says where the cache folder is.
-    #[error(
-        "procgen's engine has no cache folder: set DRIML_CACHE, XDG_CACHE_HOME or HOME {WITHOUT_ENGINE}"
-    )]
-    NoCacheFolder,
-    /// The engine was never installed.
-    #[error("procgen's engine is not installed in {root}: {to_install} {WITHOUT_ENGINE}", to_install = to_install(.root))]
-    Missing {
-        /// Where it would lie.
-        root: PathBuf,
-    },
-    /// The engine was installed, but something of it is gone or changed.
-    #[error("procgen's engine in {root} is damaged ({reason}): {to_install} {WITHOUT_ENGINE}", to_install = to_install(.root))]
-    Damaged {
-        /// Where it lies.
-        root: PathBuf,
-        /// What is wrong with it.
-        reason: String,
-    },
-    /// Somebody else could put other code in its place.
-    #[error(
-        "procgen's engine is code that would run as you, and others can change {path}: {why}. Make it yours alone \
-         (`chown -R \"$(id -u)\" {path}` as root, `chmod -R go-w {path}`), or set DRIML_CACHE to a folder that is {WITHOUT_ENGINE}",
-        path = .path.display()
-    )]
-    Shared {
-        /// The file or folder.
-        path: PathBuf,
-        /// Who can change it.
-        why: String,
-    },
-    /// It would have to be fetched, which `DRIML_OFFLINE=1` forbids.
-    #[error("DRIML_OFFLINE=1 forbids fetching procgen's engine, and {reason}: {to_install} {WITHOUT_ENGINE}", to_install = to_install(.root))]
-    Offline {
-        /// Where it would lie.
-        root: PathBuf,
-        /// What is wrong with what lies there.
-        reason: String,
-    },
-    /// There is no pip to fetch it with.
-    #[error(
-        "fetching procgen's engine: none of `pip`, `pip3` and `python3 -m pip` works here; install pip \
-         (`apt-get install python3-pip`, `dnf install python3-pip`) {WITHOUT_ENGINE}"
-    )]
-    NoPip,
-    /// pip ran and failed.
-    #[error(
-        "fetching procgen's engine: `{pip} download` failed ({status}); is the network reachable? It said:\n  \
-         {output}\n{WITHOUT_ENGINE}"
-    )]
-    PipFailed {
-        /// The pip that ran.
-        pip: String,
-        /// How it ended.
-        status: String,
-        /// The last lines it printed.
-        output: String,
-    },
-    /// The wheel is not the pinned one.
-    #[error(
-        "{path} is not the wheel this was written for: its SHA-256 is {actual}, expected {expected}; \
-         delete it and check which package index pip uses {WITHOUT_ENGINE}"
-    )]
-    WrongHash {
-        /// The wheel.
-        path: PathBuf,
-        /// The pinned hash.
-        expected: String,
-        /// The file's hash.
-        actual: String,
-    },
-    /// The wheel cannot be unpacked.
-    #[error("unpacking {path}: {reason}; delete it and fetch it again {WITHOUT_ENGINE}")]
-    BadWheel {
-        /// The wheel.
-        path: PathBuf,
-        /// What is wrong with it.
-        reason: String,
-    },
-    /// The file system refused something.
-    #[error("installing procgen's engine: {doing} {path}: {source} {WITHOUT_ENGINE}")]
-    Io {
-        /// What was being done.
-        doing: &'static str,
-        /// With which file or folder.
-        path: PathBuf,
-        /// What the system said.
-        source: io::Error,
-    },
-}
-
-impl InstallError {
-    pub(crate) fn io(doing: &'static str, path: &Path, source: io::Error) -> InstallError {
-        InstallError::Io {
-            doing,
-            path: path.to_owned(),
-            source,
-        }
-    }
-}
-
-/// How to get the engine into `root`, with and without a network.
-fn to_install(root: &Path) -> String {
-    let cache = root.parent().unwrap_or(root);
-    let command = wheel::download_command(cache);
-    format!(
-        "run with network access and without DRIML_OFFLINE, or fetch the wheel where there is a network with `{command}` and put it into {}",
-        cache.display()
-    )
 }
 
 impl Engine {

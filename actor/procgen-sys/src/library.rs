@@ -7,7 +7,7 @@ use std::sync::{Mutex, OnceLock, PoisonError};
 
 use libloading::os::unix::{Library, RTLD_LOCAL, RTLD_NOW};
 
-use crate::WITHOUT_ENGINE;
+use crate::error::LoadError;
 use crate::ffi::{
     self, GetState, GetTensortypes, LIBENV_VERSION, Make, SetBuffers, SetState, Unit, Version,
 };
@@ -22,41 +22,6 @@ pub(crate) struct Api {
     pub(crate) close: Unit,
     pub(crate) get_state: GetState,
     pub(crate) set_state: SetState,
-}
-
-/// Why the engine's library cannot be loaded.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum LoadError {
-    /// The engine is built for Linux on x86-64 with AVX only.
-    #[error("procgen's engine cannot run here: {0} {WITHOUT_ENGINE}")]
-    Machine(String),
-    /// A system library that the engine needs is missing.
-    #[error(
-        "loading procgen's engine: the system library {library} is missing; install it with \
-         `apt-get install {debian}` (Debian, Ubuntu) or `dnf install {fedora}` (Fedora) {WITHOUT_ENGINE}"
-    )]
-    MissingLibrary {
-        /// The file that the loader looked for.
-        library: String,
-        /// Packages that hold it on Debian and Ubuntu.
-        debian: &'static str,
-        /// Package that holds it on Fedora.
-        fedora: &'static str,
-    },
-    /// The system's C or C++ library is older than the engine's.
-    #[error(
-        "loading procgen's engine: this system's C or C++ library is too old, it needs glibc 2.17 and \
-         libstdc++ of gcc 4.6 or later; use a newer distribution; the loader said: {0} {WITHOUT_ENGINE}"
-    )]
-    TooOld(String),
-    /// Anything else that the loader says.
-    #[error("loading procgen's engine from {path}: {reason} {WITHOUT_ENGINE}")]
-    Other {
-        /// The library's file.
-        path: PathBuf,
-        /// What the loader said.
-        reason: String,
-    },
 }
 
 /// The packages that hold the libraries which the engine needs: file, Debian, Fedora.
@@ -178,6 +143,7 @@ fn explain(path: &Path, said: &str) -> LoadError {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::error::WITHOUT_ENGINE;
 
     #[test]
     fn what_the_loader_says_becomes_what_to_do() {

@@ -5,7 +5,9 @@ use std::ffi::c_void;
 
 use crate::ffi::{self, DTYPE_INT32, DTYPE_UINT8, LibenvOption, LibenvOptions};
 use crate::game::{DistributionMode, Game};
-use crate::vec_game::NUM_ACTIONS;
+
+/// Number of actions; valid ones are `0..15`.
+pub const NUM_ACTIONS: usize = 15;
 
 /// Copies of a game that one handle may hold; more is refused.
 pub const NUM_ENVS_MAX: usize = 4096;

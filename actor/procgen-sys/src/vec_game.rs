@@ -3,12 +3,12 @@
 
 use std::ffi::c_void;
 
-use crate::ProcgenError;
+use crate::error::{InstallError, ProcgenError};
 use crate::ffi::{self, DTYPE_INT32, DTYPE_UINT8, Handle, LibenvBuffers, LibenvTensortype};
 use crate::game::Game;
-use crate::install::{Engine, InstallError};
+use crate::install::Engine;
 use crate::library::{self, Api};
-use crate::options::{Options, RawOptions};
+use crate::options::{NUM_ACTIONS, Options, RawOptions};
 use crate::pinned::Pinned;
 
 /// Rows and columns of a frame.
@@ -16,9 +16,6 @@ pub const FRAME_SIDE: usize = 64;
 
 /// Bytes of a frame: 64 x 64 pixels, red, green and blue.
 pub const FRAME_BYTES: usize = FRAME_SIDE * FRAME_SIDE * 3;
-
-/// Number of actions; valid ones are `0..15`.
-pub const NUM_ACTIONS: usize = 15;
 
 /// The action that takes the game's no-op and then ends the episode, whatever happened.
 pub const RESET: i32 = -1;

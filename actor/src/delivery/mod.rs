@@ -1,14 +1,11 @@
 //! Brings chunks to the replay server, each exactly once and in order, and says goodbye.
 //! It does not drop: a chunk leaves the line when the replay server says that it is stored or no longer wanted.
 
-mod courier;
+mod state;
+mod worker;
 
 use std::{
-    sync::{
-        Arc, Condvar, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering},
-        mpsc,
-    },
+    sync::{Arc, PoisonError, atomic::Ordering, mpsc},
     thread::JoinHandle,
     time::Duration,
 };
@@ -16,61 +13,13 @@ use std::{
 use driml_protocol::{Chunk, Keys, PlanesPool, Shutdown};
 use zenoh::Session;
 
-use crate::config::Config;
-use courier::Courier;
+use state::Account;
+use worker::Courier;
+
+pub use state::DeliveryLimits;
 
 /// How long an actor whose chunks wait may wait for newer weights.
 const FRESH_WEIGHTS_MAX: Duration = Duration::from_millis(200);
-
-/// Limits of one delivery.
-#[derive(Clone, Copy, Debug)]
-pub struct DeliveryLimits {
-    /// Chunks waiting to be acknowledged; at this many `send` waits.
-    pub chunks_in_flight_max: usize,
-    /// How long the replay server may be silent about a chunk that it was sent; a chunk that has to wait is answered meanwhile.
-    pub ack_timeout: Duration,
-    /// All tries for one chunk without any answer.
-    pub unreachable_max: Duration,
-}
-
-impl DeliveryLimits {
-    /// The limits that an actor's settings ask for.
-    pub const fn of(config: &Config) -> Self {
-        Self {
-            chunks_in_flight_max: config.chunks_in_flight_max as usize,
-            ack_timeout: Duration::from_millis(config.ack_timeout_ms),
-            unreachable_max: Duration::from_millis(config.unreachable_max_ms),
-        }
-    }
-}
-
-/// What the sending side and the thread tell each other beside the chunks.
-#[derive(Debug, Default)]
-struct Account {
-    inserted_total: AtomicU64,
-    actors: AtomicU32,
-    finished: AtomicBool,
-    /// The rate limiter makes chunks wait: more than one at a time would only grow old.
-    is_held: AtomicBool,
-    /// Chunks that were sent and are not yet settled.
-    waiting: Mutex<usize>,
-    settled: Condvar,
-}
-
-impl Account {
-    fn waiting(&self) -> MutexGuard<'_, usize> {
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn settle(&self) {
-        *self.waiting() -= 1;
-        self.settled.notify_all();
-    }
-
-    fn is_held(&self) -> bool {
-        self.is_held.load(Ordering::Relaxed)
-    }
-}
 
 /// A thread that delivers, and the queue to it.
 pub struct Delivery {

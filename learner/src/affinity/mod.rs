@@ -179,7 +179,7 @@ mod tests {
         }
     }
 
-    /// The preset's numbers (`deploy/presets/agent/driml-ada.toml`) on a source as skewed as a game's.
+    /// The preset's numbers (`deploy/settings/presets/agent/driml-ada.toml`) on a source as skewed as a game's.
     const PRESET: LearnedSettings = LearnedSettings {
         hidden: 32,
         lr: 2e-3,

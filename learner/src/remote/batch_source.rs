@@ -10,11 +10,9 @@ use std::{
 use anyhow::{Context, bail};
 use driml_protocol::{
     Batch, BatchHeader, BatchReply, BatchRequest, Keys, Kind, PlanesPool, ReplayStatus, RequestId,
-    Shutdown, Tally, codec, fault,
-    seldom::Seldom,
+    Seldom, Shutdown, Tally, codec, fault, join_within,
     session::{self, Asked, SessionError},
     shared_memory::Trust,
-    shutdown::join_within,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -10,8 +10,8 @@ use std::{
 };
 
 use driml_protocol::{
-    AffinityUpdate, Keys, Kind, LearnerStatus, Shutdown, WeightsUpload, answering::Answering,
-    codec, fault, seldom::Seldom, session,
+    AffinityUpdate, Answering, Keys, Kind, LearnerStatus, Seldom, Shutdown, WeightsUpload, codec,
+    fault, session,
 };
 use zenoh::{Session, bytes::ZBytes, qos::Priority, query::Queryable};
 

@@ -9,8 +9,11 @@ use std::{
 use driml_protocol::{Chunk, Claim, InsertReply, Kind, fault};
 use zenoh::{bytes::ZBytes, query::Query};
 
-use super::{Question, Service, State, parked::ParkedChunk};
-use crate::PackedChunk;
+use super::{
+    parked::ParkedChunk,
+    server::{Question, Service, State},
+};
+use crate::storage::frame_store::PackedChunk;
 
 /// How long the thread sleeps when nothing is parked; it is woken when something is.
 const IDLE: Duration = Duration::from_secs(60);

@@ -8,7 +8,7 @@ use std::{
 
 use driml_protocol::{BatchRequest, ChunkHeader, Claim};
 
-use crate::PackedChunk;
+use crate::storage::frame_store::PackedChunk;
 
 /// Bytes of the chunks kept; whoever sends one more is told to send it again later.
 const CHUNK_BYTES_MAX: usize = 1 << 28;
@@ -209,7 +209,7 @@ mod tests {
     use driml_protocol::{Chunk, RequestId};
 
     use super::*;
-    use crate::{Compression, Packer};
+    use crate::{config::Compression, storage::frame_store::Packer};
 
     fn chunk(actor: u32, sequence: u64, steps: u32, frame_bytes: u32) -> PackedChunk<'static> {
         let chunk = Chunk::zeroed(ChunkHeader {

@@ -1,114 +1,17 @@
-//! The newest weights: taken from the learner once a version, announced, and given to actors in pieces.
+//! Weights on their way: taken from the learner once a version, announced, and given to actors in pieces.
 //! It does not read them.
 
 use std::{
-    sync::{Arc, MutexGuard, PoisonError},
-    time::{Duration, Instant},
+    sync::{MutexGuard, PoisonError},
+    time::Instant,
 };
 
 use driml_protocol::{
-    Kind, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec,
-    session, weights::PIECE_BYTES,
+    Kind, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec, session,
 };
 use zenoh::{Wait, bytes::ZBytes, query::Query};
 
-use super::Service;
-
-/// Versions that are kept while actors pull them. When so many are being pulled, whoever begins gets the newest of these: many
-/// actors that pull slowly are served to the end, with weights that are a little older.
-const KEPT_MAX: usize = 8;
-/// How long a version is kept after its last piece was asked for.
-const KEPT_FOR: Duration = Duration::from_secs(5);
-/// Most versions that one upload may be ahead of the one before: more is no count of a learner's.
-const VERSION_STEP_MAX: u64 = 1 << 20;
-
-/// Weights as they came.
-struct Weights {
-    header: WeightsHeader,
-    safetensors: Vec<u8>,
-}
-
-/// The newest weights, and older ones that are being pulled.
-#[derive(Default)]
-pub(super) struct WeightsStore {
-    newest: Option<Arc<Weights>>,
-    /// Those that are being pulled, oldest version first, and when each was last asked for.
-    pulled: Vec<(Arc<Weights>, Instant)>,
-}
-
-impl WeightsStore {
-    /// Version of the newest; 0 before the first.
-    pub(super) fn version(&self) -> u64 {
-        self.newest.as_ref().map_or(0, |it| it.header.version)
-    }
-
-    /// Takes newer weights; the same ones may come again. Returns whether they are new.
-    ///
-    /// # Errors
-    /// A version that cannot follow the newest one; the reason, for a person.
-    fn put(&mut self, header: WeightsHeader, safetensors: &[u8]) -> Result<bool, String> {
-        let newest = self.version();
-        if self.newest.as_ref().is_some_and(|it| it.header == header) {
-            return Ok(false);
-        }
-        if header.version <= newest || header.version - newest > VERSION_STEP_MAX {
-            return Err(format!("version {} after version {newest}", header.version));
-        }
-        self.newest = Some(Arc::new(Weights {
-            header,
-            safetensors: safetensors.to_vec(),
-        }));
-        Ok(true)
-    }
-
-    /// The weights that `request` asks for, and where the piece starts.
-    fn find(
-        &mut self,
-        request: WeightsRequest,
-        now: Instant,
-    ) -> Result<(Arc<Weights>, usize), WeightsReply> {
-        let (version, offset) = match request {
-            WeightsRequest::NewerThan(version) => (self.begin(version, now)?, 0),
-            WeightsRequest::Piece { version, offset } => {
-                (version, usize::try_from(offset).unwrap_or(usize::MAX))
-            }
-        };
-        let mut kept = self.pulled.iter_mut();
-        let (weights, asked) = kept
-            .find(|(weights, _)| weights.header.version == version)
-            .ok_or(WeightsReply::Gone)?;
-        *asked = now;
-        if offset < weights.safetensors.len() && offset.is_multiple_of(PIECE_BYTES) {
-            Ok((weights.clone(), offset))
-        } else {
-            Err(WeightsReply::Gone)
-        }
-    }
-
-    /// The version that somebody who has `version` is to pull.
-    fn begin(&mut self, version: u64, now: Instant) -> Result<u64, WeightsReply> {
-        let newest = self.newest.as_ref();
-        let newest = newest.filter(|it| it.header.version > version);
-        let newest = newest.ok_or(WeightsReply::NoneNewer)?;
-        let last = |pulled: &[(Arc<Weights>, Instant)]| {
-            pulled.last().map_or(0, |(it, _)| it.header.version)
-        };
-        if last(&self.pulled) == newest.header.version {
-            return Ok(newest.header.version);
-        }
-        self.pulled
-            .retain(|(_, asked)| now.saturating_duration_since(*asked) < KEPT_FOR);
-        if self.pulled.len() == KEPT_MAX {
-            if last(&self.pulled) > version {
-                return Ok(last(&self.pulled));
-            }
-            let idle = (0..KEPT_MAX).min_by_key(|&at| self.pulled[at].1);
-            idle.map(|at| self.pulled.remove(at));
-        }
-        self.pulled.push((newest.clone(), now));
-        Ok(newest.header.version)
-    }
-}
+use super::{server::Service, weights_store::WeightsStore};
 
 impl Service {
     pub(super) fn weights(&self) -> MutexGuard<'_, WeightsStore> {
@@ -182,107 +85,5 @@ impl Service {
             }
             Err(e) => tracing::error!("weights were not sent: {e}"),
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn header(version: u64) -> WeightsHeader {
-        WeightsHeader::new(version, 0, &[])
-    }
-
-    fn piece(version: u64, offset: usize) -> WeightsRequest {
-        let offset = offset as u64;
-        WeightsRequest::Piece { version, offset }
-    }
-
-    #[test]
-    fn versions_rise_by_sane_steps() {
-        let mut store = WeightsStore::default();
-        assert_eq!(store.put(header(1), b"a"), Ok(true));
-        assert_eq!(store.put(header(1), b"a"), Ok(false), "sent again");
-        assert_eq!(store.put(header(3), b"b"), Ok(true));
-        for version in [0, 2, 3, 4 + VERSION_STEP_MAX, u64::MAX] {
-            let other = WeightsHeader::new(version, 9, &[]);
-            assert!(store.put(other, b"c").is_err(), "{version}");
-        }
-        assert_eq!(store.version(), 3);
-    }
-
-    /// What comes of a request after so many seconds: the version and the offset.
-    fn found(
-        store: &mut WeightsStore,
-        request: WeightsRequest,
-        now: Instant,
-    ) -> Result<(u64, usize), WeightsReply> {
-        let found = store.find(request, now);
-        found.map(|(weights, offset)| (weights.header.version, offset))
-    }
-
-    #[test]
-    fn a_slow_actor_gets_what_it_began_with_while_others_go_on() {
-        let (mut store, start) = (WeightsStore::default(), Instant::now());
-        let newest = WeightsRequest::NewerThan(0);
-        let file = vec![7; 3 * PIECE_BYTES];
-        assert_eq!(
-            found(&mut store, newest, start),
-            Err(WeightsReply::NoneNewer)
-        );
-        store.put(header(1), &file).unwrap();
-        assert_eq!(found(&mut store, newest, start), Ok((1, 0)));
-        for version in 2..20 {
-            let now = start + Duration::from_secs(version);
-            store.put(header(version), &file).unwrap();
-            let next = WeightsRequest::NewerThan(version - 1);
-            assert_eq!(found(&mut store, next, now), Ok((version, 0)));
-            let slow = piece(1, PIECE_BYTES);
-            assert_eq!(found(&mut store, slow, now), Ok((1, PIECE_BYTES)));
-            assert!(store.pulled.len() <= KEPT_MAX);
-        }
-        let now = start + Duration::from_secs(20);
-        let current = WeightsRequest::NewerThan(19);
-        assert_eq!(
-            found(&mut store, current, now),
-            Err(WeightsReply::NoneNewer)
-        );
-        for gone in [
-            piece(2, 0),
-            piece(99, 0),
-            piece(19, 1),
-            piece(19, 3 * PIECE_BYTES),
-        ] {
-            assert_eq!(
-                found(&mut store, gone, now),
-                Err(WeightsReply::Gone),
-                "{gone:?}"
-            );
-        }
-    }
-
-    #[test]
-    fn when_too_many_versions_are_pulled_those_who_begin_join_one() {
-        let (mut store, now) = (WeightsStore::default(), Instant::now());
-        let last = KEPT_MAX as u64;
-        for version in 1..=last + 5 {
-            store.put(header(version), &[7]).unwrap();
-            let begun = found(&mut store, WeightsRequest::NewerThan(0), now).unwrap();
-            assert_eq!(begun.0, version.min(last), "the newest that is pulled");
-        }
-        for version in 1..=last {
-            assert_eq!(found(&mut store, piece(version, 0), now), Ok((version, 0)));
-        }
-        // One that has it already gets the newest, in the place of the one that was asked for longest ago.
-        let later = now + Duration::from_secs(1);
-        for version in 2..=last {
-            found(&mut store, piece(version, 0), later).unwrap();
-        }
-        let newer = WeightsRequest::NewerThan(last);
-        assert_eq!(found(&mut store, newer, later), Ok((last + 5, 0)));
-        assert_eq!(
-            found(&mut store, piece(1, 0), later),
-            Err(WeightsReply::Gone)
-        );
     }
 }

@@ -562,8 +562,6 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
         replay.sample(8).unwrap();
     }
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(18));
-    assert!(replay.set_replay_ratio(3.9).is_err(), "2 * 3.9 < 8");
-    replay.set_replay_ratio(8.0).unwrap();
     let foreign = AffinityUpdate {
         learner: 1,
         version: 1,

@@ -4,6 +4,7 @@
 use std::io::Write;
 
 use super::*;
+use crate::error::WITHOUT_ENGINE;
 
 fn cache(folder: &Path, offline: bool) -> Cache {
     Cache {
@@ -40,7 +41,8 @@ fn made_up(folder: &Path) -> (PathBuf, String) {
 /// Names of what lies in the cache folder, sorted.
 fn left(cache: &Cache) -> Vec<String> {
     let entries = fs::read_dir(&cache.folder).unwrap();
-    let name = |entry: io::Result<fs::DirEntry>| entry.unwrap().file_name().into_string().unwrap();
+    let name =
+        |entry: std::io::Result<fs::DirEntry>| entry.unwrap().file_name().into_string().unwrap();
     let mut names: Vec<String> = entries.map(name).collect();
     names.sort();
     names

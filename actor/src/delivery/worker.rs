@@ -1,0 +1,386 @@
+//! The delivering thread: sends chunks, understands the answers, sends again what did not arrive.
+//! It never waits without hearing: a server that makes a chunk wait says so every few seconds, and one that is silent is
+//! given up.
+
+use std::{
+    collections::VecDeque,
+    sync::{Arc, atomic::Ordering, mpsc},
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context, bail};
+use driml_protocol::{
+    Chunk, ChunkHeader, Claim, Goodbye, InsertReply, Keys, Kind, PlanesPool, Seldom, Shutdown,
+    codec, fault,
+    session::{self, Asked, SessionError},
+};
+use zenoh::{Session, bytes::ZBytes, qos::Priority};
+
+use super::state::{Account, DeliveryLimits};
+
+/// After `Shutdown`, how long the chunks at hand may take to be stored.
+const DRAIN_MAX: Duration = Duration::from_secs(20);
+/// After `Shutdown`, how long the replay server may be silent about one of them before it is sent again: several tries must fit.
+const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(4);
+/// Pause between two tries when the replay server is out of reach or has no room.
+const RETRY_PAUSE: Duration = Duration::from_millis(200);
+/// How often a thread that waits for an answer looks whether the actor is to stop.
+const TICK: Duration = Duration::from_millis(50);
+/// How long the goodbye is tried.
+const GOODBYE_MAX: Duration = Duration::from_secs(5);
+
+/// A chunk that is not settled yet.
+struct Outgoing {
+    header: ChunkHeader,
+    planes: ZBytes,
+    in_shared_memory: bool,
+    /// Set while a question about it is on its way.
+    asked: Option<Asked>,
+    /// The replay server has it and will store it: a claim is enough.
+    is_kept: bool,
+}
+
+/// What became of the first chunk in line.
+enum Fate {
+    Stored,
+    /// The run has enough transitions.
+    Unwanted,
+    /// It is asked about again.
+    Again,
+}
+
+/// The delivering thread's state. Several chunks are on their way at once; they are settled in order, and where one has to go
+/// again those after it, which the replay server then refused as out of order, go again too.
+pub(super) struct Courier {
+    session: Session,
+    keys: Keys,
+    spec_hash: u64,
+    limits: DeliveryLimits,
+    pool: PlanesPool,
+    shutdown: Shutdown,
+    account: Arc<Account>,
+    outgoing: VecDeque<Outgoing>,
+    /// Chunks that may be on their way: one after a chunk had to wait or go again, and one more with each that is stored at once.
+    window: usize,
+    /// When the replay server last answered.
+    answered: Instant,
+    /// When the chunk that waits at the rate limiter began to wait.
+    held_since: Option<Instant>,
+    draining_since: Option<Instant>,
+    retries_said: Seldom,
+    waiting_said: Seldom,
+}
+
+impl Courier {
+    pub(super) fn new(
+        session: Session,
+        (keys, spec_hash): (Keys, u64),
+        limits: DeliveryLimits,
+        pool: PlanesPool,
+        shutdown: Shutdown,
+        account: Arc<Account>,
+    ) -> Self {
+        Self {
+            session,
+            keys,
+            spec_hash,
+            limits,
+            pool,
+            shutdown,
+            account,
+            outgoing: VecDeque::new(),
+            window: 1,
+            answered: Instant::now(),
+            held_since: None,
+            draining_since: None,
+            retries_said: Seldom::default(),
+            waiting_said: Seldom::default(),
+        }
+    }
+
+    /// Delivers until the queue ends; gives the number of transitions that were not wanted.
+    pub(super) fn run(mut self, chunks: &mpsc::Receiver<Chunk>) -> anyhow::Result<u64> {
+        let mut last = None;
+        let mut produced = 0;
+        let mut unwanted = 0;
+        let mut outcome = Ok(());
+        while let Some(header) = self.first_in_line(chunks) {
+            fault::point("delivery");
+            let transitions = header.transitions() as u64;
+            // After a failure the rest is only counted, so that the goodbye tells the truth.
+            let fate = match outcome {
+                Ok(()) => self.settle_first(),
+                Err(_) => Ok(Fate::Stored),
+            };
+            match fate {
+                Ok(Fate::Again) => continue,
+                Ok(Fate::Stored) => {}
+                Ok(Fate::Unwanted) => unwanted += transitions,
+                Err(e) => {
+                    outcome = Err(e);
+                    self.account.finished.store(true, Ordering::Relaxed);
+                }
+            }
+            produced += transitions;
+            last = Some((header.actor, header.epoch));
+            self.outgoing.pop_front();
+            self.account.settle();
+        }
+        if let Some((actor, epoch)) = last {
+            self.say_goodbye(Goodbye {
+                actor,
+                epoch,
+                produced: produced - unwanted,
+            });
+        }
+        outcome.map(|()| unwanted)
+    }
+
+    /// Lines up what was queued and gives the first, waiting for one if there is none; `None` when no more will come.
+    fn first_in_line(&mut self, chunks: &mpsc::Receiver<Chunk>) -> Option<ChunkHeader> {
+        while self.outgoing.len() < self.limits.chunks_in_flight_max {
+            let next = match self.outgoing.is_empty() {
+                true => chunks.recv().ok(),
+                false => chunks.try_recv().ok(),
+            };
+            let Some(chunk) = next else { break };
+            if self.outgoing.is_empty() {
+                // While there was nothing to say, the replay server could not answer.
+                self.answered = Instant::now();
+            }
+            let header = chunk.header;
+            let planes = chunk.into_planes();
+            self.outgoing.push_back(Outgoing {
+                header,
+                in_shared_memory: planes.are_shared(),
+                planes: planes.freeze(),
+                asked: None,
+                is_kept: false,
+            });
+        }
+        if self.shutdown.is_set() {
+            // Copying costs nobody anything now, and a message that is lost costs the time that is left.
+            self.copy_out_of_shared_memory();
+        }
+        self.outgoing.front().map(|first| first.header)
+    }
+
+    /// Sends what the window allows and waits for what becomes of the first.
+    fn settle_first(&mut self) -> anyhow::Result<Fate> {
+        let sequence = self.outgoing[0].header.sequence;
+        if self.shutdown.is_set() {
+            let since = *self.draining_since.get_or_insert_with(Instant::now);
+            if since.elapsed() > DRAIN_MAX {
+                bail!("chunk {sequence} was not stored within {DRAIN_MAX:?} of the end");
+            }
+        }
+        let reply = match self.send_window().and_then(|()| self.wait_for_first()) {
+            Ok(Some(reply)) => Ok(reply),
+            // To be let in at once, as the actor leaves.
+            Ok(None) => return Ok(self.again()),
+            Err(e) => Err(e),
+        };
+        if reply.is_ok() {
+            self.answered = Instant::now();
+        }
+        match reply {
+            Ok(InsertReply::Stored {
+                inserted_total,
+                actors,
+                waited,
+            }) => {
+                self.hear(inserted_total);
+                self.account.actors.store(actors, Ordering::Relaxed);
+                let was_held = self.held_since.take().is_some() || waited;
+                self.account.is_held.store(was_held, Ordering::Relaxed);
+                self.window = match was_held {
+                    true => 1,
+                    false => (self.window + 1).min(self.limits.chunks_in_flight_max),
+                };
+                if self.outgoing[0].in_shared_memory {
+                    self.pool.shared_memory_works();
+                }
+                Ok(Fate::Stored)
+            }
+            Ok(InsertReply::Finished { inserted_total }) => {
+                self.hear(inserted_total);
+                self.account.finished.store(true, Ordering::Relaxed);
+                Ok(Fate::Unwanted)
+            }
+            Ok(InsertReply::Wait {
+                inserted_total,
+                kept,
+            }) => {
+                self.hear(inserted_total);
+                self.is_held(kept);
+                Ok(self.again())
+            }
+            // Judged while one before it waited; all of those are stored now.
+            Ok(InsertReply::OutOfOrder { .. }) => Ok(self.again()),
+            Ok(InsertReply::Refused { why }) => bail!("the replay server refused a chunk: {why}"),
+            Err(e) if self.answered.elapsed() > self.limits.unreachable_max => {
+                Err(e).context(format!(
+                    "the replay server was out of reach for {:?}",
+                    self.limits.unreachable_max
+                ))
+            }
+            Err(e) => {
+                if let Some(more) = self.retries_said.due() {
+                    tracing::warn!("chunk {sequence} will be sent again: {e}{more}");
+                }
+                // What was not answered may not have arrived, whatever was said of it before.
+                self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
+                self.leave_shared_memory();
+                std::thread::sleep(RETRY_PAUSE);
+                Ok(self.again())
+            }
+        }
+    }
+
+    /// The answer about the first chunk; none if the actor is to leave meanwhile, which the replay server does not know yet.
+    fn wait_for_first(&mut self) -> Result<Option<InsertReply>, SessionError> {
+        let first = &mut self.outgoing[0];
+        let Some(asked) = first.asked.take() else {
+            unreachable!("the window has room for one");
+        };
+        let answer = loop {
+            match asked.answer_within(TICK)? {
+                Some(answer) => break answer,
+                None if self.shutdown.is_set() && !first.header.leaving => return Ok(None),
+                None => {}
+            }
+        };
+        self.read(&self.keys.ingest(), Kind::InsertReply, &answer)
+            .map(Some)
+    }
+
+    /// The rate limiter makes the first chunk wait; it is asked about again at once if the replay server keeps it.
+    fn is_held(&mut self, kept: bool) {
+        let since = *self.held_since.get_or_insert_with(Instant::now);
+        self.account.is_held.store(true, Ordering::Relaxed);
+        self.outgoing[0].is_kept = kept;
+        if !kept {
+            self.shutdown.wait_timeout(RETRY_PAUSE);
+        }
+        let seconds = since.elapsed().as_secs();
+        if seconds >= 10
+            && let Some(more) = self.waiting_said.due()
+        {
+            tracing::info!(
+                "waiting for the learner, which is behind by the replay ratio: a chunk has waited {seconds} s{more}"
+            );
+        }
+    }
+
+    fn hear(&self, inserted_total: u64) {
+        self.account
+            .inserted_total
+            .store(inserted_total, Ordering::Relaxed);
+    }
+
+    fn again(&mut self) -> Fate {
+        self.window = 1;
+        self.outgoing.iter_mut().for_each(|it| it.asked = None);
+        Fate::Again
+    }
+
+    /// The replay server may be unable to read shared memory: what is at hand, and the next chunks, go through the socket.
+    fn leave_shared_memory(&mut self) {
+        if self.outgoing[0].in_shared_memory {
+            self.pool.avoid_shared_memory();
+        }
+        self.copy_out_of_shared_memory();
+    }
+
+    fn copy_out_of_shared_memory(&mut self) {
+        for it in self.outgoing.iter_mut().filter(|it| it.in_shared_memory) {
+            it.planes = ZBytes::from(it.planes.to_bytes().into_owned());
+            it.in_shared_memory = false;
+        }
+    }
+
+    fn send_window(&mut self) -> Result<(), SessionError> {
+        let leaving = self.shutdown.is_set();
+        let timeout = match leaving {
+            true => self.limits.ack_timeout.min(DRAIN_ACK_TIMEOUT),
+            false => self.limits.ack_timeout,
+        };
+        for it in self.outgoing.iter_mut().take(self.window) {
+            if it.asked.is_some() {
+                continue;
+            }
+            it.header.leaving |= leaving;
+            let (key, message) = if it.is_kept {
+                (self.keys.claim(), claim(it, self.spec_hash))
+            } else {
+                (self.keys.ingest(), chunk(it, self.spec_hash))
+            };
+            let message = message.map_err(|e| SessionError::Zenoh {
+                key: key.clone(),
+                why: e.to_string(),
+            })?;
+            let asked = session::send(&self.session, &key, message, Priority::Data, timeout)?;
+            it.asked = Some(asked);
+        }
+        Ok(())
+    }
+
+    fn say_goodbye(&self, goodbye: Goodbye) {
+        let started = Instant::now();
+        loop {
+            let said = codec::encode(Kind::Goodbye, self.spec_hash, &goodbye, &[])
+                .context("encoding the goodbye")
+                .and_then(|bytes| {
+                    let (key, timeout) = (self.keys.goodbye(), GOODBYE_MAX);
+                    let answer =
+                        session::ask(&self.session, &key, bytes.into(), Priority::Data, timeout)?;
+                    Ok(self.read::<()>(&key, Kind::Done, &answer)?)
+                });
+            match said {
+                Ok(()) => return,
+                Err(e) if started.elapsed() > GOODBYE_MAX => {
+                    tracing::warn!("the replay server did not hear the goodbye: {e:#}");
+                    return;
+                }
+                Err(_) => std::thread::sleep(RETRY_PAUSE),
+            }
+        }
+    }
+
+    fn read<H: serde::de::DeserializeOwned>(
+        &self,
+        key: &str,
+        kind: Kind,
+        answer: &ZBytes,
+    ) -> Result<H, SessionError> {
+        let bytes = answer.to_bytes();
+        codec::decode(&bytes, kind, Some(self.spec_hash))
+            .map(|(header, _)| header)
+            .map_err(|e| SessionError::Zenoh {
+                key: key.into(),
+                why: e.to_string(),
+            })
+    }
+}
+
+fn chunk(it: &Outgoing, spec_hash: u64) -> Result<ZBytes, codec::CodecError> {
+    let head = codec::seal(Kind::Chunk, spec_hash, &it.header, &it.planes.to_bytes())?;
+    Ok(session::join_planes(head, it.planes.clone()))
+}
+
+fn claim(it: &Outgoing, spec_hash: u64) -> Result<ZBytes, codec::CodecError> {
+    let ChunkHeader {
+        actor,
+        epoch,
+        sequence,
+        leaving,
+        ..
+    } = it.header;
+    let claim = Claim {
+        actor,
+        epoch,
+        sequence,
+        leaving,
+    };
+    codec::encode(Kind::Claim, spec_hash, &claim, &[]).map(Into::into)
+}

@@ -1,0 +1,45 @@
+//! The action-affinity matrix on its way from the learner to the replay server.
+//! It does not estimate: how A comes about is the learner's.
+
+use serde::{Deserialize, Serialize};
+
+use crate::wire::codec::CodecError;
+
+/// A, row by row: `matrix[i * n + j]` is the softmax over j of q(a_i, a_j); rows sum to 1.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AffinityUpdate {
+    /// Which learner sends it: that of its [`LearnerJoin`](crate::LearnerJoin).
+    pub learner: u64,
+    /// Counts up from 1; an older one than this learner's newest is ignored.
+    pub version: u64,
+    /// Raw actions of the world, the side of the matrix.
+    pub num_actions: u32,
+    /// [n, n] probabilities.
+    pub matrix: Vec<f32>,
+}
+
+impl AffinityUpdate {
+    /// Checks the size and that every entry is a probability.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub fn validate(&self, num_actions: u32) -> Result<(), CodecError> {
+        let n = num_actions as usize;
+        if self.num_actions != num_actions || self.matrix.len() != n * n {
+            return Err(CodecError::Header(format!(
+                "an affinity of {} actions with {} entries; this run has {num_actions} actions",
+                self.num_actions,
+                self.matrix.len()
+            )));
+        }
+        match self.matrix.iter().position(|p| !(0.0..=1.0).contains(p)) {
+            Some(at) => Err(CodecError::Header(format!(
+                "entry ({}, {}) of the affinity is {}, not a probability",
+                at / n,
+                at % n,
+                self.matrix[at]
+            ))),
+            None => Ok(()),
+        }
+    }
+}

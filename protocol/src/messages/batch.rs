@@ -1,0 +1,389 @@
+//! Batches on their way from the replay server to the learner.
+//! It does not sample: which rows and which k are the replay server's choice.
+
+use serde::{Deserialize, Serialize};
+
+use super::{batch_request::Tally, status::Waiting};
+use crate::{
+    run_spec::RunSpec,
+    wire::{
+        buffers::Planes,
+        codec::{self, CodecError, Kind},
+        shared_memory,
+    },
+};
+
+/// Stands where a row has no next action: its transition ended the episode or the level.
+pub const NO_ACTION: u8 = 255;
+
+/// Planes of a batch.
+const PLANES: usize = 9;
+/// Batches that a replay server keeps in shared memory: those that are assembled, on their way, and being copied by the learner.
+pub const POOL_BATCHES: usize = 6;
+
+/// What a batch says of itself.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct BatchHeader {
+    /// Rows, B.
+    pub rows: u32,
+    /// Positives a row, P: 0 without DIM.
+    pub positives: u32,
+    /// Bytes of one state.
+    pub state_bytes: u32,
+    /// What the replay server that drew this had counted then, this batch included.
+    pub tally: Tally,
+    /// Transitions that it held.
+    pub held: u64,
+    /// Mean age of the rows, in transitions stored since.
+    pub mean_age: f64,
+    /// Version of the newest weights that chose an action of this batch, and of the oldest.
+    pub weights_versions: (u64, u64),
+}
+
+impl BatchHeader {
+    /// A batch of `rows` rows of this run, before any row is written.
+    pub fn of(spec: &RunSpec, rows: u32) -> Self {
+        Self {
+            rows,
+            positives: spec.horizon.positives() as u32,
+            state_bytes: spec.state_bytes() as u32,
+            tally: Tally::default(),
+            held: 0,
+            mean_age: 0.0,
+            weights_versions: (0, u64::MAX),
+        }
+    }
+
+    /// Bytes of the shared memory in which a replay server keeps [`POOL_BATCHES`] such batches.
+    pub fn pool_bytes(&self) -> usize {
+        shared_memory::pool_bytes(POOL_BATCHES, self.planes_bytes())
+    }
+
+    /// Bytes of the planes of such a batch.
+    ///
+    /// # Panics
+    /// If they are more than the address space, which no batch of a run is.
+    pub fn planes_bytes(&self) -> usize {
+        planes_bytes(self).expect("a batch is far below the address space")
+    }
+}
+
+/// The answer to a request.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum BatchReply {
+    /// The planes that follow are a batch.
+    Batch(BatchHeader),
+    /// Nothing yet: ask again.
+    Wait(Waiting),
+    /// All transitions are in and all their rows were sampled: stop.
+    Finished,
+    /// Never: the reason, for a person.
+    Refused {
+        /// The reason.
+        why: String,
+    },
+}
+
+/// Rows (s_t, a_t, a_{t+1}, R_t, discount, s_{t+k}, s_{t+n}), as the replay server made them.
+///
+/// Planes, one after the other, B rows each: frames_t, frames_k [P, B, ..], frames_n [B, state bytes]; n-step return f32,
+/// bootstrap discount f32 (little-endian); action, next action, positive valid [P, B], k [P, B] (u8).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Batch {
+    /// What it says of itself.
+    pub header: BatchHeader,
+    planes: Planes,
+}
+
+impl Batch {
+    /// A batch of zeros, to be filled in place.
+    pub fn zeroed(header: BatchHeader) -> Self {
+        let planes = Planes::zeroed(header.planes_bytes());
+        Self { header, planes }
+    }
+
+    /// A batch in memory that may hold anything: every row is to be written with [`Batch::rows_mut`].
+    ///
+    /// # Panics
+    /// If the memory is not of [`BatchHeader::planes_bytes`].
+    pub fn in_memory(header: BatchHeader, planes: Planes) -> Self {
+        assert_eq!(planes.len(), header.planes_bytes(), "memory for a batch");
+        Self { header, planes }
+    }
+
+    /// The rows of all `parts`, one part after the other, in memory that may hold anything; as many bytes as
+    /// [`Batch::merged_header`] says.
+    ///
+    /// # Panics
+    /// If there is no such header, or the memory is of another size.
+    pub fn merge(parts: &[Self], memory: Planes) -> Self {
+        let header = Self::merged_header(parts).expect("parts of one batch");
+        let mut merged = Self::in_memory(header, memory);
+        let offsets = merged.offsets();
+        let mut first_row = 0;
+        for part in parts {
+            for (plane, &offset) in offsets[..PLANES].iter().enumerate() {
+                let per_positive = matches!(plane, 1 | 7 | 8);
+                let blocks = if per_positive { part.positives() } else { 1 };
+                let values = part.plane(plane);
+                let row_bytes = values.len() / (blocks.max(1) * part.rows());
+                for block in 0..blocks {
+                    let from =
+                        &values[block * part.rows() * row_bytes..][..part.rows() * row_bytes];
+                    let row = block * merged.rows() + first_row;
+                    merged.planes[offset + row * row_bytes..][..from.len()].copy_from_slice(from);
+                }
+            }
+            first_row += part.rows();
+        }
+        merged
+    }
+
+    /// The header of [`Batch::merge`]; none if `parts` are none or differ in shape.
+    pub fn merged_header(parts: &[Self]) -> Option<BatchHeader> {
+        let mut merged = parts.first()?.header;
+        let mut age_total = 0.0;
+        (merged.rows, merged.tally, merged.held) = (0, Tally::default(), 0);
+        for BatchHeader {
+            rows,
+            positives,
+            state_bytes,
+            tally,
+            held,
+            mean_age,
+            weights_versions: (newest, oldest),
+        } in parts.iter().map(|part| part.header)
+        {
+            if (positives, state_bytes) != (merged.positives, merged.state_bytes) {
+                return None;
+            }
+            merged.rows += rows;
+            merged.tally = merged.tally + tally;
+            merged.held += held;
+            age_total += mean_age * f64::from(rows);
+            let (a, b) = merged.weights_versions;
+            merged.weights_versions = (a.max(newest), b.min(oldest));
+        }
+        merged.mean_age = age_total / f64::from(merged.rows);
+        Some(merged)
+    }
+
+    /// Rows, B.
+    pub const fn rows(&self) -> usize {
+        self.header.rows as usize
+    }
+
+    /// Positives a row, P.
+    pub const fn positives(&self) -> usize {
+        self.header.positives as usize
+    }
+
+    fn frames_bytes(&self) -> usize {
+        self.rows() * self.header.state_bytes as usize
+    }
+
+    /// Byte offsets of the planes, in their order, and the end.
+    fn offsets(&self) -> [usize; PLANES + 1] {
+        let (rows, positives, frames) = (self.rows(), self.positives(), self.frames_bytes());
+        let lengths = [
+            frames,
+            frames * positives,
+            frames,
+            4 * rows,
+            4 * rows,
+            rows,
+            rows,
+            rows * positives,
+            rows * positives,
+        ];
+        let mut offsets = [0; PLANES + 1];
+        for (i, length) in lengths.iter().enumerate() {
+            offsets[i + 1] = offsets[i] + length;
+        }
+        offsets
+    }
+
+    fn plane(&self, index: usize) -> &[u8] {
+        let offsets = self.offsets();
+        &self.planes[offsets[index]..offsets[index + 1]]
+    }
+
+    fn plane_f32(&self, index: usize) -> Vec<f32> {
+        let value = |b: &[u8]| f32::from_le_bytes(b.try_into().expect("chunks of four"));
+        self.plane(index).chunks_exact(4).map(value).collect()
+    }
+
+    /// s_t [B, state bytes].
+    pub fn frames_t(&self) -> &[u8] {
+        self.plane(0)
+    }
+
+    /// s_{t+k} [P, B, state bytes]; rows without a positive hold zeros.
+    pub fn frames_k(&self) -> &[u8] {
+        self.plane(1)
+    }
+
+    /// s_{t+n} [B, state bytes]; rows that do not bootstrap hold zeros.
+    pub fn frames_n(&self) -> &[u8] {
+        self.plane(2)
+    }
+
+    /// Sum of gamma^i r_{t+i} over i < n, stopped at the episode's end [B].
+    pub fn n_step_returns(&self) -> Vec<f32> {
+        self.plane_f32(3)
+    }
+
+    /// gamma^n, or 0 where the episode ended within the n steps [B].
+    pub fn bootstrap_discounts(&self) -> Vec<f32> {
+        self.plane_f32(4)
+    }
+
+    /// a_t [B].
+    pub fn actions(&self) -> &[u8] {
+        self.plane(5)
+    }
+
+    /// a_{t+1} [B], or [`NO_ACTION`].
+    pub fn next_actions(&self) -> &[u8] {
+        self.plane(6)
+    }
+
+    /// 1 where the row has a positive [P, B].
+    pub fn positive_valid(&self) -> &[u8] {
+        self.plane(7)
+    }
+
+    /// k [P, B], capped at 255; 0 where the row has no positive.
+    pub fn ks(&self) -> &[u8] {
+        self.plane(8)
+    }
+
+    /// Everything of one row, to be written in place.
+    pub fn rows_mut(&mut self) -> BatchRowsMut<'_> {
+        let offsets = self.offsets();
+        let state_bytes = self.header.state_bytes as usize;
+        let rows = self.rows();
+        let mut rest = &mut self.planes[..];
+        let mut take = |i: usize| -> &mut [u8] {
+            let (head, tail) = std::mem::take(&mut rest).split_at_mut(offsets[i + 1] - offsets[i]);
+            rest = tail;
+            head
+        };
+        BatchRowsMut {
+            rows,
+            state_bytes,
+            frames_t: take(0),
+            frames_k: take(1),
+            frames_n: take(2),
+            n_step_return: take(3),
+            bootstrap_discount: take(4),
+            action: take(5),
+            next_action: take(6),
+            positive_valid: take(7),
+            k: take(8),
+        }
+    }
+
+    /// The batch as it travels: prefix and header, then the planes.
+    ///
+    /// # Errors
+    /// A batch over the codec's limits.
+    pub fn seal(self, spec_hash: u64) -> Result<(Vec<u8>, Planes), CodecError> {
+        let head = codec::seal(
+            Kind::BatchReply,
+            spec_hash,
+            &BatchReply::Batch(self.header),
+            &self.planes,
+        )?;
+        Ok((head, self.planes))
+    }
+
+    /// Takes the planes of a decoded reply, checking that they are as long as its header says.
+    ///
+    /// # Errors
+    /// Planes of another length.
+    pub fn from_planes(header: BatchHeader, planes: Planes) -> Result<Self, CodecError> {
+        if planes_bytes(&header) != Some(planes.len()) || header.rows == 0 {
+            return Err(CodecError::Header(format!(
+                "{} rows with {} positives of {} bytes do not fill {} bytes of planes",
+                header.rows,
+                header.positives,
+                header.state_bytes,
+                planes.len()
+            )));
+        }
+        Ok(Self { header, planes })
+    }
+}
+
+fn planes_bytes(header: &BatchHeader) -> Option<usize> {
+    let (rows, positives) = (header.rows as usize, header.positives as usize);
+    let states = (header.state_bytes as usize).checked_mul(positives.checked_add(2)?)?;
+    rows.checked_mul(
+        states
+            .checked_add(10)?
+            .checked_add(positives.checked_mul(2)?)?,
+    )
+}
+
+/// The planes of a batch, borrowed for writing, row by row.
+#[derive(Debug)]
+pub struct BatchRowsMut<'a> {
+    rows: usize,
+    state_bytes: usize,
+    frames_t: &'a mut [u8],
+    frames_k: &'a mut [u8],
+    frames_n: &'a mut [u8],
+    n_step_return: &'a mut [u8],
+    bootstrap_discount: &'a mut [u8],
+    action: &'a mut [u8],
+    next_action: &'a mut [u8],
+    positive_valid: &'a mut [u8],
+    k: &'a mut [u8],
+}
+
+impl BatchRowsMut<'_> {
+    /// Where s_t of `row` is written.
+    pub fn frame_t(&mut self, row: usize) -> &mut [u8] {
+        &mut self.frames_t[row * self.state_bytes..(row + 1) * self.state_bytes]
+    }
+
+    /// Where s_{t+n} of `row` is written; zeros if the row does not bootstrap.
+    pub fn frame_n(&mut self, row: usize) -> &mut [u8] {
+        &mut self.frames_n[row * self.state_bytes..(row + 1) * self.state_bytes]
+    }
+
+    /// Positives a row, P.
+    pub const fn positives(&self) -> usize {
+        self.positive_valid.len() / self.rows
+    }
+
+    /// Marks `row` as having no positive `p`.
+    pub fn no_positive(&mut self, p: usize, row: usize) {
+        self.positive(p, row, 0).fill(0);
+        self.positive_valid[p * self.rows + row] = 0;
+    }
+
+    /// Marks positive `p` of `row` as `k` steps ahead and gives where s_{t+k} is written.
+    pub fn positive(&mut self, p: usize, row: usize, k: u32) -> &mut [u8] {
+        let at = p * self.rows + row;
+        self.positive_valid[at] = 1;
+        self.k[at] = u8::try_from(k).unwrap_or(u8::MAX);
+        &mut self.frames_k[at * self.state_bytes..(at + 1) * self.state_bytes]
+    }
+
+    /// Writes the scalars of `row`.
+    pub fn set(
+        &mut self,
+        row: usize,
+        action: u8,
+        next_action: u8,
+        n_step_return: f32,
+        discount: f32,
+    ) {
+        self.action[row] = action;
+        self.next_action[row] = next_action;
+        self.n_step_return[4 * row..4 * row + 4].copy_from_slice(&n_step_return.to_le_bytes());
+        self.bootstrap_discount[4 * row..4 * row + 4].copy_from_slice(&discount.to_le_bytes());
+    }
+}

@@ -1,0 +1,80 @@
+//! The learner's request for a batch, and how one that repeats another is told from a new one.
+//! Which rows a batch has is the replay server's choice.
+
+use serde::{Deserialize, Serialize};
+
+/// The learner's request.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct BatchRequest {
+    /// Which learner asks: that of its [`LearnerJoin`](crate::LearnerJoin).
+    pub learner: u64,
+    /// Which request this is.
+    pub id: RequestId,
+    /// Rows wanted, B.
+    pub rows: u32,
+    /// Whether the batch may come through shared memory.
+    pub shared_memory: bool,
+    /// Where the replay has several shards: what all the others have counted together, and these rows are part of a batch.
+    pub elsewhere: Option<Tally>,
+}
+
+/// Tells a request that repeats another from a new one: a batch that did not arrive must not count as sampled.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RequestId {
+    /// Who asks: a random number, which tells it from all others. It waits for one request at a time.
+    pub asker: u64,
+    /// How many requests of this asker were answered before.
+    pub number: u64,
+    /// Which attempt at this one it is: a later one has a higher number.
+    pub attempt: u64,
+}
+
+impl RequestId {
+    /// The first request of an asker.
+    pub const fn first(asker: u64) -> Self {
+        Self {
+            asker,
+            number: 0,
+            attempt: 0,
+        }
+    }
+
+    /// The same request, sent once more.
+    #[must_use]
+    pub const fn again(self) -> Self {
+        Self {
+            attempt: self.attempt + 1,
+            ..self
+        }
+    }
+
+    /// The request after this one, which was answered.
+    #[must_use]
+    pub const fn next(self) -> Self {
+        Self {
+            number: self.number + 1,
+            attempt: 0,
+            ..self
+        }
+    }
+}
+
+/// What the rate limiter counts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Tally {
+    /// Transitions stored.
+    pub inserted: u64,
+    /// Rows sampled.
+    pub rows_sampled: u64,
+}
+
+impl std::ops::Add for Tally {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            inserted: self.inserted.saturating_add(other.inserted),
+            rows_sampled: self.rows_sampled.saturating_add(other.rows_sampled),
+        }
+    }
+}

@@ -1,0 +1,239 @@
+//! Transitions on their way from an actor to the replay server.
+//! It does not decide what is stored: exactly-once and order are the replay server's.
+
+use serde::{Deserialize, Serialize};
+
+use crate::wire::{
+    buffers::{Planes, PlanesPool},
+    codec::{self, CodecError, Kind},
+};
+
+/// Bytes of one transition in a chunk beside its frame: an action, an end and a reward.
+pub const TRANSITION_BYTES: usize = 1 + 1 + 4;
+
+/// What a step ended, if anything.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[repr(u8)]
+pub enum End {
+    /// Nothing.
+    Running = 0,
+    /// A level: a boundary for DIM, not for the return.
+    LevelChange = 1,
+    /// The episode, by its step limit.
+    TimedOut = 2,
+    /// The episode.
+    Terminal = 3,
+}
+
+impl End {
+    /// The end that `byte` stands for.
+    pub const fn from_byte(byte: u8) -> Option<Self> {
+        match byte {
+            0 => Some(Self::Running),
+            1 => Some(Self::LevelChange),
+            2 => Some(Self::TimedOut),
+            3 => Some(Self::Terminal),
+            _ => None,
+        }
+    }
+
+    /// Whether the episode is over, for whatever reason.
+    pub const fn is_episode_end(self) -> bool {
+        matches!(self, Self::TimedOut | Self::Terminal)
+    }
+}
+
+/// What a chunk says of itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ChunkHeader {
+    /// Which actor, unique in the run.
+    pub actor: u32,
+    /// Which life of that actor: drawn anew at each start.
+    pub epoch: u64,
+    /// Number of the chunk within the epoch, from 0.
+    pub sequence: u64,
+    /// Transitions that this epoch produced before this chunk: the second count, by which loss shows.
+    pub first_transition: u64,
+    /// The weights that chose every action of this chunk; 0 before the first.
+    pub weights_version: u64,
+    /// The actor was told to stop and sends what it has left: the rate limiter lets it pass.
+    pub leaving: bool,
+    /// Copies of the world, each a stream of its own.
+    pub streams: u32,
+    /// Consecutive steps of each stream in this chunk.
+    pub steps: u32,
+    /// Bytes of one frame.
+    pub frame_bytes: u32,
+}
+
+impl ChunkHeader {
+    /// Transitions in the chunk.
+    pub const fn transitions(&self) -> usize {
+        self.streams as usize * self.steps as usize
+    }
+
+    /// Bytes of the planes of such a chunk; none if they are more than the address space.
+    pub fn planes_bytes(&self) -> Option<usize> {
+        self.transitions()
+            .checked_mul(self.frame_bytes as usize + TRANSITION_BYTES)
+    }
+}
+
+/// Consecutive steps of several streams: row `stream * steps + step` is (s_t, a_t, r_t, what a_t ended).
+///
+/// Planes, one after the other: frames [rows, frame bytes], actions [rows], ends [rows], rewards [rows] f32 little-endian.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Chunk {
+    /// What it says of itself.
+    pub header: ChunkHeader,
+    planes: Planes,
+}
+
+impl Chunk {
+    /// A chunk of zeros, to be filled in place.
+    pub fn zeroed(header: ChunkHeader) -> Self {
+        let bytes = header
+            .planes_bytes()
+            .expect("an actor's chunk is far below the address space");
+        Self {
+            header,
+            planes: Planes::zeroed(bytes),
+        }
+    }
+
+    /// A chunk in memory that may hold anything: every row is to be written.
+    ///
+    /// # Panics
+    /// If the memory is not of [`ChunkHeader::planes_bytes`].
+    pub fn in_memory(header: ChunkHeader, planes: Planes) -> Self {
+        assert_eq!(
+            Some(planes.len()),
+            header.planes_bytes(),
+            "memory for a chunk"
+        );
+        Self { header, planes }
+    }
+
+    fn rows(&self) -> usize {
+        self.header.transitions()
+    }
+
+    fn frames_end(&self) -> usize {
+        self.rows() * self.header.frame_bytes as usize
+    }
+
+    /// Frames [rows, frame bytes].
+    pub fn frames(&self) -> &[u8] {
+        &self.planes[..self.frames_end()]
+    }
+
+    /// Actions [rows].
+    pub fn actions(&self) -> &[u8] {
+        let start = self.frames_end();
+        &self.planes[start..start + self.rows()]
+    }
+
+    /// Ends [rows], as bytes of [`End`].
+    pub fn ends(&self) -> &[u8] {
+        let start = self.frames_end() + self.rows();
+        &self.planes[start..start + self.rows()]
+    }
+
+    /// The end of one row; every byte was checked when the chunk was made or decoded.
+    pub fn end(&self, row: usize) -> End {
+        End::from_byte(self.ends()[row]).expect("checked when the chunk was decoded")
+    }
+
+    /// The reward of one row.
+    pub fn reward(&self, row: usize) -> f32 {
+        let at = self.frames_end() + 2 * self.rows() + 4 * row;
+        f32::from_le_bytes(self.planes[at..at + 4].try_into().expect("four bytes"))
+    }
+
+    /// Where row's frame is written.
+    pub fn frame_mut(&mut self, row: usize) -> &mut [u8] {
+        let bytes = self.header.frame_bytes as usize;
+        &mut self.planes[row * bytes..(row + 1) * bytes]
+    }
+
+    /// Writes everything of one row but its frame.
+    pub fn set(&mut self, row: usize, action: u8, reward: f32, end: End) {
+        let (rows, frames_end) = (self.rows(), self.frames_end());
+        assert!(row < rows, "row {row} of a chunk of {rows}");
+        self.planes[frames_end + row] = action;
+        self.planes[frames_end + rows + row] = end as u8;
+        let at = frames_end + 2 * rows + 4 * row;
+        self.planes[at..at + 4].copy_from_slice(&reward.to_le_bytes());
+    }
+
+    /// The chunk as it travels: prefix and header, then the planes, uncopied.
+    ///
+    /// # Errors
+    /// A chunk over the codec's limits.
+    pub fn seal(&self, spec_hash: u64) -> Result<(Vec<u8>, &[u8]), CodecError> {
+        Ok((
+            codec::seal(Kind::Chunk, spec_hash, &self.header, &self.planes)?,
+            &self.planes,
+        ))
+    }
+
+    /// The planes, to travel after a head from [`Chunk::seal`].
+    pub fn into_planes(self) -> Planes {
+        self.planes
+    }
+
+    /// Reads a chunk in one piece and checks lengths, actions, ends and rewards.
+    ///
+    /// # Errors
+    /// Whatever makes it unfit to be stored; the message says what.
+    pub fn decode(bytes: &[u8], spec_hash: u64, num_actions: u32) -> Result<Self, CodecError> {
+        let (header, planes) = codec::decode(bytes, Kind::Chunk, Some(spec_hash))?;
+        Self::checked(header, planes.to_vec().into(), num_actions)
+    }
+
+    /// [`Chunk::decode`] of a message in `pieces`, `len` bytes in all; the chunk lies in own memory of `pool`.
+    ///
+    /// # Errors
+    /// As [`Chunk::decode`].
+    pub fn receive<'a>(
+        pieces: impl IntoIterator<Item = &'a [u8]>,
+        len: usize,
+        pool: &PlanesPool,
+        spec_hash: u64,
+        num_actions: u32,
+    ) -> Result<Self, CodecError> {
+        let (header, planes) = codec::receive(pieces, len, pool, Kind::Chunk, Some(spec_hash))?;
+        Self::checked(header, planes, num_actions)
+    }
+
+    fn checked(header: ChunkHeader, planes: Planes, num_actions: u32) -> Result<Self, CodecError> {
+        if header.planes_bytes() != Some(planes.len()) || header.transitions() == 0 {
+            return Err(CodecError::Header(format!(
+                "{} streams of {} steps of {} bytes do not fill {} bytes of planes",
+                header.streams,
+                header.steps,
+                header.frame_bytes,
+                planes.len()
+            )));
+        }
+        let chunk = Self { header, planes };
+        if let Some(action) = chunk
+            .actions()
+            .iter()
+            .find(|&&a| u32::from(a) >= num_actions)
+        {
+            return Err(CodecError::Header(format!(
+                "action {action} of {num_actions}"
+            )));
+        }
+        if let Some(end) = chunk.ends().iter().find(|&&e| End::from_byte(e).is_none()) {
+            return Err(CodecError::Header(format!("end {end} is none that exists")));
+        }
+        if let Some(row) = (0..chunk.rows()).find(|&row| !chunk.reward(row).is_finite()) {
+            return Err(CodecError::Header(format!(
+                "the reward of row {row} is not finite"
+            )));
+        }
+        Ok(chunk)
+    }
+}

@@ -1,0 +1,23 @@
+//! What a part that joins a run is told first: the run's settings, and how far the run is.
+//! What it then does with them is its own.
+
+use serde::{Deserialize, Serialize};
+
+use super::batch_request::Tally;
+
+/// What a joining part needs: the run's resolved settings, from the replay server.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Hello {
+    /// The resolved configuration, TOML.
+    pub config_toml: String,
+    /// Transitions that the run has stored, for the exploration schedule.
+    pub inserted_total: u64,
+    /// What this replay server has counted by itself.
+    pub tally: Tally,
+    /// Updates after which the run goes on, if it was resumed; 0 in a run from its start.
+    pub after_updates: u64,
+    /// Which of the replay's shards this is, from 0, and how many there are.
+    pub shard: (u32, u32),
+    /// Whether chunks may come through shared memory: the replay server can read it.
+    pub shared_memory: bool,
+}

@@ -1,0 +1,46 @@
+//! Taking part in a run, as an actor or as its learner, and the answer.
+//! It does not start or stop processes: that is the launcher's.
+
+use serde::{Deserialize, Serialize};
+
+/// An actor starts: from now on the replay server takes its chunks. The same one may be sent any number of times.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ActorJoin {
+    /// Which actor, unique in the run.
+    pub actor: u32,
+    /// Which life of it: a random number, drawn anew at each start.
+    pub epoch: u64,
+}
+
+/// A learner starts: from now on the replay server serves it, and it alone. The same one may be sent any number of times.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LearnerJoin {
+    /// Which learner: a random number, drawn anew at each start. All its messages carry it.
+    pub learner: u64,
+    /// Rows of this shard that it has learned from. Rows served beyond them, to a learner that died, are served again.
+    pub rows_sampled: u64,
+}
+
+/// The replay server's answer to a part that joins.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum JoinReply {
+    /// It takes part.
+    Welcome {
+        /// Transitions that the run has stored.
+        inserted_total: u64,
+        /// Version of the newest weights that the replay server has; 0 before the first.
+        weights_version: u64,
+        /// Lives of this actor that were there before this one; 0 for a learner.
+        earlier_lives: u32,
+    },
+    /// Another process plays this part and is connected: ask again, it may be about to end.
+    Taken {
+        /// Who, for a person.
+        why: String,
+    },
+    /// Never: the reason, for a person.
+    Refused {
+        /// The reason.
+        why: String,
+    },
+}

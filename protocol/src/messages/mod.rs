@@ -1,0 +1,13 @@
+//! Everything that is sent, one file a message.
+//! How a message becomes bytes is `wire`'s business, who answers it the parts'.
+
+pub(crate) mod affinity;
+pub(crate) mod batch;
+pub(crate) mod batch_request;
+pub(crate) mod chunk;
+pub(crate) mod goodbye;
+pub(crate) mod hello;
+pub(crate) mod insert_reply;
+pub(crate) mod join;
+pub(crate) mod status;
+pub(crate) mod weights;

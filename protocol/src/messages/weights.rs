@@ -1,0 +1,224 @@
+//! Weights on their way: whole from the learner to the replay server, once a version; in pieces from there to the actors.
+//! It does not read them: the planes are a safetensors file, which `driml-model` knows.
+//!
+//! Pieces, because a message has to be through within seconds (see `session`): a slow link gets the weights later, not never.
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::wire::codec::{self, CodecError, Kind, PLANES_BYTES_MAX};
+
+/// Bytes of weights in one message to an actor; the last piece has fewer.
+pub const PIECE_BYTES: usize = 1 << 18;
+
+/// "These are the newest weights": small, sent at each new version.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WeightsVersion {
+    /// Counts up from 1.
+    pub version: u64,
+}
+
+/// What weights say of themselves.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WeightsHeader {
+    /// Counts up from 1.
+    pub version: u64,
+    /// Updates behind these weights.
+    pub updates: u64,
+    /// SHA-256 of the safetensors file.
+    pub sha256: [u8; 32],
+}
+
+/// New weights on their way to the replay server; the planes are a safetensors file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WeightsUpload {
+    /// Which learner sends them: that of its [`LearnerJoin`](crate::LearnerJoin).
+    pub learner: u64,
+    /// What they say of themselves.
+    pub weights: WeightsHeader,
+}
+
+/// An actor's question.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum WeightsRequest {
+    /// The first piece of the newest weights, if their version is above this one.
+    NewerThan(u64),
+    /// The piece of these weights that starts at `offset`.
+    Piece {
+        /// Which weights.
+        version: u64,
+        /// Byte of the safetensors file, a multiple of [`PIECE_BYTES`].
+        offset: u64,
+    },
+}
+
+/// The answer to a [`WeightsRequest`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum WeightsReply {
+    /// There are no newer weights.
+    NoneNewer,
+    /// These weights are no longer kept, or have no such piece: ask for the newest.
+    Gone,
+    /// The planes that follow are a piece of these weights.
+    Piece {
+        /// What the whole says of itself.
+        weights: WeightsHeader,
+        /// Bytes of the whole safetensors file.
+        bytes: u64,
+        /// Byte at which the piece starts.
+        offset: u64,
+    },
+}
+
+impl WeightsHeader {
+    /// Describes `safetensors`.
+    pub fn new(version: u64, updates: u64, safetensors: &[u8]) -> Self {
+        Self {
+            version,
+            updates,
+            sha256: Sha256::digest(safetensors).into(),
+        }
+    }
+
+    /// The hash in hexadecimal.
+    pub fn sha256_hex(&self) -> String {
+        self.sha256.iter().map(|b| format!("{b:02x}")).collect()
+    }
+
+    /// Checks that `safetensors` is what this describes.
+    ///
+    /// # Errors
+    /// It has another SHA-256.
+    pub fn check(&self, safetensors: &[u8]) -> Result<(), CodecError> {
+        if self.sha256 == <[u8; 32]>::from(Sha256::digest(safetensors)) {
+            Ok(())
+        } else {
+            Err(CodecError::Header(
+                "the weights' SHA-256 is not the one announced".into(),
+            ))
+        }
+    }
+}
+
+impl WeightsUpload {
+    /// Reads an upload and checks the hash of its planes.
+    ///
+    /// # Errors
+    /// A damaged or foreign message, or planes that are not what the header describes.
+    pub fn decode(bytes: &[u8], spec_hash: u64) -> Result<(Self, &[u8]), CodecError> {
+        let (upload, planes): (Self, _) =
+            codec::decode(bytes, Kind::WeightsUpload, Some(spec_hash))?;
+        upload.weights.check(planes)?;
+        Ok((upload, planes))
+    }
+}
+
+/// Weights of which the first pieces have come.
+#[derive(Debug)]
+pub struct Assembly {
+    weights: WeightsHeader,
+    bytes: usize,
+    have: Vec<u8>,
+}
+
+impl Assembly {
+    /// Weights of which nothing has come yet, `bytes` bytes in all.
+    ///
+    /// # Errors
+    /// More bytes than any weights have.
+    pub fn new(weights: WeightsHeader, bytes: u64) -> Result<Self, CodecError> {
+        let max = PLANES_BYTES_MAX;
+        let bytes = usize::try_from(bytes).unwrap_or(usize::MAX);
+        if bytes > max {
+            return Err(CodecError::TooLarge { have: bytes, max });
+        }
+        Ok(Self {
+            weights,
+            bytes,
+            have: Vec::new(),
+        })
+    }
+
+    /// Takes the next piece.
+    ///
+    /// # Errors
+    /// A piece of other weights, or one that is not the next: nothing of it is taken.
+    pub fn take(
+        &mut self,
+        weights: WeightsHeader,
+        offset: u64,
+        piece: &[u8],
+    ) -> Result<(), CodecError> {
+        let left = self.bytes - self.have.len();
+        if weights != self.weights
+            || offset != self.next_offset()
+            || piece.len() != left.min(PIECE_BYTES)
+        {
+            return Err(CodecError::Header(format!(
+                "{} bytes at {offset} of weights {} came where {} at {} of weights {} are due",
+                piece.len(),
+                weights.version,
+                left.min(PIECE_BYTES),
+                self.next_offset(),
+                self.weights.version
+            )));
+        }
+        self.have.extend_from_slice(piece);
+        Ok(())
+    }
+
+    /// Byte at which the next piece starts.
+    pub const fn next_offset(&self) -> u64 {
+        self.have.len() as u64
+    }
+
+    /// Bytes of the whole.
+    pub const fn bytes(&self) -> u64 {
+        self.bytes as u64
+    }
+
+    /// Whether all pieces have come.
+    pub const fn is_whole(&self) -> bool {
+        self.have.len() == self.bytes
+    }
+
+    /// The whole safetensors file.
+    ///
+    /// # Errors
+    /// It is not what the header describes.
+    pub fn finish(self) -> Result<(WeightsHeader, Vec<u8>), CodecError> {
+        self.weights.check(&self.have)?;
+        Ok((self.weights, self.have))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pieces_make_the_whole_in_their_order_alone() {
+        let file: Vec<u8> = (0..PIECE_BYTES + 10).map(|i| (i % 251) as u8).collect();
+        let weights = WeightsHeader::new(3, 7, &file);
+        let mut assembly = Assembly::new(weights, file.len() as u64).unwrap();
+        let (first, second) = file.split_at(PIECE_BYTES);
+        let at = PIECE_BYTES as u64;
+        assert!(assembly.take(weights, at, second).is_err(), "not its turn");
+        assert!(assembly.take(weights, 0, &first[1..]).is_err(), "too short");
+        let other = WeightsHeader {
+            version: 4,
+            ..weights
+        };
+        assert!(assembly.take(other, 0, first).is_err(), "of other weights");
+        assembly.take(weights, 0, first).unwrap();
+        assert!(!assembly.is_whole());
+        assembly.take(weights, at, second).unwrap();
+        assert!(assembly.is_whole());
+        assert_eq!(assembly.finish().unwrap(), (weights, file.clone()));
+
+        let mut damaged = Assembly::new(weights, 10).unwrap();
+        damaged.take(weights, 0, second).unwrap();
+        assert!(damaged.finish().is_err(), "another SHA-256");
+        assert!(Assembly::new(weights, u64::MAX).is_err());
+    }
+}

@@ -1,0 +1,8 @@
+//! What every process of a run needs beside messages: when to end, how to write a file, how seldom to log.
+//! It sends nothing.
+
+pub mod end_signs;
+pub mod fault;
+pub(crate) mod seldom;
+pub(crate) mod shutdown;
+pub mod whole_file;

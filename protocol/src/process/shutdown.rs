@@ -1,0 +1,98 @@
+//! The flag by which the threads of a process learn that it should stop.
+//! Draining and saving are each part's own; what raises the flag from outside is in `end_signs`.
+
+use std::{
+    ops::ControlFlow,
+    sync::{Arc, Condvar, Mutex},
+    thread::JoinHandle,
+    time::{Duration, Instant},
+};
+
+use super::end_signs;
+
+/// A flag that is raised once and never lowered; clones share it.
+#[derive(Clone, Debug, Default)]
+pub struct Shutdown {
+    state: Arc<(Mutex<bool>, Condvar)>,
+}
+
+impl Shutdown {
+    /// Raises the flag.
+    pub fn set(&self) {
+        *self.flag() = true;
+        self.state.1.notify_all();
+    }
+
+    /// Whether the flag is raised.
+    pub fn is_set(&self) -> bool {
+        *self.flag()
+    }
+
+    /// Sleeps for `timeout`, or until the flag is raised; returns whether it is.
+    pub fn wait_timeout(&self, timeout: Duration) -> bool {
+        let (flag, _) = self
+            .state
+            .1
+            .wait_timeout_while(self.flag(), timeout, |set| !*set)
+            .expect("no thread panics while holding the flag");
+        *flag
+    }
+
+    /// Sleeps until the flag is raised.
+    pub fn wait(&self) {
+        while !self.wait_timeout(Duration::from_secs(3600)) {}
+    }
+
+    fn flag(&self) -> std::sync::MutexGuard<'_, bool> {
+        self.state
+            .0
+            .lock()
+            .expect("no thread panics while holding the flag")
+    }
+
+    /// A flag that is raised at the first sign that this process should end: a signal, or that nobody watches it any more. The
+    /// death of the process `parent` is one.
+    ///
+    /// # Errors
+    /// As [`end_signs::listen`].
+    pub fn on_signals(parent: Option<u32>) -> std::io::Result<Self> {
+        let shutdown = Self::default();
+        let raised = shutdown.clone();
+        end_signs::listen("signals", parent, move |_| {
+            raised.set();
+            ControlFlow::Break(())
+        })?;
+        Ok(shutdown)
+    }
+}
+
+/// Waits until all of `threads` have ended, at most for `wait_max`.
+///
+/// A thread that still runs while the process ends may find memory gone that it shares with others.
+pub fn join_within(threads: impl IntoIterator<Item = JoinHandle<()>>, wait_max: Duration) {
+    let started = Instant::now();
+    for thread in threads {
+        while !thread.is_finished() && started.elapsed() < wait_max {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        if thread.is_finished() && thread.join().is_err() {
+            tracing::error!("a thread had panicked");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn waiting_ends_when_the_flag_is_raised() {
+        let shutdown = Shutdown::default();
+        assert!(!shutdown.wait_timeout(Duration::from_millis(1)));
+        let other = shutdown.clone();
+        let waiter = std::thread::spawn(move || other.wait());
+        shutdown.set();
+        waiter.join().unwrap();
+        assert!(shutdown.is_set());
+    }
+}

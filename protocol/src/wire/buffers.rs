@@ -1,0 +1,283 @@
+//! Memory for the long planes of messages: used again and again, and shared with the other side where both are on one host.
+//! It does not know what is in it, and a message fares the same in either kind of memory.
+//!
+//! Fresh memory costs a page fault every 4 KiB, more than filling it. Shared memory saves the trip through a socket, but a
+//! receiver may lose it (zenoh takes it back from a process that seems dead), so receivers copy before they check.
+
+use std::{
+    fmt,
+    ops::{Deref, DerefMut},
+    sync::{Arc, Mutex, PoisonError},
+};
+
+use zenoh::{
+    Wait,
+    bytes::ZBytes,
+    shm::{
+        Defragment, GarbageCollect, PosixShmProviderBackend, ShmProvider, ShmProviderBuilder,
+        ZShmMut,
+    },
+};
+
+use super::shared_memory::{self, Trust};
+
+/// Where the operating system keeps shared memory.
+const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
+
+/// The bytes of a message's planes. Clones have memory of their own.
+pub struct Planes(Memory);
+
+enum Memory {
+    /// Given back to the pool, if there is one.
+    Own(Vec<u8>, Option<Arc<Pool>>),
+    Shared(ZShmMut),
+}
+
+struct Pool {
+    spare: Mutex<Vec<Vec<u8>>>,
+    spare_max: usize,
+    shared: Option<Shared>,
+}
+
+struct Shared {
+    provider: ShmProvider<PosixShmProviderBackend>,
+    trust: Mutex<Trust>,
+}
+
+/// A source of [`Planes`]; clones are the same source.
+#[derive(Clone)]
+pub struct PlanesPool(Arc<Pool>);
+
+impl PlanesPool {
+    /// Memory of this process alone, of which `spare_max` pieces are kept for later use.
+    pub fn new(spare_max: usize) -> Self {
+        Self::with(spare_max, None)
+    }
+
+    /// As [`PlanesPool::new`], with shared memory for `count` pieces of `bytes` each; where the machine does not grant it,
+    /// a warning says so and everything works without.
+    pub fn shared(spare_max: usize, count: usize, bytes: usize) -> Self {
+        let shared = match provider(shared_memory::pool_bytes(count, bytes)) {
+            Ok(provider) => Some(Shared {
+                provider,
+                trust: Mutex::default(),
+            }),
+            Err(why) => {
+                tracing::warn!(
+                    "no shared memory, so messages go through sockets, which is slower: {why}; \
+                     --set transport.shared_memory=false asks for none"
+                );
+                None
+            }
+        };
+        Self::with(spare_max, shared)
+    }
+
+    fn with(spare_max: usize, shared: Option<Shared>) -> Self {
+        Self(Arc::new(Pool {
+            spare: Mutex::default(),
+            spare_max,
+            shared,
+        }))
+    }
+
+    /// `bytes` bytes of this process's own memory, with whatever was in them before.
+    pub fn take_own(&self, bytes: usize) -> Planes {
+        let spare = self
+            .0
+            .spare
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .pop();
+        let mut vec = spare.unwrap_or_default();
+        vec.resize(bytes, 0);
+        Planes(Memory::Own(vec, Some(self.0.clone())))
+    }
+
+    /// `bytes` bytes with whatever was in them before: shared with others on this host if there is any, else
+    /// [`PlanesPool::take_own`].
+    pub fn take(&self, bytes: usize) -> Planes {
+        match self.0.shared.as_ref().and_then(|shared| shared.take(bytes)) {
+            Some(shared) => Planes(Memory::Shared(shared)),
+            None => self.take_own(bytes),
+        }
+    }
+
+    /// Tells that a message in shared memory did not arrive: the next ones are made of own memory.
+    pub fn avoid_shared_memory(&self) {
+        if let Some(shared) = &self.0.shared {
+            shared.trust().lost();
+        }
+    }
+
+    /// Tells that a message in shared memory has arrived.
+    pub fn shared_memory_works(&self) {
+        if let Some(shared) = &self.0.shared {
+            shared.trust().worked();
+        }
+    }
+}
+
+impl Shared {
+    fn trust(&self) -> std::sync::MutexGuard<'_, Trust> {
+        self.trust.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Never waits: a receiver that died may keep its pieces for a while.
+    fn take(&self, bytes: usize) -> Option<ZShmMut> {
+        if !self.trust().ask() {
+            return None;
+        }
+        let taken = self
+            .provider
+            .alloc(bytes)
+            .with_policy::<Defragment<GarbageCollect>>()
+            .wait();
+        if let Err(e) = &taken {
+            tracing::debug!("{bytes} bytes of shared memory are not free: {e:?}");
+        }
+        taken.ok()
+    }
+}
+
+/// A pool of `bytes` bytes of shared memory, or why there is none.
+fn provider(bytes: usize) -> Result<ShmProvider<PosixShmProviderBackend>, String> {
+    // The system would grant more than there is, and kill the process that writes to it.
+    let free = nix::sys::statvfs::statvfs(SHARED_MEMORY_FOLDER)
+        .map(|it| it.blocks_available().saturating_mul(it.fragment_size()))
+        .map_err(|e| format!("{SHARED_MEMORY_FOLDER}: {e}"))?;
+    if free < bytes as u64 {
+        return Err(format!(
+            "{SHARED_MEMORY_FOLDER} has {free} bytes free, {bytes} are needed (a container needs --shm-size)"
+        ));
+    }
+    shared_memory::check_lockable(bytes)?;
+    ShmProviderBuilder::default_backend(bytes)
+        .wait()
+        .map_err(|e| e.to_string())
+}
+
+impl Planes {
+    /// `bytes` zeros in memory of their own.
+    pub fn zeroed(bytes: usize) -> Self {
+        Self::from(vec![0; bytes])
+    }
+
+    /// Whether they lie in memory that others on this host can read.
+    pub const fn are_shared(&self) -> bool {
+        matches!(self.0, Memory::Shared(_))
+    }
+
+    /// The bytes as they travel, not copied. Own memory goes back to its pool when the last clone is dropped.
+    pub fn freeze(mut self) -> ZBytes {
+        match std::mem::replace(&mut self.0, Memory::Own(Vec::new(), None)) {
+            Memory::Shared(shared) => ZBytes::from(shared),
+            own => ZBytes::from(bytes::Bytes::from_owner(Self(own))),
+        }
+    }
+}
+
+impl From<Vec<u8>> for Planes {
+    fn from(bytes: Vec<u8>) -> Self {
+        Self(Memory::Own(bytes, None))
+    }
+}
+
+impl Drop for Planes {
+    fn drop(&mut self) {
+        if let Memory::Own(bytes, Some(pool)) = &mut self.0 {
+            let mut spare = pool.spare.lock().unwrap_or_else(PoisonError::into_inner);
+            if spare.len() < pool.spare_max {
+                spare.push(std::mem::take(bytes));
+            }
+        }
+    }
+}
+
+impl Deref for Planes {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        match &self.0 {
+            Memory::Own(bytes, _) => bytes,
+            Memory::Shared(bytes) => bytes,
+        }
+    }
+}
+
+impl DerefMut for Planes {
+    fn deref_mut(&mut self) -> &mut [u8] {
+        match &mut self.0 {
+            Memory::Own(bytes, _) => bytes,
+            Memory::Shared(bytes) => bytes,
+        }
+    }
+}
+
+impl AsRef<[u8]> for Planes {
+    fn as_ref(&self) -> &[u8] {
+        self
+    }
+}
+
+impl Clone for Planes {
+    fn clone(&self) -> Self {
+        Self::from(self.to_vec())
+    }
+}
+
+impl PartialEq for Planes {
+    fn eq(&self, other: &Self) -> bool {
+        **self == **other
+    }
+}
+
+impl fmt::Debug for Planes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Planes({} bytes)", self.len())
+    }
+}
+
+impl fmt::Debug for PlanesPool {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("PlanesPool").finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn own_memory_comes_back_also_from_the_wire() {
+        let pool = PlanesPool::new(1);
+        let mut planes = pool.take_own(5);
+        planes.copy_from_slice(b"abcde");
+        let address = planes.as_ptr();
+        let (sent, again) = (planes.freeze(), pool.take_own(5));
+        assert_ne!(again.as_ptr(), address);
+        assert_eq!(sent.to_bytes(), &b"abcde"[..]);
+        drop((sent.clone(), again, sent));
+        // One piece is kept: the first that came back.
+        assert_eq!(pool.0.spare.lock().unwrap().len(), 1);
+        assert_eq!(pool.take_own(3).len(), 3);
+    }
+
+    #[test]
+    fn shared_memory_is_avoided_after_a_loss_and_never_waited_for() {
+        let pool = PlanesPool::shared(4, 2, 1_000_000);
+        if pool.0.shared.is_none() {
+            // This machine grants none: then there is nothing but own memory.
+            assert!(!pool.take(1_000_000).are_shared());
+            return;
+        }
+        let pieces: Vec<_> = (0..8).map(|_| pool.take(1_000_000)).collect();
+        assert!(pieces[0].are_shared() && pieces[1].are_shared() && !pieces[7].are_shared());
+        drop(pieces);
+        pool.avoid_shared_memory();
+        assert!(!pool.take(1_000_000).are_shared());
+        while !pool.take(1_000_000).are_shared() {}
+        pool.avoid_shared_memory();
+        assert!((0..1_000).all(|_| !pool.take(1_000_000).are_shared()));
+    }
+}

@@ -1,0 +1,251 @@
+//! Exactly once: which life of each actor counts, which chunk it sends next, what it says it produced, where its streams stand.
+//! It stores no transitions, answers nothing itself and does not know who is connected.
+
+use std::collections::{HashMap, VecDeque};
+
+use driml_protocol::{ActorJoin, ChunkHeader, Claim, Goodbye};
+
+use crate::storage::ring::Link;
+
+/// Most actors a run may ever have; a further one is refused, the known ones go on.
+pub const ACTORS_MAX: usize = 4096;
+/// Most streams of one actor; a chunk with more is refused.
+pub const STREAMS_MAX: u32 = 4096;
+/// Past lives remembered for each actor; what an older one still says is ignored.
+const PAST_LIVES_MAX: usize = 64;
+
+/// One copy of an actor's world.
+pub(crate) struct Stream {
+    /// How its next transition hangs together with the last.
+    pub(crate) link: Link,
+    /// Undiscounted return of the episode so far; none if a part of the episode was lost.
+    pub(crate) episode_return: Option<f64>,
+}
+
+/// What is counted of one life of an actor.
+#[derive(Clone, Copy)]
+struct Count {
+    epoch: u64,
+    /// Transitions it has produced by its own account, as far as heard.
+    produced: u64,
+    said_goodbye: bool,
+}
+
+impl Count {
+    /// Takes the last word of this life and gives the difference that it reveals; a second one reveals nothing.
+    fn goodbye(&mut self, produced: u64) -> Difference {
+        if std::mem::replace(&mut self.said_goodbye, true) {
+            return Difference::default();
+        }
+        Difference::between(produced, std::mem::replace(&mut self.produced, produced))
+    }
+}
+
+struct Actor {
+    current: Count,
+    /// Number of the chunk that comes next in the current life.
+    expected: u64,
+    streams: Vec<Stream>,
+    past: VecDeque<Count>,
+    /// Lives before the current one, forgotten ones too.
+    earlier_lives: u32,
+}
+
+/// What is to be done with a chunk.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Verdict {
+    /// The next of its actor: store it.
+    Next,
+    /// Stored already.
+    Retried,
+    /// Chunks before this one are missing.
+    OutOfOrder { expected: u64 },
+    /// Not to be stored, ever.
+    Refused(String),
+}
+
+/// How two counts of the same transitions differ.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Difference {
+    /// Produced, never stored.
+    pub(crate) lost: u64,
+    /// Stored, never produced.
+    pub(crate) duplicated: u64,
+}
+
+impl Difference {
+    const fn between(produced: u64, stored: u64) -> Self {
+        Self {
+            lost: produced.saturating_sub(stored),
+            duplicated: stored.saturating_sub(produced),
+        }
+    }
+}
+
+/// All actors that ever joined.
+#[derive(Default)]
+pub(crate) struct Actors {
+    actors: HashMap<u32, Actor>,
+}
+
+impl Actors {
+    /// Makes `join.epoch` the life that counts of its actor; the same one may be named again.
+    ///
+    /// # Errors
+    /// One actor more than a run may have, or a life that another one has replaced; the reason, for a person.
+    pub(crate) fn join(&mut self, join: ActorJoin) -> Result<(), String> {
+        let ActorJoin { actor, epoch } = join;
+        let fresh = Count {
+            epoch,
+            produced: 0,
+            said_goodbye: false,
+        };
+        if let Some(known) = self.actors.get_mut(&actor) {
+            if known.current.epoch == epoch {
+                return Ok(());
+            }
+            if known.past.iter().any(|past| past.epoch == epoch) {
+                return Err(replaced(actor));
+            }
+            if known.past.len() == PAST_LIVES_MAX {
+                known.past.pop_front();
+            }
+            known.past.push_back(known.current);
+            known.earlier_lives = known.earlier_lives.saturating_add(1);
+            (known.current, known.expected) = (fresh, 0);
+            known.streams.clear();
+            return Ok(());
+        }
+        if self.actors.len() >= ACTORS_MAX {
+            return Err(format!(
+                "actor {actor} is one more than the {ACTORS_MAX} that a run may have: use the numbers of actors that have ended"
+            ));
+        }
+        self.actors.insert(
+            actor,
+            Actor {
+                current: fresh,
+                expected: 0,
+                streams: Vec::new(),
+                past: VecDeque::new(),
+                earlier_lives: 0,
+            },
+        );
+        Ok(())
+    }
+
+    /// Lives of `actor` before the one that counts.
+    pub(crate) fn earlier_lives(&self, actor: u32) -> u32 {
+        self.actors.get(&actor).map_or(0, |it| it.earlier_lives)
+    }
+
+    /// The life of `actor` that counts; none before the first.
+    pub(crate) fn current_epoch(&self, actor: u32) -> Option<u64> {
+        self.actors.get(&actor).map(|it| it.current.epoch)
+    }
+
+    /// The actor, if this is the life of it that counts.
+    fn living(&self, actor: u32, epoch: u64) -> Result<&Actor, String> {
+        match self.actors.get(&actor) {
+            Some(known) if known.current.epoch == epoch => Ok(known),
+            Some(known) if known.past.iter().any(|past| past.epoch == epoch) => {
+                Err(replaced(actor))
+            }
+            _ => Err(format!(
+                "this replay server does not know this life of actor {actor}: it was started anew since the actor joined, \
+                 and what it held is gone; start the actor again"
+            )),
+        }
+    }
+
+    /// Judges a chunk without changing anything.
+    pub(crate) fn judge(&self, header: &ChunkHeader) -> Verdict {
+        let actor = match self.living(header.actor, header.epoch) {
+            Ok(actor) => actor,
+            Err(why) => return Verdict::Refused(why),
+        };
+        if header.streams > STREAMS_MAX {
+            return Verdict::Refused(format!(
+                "{} streams in one chunk; an actor has at most {STREAMS_MAX}",
+                header.streams
+            ));
+        }
+        if header.sequence < actor.expected {
+            return Verdict::Retried;
+        }
+        if actor.current.said_goodbye {
+            return Verdict::Refused(format!(
+                "actor {} said goodbye before this chunk",
+                header.actor
+            ));
+        }
+        if header.sequence > actor.expected {
+            return Verdict::OutOfOrder {
+                expected: actor.expected,
+            };
+        }
+        if header.sequence > 0 && header.streams as usize != actor.streams.len() {
+            return Verdict::Refused(format!(
+                "actor {} sends {} streams after {}; their number must not change before it starts anew",
+                header.actor,
+                header.streams,
+                actor.streams.len()
+            ));
+        }
+        Verdict::Next
+    }
+
+    /// Whether a chunk is stored.
+    ///
+    /// # Errors
+    /// It is of no life that counts; the reason, for a person.
+    pub(crate) fn is_stored(&self, claim: &Claim) -> Result<bool, String> {
+        let actor = self.living(claim.actor, claim.epoch)?;
+        Ok(claim.sequence < actor.expected)
+    }
+
+    /// Counts a chunk that was judged `Next`; gives its streams, and how its own count of what came before differs.
+    ///
+    /// A new life starts with fresh streams. Where the counts differ, the streams are cut: what follows does not continue
+    /// what was stored.
+    pub(crate) fn accept(&mut self, header: &ChunkHeader) -> (&mut [Stream], Difference) {
+        let actor = self
+            .actors
+            .get_mut(&header.actor)
+            .expect("a chunk of an actor that has not joined is never judged Next");
+        let difference = Difference::between(header.first_transition, actor.current.produced);
+        if header.sequence == 0 {
+            let start = || Stream {
+                link: Link::EpisodeStart,
+                episode_return: Some(0.0),
+            };
+            actor.streams.resize_with(header.streams as usize, start);
+        }
+        if difference != Difference::default() {
+            actor.streams.fill_with(|| Stream {
+                link: Link::Lost,
+                episode_return: None,
+            });
+        }
+        actor.expected = header.sequence + 1;
+        actor.current.produced = header.first_transition + header.transitions() as u64;
+        (&mut actor.streams, difference)
+    }
+
+    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second goodbye,
+    /// and that of a life that never joined, reveal nothing.
+    pub(crate) fn goodbye(&mut self, goodbye: &Goodbye) -> Difference {
+        let Some(actor) = self.actors.get_mut(&goodbye.actor) else {
+            return Difference::default();
+        };
+        let mut lives = std::iter::once(&mut actor.current).chain(&mut actor.past);
+        let life = lives.find(|life| life.epoch == goodbye.epoch);
+        life.map_or_else(Difference::default, |life| life.goodbye(goodbye.produced))
+    }
+}
+
+fn replaced(actor: u32) -> String {
+    format!(
+        "another process has joined as actor {actor} since this one did: give each actor a number of its own (--id)"
+    )
+}

@@ -1,0 +1,189 @@
+//! Batches on their way out: whether one may be served, its rows, and what becomes of one that did not arrive.
+//! The rules of the return, of the anchors and of k are those of `sampling`.
+
+use driml_protocol::{
+    AffinityUpdate, Batch, BatchHeader, CodecError, Planes, RequestId, Tally, Waiting,
+};
+
+use super::{Replay, Unready};
+use crate::{
+    config,
+    ledger::requests::{Requests, Standing},
+    sampling::packed_batch::{Draft, PackedStates},
+};
+
+impl Replay {
+    /// A learner takes over that has learned from `rows_sampled` rows of this replay. What was served beyond them, to one that
+    /// died before it saved what it learned, does not count as sampled any more; nor do versions of that one's affinity.
+    ///
+    /// # Errors
+    /// It has learned from more rows than were ever served here; what to do, for a person.
+    pub fn learner_starts(&mut self, rows_sampled: u64) -> Result<(), String> {
+        let served = self.limiter.tally().rows_sampled;
+        let Some(unlearned) = served.checked_sub(rows_sampled) else {
+            return Err(format!(
+                "the learner has learned from {rows_sampled} rows of a replay that has served {served}: start the replay server with \
+                 --after-updates, as the run goes on"
+            ));
+        };
+        self.limiter.taken_back(unlearned);
+        self.statistics.rows_unlearned += unlearned;
+        self.requests = Requests::default();
+        self.affinity.expect_another_source();
+        Ok(())
+    }
+
+    /// Makes a batch: [`Replay::draw`] and [`Draft::unpack`] in one.
+    ///
+    /// # Errors
+    /// As [`Replay::draw`].
+    pub fn sample(&mut self, rows: u32) -> Result<Batch, Unready> {
+        self.draw(rows).map(Draft::unpack)
+    }
+
+    /// A batch of `rows` rows, anchors uniform over the valid ones and drawn with replacement, or why there is none. With
+    /// compression its frames are left to be unpacked, which needs the replay no more.
+    ///
+    /// # Errors
+    /// The limiter or the lack of any valid anchor asks to wait; the run is over; `rows` can never be served.
+    pub fn draw(&mut self, rows: u32) -> Result<Draft, Unready> {
+        self.draw_in(rows, Planes::zeroed)
+    }
+
+    /// [`Replay::draw`] into memory that `memory` gives, so many bytes, all of which are written by the time it is unpacked.
+    ///
+    /// # Errors
+    /// As [`Replay::draw`].
+    pub fn draw_in(
+        &mut self,
+        rows: u32,
+        memory: impl FnOnce(usize) -> Planes,
+    ) -> Result<Draft, Unready> {
+        let rows_max = config::rows_max(&self.spec).min(self.limiter.rows_max());
+        if rows == 0 || rows > rows_max {
+            self.statistics.messages_refused += 1;
+            let why = format!(
+                "a batch of {rows} rows; this run serves 1 to {rows_max}: change the batch size, or raise slack_transitions"
+            );
+            return Err(Unready::Refused { why });
+        }
+        if self.limiter.finished(rows) {
+            return Err(Unready::Finished);
+        }
+        if !self.limiter.may_sample(rows) {
+            return Err(Unready::Wait(self.limiter.waiting(rows)));
+        }
+        let mut header = self.batch_header(rows);
+        let mut batch = Batch::in_memory(header, memory(header.planes_bytes()));
+        let pixel_bytes = self.spec.frame_channels as usize;
+        let mut packed = PackedStates::new(self.spec.frame_bytes(), pixel_bytes);
+        let mut ks = Vec::with_capacity(rows as usize);
+        let mut age_total = 0;
+        let mut rows_mut = batch.rows_mut();
+        for row in 0..rows as usize {
+            if !self
+                .anchors
+                .draw(&self.ring, &self.episodes, &mut self.rng, &mut self.window)
+            {
+                return Err(self.no_anchor());
+            }
+            let states = self.assembler.write_row(
+                &self.affinity,
+                &self.window,
+                &mut self.rng,
+                (&mut rows_mut, row),
+            );
+            packed.write_or_take_row(&self.ring, &self.episodes, states, &mut rows_mut, row);
+            ks.push(states.k());
+            age_total += self.ring.inserted() - 1 - self.window.index(0);
+            let version = self.window.step(0).weights_version;
+            let (newest, oldest) = header.weights_versions;
+            header.weights_versions = (newest.max(version), oldest.min(version));
+        }
+        header.mean_age = age_total as f64 / f64::from(rows);
+        self.statistics.mean_age = header.mean_age;
+        self.statistics.served(&ks);
+        self.limiter.sampled(rows);
+        header.tally = self.limiter.tally();
+        batch.header = header;
+        self.starving = false;
+        Ok(Draft { batch, packed, ks })
+    }
+
+    /// [`Replay::draw_in`] for request `id`. What an earlier attempt at this request was given did not arrive: from now on it
+    /// does not count as sampled.
+    ///
+    /// # Errors
+    /// As [`Replay::draw`]; a request that nobody waits for any more is told to wait.
+    pub fn draw_for(
+        &mut self,
+        id: RequestId,
+        rows: u32,
+        memory: impl FnOnce(usize) -> Planes,
+    ) -> Result<Draft, Unready> {
+        match self.requests.enter(id) {
+            Standing::Overtaken => return Err(Unready::Wait(self.limiter.waiting(rows))),
+            Standing::Open(lost) => {
+                if !lost.is_empty() {
+                    tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
+                    self.limiter.taken_back(lost.len() as u64);
+                    self.statistics.taken_back(&lost);
+                }
+            }
+        }
+        let draft = self.draw_in(rows, memory)?;
+        self.requests.give(id.asker, draft.ks.clone());
+        Ok(draft)
+    }
+
+    /// What a batch of `rows` rows says of itself before any row is written.
+    pub(crate) fn batch_header(&self, rows: u32) -> BatchHeader {
+        BatchHeader {
+            tally: self.limiter.tally(),
+            held: self.ring.inserted() - self.ring.oldest(),
+            ..BatchHeader::of(&self.spec, rows)
+        }
+    }
+
+    fn no_anchor(&mut self) -> Unready {
+        if self.limiter.all_in() {
+            let why = format!(
+                "none of the {} transitions held can be sampled, and no more will come: every copy of the world needs n_step or k_max consecutive ones; raise capacity_transitions or transitions_max, or use fewer copies",
+                self.ring.inserted() - self.ring.oldest()
+            );
+            return Unready::Refused { why };
+        }
+        self.starving = true;
+        Unready::Wait(Waiting::LearnerWaitsForActors)
+    }
+
+    /// Takes a newer affinity matrix; one that is not newer than this learner's last is ignored.
+    ///
+    /// # Errors
+    /// A matrix of another size, or with an entry that is no probability; it counts as a refused message.
+    pub fn set_affinity(&mut self, update: &AffinityUpdate) -> Result<(), CodecError> {
+        self.affinity
+            .update(update)
+            .inspect_err(|_| self.note_refused_message())
+    }
+
+    /// Takes what the replay's other shards have counted.
+    ///
+    /// # Errors
+    /// More transitions than the run can ever have; the reason, for a person.
+    pub fn heard(&mut self, elsewhere: Tally) -> Result<(), String> {
+        let config = &self.config;
+        // Each shard takes what its limiter allows until it hears of the others, at most what it holds.
+        let most = |max: u64| max.saturating_add(config.capacity_transitions);
+        if let Some(most) = config.transitions_max.map(most)
+            && elsewhere.inserted > most
+        {
+            return Err(format!(
+                "the other shards are said to have stored {} transitions; this run has at most {most}",
+                elsewhere.inserted
+            ));
+        }
+        self.limiter.heard(elsewhere);
+        Ok(())
+    }
+}

@@ -1,0 +1,176 @@
+//! Makes one row of a batch: a_t, a_{t+1}, the n-step return, and which transitions' states are s_t, s_{t+n} and s_{t+k}, with
+//! each k drawn here. It does not choose the anchor and reads no frame.
+
+use driml_protocol::{BatchRowsMut, End, Horizon, NO_ACTION, POSITIVES_MAX, RunSpec, TimeoutRule};
+use rand::Rng;
+
+use super::{
+    episodes::Window,
+    horizon::{self, Affinity},
+};
+use crate::config::Study;
+
+/// The states of a row, as indices in the ring.
+#[derive(Clone, Copy)]
+pub(crate) struct RowStates {
+    t: u64,
+    /// Where the row bootstraps from.
+    n: Option<u64>,
+    /// k of the first positive; the others follow it step by step.
+    k_first: u32,
+    /// Positives that the row has.
+    positives: usize,
+    /// s_{t+k} of each.
+    s_tpk: [u64; POSITIVES_MAX],
+}
+
+impl RowStates {
+    /// k, of several positives the furthest, 0 without any.
+    pub(crate) fn k(&self) -> u32 {
+        match self.positives {
+            0 => 0,
+            positives => self.k_first + positives as u32 - 1,
+        }
+    }
+
+    /// s_t, s_{t+n}, s_{t+k} for each k: those that the row has.
+    pub(crate) fn indices(&self) -> impl Iterator<Item = u64> {
+        let first = [Some(self.t), self.n].into_iter().flatten();
+        first.chain(self.s_tpk.into_iter().take(self.positives))
+    }
+
+    /// Calls `write` with the index and the place of each state, in the order of [`RowStates::indices`]; the places of the
+    /// states that the row does not have are filled with zeros.
+    pub(crate) fn write(
+        &self,
+        rows: &mut BatchRowsMut<'_>,
+        row: usize,
+        mut write: impl FnMut(u64, &mut [u8]),
+    ) {
+        write(self.t, rows.frame_t(row));
+        match self.n {
+            Some(index) => write(index, rows.frame_n(row)),
+            None => rows.frame_n(row).fill(0),
+        }
+        for p in 0..rows.positives() {
+            if p < self.positives {
+                let place = rows.positive(p, row, self.k_first + p as u32);
+                write(self.s_tpk[p], place);
+            } else {
+                rows.no_positive(p, row);
+            }
+        }
+    }
+}
+
+/// The rules of return and positive, and scratch space so that a row allocates nothing.
+pub(crate) struct Assembler {
+    horizon: Horizon,
+    timeout: TimeoutRule,
+    study: Option<Study>,
+    /// gamma^0 ..= gamma^n.
+    discounts: Vec<f64>,
+    actions: Vec<u8>,
+}
+
+impl Assembler {
+    pub(crate) fn new(spec: &RunSpec, study: Option<Study>) -> Self {
+        let powers = std::iter::successors(Some(1.0), |power| Some(power * spec.gamma));
+        Self {
+            horizon: spec.horizon,
+            timeout: spec.timeout,
+            study,
+            discounts: powers.take(spec.n_step as usize + 1).collect(),
+            actions: Vec::with_capacity(spec.horizon.k_max() as usize),
+        }
+    }
+
+    /// Writes all of the row of the window's anchor but its states, and gives those.
+    pub(crate) fn write_row(
+        &mut self,
+        affinity: &Affinity,
+        window: &Window,
+        rng: &mut impl Rng,
+        (rows, row): (&mut BatchRowsMut<'_>, usize),
+    ) -> RowStates {
+        let anchor = window.step(0);
+        let next_action = if anchor.end == End::Running {
+            window.step(1).action
+        } else {
+            NO_ACTION
+        };
+        let (n_step_return, follows) = self.n_step_return(window);
+        let bootstrap = match self.study {
+            None => follows.map(|i| (i, self.discounts[i])),
+            Some(Study::BootstrapFromNextState) => self.next_state(window),
+        };
+        let discount = bootstrap.map_or(0.0, |(_, discount)| discount);
+        rows.set(
+            row,
+            anchor.action,
+            next_action,
+            n_step_return as f32,
+            discount as f32,
+        );
+        let furthest = self.draw_k(affinity, window, rng).unwrap_or(0);
+        let k_first = match self.horizon {
+            Horizon::All { .. } => 1,
+            _ => furthest,
+        };
+        let mut states = RowStates {
+            t: window.index(0),
+            n: bootstrap.map(|(i, _)| window.index(i)),
+            k_first,
+            positives: 0,
+            s_tpk: [0; POSITIVES_MAX],
+        };
+        // A k of 0 is none.
+        for k in (k_first..=furthest).filter(|&k| k > 0) {
+            states.s_tpk[states.positives] = window.index(k as usize);
+            states.positives += 1;
+        }
+        states
+    }
+
+    /// Sum of gamma^i r_{t+i} over i < n, and the i of the state to bootstrap from: n, unless the episode ended before.
+    ///
+    /// After a terminal step nothing follows. A time-out counts as one (`TimeoutRule::Terminal`), or cuts the return short
+    /// of its own step and bootstraps from that step's state (`TimeoutRule::Bootstrap`).
+    fn n_step_return(&self, window: &Window) -> (f64, Option<usize>) {
+        let n = self.discounts.len() - 1;
+        let mut sum = 0.0;
+        for (i, step) in window.steps().take(n).enumerate() {
+            if step.end == End::TimedOut && self.timeout == TimeoutRule::Bootstrap {
+                return (sum, Some(i));
+            }
+            sum += self.discounts[i] * f64::from(step.reward);
+            if step.end.is_episode_end() {
+                return (sum, None);
+            }
+        }
+        (sum, Some(n))
+    }
+
+    /// s_{t+1} at gamma^n, unless step t ended its episode: the fault of [`Study::BootstrapFromNextState`].
+    fn next_state(&self, window: &Window) -> Option<(usize, f64)> {
+        let n = self.discounts.len() - 1;
+        (!window.step(0).end.is_episode_end()).then(|| (1, self.discounts[n]))
+    }
+
+    /// k, or none where no positive is served or a_t ended its episode or level.
+    ///
+    /// H is the number of states after s_t, at most k_max, that come before the end of the episode or level.
+    fn draw_k(&mut self, affinity: &Affinity, window: &Window, rng: &mut impl Rng) -> Option<u32> {
+        self.actions.clear();
+        let same_level = window.steps().take_while(|step| step.end == End::Running);
+        self.actions.extend(
+            same_level
+                .map(|step| step.action)
+                .take(self.horizon.k_max() as usize),
+        );
+        if self.actions.is_empty() {
+            return None;
+        }
+        horizon::draw_k(self.horizon, affinity, &self.actions, rng)
+    }
+}

@@ -1,0 +1,167 @@
+//! Walks along stored episodes: which transitions can be an anchor, the steps that follow it, and stacked frames.
+//! It does not draw anchors and computes no returns.
+
+use driml_protocol::{End, RunSpec, TimeoutRule};
+
+use crate::{
+    config,
+    storage::ring::{Previous, Ring, Step},
+};
+
+/// An anchor t and what follows it: s_t, .., s_{t+m}, where m is the reach or the episode ends at s_{t+m}. Never empty.
+#[derive(Default)]
+pub(crate) struct Window {
+    steps: Vec<(u64, Step)>,
+}
+
+impl Window {
+    /// Index of s_{t+i} in the ring; i must not pass the end of the window.
+    pub(crate) fn index(&self, i: usize) -> u64 {
+        self.steps[i].0
+    }
+
+    /// Step t+i; i must not pass the end of the window.
+    pub(crate) fn step(&self, i: usize) -> &Step {
+        &self.steps[i].1
+    }
+
+    /// Steps t, t+1, .. to the end of the window.
+    pub(crate) fn steps(&self) -> impl Iterator<Item = &Step> {
+        self.steps.iter().map(|(_, step)| step)
+    }
+}
+
+/// What a transition needs around it to be an anchor, and how its states are put together.
+pub(crate) struct Episodes {
+    reach: usize,
+    frame_stack: usize,
+    timeout: TimeoutRule,
+}
+
+impl Episodes {
+    pub(crate) fn new(spec: &RunSpec) -> Self {
+        Self {
+            reach: config::reach(spec) as usize,
+            frame_stack: spec.frame_stack as usize,
+            timeout: spec.timeout,
+        }
+    }
+
+    /// Whether the held transition `t` can be an anchor; if so, `window` is its window.
+    ///
+    /// It can if its stack's frames are held and `reach` steps follow it or its episode ends before. With
+    /// `TimeoutRule::Bootstrap` a timed-out transition has no return at all, so it cannot.
+    pub(crate) fn walk(&self, ring: &Ring, t: u64, window: &mut Window) -> bool {
+        window.steps.clear();
+        let mut index = t;
+        loop {
+            let step = *ring.step(index);
+            window.steps.push((index, step));
+            if step.end.is_episode_end() || window.steps.len() > self.reach {
+                break;
+            }
+            match step.next() {
+                Some(next) => index = next,
+                None => return false,
+            }
+        }
+        let timed_out =
+            window.step(0).end == End::TimedOut && self.timeout == TimeoutRule::Bootstrap;
+        !timed_out && self.stack_is_held(ring, t)
+    }
+
+    fn stack_is_held(&self, ring: &Ring, t: u64) -> bool {
+        let mut index = t;
+        for _ in 1..self.frame_stack {
+            match ring.previous(index) {
+                Previous::Start => return true,
+                Previous::Held(previous) => index = previous,
+                Previous::Gone => return false,
+            }
+        }
+        true
+    }
+
+    /// The frames that make the state at `index`.
+    ///
+    /// At the start of a level its first frame fills the slots of the frames before it. The stack must be held, which it is
+    /// for every state of a window: it reaches back to the anchor's stack at most.
+    pub(crate) fn stack(&self, ring: &Ring, mut index: u64) -> Stack {
+        let mut stack = Stack {
+            length: self.frame_stack,
+            indices: [index; FRAME_STACK_MAX],
+        };
+        for slot in (0..self.frame_stack - 1).rev() {
+            match ring.previous(index) {
+                Previous::Start => {}
+                Previous::Held(previous) => index = previous,
+                Previous::Gone => {
+                    unreachable!("the stack of {index} was checked with its anchor")
+                }
+            }
+            stack.indices[slot] = index;
+        }
+        stack
+    }
+}
+
+/// Longest frame stack that a run spec allows.
+const FRAME_STACK_MAX: usize = 16;
+
+/// The frames of one state, as indices in the ring, oldest first.
+pub(crate) struct Stack {
+    length: usize,
+    indices: [u64; FRAME_STACK_MAX],
+}
+
+impl Stack {
+    /// Indices of the frames, oldest first; at the start of a level the first one several times.
+    pub(crate) fn frames(&self) -> impl Iterator<Item = u64> {
+        self.indices.into_iter().take(self.length)
+    }
+
+    /// Writes the state into `out` [H, W, C * stack], a pixel's oldest channels first; `frame` gives a frame [H, W, C].
+    pub(crate) fn write<'a>(
+        &self,
+        pixel_bytes: usize,
+        out: &mut [u8],
+        frame: impl Fn(u64) -> &'a [u8],
+    ) {
+        if self.length == 1 {
+            return out.copy_from_slice(frame(self.indices[0]));
+        }
+        let mut frames: [&[u8]; FRAME_STACK_MAX] = [&[]; FRAME_STACK_MAX];
+        for (to, index) in frames.iter_mut().zip(self.frames()) {
+            *to = frame(index);
+        }
+        interleave(&frames[..self.length], pixel_bytes, out);
+    }
+}
+
+/// Writes `frames`, each [pixels, C], into `out` [pixels, stack, C].
+///
+/// A pixel of the output is written at once: the sizes in use are compiled, the others take their time.
+fn interleave(frames: &[&[u8]], pixel_bytes: usize, out: &mut [u8]) {
+    fn compiled<const STACK: usize, const C: usize>(frames: &[&[u8]], out: &mut [u8]) {
+        let frames: [&[[u8; C]]; STACK] = std::array::from_fn(|slot| frames[slot].as_chunks().0);
+        let (pixels, _) = out.as_chunks_mut::<C>().0.as_chunks_mut::<STACK>();
+        // Equal lengths, known before the loop, keep bounds checks out of it.
+        let frames = frames.map(|frame| &frame[..pixels.len()]);
+        for (i, pixel) in pixels.iter_mut().enumerate() {
+            for slot in 0..STACK {
+                pixel[slot] = frames[slot][i];
+            }
+        }
+    }
+    match (frames.len(), pixel_bytes) {
+        (4, 1) => compiled::<4, 1>(frames, out),
+        (4, 3) => compiled::<4, 3>(frames, out),
+        (stack, _) => {
+            for (slot, frame) in frames.iter().enumerate() {
+                let to = out.chunks_exact_mut(pixel_bytes).skip(slot).step_by(stack);
+                to.zip(frame.chunks_exact(pixel_bytes))
+                    .for_each(|(to, from)| to.copy_from_slice(from));
+            }
+        }
+    }
+}

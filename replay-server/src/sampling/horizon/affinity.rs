@@ -1,0 +1,56 @@
+//! The action affinity that the adaptive rule walks along: the newest matrix that the learner sent.
+//! It does not estimate: how A comes about is the learner's.
+
+use driml_protocol::{AffinityUpdate, CodecError};
+
+/// A[i, j]: how strongly action j is expected after action i; rows are softmaxes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Affinity {
+    version: u64,
+    /// Whether the next matrix is newer whatever its version: it comes from another learner.
+    from_another: bool,
+    num_actions: u32,
+    matrix: Vec<f32>,
+}
+
+impl Affinity {
+    /// Before the learner's first: the softmax of zeros, 1 / `num_actions` everywhere, version 0.
+    pub fn uniform(num_actions: u32) -> Self {
+        let n = num_actions as usize;
+        Self {
+            version: 0,
+            from_another: false,
+            num_actions,
+            matrix: vec![1.0 / num_actions as f32; n * n],
+        }
+    }
+
+    /// The matrices that come from now on are another learner's, which counts its versions from an earlier update.
+    pub fn expect_another_source(&mut self) {
+        self.from_another = true;
+    }
+
+    /// Takes a newer matrix; one that is not newer is ignored.
+    ///
+    /// # Errors
+    /// A matrix of another size, or with an entry that is no probability.
+    pub fn update(&mut self, update: &AffinityUpdate) -> Result<(), CodecError> {
+        update.validate(self.num_actions)?;
+        if update.version > self.version || self.from_another {
+            self.version = update.version;
+            self.from_another = false;
+            self.matrix.copy_from_slice(&update.matrix);
+        }
+        Ok(())
+    }
+
+    /// Version in use; 0 is the uniform one.
+    pub const fn version(&self) -> u64 {
+        self.version
+    }
+
+    /// A[from, to].
+    pub fn get(&self, from: u8, to: u8) -> f32 {
+        self.matrix[usize::from(from) * self.num_actions as usize + usize::from(to)]
+    }
+}

@@ -1,0 +1,8 @@
+//! From the transitions held to a batch: anchors, the episode around each, the row made of it, and k.
+//! Nothing here changes what is stored or decides whether a batch may be served.
+
+pub(crate) mod anchors;
+pub(crate) mod assemble;
+pub(crate) mod episodes;
+pub mod horizon;
+pub(crate) mod packed_batch;

@@ -1,0 +1,206 @@
+//! A batch that left the replay with its frames still compressed, and their unpacking, for which nothing is locked.
+//! It draws nothing: which states a row has was decided before.
+
+use std::ops::Range;
+
+use driml_protocol::{Batch, BatchRowsMut};
+use lz4_flex::block::{decompress_into, decompress_into_with_dict};
+
+use super::{
+    assemble::RowStates,
+    episodes::{Episodes, Stack},
+};
+use crate::storage::{
+    frame_store::{
+        Frames,
+        compressed::{CompressedFrames, Part},
+    },
+    ring::Ring,
+};
+
+/// A batch, complete but for frames that are still to be unpacked.
+#[must_use]
+pub struct Draft {
+    pub(crate) batch: Batch,
+    /// No rows if the batch has its frames.
+    pub(crate) packed: PackedStates,
+    /// k of each row, of several the furthest; 0 where there is none.
+    pub(crate) ks: Vec<u32>,
+}
+
+impl Draft {
+    /// The batch; with compression this is where most of the work is.
+    pub fn unpack(self) -> Batch {
+        let Self {
+            mut batch, packed, ..
+        } = self;
+        packed.write(&mut batch);
+        batch
+    }
+}
+
+/// Copies of the parts of blocks that a batch's states need, row by row.
+pub(crate) struct PackedStates {
+    frame_bytes: usize,
+    pixel_bytes: usize,
+    rows: Vec<PackedRow>,
+    stacks: Vec<Stack>,
+    parts: Vec<PackedPart>,
+    bytes: Vec<u8>,
+}
+
+/// A row's states; their stacks, in the states' order; and the parts with all their frames.
+struct PackedRow {
+    states: RowStates,
+    stacks: Range<usize>,
+    parts: Range<usize>,
+}
+
+struct PackedPart {
+    transitions: Range<u64>,
+    place: Range<usize>,
+    /// The transition whose frame is its dictionary; none for a key. It is a part of the same row, further ahead.
+    key: Option<u64>,
+}
+
+impl PackedStates {
+    /// Nothing yet.
+    pub(crate) fn new(frame_bytes: usize, pixel_bytes: usize) -> Self {
+        Self {
+            frame_bytes,
+            pixel_bytes,
+            rows: Vec::new(),
+            stacks: Vec::new(),
+            parts: Vec::new(),
+            bytes: Vec::new(),
+        }
+    }
+
+    /// Writes the states of the next row, number `row`, where frames are plain; takes what is needed to write them later where
+    /// they are compressed.
+    pub(crate) fn write_or_take_row(
+        &mut self,
+        ring: &Ring,
+        episodes: &Episodes,
+        states: RowStates,
+        rows: &mut BatchRowsMut<'_>,
+        row: usize,
+    ) {
+        match ring.frames() {
+            Frames::Plain(frames) => states.write(rows, row, |index, out| {
+                let stack = episodes.stack(ring, index);
+                stack.write(self.pixel_bytes, out, |index| frames.frame(index));
+            }),
+            Frames::Compressed(frames) => self.take_row(ring, frames, episodes, states),
+        }
+    }
+
+    /// Takes what the next row needs; a part that several of its states share is taken once.
+    fn take_row(
+        &mut self,
+        ring: &Ring,
+        frames: &CompressedFrames,
+        episodes: &Episodes,
+        states: RowStates,
+    ) {
+        let (first_stack, first_part) = (self.stacks.len(), self.parts.len());
+        for state in states.indices() {
+            let stack = episodes.stack(ring, state);
+            for index in stack.frames() {
+                if self.has(first_part, index) {
+                    continue;
+                }
+                let (key, part) = frames.parts(index);
+                let key_index = key.transitions.start;
+                if !self.has(first_part, key_index) {
+                    self.take(frames, &key, None);
+                }
+                if let Some(part) = part {
+                    self.take(frames, &part, Some(key_index));
+                }
+            }
+            self.stacks.push(stack);
+        }
+        self.rows.push(PackedRow {
+            states,
+            stacks: first_stack..self.stacks.len(),
+            parts: first_part..self.parts.len(),
+        });
+    }
+
+    /// Whether the frame of `index` is among the parts from `first_part` on.
+    fn has(&self, first_part: usize, index: u64) -> bool {
+        let mut taken = self.parts[first_part..].iter();
+        taken.any(|part| part.transitions.contains(&index))
+    }
+
+    fn take(&mut self, frames: &CompressedFrames, part: &Part, key: Option<u64>) {
+        let start = self.bytes.len();
+        frames.copy(part, &mut self.bytes);
+        self.parts.push(PackedPart {
+            transitions: part.transitions.clone(),
+            place: start..self.bytes.len(),
+            key,
+        });
+    }
+
+    /// Unpacks every row's parts and writes its states.
+    fn write(&self, batch: &mut Batch) {
+        let mut rows_mut = batch.rows_mut();
+        let mut unpacked = Vec::new();
+        for (number, row) in self.rows.iter().enumerate() {
+            let parts = &self.parts[row.parts.clone()];
+            self.unpack(parts, &mut unpacked);
+            let mut stacks = self.stacks[row.stacks.clone()].iter();
+            row.states.write(&mut rows_mut, number, |_, out| {
+                let stack = stacks.next().expect("every state has its stack");
+                stack.write(self.pixel_bytes, out, |index| {
+                    self.frame(parts, &unpacked, index)
+                });
+            });
+        }
+    }
+
+    /// Unpacks parts into `out`, one after the other.
+    fn unpack(&self, parts: &[PackedPart], out: &mut Vec<u8>) {
+        let length = parts.iter().map(|part| self.length(part)).sum();
+        if out.len() < length {
+            out.resize(length, 0);
+        }
+        let mut done = 0;
+        for part in parts {
+            let stored = &self.bytes[part.place.clone()];
+            let (before, rest) = out.split_at_mut(done);
+            let to = &mut rest[..self.length(part)];
+            done += to.len();
+            if stored.len() == to.len() {
+                to.copy_from_slice(stored);
+                continue;
+            }
+            let length = match part.key {
+                None => decompress_into(stored, to),
+                Some(key) => decompress_into_with_dict(stored, to, self.frame(parts, before, key)),
+            };
+            let length = length.expect("we packed this part");
+            assert_eq!(length, to.len(), "a part has all its frames");
+        }
+    }
+
+    /// The frame of `index` among unpacked parts.
+    fn frame<'a>(&self, parts: &[PackedPart], unpacked: &'a [u8], index: u64) -> &'a [u8] {
+        let mut start = 0;
+        for part in parts {
+            if part.transitions.contains(&index) {
+                start += (index - part.transitions.start) as usize * self.frame_bytes;
+                return &unpacked[start..start + self.frame_bytes];
+            }
+            start += self.length(part);
+        }
+        unreachable!("the part with frame {index} was taken with its row")
+    }
+
+    /// Bytes of a part's frames.
+    fn length(&self, part: &PackedPart) -> usize {
+        (part.transitions.end - part.transitions.start) as usize * self.frame_bytes
+    }
+}

@@ -1,0 +1,129 @@
+//! Requests for batches as they arrive: parked until the limiter allows them, then served, several at a time.
+//! Which rows a batch has is the core's choice.
+
+use std::time::{Duration, Instant};
+
+use driml_protocol::{BatchReply, BatchRequest, Kind, Planes, fault, session};
+use zenoh::query::Query;
+
+use super::{
+    parked::ParkedRequest,
+    server::{Service, State},
+};
+use crate::{
+    replay::{Replay, Unready},
+    sampling::packed_batch::Draft,
+};
+
+/// How long a request waits before it is told to come back: far below every learner's time-out.
+const HOLD_MAX: Duration = Duration::from_secs(1);
+/// The same for a part of a batch: what another shard counts meanwhile is not heard of here.
+const SHARD_HOLD_MAX: Duration = Duration::from_millis(50);
+/// How long a thread sleeps when nothing is parked; it is woken when something is.
+const IDLE: Duration = Duration::from_secs(60);
+
+impl Service {
+    pub(super) fn request(&self, query: Query) {
+        let Some(request) = self.read::<BatchRequest>(&query, Kind::BatchRequest) else {
+            let why = "the request could not be read; the replay server's log says why".into();
+            return self.reply(&query, Kind::BatchReply, &BatchReply::Refused { why });
+        };
+        let mut state = self.state();
+        let is_allowed = state.members.check_learner(request.learner);
+        let heard = is_allowed.and_then(|()| self.hear_of_others(&mut state.replay, &request));
+        if let Err(why) = heard {
+            state.replay.note_refused_message();
+            drop(state);
+            return self.reply(&query, Kind::BatchReply, &BatchReply::Refused { why });
+        }
+        let hold_max = match request.elsewhere {
+            Some(_) => SHARD_HOLD_MAX,
+            None => HOLD_MAX,
+        };
+        state.requests.park(ParkedRequest {
+            request,
+            question: query,
+            arrived: Instant::now(),
+            hold_max,
+        });
+        drop(state);
+        self.changed.notify_all();
+    }
+
+    /// Takes what the learner says of the other shards.
+    fn hear_of_others(&self, replay: &mut Replay, request: &BatchRequest) -> Result<(), String> {
+        let (_, shards) = self.shard;
+        match request.elsewhere {
+            None if shards > 1 => Err(format!(
+                "a whole batch of one of {shards} shards: the learner must be connected to all of them"
+            )),
+            Some(_) if shards == 1 => {
+                Err("a part of a batch; this replay has one shard alone".into())
+            }
+            Some(elsewhere) => replay.heard(elsewhere),
+            None => Ok(()),
+        }
+    }
+
+    /// Serves parked requests as the limiter allows them. The thread's whole work until the end of the process.
+    pub(super) fn serve_parked(&self) {
+        while !self.shutdown.is_set() {
+            fault::point("sample");
+            let mut state = self.state();
+            let now = Instant::now();
+            let Some((parked, drawn)) = state.next_answer(now, |bytes, shared| match shared {
+                true => self.pool.take(bytes),
+                false => self.pool.take_own(bytes),
+            }) else {
+                let due_in = state.requests.due_in(now).unwrap_or(IDLE);
+                drop(self.wait(state, due_in));
+                continue;
+            };
+            let waited = now.saturating_duration_since(parked.arrived);
+            state.replay.note_learner_waited(waited.as_secs_f64());
+            drop(state);
+            self.changed.notify_all();
+            self.give_batch(&parked.question, drawn);
+        }
+    }
+
+    fn give_batch(&self, query: &Query, drawn: Result<Draft, Unready>) {
+        match drawn.map(|draft| draft.unpack().seal(self.spec_hash)) {
+            Ok(Ok((head, planes))) => {
+                session::answer(query, session::join_planes(head, planes.freeze()))
+            }
+            Ok(Err(e)) => tracing::error!("a batch was not sent: {e}"),
+            Err(unready) => self.reply(query, Kind::BatchReply, &BatchReply::from(unready)),
+        }
+    }
+}
+
+impl State {
+    /// The first parked request that can be answered now, with its answer; `memory` gives so many bytes, which may be shared.
+    fn next_answer(
+        &mut self,
+        now: Instant,
+        memory: impl Fn(usize, bool) -> Planes,
+    ) -> Option<(ParkedRequest<Query>, Result<Draft, Unready>)> {
+        let (mut waiting, mut found) = (Vec::new(), None);
+        while let Some(parked) = self.requests.pop() {
+            let BatchRequest {
+                id,
+                rows,
+                shared_memory,
+                ..
+            } = parked.request;
+            let drawn = self
+                .replay
+                .draw_for(id, rows, |bytes| memory(bytes, shared_memory));
+            if matches!(drawn, Err(Unready::Wait(_))) && !parked.left(now).is_zero() {
+                waiting.push(parked);
+            } else {
+                found = Some((parked, drawn));
+                break;
+            }
+        }
+        self.requests.put_back(waiting);
+        found
+    }
+}

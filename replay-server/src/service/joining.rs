@@ -1,0 +1,126 @@
+//! Parts that join: what they are told of the run, and whether they are let in.
+//! Who is connected and who is served is kept in `members`.
+
+use driml_protocol::{ActorJoin, Alive, Hello, JoinReply, Kind, LearnerJoin};
+use zenoh::{query::Query, sample::SampleKind};
+
+use super::server::{Service, State};
+
+impl Service {
+    pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {
+        let mut state = self.state();
+        state.members.note(who, kind == SampleKind::Put);
+        state.count_actors();
+    }
+
+    pub(super) fn hello(&self, query: Query) {
+        let state = self.state();
+        let (inserted_total, tally) = (state.replay.inserted_total(), state.replay.tally());
+        drop(state);
+        let hello = Hello {
+            config_toml: self.config_toml.clone(),
+            inserted_total,
+            tally,
+            after_updates: self.after_updates,
+            shard: self.shard,
+            shared_memory: self.shared_memory,
+        };
+        self.reply(&query, Kind::Hello, &hello);
+    }
+
+    pub(super) fn join_actor(&self, query: Query) {
+        if let Some(join) = self.read::<ActorJoin>(&query, Kind::ActorJoin) {
+            let reply = self.state().join_actor(join);
+            self.welcome(&query, reply);
+        }
+    }
+
+    pub(super) fn join_learner(&self, query: Query) {
+        if let Some(join) = self.read::<LearnerJoin>(&query, Kind::LearnerJoin) {
+            let reply = self.state().join_learner(join);
+            self.changed.notify_all();
+            self.welcome(&query, reply);
+        }
+    }
+
+    /// Answers a part that joins: how many lives it had before, or why it is not taken.
+    fn welcome(&self, query: &Query, joined: Result<u32, Rejection>) {
+        let reply = match joined {
+            Ok(earlier_lives) => JoinReply::Welcome {
+                inserted_total: self.state().replay.inserted_total(),
+                weights_version: self.weights().version(),
+                earlier_lives,
+            },
+            Err(Rejection::Taken(why)) => JoinReply::Taken { why },
+            Err(Rejection::Refused(why)) => {
+                tracing::warn!("a part was not let in: {why}");
+                self.state().replay.note_refused_message();
+                JoinReply::Refused { why }
+            }
+        };
+        self.reply(query, Kind::JoinReply, &reply);
+    }
+}
+
+/// Why a part is not taken.
+enum Rejection {
+    /// Not yet: another process is connected that plays it.
+    Taken(String),
+    /// Never.
+    Refused(String),
+}
+
+impl State {
+    fn count_actors(&mut self) {
+        let actors = self.members.actors(&self.replay);
+        self.replay.set_actors(actors);
+    }
+
+    /// Takes an actor that may take part; gives the number of its earlier lives.
+    fn join_actor(&mut self, join: ActorJoin) -> Result<u32, Rejection> {
+        let ActorJoin { actor, epoch } = join;
+        let other = self
+            .replay
+            .actor_epoch(actor)
+            .filter(|&other| other != epoch);
+        let connected = |epoch| {
+            self.members
+                .connected
+                .contains(&Alive::Actor { actor, epoch })
+        };
+        if other.is_some_and(connected) {
+            return Err(Rejection::Taken(format!(
+                "another process is actor {actor} of this run: give each actor a number of its own (--id)"
+            )));
+        }
+        let earlier_lives = self.replay.join_actor(join).map_err(Rejection::Refused)?;
+        self.count_actors();
+        if other.is_some() {
+            // A chunk that was left behind.
+            self.chunks.take(actor);
+        }
+        Ok(earlier_lives)
+    }
+
+    fn join_learner(&mut self, join: LearnerJoin) -> Result<u32, Rejection> {
+        let LearnerJoin {
+            learner,
+            rows_sampled,
+        } = join;
+        let other = self.members.learner.filter(|&other| other != learner);
+        let connected = |other| self.members.connected.contains(&Alive::Learner(other));
+        if other.is_some_and(connected) {
+            let why = "another learner takes part in this run, which has one alone";
+            return Err(Rejection::Taken(why.into()));
+        }
+        // The same one asks again when it has not heard the answer.
+        if self.members.learner != Some(learner) {
+            self.replay
+                .learner_starts(rows_sampled)
+                .map_err(Rejection::Refused)?;
+            self.members.learner = Some(learner);
+            self.requests.keep_only(learner);
+        }
+        Ok(0)
+    }
+}

@@ -1,0 +1,260 @@
+//! Starts the replay server and ends it: settings, session, everything that it answers, and the threads that do.
+//! What an answer is, is in the files named for the messages.
+
+use std::{
+    sync::{Arc, Condvar, Mutex},
+    thread::JoinHandle,
+    time::Duration,
+};
+
+use anyhow::Context;
+use driml_protocol::{
+    Answering, BatchHeader, Keys, POOL_BATCHES, PlanesPool, RunSpec, Shutdown, TRANSITION_BYTES,
+    config::{Settings, TransportConfig},
+    join_within,
+    session::{self, Endpoints},
+    shared_memory,
+};
+use zenoh::{
+    Session, Wait,
+    pubsub::{Publisher, Subscriber},
+    qos::{CongestionControl, Priority},
+    query::{Query, Queryable},
+};
+
+use super::{
+    members::Members,
+    parked::{ParkedChunks, ParkedRequests},
+    server::{Service, State},
+    timings::Timings,
+};
+use crate::{config::Config, replay::Replay};
+
+/// Threads that make batches: one assembles while another's reply is being sent.
+const BATCH_THREADS: usize = 2;
+/// Threads that send weights: an actor that stands still holds one of them until its link is given up.
+const WEIGHTS_THREADS: usize = 4;
+
+/// Most that a question about a chunk is held.
+const HOLD_MAX: Duration = Duration::from_secs(2);
+
+/// Pieces of memory kept for later chunks and batches.
+const SPARE_MAX: usize = 8;
+
+/// How long the threads may take to end.
+const THREADS_END_MAX: Duration = Duration::from_secs(2);
+
+/// What a replay server is told at its start.
+#[derive(Clone, Debug)]
+pub struct RunArgs {
+    /// Endpoints to listen on.
+    pub listen: Vec<String>,
+    /// Routers to connect to, if any.
+    pub connect: Vec<String>,
+    /// Prefix of the run's keys.
+    pub namespace: String,
+    /// Which of the replay's shards this is, from 0.
+    pub shard: u32,
+    /// Updates of the learner after which the run goes on; 0 starts it.
+    pub after_updates: u64,
+    /// The run's resolved settings, which it hands to whoever joins.
+    pub config_toml: String,
+}
+
+/// Runs the replay server until `shutdown`.
+///
+/// # Errors
+/// Settings that cannot work, memory that the system does not grant, an endpoint that cannot be listened on.
+pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
+    let settings = Settings::parse(&args.config_toml)?;
+    let spec: RunSpec = settings.table("run")?;
+    spec.validate()?;
+    let config: Config = settings.table("replay")?;
+    let batch_rows = number(&settings, "learner", "batch_rows")?;
+    let ack_timeout = Duration::from_millis(number(&settings, "actor", "ack_timeout_ms")?.into());
+    let mut replay = Replay::shard(&spec, &config, batch_rows, args.shard)?;
+    if args.after_updates > 0 {
+        replay = replay.going_on_after(args.after_updates, args.shard);
+    }
+    let transport: TransportConfig = settings.table("transport")?;
+    let batch = BatchHeader::of(&spec, batch_rows);
+    let pool = if transport.shared_memory {
+        PlanesPool::shared(SPARE_MAX, POOL_BATCHES, batch.planes_bytes())
+    } else {
+        PlanesPool::new(SPARE_MAX)
+    };
+    let reads_shared_memory = transport.shared_memory
+        && match shared_memory::check_lockable(
+            batch.pool_bytes() + chunk_pools_bytes(&settings, &spec)?,
+        ) {
+            Ok(()) => true,
+            Err(why) => {
+                tracing::warn!("chunks come through sockets, which is slower: {why}");
+                false
+            }
+        };
+    let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
+    let session = session::open(&Endpoints {
+        listen: args.listen.clone(),
+        connect: args.connect,
+    })?;
+    let declaring =
+        |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
+    let service = Arc::new(Service {
+        spec_hash: spec.hash(),
+        num_actions: spec.num_actions,
+        shard: (args.shard, config.shards),
+        after_updates: args.after_updates,
+        config_toml: args.config_toml,
+        shared_memory: reads_shared_memory,
+        hold_max: HOLD_MAX.min(ack_timeout / 4),
+        pool,
+        packer: replay.packer(),
+        state: Mutex::new(State {
+            replay,
+            members: Members::default(),
+            chunks: ParkedChunks::default(),
+            requests: ParkedRequests::default(),
+            timings: Timings::default(),
+        }),
+        changed: Condvar::new(),
+        weights: Mutex::default(),
+        announcements: announcements(&session, &keys).map_err(declaring)?,
+        shutdown: shutdown.clone(),
+    });
+    let _alive = watch_members(&session, &keys, &service)
+        .map_err(|e| anyhow::anyhow!("watching for actors and learner: {e}"))?;
+    let (answering, mut threads) = declare(&session, &keys, &service).map_err(declaring)?;
+    threads.extend(service.clone().start_working()?);
+    tracing::info!(
+        "replay server listens on {:?}, run {:016x}",
+        args.listen,
+        service.spec_hash
+    );
+    shutdown.wait();
+    service.changed.notify_all();
+    tracing::info!(
+        "replay server stops with {} transitions stored",
+        service.state().replay.inserted_total()
+    );
+    // Without the queryables no more comes, without the session nobody waits for a slow asker: the threads end.
+    drop(answering);
+    let closed = session.close().wait();
+    join_within(threads, THREADS_END_MAX);
+    closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+}
+
+/// One whole number of another part's settings.
+fn number(settings: &Settings, table: &'static str, key: &str) -> anyhow::Result<u32> {
+    let values: toml::Table = settings.table(table)?;
+    let value = values.get(key).and_then(toml::Value::as_integer);
+    let value = value.with_context(|| format!("{table}.{key} is missing or not a whole number"))?;
+    u32::try_from(value).with_context(|| format!("{table}.{key} = {value} cannot work"))
+}
+
+/// Bytes of shared memory that all actors of the run make for their chunks together, as far as the settings know of them.
+fn chunk_pools_bytes(settings: &Settings, spec: &RunSpec) -> anyhow::Result<usize> {
+    let actor = |key| anyhow::Ok(number(settings, "actor", key)? as usize);
+    let actors = number(settings, "local", "actors").unwrap_or(1) as usize;
+    let a_step = actor("envs")?;
+    // As actors reckon how long their chunks are.
+    let round_steps = actor("round_transitions_max").map(|it| it / (a_step * actors).max(1));
+    let steps = round_steps.unwrap_or(usize::MAX).max(1);
+    let steps = steps.min(actor("steps_per_chunk")?);
+    let chunk = a_step * steps * (spec.frame_bytes() + TRANSITION_BYTES);
+    let pool = shared_memory::pool_bytes(actor("chunks_in_flight_max")? + 1, chunk);
+    Ok(actors.saturating_mul(pool))
+}
+
+/// The threads that answer.
+type Threads = Vec<JoinHandle<()>>;
+
+/// Declares everything that the replay server answers; dropping the first ends it, and with it the threads.
+fn declare(
+    session: &Session,
+    keys: &Keys,
+    service: &Arc<Service>,
+) -> zenoh::Result<(Vec<Queryable<()>>, Threads)> {
+    type Answer = fn(&Service, Query);
+    let answers: [(String, &str, usize, Answer); 11] = [
+        (keys.ingest(), "insert", 1, Service::insert),
+        (keys.claim(), "claim", 1, Service::claim),
+        (keys.batch(), "request", 1, Service::request),
+        (keys.affinity(), "affinity", 1, Service::affinity),
+        (keys.hello(), "hello", 1, Service::hello),
+        (keys.actor_join(), "join-actor", 1, Service::join_actor),
+        (
+            keys.learner_join(),
+            "join-learner",
+            1,
+            Service::join_learner,
+        ),
+        (keys.goodbye(), "goodbye", 1, Service::goodbye),
+        (
+            keys.weights_upload(),
+            "weights-upload",
+            1,
+            Service::take_weights,
+        ),
+        (
+            keys.weights(),
+            "weights",
+            WEIGHTS_THREADS,
+            Service::give_weights,
+        ),
+        (keys.replay_status(), "status", 1, Service::status),
+    ];
+    let (mut queryables, mut threads) = (Vec::new(), Vec::new());
+    for (key, name, count, answer) in answers {
+        let service = service.clone();
+        let answering = Answering::start(name, count, move |query| answer(&service, query))?;
+        queryables.push(answering.declare(session, key)?);
+        threads.extend(answering.into_threads());
+    }
+    Ok((queryables, threads))
+}
+
+/// Where new weights are announced. An announcement that is dropped is made good by the next, or by the actors' own look.
+fn announcements(session: &Session, keys: &Keys) -> zenoh::Result<Publisher<'static>> {
+    session
+        .declare_publisher(keys.weights_version())
+        .congestion_control(CongestionControl::Drop)
+        .priority(Priority::InteractiveHigh)
+        .wait()
+}
+
+/// Keeps track of who is connected.
+fn watch_members(
+    session: &Session,
+    keys: &Keys,
+    service: &Arc<Service>,
+) -> zenoh::Result<Subscriber<()>> {
+    let (service, keys) = (service.clone(), keys.clone());
+    session
+        .liveliness()
+        .declare_subscriber(keys.all_alive())
+        .history(true)
+        .callback(move |sample| {
+            if let Some(who) = keys.alive(sample.key_expr().as_str()) {
+                service.note_alive(who, sample.kind());
+            }
+        })
+        .wait()
+}
+
+impl Service {
+    /// Starts the threads that deal with what was parked; they end after `shutdown`.
+    fn start_working(self: Arc<Self>) -> std::io::Result<Threads> {
+        let work = |name: &str, work: fn(&Self)| {
+            let service = self.clone();
+            std::thread::Builder::new()
+                .name(name.into())
+                .spawn(move || work(&service))
+        };
+        let mut threads = vec![work("admit", Self::admit_parked)?];
+        for i in 0..BATCH_THREADS {
+            threads.push(work(&format!("sample-{i}"), Self::serve_parked)?);
+        }
+        Ok(threads)
+    }
+}

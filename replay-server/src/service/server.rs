@@ -1,0 +1,106 @@
+//! What the threads of the replay server share, and how they read a message, reply to it and wait for a change.
+//! What each message does is in the file named for it.
+
+use std::{
+    sync::{Condvar, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+use driml_protocol::{CodecError, Kind, PlanesPool, Shutdown, codec, session};
+use zenoh::{pubsub::Publisher, query::Query};
+
+use super::{
+    members::Members,
+    parked::{ParkedChunks, ParkedRequests},
+    timings::Timings,
+    weights_store::WeightsStore,
+};
+use crate::{replay::Replay, storage::frame_store::Packer};
+
+/// What all threads share.
+pub(super) struct Service {
+    pub(super) spec_hash: u64,
+    pub(super) num_actions: u32,
+    pub(super) shard: (u32, u32),
+    pub(super) after_updates: u64,
+    pub(super) config_toml: String,
+    /// Whether chunks may come through shared memory.
+    pub(super) shared_memory: bool,
+    /// How long a question about a chunk is held before it is answered `Wait`: far below the actors' time-out, so that an actor
+    /// can tell a server that makes it wait from one that is silent.
+    pub(super) hold_max: Duration,
+    /// Memory for chunks that arrive and batches that leave.
+    pub(super) pool: PlanesPool,
+    pub(super) packer: Packer,
+    pub(super) state: Mutex<State>,
+    /// Something was stored, sampled or parked: whoever waits for the limiter looks again.
+    pub(super) changed: Condvar,
+    pub(super) weights: Mutex<WeightsStore>,
+    pub(super) announcements: Publisher<'static>,
+    pub(super) shutdown: Shutdown,
+}
+
+/// What changes, under one lock.
+pub(super) struct State {
+    pub(super) replay: Replay,
+    pub(super) members: Members,
+    pub(super) chunks: ParkedChunks<Question>,
+    pub(super) requests: ParkedRequests<Query>,
+    pub(super) timings: Timings,
+}
+
+/// Who asks about a chunk, and since when.
+pub(super) struct Question {
+    pub(super) query: Query,
+    pub(super) arrived: Instant,
+}
+
+impl Service {
+    pub(super) fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(super) fn reply<H: serde::Serialize>(&self, query: &Query, kind: Kind, header: &H) {
+        match codec::encode(kind, self.spec_hash, header, &[]) {
+            Ok(bytes) => session::answer(query, bytes.into()),
+            Err(e) => tracing::error!("a reply of kind {kind:?} was not sent: {e}"),
+        }
+    }
+
+    /// Counts and logs a message that cannot be read.
+    pub(super) fn refuse(&self, what: &str, e: &CodecError) {
+        tracing::warn!("{what} was refused: {e}");
+        self.state().replay.note_refused_message();
+    }
+
+    /// Decodes a small message, or counts it as refused.
+    pub(super) fn read<H: serde::de::DeserializeOwned>(
+        &self,
+        query: &Query,
+        kind: Kind,
+    ) -> Option<H> {
+        let payload = query
+            .payload()
+            .map(|payload| payload.to_bytes())
+            .unwrap_or_default();
+        match codec::decode(&payload, kind, Some(self.spec_hash)) {
+            Ok((header, _)) => Some(header),
+            Err(e) => {
+                self.refuse(&format!("a message of kind {kind:?}"), &e);
+                None
+            }
+        }
+    }
+
+    /// Waits until something has changed, or for `wait_max`.
+    pub(super) fn wait<'a>(
+        &'a self,
+        state: MutexGuard<'a, State>,
+        wait_max: Duration,
+    ) -> MutexGuard<'a, State> {
+        self.changed
+            .wait_timeout(state, wait_max)
+            .unwrap_or_else(PoisonError::into_inner)
+            .0
+    }
+}

@@ -1,0 +1,69 @@
+//! How the frames of the transitions held are kept: plain, or compressed without loss.
+//! It knows neither links, episodes nor stacks, and it never stores a frame twice.
+
+pub(crate) mod compressed;
+mod layout;
+pub(crate) mod log;
+mod pack;
+mod plain;
+
+use crate::config::Compression;
+use compressed::CompressedFrames;
+pub(crate) use pack::Run;
+pub use pack::{PackedChunk, Packer};
+use plain::PlainFrames;
+
+/// The frames of all transitions held.
+pub(crate) enum Frames {
+    Plain(PlainFrames),
+    Compressed(CompressedFrames),
+}
+
+impl Frames {
+    /// Room for the frames of `capacity` transitions; compressed ones take `bytes_max` bytes at most, if there is a limit.
+    ///
+    /// # Errors
+    /// The system refuses to reserve that much memory: the bytes asked for.
+    pub(crate) fn new(
+        compression: Compression,
+        capacity: u64,
+        frame_bytes: usize,
+        bytes_max: Option<u64>,
+    ) -> Result<Self, u64> {
+        match compression {
+            Compression::None => PlainFrames::new(capacity, frame_bytes).map(Self::Plain),
+            Compression::Lz4 => Ok(Self::Compressed(CompressedFrames::new(
+                frame_bytes,
+                bytes_max,
+            ))),
+        }
+    }
+
+    /// Stores the frames of the next transitions; those before `oldest` are no longer wanted. Gives the oldest that is held.
+    pub(crate) fn push(&mut self, run: Run<'_>, oldest: u64) -> u64 {
+        match (self, run) {
+            (Self::Plain(frames), Run::Plain(run)) => {
+                frames.push(run);
+                oldest
+            }
+            (Self::Compressed(frames), Run::Packed(run)) => frames.push(run, oldest),
+            _ => panic!("a chunk was packed for a replay with another compression"),
+        }
+    }
+
+    /// Bytes of memory taken for frames.
+    pub(crate) fn bytes_held(&self) -> u64 {
+        match self {
+            Self::Plain(frames) => frames.bytes_held(),
+            Self::Compressed(frames) => frames.bytes_held(),
+        }
+    }
+
+    /// Checks that the transitions `oldest..inserted` have their frames; panics if not. Slow: for tests.
+    pub(crate) fn check_valid(&self, oldest: u64, inserted: u64) {
+        match self {
+            Self::Plain(frames) => frames.check_valid(inserted - oldest),
+            Self::Compressed(frames) => frames.check_valid(oldest, inserted),
+        }
+    }
+}

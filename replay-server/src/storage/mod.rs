@@ -1,0 +1,5 @@
+//! What the replay holds: the transitions in a ring, and their frames, plain or compressed.
+//! Nothing here draws a sample or knows which actor sent what.
+
+pub(crate) mod frame_store;
+pub(crate) mod ring;

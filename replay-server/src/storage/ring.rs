@@ -1,0 +1,318 @@
+//! The transitions held: every frame once, with links along its episode.
+//! It does not know actors, sampling or stacks; how frames are kept is `frame_store`'s business.
+
+use driml_protocol::End;
+
+use super::frame_store::{Frames, Run};
+
+/// How a transition hangs together with what its stream stored before; `after` is the index of the one just before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Link {
+    /// First of an episode: nothing before it counts.
+    EpisodeStart,
+    /// First of a level: frames before it do not count, but the return runs on from `after`.
+    LevelStart { after: u64 },
+    /// Within a level.
+    Within { after: u64 },
+    /// What came before was lost: neither frames nor return may reach back.
+    Lost,
+}
+
+impl Link {
+    /// The link of the transition that follows `index`, which ended `end`.
+    pub(crate) const fn following(index: u64, end: End) -> Self {
+        match end {
+            End::Running => Self::Within { after: index },
+            End::LevelChange => Self::LevelStart { after: index },
+            End::TimedOut | End::Terminal => Self::EpisodeStart,
+        }
+    }
+}
+
+/// No successor: it has not come yet, never will, or belongs to the next episode.
+const NO_NEXT: u64 = u64::MAX;
+/// No predecessor: this is the first of an episode or level.
+const LEVEL_START: u64 = u64::MAX;
+/// The predecessor was lost on the way.
+const PREVIOUS_LOST: u64 = u64::MAX - 1;
+
+/// All of one transition but its frame: 32 bytes, so that a walk along an episode touches little memory.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Step {
+    next: u64,
+    previous: u64,
+    pub(crate) weights_version: u64,
+    pub(crate) reward: f32,
+    pub(crate) action: u8,
+    pub(crate) end: End,
+}
+
+impl Step {
+    /// A step without links.
+    pub(crate) const fn new(action: u8, reward: f32, end: End, weights_version: u64) -> Self {
+        Self {
+            next: NO_NEXT,
+            previous: LEVEL_START,
+            weights_version,
+            reward,
+            action,
+            end,
+        }
+    }
+
+    /// Index of the successor in the same episode; a successor is newer, so it is held whenever this step is.
+    pub(crate) const fn next(&self) -> Option<u64> {
+        if self.next == NO_NEXT {
+            None
+        } else {
+            Some(self.next)
+        }
+    }
+}
+
+/// What lies before a transition, as far as frames go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Previous {
+    /// Nothing: it is the first of its episode or level.
+    Start,
+    /// A transition that is held.
+    Held(u64),
+    /// A transition that is overwritten or was lost.
+    Gone,
+}
+
+/// The newest `capacity` transitions, or fewer if their frames may not take the memory; number `i` since the start lies in
+/// slot `i % capacity`.
+pub(crate) struct Ring {
+    capacity: u64,
+    oldest: u64,
+    inserted: u64,
+    /// Grows into its reservation, so that memory is taken only as transitions come.
+    steps: Vec<Step>,
+    frames: Frames,
+}
+
+impl Ring {
+    /// An empty ring of `capacity` transitions with their `frames`.
+    ///
+    /// # Errors
+    /// The system refuses to reserve that much memory: the bytes asked for.
+    pub(crate) fn new(capacity: u64, frames: Frames) -> Result<Self, u64> {
+        let asked = capacity.saturating_mul(size_of::<Step>() as u64);
+        let mut steps = Vec::new();
+        let length = usize::try_from(capacity).map_err(|_| asked)?;
+        steps.try_reserve_exact(length).map_err(|_| asked)?;
+        Ok(Self {
+            capacity,
+            oldest: 0,
+            inserted: 0,
+            steps,
+            frames,
+        })
+    }
+
+    /// Stores consecutive transitions of one stream, over the oldest ones once the ring is full.
+    ///
+    /// `link` is the first one's; the result is the link of the one that will follow the last.
+    pub(crate) fn push_run(
+        &mut self,
+        frames: Run<'_>,
+        steps: impl ExactSizeIterator<Item = Step>,
+        mut link: Link,
+    ) -> Link {
+        let inserted = self.inserted + steps.len() as u64;
+        let oldest = inserted.saturating_sub(self.capacity).max(self.oldest);
+        self.oldest = self.frames.push(frames, oldest);
+        for step in steps {
+            link = Link::following(self.push(step, link), step.end);
+        }
+        link
+    }
+
+    /// Stores one transition whose frame is stored, and gives its index.
+    fn push(&mut self, step: Step, link: Link) -> u64 {
+        let index = self.inserted;
+        let previous = match link {
+            Link::EpisodeStart | Link::LevelStart { .. } => LEVEL_START,
+            Link::Within { after } => after,
+            Link::Lost => PREVIOUS_LOST,
+        };
+        let step = Step {
+            next: NO_NEXT,
+            previous,
+            ..step
+        };
+        let slot = self.slot(index);
+        if slot == self.steps.len() {
+            self.steps.push(step);
+        } else {
+            self.steps[slot] = step;
+        }
+        self.inserted += 1;
+        if let Link::Within { after } | Link::LevelStart { after } = link
+            && after >= self.oldest
+        {
+            let slot = self.slot(after);
+            self.steps[slot].next = index;
+        }
+        index
+    }
+
+    fn slot(&self, index: u64) -> usize {
+        (index % self.capacity) as usize
+    }
+
+    /// Most transitions held.
+    pub(crate) const fn capacity(&self) -> u64 {
+        self.capacity
+    }
+
+    /// Transitions stored since the start: the index of the next one.
+    pub(crate) const fn inserted(&self) -> u64 {
+        self.inserted
+    }
+
+    /// Index of the oldest transition held (of the next one, if none is).
+    pub(crate) const fn oldest(&self) -> u64 {
+        self.oldest
+    }
+
+    /// The step at `index`, which must be held.
+    pub(crate) fn step(&self, index: u64) -> &Step {
+        debug_assert!(
+            (self.oldest()..self.inserted).contains(&index),
+            "{index} is not held"
+        );
+        &self.steps[self.slot(index)]
+    }
+
+    /// The frames of all transitions held.
+    pub(crate) const fn frames(&self) -> &Frames {
+        &self.frames
+    }
+
+    /// What lies before `index` in its level.
+    pub(crate) fn previous(&self, index: u64) -> Previous {
+        match self.step(index).previous {
+            LEVEL_START => Previous::Start,
+            PREVIOUS_LOST => Previous::Gone,
+            previous if previous < self.oldest() => Previous::Gone,
+            previous => Previous::Held(previous),
+        }
+    }
+
+    /// Checks sizes and every link; panics at the first that is wrong. Slow: for tests.
+    pub(crate) fn check_valid(&self) {
+        assert_eq!(
+            self.steps.len() as u64,
+            self.inserted.min(self.capacity),
+            "one step a transition, until they are overwritten"
+        );
+        assert!(
+            self.inserted - self.oldest <= self.capacity,
+            "no more are held than fit"
+        );
+        self.frames.check_valid(self.oldest, self.inserted);
+        for index in self.oldest()..self.inserted {
+            let step = self.step(index);
+            if let Some(next) = step.next() {
+                assert!(
+                    index < next && next < self.inserted,
+                    "{index} is followed by {next}"
+                );
+                assert!(
+                    !step.end.is_episode_end(),
+                    "{index} ended its episode, yet {next} follows"
+                );
+                let back = if step.end == End::Running {
+                    index
+                } else {
+                    LEVEL_START
+                };
+                assert_eq!(self.step(next).previous, back, "{next} follows {index}");
+            }
+            if let Previous::Held(previous) = self.previous(index) {
+                assert_eq!(
+                    self.step(previous).next,
+                    index,
+                    "{previous} precedes {index}"
+                );
+                assert_eq!(
+                    self.step(previous).end,
+                    End::Running,
+                    "{previous} precedes {index}"
+                );
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use rand::{Rng, SeedableRng};
+
+    use super::*;
+    use crate::{config::Compression, storage::frame_store::Frames};
+
+    fn plain(capacity: u64, frame_bytes: usize) -> Result<Ring, u64> {
+        let frames = Frames::new(Compression::None, capacity, frame_bytes, None)?;
+        Ring::new(capacity, frames)
+    }
+
+    proptest! {
+        /// Against a plain list of all that was ever pushed, in which every relation is searched for.
+        #[test]
+        fn equals_a_plain_list(seed in any::<u64>(), capacity in 1u64..40, streams in 1usize..4) {
+            struct Pushed { stream: usize, frame: [u8; 2], reward: f32, end: End, cut: bool }
+            let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+            let mut ring = plain(capacity, 2).unwrap();
+            let mut list: Vec<Pushed> = vec![];
+            for index in 0..120u64 {
+                let stream = rng.random_range(0..streams);
+                let ends = [End::Running, End::Running, End::LevelChange, End::TimedOut, End::Terminal];
+                let end = ends[rng.random_range(0..ends.len())];
+                let last = list.iter().rposition(|pushed| pushed.stream == stream);
+                let cut = rng.random_bool(0.1);
+                let link = match last {
+                    _ if cut => Link::Lost,
+                    Some(last) => Link::following(last as u64, list[last].end),
+                    None => Link::EpisodeStart,
+                };
+                let frame = rng.random::<[u8; 2]>();
+                let reward = rng.random();
+                let step = Step::new(3, reward, end, index);
+                let next = ring.push_run(Run::Plain(&frame), std::iter::once(step), link);
+                prop_assert_eq!(next, Link::following(index, end));
+                list.push(Pushed { stream, frame, reward, end, cut });
+                ring.check_valid();
+                prop_assert_eq!(ring.oldest(), (index + 1).saturating_sub(capacity));
+                for i in ring.oldest()..=index {
+                    let pushed = &list[i as usize];
+                    let Frames::Plain(frames) = ring.frames() else { unreachable!() };
+                    prop_assert_eq!(frames.frame(i), pushed.frame);
+                    let step = ring.step(i);
+                    prop_assert_eq!((step.reward, step.end, step.weights_version), (pushed.reward, pushed.end, i));
+                    let of_stream = |pushed: &&Pushed| pushed.stream == list[i as usize].stream;
+                    let after = list.iter().skip(i as usize + 1).find(of_stream);
+                    let follows = after.is_some_and(|next| !pushed.end.is_episode_end() && !next.cut);
+                    let next = list.iter().skip(i as usize + 1).position(|p| p.stream == pushed.stream);
+                    prop_assert_eq!(step.next(), follows.then(|| i + 1 + next.unwrap() as u64));
+                    let before = list[..i as usize].iter().rposition(|p| p.stream == pushed.stream);
+                    let previous = match before {
+                        _ if pushed.cut => Previous::Gone,
+                        Some(at) if list[at].end == End::Running && (at as u64) < ring.oldest() => Previous::Gone,
+                        Some(at) if list[at].end == End::Running => Previous::Held(at as u64),
+                        _ => Previous::Start,
+                    };
+                    prop_assert_eq!(ring.previous(i), previous);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn memory_that_is_not_there_is_an_error() {
+        assert_eq!(plain(1 << 50, 1 << 12).err(), Some(1 << 62));
+    }
+}
