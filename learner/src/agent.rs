@@ -1,14 +1,17 @@
 //! One update: C51 plus the auxiliary objective, clipped, through Adam; then the target network's turn.
 //! It does not fetch batches, publish weights or keep checkpoints, and knows no process but its own.
 
-use std::{borrow::Cow, collections::HashMap};
+use std::collections::HashMap;
 
-use candle_core::{Device, Tensor};
-use driml_model::{Compute, DimParts, Features, ModelConfig, Network, Parameters};
+use candle_core::Tensor;
+use driml_model::{Compute, DimParts, ModelConfig, Network, Parameters};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    auxiliary::{Auxiliary, cpc, curl::KeyEncoder, dim::PAIRS},
+    auxiliary::{
+        key_encoder::KeyEncoder,
+        loss::{AuxiliaryLoss, LossInputs, WeightedLoss},
+    },
     batch::Batch,
     error::UpdateError,
     losses::{
@@ -21,6 +24,7 @@ use crate::{
         target,
     },
     settings::LearnerSettings,
+    tensors::states,
 };
 
 /// What one update did, for a person to watch.
@@ -28,9 +32,9 @@ use crate::{
 pub struct UpdateReport {
     /// Mean KL divergence of the prediction from the projected target, in nats.
     pub c51_kl: f32,
-    /// Auxiliary losses in nats, in the order of [`PAIRS`]; `None` for pairs of weight 0.
-    pub dim: [Option<f32>; 4],
-    /// `c51_kl + sum of lambda * dim`.
+    /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
+    pub losses: Vec<(&'static str, f32)>,
+    /// `c51_kl + sum of weight * loss`.
     pub total: f32,
     /// Global 2-norm of the gradients before clipping.
     pub grad_norm: f64,
@@ -43,9 +47,9 @@ pub struct UpdateReport {
 pub struct Evaluation {
     /// Mean KL divergence, in nats.
     pub c51_kl: f32,
-    /// Auxiliary losses in nats, in the order of [`PAIRS`]; `None` for pairs of weight 0.
-    pub dim: [Option<f32>; 4],
-    /// `c51_kl + sum of lambda * dim`.
+    /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
+    pub losses: Vec<(&'static str, f32)>,
+    /// `c51_kl + sum of weight * loss`.
     pub total: f32,
     /// Online values of s_t [B, A].
     pub q_values_t: Vec<f32>,
@@ -70,11 +74,11 @@ pub struct NetworkParameters {
 
 /// The learner: online and target network, CURL's key encoder, optimiser, count of updates.
 #[derive(Debug)]
-pub struct Learner {
+pub struct Agent {
     model: ModelConfig,
     settings: LearnerSettings,
     compute: Compute,
-    auxiliary: Auxiliary,
+    auxiliary: Box<dyn AuxiliaryLoss>,
     pub(crate) online: Parameters,
     pub(crate) target: Parameters,
     online_network: Network,
@@ -84,7 +88,7 @@ pub struct Learner {
     pub(crate) updates: u64,
 }
 
-impl Learner {
+impl Agent {
     /// A learner with initial weights drawn from `rng`, the same on every device; the slow networks are copies.
     ///
     /// # Errors
@@ -96,7 +100,8 @@ impl Learner {
         rng: &mut ChaCha8Rng,
     ) -> Result<Self, UpdateError> {
         let online = Parameters::init(&model, rng, &compute.device)?;
-        let key = settings.curl.map(|_| KeyEncoder::copy_of(&online));
+        let key = settings.auxiliary()?.key_tau();
+        let key = key.map(|_| KeyEncoder::copy_of(&online));
         let parameters = NetworkParameters {
             target: online.without_dim()?,
             key: key.transpose()?,
@@ -108,7 +113,7 @@ impl Learner {
     /// A learner with given weights, on the device of `compute`, before its first update.
     ///
     /// # Errors
-    /// As [`Learner::new`], and parameters that do not fit the model.
+    /// As [`Agent::new`], and parameters that do not fit the model.
     pub fn from_parameters(
         model: ModelConfig,
         settings: LearnerSettings,
@@ -132,9 +137,10 @@ impl Learner {
             )));
         }
         let operations = compute.operations;
-        let key = match (settings.curl, key) {
+        let auxiliary = settings.auxiliary()?;
+        let key = match (auxiliary.key_tau(), key) {
             (None, None) => None,
-            (Some(curl), Some(key)) => Some(KeyEncoder::new(&model, curl, operations, key)?),
+            (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, operations, key)?),
             (wanted, _) => {
                 let there = if wanted.is_some() { "missing" } else { "there" };
                 let objective = settings.objective.name();
@@ -149,7 +155,7 @@ impl Learner {
             key,
             adam: Adam::new(settings.adam, &online, operations)?,
             compute: compute.clone(),
-            auxiliary: settings.auxiliary(),
+            auxiliary,
             updates: 0,
             model,
             settings,
@@ -214,7 +220,7 @@ impl Learner {
         let q_sum: f32 = taken.map(|(q, &action)| q[usize::from(action)]).sum();
         Ok(UpdateReport {
             c51_kl: evaluation.c51_kl,
-            dim: evaluation.dim,
+            losses: evaluation.losses,
             total: evaluation.total,
             grad_norm,
             q_mean: q_sum / batch.rows as f32,
@@ -226,7 +232,7 @@ impl Learner {
     /// # Errors
     /// [`UpdateError::Batch`] with what is wrong with it.
     pub(crate) fn check(&self, batch: &Batch<'_>) -> Result<(), UpdateError> {
-        batch.validate(&self.model, &self.auxiliary)
+        batch.validate(&self.model, self.settings.objective.positives())
     }
 
     /// Losses and gradients of one batch at the present parameters.
@@ -239,7 +245,7 @@ impl Learner {
 
         let features_t = self
             .online_network
-            .features(&self.frames(batch.rows, batch.frames_t)?)?;
+            .features(&self.states(batch.frames_t)?)?;
         let logits = self.online_network.logits(&features_t.f4)?;
         let q_values_t = self.online_network.q_values(&logits.detach())?;
         let kl = kl_loss(
@@ -248,25 +254,28 @@ impl Learner {
             target_projection.clone(),
             self.compute.operations,
         )?;
-        let losses = self.auxiliary_losses(batch, &features_t)?;
+        let auxiliary = self.auxiliary.losses(&LossInputs {
+            online: &self.online_network,
+            model: &self.model,
+            batch,
+            features_t: &features_t,
+            key: self.key.as_ref(),
+            device: &self.compute.device,
+        })?;
         let mut total = kl.clone();
-        for (loss, lambda) in losses.iter().zip(self.settings.lambda.values()) {
-            if let Some(loss) = loss {
-                total = (total + loss.affine(lambda, 0.0)?)?;
-            }
+        for WeightedLoss { loss, weight, .. } in &auxiliary {
+            total = (total + loss.affine(*weight, 0.0)?)?;
         }
         // Before any number is read: reading waits for a GPU, which should have all its work by then.
         let gradients = Gradients::take(&self.online, total.backward()?)?;
         let c51_kl = finite("the C51 loss", &kl)?;
-        let mut dim = [None; 4];
-        for ((value, loss), pair) in dim.iter_mut().zip(&losses).zip(PAIRS) {
-            if let Some(loss) = loss {
-                *value = Some(finite(pair, loss)?);
-            }
+        let mut losses = Vec::with_capacity(auxiliary.len());
+        for WeightedLoss { name, loss, .. } in &auxiliary {
+            losses.push((*name, finite(name, loss)?));
         }
         Ok(Evaluation {
             c51_kl,
-            dim,
+            losses,
             total: finite("the total loss", &total)?,
             q_values_t: flat(&q_values_t)?,
             next_greedy_action,
@@ -275,55 +284,11 @@ impl Learner {
         })
     }
 
-    /// The auxiliary losses, in the order of [`PAIRS`], before their weights; the torso sees what they need and no more.
-    ///
-    /// `features_t` are the online network's of the plain s_t, which serve again where the objective sees it plain.
-    fn auxiliary_losses(
-        &self,
-        batch: &Batch<'_>,
-        features_t: &Features,
-    ) -> Result<[Option<Tensor>; 4], UpdateError> {
-        if self.auxiliary == Auxiliary::None {
-            return Ok([const { None }; 4]);
-        }
-        let online = &self.online_network;
-        let seen = match batch.anchors {
-            Some(anchors) => Some(online.features(&self.frames(batch.rows, anchors)?)?),
-            None => None,
-        };
-        let anchors = seen.as_ref().unwrap_or(features_t);
-        // The network looks at them on the CPU.
-        let action = Tensor::from_slice(batch.action, batch.rows, &Device::Cpu)?;
-        let valid = batch.positive_valid;
-        match &self.auxiliary {
-            Auxiliary::None => Ok([const { None }; 4]),
-            Auxiliary::Dim(dim) => {
-                let later = online.features(&self.frames(batch.rows, batch.frames_k)?)?;
-                dim.losses(online, anchors, &later, &action, valid)
-            }
-            Auxiliary::Cpc(cpc) => {
-                let there = cpc::present(batch.frames_k, valid);
-                let count = valid.iter().filter(|&&valid| valid != 0).count();
-                let later = match count {
-                    0 => None,
-                    _ => Some(online.features(&self.frames(count, there)?)?),
-                };
-                cpc.losses(online, anchors, later.as_ref(), &action, valid)
-            }
-            Auxiliary::Curl(curl) => {
-                let encoder = self.key.as_ref();
-                let encoder = encoder.expect("a learner with this objective is made with one");
-                let keys = encoder.keys(&self.frames(batch.rows, batch.frames_k)?)?;
-                curl.losses(online, anchors, &keys, &action)
-            }
-        }
-    }
-
     /// Clips `gradients` and takes one step with them; moves the slow networks whose turn it is.
     /// Returns their global norm before clipping.
     ///
     /// # Errors
-    /// As [`Learner::update`].
+    /// As [`Agent::update`].
     pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
         let norm = gradients.norm(self.compute.operations)?;
         self.adam.step(
@@ -354,7 +319,7 @@ impl Learner {
             v_max,
             ..
         } = self.model;
-        let frames_n = self.frames(batch.rows, batch.frames_n)?;
+        let frames_n = self.states(batch.frames_n)?;
         let target_logits = distribution(&self.target_network, &frames_n)?;
         let next_q_values = if self.settings.double_dqn {
             self.online_network
@@ -390,27 +355,11 @@ impl Learner {
         Ok((next_greedy, projected))
     }
 
-    fn frames<'a>(
-        &self,
-        rows: usize,
-        frames: impl Into<Cow<'a, [u8]>>,
-    ) -> Result<Tensor, UpdateError> {
-        let ModelConfig {
-            height,
-            width,
-            channels,
-            ..
-        } = self.model;
-        let shape = (rows, height, width, channels);
-        // Bytes travel to the device; they become numbers there.
-        let device = &self.compute.device;
-        Ok(match frames.into() {
-            Cow::Borrowed(frames) => Tensor::from_slice(frames, shape, device)?,
-            Cow::Owned(frames) => Tensor::from_vec(frames, shape, device)?,
-        })
+    fn states(&self, bytes: &[u8]) -> candle_core::Result<Tensor> {
+        states(&self.model, bytes, &self.compute.device)
     }
 
-    /// Puts back a state that [`Learner::online`], [`Learner::target`] and [`Adam`] had after `updates` updates.
+    /// Puts back a state that [`Agent::online`], [`Agent::target`] and [`Adam`] had after `updates` updates.
     pub(crate) fn restore_progress(
         &mut self,
         updates: u64,

@@ -1,7 +1,7 @@
 //! A learner's work without its network connections: batch in, report out, weights and affinity on demand.
 //! The processes and the lockstep mode run this same code; it neither asks for batches nor sends anything.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use driml_model::{Compute, Enlarge};
 use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, WeightsHeader};
@@ -10,23 +10,50 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use crate::{
-    affinity::AffinityEstimator,
-    agent::{Learner, UpdateReport},
+    affinity::{AffinityError, AffinityEstimator},
+    agent::{Agent, UpdateReport},
     augment::Augment,
-    auxiliary::Objective,
+    auxiliary::positives::Positives,
     batch::Batch,
-    checkpoint::{self, RunState},
-    config::LearnerPart,
+    checkpoint::{self, CheckpointError, RunState},
+    config::{ConfigError, LearnerPart},
+    error::UpdateError,
 };
 
 /// Weights as they travel: what they say of themselves, and a safetensors file.
 pub type Weights = (WeightsHeader, Vec<u8>);
 
+/// Why a learner could not be made, learn or be saved.
+#[derive(Debug, thiserror::Error)]
+pub enum LearnerError {
+    /// The update was not taken.
+    #[error(transparent)]
+    Update(#[from] UpdateError),
+    /// The pairs of actions do not fit the affinity's alphabet, or the estimate left the finite numbers.
+    #[error(transparent)]
+    Affinity(#[from] AffinityError),
+    /// Settings of the learner that cannot work.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// Sizes that no network can have.
+    #[error(transparent)]
+    Model(#[from] driml_model::ModelError),
+    /// A checkpoint was not written or not read.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// The checkpoint's affinity is estimated in another way than this run's.
+    #[error(
+        "the checkpoint in {} estimated the action affinity otherwise: resume with the settings it was made with, or choose another folder",
+        .0.display()
+    )]
+    OtherAffinity(PathBuf),
+}
+
 /// Everything that a learner changes while it learns.
-pub struct Learning {
+pub struct Learner {
     part: LearnerPart,
     spec_hash: u64,
-    learner: Learner,
+    agent: Agent,
     affinity: Option<AffinityEstimator>,
     rng: ChaCha8Rng,
     enlarge: Option<Enlarge>,
@@ -38,16 +65,16 @@ pub struct Learning {
     weights_version: u64,
 }
 
-impl Learning {
+impl Learner {
     /// A learner at its start, all generators derived from the run's seed.
     ///
     /// # Errors
     /// Settings that cannot work.
-    pub fn new(part: LearnerPart, compute: &Compute) -> anyhow::Result<Self> {
+    pub fn new(part: LearnerPart, compute: &Compute) -> Result<Self, LearnerError> {
         let spec = &part.spec;
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
         let mut rng = ChaCha8Rng::from_seed(spec.seed_for("learner", 0));
-        let learner = Learner::new(
+        let agent = Agent::new(
             part.model.clone(),
             part.learner.update.clone(),
             compute,
@@ -68,7 +95,7 @@ impl Learning {
         });
         Ok(Self {
             spec_hash: spec.hash(),
-            learner,
+            agent,
             affinity,
             rng,
             enlarge,
@@ -84,7 +111,11 @@ impl Learning {
     ///
     /// # Errors
     /// Settings that cannot work, or a checkpoint that is damaged, of another run or of other settings.
-    pub fn resume(part: LearnerPart, compute: &Compute, folder: &Path) -> anyhow::Result<Self> {
+    pub fn resume(
+        part: LearnerPart,
+        compute: &Compute,
+        folder: &Path,
+    ) -> Result<Self, LearnerError> {
         let mut this = Self::new(part, compute)?;
         let restored = checkpoint::load_latest(
             folder,
@@ -101,13 +132,11 @@ impl Learning {
             (None, None) => true,
             _ => false,
         };
-        anyhow::ensure!(
-            same_affinity,
-            "the checkpoint in {} estimated the action affinity otherwise: resume with the settings it was made with, or choose another folder",
-            folder.display()
-        );
+        if !same_affinity {
+            return Err(LearnerError::OtherAffinity(folder.to_owned()));
+        }
         this.weights_version = restored.weights_version;
-        this.learner = restored.learner;
+        this.agent = restored.agent;
         this.affinity = restored.affinity;
         this.rng = restored.rng;
         tracing::info!(
@@ -125,7 +154,7 @@ impl Learning {
 
     /// Updates taken.
     pub const fn updates(&self) -> u64 {
-        self.learner.updates()
+        self.agent.updates()
     }
 
     /// Learns from one batch: the network and the affinity.
@@ -133,7 +162,7 @@ impl Learning {
     /// # Errors
     /// A batch that does not fit, or arithmetic that left the finite numbers; all is then as it was, except after
     /// [`UpdateError::Diverged`](crate::UpdateError::Diverged), when neither weights nor a checkpoint can be had any more.
-    pub fn update(&mut self, batch: &WireBatch) -> anyhow::Result<UpdateReport> {
+    pub fn update(&mut self, batch: &WireBatch) -> Result<UpdateReport, LearnerError> {
         let mut frames = [batch.frames_t(), batch.frames_k(), batch.frames_n()];
         if let Some(enlarge) = &self.enlarge {
             for (states, larger) in frames.iter_mut().zip(&mut self.enlarged) {
@@ -148,7 +177,7 @@ impl Learning {
         let mut rng = self.rng.clone();
         let all_valid;
         if let Some(augment) = &mut self.augment {
-            if self.part.learner.update.objective == Objective::Curl {
+            if self.part.learner.update.objective.positives() == Positives::OtherView {
                 // Two views of the same state; every row has them.
                 all_valid = vec![1; batch.rows()];
                 (frames_k, positives, valid) = (frames_t, 1, all_valid.as_slice());
@@ -172,12 +201,12 @@ impl Learning {
             bootstrap_discount: &discounts,
             positive_valid: valid,
         };
-        self.learner.check(&batch)?;
+        self.agent.check(&batch)?;
         let mut affinity = self.affinity.clone();
         if let Some(affinity) = &mut affinity {
             affinity.observe(&batch.action_pairs(), &mut rng)?;
         }
-        let report = self.learner.update(&batch)?;
+        let report = self.agent.update(&batch)?;
         (self.rng, self.affinity) = (rng, affinity);
         Ok(report)
     }
@@ -186,7 +215,8 @@ impl Learning {
     pub fn note(&self, report: &UpdateReport, status: &mut LearnerStatus) {
         status.updates = self.updates();
         status.c51_kl = report.c51_kl;
-        status.dim = report.dim;
+        let losses = report.losses.iter();
+        status.losses = losses.map(|&(name, loss)| (name.into(), loss)).collect();
         status.total = report.total;
         status.grad_norm = report.grad_norm;
         status.q_mean = report.q_mean;
@@ -202,7 +232,7 @@ impl Learning {
     pub fn affinity_update(&self, learner: u64) -> Option<AffinityUpdate> {
         self.affinity.as_ref().map(|affinity| AffinityUpdate {
             learner,
-            version: self.learner.updates(),
+            version: self.agent.updates(),
             num_actions: affinity.num_actions() as u32,
             matrix: affinity.matrix().to_vec(),
         })
@@ -210,7 +240,7 @@ impl Learning {
 
     /// Whether the actors are due newer weights after this many updates.
     pub const fn publication_is_due(&self) -> bool {
-        self.learner
+        self.agent
             .updates()
             .is_multiple_of(self.part.learner.publish_period_updates)
     }
@@ -227,8 +257,8 @@ impl Learning {
     ///
     /// # Errors
     /// The tensor library failed.
-    pub fn next_weights(&mut self) -> anyhow::Result<Weights> {
-        let safetensors = self.learner.weights()?;
+    pub fn next_weights(&mut self) -> Result<Weights, LearnerError> {
+        let safetensors = self.agent.weights()?;
         self.weights_version += 1;
         let header = WeightsHeader::new(self.weights_version, self.updates(), &safetensors);
         Ok((header, safetensors))
@@ -238,9 +268,9 @@ impl Learning {
     ///
     /// # Errors
     /// The file system refused; older checkpoints are untouched.
-    pub fn save(&self, folder: &Path) -> anyhow::Result<()> {
+    pub fn save(&self, folder: &Path) -> Result<(), LearnerError> {
         let state = RunState {
-            learner: &self.learner,
+            agent: &self.agent,
             affinity: self.affinity.as_ref(),
             rng: &self.rng,
             weights_version: self.weights_version,

@@ -2,14 +2,13 @@
 //! It fills in no number: presets do, with their sources.
 
 use driml_model::DimParts;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, de::Error};
 
 use crate::{
     auxiliary::{
-        Auxiliary, Objective,
-        cpc::Cpc,
-        curl::{Curl, CurlSettings},
-        dim::{Dim, Lambda},
+        Objective,
+        loss::AuxiliaryLoss,
+        settings::{AuxiliarySettings, Lambda},
     },
     error::UpdateError,
     optimiser::adam::AdamSettings,
@@ -17,7 +16,6 @@ use crate::{
 
 /// Everything that one update depends on beside the network's sizes. No field has a default.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct LearnerSettings {
     /// Choose the action in s_{t+n} by the online network instead of the target network.
     pub double_dqn: bool,
@@ -37,8 +35,19 @@ pub struct LearnerSettings {
     pub target_period_updates: u64,
     /// Share of the online network in a move of the target network, in (0, 1].
     pub target_tau: f64,
-    /// CURL's key encoder; there for that objective and for no other.
-    pub curl: Option<CurlSettings>,
+    /// The objective's own numbers, a table of its name such as `[learner.update.curl]`; none for an objective that has none.
+    #[serde(flatten, deserialize_with = "own_tables")]
+    pub own: toml::Table,
+}
+
+/// What is left of the settings: nothing but tables of auxiliary losses.
+fn own_tables<'de, D: Deserializer<'de>>(from: D) -> Result<toml::Table, D::Error> {
+    let own = toml::Table::deserialize(from)?;
+    let unknown = own.keys().find(|name| name.parse::<Objective>().is_err());
+    match unknown {
+        Some(name) => Err(D::Error::custom(format!("unknown field `{name}`"))),
+        None => Ok(own),
+    }
 }
 
 impl LearnerSettings {
@@ -67,32 +76,34 @@ impl LearnerSettings {
             }
         }
         self.lambda.validate()?;
-        self.objective
-            .check(&self.lambda, self.condition_on_action, self.curl.as_ref())
-            .map_err(UpdateError::Objective)?;
-        if let Some(curl) = &self.curl {
-            curl.validate()?;
-        }
+        self.auxiliary()?;
         self.adam.validate()
     }
 
-    /// The auxiliary objective.
-    pub fn auxiliary(&self) -> Auxiliary {
-        let Self {
-            lambda, tanh_clip, ..
-        } = *self;
-        let pairs = Dim { lambda, tanh_clip };
-        match self.objective {
-            Objective::None => Auxiliary::None,
-            Objective::Dim => Auxiliary::Dim(pairs),
-            Objective::Cpc => Auxiliary::Cpc(Cpc { pairs }),
-            Objective::Curl => Auxiliary::Curl(Curl { tanh_clip }),
+    /// What the auxiliary loss is made from.
+    pub const fn auxiliary_settings(&self) -> AuxiliarySettings<'_> {
+        AuxiliarySettings {
+            objective: self.objective.name(),
+            lambda: self.lambda,
+            condition_on_action: self.condition_on_action,
+            tanh_clip: self.tanh_clip,
+            own: &self.own,
         }
     }
 
-    /// The heads that the online network needs in a world of `num_actions` actions.
+    /// The auxiliary loss.
+    ///
+    /// # Errors
+    /// Settings of it that cannot work.
+    pub fn auxiliary(&self) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+        self.objective.loss(&self.auxiliary_settings())
+    }
+
+    /// The heads that the online network needs in a world of `num_actions` actions; none where the settings cannot work, which
+    /// [`LearnerSettings::validate`] says.
     pub fn dim_parts(&self, num_actions: usize) -> DimParts {
         let action = self.condition_on_action && num_actions > 1;
-        self.objective.heads(&self.lambda, action)
+        let loss = self.auxiliary();
+        loss.map_or(DimParts::NONE, |loss| loss.heads(action))
     }
 }

@@ -1,6 +1,24 @@
-//! Tensors as slices: the values behind a candle storage, for operations that compute on the CPU themselves.
+//! Between bytes, slices and candle's tensors: states as the network takes them, and the values behind a tensor on the CPU.
 
-use candle_core::{CpuStorage, Layout, bail};
+use std::borrow::Cow;
+
+use candle_core::{CpuStorage, Device, Layout, Tensor, bail};
+use driml_model::ModelConfig;
+
+/// The bytes of states as a tensor [B, H, W, C] u8 on `device`: bytes travel there, they become numbers there.
+pub(crate) fn states<'a>(
+    model: &ModelConfig,
+    bytes: impl Into<Cow<'a, [u8]>>,
+    device: &Device,
+) -> candle_core::Result<Tensor> {
+    let bytes = bytes.into();
+    let rows = bytes.len() / model.frame_len();
+    let shape = (rows, model.height, model.width, model.channels);
+    match bytes {
+        Cow::Borrowed(bytes) => Tensor::from_slice(bytes, shape, device),
+        Cow::Owned(bytes) => Tensor::from_vec(bytes, shape, device),
+    }
+}
 
 /// The f32 values of a contiguous tensor on the CPU.
 pub(crate) fn slice<'a>(

@@ -1,7 +1,7 @@
 //! Updates of the learner at the paper's sizes, and one of them by candle's stock operations.
 //! Batches are made up: nothing but the arithmetic is measured.
 
-use driml_learner::{Batch, DeviceName, Learner};
+use driml_learner::{Agent, Batch, DeviceName};
 use driml_settings::config::RunConfig;
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -41,7 +41,7 @@ pub(super) fn measure(effort: &Effort, device: DeviceName) -> anyhow::Result<Vec
         let rows = MadeUp::draw(&config, &mut rng);
         let batch = rows.batch();
         let (model, update) = (config.model.clone(), config.learner.update.clone());
-        let mut learner = Learner::new(model, update, &compute, &mut rng)?;
+        let mut learner = Agent::new(model, update, &compute, &mut rng)?;
         let rate = effort.rate_by_median(|| learner.update(&batch).map(drop))?;
         figures.push(Figure::found(name, rate, "updates/s"));
         if name == GLOBAL_DIM && device == DeviceName::Cpu {

@@ -9,7 +9,7 @@ use candle_nn::{
     AdamW, Optimizer, ParamsAdamW,
     ops::{log_softmax, softmax},
 };
-use driml_learner::{Batch, Learner, LearnerSettings, losses::projection::project};
+use driml_learner::{Agent, Batch, LearnerSettings, losses::projection::project};
 use driml_model::{ModelConfig, Parameters};
 
 /// Online and target network and the optimiser.
@@ -30,7 +30,7 @@ impl StockLearner {
     ///
     /// # Errors
     /// A learner with other settings than this one knows.
-    pub(super) fn new(learner: &Learner) -> anyhow::Result<Self> {
+    pub(super) fn new(learner: &Agent) -> anyhow::Result<Self> {
         let (model, settings) = (learner.model().clone(), learner.settings().clone());
         let [others @ .., _] = settings.lambda.values();
         let known = others == [0.0; 3] && !settings.double_dqn;
@@ -220,7 +220,7 @@ fn linear(net: &HashMap<String, Tensor>, name: &str, x: &Tensor) -> Result<Tenso
 
 #[cfg(test)]
 mod tests {
-    use driml_learner::{Compute, Learner};
+    use driml_learner::{Agent, Compute};
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
@@ -239,7 +239,7 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let made_up = MadeUp::draw(&config, &mut rng);
         let update = config.learner.update.clone();
-        let mut learner = Learner::new(config.model, update, &Compute::CPU, &mut rng).unwrap();
+        let mut learner = Agent::new(config.model, update, &Compute::CPU, &mut rng).unwrap();
         let mut stock = StockLearner::new(&learner).unwrap();
         for _ in 0..3 {
             let ours = learner.update(&made_up.batch()).unwrap().total;

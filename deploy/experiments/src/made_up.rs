@@ -23,7 +23,7 @@ pub(crate) fn spec() -> RunSpec {
 /// What a run leaves that did nothing.
 pub(crate) fn summary() -> Summary {
     let folder = tempfile::tempdir().unwrap();
-    let recorder = Recorder::create(&RunFolder::new(folder.path()), "", &[]).unwrap();
+    let recorder = Recorder::create(&RunFolder::new(folder.path()), "", &[], &[]).unwrap();
     let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
     recorder.summarise(Outcome::Finished, &spec(), &replay, &learner)
 }

@@ -457,7 +457,7 @@ mod tests {
         };
         let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
         let folder = RunFolder::new(queue.root.join("run"));
-        let mut recorder = Recorder::create(&folder, "", &[]).unwrap();
+        let mut recorder = Recorder::create(&folder, "", &[], &[]).unwrap();
         recorder.record(std::slice::from_ref(&replay), &learner, &[]);
         let summary = recorder.summarise(Outcome::Finished, &made_up::spec(), &replay, &learner);
         summary.write(&folder).unwrap();

@@ -9,13 +9,21 @@ use driml_protocol::{LearnerStatus, ReplayStatus, Waiting};
 use crate::{
     console::Screen,
     rates::Rates,
-    run_folder::{Behind, Episodes, PAIRS},
+    run_folder::{Behind, Episodes},
 };
 
 /// How often a line is written where there is no terminal.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
 /// The progress display: how far, then two lines of numbers.
 pub const TEMPLATE: &str = "{bar:40} {percent:>3}%  {elapsed_precise}\n{msg}";
+
+/// An auxiliary loss for a person to read: `DIM 4t4` of `dim_4t4`.
+pub fn loss_title(name: &str) -> String {
+    match name.split_once('_') {
+        Some((kind, of_what)) => format!("{} {of_what}", kind.to_uppercase()),
+        None => name.to_uppercase(),
+    }
+}
 
 /// The live view.
 #[derive(Debug)]
@@ -70,10 +78,8 @@ impl Display {
         let number = |value: Option<f64>, digits: usize| {
             value.map_or("-".into(), |value| format!("{value:.digits$}"))
         };
-        let dim = PAIRS
-            .iter()
-            .zip(learner.dim)
-            .filter_map(|(pair, loss)| Some(format!("  DIM {pair} {:.3}", loss?)));
+        let losses = learner.losses.iter();
+        let losses = losses.map(|(name, loss)| format!("  {} {loss:.3}", loss_title(name)));
         let k = replay
             .mean_k()
             .map_or(String::new(), |k| format!("  mean k {k:.2}"));
@@ -101,7 +107,7 @@ impl Display {
                 number(episodes.mean_return.map(|it| it.mean), 2),
                 episodes.count,
                 learner.c51_kl,
-                dim.collect::<String>(),
+                losses.collect::<String>(),
                 waiting(replay),
                 left.map_or(String::new(), |left| format!("  {} left", duration(left))),
             ),
@@ -153,7 +159,7 @@ mod tests {
         let learner = LearnerStatus {
             updates: 1000,
             c51_kl: 0.1234,
-            dim: [None, None, None, Some(4.0)],
+            losses: vec![("dim_4t4".into(), 4.0)],
             ..LearnerStatus::default()
         };
         let episodes = Episodes {

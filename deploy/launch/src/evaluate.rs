@@ -83,8 +83,8 @@ impl Player {
                 folder.display()
             )
         })?;
-        let weights = restored.learner.weights()?;
-        let updates = restored.learner.updates();
+        let weights = restored.agent.weights()?;
+        let updates = restored.agent.updates();
         Ok(Self {
             config,
             weights,

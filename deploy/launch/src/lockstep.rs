@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use driml_actor::{ActorSettings, Collector, Life};
-use driml_learner::{LearnerPart, Learning};
+use driml_learner::{Learner, LearnerPart};
 use driml_machine::error::Interrupted;
 use driml_protocol::{ActorJoin, Batch, Goodbye, InsertReply, LearnerStatus, PlanesPool, Shutdown};
 use driml_replay_server::{Replay, Unready};
@@ -34,7 +34,12 @@ pub fn run(
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(exit_with_parent).context("listening for signals")?;
-    let mut recorder = Recorder::create(run_dir, &config.to_toml(), &[])?;
+    let mut recorder = Recorder::create(
+        run_dir,
+        &config.to_toml(),
+        config.learner.update.objective.losses(),
+        &[],
+    )?;
     let screen = Screen::new(config.frames(), TEMPLATE);
     let mut parts = Parts::new(config)?;
     let mut display = Display::new(
@@ -49,9 +54,9 @@ pub fn run(
     let mut outcome = Outcome::Finished;
     let mut saved = u64::MAX;
     while parts.round()? {
-        if parts.learning.checkpoint_is_due() && parts.learning.updates() != saved {
-            saved = parts.learning.updates();
-            parts.learning.save(&folder)?;
+        if parts.learner.checkpoint_is_due() && parts.learner.updates() != saved {
+            saved = parts.learner.updates();
+            parts.learner.save(&folder)?;
         }
         if shown.elapsed() >= POLL {
             shown = Instant::now();
@@ -66,8 +71,8 @@ pub fn run(
         }
     }
     parts.end()?;
-    if parts.learning.updates() != saved {
-        parts.learning.save(&folder)?;
+    if parts.learner.updates() != saved {
+        parts.learner.save(&folder)?;
     }
     screen.clear();
     let replay = parts.replay.status();
@@ -89,7 +94,7 @@ struct Parts {
     actors: Vec<Collector>,
     next_actor: usize,
     replay: Replay,
-    learning: Learning,
+    learner: Learner,
     status: LearnerStatus,
     batch_rows: u32,
     steps_per_chunk: u32,
@@ -111,8 +116,8 @@ impl Parts {
             };
             replay.join_actor(join).map_err(anyhow::Error::msg)?;
         }
-        let mut learning = Learning::new(part, &config.local.learner_device.open()?)?;
-        let (header, weights) = learning.next_weights()?;
+        let mut learner = Learner::new(part, &config.local.learner_device.open()?)?;
+        let (header, weights) = learner.next_weights()?;
         let status = LearnerStatus {
             weights_version: header.version,
             weights_sha256: header.sha256_hex(),
@@ -141,7 +146,7 @@ impl Parts {
             actors,
             next_actor: 0,
             replay,
-            learning,
+            learner,
             status,
             batch_rows,
             steps_per_chunk: settings.actor.steps_per_chunk,
@@ -185,23 +190,23 @@ impl Parts {
     }
 
     fn learn(&mut self, batch: &Batch) -> anyhow::Result<()> {
-        let report = self.learning.update(batch)?;
-        self.learning.note(&report, &mut self.status);
-        if let Some(affinity) = self.learning.affinity_update(LEARNER) {
+        let report = self.learner.update(batch)?;
+        self.learner.note(&report, &mut self.status);
+        if let Some(affinity) = self.learner.affinity_update(LEARNER) {
             self.replay.set_affinity(&affinity)?;
         }
-        if self.learning.publication_is_due() {
+        if self.learner.publication_is_due() {
             self.publish()?;
         }
         Ok(())
     }
 
     fn publish(&mut self) -> anyhow::Result<()> {
-        let (header, weights) = self.learning.next_weights()?;
+        let (header, weights) = self.learner.next_weights()?;
         for actor in &mut self.actors {
             actor.set_weights(header.version, &weights)?;
         }
-        self.published = self.learning.updates();
+        self.published = self.learner.updates();
         self.status.weights_version = header.version;
         self.status.weights_sha256 = header.sha256_hex();
         Ok(())
@@ -209,7 +214,7 @@ impl Parts {
 
     /// The last weights and everyone's last word.
     fn end(&mut self) -> anyhow::Result<()> {
-        if self.published != self.learning.updates() {
+        if self.published != self.learner.updates() {
             self.publish()?;
         }
         for (id, (actor, unwanted)) in self.actors.iter().zip(&self.unwanted).enumerate() {

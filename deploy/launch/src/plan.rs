@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use driml_learner::{DeviceName, Objective};
+use driml_learner::{DeviceName, auxiliary::loss::Passes};
 use driml_machine::{resources::Machine, units::duration};
 use driml_model::ModelConfig;
 use driml_settings::config::{COMPRESSED_FIELDS_BYTES, RunConfig, replay_bytes_each};
@@ -71,28 +71,20 @@ pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
         dim,
     } = row_flops(model);
     let forward = local + global + head;
-    let lambda = config.learner.update.lambda.wanted();
-    let positives = config.run.horizon.positives() as f64;
-    let augmented = f64::from(u8::from(config.learner.augment.is_some()));
-    // Passes of the torso and of each head, forward ones counted once, with the backward pass three times; pairs of sets.
-    let (torso_passes, head_passes, sets) = match config.learner.update.objective {
-        Objective::None => (0.0, 0.0, 0.0),
-        // Half of the heads are for s_t.
-        Objective::Dim | Objective::Cpc => (
-            3.0 * (positives + augmented),
-            3.0 * (1.0 + positives) / 2.0,
-            positives,
-        ),
-        Objective::Curl => (4.0, 4.0, 1.0),
-    };
+    let loss = config.learner.update.auxiliary();
+    let augmented = config.learner.augment.is_some();
+    let passes = loss.map_or_else(
+        |_| Passes::default(),
+        |loss| loss.passes(config.run.horizon.positives(), augmented),
+    );
     let (height, width, _) = model.local_shape();
-    let locations = if lambda[..3].contains(&true) {
+    let locations = if passes.local {
         (height * width) as f64
     } else {
         1.0
     };
-    let scores = sets * 6.0 * locations * rows * rows * model.rkhs as f64;
-    let more_passes = torso_passes * (local + global) + head_passes * dim;
+    let scores = passes.scores * 6.0 * locations * rows * rows * model.rkhs as f64;
+    let more_passes = passes.torso * (local + global) + passes.heads * dim;
     let update = rows * (4.0 * forward + more_passes) + scores;
     let flops = config.updates() as f64 * update + config.frames() as f64 * forward;
     let seconds = flops / (GFLOPS_PER_CORE * 1e9 * f64::from(cores.max(1)));

@@ -70,11 +70,10 @@ pub fn run(
         .chain(["learner".into()])
         .chain(actors)
         .collect();
+    let (text, losses) = (config.to_toml(), config.learner.update.objective.losses());
     let mut recorder = match resumed {
-        Some(behind) => {
-            Recorder::go_on(run_dir, &config.to_toml(), &names, behind, config.frames())?
-        }
-        None => Recorder::create(run_dir, &config.to_toml(), &names)?,
+        Some(behind) => Recorder::go_on(run_dir, &text, losses, &names, behind, config.frames())?,
+        None => Recorder::create(run_dir, &text, losses, &names)?,
     };
     let behind = resumed.unwrap_or_default();
     let meeting = Meeting::create()?;

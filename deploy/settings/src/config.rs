@@ -2,7 +2,7 @@
 //! It fills in no number but those that follow from others and those that the machine decides.
 
 use driml_envs::{WorldConfig, WorldName};
-use driml_learner::{DeviceName, EstimatorKind, Objective};
+use driml_learner::{DeviceName, EstimatorKind};
 use driml_machine::{
     error::{Usage, usage},
     resources::{self, Machine},
@@ -445,29 +445,22 @@ impl RunConfig {
     /// The replay serves what the auxiliary objective needs and no more.
     fn check_objective(&self) -> Result<(), Usage> {
         let objective = self.learner.update.objective;
-        let (least, most) = objective.served();
+        let positives = objective.positives();
         let served = self.run.horizon.positives();
-        if (least..=most).contains(&served) {
+        if positives.served().contains(&served) {
             return Ok(());
         }
-        let rule = match objective {
-            Objective::None | Objective::Curl => r#"{rule="none"}"#,
-            Objective::Dim => r#"{rule="fixed",k=1}"#,
-            Objective::Cpc => r#"{rule="all",k_max=5}"#,
-        };
-        let later = |states: usize| match states {
+        let later = match served {
             0 => "no later state".into(),
             1 => "one later state".into(),
             states => format!("{states} later states"),
         };
-        let needed = match objective {
-            Objective::Cpc => "one or more later states".into(),
-            _ => later(least),
-        };
         Err(usage!(
-            "run.horizon serves {} a row, but learner.update.objective = {} looks at {needed}: --set 'run.horizon={rule}', or take another --agent",
-            later(served),
-            objective.name()
+            "run.horizon serves {} a row, but learner.update.objective = {} looks at {}: --set 'run.horizon={}', or take another --agent",
+            later,
+            objective.name(),
+            positives.served_words(),
+            positives.horizon()
         ))
     }
 }

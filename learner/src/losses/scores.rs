@@ -1,5 +1,16 @@
 //! Scores of an InfoNCE loss: dot products, scaled and softly clipped.
 
+use candle_core::Tensor;
+
+/// Dot products of every anchor with every candidate.
+#[derive(Debug)]
+pub struct Dots {
+    /// [L, B, B]: location, anchor, candidate; L = 1 where both features are global.
+    pub dots: Tensor,
+    /// Numbers in each vector.
+    pub rkhs: usize,
+}
+
 /// How dot products become scores.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Scores {

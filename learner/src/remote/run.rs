@@ -15,7 +15,11 @@ use super::{
     publish::Outlets,
     shards::Shards,
 };
-use crate::{checkpoint, config::LearnerPart, learner::Learning};
+use crate::{
+    checkpoint,
+    config::LearnerPart,
+    learner::{Learner, LearnerError},
+};
 
 /// How long a learner that was told to stop stays to be asked for its last status.
 const LAST_WORD_MAX: Duration = Duration::from_secs(3);
@@ -65,8 +69,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         tracing::warn!("batches come through sockets, which is slower: {why}");
         requests.shared_memory = false;
     }
-    let mut learning = Learning::resume(part, &compute, &folder)?;
-    let updates = learning.updates();
+    let mut learner = Learner::resume(part, &compute, &folder)?;
+    let updates = learner.updates();
     let after_updates = shards.after_updates;
     anyhow::ensure!(
         updates >= after_updates,
@@ -81,13 +85,13 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
          that run, start the replay server with --after-updates {updates}; to begin another, choose another folder",
         folder.display(),
     );
-    let spec_hash = learning.spec_hash();
+    let spec_hash = learner.spec_hash();
     let learned = updates.saturating_mul(rows.into());
     let part_in_run = shards.take_part((&keys, spec_hash), requests.learner, learned, shutdown)?;
     let Some(membership) = part_in_run else {
         return Ok(());
     };
-    learning.publish_above(membership.weights_version);
+    learner.publish_above(membership.weights_version);
     keep_settings(&args.run_dir, &shards.config_toml)?;
     let outlets = Outlets::open(
         &shards.sessions,
@@ -95,10 +99,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         requests.learner,
         shutdown,
     )?;
-    outlets.publish(learning.next_weights()?);
+    outlets.publish(learner.next_weights()?);
     if updates > 0 {
         outlets.with_status(|status| status.updates = updates);
-        if let Some(affinity) = learning.affinity_update(outlets.learner()) {
+        if let Some(affinity) = learner.affinity_update(outlets.learner()) {
             outlets.send_affinity(affinity);
         }
     }
@@ -109,17 +113,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     );
 
     let mut saving = Saving::new(folder);
-    let learned = learn(&mut learning, &mut batches, &outlets, &mut saving, shutdown);
+    let learned = learn(&mut learner, &mut batches, &outlets, &mut saving, shutdown);
     if let Err(e) = &learned {
-        tracing::error!("ends after {} updates: {e:#}", learning.updates());
+        tracing::error!("ends after {} updates: {e:#}", learner.updates());
     }
-    let saved = saving.finish(&learning);
-    if learned.is_ok() && !learning.publication_is_due() {
-        outlets.publish(learning.next_weights()?);
+    let saved = saving.finish(&learner);
+    if learned.is_ok() && !learner.publication_is_due() {
+        outlets.publish(learner.next_weights()?);
     }
-    learned.and(saved)?;
+    learned.and(saved.map_err(Into::into))?;
     outlets.with_status(|status| status.finished = true);
-    tracing::info!("finished after {} updates", learning.updates());
+    tracing::info!("finished after {} updates", learner.updates());
     shutdown.wait();
     outlets.wait_until_heard(LAST_WORD_MAX);
     drop(membership);
@@ -133,7 +137,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
 /// # Errors
 /// The replay server was out of reach for too long or refuses, or an update failed; the learner is then as after the last update.
 fn learn(
-    learning: &mut Learning,
+    learner: &mut Learner,
     batches: &mut BatchSource,
     outlets: &Outlets,
     saving: &mut Saving,
@@ -147,22 +151,22 @@ fn learn(
             Next::Finished => break,
         };
         let started = Instant::now();
-        let report = learning.update(&batch)?;
-        if let Some(affinity) = learning.affinity_update(outlets.learner()) {
+        let report = learner.update(&batch)?;
+        if let Some(affinity) = learner.affinity_update(outlets.learner()) {
             outlets.send_affinity(affinity);
         }
-        if learning.publication_is_due() {
-            outlets.publish(learning.next_weights()?);
+        if learner.publication_is_due() {
+            outlets.publish(learner.next_weights()?);
         }
         let ended = Instant::now();
         outlets.with_status(|status| {
-            learning.note(&report, status);
+            learner.note(&report, status);
             status.waiting_s += (started - waiting_since).as_secs_f64();
             status.computing_s += (ended - started).as_secs_f64();
         });
         waiting_since = ended;
-        if learning.checkpoint_is_due() {
-            saving.save(learning);
+        if learner.checkpoint_is_due() {
+            saving.save(learner);
         }
     }
     Ok(())
@@ -175,7 +179,7 @@ struct Saving {
     /// Updates in the newest checkpoint that was saved here.
     saved: Option<u64>,
     /// The first failure since then.
-    failed: Option<anyhow::Error>,
+    failed: Option<LearnerError>,
 }
 
 impl Saving {
@@ -187,16 +191,16 @@ impl Saving {
         }
     }
 
-    fn save(&mut self, learning: &Learning) {
-        match learning.save(&self.folder) {
+    fn save(&mut self, learner: &Learner) {
+        match learner.save(&self.folder) {
             Ok(()) => {
-                self.saved = Some(learning.updates());
+                self.saved = Some(learner.updates());
                 self.failed = None;
             }
             Err(e) => {
                 tracing::warn!(
                     "no checkpoint after {} updates, trying again at the next period: {e:#}",
-                    learning.updates()
+                    learner.updates()
                 );
                 self.failed.get_or_insert(e);
             }
@@ -207,9 +211,9 @@ impl Saving {
     ///
     /// # Errors
     /// The first failure since the last checkpoint that was saved.
-    fn finish(mut self, learning: &Learning) -> anyhow::Result<()> {
-        if self.saved != Some(learning.updates()) {
-            self.save(learning);
+    fn finish(mut self, learner: &Learner) -> Result<(), LearnerError> {
+        if self.saved != Some(learner.updates()) {
+            self.save(learner);
         }
         self.failed.map_or(Ok(()), Err)
     }

@@ -230,9 +230,9 @@ impl Scorer<'_> {
         let rows = features_t.f3.dim(0)?;
         let action = Tensor::zeros(rows, DType::U8, &Device::Cpu)?;
         let valid = vec![1; rows];
-        let losses = self
-            .dim
-            .losses(self.network, &features_t, &features_k, &action, &valid)?;
+        let losses =
+            self.dim
+                .pair_losses(self.network, &features_t, &features_k, &action, &valid)?;
         let [local, ..] = losses;
         local.ok_or_else(|| anyhow::anyhow!("lambda.3t3 is 0, so there is no local DIM to learn"))
     }

@@ -9,27 +9,23 @@ mod runs;
 use std::collections::BTreeSet;
 
 use driml_figure::{Axis, Chart, Figure, Format, Panel, Series};
-use driml_launch::{console::print, run_folder::RunFolder};
+use driml_launch::{console::print, display::loss_title, run_folder::RunFolder};
 use driml_machine::error::usage;
 
-use self::groups::Group;
 pub(crate) use self::{
     affinity::figure as affinities,
     groups::{Curve, over_seeds, smoothed},
     runs::Run,
 };
+use self::{groups::Group, runs::C51_LOSS};
 use crate::plot::flags::{Band, PlotArgs};
 
 /// Width and height of a chart.
 const CHART_SIZE: (f64, f64) = (460.0, 310.0);
-/// Columns that are drawn if none is asked for, those that the runs have values of.
-const OVERVIEW: [&str; 10] = [
+/// Columns that are drawn if none is asked for, those that the runs have values of; auxiliary losses follow [`C51_LOSS`].
+const OVERVIEW: [&str; 6] = [
     "mean_return",
-    "c51_kl",
-    "dim_3t3",
-    "dim_3t4",
-    "dim_4t3",
-    "dim_4t4",
+    C51_LOSS,
     "mean_k",
     "replay_ratio",
     "frames_per_second",
@@ -54,6 +50,20 @@ pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
     print(&format!("{}\n", args.out.display()))
 }
 
+/// The columns of the [`OVERVIEW`] and the auxiliary losses of which a run has values.
+fn overview(runs: &[Run]) -> Vec<String> {
+    let mut columns: Vec<&str> = OVERVIEW.into();
+    let mut place = OVERVIEW.iter().position(|it| *it == C51_LOSS).unwrap_or(0) + 1;
+    for loss in runs.iter().flat_map(Run::auxiliary_losses) {
+        if !columns.contains(&loss.as_str()) {
+            columns.insert(place, loss);
+            place += 1;
+        }
+    }
+    let has = |column: &&str| runs.iter().any(|run| run.has_values(column));
+    columns.into_iter().filter(has).map(String::from).collect()
+}
+
 fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
     let mut seen = BTreeSet::new();
     let runs = args
@@ -64,8 +74,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         .map(|folder| Run::read(&RunFolder::new(folder)))
         .collect::<anyhow::Result<Vec<_>>>()?;
     let columns = if args.column.is_empty() {
-        let has = |column: &&str| runs.iter().any(|run| run.has_values(column));
-        OVERVIEW.into_iter().filter(has).map(String::from).collect()
+        overview(&runs)
     } else {
         args.column.clone()
     };
@@ -79,7 +88,10 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         if !args.column.is_empty() && drawn.iter().all(|curve| curve.points.is_empty()) {
             return Err(usage!("none of these runs has a value of {column:?} yet").into());
         }
-        panels.push(Panel::Chart(chart(column, &groups, drawn)));
+        let is_loss = runs
+            .iter()
+            .any(|run| run.auxiliary_losses().contains(column));
+        panels.push(Panel::Chart(chart(column, is_loss, &groups, drawn)));
     }
     if panels.is_empty() {
         return Err(usage!("none of these runs has recorded a value yet").into());
@@ -97,7 +109,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
     })
 }
 
-fn chart(column: &str, groups: &[Group<'_>], curves: Vec<Curve>) -> Chart {
+fn chart(column: &str, is_loss: bool, groups: &[Group<'_>], curves: Vec<Curve>) -> Chart {
     let series = groups.iter().zip(curves).enumerate();
     let series = series
         .filter(|(_, (_, curve))| !curve.points.is_empty())
@@ -105,7 +117,12 @@ fn chart(column: &str, groups: &[Group<'_>], curves: Vec<Curve>) -> Chart {
             Series::line(&group.name, index, curve.points).banded(curve.band)
         })
         .collect();
-    let (title, y) = words(column);
+    let (title, y) = if is_loss {
+        let title = format!("{} loss", loss_title(column));
+        (title, "auxiliary loss [nats]".into())
+    } else {
+        words(column)
+    };
     Chart::new(&title, Axis::linear("frames"), Axis::linear(&y), series)
 }
 
@@ -126,14 +143,12 @@ fn words(column: &str) -> (String, String) {
         "grad_norm" => ("Gradient before clipping", "global 2-norm"),
         _ => {
             let text = column.replace('_', " ");
-            let title = match column.strip_prefix("dim_") {
-                Some(pair) => return (format!("DIM loss {pair}"), "InfoNCE [nats]".into()),
-                None if column.starts_with("rss_mib_") => {
-                    return (text, "resident memory [MiB]".into());
-                }
-                None => text.clone(),
+            let label = if column.starts_with("rss_mib_") {
+                "resident memory [MiB]".into()
+            } else {
+                text.clone()
             };
-            return (title, text);
+            return (text, label);
         }
     };
     (title.into(), label.into())

@@ -9,6 +9,9 @@ use driml_machine::error::{Usage, nearest, usage};
 
 /// The column with the standard deviation of k; runs recorded by older programs lack it.
 pub(super) const SPREAD_OF_K: &str = "sd_k";
+/// The column before those of the auxiliary losses, and the one after them.
+pub(super) const C51_LOSS: &str = "c51_kl";
+const TOTAL_LOSS: &str = "total_loss";
 /// Columns of `metrics.csv` that hold words.
 const WORDS: [&str; 1] = ["waiting"];
 
@@ -95,6 +98,15 @@ impl Run {
             }
         }
         Ok(values)
+    }
+
+    /// The columns of auxiliary losses: those between C51's loss and the total.
+    pub(super) fn auxiliary_losses(&self) -> &[String] {
+        let place = |name: &str| self.columns.header.iter().position(|it| it == name);
+        let between = place(C51_LOSS).zip(place(TOTAL_LOSS));
+        between
+            .and_then(|(first, last)| self.columns.header.get(first + 1..last))
+            .unwrap_or_default()
     }
 
     /// Whether the column is there and not empty.

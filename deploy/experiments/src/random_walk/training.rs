@@ -211,7 +211,7 @@ impl Heads {
         let valid = vec![1; pairs.len()];
         let losses = self
             .dim
-            .losses(&self.network, &now, &next, &action, &valid)?;
+            .pair_losses(&self.network, &now, &next, &action, &valid)?;
         for loss in losses.iter().flatten() {
             let gradients = Gradients::take(&self.parameters, loss.backward()?)?;
             let factor = clip_factor(gradients.norm(Operations::Own)?, self.max_grad_norm);

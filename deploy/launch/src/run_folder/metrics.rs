@@ -13,13 +13,11 @@ use driml_protocol::{LearnerStatus, ReplayStatus};
 
 use super::{columns::Columns, folder::RunFolder, resume_point::Behind, returns::Episodes};
 
-/// The pairs of the DIM losses, in the order of the status.
-pub const PAIRS: [&str; 4] = ["3t3", "3t4", "4t3", "4t4"];
 /// Bytes at the end of the file in which its last row lies.
 const LAST_ROW_BYTES: u64 = 4096;
 
-/// The columns of the metrics.
-pub(super) fn header(processes: &[String]) -> Vec<String> {
+/// The columns of the metrics: the auxiliary `losses` stand between C51's and the total.
+pub(super) fn header(losses: &[&str], processes: &[String]) -> Vec<String> {
     let counts = [
         "seconds",
         "frames",
@@ -44,13 +42,12 @@ pub(super) fn header(processes: &[String]) -> Vec<String> {
         "actors",
         "waiting",
     ];
-    let dim = PAIRS.map(|pair| format!("dim_{pair}"));
     let rss = processes
         .iter()
         .map(|name| format!("rss_mib_{}", name.replace('-', "_")));
     let counts = counts.map(String::from).into_iter();
     counts
-        .chain(dim)
+        .chain(losses.iter().map(ToString::to_string))
         .chain(rest.map(String::from))
         .chain(rss)
         .collect()
@@ -67,6 +64,8 @@ pub(super) struct Moment<'a> {
     pub(super) k: Option<(f64, f64)>,
     pub(super) replay: &'a ReplayStatus,
     pub(super) learner: &'a LearnerStatus,
+    /// The names of the agent's auxiliary losses.
+    pub(super) losses: &'a [&'static str],
     /// Resident memory of each process, MiB; none for one that ended.
     pub(super) rss_mib: Vec<Option<f64>>,
 }
@@ -91,7 +90,8 @@ impl Moment<'_> {
             mean_return.map_or(0, |it| it.of).to_string(),
             computed(learner.c51_kl.into()),
         ];
-        row.extend(learner.dim.map(|loss| some(loss.map(f64::from))));
+        let losses = self.losses.iter().map(|name| learner.loss(name));
+        row.extend(losses.map(|loss| some(loss.map(f64::from))));
         row.extend([
             computed(learner.total.into()),
             computed(learner.grad_norm),

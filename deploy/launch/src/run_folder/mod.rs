@@ -12,7 +12,7 @@ mod table;
 pub use self::{
     columns::Columns,
     folder::{RunFolder, write_whole},
-    metrics::{PAIRS, Progress, progress},
+    metrics::{Progress, progress},
     recorder::Recorder,
     resume_point::Behind,
     returns::{Episodes, MeanReturn},

@@ -43,6 +43,7 @@ pub struct Recorder {
     folder: RunFolder,
     metrics: Table,
     returns: TrainingReturns,
+    losses: &'static [&'static str],
     processes: Vec<String>,
     rss_max: Vec<Option<f64>>,
     started: Instant,
@@ -50,13 +51,15 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Makes the folder and writes the settings; the clock starts. `processes` are those whose memory is recorded.
+    /// Makes the folder and writes the settings; the clock starts. `losses` are the agent's auxiliary losses,
+    /// `processes` those whose memory is recorded.
     ///
     /// # Errors
     /// A folder in which something lies, or a file system that refuses.
     pub fn create(
         folder: &RunFolder,
         config_toml: &str,
+        losses: &'static [&'static str],
         processes: &[String],
     ) -> anyhow::Result<Self> {
         folder.check_free()?;
@@ -64,9 +67,17 @@ impl Recorder {
             .with_context(|| format!("making the run folder {}", folder.display()))?;
         let lock = folder.lock()?;
         folder.write_config(config_toml)?;
-        let rows = none(header(processes));
+        let rows = none(header(losses, processes));
         let returns = TrainingReturns::create(folder)?;
-        Self::begin(folder, processes, lock, rows, returns, Behind::default())
+        Self::begin(
+            folder,
+            losses,
+            processes,
+            lock,
+            rows,
+            returns,
+            Behind::default(),
+        )
     }
 
     /// Goes on to `frames_max` frames in the folder of an interrupted run, which has so much `behind` it: the rows of metrics up
@@ -77,12 +88,13 @@ impl Recorder {
     pub(crate) fn go_on(
         folder: &RunFolder,
         config_toml: &str,
+        losses: &'static [&'static str],
         processes: &[String],
         behind: Behind,
         frames_max: u64,
     ) -> anyhow::Result<Self> {
         let lock = folder.lock()?;
-        let head = header(processes);
+        let head = header(losses, processes);
         let rows = match behind.updates {
             0 => none(head),
             _ => rows_up_to(&folder.metrics(), head, behind, frames_max)?,
@@ -90,11 +102,12 @@ impl Recorder {
         let returns = TrainingReturns::go_on(folder, rows.last("frames").unwrap_or(0))?;
         Summary::remove(folder)?;
         folder.write_config(config_toml)?;
-        Self::begin(folder, processes, lock, rows, returns, behind)
+        Self::begin(folder, losses, processes, lock, rows, returns, behind)
     }
 
     fn begin(
         folder: &RunFolder,
+        losses: &'static [&'static str],
         processes: &[String],
         lock: File,
         rows: Columns,
@@ -111,6 +124,7 @@ impl Recorder {
             folder: folder.clone(),
             metrics: Table::create(&folder.metrics(), &rows.header, &rows.rows)?,
             returns,
+            losses,
             processes: processes.to_vec(),
             rss_max: vec![None; processes.len()],
             started: Instant::now(),
@@ -176,6 +190,7 @@ impl Recorder {
             k: self.k(replay, updates),
             replay,
             learner,
+            losses: self.losses,
             rss_mib: processes
                 .map(|i| rss_mib.get(i).copied().flatten())
                 .collect(),

@@ -22,6 +22,9 @@ fn spec() -> RunSpec {
     }
 }
 
+/// What DIM reports.
+const LOSSES: [&str; 4] = ["dim_3t3", "dim_3t4", "dim_4t3", "dim_4t4"];
+
 fn statuses() -> (ReplayStatus, LearnerStatus) {
     let replay = ReplayStatus {
         transitions_inserted: 2_000,
@@ -38,7 +41,7 @@ fn statuses() -> (ReplayStatus, LearnerStatus) {
     };
     let learner = LearnerStatus {
         updates: 31,
-        dim: [None, None, None, Some(2.0)],
+        losses: vec![("dim_4t4".into(), 2.0)],
         weights_version: 4,
         weights_sha256: "abcd".into(),
         finished: true,
@@ -51,8 +54,13 @@ fn statuses() -> (ReplayStatus, LearnerStatus) {
 fn a_run_leaves_settings_metrics_and_a_summary() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
-    let mut recorder =
-        Recorder::create(&run, "[run]\n", &["replay-server".into(), "actor-0".into()]).unwrap();
+    let mut recorder = Recorder::create(
+        &run,
+        "[run]\n",
+        &LOSSES,
+        &["replay-server".into(), "actor-0".into()],
+    )
+    .unwrap();
     let (replay, learner) = statuses();
     let nothing = ReplayStatus::default();
     let mut record = |replay: &ReplayStatus, learner: &LearnerStatus, rss: &[Option<f64>]| {
@@ -106,7 +114,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
     let processes = ["replay-server".into()];
-    let mut recorder = Recorder::create(&run, "[run]\n", &processes).unwrap();
+    let mut recorder = Recorder::create(&run, "[run]\n", &LOSSES, &processes).unwrap();
     let (mut replay, mut learner) = statuses();
     // Mean k is 1.5 before the run is resumed, and 2 since.
     for (frames, updates, episodes) in [(1_000, 0, 1), (2_000, 31, 7), (3_000, 62, 9)] {
@@ -118,7 +126,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
         updates: 31,
         frames: 2_000,
     };
-    let said = Recorder::go_on(&run, "", &processes, behind, 9_999).unwrap_err();
+    let said = Recorder::go_on(&run, "", &LOSSES, &processes, behind, 9_999).unwrap_err();
     assert!(said.to_string().contains("is still going on"), "{said}");
     let summary = recorder.summarise(Outcome::Interrupted, &spec(), &replay, &learner);
     summary.write(&run).unwrap();
@@ -129,9 +137,10 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     fs::write(&path, format!("{text}9.0,40")).unwrap();
 
     let other = ["replay-server".into(), "actor-0".into()];
-    let said = Recorder::go_on(&run, "", &other, behind, 9_999).unwrap_err();
+    let said = Recorder::go_on(&run, "", &LOSSES, &other, behind, 9_999).unwrap_err();
     assert!(said.to_string().contains("has other columns"), "{said}");
-    let mut recorder = Recorder::go_on(&run, "[new]\n", &processes, behind, 9_999).unwrap();
+    let mut recorder =
+        Recorder::go_on(&run, "[new]\n", &LOSSES, &processes, behind, 9_999).unwrap();
     assert!(!run.summary().exists());
     // While the replay fills again nothing is new.
     (replay.transitions_inserted, replay.episodes) = (1_500, 1);
@@ -150,7 +159,8 @@ fn a_resumed_run_goes_on_in_its_metrics() {
         updates: 99,
         ..behind
     };
-    let read = |frames_max| rows_up_to(&path, header(&processes), all, frames_max).unwrap();
+    let read =
+        |frames_max| rows_up_to(&path, header(&LOSSES, &processes), all, frames_max).unwrap();
     assert_eq!(read(2_050).rows.len(), 2);
     let rows = read(9_999);
     let column = |name| -> Vec<f64> {
