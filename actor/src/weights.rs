@@ -9,7 +9,7 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Assembly, CodecError, Keys, Kind, PIECE_BYTES, Seldom, Shutdown, WeightsHeader, WeightsReply,
+    Assembly, CodecError, Keys, PIECE_BYTES, Seldom, Shutdown, WeightsHeader, WeightsReply,
     WeightsRequest, WeightsVersion, codec, fault,
     session::{self, Asked},
 };
@@ -265,7 +265,7 @@ impl WeightsSource {
     }
 
     fn ask(&self, request: WeightsRequest) -> anyhow::Result<Asked> {
-        let message = codec::encode(Kind::WeightsRequest, self.spec_hash, &request, &[])?;
+        let message = codec::encode(self.spec_hash, &request, &[])?;
         session::send(
             &self.session,
             &self.keys.weights(),
@@ -277,14 +277,13 @@ impl WeightsSource {
     }
 
     fn read<'a>(&self, answer: &'a [u8]) -> anyhow::Result<(WeightsReply, &'a [u8])> {
-        Ok(codec::decode(answer, Kind::Weights, Some(self.spec_hash))?)
+        Ok(codec::decode(answer, Some(self.spec_hash))?)
     }
 }
 
 /// Version of the weights that a message announces.
 fn announced(message: &[u8], spec_hash: u64) -> Result<u64, CodecError> {
-    let (announced, _): (WeightsVersion, _) =
-        codec::decode(message, Kind::WeightsVersion, Some(spec_hash))?;
+    let (announced, _): (WeightsVersion, _) = codec::decode(message, Some(spec_hash))?;
     Ok(announced.version)
 }
 

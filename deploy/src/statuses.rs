@@ -4,8 +4,7 @@
 use std::time::Duration;
 
 use anyhow::Context;
-use driml_protocol::{Keys, Kind, LearnerStatus, ReplayStatus, codec, session};
-use serde::de::DeserializeOwned;
+use driml_protocol::{Keys, LearnerStatus, Message, ReplayStatus, codec, session};
 use zenoh::{Session, Wait, bytes::ZBytes, qos::Priority};
 
 /// How long an answer may take; a part that is busy answers the next time.
@@ -44,10 +43,7 @@ impl Statuses {
     /// No answer in time, or one that is not of this run.
     pub(crate) fn ask_replay(&mut self) -> anyhow::Result<()> {
         let key = self.keys.replay_status();
-        let answers = self
-            .sessions
-            .iter()
-            .map(|session| self.ask(session, &key, Kind::ReplayStatus));
+        let answers = self.sessions.iter().map(|session| self.ask(session, &key));
         let shards = answers.collect::<anyhow::Result<Vec<_>>>()?;
         self.replay = ReplayStatus::merged(&shards);
         self.shards = shards;
@@ -64,16 +60,11 @@ impl Statuses {
             .sessions
             .first()
             .context("a run has at least one replay server")?;
-        self.learner = self.ask(session, &key, Kind::LearnerStatus)?;
+        self.learner = self.ask(session, &key)?;
         Ok(())
     }
 
-    fn ask<T: DeserializeOwned>(
-        &self,
-        session: &Session,
-        key: &str,
-        kind: Kind,
-    ) -> anyhow::Result<T> {
+    fn ask<M: Message>(&self, session: &Session, key: &str) -> anyhow::Result<M> {
         let answer = session::ask(
             session,
             key,
@@ -81,7 +72,7 @@ impl Statuses {
             Priority::InteractiveHigh,
             ANSWER_MAX,
         )?;
-        let (status, _) = codec::decode(&answer.to_bytes(), kind, Some(self.spec_hash))
+        let (status, _) = codec::decode(&answer.to_bytes(), Some(self.spec_hash))
             .with_context(|| key.to_owned())?;
         Ok(status)
     }

@@ -9,7 +9,7 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Batch, BatchHeader, BatchReply, BatchRequest, Keys, Kind, PlanesPool, ReplayStatus, RequestId,
+    Batch, BatchHeader, BatchReply, BatchRequest, Keys, PlanesPool, ReplayStatus, RequestId,
     Seldom, Shutdown, Tally, codec, fault, join_within,
     session::{self, Asked, SessionError},
     shared_memory::Trust,
@@ -311,7 +311,7 @@ impl Fetcher {
                 REQUEST_TIMEOUT,
             )?;
             let (status, _): (ReplayStatus, _) =
-                codec::decode(&answer.to_bytes(), Kind::ReplayStatus, Some(self.spec_hash))
+                codec::decode(&answer.to_bytes(), Some(self.spec_hash))
                     .context("a shard's status")?;
             *count = Count {
                 tally: Tally {
@@ -339,7 +339,7 @@ impl Fetcher {
             shared_memory: self.requests.shared_memory && self.trust.ask(),
             elsewhere,
         };
-        let message = codec::encode(Kind::BatchRequest, self.spec_hash, &request, &[])?;
+        let message = codec::encode(self.spec_hash, &request, &[])?;
         let asked = session::send(
             &self.sessions[shard],
             &self.keys.batch(),
@@ -365,7 +365,6 @@ impl Fetcher {
             answer.slices(),
             answer.len(),
             &self.pool,
-            Kind::BatchReply,
             Some(self.spec_hash),
         )
         .context("a batch")?;

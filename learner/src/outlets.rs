@@ -10,7 +10,7 @@ use std::{
 };
 
 use driml_protocol::{
-    AffinityUpdate, Answering, Keys, Kind, LearnerStatus, Seldom, Shutdown, WeightsUpload, codec,
+    AffinityUpdate, Answering, Done, Keys, LearnerStatus, Seldom, Shutdown, WeightsUpload, codec,
     fault, session,
 };
 use zenoh::{Session, bytes::ZBytes, qos::Priority, query::Queryable};
@@ -89,7 +89,7 @@ impl Outlets {
         let (held, told) = (status.clone(), heard.clone());
         let status_asked = Answering::start("learner-status", 1, move |query| {
             let status = lock(&held).clone();
-            match codec::encode(Kind::LearnerStatus, spec_hash, &status, &[]) {
+            match codec::encode(spec_hash, &status, &[]) {
                 Ok(bytes) => {
                     session::answer(&query, bytes.into());
                     told.store(status.finished, Ordering::Relaxed);
@@ -127,12 +127,12 @@ impl Outlets {
                 learner,
                 weights: *header,
             };
-            let head = codec::seal(Kind::WeightsUpload, spec_hash, &upload, safetensors)?;
+            let head = codec::seal(spec_hash, &upload, safetensors)?;
             Ok(session::join_planes(head, safetensors.clone().into()))
         })?;
         let affinity = to_all("affinity", keys.affinity(), AFFINITY_TIMEOUT);
         affinity.start(this.affinity.clone(), move |update| {
-            Ok(codec::encode(Kind::Affinity, spec_hash, update, &[])?.into())
+            Ok(codec::encode(spec_hash, update, &[])?.into())
         })?;
         Ok(this)
     }
@@ -223,7 +223,7 @@ impl Sender {
     fn send(&self, session: &Session, message: ZBytes) -> anyhow::Result<()> {
         let priority = Priority::DataHigh;
         let answer = session::ask(session, &self.key, message, priority, self.timeout)?;
-        codec::decode::<()>(&answer.to_bytes(), Kind::Done, Some(self.spec_hash))?;
+        codec::decode::<Done>(&answer.to_bytes(), Some(self.spec_hash))?;
         Ok(())
     }
 }

@@ -3,7 +3,6 @@
 
 use std::time::{Duration, Instant};
 
-use serde::Serialize;
 use zenoh::{Session, bytes::ZBytes, qos::Priority};
 
 use crate::{
@@ -13,10 +12,7 @@ use crate::{
     },
     process::shutdown::Shutdown,
     session::{self, SessionError},
-    wire::{
-        codec::{self, CodecError, Kind},
-        keys::Keys,
-    },
+    wire::{codec, error::CodecError, keys::Keys, message::Message},
 };
 
 /// How long a joining part waits for a replay server.
@@ -78,9 +74,7 @@ pub fn hello(
     loop {
         match ask(session, &keys.hello(), ZBytes::new()) {
             Ok(answer) => {
-                return Ok(Some(
-                    codec::decode(&answer.to_bytes(), Kind::Hello, None)?.0,
-                ));
+                return Ok(Some(codec::decode(&answer.to_bytes(), None)?.0));
             }
             Err(last) if started.elapsed() > SERVER_MAX => return Err(JoinError::Nobody { last }),
             Err(e) => tracing::debug!("no replay server yet: {e}"),
@@ -103,7 +97,7 @@ pub fn as_actor(
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
     let key = keys.actor_join();
-    take_part(session, &key, (Kind::ActorJoin, spec_hash), &join, shutdown)
+    take_part(session, &key, spec_hash, &join, shutdown)
 }
 
 /// Takes part as the run's learner; `None` if told to stop before.
@@ -118,30 +112,24 @@ pub fn as_learner(
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
     let key = keys.learner_join();
-    take_part(
-        session,
-        &key,
-        (Kind::LearnerJoin, spec_hash),
-        &join,
-        shutdown,
-    )
+    take_part(session, &key, spec_hash, &join, shutdown)
 }
 
 fn take_part(
     session: &Session,
     key: &str,
-    (kind, spec_hash): (Kind, u64),
-    join: &impl Serialize,
+    spec_hash: u64,
+    join: &impl Message,
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
-    let message = codec::encode(kind, spec_hash, join, &[])?;
+    let message = codec::encode(spec_hash, join, &[])?;
     let started = Instant::now();
     let mut said = false;
     loop {
         match ask(session, key, message.clone().into()) {
             Ok(answer) => {
                 let bytes = answer.to_bytes();
-                match codec::decode(&bytes, Kind::JoinReply, Some(spec_hash))?.0 {
+                match codec::decode(&bytes, Some(spec_hash))?.0 {
                     JoinReply::Welcome {
                         inserted_total,
                         weights_version,

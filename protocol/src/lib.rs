@@ -18,6 +18,7 @@ pub use messages::{
     batch::{Batch, BatchHeader, BatchReply, BatchRowsMut, NO_ACTION, POOL_BATCHES},
     batch_request::{BatchRequest, RequestId, Tally},
     chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES},
+    done::Done,
     goodbye::Goodbye,
     hello::Hello,
     insert_reply::{Claim, InsertReply},
@@ -38,7 +39,9 @@ pub use query_workers::Answering;
 pub use run_spec::{Horizon, POSITIVES_MAX, RunSpec, RunSpecError, TimeoutRule};
 pub use wire::{
     buffers::{Planes, PlanesPool},
-    codec::{self, CodecError, Kind, PROTOCOL_VERSION},
+    codec::{self, PROTOCOL_VERSION},
+    error::CodecError,
     keys::{Alive, Keys},
+    message::{Kind, Message},
     shared_memory,
 };

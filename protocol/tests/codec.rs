@@ -6,14 +6,13 @@ use std::fmt::Debug;
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader,
-    Claim, CodecError, End, Goodbye, Hello, Horizon, InsertReply, JoinReply, Kind, LearnerJoin,
-    LearnerStatus, NO_ACTION, PROTOCOL_VERSION, Planes, PlanesPool, ReplayStatus, RequestId,
-    Returns, RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader, WeightsReply, WeightsRequest,
-    WeightsUpload, WeightsVersion,
+    Claim, CodecError, Done, End, Goodbye, Hello, Horizon, InsertReply, JoinReply, Kind,
+    LearnerJoin, LearnerStatus, Message, NO_ACTION, PROTOCOL_VERSION, Planes, PlanesPool,
+    ReplayStatus, RequestId, Returns, RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader,
+    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PLANES_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
-use serde::{Serialize, de::DeserializeOwned};
 
 const SPEC: u64 = 0x0123_4567_89ab_cdef;
 const ACTIONS: u32 = 15;
@@ -28,32 +27,19 @@ struct Sample {
 
 impl Sample {
     /// Encodes `header`, checks that it comes back, and keeps the bytes.
-    fn of<H: Serialize + DeserializeOwned + PartialEq + Debug>(kind: Kind, header: &H) -> Self {
-        let bytes = codec::encode(kind, SPEC, header, &[]).unwrap();
-        let (back, planes) = codec::decode::<H>(&bytes, kind, Some(SPEC)).unwrap();
+    fn of<M: Message + PartialEq + Debug>(header: &M) -> Self {
+        let bytes = codec::encode(SPEC, header, &[]).unwrap();
+        let (back, planes) = codec::decode::<M>(&bytes, Some(SPEC)).unwrap();
         assert_eq!((&back, planes.len()), (header, 0));
-        let (back, _) = codec::decode::<H>(&bytes, kind, None).unwrap();
+        let (back, _) = codec::decode::<M>(&bytes, None).unwrap();
         assert_eq!(&back, header, "where any run is welcome");
         Self {
             name: format!("{header:?}"),
-            kind,
+            kind: M::KIND,
             bytes,
-            read: reader::<H>(kind),
+            read: |bytes| codec::decode::<M>(bytes, Some(SPEC)).map(|_| ()),
         }
     }
-}
-
-/// A reader of headers of type `H`, for the kinds that carry one.
-fn reader<H: DeserializeOwned>(kind: Kind) -> fn(&[u8]) -> Result<(), CodecError> {
-    macro_rules! readers {
-        ($($kind:ident)*) => {
-            match kind {
-                $(Kind::$kind => |bytes| codec::decode::<H>(bytes, Kind::$kind, Some(SPEC)).map(|_| ()),)*
-            }
-        };
-    }
-    readers!(Chunk InsertReply BatchRequest BatchReply Affinity Weights WeightsVersion Goodbye ReplayStatus
-        LearnerStatus Hello Done ActorJoin LearnerJoin JoinReply Claim WeightsUpload WeightsRequest)
 }
 
 fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
@@ -61,7 +47,7 @@ fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
 }
 
 fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
-    match codec::decode(bytes, Kind::BatchReply, Some(SPEC))? {
+    match codec::decode::<BatchReply>(bytes, Some(SPEC))? {
         (BatchReply::Batch(header), planes) => {
             Batch::from_planes(header, planes.to_vec().into()).map(|_| ())
         }
@@ -70,7 +56,7 @@ fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
 }
 
 fn read_weights(bytes: &[u8]) -> Result<(), CodecError> {
-    WeightsUpload::decode(bytes, SPEC).map(|_| ())
+    codec::decode::<WeightsUpload>(bytes, Some(SPEC)).map(|_| ())
 }
 
 fn chunk() -> Chunk {
@@ -136,7 +122,7 @@ fn weights() -> Vec<u8> {
         learner: 5,
         weights: WeightsHeader::new(4, 312, &planes),
     };
-    codec::encode(Kind::WeightsUpload, SPEC, &upload, &planes).unwrap()
+    codec::encode(SPEC, &upload, &planes).unwrap()
 }
 
 /// One or more messages of every kind.
@@ -202,10 +188,7 @@ fn samples() -> Vec<Sample> {
         epoch: 2,
         produced: 3,
     };
-    let mut samples: Vec<Sample> = replies
-        .iter()
-        .map(|r| Sample::of(Kind::InsertReply, r))
-        .collect();
+    let mut samples: Vec<Sample> = replies.iter().map(Sample::of).collect();
     let joined = [
         JoinReply::Welcome {
             inserted_total: 3,
@@ -215,67 +198,49 @@ fn samples() -> Vec<Sample> {
         JoinReply::Taken { why: "a".into() },
         JoinReply::Refused { why: "b".into() },
     ];
-    samples.extend(joined.map(|reply| Sample::of(Kind::JoinReply, &reply)));
-    samples.extend(waits.map(|waiting| Sample::of(Kind::BatchReply, &BatchReply::Wait(waiting))));
+    samples.extend(joined.map(|reply| Sample::of(&reply)));
+    samples.extend(waits.map(|waiting| Sample::of(&BatchReply::Wait(waiting))));
     samples.extend([
-        Sample::of(Kind::BatchReply, &BatchReply::Finished),
-        Sample::of(
-            Kind::BatchReply,
-            &BatchReply::Refused { why: String::new() },
-        ),
-        Sample::of(
-            Kind::BatchRequest,
-            &BatchRequest {
-                learner: 5,
-                id: RequestId::first(u64::MAX).again(),
-                rows: 256,
-                shared_memory: true,
-                elsewhere: Some(Tally::default()),
-            },
-        ),
-        Sample::of(Kind::Affinity, &affinity),
-        Sample::of(Kind::WeightsVersion, &WeightsVersion { version: 9 }),
-        Sample::of(Kind::Goodbye, &goodbye),
-        Sample::of(Kind::ReplayStatus, &ReplayStatus::default()),
-        Sample::of(Kind::ReplayStatus, &replay),
-        Sample::of(Kind::LearnerStatus, &learner),
-        Sample::of(Kind::Hello, &hello),
-        Sample::of(Kind::ActorJoin, &ActorJoin { actor: 1, epoch: 2 }),
-        Sample::of(
-            Kind::LearnerJoin,
-            &LearnerJoin {
-                learner: 5,
-                rows_sampled: 9,
-            },
-        ),
-        Sample::of(
-            Kind::Claim,
-            &Claim {
-                actor: 1,
-                epoch: 2,
-                sequence: 3,
-                leaving: true,
-            },
-        ),
-        Sample::of(Kind::WeightsRequest, &WeightsRequest::NewerThan(7)),
-        Sample::of(
-            Kind::WeightsRequest,
-            &WeightsRequest::Piece {
-                version: 8,
-                offset: 1 << 18,
-            },
-        ),
-        Sample::of(Kind::Weights, &WeightsReply::NoneNewer),
-        Sample::of(Kind::Weights, &WeightsReply::Gone),
-        Sample::of(
-            Kind::Weights,
-            &WeightsReply::Piece {
-                weights: WeightsHeader::new(8, 9, b"these"),
-                bytes: 5,
-                offset: 0,
-            },
-        ),
-        Sample::of(Kind::Done, &()),
+        Sample::of(&BatchReply::Finished),
+        Sample::of(&BatchReply::Refused { why: String::new() }),
+        Sample::of(&BatchRequest {
+            learner: 5,
+            id: RequestId::first(u64::MAX).again(),
+            rows: 256,
+            shared_memory: true,
+            elsewhere: Some(Tally::default()),
+        }),
+        Sample::of(&affinity),
+        Sample::of(&WeightsVersion { version: 9 }),
+        Sample::of(&goodbye),
+        Sample::of(&ReplayStatus::default()),
+        Sample::of(&replay),
+        Sample::of(&learner),
+        Sample::of(&hello),
+        Sample::of(&ActorJoin { actor: 1, epoch: 2 }),
+        Sample::of(&LearnerJoin {
+            learner: 5,
+            rows_sampled: 9,
+        }),
+        Sample::of(&Claim {
+            actor: 1,
+            epoch: 2,
+            sequence: 3,
+            leaving: true,
+        }),
+        Sample::of(&WeightsRequest::NewerThan(7)),
+        Sample::of(&WeightsRequest::Piece {
+            version: 8,
+            offset: 1 << 18,
+        }),
+        Sample::of(&WeightsReply::NoneNewer),
+        Sample::of(&WeightsReply::Gone),
+        Sample::of(&WeightsReply::Piece {
+            weights: WeightsHeader::new(8, 9, b"these"),
+            bytes: 5,
+            offset: 0,
+        }),
+        Sample::of(&Done),
     ]);
     let with_planes = [
         (
@@ -341,7 +306,7 @@ fn chunk_batch_and_weights_come_back() {
     assert_eq!(back.frames()[5 * 5..], [6; 5]);
 
     let bytes = join(batch().seal(SPEC).unwrap());
-    let (reply, planes) = codec::decode(&bytes, Kind::BatchReply, Some(SPEC)).unwrap();
+    let (reply, planes) = codec::decode(&bytes, Some(SPEC)).unwrap();
     let BatchReply::Batch(header) = reply else {
         panic!("{reply:?}")
     };
@@ -371,7 +336,7 @@ fn chunk_batch_and_weights_come_back() {
     assert_eq!(back.bootstrap_discounts(), [0.0, 0.0, 0.5]);
 
     let bytes = weights();
-    let (upload, planes) = WeightsUpload::decode(&bytes, SPEC).unwrap();
+    let (upload, planes) = codec::decode::<WeightsUpload>(&bytes, Some(SPEC)).unwrap();
     let WeightsUpload { learner, weights } = upload;
     assert_eq!((learner, weights.version, weights.updates), (5, 4, 312));
     assert_eq!((planes.len(), weights.sha256_hex().len()), (40, 64));
@@ -459,7 +424,7 @@ fn parts_are_merged_row_by_row() {
 #[test]
 fn every_kind_has_a_sample_that_is_read() {
     let samples = samples();
-    for kind in 1..=12 {
+    for kind in 1..=18 {
         assert!(
             samples.iter().any(|sample| sample.kind as u16 == kind),
             "kind {kind}"
@@ -535,19 +500,11 @@ fn every_flipped_bit_is_refused() {
 #[test]
 fn each_mismatch_has_its_own_error() {
     let header = [5u8];
-    let read = |bytes: &[u8], hash| {
-        codec::decode::<WeightsVersion>(bytes, Kind::WeightsVersion, hash).map(|_| ())
-    };
+    let read = |bytes: &[u8], hash| codec::decode::<WeightsVersion>(bytes, hash).map(|_| ());
     let good = forge_whole(Kind::WeightsVersion, &header, &[]);
     assert_eq!(
         good,
-        codec::encode(
-            Kind::WeightsVersion,
-            SPEC,
-            &WeightsVersion { version: 5 },
-            &[]
-        )
-        .unwrap()
+        codec::encode(SPEC, &WeightsVersion { version: 5 }, &[]).unwrap()
     );
     assert_eq!(read(&good, Some(SPEC)), Ok(()));
 
@@ -604,7 +561,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
             &[5],
             &[],
         );
-        codec::decode::<WeightsVersion>(&bytes, Kind::WeightsVersion, Some(SPEC)).unwrap_err()
+        codec::decode::<WeightsVersion>(&bytes, Some(SPEC)).unwrap_err()
     };
     let header = HEADER_BYTES_MAX as u32 + 1;
     assert_eq!(
@@ -639,7 +596,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
     // A header that claims more elements than any header has room for.
     let claim = [&[1u8, 3, 253][..], &u64::MAX.to_le_bytes()].concat();
     let bytes = forge_whole(Kind::Affinity, &claim, &[]);
-    let refused = codec::decode::<AffinityUpdate>(&bytes, Kind::Affinity, Some(SPEC)).unwrap_err();
+    let refused = codec::decode::<AffinityUpdate>(&bytes, Some(SPEC)).unwrap_err();
     assert!(matches!(refused, CodecError::Header(_)), "{refused}");
     // The sender keeps to the limit too.
     let hello = Hello {
@@ -650,7 +607,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
         shard: (0, 1),
         shared_memory: false,
     };
-    let refused = codec::seal(Kind::Hello, SPEC, &hello, &[]).unwrap_err();
+    let refused = codec::seal(SPEC, &hello, &[]).unwrap_err();
     assert!(
         matches!(
             refused,
@@ -668,9 +625,7 @@ fn counts_that_do_not_fit_their_planes_are_refused() {
     let header = chunk().header;
     let planes = &join(chunk().seal(SPEC).unwrap())[..];
     let planes = &planes[planes.len() - 6 * 11..];
-    let read = |header: ChunkHeader| {
-        read_chunk(&codec::encode(Kind::Chunk, SPEC, &header, planes).unwrap())
-    };
+    let read = |header: ChunkHeader| read_chunk(&codec::encode(SPEC, &header, planes).unwrap());
     assert_eq!(read(header), Ok(()));
     let most = u32::MAX;
     for wrong in [
@@ -733,7 +688,7 @@ fn what_no_world_gives_is_refused() {
         let whole = join(chunk().seal(SPEC).unwrap());
         let mut planes = whole[whole.len() - 6 * 11..].to_vec();
         change(&mut planes);
-        read_chunk(&codec::encode(Kind::Chunk, SPEC, &chunk().header, &planes).unwrap())
+        read_chunk(&codec::encode(SPEC, &chunk().header, &planes).unwrap())
     };
     assert_eq!(decode(&|_| {}), Ok(()));
     assert!(
@@ -757,9 +712,9 @@ fn what_no_world_gives_is_refused() {
         learner: 5,
         weights: WeightsHeader::new(1, 1, b"these"),
     };
-    let bytes = codec::encode(Kind::WeightsUpload, SPEC, &upload, b"those").unwrap();
+    let bytes = codec::encode(SPEC, &upload, b"those").unwrap();
     assert!(matches!(
-        WeightsUpload::decode(&bytes, SPEC),
+        codec::decode::<WeightsUpload>(&bytes, Some(SPEC)),
         Err(CodecError::Header(_))
     ));
 }

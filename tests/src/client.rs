@@ -4,13 +4,12 @@
 use std::time::{Duration, Instant};
 
 use driml_protocol::{
-    ActorJoin, Chunk, InsertReply, Keys, Kind, LearnerJoin, LearnerStatus, ReplayStatus, RunSpec,
-    Shutdown, codec,
+    ActorJoin, Chunk, InsertReply, Keys, LearnerJoin, LearnerStatus, Message, ReplayStatus,
+    RunSpec, Shutdown, codec,
     config::Settings,
     join,
     session::{self, Endpoints, SessionError},
 };
-use serde::de::DeserializeOwned;
 use zenoh::{Session, Wait, qos::Priority};
 
 use crate::waiting::wait_for;
@@ -77,23 +76,19 @@ impl Client {
         .map(|answer| answer.to_bytes().into_owned())
     }
 
-    fn ask_for<T: DeserializeOwned>(&self, key: &str, kind: Kind, payload: Vec<u8>) -> Option<T> {
+    fn ask_for<M: Message>(&self, key: &str, payload: Vec<u8>) -> Option<M> {
         let answer = self.ask(key, payload).ok()?;
-        Some(
-            codec::decode(&answer, kind, Some(self.spec.hash()))
-                .unwrap()
-                .0,
-        )
+        Some(codec::decode(&answer, Some(self.spec.hash())).unwrap().0)
     }
 
     /// The replay server's status; none if it did not answer.
     pub fn replay(&self) -> Option<ReplayStatus> {
-        self.ask_for(&self.keys.replay_status(), Kind::ReplayStatus, Vec::new())
+        self.ask_for(&self.keys.replay_status(), Vec::new())
     }
 
     /// The learner's status; none if it is not there.
     pub fn learner(&self) -> Option<LearnerStatus> {
-        self.ask_for(&self.keys.learner_status(), Kind::LearnerStatus, Vec::new())
+        self.ask_for(&self.keys.learner_status(), Vec::new())
     }
 
     /// Waits until the replay server's status is as wanted, and gives it.
@@ -147,7 +142,7 @@ impl Client {
     /// # Panics
     /// If nobody answers, or not in the run's own words.
     pub fn insert_bytes(&self, bytes: Vec<u8>) -> InsertReply {
-        self.ask_for(&self.keys.ingest(), Kind::InsertReply, bytes)
+        self.ask_for(&self.keys.ingest(), bytes)
             .expect("chunks are always answered")
     }
 }

@@ -2,7 +2,7 @@
 //! That no such bytes make the codec panic is its own test; here a whole server lives on and goes on storing.
 
 use driml_protocol::{
-    AffinityUpdate, BatchReply, BatchRequest, Chunk, ChunkHeader, End, Goodbye, InsertReply, Kind,
+    AffinityUpdate, BatchReply, BatchRequest, Chunk, ChunkHeader, End, Goodbye, InsertReply,
     PROTOCOL_VERSION, RequestId, codec,
 };
 use driml_tests::{Client, Process, TestSystem};
@@ -124,7 +124,12 @@ fn chunks_of_other_runs_and_versions() {
     let mut newer = served.sealed(&chunk, hash);
     newer[4..6].copy_from_slice(&(PROTOCOL_VERSION + 1).to_le_bytes());
     served.refused(newer, "run the same build of driml everywhere");
-    let of_another_kind = codec::encode(Kind::Goodbye, hash, &chunk.header, &[]).unwrap();
+    let goodbye = Goodbye {
+        actor: 0,
+        epoch: EPOCH,
+        produced: 0,
+    };
+    let of_another_kind = codec::encode(hash, &goodbye, &[]).unwrap();
     served.refused(
         of_another_kind,
         "a message of kind 8 came where kind 1 is expected",
@@ -214,7 +219,6 @@ fn everything_else_that_a_replay_server_takes() {
     for bytes in [
         garbage.clone(),
         codec::encode(
-            Kind::BatchRequest,
             hash ^ 1,
             &BatchRequest {
                 learner: LEARNER,
@@ -229,14 +233,12 @@ fn everything_else_that_a_replay_server_takes() {
     ] {
         let before = counted();
         let reply = client.ask(&client.keys.batch(), bytes).unwrap();
-        let (reply, _): (BatchReply, _) =
-            codec::decode(&reply, Kind::BatchReply, Some(hash)).unwrap();
+        let (reply, _): (BatchReply, _) = codec::decode(&reply, Some(hash)).unwrap();
         assert!(matches!(reply, BatchReply::Refused { .. }), "{reply:?}");
         assert_eq!(counted(), before + 1);
     }
     for rows in [0, u32::MAX] {
         let request = codec::encode(
-            Kind::BatchRequest,
             hash,
             &BatchRequest {
                 learner: LEARNER,
@@ -249,8 +251,7 @@ fn everything_else_that_a_replay_server_takes() {
         )
         .unwrap();
         let reply = client.ask(&client.keys.batch(), request).unwrap();
-        let (reply, _): (BatchReply, _) =
-            codec::decode(&reply, Kind::BatchReply, Some(hash)).unwrap();
+        let (reply, _): (BatchReply, _) = codec::decode(&reply, Some(hash)).unwrap();
         assert!(
             matches!(&reply, BatchReply::Refused { why } if why.contains("a batch of")),
             "{reply:?}"
@@ -273,12 +274,12 @@ fn everything_else_that_a_replay_server_takes() {
         (client.keys.goodbye(), garbage.clone()),
         (
             client.keys.goodbye(),
-            codec::encode(Kind::Goodbye, hash ^ 1, &goodbye, &[]).unwrap(),
+            codec::encode(hash ^ 1, &goodbye, &[]).unwrap(),
         ),
         (client.keys.affinity(), garbage),
         (
             client.keys.affinity(),
-            codec::encode(Kind::Affinity, hash, &affinity, &[]).unwrap(),
+            codec::encode(hash, &affinity, &[]).unwrap(),
         ),
     ] {
         let before = counted();

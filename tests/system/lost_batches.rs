@@ -11,8 +11,8 @@ use std::{
 
 use driml_learner::batch_source::{BatchSource, Next, Requests};
 use driml_protocol::{
-    ActorJoin, BatchReply, BatchRequest, Chunk, ChunkHeader, Horizon, InsertReply, Keys, Kind,
-    Planes, RunSpec, Shutdown, TimeoutRule, codec,
+    ActorJoin, BatchReply, BatchRequest, Chunk, ChunkHeader, Horizon, InsertReply, Keys, Planes,
+    RunSpec, Shutdown, TimeoutRule, codec,
     session::{self, Endpoints},
 };
 use driml_replay_server::{Compression, Config, Replay};
@@ -86,8 +86,7 @@ fn full(shard: u32, shards: u32) -> Replay {
 fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
     let hash = spec().hash();
     let payload = query.payload().unwrap().to_bytes();
-    let (request, _): (BatchRequest, _) =
-        codec::decode(&payload, Kind::BatchRequest, Some(hash)).unwrap();
+    let (request, _): (BatchRequest, _) = codec::decode(&payload, Some(hash)).unwrap();
     let mut replay = replay.lock().unwrap();
     if let Some(elsewhere) = request.elsewhere {
         replay.heard(elsewhere).unwrap();
@@ -98,9 +97,7 @@ fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
             let (head, planes) = draft.unpack().seal(hash).unwrap();
             [&head[..], &planes[..]].concat()
         }
-        Err(unready) => {
-            codec::encode(Kind::BatchReply, hash, &BatchReply::from(unready), &[]).unwrap()
-        }
+        Err(unready) => codec::encode(hash, &BatchReply::from(unready), &[]).unwrap(),
     };
     session::answer(query, message.into());
 }
@@ -135,7 +132,7 @@ fn every_batch_comes_once(shards: u32) {
         let asked = replay.clone();
         let status = declare(&server, keys.replay_status(), move |query| {
             let status = asked.lock().unwrap().status();
-            let bytes = codec::encode(Kind::ReplayStatus, hash, &status, &[]).unwrap();
+            let bytes = codec::encode(hash, &status, &[]).unwrap();
             session::answer(query, bytes.into());
         });
         sessions.push(open(vec![], vec![endpoint]));

@@ -12,7 +12,7 @@ use std::{
 
 use driml_actor::delivery::{Delivery, DeliveryLimits};
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon, InsertReply, Keys, Kind,
+    ActorJoin, Chunk, ChunkHeader, Claim, Done, End, Goodbye, Horizon, InsertReply, Keys,
     PlanesPool, RequestId, RunSpec, Shutdown, TimeoutRule, codec,
     session::{self, Endpoints},
 };
@@ -107,16 +107,16 @@ impl Server {
         };
         let goodbye = |server: &Self, payload: &[u8]| {
             let hash = spec().hash();
-            let goodbye = codec::decode::<Goodbye>(payload, Kind::Goodbye, Some(hash));
+            let goodbye = codec::decode::<Goodbye>(payload, Some(hash));
             server.replay.lock().unwrap().goodbye(&goodbye.unwrap().0);
-            Some(codec::encode(Kind::Done, hash, &(), &[]).unwrap())
+            Some(codec::encode(hash, &Done, &[]).unwrap())
         };
         let insert = |server: &Self, payload: &[u8]| {
             let chunk = Chunk::decode(payload, spec().hash(), 3).unwrap();
             server.lossy(|replay| replay.insert(&chunk))
         };
         let claim = |server: &Self, payload: &[u8]| {
-            let claim = codec::decode::<Claim>(payload, Kind::Claim, Some(spec().hash()));
+            let claim = codec::decode::<Claim>(payload, Some(spec().hash()));
             let claim = claim.unwrap().0;
             server.lossy(|replay| replay.claim(&claim).expect("nothing is parked here"))
         };
@@ -136,7 +136,7 @@ impl Server {
             Loses::First(count) => (message >= count, true),
         };
         let reply = arrives.then(|| judge(&mut self.replay.lock().unwrap()))?;
-        is_answered.then(|| codec::encode(Kind::InsertReply, spec().hash(), &reply, &[]).unwrap())
+        is_answered.then(|| codec::encode(spec().hash(), &reply, &[]).unwrap())
     }
 
     /// Checks that the replay holds the numbers 0 to `TRANSITIONS`, each once.

@@ -10,8 +10,8 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Chunk, ChunkHeader, Claim, Goodbye, InsertReply, Keys, Kind, PlanesPool, Seldom, Shutdown,
-    codec, fault,
+    Chunk, ChunkHeader, Claim, CodecError, Done, Goodbye, InsertReply, Keys, Message, PlanesPool,
+    Seldom, Shutdown, codec, fault,
     session::{self, Asked, SessionError},
 };
 use zenoh::{Session, bytes::ZBytes, qos::Priority};
@@ -250,8 +250,7 @@ impl Courier {
                 None => {}
             }
         };
-        self.read(&self.keys.ingest(), Kind::InsertReply, &answer)
-            .map(Some)
+        self.read(&self.keys.ingest(), &answer).map(Some)
     }
 
     /// The rate limiter makes the first chunk wait; it is asked about again at once if the replay server keeps it.
@@ -328,13 +327,13 @@ impl Courier {
     fn say_goodbye(&self, goodbye: Goodbye) {
         let started = Instant::now();
         loop {
-            let said = codec::encode(Kind::Goodbye, self.spec_hash, &goodbye, &[])
+            let said = codec::encode(self.spec_hash, &goodbye, &[])
                 .context("encoding the goodbye")
                 .and_then(|bytes| {
                     let (key, timeout) = (self.keys.goodbye(), GOODBYE_MAX);
                     let answer =
                         session::ask(&self.session, &key, bytes.into(), Priority::Data, timeout)?;
-                    Ok(self.read::<()>(&key, Kind::Done, &answer)?)
+                    Ok(self.read::<Done>(&key, &answer).map(|Done| ())?)
                 });
             match said {
                 Ok(()) => return,
@@ -347,15 +346,10 @@ impl Courier {
         }
     }
 
-    fn read<H: serde::de::DeserializeOwned>(
-        &self,
-        key: &str,
-        kind: Kind,
-        answer: &ZBytes,
-    ) -> Result<H, SessionError> {
+    fn read<M: Message>(&self, key: &str, answer: &ZBytes) -> Result<M, SessionError> {
         let bytes = answer.to_bytes();
-        codec::decode(&bytes, kind, Some(self.spec_hash))
-            .map(|(header, _)| header)
+        codec::decode(&bytes, Some(self.spec_hash))
+            .map(|(message, _)| message)
             .map_err(|e| SessionError::Zenoh {
                 key: key.into(),
                 why: e.to_string(),
@@ -363,12 +357,12 @@ impl Courier {
     }
 }
 
-fn chunk(it: &Outgoing, spec_hash: u64) -> Result<ZBytes, codec::CodecError> {
-    let head = codec::seal(Kind::Chunk, spec_hash, &it.header, &it.planes.to_bytes())?;
+fn chunk(it: &Outgoing, spec_hash: u64) -> Result<ZBytes, CodecError> {
+    let head = codec::seal(spec_hash, &it.header, &it.planes.to_bytes())?;
     Ok(session::join_planes(head, it.planes.clone()))
 }
 
-fn claim(it: &Outgoing, spec_hash: u64) -> Result<ZBytes, codec::CodecError> {
+fn claim(it: &Outgoing, spec_hash: u64) -> Result<ZBytes, CodecError> {
     let ChunkHeader {
         actor,
         epoch,
@@ -382,5 +376,5 @@ fn claim(it: &Outgoing, spec_hash: u64) -> Result<ZBytes, codec::CodecError> {
         sequence,
         leaving,
     };
-    codec::encode(Kind::Claim, spec_hash, &claim, &[]).map(Into::into)
+    codec::encode(spec_hash, &claim, &[]).map(Into::into)
 }

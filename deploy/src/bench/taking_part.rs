@@ -5,8 +5,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use driml_protocol::{
-    ActorJoin, Keys, Kind, LearnerJoin, Shutdown, WeightsHeader, WeightsUpload, codec, join,
-    session,
+    ActorJoin, Keys, LearnerJoin, Shutdown, WeightsHeader, WeightsUpload, codec, join, session,
 };
 use zenoh::{Session, Wait, liveliness::LivelinessToken, qos::Priority};
 
@@ -76,7 +75,7 @@ pub(super) fn upload_weights(
         learner: LEARNER,
         weights: WeightsHeader::new(updates, updates, weights),
     };
-    let head = codec::seal(Kind::WeightsUpload, spec_hash, &upload, weights)?;
+    let head = codec::seal(spec_hash, &upload, weights)?;
     let message = session::join_planes(head, weights.to_vec().into());
     let key = keys.weights_upload();
     session::ask(session, &key, message, Priority::DataHigh, UPLOAD_MAX)?;

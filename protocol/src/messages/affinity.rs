@@ -3,7 +3,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::wire::codec::CodecError;
+use crate::wire::{
+    error::CodecError,
+    message::{Kind, Message},
+};
 
 /// A, row by row: `matrix[i * n + j]` is the softmax over j of q(a_i, a_j); rows sum to 1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -16,6 +19,10 @@ pub struct AffinityUpdate {
     pub num_actions: u32,
     /// [n, n] probabilities.
     pub matrix: Vec<f32>,
+}
+
+impl Message for AffinityUpdate {
+    const KIND: Kind = Kind::Affinity;
 }
 
 impl AffinityUpdate {

@@ -8,7 +8,9 @@ use crate::{
     run_spec::RunSpec,
     wire::{
         buffers::Planes,
-        codec::{self, CodecError, Kind},
+        codec,
+        error::CodecError,
+        message::{Kind, Message, no_payload},
         shared_memory,
     },
 };
@@ -66,6 +68,20 @@ impl BatchHeader {
     pub fn planes_bytes(&self) -> usize {
         planes_bytes(self).expect("a batch is far below the address space")
     }
+
+    /// Checks that `planes` are as long as such a batch's.
+    fn check_planes(&self, planes: &[u8]) -> Result<(), CodecError> {
+        if planes_bytes(self) == Some(planes.len()) && self.rows > 0 {
+            return Ok(());
+        }
+        Err(CodecError::Header(format!(
+            "{} rows with {} positives of {} bytes do not fill {} bytes of planes",
+            self.rows,
+            self.positives,
+            self.state_bytes,
+            planes.len()
+        )))
+    }
 }
 
 /// The answer to a request.
@@ -82,6 +98,17 @@ pub enum BatchReply {
         /// The reason.
         why: String,
     },
+}
+
+impl Message for BatchReply {
+    const KIND: Kind = Kind::BatchReply;
+
+    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+        match self {
+            Self::Batch(header) => header.check_planes(payload),
+            Self::Wait(_) | Self::Finished | Self::Refused { .. } => no_payload(payload),
+        }
+    }
 }
 
 /// Rows (s_t, a_t, a_{t+1}, R_t, discount, s_{t+k}, s_{t+n}), as the replay server made them.
@@ -289,12 +316,7 @@ impl Batch {
     /// # Errors
     /// A batch over the codec's limits.
     pub fn seal(self, spec_hash: u64) -> Result<(Vec<u8>, Planes), CodecError> {
-        let head = codec::seal(
-            Kind::BatchReply,
-            spec_hash,
-            &BatchReply::Batch(self.header),
-            &self.planes,
-        )?;
+        let head = codec::seal(spec_hash, &BatchReply::Batch(self.header), &self.planes)?;
         Ok((head, self.planes))
     }
 
@@ -303,15 +325,7 @@ impl Batch {
     /// # Errors
     /// Planes of another length.
     pub fn from_planes(header: BatchHeader, planes: Planes) -> Result<Self, CodecError> {
-        if planes_bytes(&header) != Some(planes.len()) || header.rows == 0 {
-            return Err(CodecError::Header(format!(
-                "{} rows with {} positives of {} bytes do not fill {} bytes of planes",
-                header.rows,
-                header.positives,
-                header.state_bytes,
-                planes.len()
-            )));
-        }
+        header.check_planes(&planes)?;
         Ok(Self { header, planes })
     }
 }

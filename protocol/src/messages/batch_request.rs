@@ -3,6 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::wire::message::{Kind, Message};
+
 /// The learner's request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BatchRequest {
@@ -16,6 +18,10 @@ pub struct BatchRequest {
     pub shared_memory: bool,
     /// Where the replay has several shards: what all the others have counted together, and these rows are part of a batch.
     pub elsewhere: Option<Tally>,
+}
+
+impl Message for BatchRequest {
+    const KIND: Kind = Kind::BatchRequest;
 }
 
 /// Tells a request that repeats another from a new one: a batch that did not arrive must not count as sampled.

@@ -5,7 +5,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::wire::{
     buffers::{Planes, PlanesPool},
-    codec::{self, CodecError, Kind},
+    codec,
+    error::CodecError,
+    message::{Kind, Message},
 };
 
 /// Bytes of one transition in a chunk beside its frame: an action, an end and a reward.
@@ -64,6 +66,23 @@ pub struct ChunkHeader {
     pub steps: u32,
     /// Bytes of one frame.
     pub frame_bytes: u32,
+}
+
+impl Message for ChunkHeader {
+    const KIND: Kind = Kind::Chunk;
+
+    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+        if self.planes_bytes() == Some(payload.len()) && self.transitions() > 0 {
+            return Ok(());
+        }
+        Err(CodecError::Header(format!(
+            "{} streams of {} steps of {} bytes do not fill {} bytes of planes",
+            self.streams,
+            self.steps,
+            self.frame_bytes,
+            payload.len()
+        )))
+    }
 }
 
 impl ChunkHeader {
@@ -172,7 +191,7 @@ impl Chunk {
     /// A chunk over the codec's limits.
     pub fn seal(&self, spec_hash: u64) -> Result<(Vec<u8>, &[u8]), CodecError> {
         Ok((
-            codec::seal(Kind::Chunk, spec_hash, &self.header, &self.planes)?,
+            codec::seal(spec_hash, &self.header, &self.planes)?,
             &self.planes,
         ))
     }
@@ -187,7 +206,7 @@ impl Chunk {
     /// # Errors
     /// Whatever makes it unfit to be stored; the message says what.
     pub fn decode(bytes: &[u8], spec_hash: u64, num_actions: u32) -> Result<Self, CodecError> {
-        let (header, planes) = codec::decode(bytes, Kind::Chunk, Some(spec_hash))?;
+        let (header, planes) = codec::decode(bytes, Some(spec_hash))?;
         Self::checked(header, planes.to_vec().into(), num_actions)
     }
 
@@ -202,20 +221,12 @@ impl Chunk {
         spec_hash: u64,
         num_actions: u32,
     ) -> Result<Self, CodecError> {
-        let (header, planes) = codec::receive(pieces, len, pool, Kind::Chunk, Some(spec_hash))?;
+        let (header, planes) = codec::receive(pieces, len, pool, Some(spec_hash))?;
         Self::checked(header, planes, num_actions)
     }
 
+    /// `planes` are as long as `header` says.
     fn checked(header: ChunkHeader, planes: Planes, num_actions: u32) -> Result<Self, CodecError> {
-        if header.planes_bytes() != Some(planes.len()) || header.transitions() == 0 {
-            return Err(CodecError::Header(format!(
-                "{} streams of {} steps of {} bytes do not fill {} bytes of planes",
-                header.streams,
-                header.steps,
-                header.frame_bytes,
-                planes.len()
-            )));
-        }
         let chunk = Self { header, planes };
         if let Some(action) = chunk
             .actions()

@@ -3,6 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::wire::message::{Kind, Message};
+
 /// An actor's last word: its own count of what it produced, against which the replay server checks its count.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Goodbye {
@@ -12,4 +14,8 @@ pub struct Goodbye {
     pub epoch: u64,
     /// Transitions produced, less those that the replay server answered with `Finished` or `Refused`.
     pub produced: u64,
+}
+
+impl Message for Goodbye {
+    const KIND: Kind = Kind::Goodbye;
 }

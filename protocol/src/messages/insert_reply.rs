@@ -3,6 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::wire::message::{Kind, Message};
+
 /// Asks what became of a chunk that the replay server keeps until its limiter opens: the chunk's header without its planes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Claim {
@@ -14,6 +16,10 @@ pub struct Claim {
     pub sequence: u64,
     /// The actor was told to stop: the rate limiter lets the chunk pass.
     pub leaving: bool,
+}
+
+impl Message for Claim {
+    const KIND: Kind = Kind::Claim;
 }
 
 /// The replay server's answer to a chunk or a claim.
@@ -50,4 +56,8 @@ pub enum InsertReply {
         /// The reason.
         why: String,
     },
+}
+
+impl Message for InsertReply {
+    const KIND: Kind = Kind::InsertReply;
 }

@@ -3,6 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::wire::message::{Kind, Message};
+
 /// An actor starts: from now on the replay server takes its chunks. The same one may be sent any number of times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ActorJoin {
@@ -12,6 +14,10 @@ pub struct ActorJoin {
     pub epoch: u64,
 }
 
+impl Message for ActorJoin {
+    const KIND: Kind = Kind::ActorJoin;
+}
+
 /// A learner starts: from now on the replay server serves it, and it alone. The same one may be sent any number of times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LearnerJoin {
@@ -19,6 +25,10 @@ pub struct LearnerJoin {
     pub learner: u64,
     /// Rows of this shard that it has learned from. Rows served beyond them, to a learner that died, are served again.
     pub rows_sampled: u64,
+}
+
+impl Message for LearnerJoin {
+    const KIND: Kind = Kind::LearnerJoin;
 }
 
 /// The replay server's answer to a part that joins.
@@ -43,4 +53,8 @@ pub enum JoinReply {
         /// The reason.
         why: String,
     },
+}
+
+impl Message for JoinReply {
+    const KIND: Kind = Kind::JoinReply;
 }

@@ -5,6 +5,7 @@ pub(crate) mod affinity;
 pub(crate) mod batch;
 pub(crate) mod batch_request;
 pub(crate) mod chunk;
+pub(crate) mod done;
 pub(crate) mod goodbye;
 pub(crate) mod hello;
 pub(crate) mod insert_reply;

@@ -3,6 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::wire::message::{Kind, Message};
+
 /// Who waits for whom at the rate limiter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Waiting {
@@ -141,6 +143,10 @@ pub struct ReplayStatus {
     pub affinity_version: u64,
     /// All transitions are in.
     pub finished: bool,
+}
+
+impl Message for ReplayStatus {
+    const KIND: Kind = Kind::ReplayStatus;
 }
 
 impl ReplayStatus {
@@ -286,6 +292,10 @@ pub struct LearnerStatus {
     pub waiting_s: f64,
     /// The last checkpoint is written and nothing is left to do.
     pub finished: bool,
+}
+
+impl Message for LearnerStatus {
+    const KIND: Kind = Kind::LearnerStatus;
 }
 
 #[cfg(test)]

@@ -6,7 +6,11 @@
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::wire::codec::{self, CodecError, Kind, PLANES_BYTES_MAX};
+use crate::wire::{
+    codec::PLANES_BYTES_MAX,
+    error::CodecError,
+    message::{Kind, Message, no_payload},
+};
 
 /// Bytes of weights in one message to an actor; the last piece has fewer.
 pub const PIECE_BYTES: usize = 1 << 18;
@@ -16,6 +20,10 @@ pub const PIECE_BYTES: usize = 1 << 18;
 pub struct WeightsVersion {
     /// Counts up from 1.
     pub version: u64,
+}
+
+impl Message for WeightsVersion {
+    const KIND: Kind = Kind::WeightsVersion;
 }
 
 /// What weights say of themselves.
@@ -38,6 +46,14 @@ pub struct WeightsUpload {
     pub weights: WeightsHeader,
 }
 
+impl Message for WeightsUpload {
+    const KIND: Kind = Kind::WeightsUpload;
+
+    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+        self.weights.check(payload)
+    }
+}
+
 /// An actor's question.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum WeightsRequest {
@@ -50,6 +66,10 @@ pub enum WeightsRequest {
         /// Byte of the safetensors file, a multiple of [`PIECE_BYTES`].
         offset: u64,
     },
+}
+
+impl Message for WeightsRequest {
+    const KIND: Kind = Kind::WeightsRequest;
 }
 
 /// The answer to a [`WeightsRequest`].
@@ -68,6 +88,18 @@ pub enum WeightsReply {
         /// Byte at which the piece starts.
         offset: u64,
     },
+}
+
+impl Message for WeightsReply {
+    const KIND: Kind = Kind::Weights;
+
+    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+        match self {
+            // Which piece is due is for [`Assembly`] to know.
+            Self::Piece { .. } => Ok(()),
+            Self::NoneNewer | Self::Gone => no_payload(payload),
+        }
+    }
 }
 
 impl WeightsHeader {
@@ -97,19 +129,6 @@ impl WeightsHeader {
                 "the weights' SHA-256 is not the one announced".into(),
             ))
         }
-    }
-}
-
-impl WeightsUpload {
-    /// Reads an upload and checks the hash of its planes.
-    ///
-    /// # Errors
-    /// A damaged or foreign message, or planes that are not what the header describes.
-    pub fn decode(bytes: &[u8], spec_hash: u64) -> Result<(Self, &[u8]), CodecError> {
-        let (upload, planes): (Self, _) =
-            codec::decode(bytes, Kind::WeightsUpload, Some(spec_hash))?;
-        upload.weights.check(planes)?;
-        Ok((upload, planes))
     }
 }
 

@@ -14,7 +14,11 @@
 
 use serde::{Serialize, de::DeserializeOwned};
 
-use super::buffers::{Planes, PlanesPool};
+use super::{
+    buffers::{Planes, PlanesPool},
+    error::CodecError,
+    message::{Kind, Message},
+};
 
 /// The version of every message in this crate; parts of different versions refuse each other.
 pub const PROTOCOL_VERSION: u16 = 3;
@@ -29,112 +33,6 @@ pub const PLANES_BYTES_MAX: usize = 1 << 29;
 
 /// Bytes that are copied, then summed while they are in the nearest cache.
 const BLOCK_BYTES: usize = 1 << 14;
-
-/// What a message is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u16)]
-pub enum Kind {
-    /// Transitions, actor to replay server.
-    Chunk = 1,
-    /// The answer to a chunk.
-    InsertReply = 2,
-    /// A request for a batch, learner to replay server.
-    BatchRequest = 3,
-    /// A batch, or why there is none yet.
-    BatchReply = 4,
-    /// The action-affinity matrix, learner to replay server.
-    Affinity = 5,
-    /// A piece of the newest weights, replay server to actors.
-    Weights = 6,
-    /// "Newer weights exist", replay server to actors.
-    WeightsVersion = 7,
-    /// An actor's last word.
-    Goodbye = 8,
-    /// The replay server's account of itself.
-    ReplayStatus = 9,
-    /// The learner's account of itself.
-    LearnerStatus = 10,
-    /// What a joining part needs to know.
-    Hello = 11,
-    /// "Understood"; carries nothing.
-    Done = 12,
-    /// An actor that starts.
-    ActorJoin = 13,
-    /// A learner that starts.
-    LearnerJoin = 14,
-    /// The answer to a part that starts.
-    JoinReply = 15,
-    /// What became of a chunk, actor to replay server.
-    Claim = 16,
-    /// New weights, learner to replay server.
-    WeightsUpload = 17,
-    /// A request for a piece of the newest weights, actor to replay server.
-    WeightsRequest = 18,
-}
-
-/// Why bytes were refused. None of these is ever a panic.
-#[derive(Debug, thiserror::Error, PartialEq, Eq)]
-pub enum CodecError {
-    /// Fewer or more bytes than the prefix promises.
-    #[error(
-        "the message has {have} bytes, not the {need} that it needs: it was cut off or padded on the way"
-    )]
-    Length {
-        /// Bytes at hand.
-        have: usize,
-        /// Bytes expected.
-        need: usize,
-    },
-    /// Not one of our messages.
-    #[error(
-        "the message does not start with DRML: the sender is not part of DRIML, or the bytes were damaged"
-    )]
-    Magic,
-    /// Another protocol version.
-    #[error(
-        "the sender speaks protocol version {theirs}, this part version {ours}: run the same build of driml everywhere"
-    )]
-    Version {
-        /// The sender's.
-        theirs: u16,
-        /// Ours.
-        ours: u16,
-    },
-    /// Another kind than this place takes.
-    #[error("a message of kind {theirs} came where kind {ours} is expected")]
-    Kind {
-        /// The sender's.
-        theirs: u16,
-        /// Ours.
-        ours: u16,
-    },
-    /// Another run.
-    #[error(
-        "the message belongs to run spec {theirs:016x}, this part runs {ours:016x}: start every part with the same settings, or let actors and learner fetch them with --connect"
-    )]
-    RunSpec {
-        /// The sender's hash.
-        theirs: u64,
-        /// Ours.
-        ours: u64,
-    },
-    /// Damaged bytes.
-    #[error("the message's checksum is wrong: it was damaged on the way")]
-    Checksum,
-    /// A header that does not decode, or is inconsistent with its planes.
-    #[error("the message's header makes no sense: {0}")]
-    Header(String),
-    /// Larger than a message may be.
-    #[error(
-        "the message has {have} bytes, more than the {max} allowed: use smaller chunks or batches"
-    )]
-    TooLarge {
-        /// Bytes at hand.
-        have: usize,
-        /// The limit.
-        max: usize,
-    },
-}
 
 /// Encodes `header` with bincode, refusing more than [`HEADER_BYTES_MAX`].
 fn encode_header<H: Serialize>(header: &H) -> Result<Vec<u8>, CodecError> {
@@ -158,23 +56,18 @@ pub(crate) fn canonical_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecE
 ///
 /// # Errors
 /// A header or planes over their limits.
-pub fn seal<H: Serialize>(
-    kind: Kind,
-    spec_hash: u64,
-    header: &H,
-    planes: &[u8],
-) -> Result<Vec<u8>, CodecError> {
+pub fn seal<M: Message>(spec_hash: u64, message: &M, planes: &[u8]) -> Result<Vec<u8>, CodecError> {
     if planes.len() > PLANES_BYTES_MAX {
         return Err(CodecError::TooLarge {
             have: planes.len(),
             max: PLANES_BYTES_MAX,
         });
     }
-    let header = encode_header(header)?;
+    let header = encode_header(message)?;
     let mut out = Vec::with_capacity(PREFIX_BYTES + header.len());
     out.extend_from_slice(&MAGIC);
     out.extend_from_slice(&PROTOCOL_VERSION.to_le_bytes());
-    out.extend_from_slice(&(kind as u16).to_le_bytes());
+    out.extend_from_slice(&(M::KIND as u16).to_le_bytes());
     out.extend_from_slice(&spec_hash.to_le_bytes());
     out.extend_from_slice(&(header.len() as u32).to_le_bytes());
     out.extend_from_slice(&(planes.len() as u64).to_le_bytes());
@@ -188,35 +81,32 @@ pub fn seal<H: Serialize>(
 ///
 /// # Errors
 /// As [`seal`].
-pub fn encode<H: Serialize>(
-    kind: Kind,
+pub fn encode<M: Message>(
     spec_hash: u64,
-    header: &H,
+    message: &M,
     planes: &[u8],
 ) -> Result<Vec<u8>, CodecError> {
-    let mut out = seal(kind, spec_hash, header, planes)?;
+    let mut out = seal(spec_hash, message, planes)?;
     out.extend_from_slice(planes);
     Ok(out)
 }
 
-/// Checks a message in one piece and gives its header and planes.
+/// Checks a message in one piece and gives it and its planes.
 ///
 /// `spec_hash` is the hash that this part runs, or `None` where any run is welcome (a part that joins to learn it).
 ///
 /// # Errors
 /// Anything that is not a whole, undamaged message of this kind, version and run.
-pub fn decode<H: DeserializeOwned>(
-    bytes: &[u8],
-    kind: Kind,
-    spec_hash: Option<u64>,
-) -> Result<(H, &[u8]), CodecError> {
+pub fn decode<M: Message>(bytes: &[u8], spec_hash: Option<u64>) -> Result<(M, &[u8]), CodecError> {
     let prefix = Prefix::read(bytes.first_chunk(), bytes.len())?;
     let (header, planes) = bytes[PREFIX_BYTES..].split_at(prefix.header_len());
     let mut sum = prefix.checksum_begun();
     sum.update(header);
     sum.update(planes);
-    prefix.check(sum, kind, spec_hash)?;
-    Ok((decode_header(header)?, planes))
+    prefix.check(sum, M::KIND, spec_hash)?;
+    let message: M = decode_header(header)?;
+    message.validate(planes)?;
+    Ok((message, planes))
 }
 
 /// Checks a message that came in `pieces`, `len` bytes in all, and copies its planes into own memory of `pool`.
@@ -225,13 +115,12 @@ pub fn decode<H: DeserializeOwned>(
 ///
 /// # Errors
 /// As [`decode`].
-pub fn receive<'a, H: DeserializeOwned>(
+pub fn receive<'a, M: Message>(
     pieces: impl IntoIterator<Item = &'a [u8]>,
     len: usize,
     pool: &PlanesPool,
-    kind: Kind,
     spec_hash: Option<u64>,
-) -> Result<(H, Planes), CodecError> {
+) -> Result<(M, Planes), CodecError> {
     let mut pieces = Pieces {
         current: &[],
         rest: pieces.into_iter(),
@@ -244,8 +133,10 @@ pub fn receive<'a, H: DeserializeOwned>(
     pieces.copy_to(&mut header, Some(&mut sum));
     let mut planes = pool.take_own(prefix.planes_len());
     pieces.copy_to(&mut planes, Some(&mut sum));
-    prefix.check(sum, kind, spec_hash)?;
-    Ok((decode_header(&header)?, planes))
+    prefix.check(sum, M::KIND, spec_hash)?;
+    let message: M = decode_header(&header)?;
+    message.validate(&planes)?;
+    Ok((message, planes))
 }
 
 /// Bytes that lie in several places.

@@ -3,5 +3,7 @@
 
 pub(crate) mod buffers;
 pub mod codec;
+pub(crate) mod error;
 pub(crate) mod keys;
+pub(crate) mod message;
 pub mod shared_memory;

@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use driml_protocol::{BatchReply, BatchRequest, Kind, Planes, fault, session};
+use driml_protocol::{BatchReply, BatchRequest, Planes, fault, session};
 use zenoh::query::Query;
 
 use super::{
@@ -24,9 +24,9 @@ const IDLE: Duration = Duration::from_secs(60);
 
 impl Service {
     pub(super) fn request(&self, query: Query) {
-        let Some(request) = self.read::<BatchRequest>(&query, Kind::BatchRequest) else {
+        let Some(request) = self.read::<BatchRequest>(&query) else {
             let why = "the request could not be read; the replay server's log says why".into();
-            return self.reply(&query, Kind::BatchReply, &BatchReply::Refused { why });
+            return self.reply(&query, &BatchReply::Refused { why });
         };
         let mut state = self.state();
         let is_allowed = state.members.check_learner(request.learner);
@@ -34,7 +34,7 @@ impl Service {
         if let Err(why) = heard {
             state.replay.note_refused_message();
             drop(state);
-            return self.reply(&query, Kind::BatchReply, &BatchReply::Refused { why });
+            return self.reply(&query, &BatchReply::Refused { why });
         }
         let hold_max = match request.elsewhere {
             Some(_) => SHARD_HOLD_MAX,
@@ -93,7 +93,7 @@ impl Service {
                 session::answer(query, session::join_planes(head, planes.freeze()))
             }
             Ok(Err(e)) => tracing::error!("a batch was not sent: {e}"),
-            Err(unready) => self.reply(query, Kind::BatchReply, &BatchReply::from(unready)),
+            Err(unready) => self.reply(query, &BatchReply::from(unready)),
         }
     }
 }

@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{Chunk, Claim, InsertReply, Kind, fault};
+use driml_protocol::{Chunk, Claim, InsertReply, fault};
 use zenoh::{bytes::ZBytes, query::Query};
 
 use super::{
@@ -33,7 +33,7 @@ impl Service {
             Err(e) => {
                 self.refuse("a chunk", &e);
                 let refused = InsertReply::Refused { why: e.to_string() };
-                return self.reply(&query, Kind::InsertReply, &refused);
+                return self.reply(&query, &refused);
             }
         };
         let packed = self.packer.pack(Cow::Owned(chunk));
@@ -44,7 +44,7 @@ impl Service {
 
     pub(super) fn claim(&self, query: Query) {
         let arrived = Instant::now();
-        let Some(claim) = self.read::<Claim>(&query, Kind::Claim) else {
+        let Some(claim) = self.read::<Claim>(&query) else {
             return;
         };
         let answers = self.state().take_claim(&claim, Question { query, arrived });
@@ -80,7 +80,7 @@ impl Service {
 
     fn answer_all(&self, answers: Answers) {
         for (Question { query, arrived }, reply) in answers {
-            self.reply(&query, Kind::InsertReply, &reply);
+            self.reply(&query, &reply);
             self.state().timings.answered(arrived.elapsed());
         }
     }

@@ -1,7 +1,7 @@
 //! Parts that join: what they are told of the run, and whether they are let in.
 //! Who is connected and who is served is kept in `members`.
 
-use driml_protocol::{ActorJoin, Alive, Hello, JoinReply, Kind, LearnerJoin};
+use driml_protocol::{ActorJoin, Alive, Hello, JoinReply, LearnerJoin};
 use zenoh::{query::Query, sample::SampleKind};
 
 use super::server::{Service, State};
@@ -25,18 +25,18 @@ impl Service {
             shard: self.shard,
             shared_memory: self.shared_memory,
         };
-        self.reply(&query, Kind::Hello, &hello);
+        self.reply(&query, &hello);
     }
 
     pub(super) fn join_actor(&self, query: Query) {
-        if let Some(join) = self.read::<ActorJoin>(&query, Kind::ActorJoin) {
+        if let Some(join) = self.read::<ActorJoin>(&query) {
             let reply = self.state().join_actor(join);
             self.welcome(&query, reply);
         }
     }
 
     pub(super) fn join_learner(&self, query: Query) {
-        if let Some(join) = self.read::<LearnerJoin>(&query, Kind::LearnerJoin) {
+        if let Some(join) = self.read::<LearnerJoin>(&query) {
             let reply = self.state().join_learner(join);
             self.changed.notify_all();
             self.welcome(&query, reply);
@@ -58,7 +58,7 @@ impl Service {
                 JoinReply::Refused { why }
             }
         };
-        self.reply(query, Kind::JoinReply, &reply);
+        self.reply(query, &reply);
     }
 }
 

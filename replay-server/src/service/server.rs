@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{CodecError, Kind, PlanesPool, Shutdown, codec, session};
+use driml_protocol::{CodecError, Message, PlanesPool, Shutdown, codec, session};
 use zenoh::{pubsub::Publisher, query::Query};
 
 use super::{
@@ -60,10 +60,10 @@ impl Service {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(super) fn reply<H: serde::Serialize>(&self, query: &Query, kind: Kind, header: &H) {
-        match codec::encode(kind, self.spec_hash, header, &[]) {
+    pub(super) fn reply<M: Message>(&self, query: &Query, message: &M) {
+        match codec::encode(self.spec_hash, message, &[]) {
             Ok(bytes) => session::answer(query, bytes.into()),
-            Err(e) => tracing::error!("a reply of kind {kind:?} was not sent: {e}"),
+            Err(e) => tracing::error!("a reply of kind {:?} was not sent: {e}", M::KIND),
         }
     }
 
@@ -74,19 +74,15 @@ impl Service {
     }
 
     /// Decodes a small message, or counts it as refused.
-    pub(super) fn read<H: serde::de::DeserializeOwned>(
-        &self,
-        query: &Query,
-        kind: Kind,
-    ) -> Option<H> {
+    pub(super) fn read<M: Message>(&self, query: &Query) -> Option<M> {
         let payload = query
             .payload()
             .map(|payload| payload.to_bytes())
             .unwrap_or_default();
-        match codec::decode(&payload, kind, Some(self.spec_hash)) {
-            Ok((header, _)) => Some(header),
+        match codec::decode(&payload, Some(self.spec_hash)) {
+            Ok((message, _)) => Some(message),
             Err(e) => {
-                self.refuse(&format!("a message of kind {kind:?}"), &e);
+                self.refuse(&format!("a message of kind {:?}", M::KIND), &e);
                 None
             }
         }

@@ -1,21 +1,21 @@
 //! The small messages that need no file of their own: an actor's goodbye, the learner's affinity, and the status.
 //! None of them ever waits.
 
-use driml_protocol::{AffinityUpdate, Goodbye, Kind};
+use driml_protocol::{AffinityUpdate, Done, Goodbye};
 use zenoh::query::Query;
 
 use super::server::Service;
 
 impl Service {
     pub(super) fn goodbye(&self, query: Query) {
-        if let Some(goodbye) = self.read::<Goodbye>(&query, Kind::Goodbye) {
+        if let Some(goodbye) = self.read::<Goodbye>(&query) {
             self.state().replay.goodbye(&goodbye);
-            self.reply(&query, Kind::Done, &());
+            self.reply(&query, &Done);
         }
     }
 
     pub(super) fn affinity(&self, query: Query) {
-        let Some(update) = self.read::<AffinityUpdate>(&query, Kind::Affinity) else {
+        let Some(update) = self.read::<AffinityUpdate>(&query) else {
             return;
         };
         let mut state = self.state();
@@ -31,7 +31,7 @@ impl Service {
         };
         drop(state);
         match set {
-            Ok(()) => self.reply(&query, Kind::Done, &()),
+            Ok(()) => self.reply(&query, &Done),
             Err(why) => tracing::warn!("an affinity matrix was refused: {why}"),
         }
     }
@@ -46,6 +46,6 @@ impl Service {
         status.weights_behind_s = state.timings.weights_behind_s();
         status.weights_behind_updates = state.timings.weights_behind_updates();
         drop(state);
-        self.reply(&query, Kind::ReplayStatus, &status);
+        self.reply(&query, &status);
     }
 }

@@ -7,7 +7,7 @@ use std::{
 };
 
 use driml_protocol::{
-    Kind, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec, session,
+    Done, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec, session,
 };
 use zenoh::{Wait, bytes::ZBytes, query::Query};
 
@@ -21,7 +21,7 @@ impl Service {
     pub(super) fn take_weights(&self, query: Query) {
         let payload = query.payload().map(|payload| payload.to_bytes());
         let payload = payload.unwrap_or_default();
-        let (upload, safetensors) = match WeightsUpload::decode(&payload, self.spec_hash) {
+        let (upload, safetensors) = match codec::decode(&payload, Some(self.spec_hash)) {
             Ok(read) => read,
             Err(e) => return self.refuse("an upload of weights", &e),
         };
@@ -34,7 +34,7 @@ impl Service {
                     self.state().timings.weights_came(&weights, now);
                     self.announce(weights.version);
                 }
-                self.reply(&query, Kind::Done, &());
+                self.reply(&query, &Done);
             }
             Err(why) => {
                 tracing::warn!("weights were refused: {why}");
@@ -44,12 +44,7 @@ impl Service {
     }
 
     fn announce(&self, version: u64) {
-        let announced = codec::encode(
-            Kind::WeightsVersion,
-            self.spec_hash,
-            &WeightsVersion { version },
-            &[],
-        );
+        let announced = codec::encode(self.spec_hash, &WeightsVersion { version }, &[]);
         let put = announced.map_err(|e| e.to_string()).and_then(|bytes| {
             self.announcements
                 .put(bytes)
@@ -62,7 +57,7 @@ impl Service {
     }
 
     pub(super) fn give_weights(&self, query: Query) {
-        let Some(request) = self.read::<WeightsRequest>(&query, Kind::WeightsRequest) else {
+        let Some(request) = self.read::<WeightsRequest>(&query) else {
             return;
         };
         let found = self.weights().find(request, Instant::now());
@@ -78,7 +73,7 @@ impl Service {
             }
             Err(reply) => (*reply, &[][..]),
         };
-        match codec::seal(Kind::Weights, self.spec_hash, &reply, piece) {
+        match codec::seal(self.spec_hash, &reply, piece) {
             Ok(head) => {
                 let piece = ZBytes::from(piece.to_vec());
                 session::answer(&query, session::join_planes(head, piece));
