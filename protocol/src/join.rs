@@ -3,16 +3,22 @@
 
 use std::time::{Duration, Instant};
 
-use zenoh::{Session, bytes::ZBytes, qos::Priority};
+use zenoh::{Session, bytes::ZBytes};
 
 use crate::{
+    client::RunClient,
     messages::{
         hello::Hello,
         join::{ActorJoin, JoinReply, LearnerJoin},
     },
     process::shutdown::Shutdown,
     session::{self, SessionError},
-    wire::{codec, error::CodecError, keys::Keys, message::Message},
+    wire::{
+        codec,
+        error::CodecError,
+        keys::Keys,
+        message::{Keyed, Request},
+    },
 };
 
 /// How long a joining part waits for a replay server.
@@ -72,7 +78,8 @@ pub fn hello(
 ) -> Result<Option<Hello>, JoinError> {
     let started = Instant::now();
     loop {
-        match ask(session, &keys.hello(), ZBytes::new()) {
+        let (key, nothing) = (keys.of::<Hello>(), ZBytes::new());
+        match session::ask(session, &key, nothing, Hello::PRIORITY, TRY_MAX) {
             Ok(answer) => {
                 return Ok(Some(codec::decode(&answer.to_bytes(), None)?.0));
             }
@@ -90,14 +97,11 @@ pub fn hello(
 /// # Errors
 /// Another process is this actor and stays; the replay server refuses, or does not answer for a minute.
 pub fn as_actor(
-    session: &Session,
-    keys: &Keys,
-    spec_hash: u64,
+    client: &RunClient,
     join: ActorJoin,
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
-    let key = keys.actor_join();
-    take_part(session, &key, spec_hash, &join, shutdown)
+    take_part(client, &join, shutdown)
 }
 
 /// Takes part as the run's learner; `None` if told to stop before.
@@ -105,54 +109,44 @@ pub fn as_actor(
 /// # Errors
 /// Another learner takes part and stays; the replay server refuses, or does not answer for a minute.
 pub fn as_learner(
-    session: &Session,
-    keys: &Keys,
-    spec_hash: u64,
+    client: &RunClient,
     join: LearnerJoin,
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
-    let key = keys.learner_join();
-    take_part(session, &key, spec_hash, &join, shutdown)
+    take_part(client, &join, shutdown)
 }
 
 fn take_part(
-    session: &Session,
-    key: &str,
-    spec_hash: u64,
-    join: &impl Message,
+    client: &RunClient,
+    join: &impl Request<Reply = JoinReply>,
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
-    let message = codec::encode(spec_hash, join, &[])?;
     let started = Instant::now();
     let mut said = false;
     loop {
-        match ask(session, key, message.clone().into()) {
-            Ok(answer) => {
-                let bytes = answer.to_bytes();
-                match codec::decode(&bytes, Some(spec_hash))?.0 {
-                    JoinReply::Welcome {
-                        inserted_total,
-                        weights_version,
-                        earlier_lives,
-                    } => {
-                        return Ok(Some(Welcome {
-                            inserted_total,
-                            weights_version,
-                            earlier_lives,
-                        }));
-                    }
-                    JoinReply::Refused { why } => return Err(JoinError::Refused { why }),
-                    JoinReply::Taken { why } if started.elapsed() > TAKEN_MAX => {
-                        return Err(JoinError::Taken { why });
-                    }
-                    JoinReply::Taken { why } => {
-                        if !std::mem::replace(&mut said, true) {
-                            let max = TAKEN_MAX.as_secs();
-                            tracing::warn!("{why}; waiting up to {max} s for its end");
-                        }
-                    }
+        match client.ask(join, TRY_MAX) {
+            Ok(JoinReply::Welcome {
+                inserted_total,
+                weights_version,
+                earlier_lives,
+            }) => {
+                return Ok(Some(Welcome {
+                    inserted_total,
+                    weights_version,
+                    earlier_lives,
+                }));
+            }
+            Ok(JoinReply::Refused { why }) => return Err(JoinError::Refused { why }),
+            Ok(JoinReply::Taken { why }) if started.elapsed() > TAKEN_MAX => {
+                return Err(JoinError::Taken { why });
+            }
+            Ok(JoinReply::Taken { why }) => {
+                if !std::mem::replace(&mut said, true) {
+                    let max = TAKEN_MAX.as_secs();
+                    tracing::warn!("{why}; waiting up to {max} s for its end");
                 }
             }
+            Err(SessionError::Unreadable { why, .. }) => return Err(why.into()),
             Err(last) if started.elapsed() > SERVER_MAX => return Err(JoinError::Nobody { last }),
             Err(e) => tracing::debug!("the replay server did not answer: {e}"),
         }
@@ -160,8 +154,4 @@ fn take_part(
             return Ok(None);
         }
     }
-}
-
-fn ask(session: &Session, key: &str, payload: ZBytes) -> Result<ZBytes, SessionError> {
-    session::ask(session, key, payload, Priority::Data, TRY_MAX)
 }

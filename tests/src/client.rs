@@ -4,8 +4,8 @@
 use std::time::{Duration, Instant};
 
 use driml_protocol::{
-    ActorJoin, Chunk, InsertReply, Keys, LearnerJoin, LearnerStatus, Message, ReplayStatus,
-    RunSpec, Shutdown, codec,
+    ActorJoin, Chunk, ChunkHeader, InsertReply, Keyed, Keys, LearnerJoin, LearnerStatus,
+    ReplayStatus, RunClient, RunSpec, Shutdown, codec,
     config::Settings,
     join,
     session::{self, Endpoints, SessionError},
@@ -76,19 +76,26 @@ impl Client {
         .map(|answer| answer.to_bytes().into_owned())
     }
 
-    fn ask_for<M: Message>(&self, key: &str, payload: Vec<u8>) -> Option<M> {
-        let answer = self.ask(key, payload).ok()?;
-        Some(codec::decode(&answer, Some(self.spec.hash())).unwrap().0)
+    /// The session, keys and hash, as the parts of the run have them.
+    pub fn run(&self) -> RunClient {
+        RunClient::new(self.session.clone(), self.keys.clone(), self.spec.hash())
     }
 
     /// The replay server's status; none if it did not answer.
     pub fn replay(&self) -> Option<ReplayStatus> {
-        self.ask_for(&self.keys.replay_status(), Vec::new())
+        self.fetch()
     }
 
     /// The learner's status; none if it is not there.
     pub fn learner(&self) -> Option<LearnerStatus> {
-        self.ask_for(&self.keys.learner_status(), Vec::new())
+        self.fetch()
+    }
+
+    fn fetch<M: Keyed>(&self) -> Option<M> {
+        match self.run().fetch(ANSWER_MAX) {
+            Err(e @ SessionError::Unreadable { .. }) => panic!("{e}"),
+            fetched => fetched.ok(),
+        }
     }
 
     /// Waits until the replay server's status is as wanted, and gives it.
@@ -116,7 +123,7 @@ impl Client {
     pub fn join_as_actor(&self, actor: u32, epoch: u64) {
         let join = ActorJoin { actor, epoch };
         let never = Shutdown::default();
-        join::as_actor(&self.session, &self.keys, self.spec.hash(), join, &never).unwrap();
+        join::as_actor(&self.run(), join, &never).unwrap();
     }
 
     /// Takes part as the learner, which has learned from so many rows.
@@ -129,7 +136,7 @@ impl Client {
             rows_sampled,
         };
         let never = Shutdown::default();
-        join::as_learner(&self.session, &self.keys, self.spec.hash(), join, &never).unwrap();
+        join::as_learner(&self.run(), join, &never).unwrap();
     }
 
     /// Sends a chunk as an actor would.
@@ -142,8 +149,10 @@ impl Client {
     /// # Panics
     /// If nobody answers, or not in the run's own words.
     pub fn insert_bytes(&self, bytes: Vec<u8>) -> InsertReply {
-        self.ask_for(&self.keys.ingest(), bytes)
-            .expect("chunks are always answered")
+        let reply = self
+            .ask(&self.keys.of::<ChunkHeader>(), bytes)
+            .expect("chunks are always answered");
+        codec::decode(&reply, Some(self.spec.hash())).unwrap().0
     }
 }
 

@@ -232,7 +232,9 @@ fn everything_else_that_a_replay_server_takes() {
         .unwrap(),
     ] {
         let before = counted();
-        let reply = client.ask(&client.keys.batch(), bytes).unwrap();
+        let reply = client
+            .ask(&client.keys.of::<BatchRequest>(), bytes)
+            .unwrap();
         let (reply, _): (BatchReply, _) = codec::decode(&reply, Some(hash)).unwrap();
         assert!(matches!(reply, BatchReply::Refused { .. }), "{reply:?}");
         assert_eq!(counted(), before + 1);
@@ -250,7 +252,9 @@ fn everything_else_that_a_replay_server_takes() {
             &[],
         )
         .unwrap();
-        let reply = client.ask(&client.keys.batch(), request).unwrap();
+        let reply = client
+            .ask(&client.keys.of::<BatchRequest>(), request)
+            .unwrap();
         let (reply, _): (BatchReply, _) = codec::decode(&reply, Some(hash)).unwrap();
         assert!(
             matches!(&reply, BatchReply::Refused { why } if why.contains("a batch of")),
@@ -271,14 +275,14 @@ fn everything_else_that_a_replay_server_takes() {
         matrix: vec![0.5; 4],
     };
     for (key, bytes) in [
-        (client.keys.goodbye(), garbage.clone()),
+        (client.keys.of::<Goodbye>(), garbage.clone()),
         (
-            client.keys.goodbye(),
+            client.keys.of::<Goodbye>(),
             codec::encode(hash ^ 1, &goodbye, &[]).unwrap(),
         ),
-        (client.keys.affinity(), garbage),
+        (client.keys.of::<AffinityUpdate>(), garbage),
         (
-            client.keys.affinity(),
+            client.keys.of::<AffinityUpdate>(),
             codec::encode(hash, &affinity, &[]).unwrap(),
         ),
     ] {

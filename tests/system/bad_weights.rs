@@ -30,7 +30,7 @@ impl FakeLearner<'_> {
     fn send(&self, version: u64, safetensors: &[u8]) {
         let bytes = Self::upload(version, safetensors, self.client.spec.hash(), LEARNER);
         self.client
-            .ask(&self.client.keys.weights_upload(), bytes)
+            .ask(&self.client.keys.of::<WeightsUpload>(), bytes)
             .unwrap();
     }
 
@@ -38,7 +38,9 @@ impl FakeLearner<'_> {
     fn refused(&self, bytes: Vec<u8>, why: &str) {
         let counted = || self.client.replay().unwrap().messages_refused;
         let before = counted();
-        let answer = self.client.ask(&self.client.keys.weights_upload(), bytes);
+        let answer = self
+            .client
+            .ask(&self.client.keys.of::<WeightsUpload>(), bytes);
         assert!(answer.is_err(), "{why}: {answer:?}");
         assert_eq!(counted(), before + 1, "{why}");
     }
@@ -47,7 +49,7 @@ impl FakeLearner<'_> {
     fn announce(&self, version: u64, spec_hash: u64) {
         let announced = WeightsVersion { version };
         let bytes = codec::encode(spec_hash, &announced, &[]).unwrap();
-        let key = self.client.keys.weights_version();
+        let key = self.client.keys.of::<WeightsVersion>();
         self.client.session.put(key, bytes).wait().unwrap();
     }
 }
@@ -146,7 +148,7 @@ fn parts_of_another_protocol_version_do_not_join() {
             "the settings that the replay server sent",
         ),
     ];
-    let key = Keys::new("driml").unwrap().hello();
+    let key = Keys::new("driml").unwrap().of::<Hello>();
     for (bytes, reason) in greetings {
         let answer = move |query| session::answer(&query, bytes.clone().into());
         let queryable = server

@@ -12,7 +12,7 @@ use std::{
 use driml_learner::batch_source::{BatchSource, Next, Requests};
 use driml_protocol::{
     ActorJoin, BatchReply, BatchRequest, Chunk, ChunkHeader, Horizon, InsertReply, Keys, Planes,
-    RunSpec, Shutdown, TimeoutRule, codec,
+    ReplayStatus, RunClient, RunSpec, Shutdown, TimeoutRule, codec,
     session::{self, Endpoints},
 };
 use driml_replay_server::{Compression, Config, Replay};
@@ -119,23 +119,24 @@ fn every_batch_comes_once(shards: u32) {
     let keys = Keys::new("lossy").unwrap();
     let hash = spec().hash();
     let drawn = Arc::<AtomicU32>::default();
-    let (mut replays, mut declared, mut sessions) = (vec![], vec![], vec![]);
+    let (mut replays, mut declared, mut clients) = (vec![], vec![], vec![]);
     for shard in 0..shards {
         let endpoint = format!("unixsock-stream/{}/{shard}.sock", folder.path().display());
         let open = |listen, connect| session::open(&Endpoints { listen, connect }).unwrap();
         let server = open(vec![endpoint.clone()], vec![]);
         let replay = Arc::new(Mutex::new(full(shard, shards)));
         let (asked, count) = (replay.clone(), drawn.clone());
-        let batches = declare(&server, keys.batch(), move |query| {
+        let batches = declare(&server, keys.of::<BatchRequest>(), move |query| {
             answer(query, &asked, &count)
         });
         let asked = replay.clone();
-        let status = declare(&server, keys.replay_status(), move |query| {
+        let status = declare(&server, keys.of::<ReplayStatus>(), move |query| {
             let status = asked.lock().unwrap().status();
             let bytes = codec::encode(hash, &status, &[]).unwrap();
             session::answer(query, bytes.into());
         });
-        sessions.push(open(vec![], vec![endpoint]));
+        let session = open(vec![], vec![endpoint]);
+        clients.push(RunClient::new(session, keys.clone(), hash));
         replays.push(replay);
         declared.push((server, batches, status));
     }
@@ -147,7 +148,7 @@ fn every_batch_comes_once(shards: u32) {
         unreachable_max: Duration::from_secs(60),
     };
     let stop = Shutdown::default();
-    let mut source = BatchSource::start(&sessions, &keys, hash, requests, &stop).unwrap();
+    let mut source = BatchSource::start(&clients, requests, &stop).unwrap();
     let mut batches = 0;
     loop {
         match source.next(Duration::from_secs(60)).unwrap() {

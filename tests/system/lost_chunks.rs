@@ -13,7 +13,7 @@ use std::{
 use driml_actor::delivery::{Delivery, DeliveryLimits};
 use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, Claim, Done, End, Goodbye, Horizon, InsertReply, Keys,
-    PlanesPool, RequestId, RunSpec, Shutdown, TimeoutRule, codec,
+    PlanesPool, RequestId, RunClient, RunSpec, Shutdown, TimeoutRule, codec,
     session::{self, Endpoints},
 };
 use driml_replay_server::{Compression, Config, Replay};
@@ -121,9 +121,9 @@ impl Server {
             server.lossy(|replay| replay.claim(&claim).expect("nothing is parked here"))
         };
         [
-            declare(keys.ingest(), insert),
-            declare(keys.claim(), claim),
-            declare(keys.goodbye(), goodbye),
+            declare(keys.of::<ChunkHeader>(), insert),
+            declare(keys.of::<Claim>(), claim),
+            declare(keys.of::<Goodbye>(), goodbye),
         ]
         .map(Result::unwrap)
         .into()
@@ -206,9 +206,14 @@ fn deliver_all(server: &Arc<Server>, ack_timeout: Duration, leaving: bool) {
                     unreachable_max: Duration::from_secs(60),
                 };
                 let pool = PlanesPool::new(4);
-                let delivery =
-                    Delivery::start(session, keys, spec().hash(), 0, limits, pool, stop.clone())
-                        .unwrap();
+                let delivery = Delivery::start(
+                    RunClient::new(session, keys, spec().hash()),
+                    0,
+                    limits,
+                    pool,
+                    stop.clone(),
+                )
+                .unwrap();
                 if leaving {
                     stop.set();
                 }

@@ -10,8 +10,7 @@ use std::{
     time::Duration,
 };
 
-use driml_protocol::{Chunk, Keys, PlanesPool, Shutdown};
-use zenoh::Session;
+use driml_protocol::{Chunk, PlanesPool, RunClient, Shutdown};
 
 use state::Account;
 use worker::Courier;
@@ -36,9 +35,7 @@ impl Delivery {
     /// # Errors
     /// The operating system gave no thread.
     pub fn start(
-        session: Session,
-        keys: Keys,
-        spec_hash: u64,
+        client: RunClient,
         inserted_total: u64,
         limits: DeliveryLimits,
         pool: PlanesPool,
@@ -51,14 +48,7 @@ impl Delivery {
         // Until a chunk was let in at once: many actors that start together must not run ahead of the learner together.
         account.is_held.store(true, Ordering::Relaxed);
         let (queue, chunks) = mpsc::channel();
-        let courier = Courier::new(
-            session,
-            (keys, spec_hash),
-            limits,
-            pool,
-            shutdown,
-            account.clone(),
-        );
+        let courier = Courier::new(client, limits, pool, shutdown, account.clone());
         let thread = std::thread::Builder::new()
             .name("delivery".into())
             .spawn(move || courier.run(&chunks))?;

@@ -10,11 +10,10 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Chunk, ChunkHeader, Claim, CodecError, Done, Goodbye, InsertReply, Keys, Message, PlanesPool,
-    Seldom, Shutdown, codec, fault,
-    session::{self, Asked, SessionError},
+    Chunk, ChunkHeader, Claim, Done, Goodbye, InsertReply, PendingReply, PlanesPool, RunClient,
+    Seldom, Shutdown, fault, session::SessionError,
 };
-use zenoh::{Session, bytes::ZBytes, qos::Priority};
+use zenoh::bytes::ZBytes;
 
 use super::state::{Account, DeliveryLimits};
 
@@ -35,9 +34,20 @@ struct Outgoing {
     planes: ZBytes,
     in_shared_memory: bool,
     /// Set while a question about it is on its way.
-    asked: Option<Asked>,
+    asked: Option<PendingReply<InsertReply>>,
     /// The replay server has it and will store it: a claim is enough.
     is_kept: bool,
+}
+
+impl Outgoing {
+    const fn claim(&self) -> Claim {
+        Claim {
+            actor: self.header.actor,
+            epoch: self.header.epoch,
+            sequence: self.header.sequence,
+            leaving: self.header.leaving,
+        }
+    }
 }
 
 /// What became of the first chunk in line.
@@ -52,9 +62,7 @@ enum Fate {
 /// The delivering thread's state. Several chunks are on their way at once; they are settled in order, and where one has to go
 /// again those after it, which the replay server then refused as out of order, go again too.
 pub(super) struct Courier {
-    session: Session,
-    keys: Keys,
-    spec_hash: u64,
+    client: RunClient,
     limits: DeliveryLimits,
     pool: PlanesPool,
     shutdown: Shutdown,
@@ -73,17 +81,14 @@ pub(super) struct Courier {
 
 impl Courier {
     pub(super) fn new(
-        session: Session,
-        (keys, spec_hash): (Keys, u64),
+        client: RunClient,
         limits: DeliveryLimits,
         pool: PlanesPool,
         shutdown: Shutdown,
         account: Arc<Account>,
     ) -> Self {
         Self {
-            session,
-            keys,
-            spec_hash,
+            client,
             limits,
             pool,
             shutdown,
@@ -243,14 +248,13 @@ impl Courier {
         let Some(asked) = first.asked.take() else {
             unreachable!("the window has room for one");
         };
-        let answer = loop {
-            match asked.answer_within(TICK)? {
-                Some(answer) => break answer,
+        loop {
+            match asked.wait_within(TICK)? {
+                Some(reply) => return Ok(Some(reply)),
                 None if self.shutdown.is_set() && !first.header.leaving => return Ok(None),
                 None => {}
             }
-        };
-        self.read(&self.keys.ingest(), &answer).map(Some)
+        }
     }
 
     /// The rate limiter makes the first chunk wait; it is asked about again at once if the replay server keeps it.
@@ -309,17 +313,13 @@ impl Courier {
                 continue;
             }
             it.header.leaving |= leaving;
-            let (key, message) = if it.is_kept {
-                (self.keys.claim(), claim(it, self.spec_hash))
+            it.asked = Some(if it.is_kept {
+                let claim = self.client.seal(&it.claim())?;
+                self.client.send(claim, timeout)?
             } else {
-                (self.keys.ingest(), chunk(it, self.spec_hash))
-            };
-            let message = message.map_err(|e| SessionError::Zenoh {
-                key: key.clone(),
-                why: e.to_string(),
-            })?;
-            let asked = session::send(&self.session, &key, message, Priority::Data, timeout)?;
-            it.asked = Some(asked);
+                let chunk = self.client.seal_with(&it.header, it.planes.clone())?;
+                self.client.send(chunk, timeout)?
+            });
         }
         Ok(())
     }
@@ -327,54 +327,14 @@ impl Courier {
     fn say_goodbye(&self, goodbye: Goodbye) {
         let started = Instant::now();
         loop {
-            let said = codec::encode(self.spec_hash, &goodbye, &[])
-                .context("encoding the goodbye")
-                .and_then(|bytes| {
-                    let (key, timeout) = (self.keys.goodbye(), GOODBYE_MAX);
-                    let answer =
-                        session::ask(&self.session, &key, bytes.into(), Priority::Data, timeout)?;
-                    Ok(self.read::<Done>(&key, &answer).map(|Done| ())?)
-                });
-            match said {
-                Ok(()) => return,
+            match self.client.ask(&goodbye, GOODBYE_MAX) {
+                Ok(Done) => return,
                 Err(e) if started.elapsed() > GOODBYE_MAX => {
-                    tracing::warn!("the replay server did not hear the goodbye: {e:#}");
+                    tracing::warn!("the replay server did not hear the goodbye: {e}");
                     return;
                 }
                 Err(_) => std::thread::sleep(RETRY_PAUSE),
             }
         }
     }
-
-    fn read<M: Message>(&self, key: &str, answer: &ZBytes) -> Result<M, SessionError> {
-        let bytes = answer.to_bytes();
-        codec::decode(&bytes, Some(self.spec_hash))
-            .map(|(message, _)| message)
-            .map_err(|e| SessionError::Zenoh {
-                key: key.into(),
-                why: e.to_string(),
-            })
-    }
-}
-
-fn chunk(it: &Outgoing, spec_hash: u64) -> Result<ZBytes, CodecError> {
-    let head = codec::seal(spec_hash, &it.header, &it.planes.to_bytes())?;
-    Ok(session::join_planes(head, it.planes.clone()))
-}
-
-fn claim(it: &Outgoing, spec_hash: u64) -> Result<ZBytes, CodecError> {
-    let ChunkHeader {
-        actor,
-        epoch,
-        sequence,
-        leaving,
-        ..
-    } = it.header;
-    let claim = Claim {
-        actor,
-        epoch,
-        sequence,
-        leaving,
-    };
-    codec::encode(spec_hash, &claim, &[]).map(Into::into)
 }

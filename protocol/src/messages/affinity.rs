@@ -2,10 +2,12 @@
 //! It does not estimate: how A comes about is the learner's.
 
 use serde::{Deserialize, Serialize};
+use zenoh::qos::Priority;
 
+use super::done::Done;
 use crate::wire::{
     error::CodecError,
-    message::{Kind, Message},
+    message::{Keyed, Kind, Message, Request},
 };
 
 /// A, row by row: `matrix[i * n + j]` is the softmax over j of q(a_i, a_j); rows sum to 1.
@@ -23,6 +25,15 @@ pub struct AffinityUpdate {
 
 impl Message for AffinityUpdate {
     const KIND: Kind = Kind::Affinity;
+}
+
+impl Keyed for AffinityUpdate {
+    const KEY: &'static str = "affinity";
+    const PRIORITY: Priority = Priority::DataHigh;
+}
+
+impl Request for AffinityUpdate {
+    type Reply = Done;
 }
 
 impl AffinityUpdate {

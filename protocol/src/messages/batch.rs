@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{batch_request::Tally, status::Waiting};
+use super::{status::Waiting, tally::Tally};
 use crate::{
     run_spec::RunSpec,
     wire::{
@@ -318,6 +318,11 @@ impl Batch {
     pub fn seal(self, spec_hash: u64) -> Result<(Vec<u8>, Planes), CodecError> {
         let head = codec::seal(spec_hash, &BatchReply::Batch(self.header), &self.planes)?;
         Ok((head, self.planes))
+    }
+
+    /// Header and planes, to travel as a [`BatchReply::Batch`].
+    pub fn into_planes(self) -> (BatchHeader, Planes) {
+        (self.header, self.planes)
     }
 
     /// Takes the planes of a decoded reply, checking that they are as long as its header says.

@@ -3,7 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::wire::message::{Kind, Message};
+use super::{batch::BatchReply, tally::Tally};
+use crate::wire::message::{Keyed, Kind, Message, Request};
 
 /// The learner's request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -22,6 +23,14 @@ pub struct BatchRequest {
 
 impl Message for BatchRequest {
     const KIND: Kind = Kind::BatchRequest;
+}
+
+impl Keyed for BatchRequest {
+    const KEY: &'static str = "batch";
+}
+
+impl Request for BatchRequest {
+    type Reply = BatchReply;
 }
 
 /// Tells a request that repeats another from a new one: a batch that did not arrive must not count as sampled.
@@ -61,26 +70,6 @@ impl RequestId {
             number: self.number + 1,
             attempt: 0,
             ..self
-        }
-    }
-}
-
-/// What the rate limiter counts.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Tally {
-    /// Transitions stored.
-    pub inserted: u64,
-    /// Rows sampled.
-    pub rows_sampled: u64,
-}
-
-impl std::ops::Add for Tally {
-    type Output = Self;
-
-    fn add(self, other: Self) -> Self {
-        Self {
-            inserted: self.inserted.saturating_add(other.inserted),
-            rows_sampled: self.rows_sampled.saturating_add(other.rows_sampled),
         }
     }
 }

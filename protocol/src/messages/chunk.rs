@@ -3,11 +3,12 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::insert_reply::InsertReply;
 use crate::wire::{
     buffers::{Planes, PlanesPool},
     codec,
     error::CodecError,
-    message::{Kind, Message},
+    message::{Keyed, Kind, Message, Request},
 };
 
 /// Bytes of one transition in a chunk beside its frame: an action, an end and a reward.
@@ -83,6 +84,14 @@ impl Message for ChunkHeader {
             payload.len()
         )))
     }
+}
+
+impl Keyed for ChunkHeader {
+    const KEY: &'static str = "ingest";
+}
+
+impl Request for ChunkHeader {
+    type Reply = InsertReply;
 }
 
 impl ChunkHeader {
@@ -207,7 +216,7 @@ impl Chunk {
     /// Whatever makes it unfit to be stored; the message says what.
     pub fn decode(bytes: &[u8], spec_hash: u64, num_actions: u32) -> Result<Self, CodecError> {
         let (header, planes) = codec::decode(bytes, Some(spec_hash))?;
-        Self::checked(header, planes.to_vec().into(), num_actions)
+        Self::from_planes(header, planes.to_vec().into(), num_actions)
     }
 
     /// [`Chunk::decode`] of a message in `pieces`, `len` bytes in all; the chunk lies in own memory of `pool`.
@@ -222,11 +231,19 @@ impl Chunk {
         num_actions: u32,
     ) -> Result<Self, CodecError> {
         let (header, planes) = codec::receive(pieces, len, pool, Some(spec_hash))?;
-        Self::checked(header, planes, num_actions)
+        Self::from_planes(header, planes, num_actions)
     }
 
-    /// `planes` are as long as `header` says.
-    fn checked(header: ChunkHeader, planes: Planes, num_actions: u32) -> Result<Self, CodecError> {
+    /// The chunk of a header and planes that were received; checks all that [`Chunk::decode`] does.
+    ///
+    /// # Errors
+    /// As [`Chunk::decode`].
+    pub fn from_planes(
+        header: ChunkHeader,
+        planes: Planes,
+        num_actions: u32,
+    ) -> Result<Self, CodecError> {
+        header.validate(&planes)?;
         let chunk = Self { header, planes };
         if let Some(action) = chunk
             .actions()

@@ -3,7 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::wire::message::{Kind, Message};
+use super::done::Done;
+use crate::wire::message::{Keyed, Kind, Message, Request};
 
 /// An actor's last word: its own count of what it produced, against which the replay server checks its count.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -18,4 +19,12 @@ pub struct Goodbye {
 
 impl Message for Goodbye {
     const KIND: Kind = Kind::Goodbye;
+}
+
+impl Keyed for Goodbye {
+    const KEY: &'static str = "goodbye";
+}
+
+impl Request for Goodbye {
+    type Reply = Done;
 }

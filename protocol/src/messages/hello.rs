@@ -3,8 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::batch_request::Tally;
-use crate::wire::message::{Kind, Message};
+use super::tally::Tally;
+use crate::wire::message::{Keyed, Kind, Message};
 
 /// What a joining part needs: the run's resolved settings, from the replay server.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -25,4 +25,8 @@ pub struct Hello {
 
 impl Message for Hello {
     const KIND: Kind = Kind::Hello;
+}
+
+impl Keyed for Hello {
+    const KEY: &'static str = "hello";
 }

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::wire::message::{Kind, Message};
+use crate::wire::message::{Keyed, Kind, Message, Request};
 
 /// Asks what became of a chunk that the replay server keeps until its limiter opens: the chunk's header without its planes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -20,6 +20,14 @@ pub struct Claim {
 
 impl Message for Claim {
     const KIND: Kind = Kind::Claim;
+}
+
+impl Keyed for Claim {
+    const KEY: &'static str = "claim";
+}
+
+impl Request for Claim {
+    type Reply = InsertReply;
 }
 
 /// The replay server's answer to a chunk or a claim.

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::wire::message::{Kind, Message};
+use crate::wire::message::{Keyed, Kind, Message, Request};
 
 /// An actor starts: from now on the replay server takes its chunks. The same one may be sent any number of times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -18,6 +18,14 @@ impl Message for ActorJoin {
     const KIND: Kind = Kind::ActorJoin;
 }
 
+impl Keyed for ActorJoin {
+    const KEY: &'static str = "join/actor";
+}
+
+impl Request for ActorJoin {
+    type Reply = JoinReply;
+}
+
 /// A learner starts: from now on the replay server serves it, and it alone. The same one may be sent any number of times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LearnerJoin {
@@ -29,6 +37,14 @@ pub struct LearnerJoin {
 
 impl Message for LearnerJoin {
     const KIND: Kind = Kind::LearnerJoin;
+}
+
+impl Keyed for LearnerJoin {
+    const KEY: &'static str = "join/learner";
+}
+
+impl Request for LearnerJoin {
+    type Reply = JoinReply;
 }
 
 /// The replay server's answer to a part that joins.

@@ -11,4 +11,5 @@ pub(crate) mod hello;
 pub(crate) mod insert_reply;
 pub(crate) mod join;
 pub(crate) mod status;
+pub(crate) mod tally;
 pub(crate) mod weights;

@@ -2,8 +2,9 @@
 //! It computes nothing; each part fills in its own.
 
 use serde::{Deserialize, Serialize};
+use zenoh::qos::Priority;
 
-use crate::wire::message::{Kind, Message};
+use crate::wire::message::{Keyed, Kind, Message};
 
 /// Who waits for whom at the rate limiter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -147,6 +148,11 @@ pub struct ReplayStatus {
 
 impl Message for ReplayStatus {
     const KIND: Kind = Kind::ReplayStatus;
+}
+
+impl Keyed for ReplayStatus {
+    const KEY: &'static str = "status/replay";
+    const PRIORITY: Priority = Priority::InteractiveHigh;
 }
 
 impl ReplayStatus {
@@ -296,6 +302,11 @@ pub struct LearnerStatus {
 
 impl Message for LearnerStatus {
     const KIND: Kind = Kind::LearnerStatus;
+}
+
+impl Keyed for LearnerStatus {
+    const KEY: &'static str = "status/learner";
+    const PRIORITY: Priority = Priority::InteractiveHigh;
 }
 
 #[cfg(test)]

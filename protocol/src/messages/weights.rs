@@ -5,11 +5,13 @@
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use zenoh::qos::Priority;
 
+use super::done::Done;
 use crate::wire::{
     codec::PLANES_BYTES_MAX,
     error::CodecError,
-    message::{Kind, Message, no_payload},
+    message::{Keyed, Kind, Message, Request, no_payload},
 };
 
 /// Bytes of weights in one message to an actor; the last piece has fewer.
@@ -24,6 +26,11 @@ pub struct WeightsVersion {
 
 impl Message for WeightsVersion {
     const KIND: Kind = Kind::WeightsVersion;
+}
+
+impl Keyed for WeightsVersion {
+    const KEY: &'static str = "weights-version";
+    const PRIORITY: Priority = Priority::InteractiveHigh;
 }
 
 /// What weights say of themselves.
@@ -54,6 +61,15 @@ impl Message for WeightsUpload {
     }
 }
 
+impl Keyed for WeightsUpload {
+    const KEY: &'static str = "weights-upload";
+    const PRIORITY: Priority = Priority::DataHigh;
+}
+
+impl Request for WeightsUpload {
+    type Reply = Done;
+}
+
 /// An actor's question.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum WeightsRequest {
@@ -70,6 +86,15 @@ pub enum WeightsRequest {
 
 impl Message for WeightsRequest {
     const KIND: Kind = Kind::WeightsRequest;
+}
+
+impl Keyed for WeightsRequest {
+    const KEY: &'static str = "weights";
+    const PRIORITY: Priority = Priority::DataLow;
+}
+
+impl Request for WeightsRequest {
+    type Reply = WeightsReply;
 }
 
 /// The answer to a [`WeightsRequest`].

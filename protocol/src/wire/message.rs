@@ -2,6 +2,7 @@
 //! Which messages there are is in `messages`, one file each.
 
 use serde::{Serialize, de::DeserializeOwned};
+use zenoh::qos::Priority;
 
 use super::error::CodecError;
 
@@ -18,6 +19,20 @@ pub trait Message: Serialize + DeserializeOwned {
     fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
         no_payload(payload)
     }
+}
+
+/// A message with a key of its own: where it is asked, fetched or announced. Replies have none, they travel back.
+pub trait Keyed: Message {
+    /// Its key under the run's namespace.
+    const KEY: &'static str;
+    /// How urgent it is beside other messages on the same link.
+    const PRIORITY: Priority = Priority::Data;
+}
+
+/// A message that asks for a reply.
+pub trait Request: Keyed {
+    /// What it is answered with.
+    type Reply: Message;
 }
 
 /// Checks that no payload follows the header.

@@ -1,8 +1,8 @@
 //! Parts that join: what they are told of the run, and whether they are let in.
 //! Who is connected and who is served is kept in `members`.
 
-use driml_protocol::{ActorJoin, Alive, Hello, JoinReply, LearnerJoin};
-use zenoh::{query::Query, sample::SampleKind};
+use driml_protocol::{ActorJoin, Alive, Hello, Incoming, JoinReply, LearnerJoin, Responder};
+use zenoh::sample::SampleKind;
 
 use super::server::{Service, State};
 
@@ -13,7 +13,7 @@ impl Service {
         state.count_actors();
     }
 
-    pub(super) fn hello(&self, query: Query) {
+    pub(super) fn hello(&self, responder: Responder<Hello>) {
         let state = self.state();
         let (inserted_total, tally) = (state.replay.inserted_total(), state.replay.tally());
         drop(state);
@@ -25,26 +25,26 @@ impl Service {
             shard: self.shard,
             shared_memory: self.shared_memory,
         };
-        self.reply(&query, &hello);
+        responder.reply(&hello);
     }
 
-    pub(super) fn join_actor(&self, query: Query) {
-        if let Some(join) = self.read::<ActorJoin>(&query) {
+    pub(super) fn join_actor(&self, incoming: Incoming<ActorJoin>) {
+        if let Some(join) = self.read(&incoming) {
             let reply = self.state().join_actor(join);
-            self.welcome(&query, reply);
+            self.welcome(incoming.into_responder(), reply);
         }
     }
 
-    pub(super) fn join_learner(&self, query: Query) {
-        if let Some(join) = self.read::<LearnerJoin>(&query) {
+    pub(super) fn join_learner(&self, incoming: Incoming<LearnerJoin>) {
+        if let Some(join) = self.read(&incoming) {
             let reply = self.state().join_learner(join);
             self.changed.notify_all();
-            self.welcome(&query, reply);
+            self.welcome(incoming.into_responder(), reply);
         }
     }
 
     /// Answers a part that joins: how many lives it had before, or why it is not taken.
-    fn welcome(&self, query: &Query, joined: Result<u32, Rejection>) {
+    fn welcome(&self, responder: Responder<JoinReply>, joined: Result<u32, Rejection>) {
         let reply = match joined {
             Ok(earlier_lives) => JoinReply::Welcome {
                 inserted_total: self.state().replay.inserted_total(),
@@ -58,7 +58,7 @@ impl Service {
                 JoinReply::Refused { why }
             }
         };
-        self.reply(query, &reply);
+        responder.reply(&reply);
     }
 }
 

@@ -6,8 +6,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{CodecError, Message, PlanesPool, Shutdown, codec, session};
-use zenoh::{pubsub::Publisher, query::Query};
+use driml_protocol::{
+    Announcer, BatchReply, CodecError, Incoming, InsertReply, PlanesPool, Request, Responder,
+    Shutdown, WeightsVersion,
+};
 
 use super::{
     members::Members,
@@ -19,7 +21,6 @@ use crate::{replay::Replay, storage::frame_store::Packer};
 
 /// What all threads share.
 pub(super) struct Service {
-    pub(super) spec_hash: u64,
     pub(super) num_actions: u32,
     pub(super) shard: (u32, u32),
     pub(super) after_updates: u64,
@@ -36,7 +37,7 @@ pub(super) struct Service {
     /// Something was stored, sampled or parked: whoever waits for the limiter looks again.
     pub(super) changed: Condvar,
     pub(super) weights: Mutex<WeightsStore>,
-    pub(super) announcements: Publisher<'static>,
+    pub(super) announcements: Announcer<WeightsVersion>,
     pub(super) shutdown: Shutdown,
 }
 
@@ -45,13 +46,13 @@ pub(super) struct State {
     pub(super) replay: Replay,
     pub(super) members: Members,
     pub(super) chunks: ParkedChunks<Question>,
-    pub(super) requests: ParkedRequests<Query>,
+    pub(super) requests: ParkedRequests<Responder<BatchReply>>,
     pub(super) timings: Timings,
 }
 
 /// Who asks about a chunk, and since when.
 pub(super) struct Question {
-    pub(super) query: Query,
+    pub(super) responder: Responder<InsertReply>,
     pub(super) arrived: Instant,
 }
 
@@ -60,32 +61,18 @@ impl Service {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(super) fn reply<M: Message>(&self, query: &Query, message: &M) {
-        match codec::encode(self.spec_hash, message, &[]) {
-            Ok(bytes) => session::answer(query, bytes.into()),
-            Err(e) => tracing::error!("a reply of kind {:?} was not sent: {e}", M::KIND),
-        }
-    }
-
     /// Counts and logs a message that cannot be read.
     pub(super) fn refuse(&self, what: &str, e: &CodecError) {
         tracing::warn!("{what} was refused: {e}");
         self.state().replay.note_refused_message();
     }
 
-    /// Decodes a small message, or counts it as refused.
-    pub(super) fn read<M: Message>(&self, query: &Query) -> Option<M> {
-        let payload = query
-            .payload()
-            .map(|payload| payload.to_bytes())
-            .unwrap_or_default();
-        match codec::decode(&payload, Some(self.spec_hash)) {
-            Ok((message, _)) => Some(message),
-            Err(e) => {
-                self.refuse(&format!("a message of kind {:?}", M::KIND), &e);
-                None
-            }
-        }
+    /// Reads a request without payload, or counts it as refused.
+    pub(super) fn read<R: Request>(&self, incoming: &Incoming<R>) -> Option<R> {
+        incoming
+            .read()
+            .inspect_err(|e| self.refuse(&format!("a message of kind {:?}", R::KIND), e))
+            .ok()
     }
 
     /// Waits until something has changed, or for `wait_max`.
