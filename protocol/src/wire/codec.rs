@@ -1,16 +1,7 @@
 //! The bytes of a message: a fixed prefix, a bincode header, then raw planes that serde never touches.
 //! It does not know what a message means, and it is the only file that calls bincode.
 //!
-//! | bytes | field |
-//! | --- | --- |
-//! | 0..4 | magic `DRML` |
-//! | 4..6 | protocol version, little-endian as everything here |
-//! | 6..8 | kind |
-//! | 8..16 | run spec's hash |
-//! | 16..20 | header's length |
-//! | 20..28 | planes' length |
-//! | 28..32 | CRC-32 of bytes 0..28, the header and the planes |
-//! | 32.. | header, then planes |
+//! The prefix's fields are in `prefix`.
 
 use serde::{Serialize, de::DeserializeOwned};
 
@@ -18,14 +9,14 @@ use super::{
     buffers::{Planes, PlanesPool},
     error::CodecError,
     message::{Kind, Message},
+    prefix::Prefix,
 };
 
 /// The version of every message in this crate; parts of different versions refuse each other.
 pub const PROTOCOL_VERSION: u16 = 3;
 
-const MAGIC: [u8; 4] = *b"DRML";
 /// Length of the fixed prefix, bytes.
-pub const PREFIX_BYTES: usize = 32;
+pub const PREFIX_BYTES: usize = Prefix::BYTES;
 /// Longest header, bytes; a longer one is refused by both sides.
 pub const HEADER_BYTES_MAX: usize = 1 << 20;
 /// Longest planes, bytes; longer ones are refused by both sides.
@@ -64,17 +55,20 @@ pub fn seal<M: Message>(spec_hash: u64, message: &M, planes: &[u8]) -> Result<Ve
         });
     }
     let header = encode_header(message)?;
-    let mut out = Vec::with_capacity(PREFIX_BYTES + header.len());
-    out.extend_from_slice(&MAGIC);
-    out.extend_from_slice(&PROTOCOL_VERSION.to_le_bytes());
-    out.extend_from_slice(&(M::KIND as u16).to_le_bytes());
-    out.extend_from_slice(&spec_hash.to_le_bytes());
-    out.extend_from_slice(&(header.len() as u32).to_le_bytes());
-    out.extend_from_slice(&(planes.len() as u64).to_le_bytes());
-    let checksum = checksum(&out, &header, planes);
-    out.extend_from_slice(&checksum.to_le_bytes());
-    out.extend_from_slice(&header);
-    Ok(out)
+    let mut prefix = Prefix {
+        magic: Prefix::MAGIC,
+        version: PROTOCOL_VERSION,
+        kind: M::KIND as u16,
+        spec_hash,
+        header_bytes: header.len() as u32,
+        payload_bytes: planes.len() as u64,
+        checksum: 0,
+    };
+    let mut sum = prefix.checksum_begun();
+    sum.update(&header);
+    sum.update(planes);
+    prefix.checksum = sum.finalize();
+    Ok([&prefix.to_bytes()[..], &header].concat())
 }
 
 /// A whole message in one piece, for small ones and for tests.
@@ -171,24 +165,19 @@ impl<'a, I: Iterator<Item = &'a [u8]>> Pieces<'a, I> {
     }
 }
 
-/// The fixed first bytes of a message whose magic, version and lengths are in order.
-struct Prefix([u8; PREFIX_BYTES]);
-
 impl Prefix {
-    /// `len` is the whole message's length.
+    /// The prefix of a message of `len` bytes in all, if its magic, version and lengths are in order.
     fn read(bytes: Option<&[u8; PREFIX_BYTES]>, len: usize) -> Result<Self, CodecError> {
-        let this = Self(*bytes.ok_or(CodecError::Length {
+        let this = Self::from_bytes(bytes.ok_or(CodecError::Length {
             have: len,
             need: PREFIX_BYTES,
         })?);
-        let prefix = &this.0;
-        if prefix[0..4] != MAGIC {
+        if this.magic != Self::MAGIC {
             return Err(CodecError::Magic);
         }
-        let version = u16::from_le_bytes([prefix[4], prefix[5]]);
-        if version != PROTOCOL_VERSION {
+        if this.version != PROTOCOL_VERSION {
             return Err(CodecError::Version {
-                theirs: version,
+                theirs: this.version,
                 ours: PROTOCOL_VERSION,
             });
         }
@@ -207,19 +196,12 @@ impl Prefix {
         Ok(this)
     }
 
-    fn header_len(&self) -> usize {
-        le_u32(&self.0[16..20]) as usize
+    const fn header_len(&self) -> usize {
+        self.header_bytes as usize
     }
 
     fn planes_len(&self) -> usize {
-        usize::try_from(le_u64(&self.0[20..28])).unwrap_or(usize::MAX)
-    }
-
-    /// A checksum over the prefix, to which header and planes are to be added.
-    fn checksum_begun(&self) -> crc32fast::Hasher {
-        let mut sum = crc32fast::Hasher::new();
-        sum.update(&self.0[..28]);
-        sum
+        usize::try_from(self.payload_bytes).unwrap_or(usize::MAX)
     }
 
     fn check(
@@ -228,19 +210,20 @@ impl Prefix {
         kind: Kind,
         spec_hash: Option<u64>,
     ) -> Result<(), CodecError> {
-        if sum.finalize() != le_u32(&self.0[28..32]) {
+        if sum.finalize() != self.checksum {
             return Err(CodecError::Checksum);
         }
-        let theirs = u16::from_le_bytes([self.0[6], self.0[7]]);
-        if theirs != kind as u16 {
+        if self.kind != kind as u16 {
             return Err(CodecError::Kind {
-                theirs,
+                theirs: self.kind,
                 ours: kind as u16,
             });
         }
-        let theirs = le_u64(&self.0[8..16]);
         match spec_hash {
-            Some(ours) if ours != theirs => Err(CodecError::RunSpec { theirs, ours }),
+            Some(ours) if ours != self.spec_hash => Err(CodecError::RunSpec {
+                theirs: self.spec_hash,
+                ours,
+            }),
             _ => Ok(()),
         }
     }
@@ -254,20 +237,4 @@ fn decode_header<H: DeserializeOwned>(bytes: &[u8]) -> Result<H, CodecError> {
         0 => Ok(header),
         over => Err(CodecError::Header(format!("{over} bytes after its end"))),
     }
-}
-
-fn checksum(prefix: &[u8], header: &[u8], planes: &[u8]) -> u32 {
-    let mut hasher = crc32fast::Hasher::new();
-    hasher.update(prefix);
-    hasher.update(header);
-    hasher.update(planes);
-    hasher.finalize()
-}
-
-fn le_u32(bytes: &[u8]) -> u32 {
-    u32::from_le_bytes(bytes.try_into().expect("the caller slices four bytes"))
-}
-
-fn le_u64(bytes: &[u8]) -> u64 {
-    u64::from_le_bytes(bytes.try_into().expect("the caller slices eight bytes"))
 }
