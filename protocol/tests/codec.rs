@@ -116,6 +116,12 @@ fn join((mut head, planes): (Vec<u8>, impl AsRef<[u8]>)) -> Vec<u8> {
     head
 }
 
+/// A batch as it travels.
+fn sealed(batch: Batch) -> Vec<u8> {
+    let (header, planes) = batch.into_planes();
+    codec::encode(SPEC, &BatchReply::Batch(header), &planes).unwrap()
+}
+
 fn weights() -> Vec<u8> {
     let planes: Vec<u8> = (0..40).collect();
     let upload = WeightsUpload {
@@ -249,12 +255,7 @@ fn samples() -> Vec<Sample> {
             join(chunk().seal(SPEC).unwrap()),
             read_chunk as fn(&[u8]) -> _,
         ),
-        (
-            "batch",
-            Kind::BatchReply,
-            join(batch().seal(SPEC).unwrap()),
-            read_batch,
-        ),
+        ("batch", Kind::BatchReply, sealed(batch()), read_batch),
         ("weights", Kind::WeightsUpload, weights(), read_weights),
     ];
     samples.extend(with_planes.map(|(name, kind, bytes, read)| Sample {
@@ -305,7 +306,7 @@ fn chunk_batch_and_weights_come_back() {
     );
     assert_eq!(back.frames()[5 * 5..], [6; 5]);
 
-    let bytes = join(batch().seal(SPEC).unwrap());
+    let bytes = sealed(batch());
     let (reply, planes) = codec::decode(&bytes, Some(SPEC)).unwrap();
     let BatchReply::Batch(header) = reply else {
         panic!("{reply:?}")

@@ -94,8 +94,8 @@ fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
     let message = match replay.draw_for(request.id, request.rows, Planes::zeroed) {
         Ok(_) if drawn.fetch_add(1, Ordering::Relaxed).is_multiple_of(LOSES) => return,
         Ok(draft) => {
-            let (head, planes) = draft.unpack().seal(hash).unwrap();
-            [&head[..], &planes[..]].concat()
+            let (header, planes) = draft.unpack().into_planes();
+            codec::encode(hash, &BatchReply::Batch(header), &planes).unwrap()
         }
         Err(unready) => codec::encode(hash, &BatchReply::from(unready), &[]).unwrap(),
     };

@@ -3,12 +3,15 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{status::Waiting, tally::Tally};
+use super::{
+    batch_layout::{BatchLayout, Column},
+    status::Waiting,
+    tally::Tally,
+};
 use crate::{
     run_spec::RunSpec,
     wire::{
         buffers::Planes,
-        codec,
         error::CodecError,
         message::{Kind, Message, no_payload},
         shared_memory,
@@ -18,8 +21,6 @@ use crate::{
 /// Stands where a row has no next action: its transition ended the episode or the level.
 pub const NO_ACTION: u8 = 255;
 
-/// Planes of a batch.
-const PLANES: usize = 9;
 /// Batches that a replay server keeps in shared memory: those that are assembled, on their way, and being copied by the learner.
 pub const POOL_BATCHES: usize = 6;
 
@@ -66,12 +67,22 @@ impl BatchHeader {
     /// # Panics
     /// If they are more than the address space, which no batch of a run is.
     pub fn planes_bytes(&self) -> usize {
-        planes_bytes(self).expect("a batch is far below the address space")
+        self.layout()
+            .bytes()
+            .expect("a batch is far below the address space")
+    }
+
+    const fn layout(&self) -> BatchLayout {
+        BatchLayout {
+            rows: self.rows as usize,
+            positives: self.positives as usize,
+            state_bytes: self.state_bytes as usize,
+        }
     }
 
     /// Checks that `planes` are as long as such a batch's.
     fn check_planes(&self, planes: &[u8]) -> Result<(), CodecError> {
-        if planes_bytes(self) == Some(planes.len()) && self.rows > 0 {
+        if self.layout().bytes() == Some(planes.len()) && self.rows > 0 {
             return Ok(());
         }
         Err(CodecError::Header(format!(
@@ -146,22 +157,22 @@ impl Batch {
     pub fn merge(parts: &[Self], memory: Planes) -> Self {
         let header = Self::merged_header(parts).expect("parts of one batch");
         let mut merged = Self::in_memory(header, memory);
-        let offsets = merged.offsets();
+        let whole = header.layout();
         let mut first_row = 0;
         for part in parts {
-            for (plane, &offset) in offsets[..PLANES].iter().enumerate() {
-                let per_positive = matches!(plane, 1 | 7 | 8);
-                let blocks = if per_positive { part.positives() } else { 1 };
-                let values = part.plane(plane);
-                let row_bytes = values.len() / (blocks.max(1) * part.rows());
-                for block in 0..blocks {
-                    let from =
-                        &values[block * part.rows() * row_bytes..][..part.rows() * row_bytes];
-                    let row = block * merged.rows() + first_row;
-                    merged.planes[offset + row * row_bytes..][..from.len()].copy_from_slice(from);
+            let rows = part.rows();
+            for column in Column::ALL {
+                let row_bytes = whole.value_bytes(column);
+                let to = &mut merged.planes[whole.range(column)];
+                let from = part.column(column);
+                // Of each positive, the rows of the part come together.
+                for positive in 0..whole.values_a_row(column) {
+                    let from = &from[positive * rows * row_bytes..][..rows * row_bytes];
+                    let row = positive * whole.rows + first_row;
+                    to[row * row_bytes..][..from.len()].copy_from_slice(from);
                 }
             }
-            first_row += part.rows();
+            first_row += rows;
         }
         merged
     }
@@ -205,119 +216,83 @@ impl Batch {
         self.header.positives as usize
     }
 
-    fn frames_bytes(&self) -> usize {
-        self.rows() * self.header.state_bytes as usize
+    fn column(&self, column: Column) -> &[u8] {
+        &self.planes[self.header.layout().range(column)]
     }
 
-    /// Byte offsets of the planes, in their order, and the end.
-    fn offsets(&self) -> [usize; PLANES + 1] {
-        let (rows, positives, frames) = (self.rows(), self.positives(), self.frames_bytes());
-        let lengths = [
-            frames,
-            frames * positives,
-            frames,
-            4 * rows,
-            4 * rows,
-            rows,
-            rows,
-            rows * positives,
-            rows * positives,
-        ];
-        let mut offsets = [0; PLANES + 1];
-        for (i, length) in lengths.iter().enumerate() {
-            offsets[i + 1] = offsets[i] + length;
-        }
-        offsets
-    }
-
-    fn plane(&self, index: usize) -> &[u8] {
-        let offsets = self.offsets();
-        &self.planes[offsets[index]..offsets[index + 1]]
-    }
-
-    fn plane_f32(&self, index: usize) -> Vec<f32> {
-        let value = |b: &[u8]| f32::from_le_bytes(b.try_into().expect("chunks of four"));
-        self.plane(index).chunks_exact(4).map(value).collect()
+    fn column_f32(&self, column: Column) -> Vec<f32> {
+        let (values, _) = self.column(column).as_chunks();
+        values.iter().copied().map(f32::from_le_bytes).collect()
     }
 
     /// s_t [B, state bytes].
     pub fn frames_t(&self) -> &[u8] {
-        self.plane(0)
+        self.column(Column::StatesT)
     }
 
     /// s_{t+k} [P, B, state bytes]; rows without a positive hold zeros.
     pub fn frames_k(&self) -> &[u8] {
-        self.plane(1)
+        self.column(Column::StatesK)
     }
 
     /// s_{t+n} [B, state bytes]; rows that do not bootstrap hold zeros.
     pub fn frames_n(&self) -> &[u8] {
-        self.plane(2)
+        self.column(Column::StatesN)
     }
 
     /// Sum of gamma^i r_{t+i} over i < n, stopped at the episode's end [B].
     pub fn n_step_returns(&self) -> Vec<f32> {
-        self.plane_f32(3)
+        self.column_f32(Column::NStepReturn)
     }
 
     /// gamma^n, or 0 where the episode ended within the n steps [B].
     pub fn bootstrap_discounts(&self) -> Vec<f32> {
-        self.plane_f32(4)
+        self.column_f32(Column::BootstrapDiscount)
     }
 
     /// a_t [B].
     pub fn actions(&self) -> &[u8] {
-        self.plane(5)
+        self.column(Column::Action)
     }
 
     /// a_{t+1} [B], or [`NO_ACTION`].
     pub fn next_actions(&self) -> &[u8] {
-        self.plane(6)
+        self.column(Column::NextAction)
     }
 
     /// 1 where the row has a positive [P, B].
     pub fn positive_valid(&self) -> &[u8] {
-        self.plane(7)
+        self.column(Column::PositiveValid)
     }
 
     /// k [P, B], capped at 255; 0 where the row has no positive.
     pub fn ks(&self) -> &[u8] {
-        self.plane(8)
+        self.column(Column::K)
     }
 
     /// Everything of one row, to be written in place.
     pub fn rows_mut(&mut self) -> BatchRowsMut<'_> {
-        let offsets = self.offsets();
-        let state_bytes = self.header.state_bytes as usize;
-        let rows = self.rows();
+        let layout = self.header.layout();
         let mut rest = &mut self.planes[..];
-        let mut take = |i: usize| -> &mut [u8] {
-            let (head, tail) = std::mem::take(&mut rest).split_at_mut(offsets[i + 1] - offsets[i]);
-            rest = tail;
-            head
+        // They lie in the order of their names here.
+        let mut take = |column| -> &mut [u8] {
+            let bytes = layout.column_bytes(column);
+            rest.split_off_mut(..bytes)
+                .expect("the columns fill the payload")
         };
         BatchRowsMut {
-            rows,
-            state_bytes,
-            frames_t: take(0),
-            frames_k: take(1),
-            frames_n: take(2),
-            n_step_return: take(3),
-            bootstrap_discount: take(4),
-            action: take(5),
-            next_action: take(6),
-            positive_valid: take(7),
-            k: take(8),
+            rows: layout.rows,
+            state_bytes: layout.state_bytes,
+            frames_t: take(Column::StatesT),
+            frames_k: take(Column::StatesK),
+            frames_n: take(Column::StatesN),
+            n_step_return: take(Column::NStepReturn),
+            bootstrap_discount: take(Column::BootstrapDiscount),
+            action: take(Column::Action),
+            next_action: take(Column::NextAction),
+            positive_valid: take(Column::PositiveValid),
+            k: take(Column::K),
         }
-    }
-
-    /// The batch as it travels: prefix and header, then the planes.
-    ///
-    /// # Errors
-    /// A batch over the codec's limits.
-    pub fn seal(self, spec_hash: u64) -> Result<(Vec<u8>, Planes), CodecError> {
-        let head = codec::seal(spec_hash, &BatchReply::Batch(self.header), &self.planes)?;
-        Ok((head, self.planes))
     }
 
     /// Header and planes, to travel as a [`BatchReply::Batch`].
@@ -333,16 +308,6 @@ impl Batch {
         header.check_planes(&planes)?;
         Ok(Self { header, planes })
     }
-}
-
-fn planes_bytes(header: &BatchHeader) -> Option<usize> {
-    let (rows, positives) = (header.rows as usize, header.positives as usize);
-    let states = (header.state_bytes as usize).checked_mul(positives.checked_add(2)?)?;
-    rows.checked_mul(
-        states
-            .checked_add(10)?
-            .checked_add(positives.checked_mul(2)?)?,
-    )
 }
 
 /// The planes of a batch, borrowed for writing, row by row.

@@ -1,6 +1,8 @@
 //! Transitions on their way from an actor to the replay server.
 //! It does not decide what is stored: exactly-once and order are the replay server's.
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
 use super::insert_reply::InsertReply;
@@ -12,7 +14,8 @@ use crate::wire::{
 };
 
 /// Bytes of one transition in a chunk beside its frame: an action, an end and a reward.
-pub const TRANSITION_BYTES: usize = 1 + 1 + 4;
+pub const TRANSITION_BYTES: usize = size_of::<u8>() + size_of::<End>() + size_of::<f32>();
+const _: () = assert!(TRANSITION_BYTES == 6);
 
 /// What a step ended, if anything.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -107,6 +110,34 @@ impl ChunkHeader {
     }
 }
 
+/// Where the columns of a chunk lie in its payload, one after the other.
+#[derive(Clone, Copy)]
+struct ChunkLayout {
+    rows: usize,
+    frame_bytes: usize,
+}
+
+impl ChunkLayout {
+    const fn frames(self) -> Range<usize> {
+        0..self.rows * self.frame_bytes
+    }
+
+    const fn actions(self) -> Range<usize> {
+        let start = self.frames().end;
+        start..start + self.rows
+    }
+
+    const fn ends(self) -> Range<usize> {
+        let start = self.actions().end;
+        start..start + self.rows * size_of::<End>()
+    }
+
+    const fn rewards(self) -> Range<usize> {
+        let start = self.ends().end;
+        start..start + self.rows * size_of::<f32>()
+    }
+}
+
 /// Consecutive steps of several streams: row `stream * steps + step` is (s_t, a_t, r_t, what a_t ended).
 ///
 /// Planes, one after the other: frames [rows, frame bytes], actions [rows], ends [rows], rewards [rows] f32 little-endian.
@@ -142,29 +173,26 @@ impl Chunk {
         Self { header, planes }
     }
 
-    fn rows(&self) -> usize {
-        self.header.transitions()
-    }
-
-    fn frames_end(&self) -> usize {
-        self.rows() * self.header.frame_bytes as usize
+    fn layout(&self) -> ChunkLayout {
+        ChunkLayout {
+            rows: self.header.transitions(),
+            frame_bytes: self.header.frame_bytes as usize,
+        }
     }
 
     /// Frames [rows, frame bytes].
     pub fn frames(&self) -> &[u8] {
-        &self.planes[..self.frames_end()]
+        &self.planes[self.layout().frames()]
     }
 
     /// Actions [rows].
     pub fn actions(&self) -> &[u8] {
-        let start = self.frames_end();
-        &self.planes[start..start + self.rows()]
+        &self.planes[self.layout().actions()]
     }
 
     /// Ends [rows], as bytes of [`End`].
     pub fn ends(&self) -> &[u8] {
-        let start = self.frames_end() + self.rows();
-        &self.planes[start..start + self.rows()]
+        &self.planes[self.layout().ends()]
     }
 
     /// The end of one row; every byte was checked when the chunk was made or decoded.
@@ -174,8 +202,8 @@ impl Chunk {
 
     /// The reward of one row.
     pub fn reward(&self, row: usize) -> f32 {
-        let at = self.frames_end() + 2 * self.rows() + 4 * row;
-        f32::from_le_bytes(self.planes[at..at + 4].try_into().expect("four bytes"))
+        let (rewards, _) = self.planes[self.layout().rewards()].as_chunks();
+        f32::from_le_bytes(rewards[row])
     }
 
     /// Where row's frame is written.
@@ -186,12 +214,12 @@ impl Chunk {
 
     /// Writes everything of one row but its frame.
     pub fn set(&mut self, row: usize, action: u8, reward: f32, end: End) {
-        let (rows, frames_end) = (self.rows(), self.frames_end());
-        assert!(row < rows, "row {row} of a chunk of {rows}");
-        self.planes[frames_end + row] = action;
-        self.planes[frames_end + rows + row] = end as u8;
-        let at = frames_end + 2 * rows + 4 * row;
-        self.planes[at..at + 4].copy_from_slice(&reward.to_le_bytes());
+        let layout = self.layout();
+        assert!(row < layout.rows, "row {row} of a chunk of {}", layout.rows);
+        self.planes[layout.actions()][row] = action;
+        self.planes[layout.ends()][row] = end as u8;
+        let (rewards, _) = self.planes[layout.rewards()].as_chunks_mut();
+        rewards[row] = reward.to_le_bytes();
     }
 
     /// The chunk as it travels: prefix and header, then the planes, uncopied.
@@ -257,7 +285,9 @@ impl Chunk {
         if let Some(end) = chunk.ends().iter().find(|&&e| End::from_byte(e).is_none()) {
             return Err(CodecError::Header(format!("end {end} is none that exists")));
         }
-        if let Some(row) = (0..chunk.rows()).find(|&row| !chunk.reward(row).is_finite()) {
+        if let Some(row) =
+            (0..chunk.header.transitions()).find(|&row| !chunk.reward(row).is_finite())
+        {
             return Err(CodecError::Header(format!(
                 "the reward of row {row} is not finite"
             )));
