@@ -2,7 +2,7 @@
 //! The processes and the lockstep mode run this same code; it neither sends nor waits.
 
 use anyhow::Context;
-use driml_protocol::{Chunk, PlanesPool, RunSpec};
+use driml_protocol::{BufferPool, Chunk, RunSpec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -52,7 +52,7 @@ impl Collector {
     /// the model.
     pub fn new(
         settings: ActorSettings,
-        pool: PlanesPool,
+        pool: BufferPool,
         life: Life,
         weights_version: u64,
         safetensors: &[u8],
@@ -226,7 +226,7 @@ mod tests {
         let rng = &mut ChaCha8Rng::seed_from_u64(1);
         let weights = Parameters::init(&settings.model, rng, &Compute::CPU.device).unwrap();
         let weights = weights.to_safetensors(|_| true).unwrap();
-        Collector::new(settings, PlanesPool::new(1), life, 1, &weights)
+        Collector::new(settings, BufferPool::new(1), life, 1, &weights)
     }
 
     /// The actions of a life's first chunk.

@@ -9,7 +9,7 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Assembly, CodecError, PIECE_BYTES, PendingReply, PlanesPool, RunClient, Seldom, Shutdown,
+    Assembly, BufferPool, CodecError, PIECE_BYTES, PendingReply, RunClient, Seldom, Shutdown,
     WeightsHeader, WeightsReply, WeightsRequest, WeightsVersion, fault,
 };
 
@@ -209,7 +209,7 @@ impl WeightsSource {
 
     /// The newest weights, piece by piece; none if they are not newer than `version`.
     fn pull(&self, version: u64) -> anyhow::Result<Option<Weights>> {
-        let pool = PlanesPool::new(PIECES_IN_FLIGHT);
+        let pool = BufferPool::new(PIECES_IN_FLIGHT);
         let first = self.ask(WeightsRequest::NewerThan(version))?;
         let (reply, piece) = first.receive(&pool)?;
         let WeightsReply::Piece {

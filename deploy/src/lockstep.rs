@@ -9,7 +9,7 @@ use std::{
 use anyhow::{Context, bail};
 use driml_actor::{ActorSettings, Collector, Life};
 use driml_learner::{LearnerPart, Learning};
-use driml_protocol::{ActorJoin, Batch, Goodbye, InsertReply, LearnerStatus, PlanesPool, Shutdown};
+use driml_protocol::{ActorJoin, Batch, BufferPool, Goodbye, InsertReply, LearnerStatus, Shutdown};
 use driml_replay_server::{Replay, Unready};
 
 use crate::{
@@ -132,7 +132,7 @@ impl Parts {
             };
             Collector::new(
                 settings.clone(),
-                PlanesPool::new(1),
+                BufferPool::new(1),
                 life,
                 header.version,
                 &weights,

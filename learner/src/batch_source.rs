@@ -9,7 +9,7 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Batch, BatchHeader, BatchReply, BatchRequest, PendingReply, PlanesPool, ReplayStatus,
+    Batch, BatchHeader, BatchReply, BatchRequest, BufferPool, PendingReply, ReplayStatus,
     RequestId, RunClient, Seldom, Shutdown, Tally, fault, join_within, session::SessionError,
     shared_memory::Trust,
 };
@@ -81,7 +81,7 @@ impl BatchSource {
     ) -> std::io::Result<Self> {
         let (sender, fetched) = mpsc::sync_channel(0);
         // A batch a thread, and the one that is learned from.
-        let pool = PlanesPool::new(requests.in_flight as usize + clients.len());
+        let pool = BufferPool::new(requests.in_flight as usize + clients.len());
         let making = Arc::new(Mutex::new(Making::new(clients.len())));
         let mut threads = Vec::new();
         for i in 0..requests.in_flight {
@@ -170,7 +170,7 @@ struct Fetcher {
     id: RequestId,
     rng: ChaCha8Rng,
     requests: Requests,
-    pool: PlanesPool,
+    pool: BufferPool,
     /// Whether batches may come through shared memory.
     trust: Trust,
     said: Seldom,
@@ -281,7 +281,7 @@ impl Fetcher {
         if pending.iter().all(|&rows| rows == 0) {
             let header =
                 Batch::merged_header(parts).context("the shards' parts do not fit together")?;
-            let memory = self.pool.take_own(header.planes_bytes());
+            let memory = self.pool.take_own(header.payload_bytes());
             let whole = Batch::merge(parts, memory);
             parts.clear();
             return Ok(Some(Fetched::Batch(whole)));
@@ -331,7 +331,7 @@ impl Fetcher {
         (asked, shared_memory): (PendingReply<BatchReply>, bool),
     ) -> anyhow::Result<Answer> {
         // Where this process may not map shared memory, the question seems to have been answered by nobody.
-        let (reply, planes) = asked.receive(&self.pool).inspect_err(|e| {
+        let (reply, payload) = asked.receive(&self.pool).inspect_err(|e| {
             let unheard = matches!(
                 e,
                 SessionError::NoReply { .. } | SessionError::Nobody { .. }
@@ -345,7 +345,7 @@ impl Fetcher {
                 if shared_memory {
                     self.trust.worked();
                 }
-                Answer::Batch(Batch::from_planes(header, planes)?)
+                Answer::Batch(Batch::from_payload(header, payload)?)
             }
             BatchReply::Wait(_) => Answer::Wait,
             BatchReply::Finished => Answer::Finished,

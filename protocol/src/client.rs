@@ -15,7 +15,7 @@ use zenoh::{
 use crate::{
     session::{self, PendingBytes, SessionError},
     wire::{
-        buffers::{Planes, PlanesPool},
+        buffers::{Buffer, BufferPool},
         codec,
         error::CodecError,
         keys::{Alive, Keys},
@@ -279,7 +279,7 @@ impl<M: Message> PendingReply<M> {
     ///
     /// # Errors
     /// As [`RunClient::ask`].
-    pub fn receive(self, pool: &PlanesPool) -> Result<(M, Planes), SessionError> {
+    pub fn receive(self, pool: &BufferPool) -> Result<(M, Buffer), SessionError> {
         let key = self.bytes.key().to_owned();
         let bytes = self.bytes.wait()?;
         codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))

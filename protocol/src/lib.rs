@@ -41,7 +41,7 @@ pub use process::{
 pub use query_workers::{Incoming, QueryWorkers, Responder};
 pub use run_spec::{Horizon, POSITIVES_MAX, RunSpec, RunSpecError, TimeoutRule};
 pub use wire::{
-    buffers::{Planes, PlanesPool},
+    buffers::{Buffer, BufferPool},
     codec::{self, PROTOCOL_VERSION},
     error::CodecError,
     keys::{Alive, Keys},

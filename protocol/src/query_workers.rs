@@ -25,7 +25,7 @@ use crate::{
     process::fault,
     session,
     wire::{
-        buffers::{Planes, PlanesPool},
+        buffers::{Buffer, BufferPool},
         codec,
         error::CodecError,
         message::{Keyed, Message, Request},
@@ -60,7 +60,7 @@ impl<R: Request> Incoming<R> {
     ///
     /// # Errors
     /// As [`Incoming::read`].
-    pub fn receive(&self, pool: &PlanesPool) -> Result<(R, Planes), CodecError> {
+    pub fn receive(&self, pool: &BufferPool) -> Result<(R, Buffer), CodecError> {
         let nothing = ZBytes::new();
         let bytes = self.query.payload().unwrap_or(&nothing);
         codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))

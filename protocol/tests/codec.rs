@@ -5,12 +5,12 @@
 use std::fmt::Debug;
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader,
-    Claim, CodecError, Done, End, Goodbye, Hello, Horizon, InsertReply, JoinReply, Kind,
-    LearnerJoin, LearnerStatus, Message, NO_ACTION, PROTOCOL_VERSION, Planes, PlanesPool,
+    ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, BufferPool,
+    Chunk, ChunkHeader, Claim, CodecError, Done, End, Goodbye, Hello, Horizon, InsertReply,
+    JoinReply, Kind, LearnerJoin, LearnerStatus, Message, NO_ACTION, PROTOCOL_VERSION,
     ReplayStatus, RequestId, Returns, RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader,
     WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
-    codec::{self, HEADER_BYTES_MAX, PLANES_BYTES_MAX, PREFIX_BYTES},
+    codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
 
@@ -29,8 +29,8 @@ impl Sample {
     /// Encodes `header`, checks that it comes back, and keeps the bytes.
     fn of<M: Message + PartialEq + Debug>(header: &M) -> Self {
         let bytes = codec::encode(SPEC, header, &[]).unwrap();
-        let (back, planes) = codec::decode::<M>(&bytes, Some(SPEC)).unwrap();
-        assert_eq!((&back, planes.len()), (header, 0));
+        let (back, payload) = codec::decode::<M>(&bytes, Some(SPEC)).unwrap();
+        assert_eq!((&back, payload.len()), (header, 0));
         let (back, _) = codec::decode::<M>(&bytes, None).unwrap();
         assert_eq!(&back, header, "where any run is welcome");
         Self {
@@ -48,8 +48,8 @@ fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
 
 fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
     match codec::decode::<BatchReply>(bytes, Some(SPEC))? {
-        (BatchReply::Batch(header), planes) => {
-            Batch::from_planes(header, planes.to_vec().into()).map(|_| ())
+        (BatchReply::Batch(header), payload) => {
+            Batch::from_payload(header, payload.to_vec().into()).map(|_| ())
         }
         _ => Ok(()),
     }
@@ -111,24 +111,24 @@ fn batch() -> Batch {
 }
 
 /// The bytes of a message as the wire joins them.
-fn join((mut head, planes): (Vec<u8>, impl AsRef<[u8]>)) -> Vec<u8> {
-    head.extend_from_slice(planes.as_ref());
+fn join((mut head, payload): (Vec<u8>, impl AsRef<[u8]>)) -> Vec<u8> {
+    head.extend_from_slice(payload.as_ref());
     head
 }
 
 /// A batch as it travels.
 fn sealed(batch: Batch) -> Vec<u8> {
-    let (header, planes) = batch.into_planes();
-    codec::encode(SPEC, &BatchReply::Batch(header), &planes).unwrap()
+    let (header, payload) = batch.into_payload();
+    codec::encode(SPEC, &BatchReply::Batch(header), &payload).unwrap()
 }
 
 fn weights() -> Vec<u8> {
-    let planes: Vec<u8> = (0..40).collect();
+    let payload: Vec<u8> = (0..40).collect();
     let upload = WeightsUpload {
         learner: 5,
-        weights: WeightsHeader::new(4, 312, &planes),
+        weights: WeightsHeader::new(4, 312, &payload),
     };
-    codec::encode(SPEC, &upload, &planes).unwrap()
+    codec::encode(SPEC, &upload, &payload).unwrap()
 }
 
 /// One or more messages of every kind.
@@ -248,7 +248,7 @@ fn samples() -> Vec<Sample> {
         }),
         Sample::of(&Done),
     ]);
-    let with_planes = [
+    let with_payload = [
         (
             "chunk",
             Kind::Chunk,
@@ -258,7 +258,7 @@ fn samples() -> Vec<Sample> {
         ("batch", Kind::BatchReply, sealed(batch()), read_batch),
         ("weights", Kind::WeightsUpload, weights(), read_weights),
     ];
-    samples.extend(with_planes.map(|(name, kind, bytes, read)| Sample {
+    samples.extend(with_payload.map(|(name, kind, bytes, read)| Sample {
         name: name.into(),
         kind,
         bytes,
@@ -268,7 +268,7 @@ fn samples() -> Vec<Sample> {
 }
 
 /// A message with a right checksum and whatever else.
-fn forge(version: u16, kind: u16, lengths: (u32, u64), header: &[u8], planes: &[u8]) -> Vec<u8> {
+fn forge(version: u16, kind: u16, lengths: (u32, u64), header: &[u8], payload: &[u8]) -> Vec<u8> {
     let mut bytes = b"DRML".to_vec();
     bytes.extend(version.to_le_bytes());
     bytes.extend(kind.to_le_bytes());
@@ -276,22 +276,22 @@ fn forge(version: u16, kind: u16, lengths: (u32, u64), header: &[u8], planes: &[
     bytes.extend(lengths.0.to_le_bytes());
     bytes.extend(lengths.1.to_le_bytes());
     let mut hasher = crc32fast::Hasher::new();
-    [&bytes, header, planes]
+    [&bytes, header, payload]
         .iter()
         .for_each(|part| hasher.update(part));
     bytes.extend(hasher.finalize().to_le_bytes());
     bytes.extend_from_slice(header);
-    bytes.extend_from_slice(planes);
+    bytes.extend_from_slice(payload);
     bytes
 }
 
-fn forge_whole(kind: Kind, header: &[u8], planes: &[u8]) -> Vec<u8> {
+fn forge_whole(kind: Kind, header: &[u8], payload: &[u8]) -> Vec<u8> {
     forge(
         PROTOCOL_VERSION,
         kind as u16,
-        (header.len() as u32, planes.len() as u64),
+        (header.len() as u32, payload.len() as u64),
         header,
-        planes,
+        payload,
     )
 }
 
@@ -307,11 +307,11 @@ fn chunk_batch_and_weights_come_back() {
     assert_eq!(back.frames()[5 * 5..], [6; 5]);
 
     let bytes = sealed(batch());
-    let (reply, planes) = codec::decode(&bytes, Some(SPEC)).unwrap();
+    let (reply, payload) = codec::decode(&bytes, Some(SPEC)).unwrap();
     let BatchReply::Batch(header) = reply else {
         panic!("{reply:?}")
     };
-    let back = Batch::from_planes(header, planes.to_vec().into()).unwrap();
+    let back = Batch::from_payload(header, payload.to_vec().into()).unwrap();
     assert_eq!(back, batch());
     assert_eq!(
         back.frames_t(),
@@ -337,16 +337,16 @@ fn chunk_batch_and_weights_come_back() {
     assert_eq!(back.bootstrap_discounts(), [0.0, 0.0, 0.5]);
 
     let bytes = weights();
-    let (upload, planes) = codec::decode::<WeightsUpload>(&bytes, Some(SPEC)).unwrap();
+    let (upload, payload) = codec::decode::<WeightsUpload>(&bytes, Some(SPEC)).unwrap();
     let WeightsUpload { learner, weights } = upload;
     assert_eq!((learner, weights.version, weights.updates), (5, 4, 312));
-    assert_eq!((planes.len(), weights.sha256_hex().len()), (40, 64));
+    assert_eq!((payload.len(), weights.sha256_hex().len()), (40, 64));
 }
 
 /// However a message was cut on its way, what is received is what was sent, and in memory that held something else before.
 #[test]
 fn pieces_are_received_as_the_whole_is() {
-    let pool = PlanesPool::new(1);
+    let pool = BufferPool::new(1);
     let bytes = join(chunk().seal(SPEC).unwrap());
     for at in 0..=bytes.len() {
         let (first, second) = bytes.split_at(at);
@@ -404,7 +404,7 @@ fn parts_are_merged_row_by_row() {
         part(header(1, 4.0, (9, 5)), 2),
     ];
     let whole = Batch::merged_header(&parts).unwrap();
-    let merged = Batch::merge(&parts, Planes::from(vec![0xAB; whole.planes_bytes()]));
+    let merged = Batch::merge(&parts, Buffer::from(vec![0xAB; whole.payload_bytes()]));
     let mut expected = part(whole, 0);
     assert_eq!((whole.mean_age, whole.weights_versions), (2.0, (9, 3)));
     assert_eq!((whole.tally.inserted, whole.held), (20, 10));
@@ -583,12 +583,12 @@ fn huge_lengths_are_refused_without_taking_memory() {
         read((1, u64::MAX)),
         CodecError::TooLarge {
             have: usize::MAX,
-            max: PLANES_BYTES_MAX
+            max: PAYLOAD_BYTES_MAX
         }
     );
-    let need = PREFIX_BYTES + 1 + PLANES_BYTES_MAX;
+    let need = PREFIX_BYTES + 1 + PAYLOAD_BYTES_MAX;
     assert_eq!(
-        read((1, PLANES_BYTES_MAX as u64)),
+        read((1, PAYLOAD_BYTES_MAX as u64)),
         CodecError::Length {
             have: PREFIX_BYTES + 1,
             need
@@ -622,11 +622,11 @@ fn huge_lengths_are_refused_without_taking_memory() {
 }
 
 #[test]
-fn counts_that_do_not_fit_their_planes_are_refused() {
+fn counts_that_do_not_fit_their_payload_are_refused() {
     let header = chunk().header;
-    let planes = &join(chunk().seal(SPEC).unwrap())[..];
-    let planes = &planes[planes.len() - 6 * 11..];
-    let read = |header: ChunkHeader| read_chunk(&codec::encode(SPEC, &header, planes).unwrap());
+    let payload = &join(chunk().seal(SPEC).unwrap())[..];
+    let payload = &payload[payload.len() - 6 * 11..];
+    let read = |header: ChunkHeader| read_chunk(&codec::encode(SPEC, &header, payload).unwrap());
     assert_eq!(read(header), Ok(()));
     let most = u32::MAX;
     for wrong in [
@@ -673,12 +673,12 @@ fn counts_that_do_not_fit_their_planes_are_refused() {
         },
     ] {
         assert!(
-            Batch::from_planes(wrong, Planes::zeroed(3 * 24)).is_err(),
+            Batch::from_payload(wrong, Buffer::zeroed(3 * 24)).is_err(),
             "{wrong:?}"
         );
     }
     assert!(
-        Batch::from_planes(BatchHeader { rows: 0, ..header }, Planes::zeroed(0)).is_err(),
+        Batch::from_payload(BatchHeader { rows: 0, ..header }, Buffer::zeroed(0)).is_err(),
         "no rows at all"
     );
 }
@@ -687,26 +687,26 @@ fn counts_that_do_not_fit_their_planes_are_refused() {
 fn what_no_world_gives_is_refused() {
     let decode = |change: &dyn Fn(&mut Vec<u8>)| {
         let whole = join(chunk().seal(SPEC).unwrap());
-        let mut planes = whole[whole.len() - 6 * 11..].to_vec();
-        change(&mut planes);
-        read_chunk(&codec::encode(SPEC, &chunk().header, &planes).unwrap())
+        let mut payload = whole[whole.len() - 6 * 11..].to_vec();
+        change(&mut payload);
+        read_chunk(&codec::encode(SPEC, &chunk().header, &payload).unwrap())
     };
     assert_eq!(decode(&|_| {}), Ok(()));
     assert!(
-        decode(&|planes| planes[30 + 2] = ACTIONS as u8)
+        decode(&|payload| payload[30 + 2] = ACTIONS as u8)
             .unwrap_err()
             .to_string()
             .contains("action 15")
     );
     assert!(
-        decode(&|planes| planes[36 + 5] = 4)
+        decode(&|payload| payload[36 + 5] = 4)
             .unwrap_err()
             .to_string()
             .contains("end 4")
     );
     for reward in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let refused =
-            decode(&|planes| planes[42 + 4..42 + 8].copy_from_slice(&reward.to_le_bytes()));
+            decode(&|payload| payload[42 + 4..42 + 8].copy_from_slice(&reward.to_le_bytes()));
         assert!(refused.unwrap_err().to_string().contains("row 1"));
     }
     let upload = WeightsUpload {
@@ -823,12 +823,12 @@ proptest! {
 
     /// Bytes with a right prefix and checksum are read or refused, but never a panic.
     #[test]
-    fn random_headers_and_planes_do_no_harm(
+    fn random_headers_and_payloads_do_no_harm(
         header in prop::collection::vec(any::<u8>(), 0..80),
-        planes in prop::collection::vec(any::<u8>(), 0..80),
+        payload in prop::collection::vec(any::<u8>(), 0..80),
     ) {
         for Sample { kind, read, .. } in samples() {
-            let _ = read(&forge_whole(kind, &header, &planes));
+            let _ = read(&forge_whole(kind, &header, &payload));
         }
     }
 

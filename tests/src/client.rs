@@ -158,8 +158,8 @@ impl Client {
 
 /// A chunk's bytes as a part of the run with this hash would send them.
 fn sealed(chunk: &Chunk, spec_hash: u64) -> Vec<u8> {
-    let (mut bytes, planes) = chunk.seal(spec_hash).unwrap();
-    bytes.extend_from_slice(planes);
+    let (mut bytes, payload) = chunk.seal(spec_hash).unwrap();
+    bytes.extend_from_slice(payload);
     bytes
 }
 

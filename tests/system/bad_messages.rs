@@ -69,8 +69,8 @@ impl Served {
     }
 
     fn sealed(&self, chunk: &Chunk, spec_hash: u64) -> Vec<u8> {
-        let (head, planes) = chunk.seal(spec_hash).unwrap();
-        [&head, planes].concat()
+        let (head, payload) = chunk.seal(spec_hash).unwrap();
+        [&head, payload].concat()
     }
 
     /// Sends bytes to the place of chunks and checks that they are refused for the reason, and counted.

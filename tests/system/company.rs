@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use driml_actor::delivery::{Delivery, DeliveryLimits};
 use driml_protocol::{
-    Chunk, ChunkHeader, Keys, PlanesPool, RunClient, Shutdown,
+    BufferPool, Chunk, ChunkHeader, Keys, RunClient, Shutdown,
     session::{self, Endpoints},
 };
 use driml_tests::{Client, Summary, TestSystem};
@@ -79,7 +79,7 @@ impl SyntheticActor {
         client.join_as_actor(actor, 1);
         let keys = Keys::new("driml").unwrap();
         let run = RunClient::new(session.clone(), keys, client.spec.hash());
-        let delivery = Delivery::start(run, 0, limits, PlanesPool::new(8), stop.clone()).unwrap();
+        let delivery = Delivery::start(run, 0, limits, BufferPool::new(8), stop.clone()).unwrap();
         let next = ChunkHeader {
             actor,
             epoch: 1,

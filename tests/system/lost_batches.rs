@@ -11,7 +11,7 @@ use std::{
 
 use driml_learner::batch_source::{BatchSource, Next, Requests};
 use driml_protocol::{
-    ActorJoin, BatchReply, BatchRequest, Chunk, ChunkHeader, Horizon, InsertReply, Keys, Planes,
+    ActorJoin, BatchReply, BatchRequest, Buffer, Chunk, ChunkHeader, Horizon, InsertReply, Keys,
     ReplayStatus, RunClient, RunSpec, Shutdown, TimeoutRule, codec,
     session::{self, Endpoints},
 };
@@ -91,11 +91,11 @@ fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
     if let Some(elsewhere) = request.elsewhere {
         replay.heard(elsewhere).unwrap();
     }
-    let message = match replay.draw_for(request.id, request.rows, Planes::zeroed) {
+    let message = match replay.draw_for(request.id, request.rows, Buffer::zeroed) {
         Ok(_) if drawn.fetch_add(1, Ordering::Relaxed).is_multiple_of(LOSES) => return,
         Ok(draft) => {
-            let (header, planes) = draft.unpack().into_planes();
-            codec::encode(hash, &BatchReply::Batch(header), &planes).unwrap()
+            let (header, payload) = draft.unpack().into_payload();
+            codec::encode(hash, &BatchReply::Batch(header), &payload).unwrap()
         }
         Err(unready) => codec::encode(hash, &BatchReply::from(unready), &[]).unwrap(),
     };

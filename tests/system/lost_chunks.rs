@@ -12,8 +12,8 @@ use std::{
 
 use driml_actor::delivery::{Delivery, DeliveryLimits};
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, Claim, Done, End, Goodbye, Horizon, InsertReply, Keys,
-    PlanesPool, RequestId, RunClient, RunSpec, Shutdown, TimeoutRule, codec,
+    ActorJoin, BufferPool, Chunk, ChunkHeader, Claim, Done, End, Goodbye, Horizon, InsertReply,
+    Keys, RequestId, RunClient, RunSpec, Shutdown, TimeoutRule, codec,
     session::{self, Endpoints},
 };
 use driml_replay_server::{Compression, Config, Replay};
@@ -152,7 +152,7 @@ impl Server {
         let mut numbers = BTreeSet::new();
         let mut request = RequestId::first(1);
         for _ in 0..TRANSITIONS * SAMPLED / u64::from(ROWS) {
-            let draft = replay.draw_for(request, ROWS, driml_protocol::Planes::zeroed);
+            let draft = replay.draw_for(request, ROWS, driml_protocol::Buffer::zeroed);
             let batch = draft.unwrap().unpack();
             numbers.extend(batch.n_step_returns().into_iter().map(|it| it as u64));
             request = request.next();
@@ -205,7 +205,7 @@ fn deliver_all(server: &Arc<Server>, ack_timeout: Duration, leaving: bool) {
                     ack_timeout,
                     unreachable_max: Duration::from_secs(60),
                 };
-                let pool = PlanesPool::new(4);
+                let pool = BufferPool::new(4);
                 let delivery = Delivery::start(
                     RunClient::new(session, keys, spec().hash()),
                     0,

@@ -10,7 +10,7 @@ use std::{
     time::Duration,
 };
 
-use driml_protocol::{Chunk, PlanesPool, RunClient, Shutdown};
+use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown};
 
 use state::Account;
 use worker::Courier;
@@ -38,7 +38,7 @@ impl Delivery {
         client: RunClient,
         inserted_total: u64,
         limits: DeliveryLimits,
-        pool: PlanesPool,
+        pool: BufferPool,
         shutdown: Shutdown,
     ) -> std::io::Result<Self> {
         let account = Arc::new(Account::default());

@@ -10,7 +10,7 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Chunk, ChunkHeader, Claim, Done, Goodbye, InsertReply, PendingReply, PlanesPool, RunClient,
+    BufferPool, Chunk, ChunkHeader, Claim, Done, Goodbye, InsertReply, PendingReply, RunClient,
     Seldom, Shutdown, fault, session::SessionError,
 };
 use zenoh::bytes::ZBytes;
@@ -31,7 +31,7 @@ const GOODBYE_MAX: Duration = Duration::from_secs(5);
 /// A chunk that is not settled yet.
 struct Outgoing {
     header: ChunkHeader,
-    planes: ZBytes,
+    payload: ZBytes,
     in_shared_memory: bool,
     /// Set while a question about it is on its way.
     asked: Option<PendingReply<InsertReply>>,
@@ -64,7 +64,7 @@ enum Fate {
 pub(super) struct Courier {
     client: RunClient,
     limits: DeliveryLimits,
-    pool: PlanesPool,
+    pool: BufferPool,
     shutdown: Shutdown,
     account: Arc<Account>,
     outgoing: VecDeque<Outgoing>,
@@ -83,7 +83,7 @@ impl Courier {
     pub(super) fn new(
         client: RunClient,
         limits: DeliveryLimits,
-        pool: PlanesPool,
+        pool: BufferPool,
         shutdown: Shutdown,
         account: Arc<Account>,
     ) -> Self {
@@ -154,11 +154,11 @@ impl Courier {
                 self.answered = Instant::now();
             }
             let header = chunk.header;
-            let planes = chunk.into_planes();
+            let payload = chunk.into_payload();
             self.outgoing.push_back(Outgoing {
                 header,
-                in_shared_memory: planes.are_shared(),
-                planes: planes.freeze(),
+                in_shared_memory: payload.are_shared(),
+                payload: payload.freeze(),
                 asked: None,
                 is_kept: false,
             });
@@ -297,7 +297,7 @@ impl Courier {
 
     fn copy_out_of_shared_memory(&mut self) {
         for it in self.outgoing.iter_mut().filter(|it| it.in_shared_memory) {
-            it.planes = ZBytes::from(it.planes.to_bytes().into_owned());
+            it.payload = ZBytes::from(it.payload.to_bytes().into_owned());
             it.in_shared_memory = false;
         }
     }
@@ -317,7 +317,7 @@ impl Courier {
                 let claim = self.client.seal(&it.claim())?;
                 self.client.send(claim, timeout)?
             } else {
-                let chunk = self.client.seal_with(&it.header, it.planes.clone())?;
+                let chunk = self.client.seal_with(&it.header, it.payload.clone())?;
                 self.client.send(chunk, timeout)?
             });
         }

@@ -4,7 +4,7 @@
 use std::hint::black_box;
 
 use anyhow::{bail, ensure};
-use driml_protocol::{ActorJoin, InsertReply, PlanesPool};
+use driml_protocol::{ActorJoin, BufferPool, InsertReply};
 use driml_replay_server::Replay;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -31,7 +31,7 @@ pub(super) fn measure(recording: &Recording, effort: &Effort) -> anyhow::Result<
         epoch: EPOCH,
     };
     replay.join_actor(join).map_err(anyhow::Error::msg)?;
-    for chunk in recording.chunks(0, (8, 32), PlanesPool::new(1)) {
+    for chunk in recording.chunks(0, (8, 32), BufferPool::new(1)) {
         match replay.insert(&chunk) {
             InsertReply::Stored { inserted_total, .. } if inserted_total >= CAPACITY => break,
             reply => ensure!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}"),

@@ -11,7 +11,7 @@ use super::{
 use crate::{
     run_spec::RunSpec,
     wire::{
-        buffers::Planes,
+        buffers::Buffer,
         error::CodecError,
         message::{Kind, Message, no_payload},
         shared_memory,
@@ -59,14 +59,14 @@ impl BatchHeader {
 
     /// Bytes of the shared memory in which a replay server keeps [`POOL_BATCHES`] such batches.
     pub fn pool_bytes(&self) -> usize {
-        shared_memory::pool_bytes(POOL_BATCHES, self.planes_bytes())
+        shared_memory::pool_bytes(POOL_BATCHES, self.payload_bytes())
     }
 
-    /// Bytes of the planes of such a batch.
+    /// Bytes of the payload of such a batch.
     ///
     /// # Panics
     /// If they are more than the address space, which no batch of a run is.
-    pub fn planes_bytes(&self) -> usize {
+    pub fn payload_bytes(&self) -> usize {
         self.layout()
             .bytes()
             .expect("a batch is far below the address space")
@@ -80,17 +80,17 @@ impl BatchHeader {
         }
     }
 
-    /// Checks that `planes` are as long as such a batch's.
-    fn check_planes(&self, planes: &[u8]) -> Result<(), CodecError> {
-        if self.layout().bytes() == Some(planes.len()) && self.rows > 0 {
+    /// Checks that `payload` is as long as such a batch's.
+    fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
+        if self.layout().bytes() == Some(payload.len()) && self.rows > 0 {
             return Ok(());
         }
         Err(CodecError::Header(format!(
-            "{} rows with {} positives of {} bytes do not fill {} bytes of planes",
+            "{} rows with {} positives of {} bytes do not fill {} bytes of payload",
             self.rows,
             self.positives,
             self.state_bytes,
-            planes.len()
+            payload.len()
         )))
     }
 }
@@ -98,7 +98,7 @@ impl BatchHeader {
 /// The answer to a request.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum BatchReply {
-    /// The planes that follow are a batch.
+    /// The payload that follows is a batch.
     Batch(BatchHeader),
     /// Nothing yet: ask again.
     Wait(Waiting),
@@ -116,7 +116,7 @@ impl Message for BatchReply {
 
     fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
         match self {
-            Self::Batch(header) => header.check_planes(payload),
+            Self::Batch(header) => header.check_payload(payload),
             Self::Wait(_) | Self::Finished | Self::Refused { .. } => no_payload(payload),
         }
     }
@@ -124,29 +124,29 @@ impl Message for BatchReply {
 
 /// Rows (s_t, a_t, a_{t+1}, R_t, discount, s_{t+k}, s_{t+n}), as the replay server made them.
 ///
-/// Planes, one after the other, B rows each: frames_t, frames_k [P, B, ..], frames_n [B, state bytes]; n-step return f32,
+/// Buffer, one after the other, B rows each: frames_t, frames_k [P, B, ..], frames_n [B, state bytes]; n-step return f32,
 /// bootstrap discount f32 (little-endian); action, next action, positive valid [P, B], k [P, B] (u8).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Batch {
     /// What it says of itself.
     pub header: BatchHeader,
-    planes: Planes,
+    payload: Buffer,
 }
 
 impl Batch {
     /// A batch of zeros, to be filled in place.
     pub fn zeroed(header: BatchHeader) -> Self {
-        let planes = Planes::zeroed(header.planes_bytes());
-        Self { header, planes }
+        let payload = Buffer::zeroed(header.payload_bytes());
+        Self { header, payload }
     }
 
     /// A batch in memory that may hold anything: every row is to be written with [`Batch::rows_mut`].
     ///
     /// # Panics
-    /// If the memory is not of [`BatchHeader::planes_bytes`].
-    pub fn in_memory(header: BatchHeader, planes: Planes) -> Self {
-        assert_eq!(planes.len(), header.planes_bytes(), "memory for a batch");
-        Self { header, planes }
+    /// If the memory is not of [`BatchHeader::payload_bytes`].
+    pub fn in_memory(header: BatchHeader, payload: Buffer) -> Self {
+        assert_eq!(payload.len(), header.payload_bytes(), "memory for a batch");
+        Self { header, payload }
     }
 
     /// The rows of all `parts`, one part after the other, in memory that may hold anything; as many bytes as
@@ -154,7 +154,7 @@ impl Batch {
     ///
     /// # Panics
     /// If there is no such header, or the memory is of another size.
-    pub fn merge(parts: &[Self], memory: Planes) -> Self {
+    pub fn merge(parts: &[Self], memory: Buffer) -> Self {
         let header = Self::merged_header(parts).expect("parts of one batch");
         let mut merged = Self::in_memory(header, memory);
         let whole = header.layout();
@@ -163,7 +163,7 @@ impl Batch {
             let rows = part.rows();
             for column in Column::ALL {
                 let row_bytes = whole.value_bytes(column);
-                let to = &mut merged.planes[whole.range(column)];
+                let to = &mut merged.payload[whole.range(column)];
                 let from = part.column(column);
                 // Of each positive, the rows of the part come together.
                 for positive in 0..whole.values_a_row(column) {
@@ -217,7 +217,7 @@ impl Batch {
     }
 
     fn column(&self, column: Column) -> &[u8] {
-        &self.planes[self.header.layout().range(column)]
+        &self.payload[self.header.layout().range(column)]
     }
 
     fn column_f32(&self, column: Column) -> Vec<f32> {
@@ -273,7 +273,7 @@ impl Batch {
     /// Everything of one row, to be written in place.
     pub fn rows_mut(&mut self) -> BatchRowsMut<'_> {
         let layout = self.header.layout();
-        let mut rest = &mut self.planes[..];
+        let mut rest = &mut self.payload[..];
         // They lie in the order of their names here.
         let mut take = |column| -> &mut [u8] {
             let bytes = layout.column_bytes(column);
@@ -295,22 +295,22 @@ impl Batch {
         }
     }
 
-    /// Header and planes, to travel as a [`BatchReply::Batch`].
-    pub fn into_planes(self) -> (BatchHeader, Planes) {
-        (self.header, self.planes)
+    /// Header and payload, to travel as a [`BatchReply::Batch`].
+    pub fn into_payload(self) -> (BatchHeader, Buffer) {
+        (self.header, self.payload)
     }
 
-    /// Takes the planes of a decoded reply, checking that they are as long as its header says.
+    /// Takes the payload of a decoded reply, checking that it is as long as its header says.
     ///
     /// # Errors
-    /// Planes of another length.
-    pub fn from_planes(header: BatchHeader, planes: Planes) -> Result<Self, CodecError> {
-        header.check_planes(&planes)?;
-        Ok(Self { header, planes })
+    /// Buffer of another length.
+    pub fn from_payload(header: BatchHeader, payload: Buffer) -> Result<Self, CodecError> {
+        header.check_payload(&payload)?;
+        Ok(Self { header, payload })
     }
 }
 
-/// The planes of a batch, borrowed for writing, row by row.
+/// The columns of a batch, borrowed for writing, row by row.
 #[derive(Debug)]
 pub struct BatchRowsMut<'a> {
     rows: usize,

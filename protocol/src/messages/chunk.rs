@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::insert_reply::InsertReply;
 use crate::wire::{
-    buffers::{Planes, PlanesPool},
+    buffers::{Buffer, BufferPool},
     codec,
     error::CodecError,
     message::{Keyed, Kind, Message, Request},
@@ -76,11 +76,11 @@ impl Message for ChunkHeader {
     const KIND: Kind = Kind::Chunk;
 
     fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
-        if self.planes_bytes() == Some(payload.len()) && self.transitions() > 0 {
+        if self.payload_bytes() == Some(payload.len()) && self.transitions() > 0 {
             return Ok(());
         }
         Err(CodecError::Header(format!(
-            "{} streams of {} steps of {} bytes do not fill {} bytes of planes",
+            "{} streams of {} steps of {} bytes do not fill {} bytes of payload",
             self.streams,
             self.steps,
             self.frame_bytes,
@@ -103,8 +103,8 @@ impl ChunkHeader {
         self.streams as usize * self.steps as usize
     }
 
-    /// Bytes of the planes of such a chunk; none if they are more than the address space.
-    pub fn planes_bytes(&self) -> Option<usize> {
+    /// Bytes of the payload of such a chunk; none if they are more than the address space.
+    pub fn payload_bytes(&self) -> Option<usize> {
         self.transitions()
             .checked_mul(self.frame_bytes as usize + TRANSITION_BYTES)
     }
@@ -140,37 +140,37 @@ impl ChunkLayout {
 
 /// Consecutive steps of several streams: row `stream * steps + step` is (s_t, a_t, r_t, what a_t ended).
 ///
-/// Planes, one after the other: frames [rows, frame bytes], actions [rows], ends [rows], rewards [rows] f32 little-endian.
+/// Buffer, one after the other: frames [rows, frame bytes], actions [rows], ends [rows], rewards [rows] f32 little-endian.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Chunk {
     /// What it says of itself.
     pub header: ChunkHeader,
-    planes: Planes,
+    payload: Buffer,
 }
 
 impl Chunk {
     /// A chunk of zeros, to be filled in place.
     pub fn zeroed(header: ChunkHeader) -> Self {
         let bytes = header
-            .planes_bytes()
+            .payload_bytes()
             .expect("an actor's chunk is far below the address space");
         Self {
             header,
-            planes: Planes::zeroed(bytes),
+            payload: Buffer::zeroed(bytes),
         }
     }
 
     /// A chunk in memory that may hold anything: every row is to be written.
     ///
     /// # Panics
-    /// If the memory is not of [`ChunkHeader::planes_bytes`].
-    pub fn in_memory(header: ChunkHeader, planes: Planes) -> Self {
+    /// If the memory is not of [`ChunkHeader::payload_bytes`].
+    pub fn in_memory(header: ChunkHeader, payload: Buffer) -> Self {
         assert_eq!(
-            Some(planes.len()),
-            header.planes_bytes(),
+            Some(payload.len()),
+            header.payload_bytes(),
             "memory for a chunk"
         );
-        Self { header, planes }
+        Self { header, payload }
     }
 
     fn layout(&self) -> ChunkLayout {
@@ -182,17 +182,17 @@ impl Chunk {
 
     /// Frames [rows, frame bytes].
     pub fn frames(&self) -> &[u8] {
-        &self.planes[self.layout().frames()]
+        &self.payload[self.layout().frames()]
     }
 
     /// Actions [rows].
     pub fn actions(&self) -> &[u8] {
-        &self.planes[self.layout().actions()]
+        &self.payload[self.layout().actions()]
     }
 
     /// Ends [rows], as bytes of [`End`].
     pub fn ends(&self) -> &[u8] {
-        &self.planes[self.layout().ends()]
+        &self.payload[self.layout().ends()]
     }
 
     /// The end of one row; every byte was checked when the chunk was made or decoded.
@@ -202,40 +202,40 @@ impl Chunk {
 
     /// The reward of one row.
     pub fn reward(&self, row: usize) -> f32 {
-        let (rewards, _) = self.planes[self.layout().rewards()].as_chunks();
+        let (rewards, _) = self.payload[self.layout().rewards()].as_chunks();
         f32::from_le_bytes(rewards[row])
     }
 
     /// Where row's frame is written.
     pub fn frame_mut(&mut self, row: usize) -> &mut [u8] {
         let bytes = self.header.frame_bytes as usize;
-        &mut self.planes[row * bytes..(row + 1) * bytes]
+        &mut self.payload[row * bytes..(row + 1) * bytes]
     }
 
     /// Writes everything of one row but its frame.
     pub fn set(&mut self, row: usize, action: u8, reward: f32, end: End) {
         let layout = self.layout();
         assert!(row < layout.rows, "row {row} of a chunk of {}", layout.rows);
-        self.planes[layout.actions()][row] = action;
-        self.planes[layout.ends()][row] = end as u8;
-        let (rewards, _) = self.planes[layout.rewards()].as_chunks_mut();
+        self.payload[layout.actions()][row] = action;
+        self.payload[layout.ends()][row] = end as u8;
+        let (rewards, _) = self.payload[layout.rewards()].as_chunks_mut();
         rewards[row] = reward.to_le_bytes();
     }
 
-    /// The chunk as it travels: prefix and header, then the planes, uncopied.
+    /// The chunk as it travels: prefix and header, then the payload, uncopied.
     ///
     /// # Errors
     /// A chunk over the codec's limits.
     pub fn seal(&self, spec_hash: u64) -> Result<(Vec<u8>, &[u8]), CodecError> {
         Ok((
-            codec::seal(spec_hash, &self.header, &self.planes)?,
-            &self.planes,
+            codec::seal(spec_hash, &self.header, &self.payload)?,
+            &self.payload,
         ))
     }
 
-    /// The planes, to travel after a head from [`Chunk::seal`].
-    pub fn into_planes(self) -> Planes {
-        self.planes
+    /// The payload, to travel after a head from [`Chunk::seal`].
+    pub fn into_payload(self) -> Buffer {
+        self.payload
     }
 
     /// Reads a chunk in one piece and checks lengths, actions, ends and rewards.
@@ -243,8 +243,8 @@ impl Chunk {
     /// # Errors
     /// Whatever makes it unfit to be stored; the message says what.
     pub fn decode(bytes: &[u8], spec_hash: u64, num_actions: u32) -> Result<Self, CodecError> {
-        let (header, planes) = codec::decode(bytes, Some(spec_hash))?;
-        Self::from_planes(header, planes.to_vec().into(), num_actions)
+        let (header, payload) = codec::decode(bytes, Some(spec_hash))?;
+        Self::from_payload(header, payload.to_vec().into(), num_actions)
     }
 
     /// [`Chunk::decode`] of a message in `pieces`, `len` bytes in all; the chunk lies in own memory of `pool`.
@@ -254,25 +254,25 @@ impl Chunk {
     pub fn receive<'a>(
         pieces: impl IntoIterator<Item = &'a [u8]>,
         len: usize,
-        pool: &PlanesPool,
+        pool: &BufferPool,
         spec_hash: u64,
         num_actions: u32,
     ) -> Result<Self, CodecError> {
-        let (header, planes) = codec::receive(pieces, len, pool, Some(spec_hash))?;
-        Self::from_planes(header, planes, num_actions)
+        let (header, payload) = codec::receive(pieces, len, pool, Some(spec_hash))?;
+        Self::from_payload(header, payload, num_actions)
     }
 
-    /// The chunk of a header and planes that were received; checks all that [`Chunk::decode`] does.
+    /// The chunk of a header and payload that were received; checks all that [`Chunk::decode`] does.
     ///
     /// # Errors
     /// As [`Chunk::decode`].
-    pub fn from_planes(
+    pub fn from_payload(
         header: ChunkHeader,
-        planes: Planes,
+        payload: Buffer,
         num_actions: u32,
     ) -> Result<Self, CodecError> {
-        header.validate(&planes)?;
-        let chunk = Self { header, planes };
+        header.validate(&payload)?;
+        let chunk = Self { header, payload };
         if let Some(action) = chunk
             .actions()
             .iter()

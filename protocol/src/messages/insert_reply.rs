@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::wire::message::{Keyed, Kind, Message, Request};
 
-/// Asks what became of a chunk that the replay server keeps until its limiter opens: the chunk's header without its planes.
+/// Asks what became of a chunk that the replay server keeps until its limiter opens: the chunk's header without its payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Claim {
     /// Which actor.

@@ -1,5 +1,5 @@
 //! Weights on their way: whole from the learner to the replay server, once a version; in pieces from there to the actors.
-//! It does not read them: the planes are a safetensors file, which `driml-model` knows.
+//! It does not read them: the payload is a safetensors file, which `driml-model` knows.
 //!
 //! Pieces, because a message has to be through within seconds (see `session`): a slow link gets the weights later, not never.
 
@@ -9,7 +9,7 @@ use zenoh::qos::Priority;
 
 use super::done::Done;
 use crate::wire::{
-    codec::PLANES_BYTES_MAX,
+    codec::PAYLOAD_BYTES_MAX,
     error::CodecError,
     message::{Keyed, Kind, Message, Request, no_payload},
 };
@@ -44,7 +44,7 @@ pub struct WeightsHeader {
     pub sha256: [u8; 32],
 }
 
-/// New weights on their way to the replay server; the planes are a safetensors file.
+/// New weights on their way to the replay server; the payload is a safetensors file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WeightsUpload {
     /// Which learner sends them: that of its [`LearnerJoin`](crate::LearnerJoin).
@@ -104,7 +104,7 @@ pub enum WeightsReply {
     NoneNewer,
     /// These weights are no longer kept, or have no such piece: ask for the newest.
     Gone,
-    /// The planes that follow are a piece of these weights.
+    /// The payload that follows is a piece of these weights.
     Piece {
         /// What the whole says of itself.
         weights: WeightsHeader,
@@ -171,7 +171,7 @@ impl Assembly {
     /// # Errors
     /// More bytes than any weights have.
     pub fn new(weights: WeightsHeader, bytes: u64) -> Result<Self, CodecError> {
-        let max = PLANES_BYTES_MAX;
+        let max = PAYLOAD_BYTES_MAX;
         let bytes = usize::try_from(bytes).unwrap_or(usize::MAX);
         if bytes > max {
             return Err(CodecError::TooLarge { have: bytes, max });

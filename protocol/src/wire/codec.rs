@@ -1,4 +1,4 @@
-//! The bytes of a message: a fixed prefix, a bincode header, then raw planes that serde never touches.
+//! The bytes of a message: a fixed prefix, a bincode header, then a raw payload that serde never touches.
 //! It does not know what a message means, and it is the only file that calls bincode.
 //!
 //! The prefix's fields are in `prefix`.
@@ -6,7 +6,7 @@
 use serde::{Serialize, de::DeserializeOwned};
 
 use super::{
-    buffers::{Planes, PlanesPool},
+    buffers::{Buffer, BufferPool},
     error::CodecError,
     message::{Kind, Message},
     prefix::Prefix,
@@ -19,8 +19,8 @@ pub const PROTOCOL_VERSION: u16 = 3;
 pub const PREFIX_BYTES: usize = Prefix::BYTES;
 /// Longest header, bytes; a longer one is refused by both sides.
 pub const HEADER_BYTES_MAX: usize = 1 << 20;
-/// Longest planes, bytes; longer ones are refused by both sides.
-pub const PLANES_BYTES_MAX: usize = 1 << 29;
+/// Longest payload, bytes; a longer one is refused by both sides.
+pub const PAYLOAD_BYTES_MAX: usize = 1 << 29;
 
 /// Bytes that are copied, then summed while they are in the nearest cache.
 const BLOCK_BYTES: usize = 1 << 14;
@@ -43,15 +43,19 @@ pub(crate) fn canonical_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecE
     encode_header(value)
 }
 
-/// Prefix and header of a message; the wire carries these bytes followed by `planes`, which are not copied.
+/// Prefix and header of a message; the wire carries these bytes followed by `payload`, which is not copied.
 ///
 /// # Errors
-/// A header or planes over their limits.
-pub fn seal<M: Message>(spec_hash: u64, message: &M, planes: &[u8]) -> Result<Vec<u8>, CodecError> {
-    if planes.len() > PLANES_BYTES_MAX {
+/// A header or payload over their limits.
+pub fn seal<M: Message>(
+    spec_hash: u64,
+    message: &M,
+    payload: &[u8],
+) -> Result<Vec<u8>, CodecError> {
+    if payload.len() > PAYLOAD_BYTES_MAX {
         return Err(CodecError::TooLarge {
-            have: planes.len(),
-            max: PLANES_BYTES_MAX,
+            have: payload.len(),
+            max: PAYLOAD_BYTES_MAX,
         });
     }
     let header = encode_header(message)?;
@@ -61,12 +65,12 @@ pub fn seal<M: Message>(spec_hash: u64, message: &M, planes: &[u8]) -> Result<Ve
         kind: M::KIND as u16,
         spec_hash,
         header_bytes: header.len() as u32,
-        payload_bytes: planes.len() as u64,
+        payload_bytes: payload.len() as u64,
         checksum: 0,
     };
     let mut sum = prefix.checksum_begun();
     sum.update(&header);
-    sum.update(planes);
+    sum.update(payload);
     prefix.checksum = sum.finalize();
     Ok([&prefix.to_bytes()[..], &header].concat())
 }
@@ -78,14 +82,14 @@ pub fn seal<M: Message>(spec_hash: u64, message: &M, planes: &[u8]) -> Result<Ve
 pub fn encode<M: Message>(
     spec_hash: u64,
     message: &M,
-    planes: &[u8],
+    payload: &[u8],
 ) -> Result<Vec<u8>, CodecError> {
-    let mut out = seal(spec_hash, message, planes)?;
-    out.extend_from_slice(planes);
+    let mut out = seal(spec_hash, message, payload)?;
+    out.extend_from_slice(payload);
     Ok(out)
 }
 
-/// Checks a message in one piece and gives it and its planes.
+/// Checks a message in one piece and gives it and its payload.
 ///
 /// `spec_hash` is the hash that this part runs, or `None` where any run is welcome (a part that joins to learn it).
 ///
@@ -93,17 +97,17 @@ pub fn encode<M: Message>(
 /// Anything that is not a whole, undamaged message of this kind, version and run.
 pub fn decode<M: Message>(bytes: &[u8], spec_hash: Option<u64>) -> Result<(M, &[u8]), CodecError> {
     let prefix = Prefix::read(bytes.first_chunk(), bytes.len())?;
-    let (header, planes) = bytes[PREFIX_BYTES..].split_at(prefix.header_len());
+    let (header, payload) = bytes[PREFIX_BYTES..].split_at(prefix.header_len());
     let mut sum = prefix.checksum_begun();
     sum.update(header);
-    sum.update(planes);
+    sum.update(payload);
     prefix.check(sum, M::KIND, spec_hash)?;
     let message: M = decode_header(header)?;
-    message.validate(planes)?;
-    Ok((message, planes))
+    message.validate(payload)?;
+    Ok((message, payload))
 }
 
-/// Checks a message that came in `pieces`, `len` bytes in all, and copies its planes into own memory of `pool`.
+/// Checks a message that came in `pieces`, `len` bytes in all, and copies its payload into own memory of `pool`.
 ///
 /// The checksum is the copy's, so what was checked cannot change afterwards, even if it came through shared memory.
 ///
@@ -112,9 +116,9 @@ pub fn decode<M: Message>(bytes: &[u8], spec_hash: Option<u64>) -> Result<(M, &[
 pub fn receive<'a, M: Message>(
     pieces: impl IntoIterator<Item = &'a [u8]>,
     len: usize,
-    pool: &PlanesPool,
+    pool: &BufferPool,
     spec_hash: Option<u64>,
-) -> Result<(M, Planes), CodecError> {
+) -> Result<(M, Buffer), CodecError> {
     let mut pieces = Pieces {
         current: &[],
         rest: pieces.into_iter(),
@@ -125,12 +129,12 @@ pub fn receive<'a, M: Message>(
     let mut sum = prefix.checksum_begun();
     let mut header = vec![0; prefix.header_len()];
     pieces.copy_to(&mut header, Some(&mut sum));
-    let mut planes = pool.take_own(prefix.planes_len());
-    pieces.copy_to(&mut planes, Some(&mut sum));
+    let mut payload = pool.take_own(prefix.payload_len());
+    pieces.copy_to(&mut payload, Some(&mut sum));
     prefix.check(sum, M::KIND, spec_hash)?;
     let message: M = decode_header(&header)?;
-    message.validate(&planes)?;
-    Ok((message, planes))
+    message.validate(&payload)?;
+    Ok((message, payload))
 }
 
 /// Bytes that lie in several places.
@@ -183,13 +187,13 @@ impl Prefix {
         }
         for (have, max) in [
             (this.header_len(), HEADER_BYTES_MAX),
-            (this.planes_len(), PLANES_BYTES_MAX),
+            (this.payload_len(), PAYLOAD_BYTES_MAX),
         ] {
             if have > max {
                 return Err(CodecError::TooLarge { have, max });
             }
         }
-        let need = PREFIX_BYTES + this.header_len() + this.planes_len();
+        let need = PREFIX_BYTES + this.header_len() + this.payload_len();
         if len != need {
             return Err(CodecError::Length { have: len, need });
         }
@@ -200,7 +204,7 @@ impl Prefix {
         self.header_bytes as usize
     }
 
-    fn planes_len(&self) -> usize {
+    fn payload_len(&self) -> usize {
         usize::try_from(self.payload_bytes).unwrap_or(usize::MAX)
     }
 

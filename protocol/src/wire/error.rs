@@ -50,7 +50,7 @@ pub enum CodecError {
     /// Damaged bytes.
     #[error("the message's checksum is wrong: it was damaged on the way")]
     Checksum,
-    /// A header that does not decode, or is inconsistent with its planes.
+    /// A header that does not decode, or is inconsistent with its payload.
     #[error("the message's header makes no sense: {0}")]
     Header(String),
     /// Larger than a message may be.

@@ -2,7 +2,7 @@
 //! The rules of the return, of the anchors and of k are those of `sampling`.
 
 use driml_protocol::{
-    AffinityUpdate, Batch, BatchHeader, CodecError, Planes, RequestId, Tally, Waiting,
+    AffinityUpdate, Batch, BatchHeader, Buffer, CodecError, RequestId, Tally, Waiting,
 };
 
 use super::{Replay, Unready};
@@ -47,7 +47,7 @@ impl Replay {
     /// # Errors
     /// The limiter or the lack of any valid anchor asks to wait; the run is over; `rows` can never be served.
     pub fn draw(&mut self, rows: u32) -> Result<Draft, Unready> {
-        self.draw_in(rows, Planes::zeroed)
+        self.draw_in(rows, Buffer::zeroed)
     }
 
     /// [`Replay::draw`] into memory that `memory` gives, so many bytes, all of which are written by the time it is unpacked.
@@ -57,7 +57,7 @@ impl Replay {
     pub fn draw_in(
         &mut self,
         rows: u32,
-        memory: impl FnOnce(usize) -> Planes,
+        memory: impl FnOnce(usize) -> Buffer,
     ) -> Result<Draft, Unready> {
         let rows_max = config::rows_max(&self.spec).min(self.limiter.rows_max());
         if rows == 0 || rows > rows_max {
@@ -74,7 +74,7 @@ impl Replay {
             return Err(Unready::Wait(self.limiter.waiting(rows)));
         }
         let mut header = self.batch_header(rows);
-        let mut batch = Batch::in_memory(header, memory(header.planes_bytes()));
+        let mut batch = Batch::in_memory(header, memory(header.payload_bytes()));
         let pixel_bytes = self.spec.frame_channels as usize;
         let mut packed = PackedStates::new(self.spec.frame_bytes(), pixel_bytes);
         let mut ks = Vec::with_capacity(rows as usize);
@@ -119,7 +119,7 @@ impl Replay {
         &mut self,
         id: RequestId,
         rows: u32,
-        memory: impl FnOnce(usize) -> Planes,
+        memory: impl FnOnce(usize) -> Buffer,
     ) -> Result<Draft, Unready> {
         match self.requests.enter(id) {
             Standing::Overtaken => return Err(Unready::Wait(self.limiter.waiting(rows))),

@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use driml_protocol::{BatchReply, BatchRequest, Incoming, Planes, Responder, fault};
+use driml_protocol::{BatchReply, BatchRequest, Buffer, Incoming, Responder, fault};
 
 use super::{
     parked::ParkedRequest,
@@ -95,8 +95,8 @@ impl Service {
 fn give_batch(responder: Responder<BatchReply>, drawn: Result<Draft, Unready>) {
     match drawn {
         Ok(draft) => {
-            let (header, planes) = draft.unpack().into_planes();
-            responder.reply_with(&BatchReply::Batch(header), planes.freeze());
+            let (header, payload) = draft.unpack().into_payload();
+            responder.reply_with(&BatchReply::Batch(header), payload.freeze());
         }
         Err(unready) => responder.reply(&unready.into()),
     }
@@ -107,7 +107,7 @@ impl State {
     fn next_answer(
         &mut self,
         now: Instant,
-        memory: impl Fn(usize, bool) -> Planes,
+        memory: impl Fn(usize, bool) -> Buffer,
     ) -> Option<(Parked, Result<Draft, Unready>)> {
         let (mut waiting, mut found) = (Vec::new(), None);
         while let Some(parked) = self.requests.pop() {

@@ -25,7 +25,7 @@ impl Service {
         let arrived = Instant::now();
         let chunk = incoming
             .receive(&self.pool)
-            .and_then(|(header, planes)| Chunk::from_planes(header, planes, self.num_actions));
+            .and_then(|(header, payload)| Chunk::from_payload(header, payload, self.num_actions));
         let responder = incoming.into_responder();
         let chunk = match chunk {
             Ok(chunk) => chunk,

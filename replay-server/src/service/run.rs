@@ -9,7 +9,7 @@ use std::{
 
 use anyhow::Context;
 use driml_protocol::{
-    BatchHeader, Incoming, Keyed, Keys, POOL_BATCHES, PlanesPool, QueryWorkers, Request, Responder,
+    BatchHeader, BufferPool, Incoming, Keyed, Keys, POOL_BATCHES, QueryWorkers, Request, Responder,
     RunClient, RunSpec, Shutdown, TRANSITION_BYTES,
     config::{Settings, TransportConfig},
     join_within,
@@ -75,9 +75,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let transport: TransportConfig = settings.table("transport")?;
     let batch = BatchHeader::of(&spec, batch_rows);
     let pool = if transport.shared_memory {
-        PlanesPool::shared(SPARE_MAX, POOL_BATCHES, batch.planes_bytes())
+        BufferPool::shared(SPARE_MAX, POOL_BATCHES, batch.payload_bytes())
     } else {
-        PlanesPool::new(SPARE_MAX)
+        BufferPool::new(SPARE_MAX)
     };
     let reads_shared_memory = transport.shared_memory
         && match shared_memory::check_lockable(

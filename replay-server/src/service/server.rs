@@ -7,7 +7,7 @@ use std::{
 };
 
 use driml_protocol::{
-    Announcer, BatchReply, CodecError, Incoming, InsertReply, PlanesPool, Request, Responder,
+    Announcer, BatchReply, BufferPool, CodecError, Incoming, InsertReply, Request, Responder,
     Shutdown, WeightsVersion,
 };
 
@@ -31,7 +31,7 @@ pub(super) struct Service {
     /// can tell a server that makes it wait from one that is silent.
     pub(super) hold_max: Duration,
     /// Memory for chunks that arrive and batches that leave.
-    pub(super) pool: PlanesPool,
+    pub(super) pool: BufferPool,
     pub(super) packer: Packer,
     pub(super) state: Mutex<State>,
     /// Something was stored, sampled or parked: whoever waits for the limiter looks again.

@@ -7,7 +7,7 @@ use std::{
 };
 
 use driml_protocol::{
-    Done, Incoming, PIECE_BYTES, PlanesPool, WeightsReply, WeightsRequest, WeightsUpload,
+    BufferPool, Done, Incoming, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload,
     WeightsVersion,
 };
 use zenoh::bytes::ZBytes;
@@ -21,7 +21,7 @@ impl Service {
 
     pub(super) fn take_weights(&self, incoming: Incoming<WeightsUpload>) {
         // Weights are kept for long, so their memory is not the pool's.
-        let (upload, safetensors) = match incoming.receive(&PlanesPool::new(0)) {
+        let (upload, safetensors) = match incoming.receive(&BufferPool::new(0)) {
             Ok(read) => read,
             Err(e) => return self.refuse("an upload of weights", &e),
         };

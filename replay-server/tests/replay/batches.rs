@@ -53,7 +53,7 @@ fn check_batch(batch: &Batch, history: &History) {
         assert_eq!(state(batch.frames_n(), row), frame_n, "{context}");
         assert_eq!(batch.positives(), spec.horizon.positives());
         for p in 0..batch.positives() {
-            // Planes of positives are [P, B].
+            // Buffer of positives are [P, B].
             let at = p * rows + row;
             let k = usize::from(batch.ks()[at]);
             let right = match (spec.horizon, want.steps_left) {

@@ -3,8 +3,8 @@
 //! It does not look at rows.
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon, InsertReply,
-    Planes, RequestId, RunSpec, Waiting,
+    ActorJoin, AffinityUpdate, Buffer, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon,
+    InsertReply, RequestId, RunSpec, Waiting,
 };
 use driml_replay_server::{ACTORS_MAX, Replay, STREAMS_MAX, Unready};
 use proptest::prelude::*;
@@ -143,7 +143,7 @@ proptest! {
             let at = rng.random_range(0..in_flight.len());
             let id = in_flight.remove(at);
             in_flight.truncate(20);
-            let draft = replay.draw_for(id, 8, Planes::zeroed);
+            let draft = replay.draw_for(id, 8, Buffer::zeroed);
             replay.check_valid();
             let is_awaited = asked[id.asker as usize] == id;
             match draft {
