@@ -247,9 +247,9 @@ impl Fetcher {
         }
         let mut asked = Vec::new();
         for shard in (0..pending.len()).filter(|&shard| pending[shard] > 0) {
-            let elsewhere = shards::elsewhere(counts, pending, shard);
+            let other_shards = shards::other_shards(counts, pending, shard);
             ids[shard] = ids[shard].again();
-            let part = self.ask(shard, ids[shard], pending[shard], Some(elsewhere))?;
+            let part = self.ask(shard, ids[shard], pending[shard], Some(other_shards))?;
             asked.push((shard, part));
         }
         let (mut finished, mut failed) = (false, None);
@@ -312,14 +312,14 @@ impl Fetcher {
         shard: usize,
         id: RequestId,
         rows: u32,
-        elsewhere: Option<Tally>,
+        other_shards: Option<Tally>,
     ) -> anyhow::Result<(PendingReply<BatchReply>, bool)> {
         let request = BatchRequest {
             learner: self.requests.learner,
             id,
             rows,
             shared_memory: self.requests.shared_memory && self.trust.ask(),
-            elsewhere,
+            other_shards,
         };
         let client = &self.clients[shard];
         let asked = client.send(client.seal(&request)?, REQUEST_TIMEOUT)?;

@@ -203,7 +203,7 @@ pub(crate) fn split(rows: u32, counts: &[Count], rng: &mut impl Rng) -> Option<V
 }
 
 /// What all shards but `this` have counted once they have given `pending` rows more, so many each.
-pub(crate) fn elsewhere(counts: &[Count], pending: &[u32], this: usize) -> Tally {
+pub(crate) fn other_shards(counts: &[Count], pending: &[u32], this: usize) -> Tally {
     let others = counts.iter().zip(pending).enumerate();
     others.filter(|(at, _)| *at != this).fold(
         Tally::default(),
@@ -276,7 +276,7 @@ mod tests {
     #[test]
     fn a_shard_is_told_of_all_others_and_of_the_rest_of_its_batch() {
         let counts = [count(1, 10, 100), count(2, 20, 200), count(3, 30, 300)];
-        let told = |this| elsewhere(&counts, &[5, 6, 7], this);
+        let told = |this| other_shards(&counts, &[5, 6, 7], this);
         assert_eq!(
             told(1),
             Tally {

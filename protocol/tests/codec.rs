@@ -214,7 +214,7 @@ fn samples() -> Vec<Sample> {
             id: RequestId::first(u64::MAX).again(),
             rows: 256,
             shared_memory: true,
-            elsewhere: Some(Tally::default()),
+            other_shards: Some(Tally::default()),
         }),
         Sample::of(&affinity),
         Sample::of(&WeightsVersion { version: 9 }),

@@ -225,7 +225,7 @@ fn everything_else_that_a_replay_server_takes() {
                 id: RequestId::first(7),
                 rows: 16,
                 shared_memory: false,
-                elsewhere: None,
+                other_shards: None,
             },
             &[],
         )
@@ -247,7 +247,7 @@ fn everything_else_that_a_replay_server_takes() {
                 id: RequestId::first(7),
                 rows,
                 shared_memory: false,
-                elsewhere: None,
+                other_shards: None,
             },
             &[],
         )

@@ -88,8 +88,8 @@ fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
     let payload = query.payload().unwrap().to_bytes();
     let (request, _): (BatchRequest, _) = codec::decode(&payload, Some(hash)).unwrap();
     let mut replay = replay.lock().unwrap();
-    if let Some(elsewhere) = request.elsewhere {
-        replay.heard(elsewhere).unwrap();
+    if let Some(other_shards) = request.other_shards {
+        replay.set_other_shards(other_shards).unwrap();
     }
     let message = match replay.draw_for(request.id, request.rows, Buffer::zeroed) {
         Ok(_) if drawn.fetch_add(1, Ordering::Relaxed).is_multiple_of(LOSES) => return,

@@ -18,7 +18,7 @@ pub struct BatchRequest {
     /// Whether the batch may come through shared memory.
     pub shared_memory: bool,
     /// Where the replay has several shards: what all the others have counted together, and these rows are part of a batch.
-    pub elsewhere: Option<Tally>,
+    pub other_shards: Option<Tally>,
 }
 
 impl Message for BatchRequest {
@@ -37,18 +37,18 @@ impl Request for BatchRequest {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RequestId {
     /// Who asks: a random number, which tells it from all others. It waits for one request at a time.
-    pub asker: u64,
-    /// How many requests of this asker were answered before.
+    pub client_id: u64,
+    /// How many requests of this client were answered before.
     pub number: u64,
     /// Which attempt at this one it is: a later one has a higher number.
     pub attempt: u64,
 }
 
 impl RequestId {
-    /// The first request of an asker.
-    pub const fn first(asker: u64) -> Self {
+    /// The first request of an client.
+    pub const fn first(client_id: u64) -> Self {
         Self {
-            asker,
+            client_id,
             number: 0,
             attempt: 0,
         }

@@ -8,7 +8,7 @@ use driml_protocol::{
 use super::{Replay, Unready};
 use crate::{
     config,
-    ledger::requests::{Requests, Standing},
+    ledger::requests::{Dedup, Requests},
     sampling::packed_batch::{Draft, PackedStates},
 };
 
@@ -26,7 +26,7 @@ impl Replay {
                  --after-updates, as the run goes on"
             ));
         };
-        self.limiter.taken_back(unlearned);
+        self.limiter.refund(unlearned);
         self.statistics.rows_unlearned += unlearned;
         self.requests = Requests::default();
         self.affinity.expect_another_source();
@@ -121,18 +121,18 @@ impl Replay {
         rows: u32,
         memory: impl FnOnce(usize) -> Buffer,
     ) -> Result<Draft, Unready> {
-        match self.requests.enter(id) {
-            Standing::Overtaken => return Err(Unready::Wait(self.limiter.waiting(rows))),
-            Standing::Open(lost) => {
+        match self.requests.begin(id) {
+            Dedup::Superseded => return Err(Unready::Wait(self.limiter.waiting(rows))),
+            Dedup::Fresh(lost) => {
                 if !lost.is_empty() {
                     tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
-                    self.limiter.taken_back(lost.len() as u64);
-                    self.statistics.taken_back(&lost);
+                    self.limiter.refund(lost.len() as u64);
+                    self.statistics.refund(&lost);
                 }
             }
         }
         let draft = self.draw_in(rows, memory)?;
-        self.requests.give(id.asker, draft.ks.clone());
+        self.requests.complete(id.client_id, draft.ks.clone());
         Ok(draft)
     }
 
@@ -171,19 +171,19 @@ impl Replay {
     ///
     /// # Errors
     /// More transitions than the run can ever have; the reason, for a person.
-    pub fn heard(&mut self, elsewhere: Tally) -> Result<(), String> {
+    pub fn set_other_shards(&mut self, other_shards: Tally) -> Result<(), String> {
         let config = &self.config;
         // Each shard takes what its limiter allows until it hears of the others, at most what it holds.
         let most = |max: u64| max.saturating_add(config.capacity_transitions);
         if let Some(most) = config.transitions_max.map(most)
-            && elsewhere.inserted > most
+            && other_shards.inserted > most
         {
             return Err(format!(
                 "the other shards are said to have stored {} transitions; this run has at most {most}",
-                elsewhere.inserted
+                other_shards.inserted
             ));
         }
-        self.limiter.heard(elsewhere);
+        self.limiter.set_other_shards(other_shards);
         Ok(())
     }
 }

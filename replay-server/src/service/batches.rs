@@ -40,7 +40,7 @@ impl Service {
             drop(state);
             return responder.reply(&BatchReply::Refused { why });
         }
-        let hold_max = match request.elsewhere {
+        let hold_max = match request.other_shards {
             Some(_) => SHARD_HOLD_MAX,
             None => HOLD_MAX,
         };
@@ -57,14 +57,14 @@ impl Service {
     /// Takes what the learner says of the other shards.
     fn hear_of_others(&self, replay: &mut Replay, request: &BatchRequest) -> Result<(), String> {
         let (_, shards) = self.shard;
-        match request.elsewhere {
+        match request.other_shards {
             None if shards > 1 => Err(format!(
                 "a whole batch of one of {shards} shards: the learner must be connected to all of them"
             )),
             Some(_) if shards == 1 => {
                 Err("a part of a batch; this replay has one shard alone".into())
             }
-            Some(elsewhere) => replay.heard(elsewhere),
+            Some(other_shards) => replay.set_other_shards(other_shards),
             None => Ok(()),
         }
     }

@@ -70,7 +70,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let ack_timeout = Duration::from_millis(number(&settings, "actor", "ack_timeout_ms")?.into());
     let mut replay = Replay::shard(&spec, &config, batch_rows, args.shard)?;
     if args.after_updates > 0 {
-        replay = replay.going_on_after(args.after_updates, args.shard);
+        replay = replay.resumed_at(args.after_updates, args.shard);
     }
     let transport: TransportConfig = settings.table("transport")?;
     let batch = BatchHeader::of(&spec, batch_rows);

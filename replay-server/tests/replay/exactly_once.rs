@@ -115,7 +115,7 @@ proptest! {
     }
 
     #[test]
-    fn batches_that_do_not_arrive_do_not_count(seed in any::<u64>(), askers in 1u64..4, batches in 1u64..30) {
+    fn batches_that_do_not_arrive_do_not_count(seed in any::<u64>(), clients in 1u64..4, batches in 1u64..30) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut config = unlimited(10_000);
         (config.replay_ratio, config.slack_transitions) = (1.0, 10_000);
@@ -128,7 +128,7 @@ proptest! {
                 break;
             }
         }
-        let mut asked: Vec<_> = (0..askers).map(RequestId::first).collect();
+        let mut asked: Vec<_> = (0..clients).map(RequestId::first).collect();
         let mut ks = vec![0; 4];
         let (mut arrived, mut lost) = (0, 0);
         // What was sent, overtaken requests too, in the order of its arrival.
@@ -137,20 +137,20 @@ proptest! {
             if arrived == batches {
                 break;
             }
-            let asker = rng.random_range(0..askers) as usize;
-            asked[asker] = asked[asker].again();
-            in_flight.push(asked[asker]);
+            let client_id = rng.random_range(0..clients) as usize;
+            asked[client_id] = asked[client_id].again();
+            in_flight.push(asked[client_id]);
             let at = rng.random_range(0..in_flight.len());
             let id = in_flight.remove(at);
             in_flight.truncate(20);
             let draft = replay.draw_for(id, 8, Buffer::zeroed);
             replay.check_valid();
-            let is_awaited = asked[id.asker as usize] == id;
+            let is_awaited = asked[id.client_id as usize] == id;
             match draft {
                 Ok(draft) if is_awaited && rng.random_bool(0.7) => {
                     arrived += 1;
                     draft.unpack().ks().iter().for_each(|&k| ks[usize::from(k)] += 1);
-                    asked[id.asker as usize] = id.next();
+                    asked[id.client_id as usize] = id.next();
                 }
                 Ok(_) => lost += 1,
                 Err(Unready::Finished | Unready::Wait(_)) => {}
