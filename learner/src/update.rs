@@ -364,7 +364,7 @@ impl Learner {
 
         let features_t = self
             .online_network
-            .features(&self.frames(batch.rows, batch.frames_t)?)?;
+            .features(&self.frames(batch.rows, batch.states_t)?)?;
         let logits = self.online_network.logits(&features_t.f4)?;
         let q_values_t = self.online_network.q_values(&logits.detach())?;
         let kl = kl_loss(
@@ -423,11 +423,11 @@ impl Learner {
         match &self.auxiliary {
             Auxiliary::None => Ok([const { None }; 4]),
             Auxiliary::Dim(dim) => {
-                let later = online.features(&self.frames(batch.rows, batch.frames_k)?)?;
+                let later = online.features(&self.frames(batch.rows, batch.states_k)?)?;
                 dim.losses(online, anchors, &later, &action, valid)
             }
             Auxiliary::Cpc(cpc) => {
-                let there = cpc::present(batch.frames_k, valid);
+                let there = cpc::present(batch.states_k, valid);
                 let count = valid.iter().filter(|&&valid| valid != 0).count();
                 let later = match count {
                     0 => None,
@@ -438,7 +438,7 @@ impl Learner {
             Auxiliary::Curl(curl) => {
                 let encoder = self.key.as_ref();
                 let encoder = encoder.expect("a learner with this objective is made with one");
-                let keys = encoder.keys(&self.frames(batch.rows, batch.frames_k)?)?;
+                let keys = encoder.keys(&self.frames(batch.rows, batch.states_k)?)?;
                 curl.losses(online, anchors, &keys, &action)
             }
         }
@@ -479,11 +479,11 @@ impl Learner {
             v_max,
             ..
         } = self.model;
-        let frames_n = self.frames(batch.rows, batch.frames_n)?;
-        let target_logits = distribution(&self.target_network, &frames_n)?;
+        let states_n = self.frames(batch.rows, batch.states_n)?;
+        let target_logits = distribution(&self.target_network, &states_n)?;
         let next_q_values = if self.settings.double_dqn {
             self.online_network
-                .q_values(&distribution(&self.online_network, &frames_n)?)?
+                .q_values(&distribution(&self.online_network, &states_n)?)?
         } else {
             self.target_network.q_values(&target_logits)?
         };

@@ -94,8 +94,8 @@ fn batch() -> Batch {
     });
     let mut rows = batch.rows_mut();
     for row in 0..3 {
-        rows.frame_t(row).fill(10 + row as u8);
-        rows.frame_n(row).fill(20 + row as u8);
+        rows.state_t(row).fill(10 + row as u8);
+        rows.state_n(row).fill(20 + row as u8);
         rows.set(
             row,
             row as u8,
@@ -314,15 +314,15 @@ fn chunk_batch_and_weights_come_back() {
     let back = Batch::from_payload(header, payload.to_vec().into()).unwrap();
     assert_eq!(back, batch());
     assert_eq!(
-        back.frames_t(),
+        back.states_t(),
         [10, 10, 10, 10, 11, 11, 11, 11, 12, 12, 12, 12]
     );
     assert_eq!(
-        back.frames_n(),
+        back.states_n(),
         [20, 20, 20, 20, 21, 21, 21, 21, 22, 22, 22, 22]
     );
     assert_eq!(
-        back.frames_k(),
+        back.states_k(),
         [30, 30, 30, 30, 0, 0, 0, 0, 32, 32, 32, 32]
     );
     assert_eq!(
@@ -392,8 +392,8 @@ fn parts_are_merged_row_by_row() {
         for row in 0..header.rows as usize {
             let value = first + row as u8;
             rows.set(row, value, value + 100, f32::from(value), 0.5);
-            rows.frame_t(row).fill(value);
-            rows.frame_n(row).fill(value + 20);
+            rows.state_t(row).fill(value);
+            rows.state_n(row).fill(value + 20);
             rows.positive(0, row, 1).fill(value + 40);
             rows.positive(1, row, 2).fill(value + 60);
         }

@@ -191,7 +191,7 @@ impl Run {
         )?;
         let rate = effort.rate_overall(|| match source.next(ANSWER_MAX)? {
             Next::Batch(batch) => {
-                let planes = [batch.frames_t(), batch.frames_k(), batch.frames_n()];
+                let planes = [batch.states_t(), batch.states_k(), batch.states_n()];
                 black_box(planes.map(touched));
                 Ok(())
             }

@@ -198,9 +198,9 @@ impl Case {
             Ok(tensor.flatten_all()?.to_vec1()?)
         };
         let (mut positives, mut anchors) = (1, None);
-        let (frames_k, valid) = match self.settings.objective {
+        let (states_k, valid) = match self.settings.objective {
             Objective::None | Objective::Dim => (
-                bytes("input.frames_k", &state)?,
+                bytes("input.states_k", &state)?,
                 bytes("input.positive_valid", &[rows])?,
             ),
             Objective::Cpc => {
@@ -208,7 +208,7 @@ impl Case {
                 positives = valid.first().copied().unwrap_or(0);
                 let later = [&[positives], &state[..]].concat();
                 (
-                    bytes("input.frames_k", &later)?,
+                    bytes("input.states_k", &later)?,
                     bytes("input.positive_valid", &[positives, rows])?,
                 )
             }
@@ -217,9 +217,9 @@ impl Case {
                 (bytes("input.view_key", &state)?, vec![1; rows])
             }
         };
-        let frames_t = bytes("input.frames_t", &state)?;
-        let frames_n = bytes("input.frames_n", &state)?;
-        self.frames = [frames_t, frames_k, frames_n];
+        let states_t = bytes("input.states_t", &state)?;
+        let states_n = bytes("input.states_n", &state)?;
+        self.frames = [states_t, states_k, states_n];
         (self.positives, self.anchors, self.positive_valid) = (positives, anchors, valid);
         let actions: Vec<i64> = self.input("input.action", DType::I64, &[rows])?.to_vec1()?;
         let action = |action: i64| {
@@ -274,14 +274,14 @@ impl Case {
     }
 
     pub(super) fn batch(&self) -> Batch<'_> {
-        let [frames_t, frames_k, frames_n] = &self.frames;
+        let [states_t, states_k, states_n] = &self.frames;
         Batch {
             rows: self.rows,
-            frames_t,
+            states_t,
             anchors: self.anchors.as_deref(),
             positives: self.positives,
-            frames_k,
-            frames_n,
+            states_k,
+            states_n,
             action: &self.action,
             next_action: &self.next_action,
             n_step_return: &self.n_step_return,

@@ -263,7 +263,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<[Option<(f32, bool)>
         |frames: &[u8]| -> Result<Features, ParityError> { Ok(online.features(&states(frames)?)?) };
     let batch = case.batch();
     let valid = batch.positive_valid;
-    let anchors = features(batch.anchors.unwrap_or(batch.frames_t))?;
+    let anchors = features(batch.anchors.unwrap_or(batch.states_t))?;
     let action = Tensor::from_slice(batch.action, case.rows, &Device::Cpu)?;
     let every = Lambda {
         l3t3: 1.0,
@@ -287,7 +287,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<[Option<(f32, bool)>
     let mut losses = [None; 4];
     match settings.objective {
         Objective::None | Objective::Dim => {
-            let later = features(batch.frames_k)?;
+            let later = features(batch.states_k)?;
             let all = dim::dots(&online, &anchors, &later, &action, [true; 4])?;
             for (loss, dots) in losses.iter_mut().zip(all.iter().flatten()) {
                 let value = info_nce_loss(
@@ -300,7 +300,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<[Option<(f32, bool)>
             }
         }
         Objective::Cpc => {
-            let later = features(&cpc::present(batch.frames_k, valid))?;
+            let later = features(&cpc::present(batch.states_k, valid))?;
             let cpc = Cpc { pairs };
             let all = cpc.losses(&online, &anchors, Some(&later), &action, valid)?;
             for (loss, value) in losses.iter_mut().zip(all.iter().flatten()) {
@@ -321,7 +321,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<[Option<(f32, bool)>
             let key = key_parameters(case, &model, compute)?;
             let key = key.ok_or_else(|| ParityError::Config("key_tau is missing".to_owned()))?;
             let encoder = Encoder::new(&model, &key, compute.operations)?;
-            let keys = encoder.encode(&states(batch.frames_k)?)?;
+            let keys = encoder.encode(&states(batch.states_k)?)?;
             let all = curl.losses(&online, &anchors, &keys, &action)?;
             for (loss, value) in losses.iter_mut().zip(all) {
                 if let Some(value) = value {

@@ -124,7 +124,7 @@ impl Message for BatchReply {
 
 /// Rows (s_t, a_t, a_{t+1}, R_t, discount, s_{t+k}, s_{t+n}), as the replay server made them.
 ///
-/// Buffer, one after the other, B rows each: frames_t, frames_k [P, B, ..], frames_n [B, state bytes]; n-step return f32,
+/// Buffer, one after the other, B rows each: states_t, states_k [P, B, ..], states_n [B, state bytes]; n-step return f32,
 /// bootstrap discount f32 (little-endian); action, next action, positive valid [P, B], k [P, B] (u8).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Batch {
@@ -226,17 +226,17 @@ impl Batch {
     }
 
     /// s_t [B, state bytes].
-    pub fn frames_t(&self) -> &[u8] {
+    pub fn states_t(&self) -> &[u8] {
         self.column(Column::StatesT)
     }
 
     /// s_{t+k} [P, B, state bytes]; rows without a positive hold zeros.
-    pub fn frames_k(&self) -> &[u8] {
+    pub fn states_k(&self) -> &[u8] {
         self.column(Column::StatesK)
     }
 
     /// s_{t+n} [B, state bytes]; rows that do not bootstrap hold zeros.
-    pub fn frames_n(&self) -> &[u8] {
+    pub fn states_n(&self) -> &[u8] {
         self.column(Column::StatesN)
     }
 
@@ -283,9 +283,9 @@ impl Batch {
         BatchRowsMut {
             rows: layout.rows,
             state_bytes: layout.state_bytes,
-            frames_t: take(Column::StatesT),
-            frames_k: take(Column::StatesK),
-            frames_n: take(Column::StatesN),
+            states_t: take(Column::StatesT),
+            states_k: take(Column::StatesK),
+            states_n: take(Column::StatesN),
             n_step_return: take(Column::NStepReturn),
             bootstrap_discount: take(Column::BootstrapDiscount),
             action: take(Column::Action),
@@ -315,9 +315,9 @@ impl Batch {
 pub struct BatchRowsMut<'a> {
     rows: usize,
     state_bytes: usize,
-    frames_t: &'a mut [u8],
-    frames_k: &'a mut [u8],
-    frames_n: &'a mut [u8],
+    states_t: &'a mut [u8],
+    states_k: &'a mut [u8],
+    states_n: &'a mut [u8],
     n_step_return: &'a mut [u8],
     bootstrap_discount: &'a mut [u8],
     action: &'a mut [u8],
@@ -328,13 +328,13 @@ pub struct BatchRowsMut<'a> {
 
 impl BatchRowsMut<'_> {
     /// Where s_t of `row` is written.
-    pub fn frame_t(&mut self, row: usize) -> &mut [u8] {
-        &mut self.frames_t[row * self.state_bytes..(row + 1) * self.state_bytes]
+    pub fn state_t(&mut self, row: usize) -> &mut [u8] {
+        &mut self.states_t[row * self.state_bytes..(row + 1) * self.state_bytes]
     }
 
     /// Where s_{t+n} of `row` is written; zeros if the row does not bootstrap.
-    pub fn frame_n(&mut self, row: usize) -> &mut [u8] {
-        &mut self.frames_n[row * self.state_bytes..(row + 1) * self.state_bytes]
+    pub fn state_n(&mut self, row: usize) -> &mut [u8] {
+        &mut self.states_n[row * self.state_bytes..(row + 1) * self.state_bytes]
     }
 
     /// Positives a row, P.
@@ -353,7 +353,7 @@ impl BatchRowsMut<'_> {
         let at = p * self.rows + row;
         self.positive_valid[at] = 1;
         self.k[at] = u8::try_from(k).unwrap_or(u8::MAX);
-        &mut self.frames_k[at * self.state_bytes..(at + 1) * self.state_bytes]
+        &mut self.states_k[at * self.state_bytes..(at + 1) * self.state_bytes]
     }
 
     /// Writes the scalars of `row`.

@@ -59,7 +59,7 @@ impl Setup {
         let bytes = self.history.spec.state_bytes();
         for _ in 0..anchors.len() * 2 {
             let batch = self.replay.sample(64).unwrap();
-            for state in batch.frames_t().chunks(bytes) {
+            for state in batch.states_t().chunks(bytes) {
                 *counts
                     .get_mut(&identity(&self.history.spec, state))
                     .unwrap() += 1;

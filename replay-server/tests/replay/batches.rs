@@ -22,7 +22,7 @@ fn check_batch(batch: &Batch, history: &History) {
     let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
     let (mut ages, mut versions) = (0, (0, u64::MAX));
     for row in 0..rows {
-        let (key, t) = identity(spec, &state(batch.frames_t(), row));
+        let (key, t) = identity(spec, &state(batch.states_t(), row));
         assert!(
             history.is_valid(key, t),
             "{key:?} step {t} is no valid anchor"
@@ -31,7 +31,7 @@ fn check_batch(batch: &Batch, history: &History) {
         let context = format!("{key:?} step {t}: {want:?}");
         let record = &history.streams[&key][t];
         assert_eq!(
-            state(batch.frames_t(), row),
+            state(batch.states_t(), row),
             history.state(key, t),
             "{context}"
         );
@@ -50,7 +50,7 @@ fn check_batch(batch: &Batch, history: &History) {
         let frame_n = want
             .bootstrap
             .map_or(vec![0; bytes], |i| history.state(key, t + i));
-        assert_eq!(state(batch.frames_n(), row), frame_n, "{context}");
+        assert_eq!(state(batch.states_n(), row), frame_n, "{context}");
         assert_eq!(batch.positives(), spec.horizon.positives());
         for p in 0..batch.positives() {
             // Buffer of positives are [P, B].
@@ -69,7 +69,7 @@ fn check_batch(batch: &Batch, history: &History) {
             } else {
                 history.state(key, t + k)
             };
-            assert_eq!(state(batch.frames_k(), at), frame_k, "{context}: k = {k}");
+            assert_eq!(state(batch.states_k(), at), frame_k, "{context}: k = {k}");
         }
         ages += history.inserted - 1 - record.index;
         versions = (
