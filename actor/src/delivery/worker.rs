@@ -15,7 +15,7 @@ use driml_protocol::{
 };
 use zenoh::bytes::ZBytes;
 
-use super::state::{Account, DeliveryLimits};
+use super::state::{DeliveryLimits, DeliveryState};
 
 /// After `Shutdown`, how long the chunks at hand may take to be stored.
 const DRAIN_MAX: Duration = Duration::from_secs(20);
@@ -51,7 +51,7 @@ impl Outgoing {
 }
 
 /// What became of the first chunk in line.
-enum Fate {
+enum Outcome {
     Stored,
     /// The run has enough transitions.
     Unwanted,
@@ -61,12 +61,12 @@ enum Fate {
 
 /// The delivering thread's state. Several chunks are on their way at once; they are settled in order, and where one has to go
 /// again those after it, which the replay server then refused as out of order, go again too.
-pub(super) struct Courier {
+pub(super) struct DeliveryWorker {
     client: RunClient,
     limits: DeliveryLimits,
     pool: BufferPool,
     shutdown: Shutdown,
-    account: Arc<Account>,
+    state: Arc<DeliveryState>,
     outgoing: VecDeque<Outgoing>,
     /// Chunks that may be on their way: one after a chunk had to wait or go again, and one more with each that is stored at once.
     window: usize,
@@ -79,20 +79,20 @@ pub(super) struct Courier {
     waiting_said: Seldom,
 }
 
-impl Courier {
+impl DeliveryWorker {
     pub(super) fn new(
         client: RunClient,
         limits: DeliveryLimits,
         pool: BufferPool,
         shutdown: Shutdown,
-        account: Arc<Account>,
+        state: Arc<DeliveryState>,
     ) -> Self {
         Self {
             client,
             limits,
             pool,
             shutdown,
-            account,
+            state,
             outgoing: VecDeque::new(),
             window: 1,
             answered: Instant::now(),
@@ -113,23 +113,23 @@ impl Courier {
             fault::point("delivery");
             let transitions = header.transitions() as u64;
             // After a failure the rest is only counted, so that the goodbye tells the truth.
-            let fate = match outcome {
+            let outcome_of_first = match outcome {
                 Ok(()) => self.settle_first(),
-                Err(_) => Ok(Fate::Stored),
+                Err(_) => Ok(Outcome::Stored),
             };
-            match fate {
-                Ok(Fate::Again) => continue,
-                Ok(Fate::Stored) => {}
-                Ok(Fate::Unwanted) => unwanted += transitions,
+            match outcome_of_first {
+                Ok(Outcome::Again) => continue,
+                Ok(Outcome::Stored) => {}
+                Ok(Outcome::Unwanted) => unwanted += transitions,
                 Err(e) => {
                     outcome = Err(e);
-                    self.account.finished.store(true, Ordering::Relaxed);
+                    self.state.finished.store(true, Ordering::Relaxed);
                 }
             }
             produced += transitions;
             last = Some((header.actor, header.epoch));
             self.outgoing.pop_front();
-            self.account.settle();
+            self.state.settle();
         }
         if let Some((actor, epoch)) = last {
             self.say_goodbye(Goodbye {
@@ -171,7 +171,7 @@ impl Courier {
     }
 
     /// Sends what the window allows and waits for what becomes of the first.
-    fn settle_first(&mut self) -> anyhow::Result<Fate> {
+    fn settle_first(&mut self) -> anyhow::Result<Outcome> {
         let sequence = self.outgoing[0].header.sequence;
         if self.shutdown.is_set() {
             let since = *self.draining_since.get_or_insert_with(Instant::now);
@@ -195,9 +195,9 @@ impl Courier {
                 waited,
             }) => {
                 self.hear(inserted_total);
-                self.account.actors.store(actors, Ordering::Relaxed);
+                self.state.actors.store(actors, Ordering::Relaxed);
                 let was_held = self.held_since.take().is_some() || waited;
-                self.account.is_held.store(was_held, Ordering::Relaxed);
+                self.state.is_held.store(was_held, Ordering::Relaxed);
                 self.window = match was_held {
                     true => 1,
                     false => (self.window + 1).min(self.limits.chunks_in_flight_max),
@@ -205,12 +205,12 @@ impl Courier {
                 if self.outgoing[0].in_shared_memory {
                     self.pool.shared_memory_works();
                 }
-                Ok(Fate::Stored)
+                Ok(Outcome::Stored)
             }
             Ok(InsertReply::Finished { inserted_total }) => {
                 self.hear(inserted_total);
-                self.account.finished.store(true, Ordering::Relaxed);
-                Ok(Fate::Unwanted)
+                self.state.finished.store(true, Ordering::Relaxed);
+                Ok(Outcome::Unwanted)
             }
             Ok(InsertReply::Wait {
                 inserted_total,
@@ -260,7 +260,7 @@ impl Courier {
     /// The rate limiter makes the first chunk wait; it is asked about again at once if the replay server keeps it.
     fn is_held(&mut self, kept: bool) {
         let since = *self.held_since.get_or_insert_with(Instant::now);
-        self.account.is_held.store(true, Ordering::Relaxed);
+        self.state.is_held.store(true, Ordering::Relaxed);
         self.outgoing[0].is_kept = kept;
         if !kept {
             self.shutdown.wait_timeout(RETRY_PAUSE);
@@ -276,15 +276,15 @@ impl Courier {
     }
 
     fn hear(&self, inserted_total: u64) {
-        self.account
+        self.state
             .inserted_total
             .store(inserted_total, Ordering::Relaxed);
     }
 
-    fn again(&mut self) -> Fate {
+    fn again(&mut self) -> Outcome {
         self.window = 1;
         self.outgoing.iter_mut().for_each(|it| it.asked = None);
-        Fate::Again
+        Outcome::Again
     }
 
     /// The replay server may be unable to read shared memory: what is at hand, and the next chunks, go through the socket.
