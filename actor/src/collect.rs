@@ -13,22 +13,22 @@ use crate::{
 
 /// Which actor this is, and which life of it.
 #[derive(Clone, Copy, Debug)]
-pub struct Life {
+pub struct Incarnation {
     /// Its number, unique in the run.
     pub actor: u32,
     /// Tells this life of it from others; it does not influence what is computed.
-    pub epoch: u64,
+    pub incarnation: u64,
     /// Updates after which the run goes on: a resumed run does not play the episodes of its start again.
     pub after_updates: u64,
     /// Lives of this actor before this one: one that follows a dead one does not play its episodes again.
-    pub earlier_lives: u32,
+    pub earlier_incarnations: u32,
 }
 
-impl Life {
-    /// The seed of one of its generators. Lives that differ in `actor`, `after_updates` or `earlier_lives` have others.
+impl Incarnation {
+    /// The seed of one of its generators. Lives that differ in `actor`, `after_updates` or `earlier_incarnations` have others.
     fn seed(&self, spec: &RunSpec, used_for: &str) -> [u8; 32] {
         let index = u64::from(self.actor) | self.after_updates << u32::BITS;
-        match self.earlier_lives {
+        match self.earlier_incarnations {
             0 => spec.seed_for(used_for, index),
             lives => spec.seed_for(&format!("{used_for} after {lives} lives"), index),
         }
@@ -53,7 +53,7 @@ impl Collector {
     pub fn new(
         settings: ActorSettings,
         pool: BufferPool,
-        life: Life,
+        life: Incarnation,
         weights_version: u64,
         safetensors: &[u8],
     ) -> anyhow::Result<Self> {
@@ -94,7 +94,7 @@ impl Collector {
             recorder: Recorder::new(
                 pool,
                 life.actor,
-                life.epoch,
+                life.incarnation,
                 config.envs,
                 spec.frame_bytes() as u32,
             ),
@@ -149,11 +149,11 @@ mod tests {
 
     const ENVS: u32 = 32;
     const STEPS: u32 = 32;
-    const FIRST: Life = Life {
+    const FIRST: Incarnation = Incarnation {
         actor: 3,
-        epoch: 1,
+        incarnation: 1,
         after_updates: 0,
-        earlier_lives: 0,
+        earlier_incarnations: 0,
     };
 
     fn settings(epsilon: f64) -> ActorSettings {
@@ -222,7 +222,7 @@ mod tests {
         }
     }
 
-    fn collector(settings: ActorSettings, life: Life) -> anyhow::Result<Collector> {
+    fn collector(settings: ActorSettings, life: Incarnation) -> anyhow::Result<Collector> {
         let rng = &mut ChaCha8Rng::seed_from_u64(1);
         let weights = Parameters::init(&settings.model, rng, &Compute::CPU.device).unwrap();
         let weights = weights.to_safetensors(|_| true).unwrap();
@@ -230,7 +230,7 @@ mod tests {
     }
 
     /// The actions of a life's first chunk.
-    fn actions(settings: ActorSettings, life: Life) -> Vec<u8> {
+    fn actions(settings: ActorSettings, life: Incarnation) -> Vec<u8> {
         let chunk = collector(settings, life)
             .unwrap()
             .collect(0, STEPS)
@@ -243,21 +243,27 @@ mod tests {
     fn a_restarted_actor_does_not_repeat_its_own_random_numbers() {
         let random = |life| actions(settings(1.0), life);
         let first = random(FIRST);
-        assert_eq!(random(Life { epoch: 2, ..FIRST }), first);
-        let at = |earlier_lives| Life {
-            earlier_lives,
+        assert_eq!(
+            random(Incarnation {
+                incarnation: 2,
+                ..FIRST
+            }),
+            first
+        );
+        let at = |earlier_incarnations| Incarnation {
+            earlier_incarnations,
             ..FIRST
         };
         let lives = [
             FIRST,
             at(1),
             at(2),
-            Life { actor: 2, ..FIRST },
-            Life {
+            Incarnation { actor: 2, ..FIRST },
+            Incarnation {
                 after_updates: 7,
                 ..FIRST
             },
-            Life {
+            Incarnation {
                 after_updates: 7,
                 ..at(1)
             },

@@ -27,10 +27,16 @@ pub struct Recorder {
 
 impl Recorder {
     /// A recorder for `streams` copies; how long its chunks are is for [`Recorder::begin`].
-    pub fn new(pool: BufferPool, actor: u32, epoch: u64, streams: u32, frame_bytes: u32) -> Self {
+    pub fn new(
+        pool: BufferPool,
+        actor: u32,
+        incarnation: u64,
+        streams: u32,
+        frame_bytes: u32,
+    ) -> Self {
         let header = ChunkHeader {
             actor,
-            epoch,
+            incarnation,
             sequence: 0,
             first_transition: 0,
             weights_version: 0,

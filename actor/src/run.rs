@@ -11,7 +11,7 @@ use driml_protocol::{
 use zenoh::Wait;
 
 use crate::{
-    collect::{Collector, Life},
+    collect::{Collector, Incarnation},
     config::ActorSettings,
     delivery::{Delivery, DeliveryLimits},
     weights::WeightsSource,
@@ -60,14 +60,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let spec_hash = settings.spec.hash();
     let join = ActorJoin {
         actor: args.actor,
-        epoch: rand::random(),
+        incarnation: rand::random(),
     };
     // Before it joins, so that no other process can take its place from then on.
     let client = RunClient::new(session, keys, spec_hash);
     let alive = client
         .declare_alive(Alive::Actor {
             actor: join.actor,
-            epoch: join.epoch,
+            incarnation: join.incarnation,
         })
         .map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
     let Some(welcome) = join::as_actor(&client, join, shutdown)? else {
@@ -86,11 +86,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let mut collector = Collector::new(
         settings,
         pool.clone(),
-        Life {
+        Incarnation {
             actor: join.actor,
-            epoch: join.epoch,
+            incarnation: join.incarnation,
             after_updates: hello.after_updates,
-            earlier_lives: welcome.earlier_lives,
+            earlier_incarnations: welcome.earlier_incarnations,
         },
         header.version,
         &weights,

@@ -64,7 +64,7 @@ pub struct Welcome {
     /// Version of the newest weights that the replay server has; 0 before the first.
     pub weights_version: u64,
     /// Lives of this actor that were there before this one; 0 for a learner.
-    pub earlier_lives: u32,
+    pub earlier_incarnations: u32,
 }
 
 /// Asks the replay server for the run's settings, waiting for it if it is not there yet; `None` if told to stop before.
@@ -128,12 +128,12 @@ fn take_part(
             Ok(JoinReply::Welcome {
                 inserted_total,
                 weights_version,
-                earlier_lives,
+                earlier_incarnations,
             }) => {
                 return Ok(Some(Welcome {
                     inserted_total,
                     weights_version,
-                    earlier_lives,
+                    earlier_incarnations,
                 }));
             }
             Ok(JoinReply::Refused { why }) => return Err(JoinError::Refused { why }),

@@ -62,7 +62,7 @@ fn read_weights(bytes: &[u8]) -> Result<(), CodecError> {
 fn chunk() -> Chunk {
     let mut chunk = Chunk::zeroed(ChunkHeader {
         actor: 3,
-        epoch: u64::MAX,
+        incarnation: u64::MAX,
         sequence: 5,
         first_transition: 60,
         weights_version: 7,
@@ -191,7 +191,7 @@ fn samples() -> Vec<Sample> {
     };
     let goodbye = Goodbye {
         actor: 1,
-        epoch: 2,
+        incarnation: 2,
         produced: 3,
     };
     let mut samples: Vec<Sample> = replies.iter().map(Sample::of).collect();
@@ -199,7 +199,7 @@ fn samples() -> Vec<Sample> {
         JoinReply::Welcome {
             inserted_total: 3,
             weights_version: 4,
-            earlier_lives: 5,
+            earlier_incarnations: 5,
         },
         JoinReply::Taken { why: "a".into() },
         JoinReply::Refused { why: "b".into() },
@@ -223,14 +223,17 @@ fn samples() -> Vec<Sample> {
         Sample::of(&replay),
         Sample::of(&learner),
         Sample::of(&hello),
-        Sample::of(&ActorJoin { actor: 1, epoch: 2 }),
+        Sample::of(&ActorJoin {
+            actor: 1,
+            incarnation: 2,
+        }),
         Sample::of(&LearnerJoin {
             learner: 5,
             rows_sampled: 9,
         }),
         Sample::of(&Claim {
             actor: 1,
-            epoch: 2,
+            incarnation: 2,
             sequence: 3,
             leaving: true,
         }),
@@ -835,12 +838,12 @@ proptest! {
     #[test]
     fn any_chunk_comes_back(
         (streams, steps, frame_bytes) in (1u32..5, 1u32..9, 0u32..40),
-        (actor, epoch, sequence, first_transition) in any::<(u32, u64, u64, u64)>(),
+        (actor, incarnation, sequence, first_transition) in any::<(u32, u64, u64, u64)>(),
         fill in any::<u8>(),
         rewards in prop::collection::vec(-1e30f32..1e30, 45),
     ) {
         let mut chunk = Chunk::zeroed(ChunkHeader {
-            actor, epoch, sequence, first_transition, weights_version: epoch ^ 1,
+            actor, incarnation, sequence, first_transition, weights_version: incarnation ^ 1,
             leaving: fill > 99, streams, steps, frame_bytes,
         });
         for (row, &reward) in rewards.iter().enumerate().take(chunk.header.transitions()) {

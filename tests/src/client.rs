@@ -116,12 +116,12 @@ impl Client {
         wait_for(what, || self.learner().filter(&wanted))
     }
 
-    /// Takes part as an actor; its chunks are of this `epoch`.
+    /// Takes part as an actor; its chunks are of this `incarnation`.
     ///
     /// # Panics
     /// If the replay server does not take it.
-    pub fn join_as_actor(&self, actor: u32, epoch: u64) {
-        let join = ActorJoin { actor, epoch };
+    pub fn join_as_actor(&self, actor: u32, incarnation: u64) {
+        let join = ActorJoin { actor, incarnation };
         let never = Shutdown::default();
         join::as_actor(&self.run(), join, &never).unwrap();
     }

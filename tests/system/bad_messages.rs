@@ -17,14 +17,14 @@ struct Served {
 }
 
 /// The life of actor 0 that sends chunks here, and the learner.
-const EPOCH: u64 = 9;
+const INCARNATION: u64 = 9;
 const LEARNER: u64 = 5;
 
 fn served() -> Served {
     let system = system();
     let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
     let client = system.connect();
-    client.join_as_actor(0, EPOCH);
+    client.join_as_actor(0, INCARNATION);
     client.join_as_learner(LEARNER, 0);
     Served {
         client,
@@ -47,7 +47,7 @@ impl Served {
         let spec = &self.client.spec;
         let header = ChunkHeader {
             actor: 0,
-            epoch: EPOCH,
+            incarnation: INCARNATION,
             sequence,
             first_transition: 6 * sequence,
             weights_version: 1,
@@ -126,7 +126,7 @@ fn chunks_of_other_runs_and_versions() {
     served.refused(newer, "run the same build of driml everywhere");
     let goodbye = Goodbye {
         actor: 0,
-        epoch: EPOCH,
+        incarnation: INCARNATION,
         produced: 0,
     };
     let of_another_kind = codec::encode(hash, &goodbye, &[]).unwrap();
@@ -199,7 +199,7 @@ fn chunks_that_make_no_sense_in_this_run() {
     );
     // Another life of the actor, and then a late message of the first.
     let mut second_life = served.chunk(0);
-    second_life.header.epoch = 10;
+    second_life.header.incarnation = 10;
     let unknown = served.sealed(&second_life, served.client.spec.hash());
     served.refused(unknown, "does not know this life of actor 0");
     served.client.join_as_actor(0, 10);
@@ -265,7 +265,7 @@ fn everything_else_that_a_replay_server_takes() {
     // What needs no answer gets none, and is counted.
     let goodbye = Goodbye {
         actor: 0,
-        epoch: 9,
+        incarnation: 9,
         produced: 1000,
     };
     let affinity = AffinityUpdate {

@@ -82,7 +82,7 @@ impl SyntheticActor {
         let delivery = Delivery::start(run, 0, limits, BufferPool::new(8), stop.clone()).unwrap();
         let next = ChunkHeader {
             actor,
-            epoch: 1,
+            incarnation: 1,
             sequence: 0,
             first_transition: 0,
             weights_version: 0,

@@ -63,11 +63,16 @@ fn config(shards: u32) -> Config {
 fn full(shard: u32, shards: u32) -> Replay {
     let spec = spec();
     let mut replay = Replay::shard(&spec, &config(shards), ROWS, shard).unwrap();
-    replay.join_actor(ActorJoin { actor: 0, epoch: 1 }).unwrap();
+    replay
+        .join_actor(ActorJoin {
+            actor: 0,
+            incarnation: 1,
+        })
+        .unwrap();
     for sequence in 0..TRANSITIONS / 8 / u64::from(shards) {
         let chunk = Chunk::zeroed(ChunkHeader {
             actor: 0,
-            epoch: 1,
+            incarnation: 1,
             sequence,
             first_transition: 8 * sequence,
             weights_version: 1,

@@ -82,7 +82,12 @@ impl Server {
         };
         let mut replay = Replay::new(&spec(), &config, ROWS).unwrap();
         for actor in 0..ACTORS {
-            replay.join_actor(ActorJoin { actor, epoch: 1 }).unwrap();
+            replay
+                .join_actor(ActorJoin {
+                    actor,
+                    incarnation: 1,
+                })
+                .unwrap();
         }
         Arc::new(Self {
             replay: Mutex::new(replay),
@@ -168,7 +173,7 @@ fn deliver(actor: u32, delivery: &Delivery) {
         let first_transition = sequence * u64::from(STEPS);
         let mut chunk = Chunk::zeroed(ChunkHeader {
             actor,
-            epoch: 1,
+            incarnation: 1,
             sequence,
             first_transition,
             weights_version: 1,

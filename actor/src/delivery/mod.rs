@@ -30,7 +30,7 @@ pub struct Delivery {
 
 impl Delivery {
     /// Starts the thread. `inserted_total` is the run's count so far; `pool` is where the chunks' memory comes from. The actor
-    /// has joined the run with the epoch of its chunks.
+    /// has joined the run with the incarnation of its chunks.
     ///
     /// # Errors
     /// The operating system gave no thread.

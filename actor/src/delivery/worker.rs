@@ -43,7 +43,7 @@ impl Outgoing {
     const fn claim(&self) -> Claim {
         Claim {
             actor: self.header.actor,
-            epoch: self.header.epoch,
+            incarnation: self.header.incarnation,
             sequence: self.header.sequence,
             leaving: self.header.leaving,
         }
@@ -127,14 +127,14 @@ impl DeliveryWorker {
                 }
             }
             produced += transitions;
-            last = Some((header.actor, header.epoch));
+            last = Some((header.actor, header.incarnation));
             self.outgoing.pop_front();
             self.state.settle();
         }
-        if let Some((actor, epoch)) = last {
+        if let Some((actor, incarnation)) = last {
             self.say_goodbye(Goodbye {
                 actor,
-                epoch,
+                incarnation,
                 produced: produced - unwanted,
             });
         }

@@ -15,7 +15,7 @@ use crate::bench::{
     recording::Recording,
     replay::{AGENT, CAPACITY, SETTINGS},
     settings,
-    taking_part::EPOCH,
+    taking_part::INCARNATION,
 };
 
 /// Batches a second.
@@ -28,7 +28,7 @@ pub(super) fn measure(recording: &Recording, effort: &Effort) -> anyhow::Result<
     let mut replay = Replay::new(&config.run, &config.replay, rows)?;
     let join = ActorJoin {
         actor: 0,
-        epoch: EPOCH,
+        incarnation: INCARNATION,
     };
     replay.join_actor(join).map_err(anyhow::Error::msg)?;
     for chunk in recording.chunks(0, (8, 32), BufferPool::new(1)) {

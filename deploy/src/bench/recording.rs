@@ -10,7 +10,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    bench::{settings, taking_part::EPOCH},
+    bench::{settings, taking_part::INCARNATION},
     console,
 };
 
@@ -89,7 +89,7 @@ impl Recording {
             pool,
             next: ChunkHeader {
                 actor,
-                epoch: EPOCH,
+                incarnation: INCARNATION,
                 sequence: 0,
                 first_transition: 0,
                 weights_version: 1,

@@ -10,7 +10,7 @@ use driml_protocol::{
 use zenoh::liveliness::LivelinessToken;
 
 /// The life of an actor whose chunks [`super::recording`] makes.
-pub(super) const EPOCH: u64 = 1;
+pub(super) const INCARNATION: u64 = 1;
 /// The number of a benchmark's learner.
 pub(super) const LEARNER: u64 = 1;
 /// How long an upload may take.
@@ -25,12 +25,12 @@ pub(super) fn join_as_actor(client: &RunClient, actor: u32) -> anyhow::Result<Li
         client,
         Alive::Actor {
             actor,
-            epoch: EPOCH,
+            incarnation: INCARNATION,
         },
     )?;
     let join = ActorJoin {
         actor,
-        epoch: EPOCH,
+        incarnation: INCARNATION,
     };
     join::as_actor(client, join, &Shutdown::default())?
         .context("nobody told this client to stop")?;

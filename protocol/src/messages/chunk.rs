@@ -55,10 +55,10 @@ pub struct ChunkHeader {
     /// Which actor, unique in the run.
     pub actor: u32,
     /// Which life of that actor: drawn anew at each start.
-    pub epoch: u64,
-    /// Number of the chunk within the epoch, from 0.
+    pub incarnation: u64,
+    /// Number of the chunk within the incarnation, from 0.
     pub sequence: u64,
-    /// Transitions that this epoch produced before this chunk: the second count, by which loss shows.
+    /// Transitions that this incarnation produced before this chunk: the second count, by which loss shows.
     pub first_transition: u64,
     /// The weights that chose every action of this chunk; 0 before the first.
     pub weights_version: u64,

@@ -12,7 +12,7 @@ pub struct Goodbye {
     /// Which actor.
     pub actor: u32,
     /// Which life of it.
-    pub epoch: u64,
+    pub incarnation: u64,
     /// Transitions produced, less those that the replay server answered with `Finished` or `Refused`.
     pub produced: u64,
 }

@@ -11,8 +11,8 @@ pub struct Claim {
     /// Which actor.
     pub actor: u32,
     /// Which life of that actor.
-    pub epoch: u64,
-    /// Number of the chunk within the epoch.
+    pub incarnation: u64,
+    /// Number of the chunk within the incarnation.
     pub sequence: u64,
     /// The actor was told to stop: the rate limiter lets the chunk pass.
     pub leaving: bool,

@@ -11,7 +11,7 @@ pub struct ActorJoin {
     /// Which actor, unique in the run.
     pub actor: u32,
     /// Which life of it: a random number, drawn anew at each start.
-    pub epoch: u64,
+    pub incarnation: u64,
 }
 
 impl Message for ActorJoin {
@@ -57,7 +57,7 @@ pub enum JoinReply {
         /// Version of the newest weights that the replay server has; 0 before the first.
         weights_version: u64,
         /// Lives of this actor that were there before this one; 0 for a learner.
-        earlier_lives: u32,
+        earlier_incarnations: u32,
     },
     /// Another process plays this part and is connected: ask again, it may be about to end.
     Taken {

@@ -40,7 +40,9 @@ impl Keys {
     /// The key of the liveliness token of one life of an actor, or of a learner.
     pub fn alive_key(&self, who: Alive) -> String {
         match who {
-            Alive::Actor { actor, epoch } => self.key(&format!("alive/actor/{actor}/{epoch:016x}")),
+            Alive::Actor { actor, incarnation } => {
+                self.key(&format!("alive/actor/{actor}/{incarnation:016x}"))
+            }
             Alive::Learner(learner) => self.key(&format!("alive/learner/{learner:016x}")),
         }
     }
@@ -55,9 +57,9 @@ impl Keys {
         let rest = key.strip_prefix(&self.namespace)?.strip_prefix("/alive/")?;
         let hex = |text| u64::from_str_radix(text, 16).ok();
         match rest.split('/').collect::<Vec<_>>()[..] {
-            ["actor", actor, epoch] => Some(Alive::Actor {
+            ["actor", actor, incarnation] => Some(Alive::Actor {
                 actor: actor.parse().ok()?,
-                epoch: hex(epoch)?,
+                incarnation: hex(incarnation)?,
             }),
             ["learner", learner] => Some(Alive::Learner(hex(learner)?)),
             _ => None,
@@ -73,7 +75,7 @@ pub enum Alive {
         /// Which actor.
         actor: u32,
         /// Which life of it.
-        epoch: u64,
+        incarnation: u64,
     },
     /// A learner.
     Learner(u64),
@@ -88,7 +90,7 @@ mod tests {
         let keys = Keys::new("a/b").unwrap();
         let actor = Alive::Actor {
             actor: 7,
-            epoch: u64::MAX,
+            incarnation: u64::MAX,
         };
         assert_eq!(keys.alive(&keys.alive_key(actor)), Some(actor));
         let learner = Alive::Learner(9);

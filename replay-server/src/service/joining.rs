@@ -46,10 +46,10 @@ impl Service {
     /// Answers a part that joins: how many lives it had before, or why it is not taken.
     fn welcome(&self, responder: Responder<JoinReply>, joined: Result<u32, Rejection>) {
         let reply = match joined {
-            Ok(earlier_lives) => JoinReply::Welcome {
+            Ok(earlier_incarnations) => JoinReply::Welcome {
                 inserted_total: self.state().replay.inserted_total(),
                 weights_version: self.weights().version(),
-                earlier_lives,
+                earlier_incarnations,
             },
             Err(Rejection::Taken(why)) => JoinReply::Taken { why },
             Err(Rejection::Refused(why)) => {
@@ -78,28 +78,28 @@ impl State {
 
     /// Takes an actor that may take part; gives the number of its earlier lives.
     fn join_actor(&mut self, join: ActorJoin) -> Result<u32, Rejection> {
-        let ActorJoin { actor, epoch } = join;
+        let ActorJoin { actor, incarnation } = join;
         let other = self
             .replay
-            .actor_epoch(actor)
-            .filter(|&other| other != epoch);
-        let connected = |epoch| {
+            .actor_incarnation(actor)
+            .filter(|&other| other != incarnation);
+        let connected = |incarnation| {
             self.members
                 .connected
-                .contains(&Alive::Actor { actor, epoch })
+                .contains(&Alive::Actor { actor, incarnation })
         };
         if other.is_some_and(connected) {
             return Err(Rejection::Taken(format!(
                 "another process is actor {actor} of this run: give each actor a number of its own (--id)"
             )));
         }
-        let earlier_lives = self.replay.join_actor(join).map_err(Rejection::Refused)?;
+        let earlier_incarnations = self.replay.join_actor(join).map_err(Rejection::Refused)?;
         self.count_actors();
         if other.is_some() {
             // A chunk that was left behind.
             self.chunks.take(actor);
         }
-        Ok(earlier_lives)
+        Ok(earlier_incarnations)
     }
 
     fn join_learner(&mut self, join: LearnerJoin) -> Result<u32, Rejection> {

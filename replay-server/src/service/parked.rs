@@ -85,14 +85,15 @@ impl<Q> ParkedChunks<Q> {
     pub(super) fn claimed(&mut self, claim: &Claim) -> Option<&mut ParkedChunk<Q>> {
         self.by_actor.get_mut(&claim.actor).filter(|parked| {
             let header = &parked.chunk.chunk.header;
-            (header.epoch, header.sequence) == (claim.epoch, claim.sequence)
+            (header.incarnation, header.sequence) == (claim.incarnation, claim.sequence)
         })
     }
 
     /// Takes the older copy of a chunk that has been stored out of the line; a later chunk of its actor stays.
     pub(super) fn take_copy(&mut self, stored: &ChunkHeader) -> Option<ParkedChunk<Q>> {
         let parked = &self.by_actor.get(&stored.actor)?.chunk.chunk.header;
-        let is_copy = parked.epoch == stored.epoch && parked.sequence <= stored.sequence;
+        let is_copy =
+            parked.incarnation == stored.incarnation && parked.sequence <= stored.sequence;
         if is_copy {
             self.take(stored.actor)
         } else {
@@ -214,7 +215,7 @@ mod tests {
     fn chunk(actor: u32, sequence: u64, steps: u32, frame_bytes: u32) -> PackedChunk<'static> {
         let chunk = Chunk::zeroed(ChunkHeader {
             actor,
-            epoch: 9,
+            incarnation: 9,
             sequence,
             first_transition: 0,
             weights_version: 0,
@@ -232,7 +233,7 @@ mod tests {
     fn claim(actor: u32, sequence: u64) -> Claim {
         Claim {
             actor,
-            epoch: 9,
+            incarnation: 9,
             sequence,
             leaving: false,
         }

@@ -134,21 +134,21 @@ proptest! {
         let (mut lost, mut retried, mut refused, mut rows_sampled) = (0, 0, 0, 0);
         for _ in 0..150 {
             let number = rng.random_range(0..actors);
-            let fresh = |epoch| Actor {
+            let fresh = |incarnation| Actor {
                 next: ChunkHeader {
-                    actor: number, epoch, sequence: 0, first_transition: 0, weights_version: 0, leaving: false,
+                    actor: number, incarnation, sequence: 0, first_transition: 0, weights_version: 0, leaving: false,
                     streams, steps: 1, frame_bytes: spec.frame_bytes() as u32,
                 },
                 part: 0,
             };
             let actor = known.entry(number).or_insert_with(|| fresh(1));
-            join(&mut replay, number, actor.next.epoch);
+            join(&mut replay, number, actor.next.incarnation);
             match rng.random_range(0..20) {
                 // The actor dies and starts anew; a straggler of its former life is refused.
                 0 => {
                     let old = actor.next;
-                    *actor = fresh(old.epoch + 1);
-                    join(&mut replay, number, actor.next.epoch);
+                    *actor = fresh(old.incarnation + 1);
+                    join(&mut replay, number, actor.next.incarnation);
                     let chunk = history.next_chunk(actor.next, 0, &mut rng);
                     let stored = stored(history.inserted);
                     prop_assert_eq!(replay.insert(&chunk), stored);
@@ -217,7 +217,7 @@ proptest! {
         }
         for (&actor, Actor { next, .. }) in &known {
             if next.sequence > 0 {
-                replay.goodbye(&Goodbye { actor, epoch: next.epoch, produced: next.first_transition });
+                replay.goodbye(&Goodbye { actor, incarnation: next.incarnation, produced: next.first_transition });
             }
         }
         let status = replay.status();

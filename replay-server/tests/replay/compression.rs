@@ -75,7 +75,7 @@ impl Actor {
         Self {
             next: ChunkHeader {
                 actor: 0,
-                epoch: 1,
+                incarnation: 1,
                 sequence: 0,
                 first_transition: 0,
                 weights_version: 1,

@@ -17,10 +17,15 @@ pub(crate) fn small_spec() -> RunSpec {
     spec(3, 1, 1, Horizon::None)
 }
 
-pub(crate) fn header(actor: u32, epoch: u64, sequence: u64, first_transition: u64) -> ChunkHeader {
+pub(crate) fn header(
+    actor: u32,
+    incarnation: u64,
+    sequence: u64,
+    first_transition: u64,
+) -> ChunkHeader {
     ChunkHeader {
         actor,
-        epoch,
+        incarnation,
         sequence,
         first_transition,
         weights_version: 0,
@@ -31,14 +36,14 @@ pub(crate) fn header(actor: u32, epoch: u64, sequence: u64, first_transition: u6
     }
 }
 
-pub(crate) fn join(replay: &mut Replay, actor: u32, epoch: u64) {
-    replay.join_actor(ActorJoin { actor, epoch }).unwrap();
+pub(crate) fn join(replay: &mut Replay, actor: u32, incarnation: u64) {
+    replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
 }
 
 /// Inserts a chunk; an actor that is new joins with it.
 pub(crate) fn insert(replay: &mut Replay, header: ChunkHeader) -> InsertReply {
-    if replay.actor_epoch(header.actor).is_none() {
-        join(replay, header.actor, header.epoch);
+    if replay.actor_incarnation(header.actor).is_none() {
+        join(replay, header.actor, header.incarnation);
     }
     let reply = replay.insert(&Chunk::zeroed(header));
     replay.check_valid();
@@ -106,7 +111,7 @@ proptest! {
         }
         let produced: Vec<u64> = (0..actors).map(|actor| first(actor, chunks)).collect();
         for (actor, &produced) in produced.iter().enumerate() {
-            replay.goodbye(&Goodbye { actor: actor as u32, epoch: 9, produced });
+            replay.goodbye(&Goodbye { actor: actor as u32, incarnation: 9, produced });
         }
         let status = replay.status();
         prop_assert_eq!(status.transitions_inserted, produced.iter().sum::<u64>());
@@ -177,7 +182,7 @@ fn what_never_arrived_counts_as_lost_once() {
     assert_eq!(replay.status().transitions_lost, 5, "between chunks");
     let goodbye = Goodbye {
         actor: 0,
-        epoch: 1,
+        incarnation: 1,
         produced: 30,
     };
     replay.goodbye(&goodbye);
@@ -189,7 +194,7 @@ fn what_never_arrived_counts_as_lost_once() {
     );
     let nothing_arrived = Goodbye {
         actor: 1,
-        epoch: 1,
+        incarnation: 1,
         produced: 3,
     };
     replay.goodbye(&nothing_arrived);
@@ -216,7 +221,7 @@ fn what_was_stored_and_never_produced_counts_as_duplicated() {
     assert_eq!(replay.status().transitions_duplicated, 2);
     replay.goodbye(&Goodbye {
         actor: 0,
-        epoch: 1,
+        incarnation: 1,
         produced: 9,
     });
     assert_eq!(replay.status().transitions_duplicated, 3);
@@ -224,7 +229,7 @@ fn what_was_stored_and_never_produced_counts_as_duplicated() {
         join(&mut replay, actor, 0);
         replay.goodbye(&Goodbye {
             actor,
-            epoch: 0,
+            incarnation: 0,
             produced: u64::MAX,
         });
     }
@@ -241,7 +246,7 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
     insert(&mut replay, header(0, 1, 0, 0));
     replay.goodbye(&Goodbye {
         actor: 0,
-        epoch: 1,
+        incarnation: 1,
         produced: 6,
     });
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
@@ -253,7 +258,7 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
     // Nor does its goodbye make it one.
     let goodbye = Goodbye {
         actor: 0,
-        epoch: 2,
+        incarnation: 2,
         produced: 6,
     };
     replay.goodbye(&goodbye);
@@ -267,9 +272,15 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
         is_refused(&insert(&mut replay, header(0, 1, 0, 0))),
         "a past life"
     );
-    let again = replay.join_actor(ActorJoin { actor: 0, epoch: 2 });
+    let again = replay.join_actor(ActorJoin {
+        actor: 0,
+        incarnation: 2,
+    });
     assert_eq!(again, Ok(1), "one life before it");
-    let back = ActorJoin { actor: 0, epoch: 1 };
+    let back = ActorJoin {
+        actor: 0,
+        incarnation: 1,
+    };
     assert!(
         replay.join_actor(back).is_err(),
         "and it does not come back"
@@ -293,7 +304,7 @@ fn what_a_replaced_life_could_not_deliver_counts_as_lost() {
     assert!(is_refused(&insert(&mut replay, header(0, 1, 1, 6))));
     let last_word = Goodbye {
         actor: 0,
-        epoch: 1,
+        incarnation: 1,
         produced: 18,
     };
     replay.goodbye(&last_word);
@@ -307,9 +318,9 @@ fn a_claim_says_what_became_of_a_chunk() {
     let mut config = unlimited(1000);
     config.transitions_max = Some(12);
     let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
-    let claim = |epoch, sequence| Claim {
+    let claim = |incarnation, sequence| Claim {
         actor: 0,
-        epoch,
+        incarnation,
         sequence,
         leaving: false,
     };
@@ -449,7 +460,7 @@ fn actors_and_streams_are_bounded() {
     let one_more = ACTORS_MAX as u32;
     let join = ActorJoin {
         actor: one_more,
-        epoch: 1,
+        incarnation: 1,
     };
     assert!(replay.join_actor(join).is_err());
     assert!(is_refused(
@@ -457,7 +468,7 @@ fn actors_and_streams_are_bounded() {
     ));
     replay.goodbye(&Goodbye {
         actor: one_more,
-        epoch: 1,
+        incarnation: 1,
         produced: 6,
     });
     assert_eq!(replay.status().transitions_lost, 0);
@@ -526,7 +537,7 @@ fn the_run_ends_when_all_is_in_and_sampled() {
     );
     replay.goodbye(&Goodbye {
         actor: 0,
-        epoch: 1,
+        incarnation: 1,
         produced: 12,
     });
     assert_eq!(replay.status().transitions_lost, 0);

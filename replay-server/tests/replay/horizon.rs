@@ -201,7 +201,7 @@ fn the_k_served_follow_the_law() {
     for sequence in 0..20 {
         let header = ChunkHeader {
             actor: 0,
-            epoch: 1,
+            incarnation: 1,
             sequence,
             first_transition: sequence * 10,
             weights_version: 0,
