@@ -2,7 +2,7 @@
 //! The processes and the lockstep mode run this same code; it neither sends nor waits.
 
 use anyhow::Context;
-use driml_protocol::{Chunk, PlanesPool, RunSpec};
+use driml_protocol::{BufferPool, Chunk, RunSpec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -13,22 +13,22 @@ use crate::{
 
 /// Which actor this is, and which life of it.
 #[derive(Clone, Copy, Debug)]
-pub struct Life {
+pub struct Incarnation {
     /// Its number, unique in the run.
     pub actor: u32,
     /// Tells this life of it from others; it does not influence what is computed.
-    pub epoch: u64,
+    pub incarnation: u64,
     /// Updates after which the run goes on: a resumed run does not play the episodes of its start again.
     pub after_updates: u64,
     /// Lives of this actor before this one: one that follows a dead one does not play its episodes again.
-    pub earlier_lives: u32,
+    pub earlier_incarnations: u32,
 }
 
-impl Life {
-    /// The seed of one of its generators. Lives that differ in `actor`, `after_updates` or `earlier_lives` have others.
+impl Incarnation {
+    /// The seed of one of its generators. Lives that differ in `actor`, `after_updates` or `earlier_incarnations` have others.
     fn seed(&self, spec: &RunSpec, used_for: &str) -> [u8; 32] {
         let index = u64::from(self.actor) | self.after_updates << u32::BITS;
-        match self.earlier_lives {
+        match self.earlier_incarnations {
             0 => spec.seed_for(used_for, index),
             lives => spec.seed_for(&format!("{used_for} after {lives} lives"), index),
         }
@@ -52,8 +52,8 @@ impl Collector {
     /// the model.
     pub fn new(
         settings: ActorSettings,
-        pool: PlanesPool,
-        life: Life,
+        pool: BufferPool,
+        life: Incarnation,
         weights_version: u64,
         safetensors: &[u8],
     ) -> anyhow::Result<Self> {
@@ -95,7 +95,7 @@ impl Collector {
             recorder: Recorder::new(
                 pool,
                 life.actor,
-                life.epoch,
+                life.incarnation,
                 config.envs,
                 spec.frame_bytes() as u32,
             ),
@@ -150,11 +150,11 @@ mod tests {
 
     const ENVS: u32 = 32;
     const STEPS: u32 = 32;
-    const FIRST: Life = Life {
+    const FIRST: Incarnation = Incarnation {
         actor: 3,
-        epoch: 1,
+        incarnation: 1,
         after_updates: 0,
-        earlier_lives: 0,
+        earlier_incarnations: 0,
     };
 
     fn settings(epsilon: f64) -> ActorSettings {
@@ -223,15 +223,15 @@ mod tests {
         }
     }
 
-    fn collector(settings: ActorSettings, life: Life) -> anyhow::Result<Collector> {
+    fn collector(settings: ActorSettings, life: Incarnation) -> anyhow::Result<Collector> {
         let rng = &mut ChaCha8Rng::seed_from_u64(1);
         let weights = Parameters::init(&settings.model, rng, &Compute::CPU.device).unwrap();
         let weights = weights.to_safetensors(|_| true).unwrap();
-        Collector::new(settings, PlanesPool::new(1), life, 1, &weights)
+        Collector::new(settings, BufferPool::new(1), life, 1, &weights)
     }
 
     /// The actions of a life's first chunk.
-    fn actions(settings: ActorSettings, life: Life) -> Vec<u8> {
+    fn actions(settings: ActorSettings, life: Incarnation) -> Vec<u8> {
         let chunk = collector(settings, life)
             .unwrap()
             .collect(0, STEPS)
@@ -244,21 +244,27 @@ mod tests {
     fn a_restarted_actor_does_not_repeat_its_own_random_numbers() {
         let random = |life| actions(settings(1.0), life);
         let first = random(FIRST);
-        assert_eq!(random(Life { epoch: 2, ..FIRST }), first);
-        let at = |earlier_lives| Life {
-            earlier_lives,
+        assert_eq!(
+            random(Incarnation {
+                incarnation: 2,
+                ..FIRST
+            }),
+            first
+        );
+        let at = |earlier_incarnations| Incarnation {
+            earlier_incarnations,
             ..FIRST
         };
         let lives = [
             FIRST,
             at(1),
             at(2),
-            Life { actor: 2, ..FIRST },
-            Life {
+            Incarnation { actor: 2, ..FIRST },
+            Incarnation {
                 after_updates: 7,
                 ..FIRST
             },
-            Life {
+            Incarnation {
                 after_updates: 7,
                 ..at(1)
             },

@@ -2,8 +2,8 @@
 //! It fills in no number: presets do, with their sources.
 
 use driml_protocol::{
-    PlanesPool, RunSpec, TRANSITION_BYTES,
-    codec::PLANES_BYTES_MAX,
+    BufferPool, RunSpec, TRANSITION_BYTES,
+    codec::PAYLOAD_BYTES_MAX,
     config::{Settings, TransportConfig},
 };
 use serde::{Deserialize, Serialize};
@@ -125,7 +125,7 @@ impl ActorSettings {
             ..
         } = self.actor;
         let bytes = u64::from(envs) * u64::from(steps_per_chunk) * self.transition_bytes() as u64;
-        if bytes > PLANES_BYTES_MAX as u64 {
+        if bytes > PAYLOAD_BYTES_MAX as u64 {
             return Err(ConfigError {
                 key: "steps_per_chunk",
                 value: steps_per_chunk.to_string(),
@@ -144,14 +144,14 @@ impl ActorSettings {
 impl ActorSettings {
     /// Memory for the chunks of one actor: one that is filled, and those that are not acknowledged. Shared memory is for chunks
     /// as long as they are with the actors that are planned; longer ones lie in the process's own.
-    pub fn chunk_memory(&self) -> PlanesPool {
+    pub fn chunk_memory(&self) -> BufferPool {
         let count = self.actor.chunks_in_flight_max as usize + 1;
         let steps = self.actor.chunk_steps(self.actors_planned);
         let transitions = self.actor.envs as usize * steps as usize;
         if self.transport.shared_memory {
-            PlanesPool::shared(count, count, transitions * self.transition_bytes())
+            BufferPool::shared(count, count, transitions * self.transition_bytes())
         } else {
-            PlanesPool::new(count)
+            BufferPool::new(count)
         }
     }
 }

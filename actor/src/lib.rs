@@ -14,6 +14,6 @@ mod run;
 pub mod schedule;
 pub mod weights;
 
-pub use collect::{Collector, Life};
+pub use collect::{Collector, Incarnation};
 pub use config::{ActorSettings, Config, ConfigError, EpsilonLadder, InputSize};
 pub use run::{RunArgs, run};

@@ -2,7 +2,7 @@
 //! It does not send them.
 
 use driml_envs::StepEnd;
-use driml_protocol::{Chunk, ChunkHeader, End, PlanesPool};
+use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 
 /// What a world ended, in the words of the wire.
 pub const fn end_on_the_wire(end: StepEnd) -> End {
@@ -17,7 +17,7 @@ pub const fn end_on_the_wire(end: StepEnd) -> End {
 /// Fills chunk after chunk.
 #[derive(Debug)]
 pub struct Recorder {
-    pool: PlanesPool,
+    pool: BufferPool,
     /// Of the chunk being filled, or of the next one.
     header: ChunkHeader,
     /// None between two chunks.
@@ -27,10 +27,16 @@ pub struct Recorder {
 
 impl Recorder {
     /// A recorder for `streams` copies; how long its chunks are is for [`Recorder::begin`].
-    pub fn new(pool: PlanesPool, actor: u32, epoch: u64, streams: u32, frame_bytes: u32) -> Self {
+    pub fn new(
+        pool: BufferPool,
+        actor: u32,
+        incarnation: u64,
+        streams: u32,
+        frame_bytes: u32,
+    ) -> Self {
         let header = ChunkHeader {
             actor,
-            epoch,
+            incarnation,
             sequence: 0,
             first_transition: 0,
             weights_version: 0,
@@ -99,9 +105,9 @@ impl Recorder {
     }
 }
 
-fn fresh(pool: &PlanesPool, header: ChunkHeader) -> Chunk {
+fn fresh(pool: &BufferPool, header: ChunkHeader) -> Chunk {
     let bytes = header
-        .planes_bytes()
+        .payload_bytes()
         .expect("an actor's chunk is far below the address space");
     Chunk::in_memory(header, pool.take(bytes))
 }
@@ -112,7 +118,7 @@ mod tests {
 
     #[test]
     fn chunks_are_numbered_and_stream_major() {
-        let mut recorder = Recorder::new(PlanesPool::new(1), 7, 9, 2, 1);
+        let mut recorder = Recorder::new(BufferPool::new(1), 7, 9, 2, 1);
         let ends = [StepEnd::Running, StepEnd::Terminal];
         let mut chunks = Vec::new();
         for step in 0..7_u8 {

@@ -5,13 +5,13 @@ use std::time::Duration;
 
 use anyhow::Context;
 use driml_protocol::{
-    ActorJoin, Keys, Shutdown, join,
+    ActorJoin, Alive, Keys, RunClient, Shutdown, join,
     session::{self, Endpoints},
 };
 use zenoh::Wait;
 
 use crate::{
-    collect::{Collector, Life},
+    collect::{Collector, Incarnation},
     config::ActorSettings,
     delivery::{Delivery, DeliveryLimits},
     weights::WeightsSource,
@@ -60,21 +60,21 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let spec_hash = settings.spec.hash();
     let join = ActorJoin {
         actor: args.actor,
-        epoch: rand::random(),
+        incarnation: rand::random(),
     };
     // Before it joins, so that no other process can take its place from then on.
-    let alive = session
-        .liveliness()
-        .declare_token(keys.actor_alive(join.actor, join.epoch))
-        .wait()
+    let client = RunClient::new(session, keys, spec_hash);
+    let alive = client
+        .declare_alive(Alive::Actor {
+            actor: join.actor,
+            incarnation: join.incarnation,
+        })
         .map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
-    let Some(welcome) = join::as_actor(&session, &keys, spec_hash, join, shutdown)? else {
+    let Some(welcome) = join::as_actor(&client, join, shutdown)? else {
         return Ok(());
     };
     let source = WeightsSource {
-        session: session.clone(),
-        keys: keys.clone(),
-        spec_hash,
+        client: client.clone(),
     };
     let Some((header, weights)) = source.first(WEIGHTS_WAIT_MAX, shutdown)? else {
         return Ok(());
@@ -86,20 +86,18 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let mut collector = Collector::new(
         settings,
         pool.clone(),
-        Life {
+        Incarnation {
             actor: join.actor,
-            epoch: join.epoch,
+            incarnation: join.incarnation,
             after_updates: hello.after_updates,
-            earlier_lives: welcome.earlier_lives,
+            earlier_incarnations: welcome.earlier_incarnations,
         },
         header.version,
         &weights,
     )?;
     let newest = source.watch(header.version, shutdown.clone())?;
     let delivery = Delivery::start(
-        session.clone(),
-        keys,
-        spec_hash,
+        client.clone(),
         welcome.inserted_total,
         limits,
         pool,
@@ -135,7 +133,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         produced - unwanted
     );
     drop(alive);
-    session
+    client
+        .session()
         .close()
         .wait()
         .map_err(|e| anyhow::anyhow!("closing the session: {e}"))

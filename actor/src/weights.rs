@@ -9,11 +9,9 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Assembly, CodecError, Keys, Kind, PIECE_BYTES, Seldom, Shutdown, WeightsHeader, WeightsReply,
-    WeightsRequest, WeightsVersion, codec, fault,
-    session::{self, Asked},
+    Assembly, BufferPool, CodecError, PIECE_BYTES, PendingReply, RunClient, Seldom, Shutdown,
+    WeightsHeader, WeightsReply, WeightsRequest, WeightsVersion, fault,
 };
-use zenoh::{Session, Wait, bytes::ZBytes, qos::Priority, sample::Sample};
 
 /// One piece.
 const PIECE_TIMEOUT: Duration = Duration::from_secs(10);
@@ -120,12 +118,8 @@ impl Newest {
 /// Where weights come from.
 #[derive(Clone, Debug)]
 pub struct WeightsSource {
-    /// A session with the replay server.
-    pub session: Session,
-    /// The run's keys.
-    pub keys: Keys,
-    /// Hash of the run spec.
-    pub spec_hash: u64,
+    /// A client of the replay server.
+    pub client: RunClient,
 }
 
 impl WeightsSource {
@@ -171,16 +165,14 @@ impl WeightsSource {
     /// No subscription, or no thread.
     pub fn watch(self, version: u64, shutdown: Shutdown) -> anyhow::Result<Newest> {
         let newest = Newest::after(version);
-        let (slot, spec_hash) = (newest.clone(), self.spec_hash);
-        let hear = move |sample: Sample| match announced(&sample.payload().to_bytes(), spec_hash) {
-            Ok(version) => slot.announce(version),
+        let slot = newest.clone();
+        let hear = move |announced: Result<WeightsVersion, CodecError>| match announced {
+            Ok(announced) => slot.announce(announced.version),
             Err(e) => tracing::warn!("an announcement of weights was dropped: {e}"),
         };
         let announcements = self
-            .session
-            .declare_subscriber(self.keys.weights_version())
-            .callback(hear)
-            .wait()
+            .client
+            .subscribe(hear)
             .map_err(|e| anyhow::anyhow!("listening for new weights: {e}"))?;
         let slot = newest.clone();
         let work = move || {
@@ -201,7 +193,7 @@ impl WeightsSource {
                 match self.pull(version) {
                     Ok(weights) => slot.put(weights),
                     // The actor leaves: its session closes under this thread.
-                    Err(_) if self.session.is_closed() => return,
+                    Err(_) if self.client.session().is_closed() => return,
                     Err(e) => {
                         tracing::warn!("keeping weights {version}, newer ones did not come: {e:#}");
                         slot.put(None);
@@ -217,10 +209,9 @@ impl WeightsSource {
 
     /// The newest weights, piece by piece; none if they are not newer than `version`.
     fn pull(&self, version: u64) -> anyhow::Result<Option<Weights>> {
+        let pool = BufferPool::new(PIECES_IN_FLIGHT);
         let first = self.ask(WeightsRequest::NewerThan(version))?;
-        let answer = first.answer()?;
-        let answer = answer.to_bytes();
-        let (reply, piece) = self.read(&answer)?;
+        let (reply, piece) = first.receive(&pool)?;
         let WeightsReply::Piece {
             weights,
             bytes,
@@ -230,7 +221,7 @@ impl WeightsSource {
             return Ok(None);
         };
         let mut assembly = Assembly::new(weights, bytes)?;
-        assembly.take(weights, offset, piece)?;
+        assembly.take(weights, offset, &piece)?;
         let offsets = (assembly.next_offset()..assembly.bytes()).step_by(PIECE_BYTES);
         let mut requests = offsets.map(|offset| WeightsRequest::Piece {
             version: weights.version,
@@ -246,15 +237,13 @@ impl WeightsSource {
             let Some(next) = asked.pop_front() else {
                 bail!("weights {} have no last piece", weights.version);
             };
-            let answer = next.answer()?;
-            let answer = answer.to_bytes();
-            match self.read(&answer)? {
+            match next.receive(&pool)? {
                 (
                     WeightsReply::Piece {
                         weights, offset, ..
                     },
                     piece,
-                ) => assembly.take(weights, offset, piece)?,
+                ) => assembly.take(weights, offset, &piece)?,
                 _ => bail!(
                     "weights {} were replaced too often while they were pulled",
                     weights.version
@@ -264,28 +253,12 @@ impl WeightsSource {
         Ok(Some(assembly.finish()?))
     }
 
-    fn ask(&self, request: WeightsRequest) -> anyhow::Result<Asked> {
-        let message = codec::encode(Kind::WeightsRequest, self.spec_hash, &request, &[])?;
-        session::send(
-            &self.session,
-            &self.keys.weights(),
-            ZBytes::from(message),
-            Priority::DataLow,
-            PIECE_TIMEOUT,
-        )
-        .context("asking for weights")
+    fn ask(&self, request: WeightsRequest) -> anyhow::Result<PendingReply<WeightsReply>> {
+        let request = self.client.seal(&request)?;
+        self.client
+            .send(request, PIECE_TIMEOUT)
+            .context("asking for weights")
     }
-
-    fn read<'a>(&self, answer: &'a [u8]) -> anyhow::Result<(WeightsReply, &'a [u8])> {
-        Ok(codec::decode(answer, Kind::Weights, Some(self.spec_hash))?)
-    }
-}
-
-/// Version of the weights that a message announces.
-fn announced(message: &[u8], spec_hash: u64) -> Result<u64, CodecError> {
-    let (announced, _): (WeightsVersion, _) =
-        codec::decode(message, Kind::WeightsVersion, Some(spec_hash))?;
-    Ok(announced.version)
 }
 
 #[cfg(test)]

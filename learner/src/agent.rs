@@ -245,7 +245,7 @@ impl Agent {
 
         let features_t = self
             .online_network
-            .features(&self.states(batch.frames_t)?)?;
+            .features(&self.states(batch.states_t)?)?;
         let logits = self.online_network.logits(&features_t.f4)?;
         let q_values_t = self.online_network.q_values(&logits.detach())?;
         let kl = kl_loss(
@@ -319,11 +319,11 @@ impl Agent {
             v_max,
             ..
         } = self.model;
-        let frames_n = self.states(batch.frames_n)?;
-        let target_logits = distribution(&self.target_network, &frames_n)?;
+        let states_n = self.states(batch.states_n)?;
+        let target_logits = distribution(&self.target_network, &states_n)?;
         let next_q_values = if self.settings.double_dqn {
             self.online_network
-                .q_values(&distribution(&self.online_network, &frames_n)?)?
+                .q_values(&distribution(&self.online_network, &states_n)?)?
         } else {
             self.target_network.q_values(&target_logits)?
         };

@@ -3,10 +3,10 @@
 
 use std::time::{Duration, Instant};
 
-use serde::Serialize;
-use zenoh::{Session, bytes::ZBytes, qos::Priority};
+use zenoh::{Session, bytes::ZBytes};
 
 use crate::{
+    client::RunClient,
     messages::{
         hello::Hello,
         join::{ActorJoin, JoinReply, LearnerJoin},
@@ -14,8 +14,10 @@ use crate::{
     process::shutdown::Shutdown,
     session::{self, SessionError},
     wire::{
-        codec::{self, CodecError, Kind},
+        codec,
+        error::CodecError,
         keys::Keys,
+        message::{Keyed, Request},
     },
 };
 
@@ -62,7 +64,7 @@ pub struct Welcome {
     /// Version of the newest weights that the replay server has; 0 before the first.
     pub weights_version: u64,
     /// Lives of this actor that were there before this one; 0 for a learner.
-    pub earlier_lives: u32,
+    pub earlier_incarnations: u32,
 }
 
 /// Asks the replay server for the run's settings, waiting for it if it is not there yet; `None` if told to stop before.
@@ -76,11 +78,10 @@ pub fn hello(
 ) -> Result<Option<Hello>, JoinError> {
     let started = Instant::now();
     loop {
-        match ask(session, &keys.hello(), ZBytes::new()) {
+        let (key, nothing) = (keys.of::<Hello>(), ZBytes::new());
+        match session::ask(session, &key, nothing, Hello::PRIORITY, TRY_MAX) {
             Ok(answer) => {
-                return Ok(Some(
-                    codec::decode(&answer.to_bytes(), Kind::Hello, None)?.0,
-                ));
+                return Ok(Some(codec::decode(&answer.to_bytes(), None)?.0));
             }
             Err(last) if started.elapsed() > SERVER_MAX => return Err(JoinError::Nobody { last }),
             Err(e) => tracing::debug!("no replay server yet: {e}"),
@@ -96,14 +97,11 @@ pub fn hello(
 /// # Errors
 /// Another process is this actor and stays; the replay server refuses, or does not answer for a minute.
 pub fn as_actor(
-    session: &Session,
-    keys: &Keys,
-    spec_hash: u64,
+    client: &RunClient,
     join: ActorJoin,
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
-    let key = keys.actor_join();
-    take_part(session, &key, (Kind::ActorJoin, spec_hash), &join, shutdown)
+    take_part(client, &join, shutdown)
 }
 
 /// Takes part as the run's learner; `None` if told to stop before.
@@ -111,60 +109,44 @@ pub fn as_actor(
 /// # Errors
 /// Another learner takes part and stays; the replay server refuses, or does not answer for a minute.
 pub fn as_learner(
-    session: &Session,
-    keys: &Keys,
-    spec_hash: u64,
+    client: &RunClient,
     join: LearnerJoin,
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
-    let key = keys.learner_join();
-    take_part(
-        session,
-        &key,
-        (Kind::LearnerJoin, spec_hash),
-        &join,
-        shutdown,
-    )
+    take_part(client, &join, shutdown)
 }
 
 fn take_part(
-    session: &Session,
-    key: &str,
-    (kind, spec_hash): (Kind, u64),
-    join: &impl Serialize,
+    client: &RunClient,
+    join: &impl Request<Reply = JoinReply>,
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
-    let message = codec::encode(kind, spec_hash, join, &[])?;
     let started = Instant::now();
     let mut said = false;
     loop {
-        match ask(session, key, message.clone().into()) {
-            Ok(answer) => {
-                let bytes = answer.to_bytes();
-                match codec::decode(&bytes, Kind::JoinReply, Some(spec_hash))?.0 {
-                    JoinReply::Welcome {
-                        inserted_total,
-                        weights_version,
-                        earlier_lives,
-                    } => {
-                        return Ok(Some(Welcome {
-                            inserted_total,
-                            weights_version,
-                            earlier_lives,
-                        }));
-                    }
-                    JoinReply::Refused { why } => return Err(JoinError::Refused { why }),
-                    JoinReply::Taken { why } if started.elapsed() > TAKEN_MAX => {
-                        return Err(JoinError::Taken { why });
-                    }
-                    JoinReply::Taken { why } => {
-                        if !std::mem::replace(&mut said, true) {
-                            let max = TAKEN_MAX.as_secs();
-                            tracing::warn!("{why}; waiting up to {max} s for its end");
-                        }
-                    }
+        match client.ask(join, TRY_MAX) {
+            Ok(JoinReply::Welcome {
+                inserted_total,
+                weights_version,
+                earlier_incarnations,
+            }) => {
+                return Ok(Some(Welcome {
+                    inserted_total,
+                    weights_version,
+                    earlier_incarnations,
+                }));
+            }
+            Ok(JoinReply::Refused { why }) => return Err(JoinError::Refused { why }),
+            Ok(JoinReply::Taken { why }) if started.elapsed() > TAKEN_MAX => {
+                return Err(JoinError::Taken { why });
+            }
+            Ok(JoinReply::Taken { why }) => {
+                if !std::mem::replace(&mut said, true) {
+                    let max = TAKEN_MAX.as_secs();
+                    tracing::warn!("{why}; waiting up to {max} s for its end");
                 }
             }
+            Err(SessionError::Unreadable { why, .. }) => return Err(why.into()),
             Err(last) if started.elapsed() > SERVER_MAX => return Err(JoinError::Nobody { last }),
             Err(e) => tracing::debug!("the replay server did not answer: {e}"),
         }
@@ -172,8 +154,4 @@ fn take_part(
             return Ok(None);
         }
     }
-}
-
-fn ask(session: &Session, key: &str, payload: ZBytes) -> Result<ZBytes, SessionError> {
-    session::ask(session, key, payload, Priority::Data, TRY_MAX)
 }

@@ -3,6 +3,7 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
+mod client;
 pub mod config;
 pub mod join;
 pub mod session;
@@ -13,16 +14,19 @@ mod query_workers;
 mod run_spec;
 mod wire;
 
+pub use client::{Announcer, PendingReply, RunClient, Sealed};
 pub use messages::{
     affinity::AffinityUpdate,
     batch::{Batch, BatchHeader, BatchReply, BatchRowsMut, NO_ACTION, POOL_BATCHES},
-    batch_request::{BatchRequest, RequestId, Tally},
+    batch_request::{BatchRequest, RequestId},
     chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES},
+    done::Done,
     goodbye::Goodbye,
     hello::Hello,
     insert_reply::{Claim, InsertReply},
     join::{ActorJoin, JoinReply, LearnerJoin},
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
+    tally::Tally,
     weights::{
         Assembly, PIECE_BYTES, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
         WeightsVersion,
@@ -34,11 +38,13 @@ pub use process::{
     shutdown::{Shutdown, join_within},
     whole_file,
 };
-pub use query_workers::Answering;
+pub use query_workers::{Incoming, QueryWorkers, Responder};
 pub use run_spec::{Horizon, POSITIVES_MAX, RunSpec, RunSpecError, TimeoutRule};
 pub use wire::{
-    buffers::{Planes, PlanesPool},
-    codec::{self, CodecError, Kind, PROTOCOL_VERSION},
+    buffers::{Buffer, BufferPool},
+    codec::{self, PROTOCOL_VERSION},
+    error::CodecError,
     keys::{Alive, Keys},
+    message::{Keyed, Kind, Message, Request},
     shared_memory,
 };

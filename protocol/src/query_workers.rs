@@ -1,96 +1,207 @@
-//! Threads that answer questions, so that the threads on which zenoh receives never wait.
-//! What the answers are is each part's own.
+//! Threads that answer queries, so that the threads on which zenoh receives never wait.
+//! What the replies are is each part's own.
 //!
 //! zenoh calls back on the thread that reads the socket. Were it to send megabytes from there, or to wait for anything, nothing
 //! would be read meanwhile, and where the other side is busy with sending here, both would wait for ever.
 
 use std::{
+    marker::PhantomData,
     sync::{
-        Arc, Mutex, PoisonError,
+        Arc,
         atomic::{AtomicUsize, Ordering},
-        mpsc,
     },
     thread::JoinHandle,
 };
 
+use crossbeam_channel::Sender;
 use zenoh::{
-    Session, Wait,
+    Wait,
     bytes::ZBytes,
     query::{Query, Queryable},
 };
 
-use crate::process::fault;
+use crate::{
+    client::{RunClient, Sealed},
+    process::fault,
+    session,
+    wire::{
+        buffers::{Buffer, BufferPool},
+        codec,
+        error::CodecError,
+        message::{Keyed, Message, Request},
+    },
+};
 
-/// Questions that wait for a thread; whoever asks one more hears at once that nobody answers, and asks again.
+/// Queries that wait for a thread; whoever sends one more hears at once that nobody answers, and asks again.
 const WAITING_MAX: usize = 4096;
-/// Bytes of the questions that wait for a thread: a few hundred chunks of Procgen. Beyond it one question may wait, so that
-/// one of any size is answered in the end; whoever asks one more hears at once that nobody answers, and asks again.
+/// Bytes of the queries that wait for a thread: a few hundred chunks of Procgen. Beyond it one query may wait, so that one of
+/// any size is answered in the end; whoever sends one more hears at once that nobody answers, and asks again.
 const WAITING_BYTES_MAX: usize = 1 << 29;
 
-/// Threads and the queue to them. The threads end when this and everything that it declared are dropped.
+/// A request that has arrived and waits for its reply.
 #[derive(Debug)]
-pub struct Answering {
-    questions: mpsc::SyncSender<Query>,
+pub struct Incoming<R> {
+    query: Query,
+    spec_hash: u64,
+    request: PhantomData<fn() -> R>,
+}
+
+impl<R: Request> Incoming<R> {
+    /// Reads a request without payload.
+    ///
+    /// # Errors
+    /// Whatever makes it unfit to be answered.
+    pub fn read(&self) -> Result<R, CodecError> {
+        let bytes = self.query.payload().map(ZBytes::to_bytes);
+        codec::decode(&bytes.unwrap_or_default(), Some(self.spec_hash)).map(|(request, _)| request)
+    }
+
+    /// Reads a request and copies its payload into own memory of `pool`.
+    ///
+    /// # Errors
+    /// As [`Incoming::read`].
+    pub fn receive(&self, pool: &BufferPool) -> Result<(R, Buffer), CodecError> {
+        let nothing = ZBytes::new();
+        let bytes = self.query.payload().unwrap_or(&nothing);
+        codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))
+    }
+
+    /// What the reply goes through.
+    pub fn into_responder(self) -> Responder<R::Reply> {
+        Responder {
+            query: self.query,
+            spec_hash: self.spec_hash,
+            reply: PhantomData,
+        }
+    }
+}
+
+/// Somebody waits for a reply of type `M`; where this is dropped without one, they hear that nobody answers.
+#[derive(Debug)]
+pub struct Responder<M> {
+    query: Query,
+    spec_hash: u64,
+    reply: PhantomData<fn() -> M>,
+}
+
+impl<M: Message> Responder<M> {
+    /// Sends the reply. That it cannot be sent is logged: its asker asks again.
+    pub fn reply(self, reply: &M) {
+        self.send(Sealed::new(reply, self.spec_hash));
+    }
+
+    /// Sends the reply with a payload, as [`Responder::reply`] does without.
+    pub fn reply_with(self, reply: &M, payload: ZBytes) {
+        self.send(Sealed::with_payload(reply, payload, self.spec_hash));
+    }
+
+    fn send(&self, sealed: Result<Sealed<M>, CodecError>) {
+        match sealed {
+            Ok(sealed) => session::answer(&self.query, sealed.into_bytes()),
+            Err(e) => tracing::error!("a reply of kind {:?} was not sent: {e}", M::KIND),
+        }
+    }
+}
+
+/// Threads and the queue to them, for the queries at the key of `M`. The threads end when this and everything that it declared
+/// are dropped.
+#[derive(Debug)]
+pub struct QueryWorkers<M> {
+    queries: Sender<Query>,
     waiting_bytes: Arc<AtomicUsize>,
     threads: Vec<JoinHandle<()>>,
+    message: PhantomData<fn() -> M>,
 }
 
-fn payload_bytes(query: &Query) -> usize {
-    query.payload().map_or(0, ZBytes::len)
-}
-
-impl Answering {
-    /// Starts `threads` threads, each of which answers one question after the other with `answer`.
+impl<R: Request + 'static> QueryWorkers<R> {
+    /// Starts `threads` threads, each of which answers one request of the run `spec_hash` after the other with `answer`.
     ///
     /// # Errors
     /// The operating system gave no thread.
-    pub fn start(
+    pub fn answer(
         name: &str,
         threads: usize,
-        answer: impl Fn(Query) + Clone + Send + 'static,
+        spec_hash: u64,
+        answer: impl Fn(Incoming<R>) + Clone + Send + 'static,
     ) -> std::io::Result<Self> {
-        let (questions, waiting) = mpsc::sync_channel::<Query>(WAITING_MAX);
-        let waiting = Arc::new(Mutex::new(waiting));
+        Self::start(name, threads, move |query| {
+            answer(Incoming {
+                query,
+                spec_hash,
+                request: PhantomData,
+            });
+        })
+    }
+}
+
+impl<M: Keyed + 'static> QueryWorkers<M> {
+    /// Starts `threads` threads that give an `M` to whoever fetches it.
+    ///
+    /// # Errors
+    /// The operating system gave no thread.
+    pub fn offer(
+        name: &str,
+        threads: usize,
+        spec_hash: u64,
+        give: impl Fn(Responder<M>) + Clone + Send + 'static,
+    ) -> std::io::Result<Self> {
+        Self::start(name, threads, move |query| {
+            give(Responder {
+                query,
+                spec_hash,
+                reply: PhantomData,
+            });
+        })
+    }
+
+    fn start(
+        name: &str,
+        threads: usize,
+        handle: impl Fn(Query) + Clone + Send + 'static,
+    ) -> std::io::Result<Self> {
+        let (queries, waiting) = crossbeam_channel::bounded::<Query>(WAITING_MAX);
         let waiting_bytes = Arc::<AtomicUsize>::default();
         let work = |i: usize| {
-            let (waiting, answer, bytes) = (waiting.clone(), answer.clone(), waiting_bytes.clone());
+            let (waiting, handle, bytes) = (waiting.clone(), handle.clone(), waiting_bytes.clone());
             let point = name.to_owned();
             let next = move || {
                 fault::point(&point);
-                let waiting = waiting.lock().unwrap_or_else(PoisonError::into_inner);
                 let query = waiting.recv().ok()?;
                 bytes.fetch_sub(payload_bytes(&query), Ordering::Relaxed);
                 Some(query)
             };
             std::thread::Builder::new()
                 .name(format!("{name}-{i}"))
-                .spawn(move || std::iter::from_fn(next).for_each(answer))
+                .spawn(move || std::iter::from_fn(next).for_each(handle))
         };
         let threads = (0..threads).map(work).collect::<Result<_, _>>()?;
         Ok(Self {
-            questions,
+            queries,
             waiting_bytes,
             threads,
+            message: PhantomData,
         })
     }
 
-    /// Takes the questions asked at `key`, until the result is dropped. No other part need be asked: the answer is complete.
+    /// Takes the queries at the key of `M` in the client's run, until the result is dropped. No other part need be asked: the
+    /// reply is complete.
     ///
     /// # Errors
     /// zenoh refused.
-    pub fn declare(&self, session: &Session, key: String) -> zenoh::Result<Queryable<()>> {
-        let (questions, waiting_bytes) = (self.questions.clone(), self.waiting_bytes.clone());
+    pub fn declare(&self, client: &RunClient) -> zenoh::Result<Queryable<()>> {
+        let (queries, waiting_bytes) = (self.queries.clone(), self.waiting_bytes.clone());
         let take = move |query: Query| {
             let bytes = payload_bytes(&query);
             let before = waiting_bytes.fetch_add(bytes, Ordering::Relaxed);
             // A query that is dropped ends: its asker hears that nobody answers.
-            if before > WAITING_BYTES_MAX || questions.try_send(query).is_err() {
+            if before > WAITING_BYTES_MAX || queries.try_send(query).is_err() {
                 waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
-                tracing::debug!("more questions than can wait; whoever asked asks again");
+                tracing::debug!("more queries than can wait; whoever asked asks again");
             }
         };
-        session
-            .declare_queryable(key)
+        client
+            .session()
+            .declare_queryable(client.keys().of::<M>())
             .complete(true)
             .callback(take)
             .wait()
@@ -100,4 +211,8 @@ impl Answering {
     pub fn into_threads(self) -> Vec<JoinHandle<()>> {
         self.threads
     }
+}
+
+fn payload_bytes(query: &Query) -> usize {
+    query.payload().map_or(0, ZBytes::len)
 }

@@ -12,6 +12,8 @@ use zenoh::{
     query::{ConsolidationMode, Query, QueryTarget, Reply},
 };
 
+use crate::wire::error::CodecError;
+
 /// How a part reaches the others.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -57,6 +59,22 @@ pub enum SessionError {
         key: String,
         /// How long.
         within_ms: u128,
+    },
+    /// A request that is larger than a message may be.
+    #[error("{key}: {why}")]
+    TooLarge {
+        /// Where it was to be asked.
+        key: String,
+        /// Which limit it is over.
+        why: CodecError,
+    },
+    /// A reply that is damaged, foreign or of another kind.
+    #[error("{key}: {why}")]
+    Unreadable {
+        /// Where it was asked.
+        key: String,
+        /// What is wrong with it.
+        why: CodecError,
     },
     /// zenoh failed.
     #[error("{key}: {why}")]
@@ -170,17 +188,9 @@ pub fn sweep_shared_memory() {
     zenoh::shm::cleanup_orphaned_shm_segments();
 }
 
-/// A message of a head and planes, joined without a copy.
-pub fn join_planes(head: Vec<u8>, planes: ZBytes) -> ZBytes {
-    let mut writer = ZBytes::writer();
-    writer.append(ZBytes::from(head));
-    writer.append(planes);
-    writer.finish()
-}
-
-/// A question that was sent.
+/// The bytes of a reply that is to come.
 #[derive(Debug)]
-pub struct Asked {
+pub struct PendingBytes {
     key: String,
     timeout: Duration,
     replies: FifoChannelHandler<Reply>,
@@ -196,7 +206,7 @@ pub fn send(
     payload: ZBytes,
     priority: Priority,
     timeout: Duration,
-) -> Result<Asked, SessionError> {
+) -> Result<PendingBytes, SessionError> {
     let replies = session
         .get(key)
         .payload(payload)
@@ -210,19 +220,24 @@ pub fn send(
             key: key.into(),
             why: e.to_string(),
         })?;
-    Ok(Asked {
+    Ok(PendingBytes {
         key: key.into(),
         timeout,
         replies,
     })
 }
 
-impl Asked {
+impl PendingBytes {
+    /// Where it was asked.
+    pub(crate) fn key(&self) -> &str {
+        &self.key
+    }
+
     /// Waits for the one answer.
     ///
     /// # Errors
     /// Nobody there (at once), no answer in time, or the answerer's own error. All may be tried again.
-    pub fn answer(self) -> Result<ZBytes, SessionError> {
+    pub fn wait(self) -> Result<ZBytes, SessionError> {
         let reply = self.replies.recv().ok();
         self.read(reply)
     }
@@ -230,8 +245,8 @@ impl Asked {
     /// Waits for the one answer, at most for `wait_max`; `None` if it has not come by then.
     ///
     /// # Errors
-    /// As [`Asked::answer`].
-    pub fn answer_within(&self, wait_max: Duration) -> Result<Option<ZBytes>, SessionError> {
+    /// As [`PendingBytes::wait`].
+    pub fn wait_within(&self, wait_max: Duration) -> Result<Option<ZBytes>, SessionError> {
         match self.replies.recv_timeout(wait_max) {
             Ok(None) => Ok(None),
             Ok(reply) => self.read(reply).map(Some),
@@ -259,7 +274,7 @@ impl Asked {
     }
 }
 
-/// Asks one question and waits for its one answer: [`send`] and [`Asked::answer`].
+/// Asks one question and waits for its one answer: [`send`] and [`PendingBytes::wait`].
 ///
 /// # Errors
 /// As those.
@@ -270,7 +285,7 @@ pub fn ask(
     priority: Priority,
     timeout: Duration,
 ) -> Result<ZBytes, SessionError> {
-    send(session, key, payload, priority, timeout)?.answer()
+    send(session, key, payload, priority, timeout)?.wait()
 }
 
 /// Answers a question with `payload`; an asker that has gone away is logged and forgotten.

@@ -5,15 +5,14 @@
 use std::fmt::Debug;
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Chunk, ChunkHeader,
-    Claim, CodecError, End, Goodbye, Hello, Horizon, InsertReply, JoinReply, Kind, LearnerJoin,
-    LearnerStatus, NO_ACTION, PROTOCOL_VERSION, Planes, PlanesPool, ReplayStatus, RequestId,
-    Returns, RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader, WeightsReply, WeightsRequest,
-    WeightsUpload, WeightsVersion,
-    codec::{self, HEADER_BYTES_MAX, PLANES_BYTES_MAX, PREFIX_BYTES},
+    ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, BufferPool,
+    Chunk, ChunkHeader, Claim, CodecError, Done, End, Goodbye, Hello, Horizon, InsertReply,
+    JoinReply, Kind, LearnerJoin, LearnerStatus, Message, NO_ACTION, PROTOCOL_VERSION,
+    ReplayStatus, RequestId, Returns, RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader,
+    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
+    codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
-use serde::{Serialize, de::DeserializeOwned};
 
 const SPEC: u64 = 0x0123_4567_89ab_cdef;
 const ACTIONS: u32 = 15;
@@ -28,32 +27,19 @@ struct Sample {
 
 impl Sample {
     /// Encodes `header`, checks that it comes back, and keeps the bytes.
-    fn of<H: Serialize + DeserializeOwned + PartialEq + Debug>(kind: Kind, header: &H) -> Self {
-        let bytes = codec::encode(kind, SPEC, header, &[]).unwrap();
-        let (back, planes) = codec::decode::<H>(&bytes, kind, Some(SPEC)).unwrap();
-        assert_eq!((&back, planes.len()), (header, 0));
-        let (back, _) = codec::decode::<H>(&bytes, kind, None).unwrap();
+    fn of<M: Message + PartialEq + Debug>(header: &M) -> Self {
+        let bytes = codec::encode(SPEC, header, &[]).unwrap();
+        let (back, payload) = codec::decode::<M>(&bytes, Some(SPEC)).unwrap();
+        assert_eq!((&back, payload.len()), (header, 0));
+        let (back, _) = codec::decode::<M>(&bytes, None).unwrap();
         assert_eq!(&back, header, "where any run is welcome");
         Self {
             name: format!("{header:?}"),
-            kind,
+            kind: M::KIND,
             bytes,
-            read: reader::<H>(kind),
+            read: |bytes| codec::decode::<M>(bytes, Some(SPEC)).map(|_| ()),
         }
     }
-}
-
-/// A reader of headers of type `H`, for the kinds that carry one.
-fn reader<H: DeserializeOwned>(kind: Kind) -> fn(&[u8]) -> Result<(), CodecError> {
-    macro_rules! readers {
-        ($($kind:ident)*) => {
-            match kind {
-                $(Kind::$kind => |bytes| codec::decode::<H>(bytes, Kind::$kind, Some(SPEC)).map(|_| ()),)*
-            }
-        };
-    }
-    readers!(Chunk InsertReply BatchRequest BatchReply Affinity Weights WeightsVersion Goodbye ReplayStatus
-        LearnerStatus Hello Done ActorJoin LearnerJoin JoinReply Claim WeightsUpload WeightsRequest)
 }
 
 fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
@@ -61,22 +47,22 @@ fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
 }
 
 fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
-    match codec::decode(bytes, Kind::BatchReply, Some(SPEC))? {
-        (BatchReply::Batch(header), planes) => {
-            Batch::from_planes(header, planes.to_vec().into()).map(|_| ())
+    match codec::decode::<BatchReply>(bytes, Some(SPEC))? {
+        (BatchReply::Batch(header), payload) => {
+            Batch::from_payload(header, payload.to_vec().into()).map(|_| ())
         }
         _ => Ok(()),
     }
 }
 
 fn read_weights(bytes: &[u8]) -> Result<(), CodecError> {
-    WeightsUpload::decode(bytes, SPEC).map(|_| ())
+    codec::decode::<WeightsUpload>(bytes, Some(SPEC)).map(|_| ())
 }
 
 fn chunk() -> Chunk {
     let mut chunk = Chunk::zeroed(ChunkHeader {
         actor: 3,
-        epoch: u64::MAX,
+        incarnation: u64::MAX,
         sequence: 5,
         first_transition: 60,
         weights_version: 7,
@@ -108,8 +94,8 @@ fn batch() -> Batch {
     });
     let mut rows = batch.rows_mut();
     for row in 0..3 {
-        rows.frame_t(row).fill(10 + row as u8);
-        rows.frame_n(row).fill(20 + row as u8);
+        rows.state_t(row).fill(10 + row as u8);
+        rows.state_n(row).fill(20 + row as u8);
         rows.set(
             row,
             row as u8,
@@ -125,18 +111,24 @@ fn batch() -> Batch {
 }
 
 /// The bytes of a message as the wire joins them.
-fn join((mut head, planes): (Vec<u8>, impl AsRef<[u8]>)) -> Vec<u8> {
-    head.extend_from_slice(planes.as_ref());
+fn join((mut head, payload): (Vec<u8>, impl AsRef<[u8]>)) -> Vec<u8> {
+    head.extend_from_slice(payload.as_ref());
     head
 }
 
+/// A batch as it travels.
+fn sealed(batch: Batch) -> Vec<u8> {
+    let (header, payload) = batch.into_payload();
+    codec::encode(SPEC, &BatchReply::Batch(header), &payload).unwrap()
+}
+
 fn weights() -> Vec<u8> {
-    let planes: Vec<u8> = (0..40).collect();
+    let payload: Vec<u8> = (0..40).collect();
     let upload = WeightsUpload {
         learner: 5,
-        weights: WeightsHeader::new(4, 312, &planes),
+        weights: WeightsHeader::new(4, 312, &payload),
     };
-    codec::encode(Kind::WeightsUpload, SPEC, &upload, &planes).unwrap()
+    codec::encode(SPEC, &upload, &payload).unwrap()
 }
 
 /// One or more messages of every kind.
@@ -199,100 +191,77 @@ fn samples() -> Vec<Sample> {
     };
     let goodbye = Goodbye {
         actor: 1,
-        epoch: 2,
+        incarnation: 2,
         produced: 3,
     };
-    let mut samples: Vec<Sample> = replies
-        .iter()
-        .map(|r| Sample::of(Kind::InsertReply, r))
-        .collect();
+    let mut samples: Vec<Sample> = replies.iter().map(Sample::of).collect();
     let joined = [
         JoinReply::Welcome {
             inserted_total: 3,
             weights_version: 4,
-            earlier_lives: 5,
+            earlier_incarnations: 5,
         },
         JoinReply::Taken { why: "a".into() },
         JoinReply::Refused { why: "b".into() },
     ];
-    samples.extend(joined.map(|reply| Sample::of(Kind::JoinReply, &reply)));
-    samples.extend(waits.map(|waiting| Sample::of(Kind::BatchReply, &BatchReply::Wait(waiting))));
+    samples.extend(joined.map(|reply| Sample::of(&reply)));
+    samples.extend(waits.map(|waiting| Sample::of(&BatchReply::Wait(waiting))));
     samples.extend([
-        Sample::of(Kind::BatchReply, &BatchReply::Finished),
-        Sample::of(
-            Kind::BatchReply,
-            &BatchReply::Refused { why: String::new() },
-        ),
-        Sample::of(
-            Kind::BatchRequest,
-            &BatchRequest {
-                learner: 5,
-                id: RequestId::first(u64::MAX).again(),
-                rows: 256,
-                shared_memory: true,
-                elsewhere: Some(Tally::default()),
-            },
-        ),
-        Sample::of(Kind::Affinity, &affinity),
-        Sample::of(Kind::WeightsVersion, &WeightsVersion { version: 9 }),
-        Sample::of(Kind::Goodbye, &goodbye),
-        Sample::of(Kind::ReplayStatus, &ReplayStatus::default()),
-        Sample::of(Kind::ReplayStatus, &replay),
-        Sample::of(Kind::LearnerStatus, &learner),
-        Sample::of(Kind::Hello, &hello),
-        Sample::of(Kind::ActorJoin, &ActorJoin { actor: 1, epoch: 2 }),
-        Sample::of(
-            Kind::LearnerJoin,
-            &LearnerJoin {
-                learner: 5,
-                rows_sampled: 9,
-            },
-        ),
-        Sample::of(
-            Kind::Claim,
-            &Claim {
-                actor: 1,
-                epoch: 2,
-                sequence: 3,
-                leaving: true,
-            },
-        ),
-        Sample::of(Kind::WeightsRequest, &WeightsRequest::NewerThan(7)),
-        Sample::of(
-            Kind::WeightsRequest,
-            &WeightsRequest::Piece {
-                version: 8,
-                offset: 1 << 18,
-            },
-        ),
-        Sample::of(Kind::Weights, &WeightsReply::NoneNewer),
-        Sample::of(Kind::Weights, &WeightsReply::Gone),
-        Sample::of(
-            Kind::Weights,
-            &WeightsReply::Piece {
-                weights: WeightsHeader::new(8, 9, b"these"),
-                bytes: 5,
-                offset: 0,
-            },
-        ),
-        Sample::of(Kind::Done, &()),
+        Sample::of(&BatchReply::Finished),
+        Sample::of(&BatchReply::Refused { why: String::new() }),
+        Sample::of(&BatchRequest {
+            learner: 5,
+            id: RequestId::first(u64::MAX).again(),
+            rows: 256,
+            shared_memory: true,
+            other_shards: Some(Tally::default()),
+        }),
+        Sample::of(&affinity),
+        Sample::of(&WeightsVersion { version: 9 }),
+        Sample::of(&goodbye),
+        Sample::of(&ReplayStatus::default()),
+        Sample::of(&replay),
+        Sample::of(&learner),
+        Sample::of(&hello),
+        Sample::of(&ActorJoin {
+            actor: 1,
+            incarnation: 2,
+        }),
+        Sample::of(&LearnerJoin {
+            learner: 5,
+            rows_sampled: 9,
+        }),
+        Sample::of(&Claim {
+            actor: 1,
+            incarnation: 2,
+            sequence: 3,
+            leaving: true,
+        }),
+        Sample::of(&WeightsRequest::NewerThan(7)),
+        Sample::of(&WeightsRequest::Piece {
+            version: 8,
+            offset: 1 << 18,
+        }),
+        Sample::of(&WeightsReply::NoneNewer),
+        Sample::of(&WeightsReply::Gone),
+        Sample::of(&WeightsReply::Piece {
+            weights: WeightsHeader::new(8, 9, b"these"),
+            bytes: 5,
+            offset: 0,
+        }),
+        Sample::of(&Done),
     ]);
-    let with_planes = [
+    let with_payload = [
         (
             "chunk",
             Kind::Chunk,
             join(chunk().seal(SPEC).unwrap()),
             read_chunk as fn(&[u8]) -> _,
         ),
-        (
-            "batch",
-            Kind::BatchReply,
-            join(batch().seal(SPEC).unwrap()),
-            read_batch,
-        ),
+        ("batch", Kind::BatchReply, sealed(batch()), read_batch),
         ("weights", Kind::WeightsUpload, weights(), read_weights),
     ];
-    samples.extend(with_planes.map(|(name, kind, bytes, read)| Sample {
+    samples.extend(with_payload.map(|(name, kind, bytes, read)| Sample {
         name: name.into(),
         kind,
         bytes,
@@ -302,7 +271,7 @@ fn samples() -> Vec<Sample> {
 }
 
 /// A message with a right checksum and whatever else.
-fn forge(version: u16, kind: u16, lengths: (u32, u64), header: &[u8], planes: &[u8]) -> Vec<u8> {
+fn forge(version: u16, kind: u16, lengths: (u32, u64), header: &[u8], payload: &[u8]) -> Vec<u8> {
     let mut bytes = b"DRML".to_vec();
     bytes.extend(version.to_le_bytes());
     bytes.extend(kind.to_le_bytes());
@@ -310,22 +279,22 @@ fn forge(version: u16, kind: u16, lengths: (u32, u64), header: &[u8], planes: &[
     bytes.extend(lengths.0.to_le_bytes());
     bytes.extend(lengths.1.to_le_bytes());
     let mut hasher = crc32fast::Hasher::new();
-    [&bytes, header, planes]
+    [&bytes, header, payload]
         .iter()
         .for_each(|part| hasher.update(part));
     bytes.extend(hasher.finalize().to_le_bytes());
     bytes.extend_from_slice(header);
-    bytes.extend_from_slice(planes);
+    bytes.extend_from_slice(payload);
     bytes
 }
 
-fn forge_whole(kind: Kind, header: &[u8], planes: &[u8]) -> Vec<u8> {
+fn forge_whole(kind: Kind, header: &[u8], payload: &[u8]) -> Vec<u8> {
     forge(
         PROTOCOL_VERSION,
         kind as u16,
-        (header.len() as u32, planes.len() as u64),
+        (header.len() as u32, payload.len() as u64),
         header,
-        planes,
+        payload,
     )
 }
 
@@ -340,23 +309,23 @@ fn chunk_batch_and_weights_come_back() {
     );
     assert_eq!(back.frames()[5 * 5..], [6; 5]);
 
-    let bytes = join(batch().seal(SPEC).unwrap());
-    let (reply, planes) = codec::decode(&bytes, Kind::BatchReply, Some(SPEC)).unwrap();
+    let bytes = sealed(batch());
+    let (reply, payload) = codec::decode(&bytes, Some(SPEC)).unwrap();
     let BatchReply::Batch(header) = reply else {
         panic!("{reply:?}")
     };
-    let back = Batch::from_planes(header, planes.to_vec().into()).unwrap();
+    let back = Batch::from_payload(header, payload.to_vec().into()).unwrap();
     assert_eq!(back, batch());
     assert_eq!(
-        back.frames_t(),
+        back.states_t(),
         [10, 10, 10, 10, 11, 11, 11, 11, 12, 12, 12, 12]
     );
     assert_eq!(
-        back.frames_n(),
+        back.states_n(),
         [20, 20, 20, 20, 21, 21, 21, 21, 22, 22, 22, 22]
     );
     assert_eq!(
-        back.frames_k(),
+        back.states_k(),
         [30, 30, 30, 30, 0, 0, 0, 0, 32, 32, 32, 32]
     );
     assert_eq!(
@@ -371,16 +340,16 @@ fn chunk_batch_and_weights_come_back() {
     assert_eq!(back.bootstrap_discounts(), [0.0, 0.0, 0.5]);
 
     let bytes = weights();
-    let (upload, planes) = WeightsUpload::decode(&bytes, SPEC).unwrap();
+    let (upload, payload) = codec::decode::<WeightsUpload>(&bytes, Some(SPEC)).unwrap();
     let WeightsUpload { learner, weights } = upload;
     assert_eq!((learner, weights.version, weights.updates), (5, 4, 312));
-    assert_eq!((planes.len(), weights.sha256_hex().len()), (40, 64));
+    assert_eq!((payload.len(), weights.sha256_hex().len()), (40, 64));
 }
 
 /// However a message was cut on its way, what is received is what was sent, and in memory that held something else before.
 #[test]
 fn pieces_are_received_as_the_whole_is() {
-    let pool = PlanesPool::new(1);
+    let pool = BufferPool::new(1);
     let bytes = join(chunk().seal(SPEC).unwrap());
     for at in 0..=bytes.len() {
         let (first, second) = bytes.split_at(at);
@@ -426,8 +395,8 @@ fn parts_are_merged_row_by_row() {
         for row in 0..header.rows as usize {
             let value = first + row as u8;
             rows.set(row, value, value + 100, f32::from(value), 0.5);
-            rows.frame_t(row).fill(value);
-            rows.frame_n(row).fill(value + 20);
+            rows.state_t(row).fill(value);
+            rows.state_n(row).fill(value + 20);
             rows.positive(0, row, 1).fill(value + 40);
             rows.positive(1, row, 2).fill(value + 60);
         }
@@ -438,7 +407,7 @@ fn parts_are_merged_row_by_row() {
         part(header(1, 4.0, (9, 5)), 2),
     ];
     let whole = Batch::merged_header(&parts).unwrap();
-    let merged = Batch::merge(&parts, Planes::from(vec![0xAB; whole.planes_bytes()]));
+    let merged = Batch::merge(&parts, Buffer::from(vec![0xAB; whole.payload_bytes()]));
     let mut expected = part(whole, 0);
     assert_eq!((whole.mean_age, whole.weights_versions), (2.0, (9, 3)));
     assert_eq!((whole.tally.inserted, whole.held), (20, 10));
@@ -459,7 +428,7 @@ fn parts_are_merged_row_by_row() {
 #[test]
 fn every_kind_has_a_sample_that_is_read() {
     let samples = samples();
-    for kind in 1..=12 {
+    for kind in 1..=18 {
         assert!(
             samples.iter().any(|sample| sample.kind as u16 == kind),
             "kind {kind}"
@@ -535,19 +504,11 @@ fn every_flipped_bit_is_refused() {
 #[test]
 fn each_mismatch_has_its_own_error() {
     let header = [5u8];
-    let read = |bytes: &[u8], hash| {
-        codec::decode::<WeightsVersion>(bytes, Kind::WeightsVersion, hash).map(|_| ())
-    };
+    let read = |bytes: &[u8], hash| codec::decode::<WeightsVersion>(bytes, hash).map(|_| ());
     let good = forge_whole(Kind::WeightsVersion, &header, &[]);
     assert_eq!(
         good,
-        codec::encode(
-            Kind::WeightsVersion,
-            SPEC,
-            &WeightsVersion { version: 5 },
-            &[]
-        )
-        .unwrap()
+        codec::encode(SPEC, &WeightsVersion { version: 5 }, &[]).unwrap()
     );
     assert_eq!(read(&good, Some(SPEC)), Ok(()));
 
@@ -604,7 +565,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
             &[5],
             &[],
         );
-        codec::decode::<WeightsVersion>(&bytes, Kind::WeightsVersion, Some(SPEC)).unwrap_err()
+        codec::decode::<WeightsVersion>(&bytes, Some(SPEC)).unwrap_err()
     };
     let header = HEADER_BYTES_MAX as u32 + 1;
     assert_eq!(
@@ -625,12 +586,12 @@ fn huge_lengths_are_refused_without_taking_memory() {
         read((1, u64::MAX)),
         CodecError::TooLarge {
             have: usize::MAX,
-            max: PLANES_BYTES_MAX
+            max: PAYLOAD_BYTES_MAX
         }
     );
-    let need = PREFIX_BYTES + 1 + PLANES_BYTES_MAX;
+    let need = PREFIX_BYTES + 1 + PAYLOAD_BYTES_MAX;
     assert_eq!(
-        read((1, PLANES_BYTES_MAX as u64)),
+        read((1, PAYLOAD_BYTES_MAX as u64)),
         CodecError::Length {
             have: PREFIX_BYTES + 1,
             need
@@ -639,7 +600,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
     // A header that claims more elements than any header has room for.
     let claim = [&[1u8, 3, 253][..], &u64::MAX.to_le_bytes()].concat();
     let bytes = forge_whole(Kind::Affinity, &claim, &[]);
-    let refused = codec::decode::<AffinityUpdate>(&bytes, Kind::Affinity, Some(SPEC)).unwrap_err();
+    let refused = codec::decode::<AffinityUpdate>(&bytes, Some(SPEC)).unwrap_err();
     assert!(matches!(refused, CodecError::Header(_)), "{refused}");
     // The sender keeps to the limit too.
     let hello = Hello {
@@ -650,7 +611,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
         shard: (0, 1),
         shared_memory: false,
     };
-    let refused = codec::seal(Kind::Hello, SPEC, &hello, &[]).unwrap_err();
+    let refused = codec::seal(SPEC, &hello, &[]).unwrap_err();
     assert!(
         matches!(
             refused,
@@ -664,13 +625,11 @@ fn huge_lengths_are_refused_without_taking_memory() {
 }
 
 #[test]
-fn counts_that_do_not_fit_their_planes_are_refused() {
+fn counts_that_do_not_fit_their_payload_are_refused() {
     let header = chunk().header;
-    let planes = &join(chunk().seal(SPEC).unwrap())[..];
-    let planes = &planes[planes.len() - 6 * 11..];
-    let read = |header: ChunkHeader| {
-        read_chunk(&codec::encode(Kind::Chunk, SPEC, &header, planes).unwrap())
-    };
+    let payload = &join(chunk().seal(SPEC).unwrap())[..];
+    let payload = &payload[payload.len() - 6 * 11..];
+    let read = |header: ChunkHeader| read_chunk(&codec::encode(SPEC, &header, payload).unwrap());
     assert_eq!(read(header), Ok(()));
     let most = u32::MAX;
     for wrong in [
@@ -717,12 +676,12 @@ fn counts_that_do_not_fit_their_planes_are_refused() {
         },
     ] {
         assert!(
-            Batch::from_planes(wrong, Planes::zeroed(3 * 24)).is_err(),
+            Batch::from_payload(wrong, Buffer::zeroed(3 * 24)).is_err(),
             "{wrong:?}"
         );
     }
     assert!(
-        Batch::from_planes(BatchHeader { rows: 0, ..header }, Planes::zeroed(0)).is_err(),
+        Batch::from_payload(BatchHeader { rows: 0, ..header }, Buffer::zeroed(0)).is_err(),
         "no rows at all"
     );
 }
@@ -731,35 +690,35 @@ fn counts_that_do_not_fit_their_planes_are_refused() {
 fn what_no_world_gives_is_refused() {
     let decode = |change: &dyn Fn(&mut Vec<u8>)| {
         let whole = join(chunk().seal(SPEC).unwrap());
-        let mut planes = whole[whole.len() - 6 * 11..].to_vec();
-        change(&mut planes);
-        read_chunk(&codec::encode(Kind::Chunk, SPEC, &chunk().header, &planes).unwrap())
+        let mut payload = whole[whole.len() - 6 * 11..].to_vec();
+        change(&mut payload);
+        read_chunk(&codec::encode(SPEC, &chunk().header, &payload).unwrap())
     };
     assert_eq!(decode(&|_| {}), Ok(()));
     assert!(
-        decode(&|planes| planes[30 + 2] = ACTIONS as u8)
+        decode(&|payload| payload[30 + 2] = ACTIONS as u8)
             .unwrap_err()
             .to_string()
             .contains("action 15")
     );
     assert!(
-        decode(&|planes| planes[36 + 5] = 4)
+        decode(&|payload| payload[36 + 5] = 4)
             .unwrap_err()
             .to_string()
             .contains("end 4")
     );
     for reward in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let refused =
-            decode(&|planes| planes[42 + 4..42 + 8].copy_from_slice(&reward.to_le_bytes()));
+            decode(&|payload| payload[42 + 4..42 + 8].copy_from_slice(&reward.to_le_bytes()));
         assert!(refused.unwrap_err().to_string().contains("row 1"));
     }
     let upload = WeightsUpload {
         learner: 5,
         weights: WeightsHeader::new(1, 1, b"these"),
     };
-    let bytes = codec::encode(Kind::WeightsUpload, SPEC, &upload, b"those").unwrap();
+    let bytes = codec::encode(SPEC, &upload, b"those").unwrap();
     assert!(matches!(
-        WeightsUpload::decode(&bytes, SPEC),
+        codec::decode::<WeightsUpload>(&bytes, Some(SPEC)),
         Err(CodecError::Header(_))
     ));
 }
@@ -867,24 +826,24 @@ proptest! {
 
     /// Bytes with a right prefix and checksum are read or refused, but never a panic.
     #[test]
-    fn random_headers_and_planes_do_no_harm(
+    fn random_headers_and_payloads_do_no_harm(
         header in prop::collection::vec(any::<u8>(), 0..80),
-        planes in prop::collection::vec(any::<u8>(), 0..80),
+        payload in prop::collection::vec(any::<u8>(), 0..80),
     ) {
         for Sample { kind, read, .. } in samples() {
-            let _ = read(&forge_whole(kind, &header, &planes));
+            let _ = read(&forge_whole(kind, &header, &payload));
         }
     }
 
     #[test]
     fn any_chunk_comes_back(
         (streams, steps, frame_bytes) in (1u32..5, 1u32..9, 0u32..40),
-        (actor, epoch, sequence, first_transition) in any::<(u32, u64, u64, u64)>(),
+        (actor, incarnation, sequence, first_transition) in any::<(u32, u64, u64, u64)>(),
         fill in any::<u8>(),
         rewards in prop::collection::vec(-1e30f32..1e30, 45),
     ) {
         let mut chunk = Chunk::zeroed(ChunkHeader {
-            actor, epoch, sequence, first_transition, weights_version: epoch ^ 1,
+            actor, incarnation, sequence, first_transition, weights_version: incarnation ^ 1,
             leaving: fill > 99, streams, steps, frame_bytes,
         });
         for (row, &reward) in rewards.iter().enumerate().take(chunk.header.transitions()) {

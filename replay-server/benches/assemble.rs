@@ -39,7 +39,7 @@ fn chunk(sequence: u64) -> Chunk {
     let mut rng = ChaCha8Rng::seed_from_u64(sequence);
     let mut chunk = Chunk::zeroed(ChunkHeader {
         actor: 0,
-        epoch: 1,
+        incarnation: 1,
         sequence,
         first_transition: sequence * u64::from(STREAMS * STEPS),
         weights_version: 1,
@@ -73,7 +73,12 @@ fn filled(frame_stack: u32) -> (Replay, Chunk) {
         transitions_max: None,
     };
     let mut replay = Replay::new(&spec(frame_stack), &config, ROWS).unwrap();
-    replay.join_actor(ActorJoin { actor: 0, epoch: 1 }).unwrap();
+    replay
+        .join_actor(ActorJoin {
+            actor: 0,
+            incarnation: 1,
+        })
+        .unwrap();
     let mut chunk = chunk(0);
     while replay.inserted_total() < CAPACITY + 1000 {
         insert_next(&mut replay, &mut chunk);

@@ -1,7 +1,7 @@
 //! What can be set about the replay server, and the checks that keep a run from stalling.
 //! It does not hold the rules of the return or of k: those are the run spec's, shared by every part.
 
-use driml_protocol::{RunSpec, RunSpecError, codec::PLANES_BYTES_MAX};
+use driml_protocol::{BatchHeader, RunSpec, RunSpecError, codec::PAYLOAD_BYTES_MAX};
 use serde::{Deserialize, Serialize};
 
 use crate::storage::frame_store::log::OVERHEAD_BYTES_MAX;
@@ -207,7 +207,6 @@ pub const fn compressed_bytes_least(transitions: u64, frame_bytes: usize) -> u64
 
 /// Most rows of one batch of this run, so that it stays below the codec's limit; larger requests are refused.
 pub fn rows_max(spec: &RunSpec) -> u32 {
-    let positives = spec.horizon.positives();
-    let row = spec.state_bytes() * (2 + positives) + 10 + 2 * positives;
-    u32::try_from(PLANES_BYTES_MAX / row).unwrap_or(u32::MAX)
+    let row_bytes = BatchHeader::of(spec, 1).payload_bytes();
+    u32::try_from(PAYLOAD_BYTES_MAX / row_bytes).unwrap_or(u32::MAX)
 }

@@ -16,9 +16,9 @@ pub struct RateLimiter {
     warmup_transitions: u64,
     slack_transitions: u64,
     transitions_max: Option<u64>,
-    here: Tally,
+    this_shard: Tally,
     /// What the replay's other shards have counted, as far as heard.
-    elsewhere: Tally,
+    other_shards: Tally,
 }
 
 impl RateLimiter {
@@ -34,34 +34,36 @@ impl RateLimiter {
             warmup_transitions,
             slack_transitions,
             transitions_max,
-            here: Tally::default(),
-            elsewhere: Tally::default(),
+            this_shard: Tally::default(),
+            other_shards: Tally::default(),
         }
     }
 
     /// The same, in a run that goes on after so much was counted here and in the replay's other shards.
     #[must_use]
-    pub fn going_on_after(self, here: Tally, elsewhere: Tally) -> Self {
+    pub fn resumed_at(self, this_shard: Tally, other_shards: Tally) -> Self {
         Self {
-            here,
-            elsewhere,
+            this_shard,
+            other_shards,
             ..self
         }
     }
 
     /// Transitions stored in all shards.
     pub const fn inserted_total(&self) -> u64 {
-        self.here.inserted.saturating_add(self.elsewhere.inserted)
+        self.this_shard
+            .inserted
+            .saturating_add(self.other_shards.inserted)
     }
 
     /// Takes what the other shards have counted; counts never fall.
-    pub fn heard(&mut self, elsewhere: Tally) {
+    pub fn set_other_shards(&mut self, other_shards: Tally) {
         let Tally {
             inserted,
             rows_sampled,
-        } = &mut self.elsewhere;
-        *inserted = elsewhere.inserted.max(*inserted);
-        *rows_sampled = elsewhere.rows_sampled.max(*rows_sampled);
+        } = &mut self.other_shards;
+        *inserted = other_shards.inserted.max(*inserted);
+        *rows_sampled = other_shards.rows_sampled.max(*rows_sampled);
     }
 
     fn after_warmup(&self) -> u64 {
@@ -75,7 +77,7 @@ impl RateLimiter {
     }
 
     fn credit(&self) -> f64 {
-        let Tally { rows_sampled, .. } = self.here + self.elsewhere;
+        let Tally { rows_sampled, .. } = self.this_shard + self.other_shards;
         self.rows_allowed() - rows_sampled as f64
     }
 
@@ -107,24 +109,24 @@ impl RateLimiter {
 
     /// Counts `transitions` stored.
     pub fn inserted(&mut self, transitions: u64) {
-        self.here.inserted += transitions;
+        self.this_shard.inserted += transitions;
     }
 
     /// Counts `rows` sampled.
     pub fn sampled(&mut self, rows: u32) {
         debug_assert!(self.may_sample(rows), "{rows} rows beyond the replay ratio");
-        self.here.rows_sampled += u64::from(rows);
+        self.this_shard.rows_sampled += u64::from(rows);
     }
 
     /// Counts `rows` that were sampled, and of which nothing was learned, as not sampled.
-    pub fn taken_back(&mut self, rows: u64) {
-        let rows_sampled = &mut self.here.rows_sampled;
+    pub fn refund(&mut self, rows: u64) {
+        let rows_sampled = &mut self.this_shard.rows_sampled;
         *rows_sampled = rows_sampled.saturating_sub(rows);
     }
 
     /// What was counted here since the start.
     pub const fn tally(&self) -> Tally {
-        self.here
+        self.this_shard
     }
 
     /// Who waits, for batches of `rows`.

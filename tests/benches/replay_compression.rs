@@ -62,7 +62,12 @@ fn replay(compression: Compression, frame_stack: u32) -> Replay {
         transitions_max: None,
     };
     let mut replay = Replay::new(&spec, &config, ROWS).unwrap();
-    replay.join_actor(ActorJoin { actor: 0, epoch: 1 }).unwrap();
+    replay
+        .join_actor(ActorJoin {
+            actor: 0,
+            incarnation: 1,
+        })
+        .unwrap();
     replay
 }
 
@@ -87,7 +92,7 @@ fn chunks(engine: &ProcgenEngine, game: Game, runs_right: bool) -> Vec<Chunk> {
     let mut chunk = |sequence: usize| {
         let mut chunk = Chunk::zeroed(ChunkHeader {
             actor: 0,
-            epoch: 1,
+            incarnation: 1,
             sequence: sequence as u64,
             first_transition: (sequence * COPIES * STEPS_PER_CHUNK) as u64,
             weights_version: 1,

@@ -4,13 +4,12 @@
 use std::time::{Duration, Instant};
 
 use driml_protocol::{
-    ActorJoin, Chunk, InsertReply, Keys, Kind, LearnerJoin, LearnerStatus, ReplayStatus, RunSpec,
-    Shutdown, codec,
+    ActorJoin, Chunk, ChunkHeader, InsertReply, Keyed, Keys, LearnerJoin, LearnerStatus,
+    ReplayStatus, RunClient, RunSpec, Shutdown, codec,
     config::Settings,
     join,
     session::{self, Endpoints, SessionError},
 };
-use serde::de::DeserializeOwned;
 use zenoh::{Session, Wait, qos::Priority};
 
 use crate::waiting::wait_for;
@@ -77,23 +76,26 @@ impl Client {
         .map(|answer| answer.to_bytes().into_owned())
     }
 
-    fn ask_for<T: DeserializeOwned>(&self, key: &str, kind: Kind, payload: Vec<u8>) -> Option<T> {
-        let answer = self.ask(key, payload).ok()?;
-        Some(
-            codec::decode(&answer, kind, Some(self.spec.hash()))
-                .unwrap()
-                .0,
-        )
+    /// The session, keys and hash, as the parts of the run have them.
+    pub fn run(&self) -> RunClient {
+        RunClient::new(self.session.clone(), self.keys.clone(), self.spec.hash())
     }
 
     /// The replay server's status; none if it did not answer.
     pub fn replay(&self) -> Option<ReplayStatus> {
-        self.ask_for(&self.keys.replay_status(), Kind::ReplayStatus, Vec::new())
+        self.fetch()
     }
 
     /// The learner's status; none if it is not there.
     pub fn learner(&self) -> Option<LearnerStatus> {
-        self.ask_for(&self.keys.learner_status(), Kind::LearnerStatus, Vec::new())
+        self.fetch()
+    }
+
+    fn fetch<M: Keyed>(&self) -> Option<M> {
+        match self.run().fetch(ANSWER_MAX) {
+            Err(e @ SessionError::Unreadable { .. }) => panic!("{e}"),
+            fetched => fetched.ok(),
+        }
     }
 
     /// Waits until the replay server's status is as wanted, and gives it.
@@ -114,14 +116,14 @@ impl Client {
         wait_for(what, || self.learner().filter(&wanted))
     }
 
-    /// Takes part as an actor; its chunks are of this `epoch`.
+    /// Takes part as an actor; its chunks are of this `incarnation`.
     ///
     /// # Panics
     /// If the replay server does not take it.
-    pub fn join_as_actor(&self, actor: u32, epoch: u64) {
-        let join = ActorJoin { actor, epoch };
+    pub fn join_as_actor(&self, actor: u32, incarnation: u64) {
+        let join = ActorJoin { actor, incarnation };
         let never = Shutdown::default();
-        join::as_actor(&self.session, &self.keys, self.spec.hash(), join, &never).unwrap();
+        join::as_actor(&self.run(), join, &never).unwrap();
     }
 
     /// Takes part as the learner, which has learned from so many rows.
@@ -134,7 +136,7 @@ impl Client {
             rows_sampled,
         };
         let never = Shutdown::default();
-        join::as_learner(&self.session, &self.keys, self.spec.hash(), join, &never).unwrap();
+        join::as_learner(&self.run(), join, &never).unwrap();
     }
 
     /// Sends a chunk as an actor would.
@@ -147,15 +149,17 @@ impl Client {
     /// # Panics
     /// If nobody answers, or not in the run's own words.
     pub fn insert_bytes(&self, bytes: Vec<u8>) -> InsertReply {
-        self.ask_for(&self.keys.ingest(), Kind::InsertReply, bytes)
-            .expect("chunks are always answered")
+        let reply = self
+            .ask(&self.keys.of::<ChunkHeader>(), bytes)
+            .expect("chunks are always answered");
+        codec::decode(&reply, Some(self.spec.hash())).unwrap().0
     }
 }
 
 /// A chunk's bytes as a part of the run with this hash would send them.
 fn sealed(chunk: &Chunk, spec_hash: u64) -> Vec<u8> {
-    let (mut bytes, planes) = chunk.seal(spec_hash).unwrap();
-    bytes.extend_from_slice(planes);
+    let (mut bytes, payload) = chunk.seal(spec_hash).unwrap();
+    bytes.extend_from_slice(payload);
     bytes
 }
 

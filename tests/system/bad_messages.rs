@@ -2,7 +2,7 @@
 //! That no such bytes make the codec panic is its own test; here a whole server lives on and goes on storing.
 
 use driml_protocol::{
-    AffinityUpdate, BatchReply, BatchRequest, Chunk, ChunkHeader, End, Goodbye, InsertReply, Kind,
+    AffinityUpdate, BatchReply, BatchRequest, Chunk, ChunkHeader, End, Goodbye, InsertReply,
     PROTOCOL_VERSION, RequestId, codec,
 };
 use driml_tests::{Client, Process, TestSystem};
@@ -17,14 +17,14 @@ struct Served {
 }
 
 /// The life of actor 0 that sends chunks here, and the learner.
-const EPOCH: u64 = 9;
+const INCARNATION: u64 = 9;
 const LEARNER: u64 = 5;
 
 fn served() -> Served {
     let system = system();
     let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
     let client = system.connect();
-    client.join_as_actor(0, EPOCH);
+    client.join_as_actor(0, INCARNATION);
     client.join_as_learner(LEARNER, 0);
     Served {
         client,
@@ -47,7 +47,7 @@ impl Served {
         let spec = &self.client.spec;
         let header = ChunkHeader {
             actor: 0,
-            epoch: EPOCH,
+            incarnation: INCARNATION,
             sequence,
             first_transition: 6 * sequence,
             weights_version: 1,
@@ -69,8 +69,8 @@ impl Served {
     }
 
     fn sealed(&self, chunk: &Chunk, spec_hash: u64) -> Vec<u8> {
-        let (head, planes) = chunk.seal(spec_hash).unwrap();
-        [&head, planes].concat()
+        let (head, payload) = chunk.seal(spec_hash).unwrap();
+        [&head, payload].concat()
     }
 
     /// Sends bytes to the place of chunks and checks that they are refused for the reason, and counted.
@@ -124,7 +124,12 @@ fn chunks_of_other_runs_and_versions() {
     let mut newer = served.sealed(&chunk, hash);
     newer[4..6].copy_from_slice(&(PROTOCOL_VERSION + 1).to_le_bytes());
     served.refused(newer, "run the same build of driml everywhere");
-    let of_another_kind = codec::encode(Kind::Goodbye, hash, &chunk.header, &[]).unwrap();
+    let goodbye = Goodbye {
+        actor: 0,
+        incarnation: INCARNATION,
+        produced: 0,
+    };
+    let of_another_kind = codec::encode(hash, &goodbye, &[]).unwrap();
     served.refused(
         of_another_kind,
         "a message of kind 8 came where kind 1 is expected",
@@ -194,7 +199,7 @@ fn chunks_that_make_no_sense_in_this_run() {
     );
     // Another life of the actor, and then a late message of the first.
     let mut second_life = served.chunk(0);
-    second_life.header.epoch = 10;
+    second_life.header.incarnation = 10;
     let unknown = served.sealed(&second_life, served.client.spec.hash());
     served.refused(unknown, "does not know this life of actor 0");
     served.client.join_as_actor(0, 10);
@@ -214,43 +219,43 @@ fn everything_else_that_a_replay_server_takes() {
     for bytes in [
         garbage.clone(),
         codec::encode(
-            Kind::BatchRequest,
             hash ^ 1,
             &BatchRequest {
                 learner: LEARNER,
                 id: RequestId::first(7),
                 rows: 16,
                 shared_memory: false,
-                elsewhere: None,
+                other_shards: None,
             },
             &[],
         )
         .unwrap(),
     ] {
         let before = counted();
-        let reply = client.ask(&client.keys.batch(), bytes).unwrap();
-        let (reply, _): (BatchReply, _) =
-            codec::decode(&reply, Kind::BatchReply, Some(hash)).unwrap();
+        let reply = client
+            .ask(&client.keys.of::<BatchRequest>(), bytes)
+            .unwrap();
+        let (reply, _): (BatchReply, _) = codec::decode(&reply, Some(hash)).unwrap();
         assert!(matches!(reply, BatchReply::Refused { .. }), "{reply:?}");
         assert_eq!(counted(), before + 1);
     }
     for rows in [0, u32::MAX] {
         let request = codec::encode(
-            Kind::BatchRequest,
             hash,
             &BatchRequest {
                 learner: LEARNER,
                 id: RequestId::first(7),
                 rows,
                 shared_memory: false,
-                elsewhere: None,
+                other_shards: None,
             },
             &[],
         )
         .unwrap();
-        let reply = client.ask(&client.keys.batch(), request).unwrap();
-        let (reply, _): (BatchReply, _) =
-            codec::decode(&reply, Kind::BatchReply, Some(hash)).unwrap();
+        let reply = client
+            .ask(&client.keys.of::<BatchRequest>(), request)
+            .unwrap();
+        let (reply, _): (BatchReply, _) = codec::decode(&reply, Some(hash)).unwrap();
         assert!(
             matches!(&reply, BatchReply::Refused { why } if why.contains("a batch of")),
             "{reply:?}"
@@ -260,7 +265,7 @@ fn everything_else_that_a_replay_server_takes() {
     // What needs no answer gets none, and is counted.
     let goodbye = Goodbye {
         actor: 0,
-        epoch: 9,
+        incarnation: 9,
         produced: 1000,
     };
     let affinity = AffinityUpdate {
@@ -270,15 +275,15 @@ fn everything_else_that_a_replay_server_takes() {
         matrix: vec![0.5; 4],
     };
     for (key, bytes) in [
-        (client.keys.goodbye(), garbage.clone()),
+        (client.keys.of::<Goodbye>(), garbage.clone()),
         (
-            client.keys.goodbye(),
-            codec::encode(Kind::Goodbye, hash ^ 1, &goodbye, &[]).unwrap(),
+            client.keys.of::<Goodbye>(),
+            codec::encode(hash ^ 1, &goodbye, &[]).unwrap(),
         ),
-        (client.keys.affinity(), garbage),
+        (client.keys.of::<AffinityUpdate>(), garbage),
         (
-            client.keys.affinity(),
-            codec::encode(Kind::Affinity, hash, &affinity, &[]).unwrap(),
+            client.keys.of::<AffinityUpdate>(),
+            codec::encode(hash, &affinity, &[]).unwrap(),
         ),
     ] {
         let before = counted();

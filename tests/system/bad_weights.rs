@@ -3,8 +3,7 @@
 
 use driml_learner::{Compute, Learner, LearnerPart};
 use driml_protocol::{
-    Hello, Keys, Kind, PROTOCOL_VERSION, Tally, WeightsHeader, WeightsUpload, WeightsVersion,
-    codec,
+    Hello, Keys, PROTOCOL_VERSION, Tally, WeightsHeader, WeightsUpload, WeightsVersion, codec,
     session::{self, Endpoints},
 };
 use driml_tests::Client;
@@ -24,14 +23,14 @@ impl FakeLearner<'_> {
     fn upload(version: u64, safetensors: &[u8], spec_hash: u64, learner: u64) -> Vec<u8> {
         let weights = WeightsHeader::new(version, 0, safetensors);
         let upload = WeightsUpload { learner, weights };
-        codec::encode(Kind::WeightsUpload, spec_hash, &upload, safetensors).unwrap()
+        codec::encode(spec_hash, &upload, safetensors).unwrap()
     }
 
     /// Sends weights that the replay server takes.
     fn send(&self, version: u64, safetensors: &[u8]) {
         let bytes = Self::upload(version, safetensors, self.client.spec.hash(), LEARNER);
         self.client
-            .ask(&self.client.keys.weights_upload(), bytes)
+            .ask(&self.client.keys.of::<WeightsUpload>(), bytes)
             .unwrap();
     }
 
@@ -39,7 +38,9 @@ impl FakeLearner<'_> {
     fn refused(&self, bytes: Vec<u8>, why: &str) {
         let counted = || self.client.replay().unwrap().messages_refused;
         let before = counted();
-        let answer = self.client.ask(&self.client.keys.weights_upload(), bytes);
+        let answer = self
+            .client
+            .ask(&self.client.keys.of::<WeightsUpload>(), bytes);
         assert!(answer.is_err(), "{why}: {answer:?}");
         assert_eq!(counted(), before + 1, "{why}");
     }
@@ -47,8 +48,8 @@ impl FakeLearner<'_> {
     /// Says that there are newer weights, as a stranger could.
     fn announce(&self, version: u64, spec_hash: u64) {
         let announced = WeightsVersion { version };
-        let bytes = codec::encode(Kind::WeightsVersion, spec_hash, &announced, &[]).unwrap();
-        let key = self.client.keys.weights_version();
+        let bytes = codec::encode(spec_hash, &announced, &[]).unwrap();
+        let key = self.client.keys.of::<WeightsVersion>();
         self.client.session.put(key, bytes).wait().unwrap();
     }
 }
@@ -137,17 +138,17 @@ fn parts_of_another_protocol_version_do_not_join() {
         shard: (0, 1),
         shared_memory: false,
     };
-    let mut newer = codec::encode(Kind::Hello, 0, &hello, &[]).unwrap();
+    let mut newer = codec::encode(0, &hello, &[]).unwrap();
     newer[4..6].copy_from_slice(&(PROTOCOL_VERSION + 1).to_le_bytes());
     let greetings = [
         (newer, "run the same build of driml everywhere"),
         (b"hello?".to_vec(), "it was cut off or padded"),
         (
-            codec::encode(Kind::Hello, 0, &hello, &[]).unwrap(),
+            codec::encode(0, &hello, &[]).unwrap(),
             "the settings that the replay server sent",
         ),
     ];
-    let key = Keys::new("driml").unwrap().hello();
+    let key = Keys::new("driml").unwrap().of::<Hello>();
     for (bytes, reason) in greetings {
         let answer = move |query| session::answer(&query, bytes.clone().into());
         let queryable = server

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use driml_actor::delivery::{Delivery, DeliveryLimits};
 use driml_protocol::{
-    Chunk, ChunkHeader, Keys, PlanesPool, Shutdown,
+    BufferPool, Chunk, ChunkHeader, Keys, RunClient, Shutdown,
     session::{self, Endpoints},
 };
 use driml_tests::{Client, Summary, TestSystem};
@@ -77,19 +77,12 @@ impl SyntheticActor {
         })
         .unwrap();
         client.join_as_actor(actor, 1);
-        let delivery = Delivery::start(
-            session.clone(),
-            Keys::new("driml").unwrap(),
-            client.spec.hash(),
-            0,
-            limits,
-            PlanesPool::new(8),
-            stop.clone(),
-        )
-        .unwrap();
+        let keys = Keys::new("driml").unwrap();
+        let run = RunClient::new(session.clone(), keys, client.spec.hash());
+        let delivery = Delivery::start(run, 0, limits, BufferPool::new(8), stop.clone()).unwrap();
         let next = ChunkHeader {
             actor,
-            epoch: 1,
+            incarnation: 1,
             sequence: 0,
             first_transition: 0,
             weights_version: 0,

@@ -11,8 +11,8 @@ use std::{
 
 use driml_learner::remote::batch_source::{BatchSource, Next, Requests};
 use driml_protocol::{
-    ActorJoin, BatchReply, BatchRequest, Chunk, ChunkHeader, Horizon, InsertReply, Keys, Kind,
-    Planes, RunSpec, Shutdown, TimeoutRule, codec,
+    ActorJoin, BatchReply, BatchRequest, Buffer, Chunk, ChunkHeader, Horizon, InsertReply, Keys,
+    ReplayStatus, RunClient, RunSpec, Shutdown, TimeoutRule, codec,
     session::{self, Endpoints},
 };
 use driml_replay_server::{Compression, Config, Replay};
@@ -63,11 +63,16 @@ fn config(shards: u32) -> Config {
 fn full(shard: u32, shards: u32) -> Replay {
     let spec = spec();
     let mut replay = Replay::shard(&spec, &config(shards), ROWS, shard).unwrap();
-    replay.join_actor(ActorJoin { actor: 0, epoch: 1 }).unwrap();
+    replay
+        .join_actor(ActorJoin {
+            actor: 0,
+            incarnation: 1,
+        })
+        .unwrap();
     for sequence in 0..TRANSITIONS / 8 / u64::from(shards) {
         let chunk = Chunk::zeroed(ChunkHeader {
             actor: 0,
-            epoch: 1,
+            incarnation: 1,
             sequence,
             first_transition: 8 * sequence,
             weights_version: 1,
@@ -86,21 +91,18 @@ fn full(shard: u32, shards: u32) -> Replay {
 fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
     let hash = spec().hash();
     let payload = query.payload().unwrap().to_bytes();
-    let (request, _): (BatchRequest, _) =
-        codec::decode(&payload, Kind::BatchRequest, Some(hash)).unwrap();
+    let (request, _): (BatchRequest, _) = codec::decode(&payload, Some(hash)).unwrap();
     let mut replay = replay.lock().unwrap();
-    if let Some(elsewhere) = request.elsewhere {
-        replay.heard(elsewhere).unwrap();
+    if let Some(other_shards) = request.other_shards {
+        replay.set_other_shards(other_shards).unwrap();
     }
-    let message = match replay.draw_for(request.id, request.rows, Planes::zeroed) {
+    let message = match replay.draw_for(request.id, request.rows, Buffer::zeroed) {
         Ok(_) if drawn.fetch_add(1, Ordering::Relaxed).is_multiple_of(LOSES) => return,
         Ok(draft) => {
-            let (head, planes) = draft.unpack().seal(hash).unwrap();
-            [&head[..], &planes[..]].concat()
+            let (header, payload) = draft.unpack().into_payload();
+            codec::encode(hash, &BatchReply::Batch(header), &payload).unwrap()
         }
-        Err(unready) => {
-            codec::encode(Kind::BatchReply, hash, &BatchReply::from(unready), &[]).unwrap()
-        }
+        Err(unready) => codec::encode(hash, &BatchReply::from(unready), &[]).unwrap(),
     };
     session::answer(query, message.into());
 }
@@ -122,23 +124,24 @@ fn every_batch_comes_once(shards: u32) {
     let keys = Keys::new("lossy").unwrap();
     let hash = spec().hash();
     let drawn = Arc::<AtomicU32>::default();
-    let (mut replays, mut declared, mut sessions) = (vec![], vec![], vec![]);
+    let (mut replays, mut declared, mut clients) = (vec![], vec![], vec![]);
     for shard in 0..shards {
         let endpoint = format!("unixsock-stream/{}/{shard}.sock", folder.path().display());
         let open = |listen, connect| session::open(&Endpoints { listen, connect }).unwrap();
         let server = open(vec![endpoint.clone()], vec![]);
         let replay = Arc::new(Mutex::new(full(shard, shards)));
         let (asked, count) = (replay.clone(), drawn.clone());
-        let batches = declare(&server, keys.batch(), move |query| {
+        let batches = declare(&server, keys.of::<BatchRequest>(), move |query| {
             answer(query, &asked, &count)
         });
         let asked = replay.clone();
-        let status = declare(&server, keys.replay_status(), move |query| {
+        let status = declare(&server, keys.of::<ReplayStatus>(), move |query| {
             let status = asked.lock().unwrap().status();
-            let bytes = codec::encode(Kind::ReplayStatus, hash, &status, &[]).unwrap();
+            let bytes = codec::encode(hash, &status, &[]).unwrap();
             session::answer(query, bytes.into());
         });
-        sessions.push(open(vec![], vec![endpoint]));
+        let session = open(vec![], vec![endpoint]);
+        clients.push(RunClient::new(session, keys.clone(), hash));
         replays.push(replay);
         declared.push((server, batches, status));
     }
@@ -150,7 +153,7 @@ fn every_batch_comes_once(shards: u32) {
         unreachable_max: Duration::from_secs(60),
     };
     let stop = Shutdown::default();
-    let mut source = BatchSource::start(&sessions, &keys, hash, requests, &stop).unwrap();
+    let mut source = BatchSource::start(&clients, requests, &stop).unwrap();
     let mut batches = 0;
     loop {
         match source.next(Duration::from_secs(60)).unwrap() {

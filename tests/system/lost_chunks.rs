@@ -12,8 +12,8 @@ use std::{
 
 use driml_actor::delivery::{Delivery, DeliveryLimits};
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon, InsertReply, Keys, Kind,
-    PlanesPool, RequestId, RunSpec, Shutdown, TimeoutRule, codec,
+    ActorJoin, BufferPool, Chunk, ChunkHeader, Claim, Done, End, Goodbye, Horizon, InsertReply,
+    Keys, RequestId, RunClient, RunSpec, Shutdown, TimeoutRule, codec,
     session::{self, Endpoints},
 };
 use driml_replay_server::{Compression, Config, Replay};
@@ -82,7 +82,12 @@ impl Server {
         };
         let mut replay = Replay::new(&spec(), &config, ROWS).unwrap();
         for actor in 0..ACTORS {
-            replay.join_actor(ActorJoin { actor, epoch: 1 }).unwrap();
+            replay
+                .join_actor(ActorJoin {
+                    actor,
+                    incarnation: 1,
+                })
+                .unwrap();
         }
         Arc::new(Self {
             replay: Mutex::new(replay),
@@ -107,23 +112,23 @@ impl Server {
         };
         let goodbye = |server: &Self, payload: &[u8]| {
             let hash = spec().hash();
-            let goodbye = codec::decode::<Goodbye>(payload, Kind::Goodbye, Some(hash));
+            let goodbye = codec::decode::<Goodbye>(payload, Some(hash));
             server.replay.lock().unwrap().goodbye(&goodbye.unwrap().0);
-            Some(codec::encode(Kind::Done, hash, &(), &[]).unwrap())
+            Some(codec::encode(hash, &Done, &[]).unwrap())
         };
         let insert = |server: &Self, payload: &[u8]| {
             let chunk = Chunk::decode(payload, spec().hash(), 3).unwrap();
             server.lossy(|replay| replay.insert(&chunk))
         };
         let claim = |server: &Self, payload: &[u8]| {
-            let claim = codec::decode::<Claim>(payload, Kind::Claim, Some(spec().hash()));
+            let claim = codec::decode::<Claim>(payload, Some(spec().hash()));
             let claim = claim.unwrap().0;
             server.lossy(|replay| replay.claim(&claim).expect("nothing is parked here"))
         };
         [
-            declare(keys.ingest(), insert),
-            declare(keys.claim(), claim),
-            declare(keys.goodbye(), goodbye),
+            declare(keys.of::<ChunkHeader>(), insert),
+            declare(keys.of::<Claim>(), claim),
+            declare(keys.of::<Goodbye>(), goodbye),
         ]
         .map(Result::unwrap)
         .into()
@@ -136,7 +141,7 @@ impl Server {
             Loses::First(count) => (message >= count, true),
         };
         let reply = arrives.then(|| judge(&mut self.replay.lock().unwrap()))?;
-        is_answered.then(|| codec::encode(Kind::InsertReply, spec().hash(), &reply, &[]).unwrap())
+        is_answered.then(|| codec::encode(spec().hash(), &reply, &[]).unwrap())
     }
 
     /// Checks that the replay holds the numbers 0 to `TRANSITIONS`, each once.
@@ -152,7 +157,7 @@ impl Server {
         let mut numbers = BTreeSet::new();
         let mut request = RequestId::first(1);
         for _ in 0..TRANSITIONS * SAMPLED / u64::from(ROWS) {
-            let draft = replay.draw_for(request, ROWS, driml_protocol::Planes::zeroed);
+            let draft = replay.draw_for(request, ROWS, driml_protocol::Buffer::zeroed);
             let batch = draft.unwrap().unpack();
             numbers.extend(batch.n_step_returns().into_iter().map(|it| it as u64));
             request = request.next();
@@ -168,7 +173,7 @@ fn deliver(actor: u32, delivery: &Delivery) {
         let first_transition = sequence * u64::from(STEPS);
         let mut chunk = Chunk::zeroed(ChunkHeader {
             actor,
-            epoch: 1,
+            incarnation: 1,
             sequence,
             first_transition,
             weights_version: 1,
@@ -205,10 +210,15 @@ fn deliver_all(server: &Arc<Server>, ack_timeout: Duration, leaving: bool) {
                     ack_timeout,
                     unreachable_max: Duration::from_secs(60),
                 };
-                let pool = PlanesPool::new(4);
-                let delivery =
-                    Delivery::start(session, keys, spec().hash(), 0, limits, pool, stop.clone())
-                        .unwrap();
+                let pool = BufferPool::new(4);
+                let delivery = Delivery::start(
+                    RunClient::new(session, keys, spec().hash()),
+                    0,
+                    limits,
+                    pool,
+                    stop.clone(),
+                )
+                .unwrap();
                 if leaving {
                     stop.set();
                 }

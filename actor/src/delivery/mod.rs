@@ -10,11 +10,10 @@ use std::{
     time::Duration,
 };
 
-use driml_protocol::{Chunk, Keys, PlanesPool, Shutdown};
-use zenoh::Session;
+use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown};
 
-use state::Account;
-use worker::Courier;
+use state::DeliveryState;
+use worker::DeliveryWorker;
 
 pub use state::DeliveryLimits;
 
@@ -25,65 +24,56 @@ const FRESH_WEIGHTS_MAX: Duration = Duration::from_millis(200);
 pub struct Delivery {
     queue: mpsc::Sender<Chunk>,
     limit: usize,
-    account: Arc<Account>,
+    state: Arc<DeliveryState>,
     thread: JoinHandle<anyhow::Result<u64>>,
 }
 
 impl Delivery {
     /// Starts the thread. `inserted_total` is the run's count so far; `pool` is where the chunks' memory comes from. The actor
-    /// has joined the run with the epoch of its chunks.
+    /// has joined the run with the incarnation of its chunks.
     ///
     /// # Errors
     /// The operating system gave no thread.
     pub fn start(
-        session: Session,
-        keys: Keys,
-        spec_hash: u64,
+        client: RunClient,
         inserted_total: u64,
         limits: DeliveryLimits,
-        pool: PlanesPool,
+        pool: BufferPool,
         shutdown: Shutdown,
     ) -> std::io::Result<Self> {
-        let account = Arc::new(Account::default());
-        account
+        let state = Arc::new(DeliveryState::default());
+        state
             .inserted_total
             .store(inserted_total, Ordering::Relaxed);
         // Until a chunk was let in at once: many actors that start together must not run ahead of the learner together.
-        account.is_held.store(true, Ordering::Relaxed);
+        state.is_held.store(true, Ordering::Relaxed);
         let (queue, chunks) = mpsc::channel();
-        let courier = Courier::new(
-            session,
-            (keys, spec_hash),
-            limits,
-            pool,
-            shutdown,
-            account.clone(),
-        );
+        let worker = DeliveryWorker::new(client, limits, pool, shutdown, state.clone());
         let thread = std::thread::Builder::new()
             .name("delivery".into())
-            .spawn(move || courier.run(&chunks))?;
+            .spawn(move || worker.run(&chunks))?;
         Ok(Self {
             queue,
             limit: limits.chunks_in_flight_max,
-            account,
+            state,
             thread,
         })
     }
 
     /// Transitions that the run has stored, as of the last answer.
     pub fn inserted_total(&self) -> u64 {
-        self.account.inserted_total.load(Ordering::Relaxed)
+        self.state.inserted_total.load(Ordering::Relaxed)
     }
 
     /// Actors that are connected to the run, as of the last answer; 0 before the first.
     pub fn actors(&self) -> u32 {
-        self.account.actors.load(Ordering::Relaxed)
+        self.state.actors.load(Ordering::Relaxed)
     }
 
     /// How long the actor has time to wait for newer weights before it begins its next chunk: where the rate limiter makes its
     /// chunks wait, it loses nothing by acting with the newest.
     pub fn fresh_weights_max(&self) -> Duration {
-        match self.account.is_held() {
+        match self.state.is_held() {
             true => FRESH_WEIGHTS_MAX,
             false => Duration::ZERO,
         }
@@ -91,25 +81,21 @@ impl Delivery {
 
     /// The run has all the transitions it wants.
     pub fn is_finished(&self) -> bool {
-        self.account.finished.load(Ordering::Relaxed)
+        self.state.finished.load(Ordering::Relaxed)
     }
 
     /// Queues a chunk, waiting while too many are not acknowledged: one, where the rate limiter makes chunks wait. `false`: the
     /// thread has ended; [`Self::finish`] says why.
     pub fn send(&self, chunk: Chunk) -> bool {
-        let mut waiting = self.account.waiting();
+        let mut waiting = self.state.waiting();
         loop {
-            let limit = if self.account.is_held() {
-                1
-            } else {
-                self.limit
-            };
+            let limit = if self.state.is_held() { 1 } else { self.limit };
             if *waiting < limit || self.thread.is_finished() {
                 break;
             }
             // The time-out is for a thread that ended without a word.
             (waiting, _) = self
-                .account
+                .state
                 .settled
                 .wait_timeout(waiting, Duration::from_secs(1))
                 .unwrap_or_else(PoisonError::into_inner);

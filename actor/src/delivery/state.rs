@@ -35,7 +35,7 @@ impl DeliveryLimits {
 
 /// What the sending side and the thread tell each other beside the chunks.
 #[derive(Debug, Default)]
-pub(super) struct Account {
+pub(super) struct DeliveryState {
     pub(super) inserted_total: AtomicU64,
     pub(super) actors: AtomicU32,
     pub(super) finished: AtomicBool,
@@ -46,7 +46,7 @@ pub(super) struct Account {
     pub(super) settled: Condvar,
 }
 
-impl Account {
+impl DeliveryState {
     pub(super) fn waiting(&self) -> MutexGuard<'_, usize> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }

@@ -10,13 +10,12 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Chunk, ChunkHeader, Claim, Goodbye, InsertReply, Keys, Kind, PlanesPool, Seldom, Shutdown,
-    codec, fault,
-    session::{self, Asked, SessionError},
+    BufferPool, Chunk, ChunkHeader, Claim, Done, Goodbye, InsertReply, PendingReply, RunClient,
+    Seldom, Shutdown, fault, session::SessionError,
 };
-use zenoh::{Session, bytes::ZBytes, qos::Priority};
+use zenoh::bytes::ZBytes;
 
-use super::state::{Account, DeliveryLimits};
+use super::state::{DeliveryLimits, DeliveryState};
 
 /// After `Shutdown`, how long the chunks at hand may take to be stored.
 const DRAIN_MAX: Duration = Duration::from_secs(20);
@@ -32,16 +31,27 @@ const GOODBYE_MAX: Duration = Duration::from_secs(5);
 /// A chunk that is not settled yet.
 struct Outgoing {
     header: ChunkHeader,
-    planes: ZBytes,
+    payload: ZBytes,
     in_shared_memory: bool,
     /// Set while a question about it is on its way.
-    asked: Option<Asked>,
+    asked: Option<PendingReply<InsertReply>>,
     /// The replay server has it and will store it: a claim is enough.
     is_kept: bool,
 }
 
+impl Outgoing {
+    const fn claim(&self) -> Claim {
+        Claim {
+            actor: self.header.actor,
+            incarnation: self.header.incarnation,
+            sequence: self.header.sequence,
+            leaving: self.header.leaving,
+        }
+    }
+}
+
 /// What became of the first chunk in line.
-enum Fate {
+enum Outcome {
     Stored,
     /// The run has enough transitions.
     Unwanted,
@@ -51,14 +61,12 @@ enum Fate {
 
 /// The delivering thread's state. Several chunks are on their way at once; they are settled in order, and where one has to go
 /// again those after it, which the replay server then refused as out of order, go again too.
-pub(super) struct Courier {
-    session: Session,
-    keys: Keys,
-    spec_hash: u64,
+pub(super) struct DeliveryWorker {
+    client: RunClient,
     limits: DeliveryLimits,
-    pool: PlanesPool,
+    pool: BufferPool,
     shutdown: Shutdown,
-    account: Arc<Account>,
+    state: Arc<DeliveryState>,
     outgoing: VecDeque<Outgoing>,
     /// Chunks that may be on their way: one after a chunk had to wait or go again, and one more with each that is stored at once.
     window: usize,
@@ -71,23 +79,20 @@ pub(super) struct Courier {
     waiting_said: Seldom,
 }
 
-impl Courier {
+impl DeliveryWorker {
     pub(super) fn new(
-        session: Session,
-        (keys, spec_hash): (Keys, u64),
+        client: RunClient,
         limits: DeliveryLimits,
-        pool: PlanesPool,
+        pool: BufferPool,
         shutdown: Shutdown,
-        account: Arc<Account>,
+        state: Arc<DeliveryState>,
     ) -> Self {
         Self {
-            session,
-            keys,
-            spec_hash,
+            client,
             limits,
             pool,
             shutdown,
-            account,
+            state,
             outgoing: VecDeque::new(),
             window: 1,
             answered: Instant::now(),
@@ -108,28 +113,28 @@ impl Courier {
             fault::point("delivery");
             let transitions = header.transitions() as u64;
             // After a failure the rest is only counted, so that the goodbye tells the truth.
-            let fate = match outcome {
+            let outcome_of_first = match outcome {
                 Ok(()) => self.settle_first(),
-                Err(_) => Ok(Fate::Stored),
+                Err(_) => Ok(Outcome::Stored),
             };
-            match fate {
-                Ok(Fate::Again) => continue,
-                Ok(Fate::Stored) => {}
-                Ok(Fate::Unwanted) => unwanted += transitions,
+            match outcome_of_first {
+                Ok(Outcome::Again) => continue,
+                Ok(Outcome::Stored) => {}
+                Ok(Outcome::Unwanted) => unwanted += transitions,
                 Err(e) => {
                     outcome = Err(e);
-                    self.account.finished.store(true, Ordering::Relaxed);
+                    self.state.finished.store(true, Ordering::Relaxed);
                 }
             }
             produced += transitions;
-            last = Some((header.actor, header.epoch));
+            last = Some((header.actor, header.incarnation));
             self.outgoing.pop_front();
-            self.account.settle();
+            self.state.settle();
         }
-        if let Some((actor, epoch)) = last {
+        if let Some((actor, incarnation)) = last {
             self.say_goodbye(Goodbye {
                 actor,
-                epoch,
+                incarnation,
                 produced: produced - unwanted,
             });
         }
@@ -149,11 +154,11 @@ impl Courier {
                 self.answered = Instant::now();
             }
             let header = chunk.header;
-            let planes = chunk.into_planes();
+            let payload = chunk.into_payload();
             self.outgoing.push_back(Outgoing {
                 header,
-                in_shared_memory: planes.are_shared(),
-                planes: planes.freeze(),
+                in_shared_memory: payload.are_shared(),
+                payload: payload.freeze(),
                 asked: None,
                 is_kept: false,
             });
@@ -166,7 +171,7 @@ impl Courier {
     }
 
     /// Sends what the window allows and waits for what becomes of the first.
-    fn settle_first(&mut self) -> anyhow::Result<Fate> {
+    fn settle_first(&mut self) -> anyhow::Result<Outcome> {
         let sequence = self.outgoing[0].header.sequence;
         if self.shutdown.is_set() {
             let since = *self.draining_since.get_or_insert_with(Instant::now);
@@ -190,9 +195,9 @@ impl Courier {
                 waited,
             }) => {
                 self.hear(inserted_total);
-                self.account.actors.store(actors, Ordering::Relaxed);
+                self.state.actors.store(actors, Ordering::Relaxed);
                 let was_held = self.held_since.take().is_some() || waited;
-                self.account.is_held.store(was_held, Ordering::Relaxed);
+                self.state.is_held.store(was_held, Ordering::Relaxed);
                 self.window = match was_held {
                     true => 1,
                     false => (self.window + 1).min(self.limits.chunks_in_flight_max),
@@ -200,12 +205,12 @@ impl Courier {
                 if self.outgoing[0].in_shared_memory {
                     self.pool.shared_memory_works();
                 }
-                Ok(Fate::Stored)
+                Ok(Outcome::Stored)
             }
             Ok(InsertReply::Finished { inserted_total }) => {
                 self.hear(inserted_total);
-                self.account.finished.store(true, Ordering::Relaxed);
-                Ok(Fate::Unwanted)
+                self.state.finished.store(true, Ordering::Relaxed);
+                Ok(Outcome::Unwanted)
             }
             Ok(InsertReply::Wait {
                 inserted_total,
@@ -243,21 +248,19 @@ impl Courier {
         let Some(asked) = first.asked.take() else {
             unreachable!("the window has room for one");
         };
-        let answer = loop {
-            match asked.answer_within(TICK)? {
-                Some(answer) => break answer,
+        loop {
+            match asked.wait_within(TICK)? {
+                Some(reply) => return Ok(Some(reply)),
                 None if self.shutdown.is_set() && !first.header.leaving => return Ok(None),
                 None => {}
             }
-        };
-        self.read(&self.keys.ingest(), Kind::InsertReply, &answer)
-            .map(Some)
+        }
     }
 
     /// The rate limiter makes the first chunk wait; it is asked about again at once if the replay server keeps it.
     fn is_held(&mut self, kept: bool) {
         let since = *self.held_since.get_or_insert_with(Instant::now);
-        self.account.is_held.store(true, Ordering::Relaxed);
+        self.state.is_held.store(true, Ordering::Relaxed);
         self.outgoing[0].is_kept = kept;
         if !kept {
             self.shutdown.wait_timeout(RETRY_PAUSE);
@@ -273,15 +276,15 @@ impl Courier {
     }
 
     fn hear(&self, inserted_total: u64) {
-        self.account
+        self.state
             .inserted_total
             .store(inserted_total, Ordering::Relaxed);
     }
 
-    fn again(&mut self) -> Fate {
+    fn again(&mut self) -> Outcome {
         self.window = 1;
         self.outgoing.iter_mut().for_each(|it| it.asked = None);
-        Fate::Again
+        Outcome::Again
     }
 
     /// The replay server may be unable to read shared memory: what is at hand, and the next chunks, go through the socket.
@@ -294,7 +297,7 @@ impl Courier {
 
     fn copy_out_of_shared_memory(&mut self) {
         for it in self.outgoing.iter_mut().filter(|it| it.in_shared_memory) {
-            it.planes = ZBytes::from(it.planes.to_bytes().into_owned());
+            it.payload = ZBytes::from(it.payload.to_bytes().into_owned());
             it.in_shared_memory = false;
         }
     }
@@ -310,17 +313,13 @@ impl Courier {
                 continue;
             }
             it.header.leaving |= leaving;
-            let (key, message) = if it.is_kept {
-                (self.keys.claim(), claim(it, self.spec_hash))
+            it.asked = Some(if it.is_kept {
+                let claim = self.client.seal(&it.claim())?;
+                self.client.send(claim, timeout)?
             } else {
-                (self.keys.ingest(), chunk(it, self.spec_hash))
-            };
-            let message = message.map_err(|e| SessionError::Zenoh {
-                key: key.clone(),
-                why: e.to_string(),
-            })?;
-            let asked = session::send(&self.session, &key, message, Priority::Data, timeout)?;
-            it.asked = Some(asked);
+                let chunk = self.client.seal_with(&it.header, it.payload.clone())?;
+                self.client.send(chunk, timeout)?
+            });
         }
         Ok(())
     }
@@ -328,59 +327,14 @@ impl Courier {
     fn say_goodbye(&self, goodbye: Goodbye) {
         let started = Instant::now();
         loop {
-            let said = codec::encode(Kind::Goodbye, self.spec_hash, &goodbye, &[])
-                .context("encoding the goodbye")
-                .and_then(|bytes| {
-                    let (key, timeout) = (self.keys.goodbye(), GOODBYE_MAX);
-                    let answer =
-                        session::ask(&self.session, &key, bytes.into(), Priority::Data, timeout)?;
-                    Ok(self.read::<()>(&key, Kind::Done, &answer)?)
-                });
-            match said {
-                Ok(()) => return,
+            match self.client.ask(&goodbye, GOODBYE_MAX) {
+                Ok(Done) => return,
                 Err(e) if started.elapsed() > GOODBYE_MAX => {
-                    tracing::warn!("the replay server did not hear the goodbye: {e:#}");
+                    tracing::warn!("the replay server did not hear the goodbye: {e}");
                     return;
                 }
                 Err(_) => std::thread::sleep(RETRY_PAUSE),
             }
         }
     }
-
-    fn read<H: serde::de::DeserializeOwned>(
-        &self,
-        key: &str,
-        kind: Kind,
-        answer: &ZBytes,
-    ) -> Result<H, SessionError> {
-        let bytes = answer.to_bytes();
-        codec::decode(&bytes, kind, Some(self.spec_hash))
-            .map(|(header, _)| header)
-            .map_err(|e| SessionError::Zenoh {
-                key: key.into(),
-                why: e.to_string(),
-            })
-    }
-}
-
-fn chunk(it: &Outgoing, spec_hash: u64) -> Result<ZBytes, codec::CodecError> {
-    let head = codec::seal(Kind::Chunk, spec_hash, &it.header, &it.planes.to_bytes())?;
-    Ok(session::join_planes(head, it.planes.clone()))
-}
-
-fn claim(it: &Outgoing, spec_hash: u64) -> Result<ZBytes, codec::CodecError> {
-    let ChunkHeader {
-        actor,
-        epoch,
-        sequence,
-        leaving,
-        ..
-    } = it.header;
-    let claim = Claim {
-        actor,
-        epoch,
-        sequence,
-        leaving,
-    };
-    codec::encode(Kind::Claim, spec_hash, &claim, &[]).map(Into::into)
 }

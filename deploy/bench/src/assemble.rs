@@ -4,7 +4,7 @@
 use std::hint::black_box;
 
 use anyhow::{bail, ensure};
-use driml_protocol::{ActorJoin, InsertReply, PlanesPool};
+use driml_protocol::{ActorJoin, BufferPool, InsertReply};
 use driml_replay_server::Replay;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -15,7 +15,7 @@ use crate::{
     recording::Recording,
     replay::{AGENT, CAPACITY, SETTINGS},
     settings,
-    taking_part::EPOCH,
+    taking_part::INCARNATION,
 };
 
 /// Batches a second.
@@ -28,10 +28,10 @@ pub(super) fn measure(recording: &Recording, effort: &Effort) -> anyhow::Result<
     let mut replay = Replay::new(&config.run, &config.replay, rows)?;
     let join = ActorJoin {
         actor: 0,
-        epoch: EPOCH,
+        incarnation: INCARNATION,
     };
     replay.join_actor(join).map_err(anyhow::Error::msg)?;
-    for chunk in recording.chunks(0, (8, 32), PlanesPool::new(1)) {
+    for chunk in recording.chunks(0, (8, 32), BufferPool::new(1)) {
         match replay.insert(&chunk) {
             InsertReply::Stored { inserted_total, .. } if inserted_total >= CAPACITY => break,
             reply => ensure!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}"),

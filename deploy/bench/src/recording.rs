@@ -6,11 +6,11 @@ use std::path::Path;
 use anyhow::Context;
 use driml_envs::StepEnd;
 use driml_launch::console;
-use driml_protocol::{Chunk, ChunkHeader, End, PlanesPool};
+use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{settings, taking_part::EPOCH};
+use crate::{settings, taking_part::INCARNATION};
 
 /// Copies of the game, each a stream of transitions.
 pub(super) const STREAMS: usize = 8;
@@ -76,7 +76,7 @@ impl Recording {
         &self,
         actor: u32,
         (streams, steps): (u32, u32),
-        pool: PlanesPool,
+        pool: BufferPool,
     ) -> Chunks<'_> {
         assert!(
             streams as usize <= STREAMS,
@@ -87,7 +87,7 @@ impl Recording {
             pool,
             next: ChunkHeader {
                 actor,
-                epoch: EPOCH,
+                incarnation: INCARNATION,
                 sequence: 0,
                 first_transition: 0,
                 weights_version: 1,
@@ -103,7 +103,7 @@ impl Recording {
 /// An actor's chunks without end, each filled anew as a real actor's are.
 pub(super) struct Chunks<'a> {
     recording: &'a Recording,
-    pool: PlanesPool,
+    pool: BufferPool,
     next: ChunkHeader,
 }
 
@@ -126,7 +126,7 @@ impl Chunks<'_> {
             frames,
             steps: recorded,
         } = self.recording;
-        let bytes = self.next.planes_bytes();
+        let bytes = self.next.payload_bytes();
         let bytes = bytes.expect("a chunk of a bench is far below the address space");
         let mut chunk = Chunk::in_memory(self.next, self.pool.take(bytes));
         let (streams, steps) = (self.next.streams as usize, steps as usize);
@@ -165,7 +165,7 @@ mod tests {
             frames: (0..STEPS * STREAMS).flat_map(place).collect(),
             steps: vec![(1, 0.5, End::Running); STEPS * STREAMS],
         };
-        let mut chunks = recording.chunks(3, (2, 3), PlanesPool::new(1));
+        let mut chunks = recording.chunks(3, (2, 3), BufferPool::new(1));
         let (first, second) = (chunks.next().unwrap(), chunks.next().unwrap());
         assert_eq!(first.frames(), [0, 0, 1, 0, 2, 0, 0, 1, 1, 1, 2, 1]);
         assert_eq!(second.frames(), [3, 0, 4, 0, 5, 0, 3, 1, 4, 1, 5, 1]);

@@ -22,7 +22,7 @@ use driml_learner::{
     remote::batch_source::{BatchSource, Next, Requests},
 };
 use driml_protocol::{
-    Keys, Shutdown, join,
+    Keys, RunClient, Shutdown, join,
     session::{self, Endpoints},
 };
 use zenoh::{Session, Wait};
@@ -139,11 +139,10 @@ impl Run {
         let pool = self.actor.chunk_memory();
         self.deliveries += 1;
         let (spec_hash, actor) = (self.actor.spec.hash(), self.deliveries);
-        let alive = taking_part::join_as_actor(&self.session, &self.keys, spec_hash, actor)?;
+        let client = self.client(spec_hash);
+        let alive = taking_part::join_as_actor(&client, actor)?;
         let delivery = Delivery::start(
-            self.session.clone(),
-            self.keys.clone(),
-            spec_hash,
+            client,
             0,
             DeliveryLimits::of(&self.actor.actor),
             pool.clone(),
@@ -164,6 +163,10 @@ impl Run {
         Ok(chunks.transitions() as f64 / seconds)
     }
 
+    fn client(&self, spec_hash: u64) -> RunClient {
+        RunClient::new(self.session.clone(), self.keys.clone(), spec_hash)
+    }
+
     /// Batches a second, each read as a learner would.
     fn fetch(&self, effort: &Effort) -> anyhow::Result<f64> {
         let shutdown = Shutdown::default();
@@ -173,11 +176,10 @@ impl Run {
             transport,
             ..
         } = &self.learner;
-        let _alive = taking_part::join_as_learner(&self.session, &self.keys, spec.hash())?;
+        let client = self.client(spec.hash());
+        let _alive = taking_part::join_as_learner(&client)?;
         let mut source = BatchSource::start(
-            std::slice::from_ref(&self.session),
-            &self.keys,
-            spec.hash(),
+            std::slice::from_ref(&client),
             Requests {
                 learner: taking_part::LEARNER,
                 rows: learner.batch_rows,
@@ -189,7 +191,7 @@ impl Run {
         )?;
         let rate = effort.rate_overall(|| match source.next(ANSWER_MAX)? {
             Next::Batch(batch) => {
-                let planes = [batch.frames_t(), batch.frames_k(), batch.frames_n()];
+                let planes = [batch.states_t(), batch.states_k(), batch.states_n()];
                 black_box(planes.map(touched));
                 Ok(())
             }

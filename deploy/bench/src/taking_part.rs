@@ -5,13 +5,12 @@ use std::time::Duration;
 
 use anyhow::Context;
 use driml_protocol::{
-    ActorJoin, Keys, Kind, LearnerJoin, Shutdown, WeightsHeader, WeightsUpload, codec, join,
-    session,
+    ActorJoin, Alive, LearnerJoin, RunClient, Shutdown, WeightsHeader, WeightsUpload, join,
 };
-use zenoh::{Session, Wait, liveliness::LivelinessToken, qos::Priority};
+use zenoh::liveliness::LivelinessToken;
 
 /// The life of an actor whose chunks [`super::recording`] makes.
-pub(super) const EPOCH: u64 = 1;
+pub(super) const INCARNATION: u64 = 1;
 /// The number of a benchmark's learner.
 pub(super) const LEARNER: u64 = 1;
 /// How long an upload may take.
@@ -21,18 +20,19 @@ const UPLOAD_MAX: Duration = Duration::from_secs(10);
 ///
 /// # Errors
 /// The replay server does not answer or refuses.
-pub(super) fn join_as_actor(
-    session: &Session,
-    keys: &Keys,
-    spec_hash: u64,
-    actor: u32,
-) -> anyhow::Result<LivelinessToken> {
-    let alive = alive(session, keys.actor_alive(actor, EPOCH))?;
+pub(super) fn join_as_actor(client: &RunClient, actor: u32) -> anyhow::Result<LivelinessToken> {
+    let alive = alive(
+        client,
+        Alive::Actor {
+            actor,
+            incarnation: INCARNATION,
+        },
+    )?;
     let join = ActorJoin {
         actor,
-        epoch: EPOCH,
+        incarnation: INCARNATION,
     };
-    join::as_actor(session, keys, spec_hash, join, &Shutdown::default())?
+    join::as_actor(client, join, &Shutdown::default())?
         .context("nobody told this client to stop")?;
     Ok(alive)
 }
@@ -41,23 +41,19 @@ pub(super) fn join_as_actor(
 ///
 /// # Errors
 /// As [`join_as_actor`].
-pub(super) fn join_as_learner(
-    session: &Session,
-    keys: &Keys,
-    spec_hash: u64,
-) -> anyhow::Result<LivelinessToken> {
-    let alive = alive(session, keys.learner_alive(LEARNER))?;
+pub(super) fn join_as_learner(client: &RunClient) -> anyhow::Result<LivelinessToken> {
+    let alive = alive(client, Alive::Learner(LEARNER))?;
     let join = LearnerJoin {
         learner: LEARNER,
         rows_sampled: 0,
     };
-    join::as_learner(session, keys, spec_hash, join, &Shutdown::default())?
+    join::as_learner(client, join, &Shutdown::default())?
         .context("nobody told this client to stop")?;
     Ok(alive)
 }
 
-fn alive(session: &Session, key: String) -> anyhow::Result<LivelinessToken> {
-    let token = session.liveliness().declare_token(key).wait();
+fn alive(client: &RunClient, who: Alive) -> anyhow::Result<LivelinessToken> {
+    let token = client.declare_alive(who);
     token.map_err(|e| anyhow::anyhow!("declaring a client alive: {e}"))
 }
 
@@ -66,9 +62,7 @@ fn alive(session: &Session, key: String) -> anyhow::Result<LivelinessToken> {
 /// # Errors
 /// The replay server does not answer or refuses.
 pub(super) fn upload_weights(
-    session: &Session,
-    keys: &Keys,
-    spec_hash: u64,
+    client: &RunClient,
     updates: u64,
     weights: &[u8],
 ) -> anyhow::Result<()> {
@@ -76,9 +70,7 @@ pub(super) fn upload_weights(
         learner: LEARNER,
         weights: WeightsHeader::new(updates, updates, weights),
     };
-    let head = codec::seal(Kind::WeightsUpload, spec_hash, &upload, weights)?;
-    let message = session::join_planes(head, weights.to_vec().into());
-    let key = keys.weights_upload();
-    session::ask(session, &key, message, Priority::DataHigh, UPLOAD_MAX)?;
+    let sealed = client.seal_with(&upload, weights.to_vec().into())?;
+    client.send(sealed, UPLOAD_MAX)?.wait()?;
     Ok(())
 }

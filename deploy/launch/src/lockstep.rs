@@ -4,10 +4,10 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use driml_actor::{ActorSettings, Collector, Life};
+use driml_actor::{ActorSettings, Collector, Incarnation};
 use driml_learner::{Learner, LearnerPart};
 use driml_machine::error::Interrupted;
-use driml_protocol::{ActorJoin, Batch, Goodbye, InsertReply, LearnerStatus, PlanesPool, Shutdown};
+use driml_protocol::{ActorJoin, Batch, BufferPool, Goodbye, InsertReply, LearnerStatus, Shutdown};
 use driml_replay_server::{Replay, Unready};
 use driml_settings::config::RunConfig;
 
@@ -19,8 +19,8 @@ use crate::{
 
 /// How often progress is shown and recorded.
 const POLL: Duration = Duration::from_secs(1);
-/// Every actor's epoch: an actor of this mode has one life, and its number influences nothing.
-const EPOCH: u64 = 1;
+/// Every actor's incarnation: an actor of this mode has one life, and its number influences nothing.
+const INCARNATION: u64 = 1;
 /// The learner's number, which influences nothing either.
 const LEARNER: u64 = 1;
 
@@ -112,7 +112,7 @@ impl Parts {
         for actor in 0..config.local.actors {
             let join = ActorJoin {
                 actor,
-                epoch: EPOCH,
+                incarnation: INCARNATION,
             };
             replay.join_actor(join).map_err(anyhow::Error::msg)?;
         }
@@ -124,15 +124,15 @@ impl Parts {
             ..LearnerStatus::default()
         };
         let actor = |actor| {
-            let life = Life {
+            let life = Incarnation {
                 actor,
-                epoch: EPOCH,
+                incarnation: INCARNATION,
                 after_updates: 0,
-                earlier_lives: 0,
+                earlier_incarnations: 0,
             };
             Collector::new(
                 settings.clone(),
-                PlanesPool::new(1),
+                BufferPool::new(1),
                 life,
                 header.version,
                 &weights,
@@ -221,7 +221,7 @@ impl Parts {
             let produced = actor.produced() - unwanted;
             self.replay.goodbye(&Goodbye {
                 actor: id as u32,
-                epoch: EPOCH,
+                incarnation: INCARNATION,
                 produced,
             });
         }

@@ -4,9 +4,8 @@
 use std::time::Duration;
 
 use anyhow::Context;
-use driml_protocol::{Keys, Kind, LearnerStatus, ReplayStatus, codec, session};
-use serde::de::DeserializeOwned;
-use zenoh::{Session, Wait, bytes::ZBytes, qos::Priority};
+use driml_protocol::{Keys, LearnerStatus, ReplayStatus, RunClient};
+use zenoh::{Session, Wait};
 
 /// How long an answer may take; a part that is busy answers the next time.
 const ANSWER_MAX: Duration = Duration::from_secs(2);
@@ -14,9 +13,7 @@ const ANSWER_MAX: Duration = Duration::from_secs(2);
 /// A client of a run that asks its parts how they are.
 pub struct Statuses {
     /// One for each shard of the replay.
-    sessions: Vec<Session>,
-    keys: Keys,
-    spec_hash: u64,
+    clients: Vec<RunClient>,
     /// Each replay server's last answer.
     pub shards: Vec<ReplayStatus>,
     /// The same, as of one.
@@ -28,10 +25,9 @@ pub struct Statuses {
 impl Statuses {
     /// A client over open sessions, one for each shard of the replay.
     pub fn new(sessions: Vec<Session>, keys: Keys, spec_hash: u64) -> Self {
+        let client = |session| RunClient::new(session, keys.clone(), spec_hash);
         Self {
-            sessions,
-            keys,
-            spec_hash,
+            clients: sessions.into_iter().map(client).collect(),
             shards: Vec::new(),
             replay: ReplayStatus::default(),
             learner: LearnerStatus::default(),
@@ -43,12 +39,8 @@ impl Statuses {
     /// # Errors
     /// No answer in time, or one that is not of this run.
     pub fn ask_replay(&mut self) -> anyhow::Result<()> {
-        let key = self.keys.replay_status();
-        let answers = self
-            .sessions
-            .iter()
-            .map(|session| self.ask(session, &key, Kind::ReplayStatus));
-        let shards = answers.collect::<anyhow::Result<Vec<_>>>()?;
+        let answers = self.clients.iter().map(|client| client.fetch(ANSWER_MAX));
+        let shards = answers.collect::<Result<Vec<_>, _>>()?;
         self.replay = ReplayStatus::merged(&shards);
         self.shards = shards;
         Ok(())
@@ -59,37 +51,18 @@ impl Statuses {
     /// # Errors
     /// No answer in time, or one that is not of this run.
     pub fn ask_learner(&mut self) -> anyhow::Result<()> {
-        let key = self.keys.learner_status();
-        let session = self
-            .sessions
+        let client = self
+            .clients
             .first()
             .context("a run has at least one replay server")?;
-        self.learner = self.ask(session, &key, Kind::LearnerStatus)?;
+        self.learner = client.fetch(ANSWER_MAX)?;
         Ok(())
-    }
-
-    fn ask<T: DeserializeOwned>(
-        &self,
-        session: &Session,
-        key: &str,
-        kind: Kind,
-    ) -> anyhow::Result<T> {
-        let answer = session::ask(
-            session,
-            key,
-            ZBytes::new(),
-            Priority::InteractiveHigh,
-            ANSWER_MAX,
-        )?;
-        let (status, _) = codec::decode(&answer.to_bytes(), kind, Some(self.spec_hash))
-            .with_context(|| key.to_owned())?;
-        Ok(status)
     }
 
     /// Leaves the run; the last answers stay.
     pub fn close(&self) {
-        for session in &self.sessions {
-            if let Err(e) = session.close().wait() {
+        for client in &self.clients {
+            if let Err(e) = client.session().close().wait() {
                 tracing::debug!("closing the session: {e}");
             }
         }

@@ -65,7 +65,7 @@ impl AuxiliaryLoss for Cpc {
         let (online, valid) = (inputs.online, inputs.batch.positive_valid);
         let anchors = inputs.anchors()?;
         let later = if valid.iter().any(|&valid| valid != 0) {
-            Some(inputs.features(present(inputs.batch.frames_k, valid))?)
+            Some(inputs.features(present(inputs.batch.states_k, valid))?)
         } else {
             None
         };

@@ -102,7 +102,7 @@ impl AuxiliaryLoss for Dim {
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
         let (online, batch) = (inputs.online, inputs.batch);
         let anchors = inputs.anchors()?;
-        let later = inputs.features(batch.frames_k)?;
+        let later = inputs.features(batch.states_k)?;
         let wanted = self.lambda.wanted();
         let dots = dots(online, &anchors, &later, &inputs.action()?, wanted)?;
         let mut losses = Vec::new();

@@ -133,7 +133,7 @@ impl LossInputs<'_> {
     /// If the loss has no [`AuxiliaryLoss::key_tau`].
     pub fn keys(&self) -> Result<Tensor, UpdateError> {
         let key = self.key.expect("a loss with key_tau is given its encoder");
-        key.keys(&self.tensor(self.batch.frames_k)?)
+        key.keys(&self.tensor(self.batch.states_k)?)
     }
 
     /// a_t [B], on the CPU, where the network looks at them.

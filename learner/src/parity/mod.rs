@@ -272,7 +272,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
         _ => None,
     };
     let batch = case.batch();
-    let features_t = online.features(&states(&model, batch.frames_t, device)?)?;
+    let features_t = online.features(&states(&model, batch.states_t, device)?)?;
     let losses = loss.losses(&LossInputs {
         online: &online,
         model: &model,

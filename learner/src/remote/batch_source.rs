@@ -9,14 +9,12 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_protocol::{
-    Batch, BatchHeader, BatchReply, BatchRequest, Keys, Kind, PlanesPool, ReplayStatus, RequestId,
-    Seldom, Shutdown, Tally, codec, fault, join_within,
-    session::{self, Asked, SessionError},
+    Batch, BatchHeader, BatchReply, BatchRequest, BufferPool, PendingReply, ReplayStatus,
+    RequestId, RunClient, Seldom, Shutdown, Tally, fault, join_within, session::SessionError,
     shared_memory::Trust,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use zenoh::{Session, bytes::ZBytes, qos::Priority};
 
 use super::shards::{self, Count};
 
@@ -77,27 +75,23 @@ impl BatchSource {
     /// # Errors
     /// The operating system gave no thread.
     pub fn start(
-        sessions: &[Session],
-        keys: &Keys,
-        spec_hash: u64,
+        clients: &[RunClient],
         requests: Requests,
         shutdown: &Shutdown,
     ) -> std::io::Result<Self> {
         let (sender, fetched) = mpsc::sync_channel(0);
         // A batch a thread, and the one that is learned from.
-        let pool = PlanesPool::new(requests.in_flight as usize + sessions.len());
-        let making = Arc::new(Mutex::new(Making::new(sessions.len())));
+        let pool = BufferPool::new(requests.in_flight as usize + clients.len());
+        let making = Arc::new(Mutex::new(Making::new(clients.len())));
         let mut threads = Vec::new();
         for i in 0..requests.in_flight {
             // Which rows come from which shard follows from the order of answers, so this need not be the run's.
             let mut rng = ChaCha8Rng::from_os_rng();
             let fetcher = Fetcher {
-                sessions: sessions.to_vec(),
-                keys: keys.clone(),
+                clients: clients.to_vec(),
                 making: making.clone(),
                 id: RequestId::first(rng.random()),
                 rng,
-                spec_hash,
                 requests,
                 pool: pool.clone(),
                 trust: Trust::default(),
@@ -170,15 +164,13 @@ impl Making {
 }
 
 struct Fetcher {
-    sessions: Vec<Session>,
-    keys: Keys,
+    clients: Vec<RunClient>,
     making: Arc<Mutex<Making>>,
     /// The request for a whole batch that comes next.
     id: RequestId,
     rng: ChaCha8Rng,
-    spec_hash: u64,
     requests: Requests,
-    pool: PlanesPool,
+    pool: BufferPool,
     /// Whether batches may come through shared memory.
     trust: Trust,
     said: Seldom,
@@ -218,7 +210,7 @@ impl Fetcher {
 
     /// One batch; `None` where the replay has nothing yet.
     fn fetch(&mut self) -> anyhow::Result<Option<Fetched>> {
-        if self.sessions.len() > 1 {
+        if self.clients.len() > 1 {
             return self.fetch_parts();
         }
         self.id = self.id.again();
@@ -255,9 +247,9 @@ impl Fetcher {
         }
         let mut asked = Vec::new();
         for shard in (0..pending.len()).filter(|&shard| pending[shard] > 0) {
-            let elsewhere = shards::elsewhere(counts, pending, shard);
+            let other_shards = shards::other_shards(counts, pending, shard);
             ids[shard] = ids[shard].again();
-            let part = self.ask(shard, ids[shard], pending[shard], Some(elsewhere))?;
+            let part = self.ask(shard, ids[shard], pending[shard], Some(other_shards))?;
             asked.push((shard, part));
         }
         let (mut finished, mut failed) = (false, None);
@@ -289,7 +281,7 @@ impl Fetcher {
         if pending.iter().all(|&rows| rows == 0) {
             let header =
                 Batch::merged_header(parts).context("the shards' parts do not fit together")?;
-            let memory = self.pool.take_own(header.planes_bytes());
+            let memory = self.pool.take_own(header.payload_bytes());
             let whole = Batch::merge(parts, memory);
             parts.clear();
             return Ok(Some(Fetched::Batch(whole)));
@@ -301,18 +293,8 @@ impl Fetcher {
 
     /// Asks all shards what they have counted.
     fn recount(&self, counts: &mut [Count]) -> anyhow::Result<()> {
-        let key = self.keys.replay_status();
-        for (session, count) in self.sessions.iter().zip(counts) {
-            let answer = session::ask(
-                session,
-                &key,
-                ZBytes::new(),
-                Priority::DataHigh,
-                REQUEST_TIMEOUT,
-            )?;
-            let (status, _): (ReplayStatus, _) =
-                codec::decode(&answer.to_bytes(), Kind::ReplayStatus, Some(self.spec_hash))
-                    .context("a shard's status")?;
+        for (client, count) in self.clients.iter().zip(counts) {
+            let status: ReplayStatus = client.fetch(REQUEST_TIMEOUT).context("a shard's status")?;
             *count = Count {
                 tally: Tally {
                     inserted: status.transitions_inserted,
@@ -330,29 +312,26 @@ impl Fetcher {
         shard: usize,
         id: RequestId,
         rows: u32,
-        elsewhere: Option<Tally>,
-    ) -> anyhow::Result<(Asked, bool)> {
+        other_shards: Option<Tally>,
+    ) -> anyhow::Result<(PendingReply<BatchReply>, bool)> {
         let request = BatchRequest {
             learner: self.requests.learner,
             id,
             rows,
             shared_memory: self.requests.shared_memory && self.trust.ask(),
-            elsewhere,
+            other_shards,
         };
-        let message = codec::encode(Kind::BatchRequest, self.spec_hash, &request, &[])?;
-        let asked = session::send(
-            &self.sessions[shard],
-            &self.keys.batch(),
-            message.into(),
-            Priority::Data,
-            REQUEST_TIMEOUT,
-        )?;
+        let client = &self.clients[shard];
+        let asked = client.send(client.seal(&request)?, REQUEST_TIMEOUT)?;
         Ok((asked, request.shared_memory))
     }
 
-    fn answer(&mut self, (asked, shared_memory): (Asked, bool)) -> anyhow::Result<Answer> {
+    fn answer(
+        &mut self,
+        (asked, shared_memory): (PendingReply<BatchReply>, bool),
+    ) -> anyhow::Result<Answer> {
         // Where this process may not map shared memory, the question seems to have been answered by nobody.
-        let answer = asked.answer().inspect_err(|e| {
+        let (reply, payload) = asked.receive(&self.pool).inspect_err(|e| {
             let unheard = matches!(
                 e,
                 SessionError::NoReply { .. } | SessionError::Nobody { .. }
@@ -361,20 +340,12 @@ impl Fetcher {
                 self.trust.lost();
             }
         })?;
-        let (reply, planes) = codec::receive(
-            answer.slices(),
-            answer.len(),
-            &self.pool,
-            Kind::BatchReply,
-            Some(self.spec_hash),
-        )
-        .context("a batch")?;
         Ok(match reply {
             BatchReply::Batch(header) => {
                 if shared_memory {
                     self.trust.worked();
                 }
-                Answer::Batch(Batch::from_planes(header, planes)?)
+                Answer::Batch(Batch::from_payload(header, payload)?)
             }
             BatchReply::Wait(_) => Answer::Wait,
             BatchReply::Finished => Answer::Finished,

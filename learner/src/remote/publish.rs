@@ -10,10 +10,10 @@ use std::{
 };
 
 use driml_protocol::{
-    AffinityUpdate, Answering, Keys, Kind, LearnerStatus, Seldom, Shutdown, WeightsUpload, codec,
-    fault, session,
+    AffinityUpdate, CodecError, Done, LearnerStatus, QueryWorkers, Request, Responder, RunClient,
+    Sealed, Seldom, Shutdown, WeightsUpload, fault,
 };
-use zenoh::{Session, bytes::ZBytes, qos::Priority, query::Queryable};
+use zenoh::query::Queryable;
 
 use crate::learner::Weights;
 
@@ -79,27 +79,23 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 impl Outlets {
     /// Declares the status in every session, and starts the threads that send weights and affinity as those of `learner`.
     pub(crate) fn open(
-        sessions: &[Session],
-        (keys, spec_hash): (&Keys, u64),
+        clients: &[RunClient],
+        spec_hash: u64,
         learner: u64,
         shutdown: &Shutdown,
     ) -> anyhow::Result<Self> {
         let status: Arc<Mutex<LearnerStatus>> = Arc::default();
         let heard: Arc<AtomicBool> = Arc::default();
         let (held, told) = (status.clone(), heard.clone());
-        let status_asked = Answering::start("learner-status", 1, move |query| {
+        let give = move |responder: Responder<LearnerStatus>| {
             let status = lock(&held).clone();
-            match codec::encode(Kind::LearnerStatus, spec_hash, &status, &[]) {
-                Ok(bytes) => {
-                    session::answer(&query, bytes.into());
-                    told.store(status.finished, Ordering::Relaxed);
-                }
-                Err(e) => tracing::warn!("the learner's status was not sent: {e}"),
-            }
-        })?;
+            responder.reply(&status);
+            told.store(status.finished, Ordering::Relaxed);
+        };
+        let status_asked = QueryWorkers::offer("learner-status", 1, spec_hash, give)?;
         let mut queryables = Vec::new();
-        for session in sessions {
-            let declared = status_asked.declare(session, keys.learner_status());
+        for client in clients {
+            let declared = status_asked.declare(client);
             queryables.push(
                 declared.map_err(|e| anyhow::anyhow!("declaring the learner's status: {e}"))?,
             );
@@ -112,27 +108,24 @@ impl Outlets {
             affinity: Arc::default(),
             _queryables: queryables,
         };
-        let to_all = |what, key: String, timeout| Sender {
+        let to_all = |what, timeout| Sender {
             what,
-            sessions: sessions.to_vec(),
-            key,
-            spec_hash,
+            clients: clients.to_vec(),
             timeout,
             shutdown: shutdown.clone(),
             said: Seldom::default(),
         };
-        let weights = to_all("weights", keys.weights_upload(), WEIGHTS_TIMEOUT);
+        let weights = to_all("weights", WEIGHTS_TIMEOUT);
         weights.start(this.weights.clone(), move |(header, safetensors)| {
             let upload = WeightsUpload {
                 learner,
                 weights: *header,
             };
-            let head = codec::seal(Kind::WeightsUpload, spec_hash, &upload, safetensors)?;
-            Ok(session::join_planes(head, safetensors.clone().into()))
+            Sealed::with_payload(&upload, safetensors.clone().into(), spec_hash)
         })?;
-        let affinity = to_all("affinity", keys.affinity(), AFFINITY_TIMEOUT);
+        let affinity = to_all("affinity", AFFINITY_TIMEOUT);
         affinity.start(this.affinity.clone(), move |update| {
-            Ok(codec::encode(Kind::Affinity, spec_hash, update, &[])?.into())
+            Sealed::new(update, spec_hash)
         })?;
         Ok(this)
     }
@@ -174,9 +167,7 @@ impl Outlets {
 /// Sends the newest of its kind to all replay servers, again until each has said that it has it or something newer is there.
 struct Sender {
     what: &'static str,
-    sessions: Vec<Session>,
-    key: String,
-    spec_hash: u64,
+    clients: Vec<RunClient>,
     timeout: Duration,
     shutdown: Shutdown,
     said: Seldom,
@@ -184,10 +175,10 @@ struct Sender {
 
 impl Sender {
     /// Starts a thread that sends until the shutdown; `message` makes the bytes of what is sent.
-    fn start<T: Send + 'static>(
+    fn start<T: Send + 'static, R: Request<Reply = Done>>(
         mut self,
         newest: Arc<Newest<T>>,
-        message: impl Fn(&T) -> anyhow::Result<ZBytes> + Send + 'static,
+        message: impl Fn(&T) -> Result<Sealed<R>, CodecError> + Send + 'static,
     ) -> std::io::Result<()> {
         let name = format!("{}-sender", self.what);
         let thread = std::thread::Builder::new().name(name.clone());
@@ -197,33 +188,28 @@ impl Sender {
                 let Some(value) = newest.take() else { continue };
                 match message(&value) {
                     Ok(message) => self.send_to_all(&message, || newest.is_filled()),
-                    Err(e) => tracing::error!("the {} cannot be sent: {e:#}", self.what),
+                    Err(e) => tracing::error!("the {} cannot be sent: {e}", self.what),
                 }
             }
         })?;
         Ok(())
     }
 
-    fn send_to_all(&mut self, message: &ZBytes, is_old: impl Fn() -> bool) {
-        for session in &self.sessions {
-            while let Err(e) = self.send(session, message.clone()) {
+    fn send_to_all<R: Request<Reply = Done>>(
+        &mut self,
+        message: &Sealed<R>,
+        is_old: impl Fn() -> bool,
+    ) {
+        for client in &self.clients {
+            let send = || client.send(message.clone(), self.timeout)?.wait();
+            while let Err(e) = send() {
                 if is_old() || self.shutdown.wait_timeout(RETRY_PAUSE) {
                     break;
                 }
                 if let Some(more) = self.said.due() {
-                    tracing::warn!(
-                        "the {} did not arrive, trying again: {e:#}{more}",
-                        self.what
-                    );
+                    tracing::warn!("the {} did not arrive, trying again: {e}{more}", self.what);
                 }
             }
         }
-    }
-
-    fn send(&self, session: &Session, message: ZBytes) -> anyhow::Result<()> {
-        let priority = Priority::DataHigh;
-        let answer = session::ask(session, &self.key, message, priority, self.timeout)?;
-        codec::decode::<()>(&answer.to_bytes(), Kind::Done, Some(self.spec_hash))?;
-        Ok(())
     }
 }

@@ -87,18 +87,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     );
     let spec_hash = learner.spec_hash();
     let learned = updates.saturating_mul(rows.into());
-    let part_in_run = shards.take_part((&keys, spec_hash), requests.learner, learned, shutdown)?;
+    let clients = shards.clients(&keys, spec_hash);
+    let part_in_run = shards.take_part(&clients, requests.learner, learned, shutdown)?;
     let Some(membership) = part_in_run else {
         return Ok(());
     };
     learner.publish_above(membership.weights_version);
     keep_settings(&args.run_dir, &shards.config_toml)?;
-    let outlets = Outlets::open(
-        &shards.sessions,
-        (&keys, spec_hash),
-        requests.learner,
-        shutdown,
-    )?;
+    let outlets = Outlets::open(&clients, spec_hash, requests.learner, shutdown)?;
     outlets.publish(learner.next_weights()?);
     if updates > 0 {
         outlets.with_status(|status| status.updates = updates);
@@ -106,7 +102,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             outlets.send_affinity(affinity);
         }
     }
-    let mut batches = BatchSource::start(&shards.sessions, &keys, spec_hash, requests, shutdown)?;
+    let mut batches = BatchSource::start(&clients, requests, shutdown)?;
     tracing::info!(
         "learning on {} from batches of {rows} rows, run {spec_hash:016x}",
         args.device,

@@ -3,7 +3,7 @@
 
 use anyhow::{Context, ensure};
 use driml_protocol::{
-    Hello, Keys, LearnerJoin, Shutdown, Tally, join,
+    Alive, Hello, Keys, LearnerJoin, RunClient, Shutdown, Tally, join,
     session::{self, Endpoints},
 };
 use rand::Rng;
@@ -63,6 +63,12 @@ impl Shards {
         }))
     }
 
+    /// A client of each shard, for the run whose spec has this hash.
+    pub(crate) fn clients(&self, keys: &Keys, spec_hash: u64) -> Vec<RunClient> {
+        let client = |session: &Session| RunClient::new(session.clone(), keys.clone(), spec_hash);
+        self.sessions.iter().map(client).collect()
+    }
+
     /// Updates for which rows were served, of batches of `rows` rows.
     pub(crate) fn updates_counted(&self, rows: u32) -> u64 {
         self.served.iter().sum::<u64>() / u64::from(rows.max(1))
@@ -75,7 +81,7 @@ impl Shards {
     /// Another learner takes part, or a replay server refuses.
     pub(crate) fn take_part(
         &self,
-        (keys, spec_hash): (&Keys, u64),
+        clients: &[RunClient],
         learner: u64,
         rows: u64,
         shutdown: &Shutdown,
@@ -85,19 +91,16 @@ impl Shards {
             _alive: Vec::new(),
         };
         let learned = learned(&self.served, rows);
-        for (session, rows_sampled) in self.sessions.iter().zip(learned) {
+        for (client, rows_sampled) in clients.iter().zip(learned) {
             // Before it joins, so that no other learner can take its place from then on.
-            let alive = session
-                .liveliness()
-                .declare_token(keys.learner_alive(learner))
-                .wait();
+            let alive = client.declare_alive(Alive::Learner(learner));
             let alive = alive.map_err(|e| anyhow::anyhow!("declaring the learner alive: {e}"))?;
             membership._alive.push(alive);
             let join = LearnerJoin {
                 learner,
                 rows_sampled,
             };
-            let joined = join::as_learner(session, keys, spec_hash, join, shutdown)?;
+            let joined = join::as_learner(client, join, shutdown)?;
             let Some(welcome) = joined else {
                 return Ok(None);
             };
@@ -200,7 +203,7 @@ pub(crate) fn split(rows: u32, counts: &[Count], rng: &mut impl Rng) -> Option<V
 }
 
 /// What all shards but `this` have counted once they have given `pending` rows more, so many each.
-pub(crate) fn elsewhere(counts: &[Count], pending: &[u32], this: usize) -> Tally {
+pub(crate) fn other_shards(counts: &[Count], pending: &[u32], this: usize) -> Tally {
     let others = counts.iter().zip(pending).enumerate();
     others.filter(|(at, _)| *at != this).fold(
         Tally::default(),
@@ -273,7 +276,7 @@ mod tests {
     #[test]
     fn a_shard_is_told_of_all_others_and_of_the_rest_of_its_batch() {
         let counts = [count(1, 10, 100), count(2, 20, 200), count(3, 30, 300)];
-        let told = |this| elsewhere(&counts, &[5, 6, 7], this);
+        let told = |this| other_shards(&counts, &[5, 6, 7], this);
         assert_eq!(
             told(1),
             Tally {

@@ -2,8 +2,13 @@
 //! It does not estimate: how A comes about is the learner's.
 
 use serde::{Deserialize, Serialize};
+use zenoh::qos::Priority;
 
-use crate::wire::codec::CodecError;
+use super::done::Done;
+use crate::wire::{
+    error::CodecError,
+    message::{Keyed, Kind, Message, Request},
+};
 
 /// A, row by row: `matrix[i * n + j]` is the softmax over j of q(a_i, a_j); rows sum to 1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -16,6 +21,19 @@ pub struct AffinityUpdate {
     pub num_actions: u32,
     /// [n, n] probabilities.
     pub matrix: Vec<f32>,
+}
+
+impl Message for AffinityUpdate {
+    const KIND: Kind = Kind::Affinity;
+}
+
+impl Keyed for AffinityUpdate {
+    const KEY: &'static str = "affinity";
+    const PRIORITY: Priority = Priority::DataHigh;
+}
+
+impl Request for AffinityUpdate {
+    type Reply = Done;
 }
 
 impl AffinityUpdate {

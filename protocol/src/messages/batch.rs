@@ -3,12 +3,17 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{batch_request::Tally, status::Waiting};
+use super::{
+    batch_layout::{BatchLayout, Column},
+    status::Waiting,
+    tally::Tally,
+};
 use crate::{
     run_spec::RunSpec,
     wire::{
-        buffers::Planes,
-        codec::{self, CodecError, Kind},
+        buffers::Buffer,
+        error::CodecError,
+        message::{Kind, Message, no_payload},
         shared_memory,
     },
 };
@@ -16,8 +21,6 @@ use crate::{
 /// Stands where a row has no next action: its transition ended the episode or the level.
 pub const NO_ACTION: u8 = 255;
 
-/// Planes of a batch.
-const PLANES: usize = 9;
 /// Batches that a replay server keeps in shared memory: those that are assembled, on their way, and being copied by the learner.
 pub const POOL_BATCHES: usize = 6;
 
@@ -56,22 +59,46 @@ impl BatchHeader {
 
     /// Bytes of the shared memory in which a replay server keeps [`POOL_BATCHES`] such batches.
     pub fn pool_bytes(&self) -> usize {
-        shared_memory::pool_bytes(POOL_BATCHES, self.planes_bytes())
+        shared_memory::pool_bytes(POOL_BATCHES, self.payload_bytes())
     }
 
-    /// Bytes of the planes of such a batch.
+    /// Bytes of the payload of such a batch.
     ///
     /// # Panics
     /// If they are more than the address space, which no batch of a run is.
-    pub fn planes_bytes(&self) -> usize {
-        planes_bytes(self).expect("a batch is far below the address space")
+    pub fn payload_bytes(&self) -> usize {
+        self.layout()
+            .bytes()
+            .expect("a batch is far below the address space")
+    }
+
+    const fn layout(&self) -> BatchLayout {
+        BatchLayout {
+            rows: self.rows as usize,
+            positives: self.positives as usize,
+            state_bytes: self.state_bytes as usize,
+        }
+    }
+
+    /// Checks that `payload` is as long as such a batch's.
+    fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
+        if self.layout().bytes() == Some(payload.len()) && self.rows > 0 {
+            return Ok(());
+        }
+        Err(CodecError::Header(format!(
+            "{} rows with {} positives of {} bytes do not fill {} bytes of payload",
+            self.rows,
+            self.positives,
+            self.state_bytes,
+            payload.len()
+        )))
     }
 }
 
 /// The answer to a request.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum BatchReply {
-    /// The planes that follow are a batch.
+    /// The payload that follows is a batch.
     Batch(BatchHeader),
     /// Nothing yet: ask again.
     Wait(Waiting),
@@ -84,31 +111,42 @@ pub enum BatchReply {
     },
 }
 
+impl Message for BatchReply {
+    const KIND: Kind = Kind::BatchReply;
+
+    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+        match self {
+            Self::Batch(header) => header.check_payload(payload),
+            Self::Wait(_) | Self::Finished | Self::Refused { .. } => no_payload(payload),
+        }
+    }
+}
+
 /// Rows (s_t, a_t, a_{t+1}, R_t, discount, s_{t+k}, s_{t+n}), as the replay server made them.
 ///
-/// Planes, one after the other, B rows each: frames_t, frames_k [P, B, ..], frames_n [B, state bytes]; n-step return f32,
+/// Buffer, one after the other, B rows each: states_t, states_k [P, B, ..], states_n [B, state bytes]; n-step return f32,
 /// bootstrap discount f32 (little-endian); action, next action, positive valid [P, B], k [P, B] (u8).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Batch {
     /// What it says of itself.
     pub header: BatchHeader,
-    planes: Planes,
+    payload: Buffer,
 }
 
 impl Batch {
     /// A batch of zeros, to be filled in place.
     pub fn zeroed(header: BatchHeader) -> Self {
-        let planes = Planes::zeroed(header.planes_bytes());
-        Self { header, planes }
+        let payload = Buffer::zeroed(header.payload_bytes());
+        Self { header, payload }
     }
 
     /// A batch in memory that may hold anything: every row is to be written with [`Batch::rows_mut`].
     ///
     /// # Panics
-    /// If the memory is not of [`BatchHeader::planes_bytes`].
-    pub fn in_memory(header: BatchHeader, planes: Planes) -> Self {
-        assert_eq!(planes.len(), header.planes_bytes(), "memory for a batch");
-        Self { header, planes }
+    /// If the memory is not of [`BatchHeader::payload_bytes`].
+    pub fn in_memory(header: BatchHeader, payload: Buffer) -> Self {
+        assert_eq!(payload.len(), header.payload_bytes(), "memory for a batch");
+        Self { header, payload }
     }
 
     /// The rows of all `parts`, one part after the other, in memory that may hold anything; as many bytes as
@@ -116,25 +154,25 @@ impl Batch {
     ///
     /// # Panics
     /// If there is no such header, or the memory is of another size.
-    pub fn merge(parts: &[Self], memory: Planes) -> Self {
+    pub fn merge(parts: &[Self], memory: Buffer) -> Self {
         let header = Self::merged_header(parts).expect("parts of one batch");
         let mut merged = Self::in_memory(header, memory);
-        let offsets = merged.offsets();
+        let whole = header.layout();
         let mut first_row = 0;
         for part in parts {
-            for (plane, &offset) in offsets[..PLANES].iter().enumerate() {
-                let per_positive = matches!(plane, 1 | 7 | 8);
-                let blocks = if per_positive { part.positives() } else { 1 };
-                let values = part.plane(plane);
-                let row_bytes = values.len() / (blocks.max(1) * part.rows());
-                for block in 0..blocks {
-                    let from =
-                        &values[block * part.rows() * row_bytes..][..part.rows() * row_bytes];
-                    let row = block * merged.rows() + first_row;
-                    merged.planes[offset + row * row_bytes..][..from.len()].copy_from_slice(from);
+            let rows = part.rows();
+            for column in Column::ALL {
+                let row_bytes = whole.value_bytes(column);
+                let to = &mut merged.payload[whole.range(column)];
+                let from = part.column(column);
+                // Of each positive, the rows of the part come together.
+                for positive in 0..whole.values_a_row(column) {
+                    let from = &from[positive * rows * row_bytes..][..rows * row_bytes];
+                    let row = positive * whole.rows + first_row;
+                    to[row * row_bytes..][..from.len()].copy_from_slice(from);
                 }
             }
-            first_row += part.rows();
+            first_row += rows;
         }
         merged
     }
@@ -178,162 +216,108 @@ impl Batch {
         self.header.positives as usize
     }
 
-    fn frames_bytes(&self) -> usize {
-        self.rows() * self.header.state_bytes as usize
+    fn column(&self, column: Column) -> &[u8] {
+        &self.payload[self.header.layout().range(column)]
     }
 
-    /// Byte offsets of the planes, in their order, and the end.
-    fn offsets(&self) -> [usize; PLANES + 1] {
-        let (rows, positives, frames) = (self.rows(), self.positives(), self.frames_bytes());
-        let lengths = [
-            frames,
-            frames * positives,
-            frames,
-            4 * rows,
-            4 * rows,
-            rows,
-            rows,
-            rows * positives,
-            rows * positives,
-        ];
-        let mut offsets = [0; PLANES + 1];
-        for (i, length) in lengths.iter().enumerate() {
-            offsets[i + 1] = offsets[i] + length;
-        }
-        offsets
-    }
-
-    fn plane(&self, index: usize) -> &[u8] {
-        let offsets = self.offsets();
-        &self.planes[offsets[index]..offsets[index + 1]]
-    }
-
-    fn plane_f32(&self, index: usize) -> Vec<f32> {
-        let value = |b: &[u8]| f32::from_le_bytes(b.try_into().expect("chunks of four"));
-        self.plane(index).chunks_exact(4).map(value).collect()
+    fn column_f32(&self, column: Column) -> Vec<f32> {
+        let (values, _) = self.column(column).as_chunks();
+        values.iter().copied().map(f32::from_le_bytes).collect()
     }
 
     /// s_t [B, state bytes].
-    pub fn frames_t(&self) -> &[u8] {
-        self.plane(0)
+    pub fn states_t(&self) -> &[u8] {
+        self.column(Column::StatesT)
     }
 
     /// s_{t+k} [P, B, state bytes]; rows without a positive hold zeros.
-    pub fn frames_k(&self) -> &[u8] {
-        self.plane(1)
+    pub fn states_k(&self) -> &[u8] {
+        self.column(Column::StatesK)
     }
 
     /// s_{t+n} [B, state bytes]; rows that do not bootstrap hold zeros.
-    pub fn frames_n(&self) -> &[u8] {
-        self.plane(2)
+    pub fn states_n(&self) -> &[u8] {
+        self.column(Column::StatesN)
     }
 
     /// Sum of gamma^i r_{t+i} over i < n, stopped at the episode's end [B].
     pub fn n_step_returns(&self) -> Vec<f32> {
-        self.plane_f32(3)
+        self.column_f32(Column::NStepReturn)
     }
 
     /// gamma^n, or 0 where the episode ended within the n steps [B].
     pub fn bootstrap_discounts(&self) -> Vec<f32> {
-        self.plane_f32(4)
+        self.column_f32(Column::BootstrapDiscount)
     }
 
     /// a_t [B].
     pub fn actions(&self) -> &[u8] {
-        self.plane(5)
+        self.column(Column::Action)
     }
 
     /// a_{t+1} [B], or [`NO_ACTION`].
     pub fn next_actions(&self) -> &[u8] {
-        self.plane(6)
+        self.column(Column::NextAction)
     }
 
     /// 1 where the row has a positive [P, B].
     pub fn positive_valid(&self) -> &[u8] {
-        self.plane(7)
+        self.column(Column::PositiveValid)
     }
 
     /// k [P, B], capped at 255; 0 where the row has no positive.
     pub fn ks(&self) -> &[u8] {
-        self.plane(8)
+        self.column(Column::K)
     }
 
     /// Everything of one row, to be written in place.
     pub fn rows_mut(&mut self) -> BatchRowsMut<'_> {
-        let offsets = self.offsets();
-        let state_bytes = self.header.state_bytes as usize;
-        let rows = self.rows();
-        let mut rest = &mut self.planes[..];
-        let mut take = |i: usize| -> &mut [u8] {
-            let (head, tail) = std::mem::take(&mut rest).split_at_mut(offsets[i + 1] - offsets[i]);
-            rest = tail;
-            head
+        let layout = self.header.layout();
+        let mut rest = &mut self.payload[..];
+        // They lie in the order of their names here.
+        let mut take = |column| -> &mut [u8] {
+            let bytes = layout.column_bytes(column);
+            rest.split_off_mut(..bytes)
+                .expect("the columns fill the payload")
         };
         BatchRowsMut {
-            rows,
-            state_bytes,
-            frames_t: take(0),
-            frames_k: take(1),
-            frames_n: take(2),
-            n_step_return: take(3),
-            bootstrap_discount: take(4),
-            action: take(5),
-            next_action: take(6),
-            positive_valid: take(7),
-            k: take(8),
+            rows: layout.rows,
+            state_bytes: layout.state_bytes,
+            states_t: take(Column::StatesT),
+            states_k: take(Column::StatesK),
+            states_n: take(Column::StatesN),
+            n_step_return: take(Column::NStepReturn),
+            bootstrap_discount: take(Column::BootstrapDiscount),
+            action: take(Column::Action),
+            next_action: take(Column::NextAction),
+            positive_valid: take(Column::PositiveValid),
+            k: take(Column::K),
         }
     }
 
-    /// The batch as it travels: prefix and header, then the planes.
-    ///
-    /// # Errors
-    /// A batch over the codec's limits.
-    pub fn seal(self, spec_hash: u64) -> Result<(Vec<u8>, Planes), CodecError> {
-        let head = codec::seal(
-            Kind::BatchReply,
-            spec_hash,
-            &BatchReply::Batch(self.header),
-            &self.planes,
-        )?;
-        Ok((head, self.planes))
+    /// Header and payload, to travel as a [`BatchReply::Batch`].
+    pub fn into_payload(self) -> (BatchHeader, Buffer) {
+        (self.header, self.payload)
     }
 
-    /// Takes the planes of a decoded reply, checking that they are as long as its header says.
+    /// Takes the payload of a decoded reply, checking that it is as long as its header says.
     ///
     /// # Errors
-    /// Planes of another length.
-    pub fn from_planes(header: BatchHeader, planes: Planes) -> Result<Self, CodecError> {
-        if planes_bytes(&header) != Some(planes.len()) || header.rows == 0 {
-            return Err(CodecError::Header(format!(
-                "{} rows with {} positives of {} bytes do not fill {} bytes of planes",
-                header.rows,
-                header.positives,
-                header.state_bytes,
-                planes.len()
-            )));
-        }
-        Ok(Self { header, planes })
+    /// Buffer of another length.
+    pub fn from_payload(header: BatchHeader, payload: Buffer) -> Result<Self, CodecError> {
+        header.check_payload(&payload)?;
+        Ok(Self { header, payload })
     }
 }
 
-fn planes_bytes(header: &BatchHeader) -> Option<usize> {
-    let (rows, positives) = (header.rows as usize, header.positives as usize);
-    let states = (header.state_bytes as usize).checked_mul(positives.checked_add(2)?)?;
-    rows.checked_mul(
-        states
-            .checked_add(10)?
-            .checked_add(positives.checked_mul(2)?)?,
-    )
-}
-
-/// The planes of a batch, borrowed for writing, row by row.
+/// The columns of a batch, borrowed for writing, row by row.
 #[derive(Debug)]
 pub struct BatchRowsMut<'a> {
     rows: usize,
     state_bytes: usize,
-    frames_t: &'a mut [u8],
-    frames_k: &'a mut [u8],
-    frames_n: &'a mut [u8],
+    states_t: &'a mut [u8],
+    states_k: &'a mut [u8],
+    states_n: &'a mut [u8],
     n_step_return: &'a mut [u8],
     bootstrap_discount: &'a mut [u8],
     action: &'a mut [u8],
@@ -344,13 +328,13 @@ pub struct BatchRowsMut<'a> {
 
 impl BatchRowsMut<'_> {
     /// Where s_t of `row` is written.
-    pub fn frame_t(&mut self, row: usize) -> &mut [u8] {
-        &mut self.frames_t[row * self.state_bytes..(row + 1) * self.state_bytes]
+    pub fn state_t(&mut self, row: usize) -> &mut [u8] {
+        &mut self.states_t[row * self.state_bytes..(row + 1) * self.state_bytes]
     }
 
     /// Where s_{t+n} of `row` is written; zeros if the row does not bootstrap.
-    pub fn frame_n(&mut self, row: usize) -> &mut [u8] {
-        &mut self.frames_n[row * self.state_bytes..(row + 1) * self.state_bytes]
+    pub fn state_n(&mut self, row: usize) -> &mut [u8] {
+        &mut self.states_n[row * self.state_bytes..(row + 1) * self.state_bytes]
     }
 
     /// Positives a row, P.
@@ -369,7 +353,7 @@ impl BatchRowsMut<'_> {
         let at = p * self.rows + row;
         self.positive_valid[at] = 1;
         self.k[at] = u8::try_from(k).unwrap_or(u8::MAX);
-        &mut self.frames_k[at * self.state_bytes..(at + 1) * self.state_bytes]
+        &mut self.states_k[at * self.state_bytes..(at + 1) * self.state_bytes]
     }
 
     /// Writes the scalars of `row`.

@@ -3,6 +3,9 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::{batch::BatchReply, tally::Tally};
+use crate::wire::message::{Keyed, Kind, Message, Request};
+
 /// The learner's request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BatchRequest {
@@ -15,25 +18,37 @@ pub struct BatchRequest {
     /// Whether the batch may come through shared memory.
     pub shared_memory: bool,
     /// Where the replay has several shards: what all the others have counted together, and these rows are part of a batch.
-    pub elsewhere: Option<Tally>,
+    pub other_shards: Option<Tally>,
+}
+
+impl Message for BatchRequest {
+    const KIND: Kind = Kind::BatchRequest;
+}
+
+impl Keyed for BatchRequest {
+    const KEY: &'static str = "batch";
+}
+
+impl Request for BatchRequest {
+    type Reply = BatchReply;
 }
 
 /// Tells a request that repeats another from a new one: a batch that did not arrive must not count as sampled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RequestId {
     /// Who asks: a random number, which tells it from all others. It waits for one request at a time.
-    pub asker: u64,
-    /// How many requests of this asker were answered before.
+    pub client_id: u64,
+    /// How many requests of this client were answered before.
     pub number: u64,
     /// Which attempt at this one it is: a later one has a higher number.
     pub attempt: u64,
 }
 
 impl RequestId {
-    /// The first request of an asker.
-    pub const fn first(asker: u64) -> Self {
+    /// The first request of an client.
+    pub const fn first(client_id: u64) -> Self {
         Self {
-            asker,
+            client_id,
             number: 0,
             attempt: 0,
         }
@@ -55,26 +70,6 @@ impl RequestId {
             number: self.number + 1,
             attempt: 0,
             ..self
-        }
-    }
-}
-
-/// What the rate limiter counts.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Tally {
-    /// Transitions stored.
-    pub inserted: u64,
-    /// Rows sampled.
-    pub rows_sampled: u64,
-}
-
-impl std::ops::Add for Tally {
-    type Output = Self;
-
-    fn add(self, other: Self) -> Self {
-        Self {
-            inserted: self.inserted.saturating_add(other.inserted),
-            rows_sampled: self.rows_sampled.saturating_add(other.rows_sampled),
         }
     }
 }

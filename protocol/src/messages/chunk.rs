@@ -1,15 +1,21 @@
 //! Transitions on their way from an actor to the replay server.
 //! It does not decide what is stored: exactly-once and order are the replay server's.
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
+use super::insert_reply::InsertReply;
 use crate::wire::{
-    buffers::{Planes, PlanesPool},
-    codec::{self, CodecError, Kind},
+    buffers::{Buffer, BufferPool},
+    codec,
+    error::CodecError,
+    message::{Keyed, Kind, Message, Request},
 };
 
 /// Bytes of one transition in a chunk beside its frame: an action, an end and a reward.
-pub const TRANSITION_BYTES: usize = 1 + 1 + 4;
+pub const TRANSITION_BYTES: usize = size_of::<u8>() + size_of::<End>() + size_of::<f32>();
+const _: () = assert!(TRANSITION_BYTES == 6);
 
 /// What a step ended, if anything.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -49,10 +55,10 @@ pub struct ChunkHeader {
     /// Which actor, unique in the run.
     pub actor: u32,
     /// Which life of that actor: drawn anew at each start.
-    pub epoch: u64,
-    /// Number of the chunk within the epoch, from 0.
+    pub incarnation: u64,
+    /// Number of the chunk within the incarnation, from 0.
     pub sequence: u64,
-    /// Transitions that this epoch produced before this chunk: the second count, by which loss shows.
+    /// Transitions that this incarnation produced before this chunk: the second count, by which loss shows.
     pub first_transition: u64,
     /// The weights that chose every action of this chunk; 0 before the first.
     pub weights_version: u64,
@@ -66,77 +72,127 @@ pub struct ChunkHeader {
     pub frame_bytes: u32,
 }
 
+impl Message for ChunkHeader {
+    const KIND: Kind = Kind::Chunk;
+
+    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+        if self.payload_bytes() == Some(payload.len()) && self.transitions() > 0 {
+            return Ok(());
+        }
+        Err(CodecError::Header(format!(
+            "{} streams of {} steps of {} bytes do not fill {} bytes of payload",
+            self.streams,
+            self.steps,
+            self.frame_bytes,
+            payload.len()
+        )))
+    }
+}
+
+impl Keyed for ChunkHeader {
+    const KEY: &'static str = "ingest";
+}
+
+impl Request for ChunkHeader {
+    type Reply = InsertReply;
+}
+
 impl ChunkHeader {
     /// Transitions in the chunk.
     pub const fn transitions(&self) -> usize {
         self.streams as usize * self.steps as usize
     }
 
-    /// Bytes of the planes of such a chunk; none if they are more than the address space.
-    pub fn planes_bytes(&self) -> Option<usize> {
+    /// Bytes of the payload of such a chunk; none if they are more than the address space.
+    pub fn payload_bytes(&self) -> Option<usize> {
         self.transitions()
             .checked_mul(self.frame_bytes as usize + TRANSITION_BYTES)
     }
 }
 
+/// Where the columns of a chunk lie in its payload, one after the other.
+#[derive(Clone, Copy)]
+struct ChunkLayout {
+    rows: usize,
+    frame_bytes: usize,
+}
+
+impl ChunkLayout {
+    const fn frames(self) -> Range<usize> {
+        0..self.rows * self.frame_bytes
+    }
+
+    const fn actions(self) -> Range<usize> {
+        let start = self.frames().end;
+        start..start + self.rows
+    }
+
+    const fn ends(self) -> Range<usize> {
+        let start = self.actions().end;
+        start..start + self.rows * size_of::<End>()
+    }
+
+    const fn rewards(self) -> Range<usize> {
+        let start = self.ends().end;
+        start..start + self.rows * size_of::<f32>()
+    }
+}
+
 /// Consecutive steps of several streams: row `stream * steps + step` is (s_t, a_t, r_t, what a_t ended).
 ///
-/// Planes, one after the other: frames [rows, frame bytes], actions [rows], ends [rows], rewards [rows] f32 little-endian.
+/// Buffer, one after the other: frames [rows, frame bytes], actions [rows], ends [rows], rewards [rows] f32 little-endian.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Chunk {
     /// What it says of itself.
     pub header: ChunkHeader,
-    planes: Planes,
+    payload: Buffer,
 }
 
 impl Chunk {
     /// A chunk of zeros, to be filled in place.
     pub fn zeroed(header: ChunkHeader) -> Self {
         let bytes = header
-            .planes_bytes()
+            .payload_bytes()
             .expect("an actor's chunk is far below the address space");
         Self {
             header,
-            planes: Planes::zeroed(bytes),
+            payload: Buffer::zeroed(bytes),
         }
     }
 
     /// A chunk in memory that may hold anything: every row is to be written.
     ///
     /// # Panics
-    /// If the memory is not of [`ChunkHeader::planes_bytes`].
-    pub fn in_memory(header: ChunkHeader, planes: Planes) -> Self {
+    /// If the memory is not of [`ChunkHeader::payload_bytes`].
+    pub fn in_memory(header: ChunkHeader, payload: Buffer) -> Self {
         assert_eq!(
-            Some(planes.len()),
-            header.planes_bytes(),
+            Some(payload.len()),
+            header.payload_bytes(),
             "memory for a chunk"
         );
-        Self { header, planes }
+        Self { header, payload }
     }
 
-    fn rows(&self) -> usize {
-        self.header.transitions()
-    }
-
-    fn frames_end(&self) -> usize {
-        self.rows() * self.header.frame_bytes as usize
+    fn layout(&self) -> ChunkLayout {
+        ChunkLayout {
+            rows: self.header.transitions(),
+            frame_bytes: self.header.frame_bytes as usize,
+        }
     }
 
     /// Frames [rows, frame bytes].
     pub fn frames(&self) -> &[u8] {
-        &self.planes[..self.frames_end()]
+        &self.payload[self.layout().frames()]
     }
 
     /// Actions [rows].
     pub fn actions(&self) -> &[u8] {
-        let start = self.frames_end();
-        &self.planes[start..start + self.rows()]
+        &self.payload[self.layout().actions()]
     }
 
     /// Ends [rows], as bytes of [`End`].
     pub fn ends(&self) -> &[u8] {
-        let start = self.frames_end() + self.rows();
-        &self.planes[start..start + self.rows()]
+        &self.payload[self.layout().ends()]
     }
 
     /// The end of one row; every byte was checked when the chunk was made or decoded.
@@ -146,40 +202,40 @@ impl Chunk {
 
     /// The reward of one row.
     pub fn reward(&self, row: usize) -> f32 {
-        let at = self.frames_end() + 2 * self.rows() + 4 * row;
-        f32::from_le_bytes(self.planes[at..at + 4].try_into().expect("four bytes"))
+        let (rewards, _) = self.payload[self.layout().rewards()].as_chunks();
+        f32::from_le_bytes(rewards[row])
     }
 
     /// Where row's frame is written.
     pub fn frame_mut(&mut self, row: usize) -> &mut [u8] {
         let bytes = self.header.frame_bytes as usize;
-        &mut self.planes[row * bytes..(row + 1) * bytes]
+        &mut self.payload[row * bytes..(row + 1) * bytes]
     }
 
     /// Writes everything of one row but its frame.
     pub fn set(&mut self, row: usize, action: u8, reward: f32, end: End) {
-        let (rows, frames_end) = (self.rows(), self.frames_end());
-        assert!(row < rows, "row {row} of a chunk of {rows}");
-        self.planes[frames_end + row] = action;
-        self.planes[frames_end + rows + row] = end as u8;
-        let at = frames_end + 2 * rows + 4 * row;
-        self.planes[at..at + 4].copy_from_slice(&reward.to_le_bytes());
+        let layout = self.layout();
+        assert!(row < layout.rows, "row {row} of a chunk of {}", layout.rows);
+        self.payload[layout.actions()][row] = action;
+        self.payload[layout.ends()][row] = end as u8;
+        let (rewards, _) = self.payload[layout.rewards()].as_chunks_mut();
+        rewards[row] = reward.to_le_bytes();
     }
 
-    /// The chunk as it travels: prefix and header, then the planes, uncopied.
+    /// The chunk as it travels: prefix and header, then the payload, uncopied.
     ///
     /// # Errors
     /// A chunk over the codec's limits.
     pub fn seal(&self, spec_hash: u64) -> Result<(Vec<u8>, &[u8]), CodecError> {
         Ok((
-            codec::seal(Kind::Chunk, spec_hash, &self.header, &self.planes)?,
-            &self.planes,
+            codec::seal(spec_hash, &self.header, &self.payload)?,
+            &self.payload,
         ))
     }
 
-    /// The planes, to travel after a head from [`Chunk::seal`].
-    pub fn into_planes(self) -> Planes {
-        self.planes
+    /// The payload, to travel after a head from [`Chunk::seal`].
+    pub fn into_payload(self) -> Buffer {
+        self.payload
     }
 
     /// Reads a chunk in one piece and checks lengths, actions, ends and rewards.
@@ -187,8 +243,8 @@ impl Chunk {
     /// # Errors
     /// Whatever makes it unfit to be stored; the message says what.
     pub fn decode(bytes: &[u8], spec_hash: u64, num_actions: u32) -> Result<Self, CodecError> {
-        let (header, planes) = codec::decode(bytes, Kind::Chunk, Some(spec_hash))?;
-        Self::checked(header, planes.to_vec().into(), num_actions)
+        let (header, payload) = codec::decode(bytes, Some(spec_hash))?;
+        Self::from_payload(header, payload.to_vec().into(), num_actions)
     }
 
     /// [`Chunk::decode`] of a message in `pieces`, `len` bytes in all; the chunk lies in own memory of `pool`.
@@ -198,25 +254,25 @@ impl Chunk {
     pub fn receive<'a>(
         pieces: impl IntoIterator<Item = &'a [u8]>,
         len: usize,
-        pool: &PlanesPool,
+        pool: &BufferPool,
         spec_hash: u64,
         num_actions: u32,
     ) -> Result<Self, CodecError> {
-        let (header, planes) = codec::receive(pieces, len, pool, Kind::Chunk, Some(spec_hash))?;
-        Self::checked(header, planes, num_actions)
+        let (header, payload) = codec::receive(pieces, len, pool, Some(spec_hash))?;
+        Self::from_payload(header, payload, num_actions)
     }
 
-    fn checked(header: ChunkHeader, planes: Planes, num_actions: u32) -> Result<Self, CodecError> {
-        if header.planes_bytes() != Some(planes.len()) || header.transitions() == 0 {
-            return Err(CodecError::Header(format!(
-                "{} streams of {} steps of {} bytes do not fill {} bytes of planes",
-                header.streams,
-                header.steps,
-                header.frame_bytes,
-                planes.len()
-            )));
-        }
-        let chunk = Self { header, planes };
+    /// The chunk of a header and payload that were received; checks all that [`Chunk::decode`] does.
+    ///
+    /// # Errors
+    /// As [`Chunk::decode`].
+    pub fn from_payload(
+        header: ChunkHeader,
+        payload: Buffer,
+        num_actions: u32,
+    ) -> Result<Self, CodecError> {
+        header.validate(&payload)?;
+        let chunk = Self { header, payload };
         if let Some(action) = chunk
             .actions()
             .iter()
@@ -229,7 +285,9 @@ impl Chunk {
         if let Some(end) = chunk.ends().iter().find(|&&e| End::from_byte(e).is_none()) {
             return Err(CodecError::Header(format!("end {end} is none that exists")));
         }
-        if let Some(row) = (0..chunk.rows()).find(|&row| !chunk.reward(row).is_finite()) {
+        if let Some(row) =
+            (0..chunk.header.transitions()).find(|&row| !chunk.reward(row).is_finite())
+        {
             return Err(CodecError::Header(format!(
                 "the reward of row {row} is not finite"
             )));

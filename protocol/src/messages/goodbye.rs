@@ -3,13 +3,28 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::done::Done;
+use crate::wire::message::{Keyed, Kind, Message, Request};
+
 /// An actor's last word: its own count of what it produced, against which the replay server checks its count.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Goodbye {
     /// Which actor.
     pub actor: u32,
     /// Which life of it.
-    pub epoch: u64,
+    pub incarnation: u64,
     /// Transitions produced, less those that the replay server answered with `Finished` or `Refused`.
     pub produced: u64,
+}
+
+impl Message for Goodbye {
+    const KIND: Kind = Kind::Goodbye;
+}
+
+impl Keyed for Goodbye {
+    const KEY: &'static str = "goodbye";
+}
+
+impl Request for Goodbye {
+    type Reply = Done;
 }

@@ -3,7 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::batch_request::Tally;
+use super::tally::Tally;
+use crate::wire::message::{Keyed, Kind, Message};
 
 /// What a joining part needs: the run's resolved settings, from the replay server.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -20,4 +21,12 @@ pub struct Hello {
     pub shard: (u32, u32),
     /// Whether chunks may come through shared memory: the replay server can read it.
     pub shared_memory: bool,
+}
+
+impl Message for Hello {
+    const KIND: Kind = Kind::Hello;
+}
+
+impl Keyed for Hello {
+    const KEY: &'static str = "hello";
 }

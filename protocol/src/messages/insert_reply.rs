@@ -3,17 +3,31 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Asks what became of a chunk that the replay server keeps until its limiter opens: the chunk's header without its planes.
+use crate::wire::message::{Keyed, Kind, Message, Request};
+
+/// Asks what became of a chunk that the replay server keeps until its limiter opens: the chunk's header without its payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Claim {
     /// Which actor.
     pub actor: u32,
     /// Which life of that actor.
-    pub epoch: u64,
-    /// Number of the chunk within the epoch.
+    pub incarnation: u64,
+    /// Number of the chunk within the incarnation.
     pub sequence: u64,
     /// The actor was told to stop: the rate limiter lets the chunk pass.
     pub leaving: bool,
+}
+
+impl Message for Claim {
+    const KIND: Kind = Kind::Claim;
+}
+
+impl Keyed for Claim {
+    const KEY: &'static str = "claim";
+}
+
+impl Request for Claim {
+    type Reply = InsertReply;
 }
 
 /// The replay server's answer to a chunk or a claim.
@@ -50,4 +64,8 @@ pub enum InsertReply {
         /// The reason.
         why: String,
     },
+}
+
+impl Message for InsertReply {
+    const KIND: Kind = Kind::InsertReply;
 }

@@ -3,13 +3,27 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::wire::message::{Keyed, Kind, Message, Request};
+
 /// An actor starts: from now on the replay server takes its chunks. The same one may be sent any number of times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ActorJoin {
     /// Which actor, unique in the run.
     pub actor: u32,
     /// Which life of it: a random number, drawn anew at each start.
-    pub epoch: u64,
+    pub incarnation: u64,
+}
+
+impl Message for ActorJoin {
+    const KIND: Kind = Kind::ActorJoin;
+}
+
+impl Keyed for ActorJoin {
+    const KEY: &'static str = "join/actor";
+}
+
+impl Request for ActorJoin {
+    type Reply = JoinReply;
 }
 
 /// A learner starts: from now on the replay server serves it, and it alone. The same one may be sent any number of times.
@@ -19,6 +33,18 @@ pub struct LearnerJoin {
     pub learner: u64,
     /// Rows of this shard that it has learned from. Rows served beyond them, to a learner that died, are served again.
     pub rows_sampled: u64,
+}
+
+impl Message for LearnerJoin {
+    const KIND: Kind = Kind::LearnerJoin;
+}
+
+impl Keyed for LearnerJoin {
+    const KEY: &'static str = "join/learner";
+}
+
+impl Request for LearnerJoin {
+    type Reply = JoinReply;
 }
 
 /// The replay server's answer to a part that joins.
@@ -31,7 +57,7 @@ pub enum JoinReply {
         /// Version of the newest weights that the replay server has; 0 before the first.
         weights_version: u64,
         /// Lives of this actor that were there before this one; 0 for a learner.
-        earlier_lives: u32,
+        earlier_incarnations: u32,
     },
     /// Another process plays this part and is connected: ask again, it may be about to end.
     Taken {
@@ -43,4 +69,8 @@ pub enum JoinReply {
         /// The reason.
         why: String,
     },
+}
+
+impl Message for JoinReply {
+    const KIND: Kind = Kind::JoinReply;
 }

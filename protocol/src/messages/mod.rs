@@ -3,11 +3,14 @@
 
 pub(crate) mod affinity;
 pub(crate) mod batch;
+mod batch_layout;
 pub(crate) mod batch_request;
 pub(crate) mod chunk;
+pub(crate) mod done;
 pub(crate) mod goodbye;
 pub(crate) mod hello;
 pub(crate) mod insert_reply;
 pub(crate) mod join;
 pub(crate) mod status;
+pub(crate) mod tally;
 pub(crate) mod weights;

@@ -2,6 +2,9 @@
 //! It computes nothing; each part fills in its own.
 
 use serde::{Deserialize, Serialize};
+use zenoh::qos::Priority;
+
+use crate::wire::message::{Keyed, Kind, Message};
 
 /// Who waits for whom at the rate limiter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -141,6 +144,15 @@ pub struct ReplayStatus {
     pub affinity_version: u64,
     /// All transitions are in.
     pub finished: bool,
+}
+
+impl Message for ReplayStatus {
+    const KIND: Kind = Kind::ReplayStatus;
+}
+
+impl Keyed for ReplayStatus {
+    const KEY: &'static str = "status/replay";
+    const PRIORITY: Priority = Priority::InteractiveHigh;
 }
 
 impl ReplayStatus {
@@ -294,6 +306,15 @@ impl LearnerStatus {
         let found = self.losses.iter().find(|(known, _)| known == name);
         found.map(|(_, loss)| *loss)
     }
+}
+
+impl Message for LearnerStatus {
+    const KIND: Kind = Kind::LearnerStatus;
+}
+
+impl Keyed for LearnerStatus {
+    const KEY: &'static str = "status/learner";
+    const PRIORITY: Priority = Priority::InteractiveHigh;
 }
 
 #[cfg(test)]

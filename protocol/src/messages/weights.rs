@@ -1,12 +1,18 @@
 //! Weights on their way: whole from the learner to the replay server, once a version; in pieces from there to the actors.
-//! It does not read them: the planes are a safetensors file, which `driml-model` knows.
+//! It does not read them: the payload is a safetensors file, which `driml-model` knows.
 //!
 //! Pieces, because a message has to be through within seconds (see `session`): a slow link gets the weights later, not never.
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use zenoh::qos::Priority;
 
-use crate::wire::codec::{self, CodecError, Kind, PLANES_BYTES_MAX};
+use super::done::Done;
+use crate::wire::{
+    codec::PAYLOAD_BYTES_MAX,
+    error::CodecError,
+    message::{Keyed, Kind, Message, Request, no_payload},
+};
 
 /// Bytes of weights in one message to an actor; the last piece has fewer.
 pub const PIECE_BYTES: usize = 1 << 18;
@@ -16,6 +22,15 @@ pub const PIECE_BYTES: usize = 1 << 18;
 pub struct WeightsVersion {
     /// Counts up from 1.
     pub version: u64,
+}
+
+impl Message for WeightsVersion {
+    const KIND: Kind = Kind::WeightsVersion;
+}
+
+impl Keyed for WeightsVersion {
+    const KEY: &'static str = "weights-version";
+    const PRIORITY: Priority = Priority::InteractiveHigh;
 }
 
 /// What weights say of themselves.
@@ -29,13 +44,30 @@ pub struct WeightsHeader {
     pub sha256: [u8; 32],
 }
 
-/// New weights on their way to the replay server; the planes are a safetensors file.
+/// New weights on their way to the replay server; the payload is a safetensors file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WeightsUpload {
     /// Which learner sends them: that of its [`LearnerJoin`](crate::LearnerJoin).
     pub learner: u64,
     /// What they say of themselves.
     pub weights: WeightsHeader,
+}
+
+impl Message for WeightsUpload {
+    const KIND: Kind = Kind::WeightsUpload;
+
+    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+        self.weights.check(payload)
+    }
+}
+
+impl Keyed for WeightsUpload {
+    const KEY: &'static str = "weights-upload";
+    const PRIORITY: Priority = Priority::DataHigh;
+}
+
+impl Request for WeightsUpload {
+    type Reply = Done;
 }
 
 /// An actor's question.
@@ -52,6 +84,19 @@ pub enum WeightsRequest {
     },
 }
 
+impl Message for WeightsRequest {
+    const KIND: Kind = Kind::WeightsRequest;
+}
+
+impl Keyed for WeightsRequest {
+    const KEY: &'static str = "weights";
+    const PRIORITY: Priority = Priority::DataLow;
+}
+
+impl Request for WeightsRequest {
+    type Reply = WeightsReply;
+}
+
 /// The answer to a [`WeightsRequest`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum WeightsReply {
@@ -59,7 +104,7 @@ pub enum WeightsReply {
     NoneNewer,
     /// These weights are no longer kept, or have no such piece: ask for the newest.
     Gone,
-    /// The planes that follow are a piece of these weights.
+    /// The payload that follows is a piece of these weights.
     Piece {
         /// What the whole says of itself.
         weights: WeightsHeader,
@@ -68,6 +113,18 @@ pub enum WeightsReply {
         /// Byte at which the piece starts.
         offset: u64,
     },
+}
+
+impl Message for WeightsReply {
+    const KIND: Kind = Kind::Weights;
+
+    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+        match self {
+            // Which piece is due is for [`Assembly`] to know.
+            Self::Piece { .. } => Ok(()),
+            Self::NoneNewer | Self::Gone => no_payload(payload),
+        }
+    }
 }
 
 impl WeightsHeader {
@@ -100,19 +157,6 @@ impl WeightsHeader {
     }
 }
 
-impl WeightsUpload {
-    /// Reads an upload and checks the hash of its planes.
-    ///
-    /// # Errors
-    /// A damaged or foreign message, or planes that are not what the header describes.
-    pub fn decode(bytes: &[u8], spec_hash: u64) -> Result<(Self, &[u8]), CodecError> {
-        let (upload, planes): (Self, _) =
-            codec::decode(bytes, Kind::WeightsUpload, Some(spec_hash))?;
-        upload.weights.check(planes)?;
-        Ok((upload, planes))
-    }
-}
-
 /// Weights of which the first pieces have come.
 #[derive(Debug)]
 pub struct Assembly {
@@ -127,7 +171,7 @@ impl Assembly {
     /// # Errors
     /// More bytes than any weights have.
     pub fn new(weights: WeightsHeader, bytes: u64) -> Result<Self, CodecError> {
-        let max = PLANES_BYTES_MAX;
+        let max = PAYLOAD_BYTES_MAX;
         let bytes = usize::try_from(bytes).unwrap_or(usize::MAX);
         if bytes > max {
             return Err(CodecError::TooLarge { have: bytes, max });

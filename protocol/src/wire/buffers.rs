@@ -1,4 +1,4 @@
-//! Memory for the long planes of messages: used again and again, and shared with the other side where both are on one host.
+//! Memory for the long payloads of messages: used again and again, and shared with the other side where both are on one host.
 //! It does not know what is in it, and a message fares the same in either kind of memory.
 //!
 //! Fresh memory costs a page fault every 4 KiB, more than filling it. Shared memory saves the trip through a socket, but a
@@ -24,8 +24,8 @@ use super::shared_memory::{self, Trust};
 /// Where the operating system keeps shared memory.
 const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
 
-/// The bytes of a message's planes. Clones have memory of their own.
-pub struct Planes(Memory);
+/// Memory for the payload of a message. Clones have memory of their own.
+pub struct Buffer(Memory);
 
 enum Memory {
     /// Given back to the pool, if there is one.
@@ -44,17 +44,17 @@ struct Shared {
     trust: Mutex<Trust>,
 }
 
-/// A source of [`Planes`]; clones are the same source.
+/// A source of [`Buffer`]; clones are the same source.
 #[derive(Clone)]
-pub struct PlanesPool(Arc<Pool>);
+pub struct BufferPool(Arc<Pool>);
 
-impl PlanesPool {
+impl BufferPool {
     /// Memory of this process alone, of which `spare_max` pieces are kept for later use.
     pub fn new(spare_max: usize) -> Self {
         Self::with(spare_max, None)
     }
 
-    /// As [`PlanesPool::new`], with shared memory for `count` pieces of `bytes` each; where the machine does not grant it,
+    /// As [`BufferPool::new`], with shared memory for `count` pieces of `bytes` each; where the machine does not grant it,
     /// a warning says so and everything works without.
     pub fn shared(spare_max: usize, count: usize, bytes: usize) -> Self {
         let shared = match provider(shared_memory::pool_bytes(count, bytes)) {
@@ -82,7 +82,7 @@ impl PlanesPool {
     }
 
     /// `bytes` bytes of this process's own memory, with whatever was in them before.
-    pub fn take_own(&self, bytes: usize) -> Planes {
+    pub fn take_own(&self, bytes: usize) -> Buffer {
         let spare = self
             .0
             .spare
@@ -91,14 +91,14 @@ impl PlanesPool {
             .pop();
         let mut vec = spare.unwrap_or_default();
         vec.resize(bytes, 0);
-        Planes(Memory::Own(vec, Some(self.0.clone())))
+        Buffer(Memory::Own(vec, Some(self.0.clone())))
     }
 
     /// `bytes` bytes with whatever was in them before: shared with others on this host if there is any, else
-    /// [`PlanesPool::take_own`].
-    pub fn take(&self, bytes: usize) -> Planes {
+    /// [`BufferPool::take_own`].
+    pub fn take(&self, bytes: usize) -> Buffer {
         match self.0.shared.as_ref().and_then(|shared| shared.take(bytes)) {
-            Some(shared) => Planes(Memory::Shared(shared)),
+            Some(shared) => Buffer(Memory::Shared(shared)),
             None => self.take_own(bytes),
         }
     }
@@ -157,7 +157,7 @@ fn provider(bytes: usize) -> Result<ShmProvider<PosixShmProviderBackend>, String
         .map_err(|e| e.to_string())
 }
 
-impl Planes {
+impl Buffer {
     /// `bytes` zeros in memory of their own.
     pub fn zeroed(bytes: usize) -> Self {
         Self::from(vec![0; bytes])
@@ -177,13 +177,13 @@ impl Planes {
     }
 }
 
-impl From<Vec<u8>> for Planes {
+impl From<Vec<u8>> for Buffer {
     fn from(bytes: Vec<u8>) -> Self {
         Self(Memory::Own(bytes, None))
     }
 }
 
-impl Drop for Planes {
+impl Drop for Buffer {
     fn drop(&mut self) {
         if let Memory::Own(bytes, Some(pool)) = &mut self.0 {
             let mut spare = pool.spare.lock().unwrap_or_else(PoisonError::into_inner);
@@ -194,7 +194,7 @@ impl Drop for Planes {
     }
 }
 
-impl Deref for Planes {
+impl Deref for Buffer {
     type Target = [u8];
 
     fn deref(&self) -> &[u8] {
@@ -205,7 +205,7 @@ impl Deref for Planes {
     }
 }
 
-impl DerefMut for Planes {
+impl DerefMut for Buffer {
     fn deref_mut(&mut self) -> &mut [u8] {
         match &mut self.0 {
             Memory::Own(bytes, _) => bytes,
@@ -214,33 +214,33 @@ impl DerefMut for Planes {
     }
 }
 
-impl AsRef<[u8]> for Planes {
+impl AsRef<[u8]> for Buffer {
     fn as_ref(&self) -> &[u8] {
         self
     }
 }
 
-impl Clone for Planes {
+impl Clone for Buffer {
     fn clone(&self) -> Self {
         Self::from(self.to_vec())
     }
 }
 
-impl PartialEq for Planes {
+impl PartialEq for Buffer {
     fn eq(&self, other: &Self) -> bool {
         **self == **other
     }
 }
 
-impl fmt::Debug for Planes {
+impl fmt::Debug for Buffer {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "Planes({} bytes)", self.len())
+        write!(f, "Buffer({} bytes)", self.len())
     }
 }
 
-impl fmt::Debug for PlanesPool {
+impl fmt::Debug for BufferPool {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("PlanesPool").finish_non_exhaustive()
+        f.debug_struct("BufferPool").finish_non_exhaustive()
     }
 }
 
@@ -250,11 +250,11 @@ mod tests {
 
     #[test]
     fn own_memory_comes_back_also_from_the_wire() {
-        let pool = PlanesPool::new(1);
-        let mut planes = pool.take_own(5);
-        planes.copy_from_slice(b"abcde");
-        let address = planes.as_ptr();
-        let (sent, again) = (planes.freeze(), pool.take_own(5));
+        let pool = BufferPool::new(1);
+        let mut payload = pool.take_own(5);
+        payload.copy_from_slice(b"abcde");
+        let address = payload.as_ptr();
+        let (sent, again) = (payload.freeze(), pool.take_own(5));
         assert_ne!(again.as_ptr(), address);
         assert_eq!(sent.to_bytes(), &b"abcde"[..]);
         drop((sent.clone(), again, sent));
@@ -265,7 +265,7 @@ mod tests {
 
     #[test]
     fn shared_memory_is_avoided_after_a_loss_and_never_waited_for() {
-        let pool = PlanesPool::shared(4, 2, 1_000_000);
+        let pool = BufferPool::shared(4, 2, 1_000_000);
         if pool.0.shared.is_none() {
             // This machine grants none: then there is nothing but own memory.
             assert!(!pool.take(1_000_000).are_shared());

@@ -1,140 +1,29 @@
-//! The bytes of a message: a fixed prefix, a bincode header, then raw planes that serde never touches.
+//! The bytes of a message: a fixed prefix, a bincode header, then a raw payload that serde never touches.
 //! It does not know what a message means, and it is the only file that calls bincode.
 //!
-//! | bytes | field |
-//! | --- | --- |
-//! | 0..4 | magic `DRML` |
-//! | 4..6 | protocol version, little-endian as everything here |
-//! | 6..8 | kind |
-//! | 8..16 | run spec's hash |
-//! | 16..20 | header's length |
-//! | 20..28 | planes' length |
-//! | 28..32 | CRC-32 of bytes 0..28, the header and the planes |
-//! | 32.. | header, then planes |
+//! The prefix's fields are in `prefix`.
 
 use serde::{Serialize, de::DeserializeOwned};
 
-use super::buffers::{Planes, PlanesPool};
+use super::{
+    buffers::{Buffer, BufferPool},
+    error::CodecError,
+    message::{Kind, Message},
+    prefix::Prefix,
+};
 
 /// The version of every message in this crate; parts of different versions refuse each other.
 pub const PROTOCOL_VERSION: u16 = 3;
 
-const MAGIC: [u8; 4] = *b"DRML";
 /// Length of the fixed prefix, bytes.
-pub const PREFIX_BYTES: usize = 32;
+pub const PREFIX_BYTES: usize = Prefix::BYTES;
 /// Longest header, bytes; a longer one is refused by both sides.
 pub const HEADER_BYTES_MAX: usize = 1 << 20;
-/// Longest planes, bytes; longer ones are refused by both sides.
-pub const PLANES_BYTES_MAX: usize = 1 << 29;
+/// Longest payload, bytes; a longer one is refused by both sides.
+pub const PAYLOAD_BYTES_MAX: usize = 1 << 29;
 
 /// Bytes that are copied, then summed while they are in the nearest cache.
 const BLOCK_BYTES: usize = 1 << 14;
-
-/// What a message is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u16)]
-pub enum Kind {
-    /// Transitions, actor to replay server.
-    Chunk = 1,
-    /// The answer to a chunk.
-    InsertReply = 2,
-    /// A request for a batch, learner to replay server.
-    BatchRequest = 3,
-    /// A batch, or why there is none yet.
-    BatchReply = 4,
-    /// The action-affinity matrix, learner to replay server.
-    Affinity = 5,
-    /// A piece of the newest weights, replay server to actors.
-    Weights = 6,
-    /// "Newer weights exist", replay server to actors.
-    WeightsVersion = 7,
-    /// An actor's last word.
-    Goodbye = 8,
-    /// The replay server's account of itself.
-    ReplayStatus = 9,
-    /// The learner's account of itself.
-    LearnerStatus = 10,
-    /// What a joining part needs to know.
-    Hello = 11,
-    /// "Understood"; carries nothing.
-    Done = 12,
-    /// An actor that starts.
-    ActorJoin = 13,
-    /// A learner that starts.
-    LearnerJoin = 14,
-    /// The answer to a part that starts.
-    JoinReply = 15,
-    /// What became of a chunk, actor to replay server.
-    Claim = 16,
-    /// New weights, learner to replay server.
-    WeightsUpload = 17,
-    /// A request for a piece of the newest weights, actor to replay server.
-    WeightsRequest = 18,
-}
-
-/// Why bytes were refused. None of these is ever a panic.
-#[derive(Debug, thiserror::Error, PartialEq, Eq)]
-pub enum CodecError {
-    /// Fewer or more bytes than the prefix promises.
-    #[error(
-        "the message has {have} bytes, not the {need} that it needs: it was cut off or padded on the way"
-    )]
-    Length {
-        /// Bytes at hand.
-        have: usize,
-        /// Bytes expected.
-        need: usize,
-    },
-    /// Not one of our messages.
-    #[error(
-        "the message does not start with DRML: the sender is not part of DRIML, or the bytes were damaged"
-    )]
-    Magic,
-    /// Another protocol version.
-    #[error(
-        "the sender speaks protocol version {theirs}, this part version {ours}: run the same build of driml everywhere"
-    )]
-    Version {
-        /// The sender's.
-        theirs: u16,
-        /// Ours.
-        ours: u16,
-    },
-    /// Another kind than this place takes.
-    #[error("a message of kind {theirs} came where kind {ours} is expected")]
-    Kind {
-        /// The sender's.
-        theirs: u16,
-        /// Ours.
-        ours: u16,
-    },
-    /// Another run.
-    #[error(
-        "the message belongs to run spec {theirs:016x}, this part runs {ours:016x}: start every part with the same settings, or let actors and learner fetch them with --connect"
-    )]
-    RunSpec {
-        /// The sender's hash.
-        theirs: u64,
-        /// Ours.
-        ours: u64,
-    },
-    /// Damaged bytes.
-    #[error("the message's checksum is wrong: it was damaged on the way")]
-    Checksum,
-    /// A header that does not decode, or is inconsistent with its planes.
-    #[error("the message's header makes no sense: {0}")]
-    Header(String),
-    /// Larger than a message may be.
-    #[error(
-        "the message has {have} bytes, more than the {max} allowed: use smaller chunks or batches"
-    )]
-    TooLarge {
-        /// Bytes at hand.
-        have: usize,
-        /// The limit.
-        max: usize,
-    },
-}
 
 /// Encodes `header` with bincode, refusing more than [`HEADER_BYTES_MAX`].
 fn encode_header<H: Serialize>(header: &H) -> Result<Vec<u8>, CodecError> {
@@ -154,84 +43,82 @@ pub(crate) fn canonical_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecE
     encode_header(value)
 }
 
-/// Prefix and header of a message; the wire carries these bytes followed by `planes`, which are not copied.
+/// Prefix and header of a message; the wire carries these bytes followed by `payload`, which is not copied.
 ///
 /// # Errors
-/// A header or planes over their limits.
-pub fn seal<H: Serialize>(
-    kind: Kind,
+/// A header or payload over their limits.
+pub fn seal<M: Message>(
     spec_hash: u64,
-    header: &H,
-    planes: &[u8],
+    message: &M,
+    payload: &[u8],
 ) -> Result<Vec<u8>, CodecError> {
-    if planes.len() > PLANES_BYTES_MAX {
+    if payload.len() > PAYLOAD_BYTES_MAX {
         return Err(CodecError::TooLarge {
-            have: planes.len(),
-            max: PLANES_BYTES_MAX,
+            have: payload.len(),
+            max: PAYLOAD_BYTES_MAX,
         });
     }
-    let header = encode_header(header)?;
-    let mut out = Vec::with_capacity(PREFIX_BYTES + header.len());
-    out.extend_from_slice(&MAGIC);
-    out.extend_from_slice(&PROTOCOL_VERSION.to_le_bytes());
-    out.extend_from_slice(&(kind as u16).to_le_bytes());
-    out.extend_from_slice(&spec_hash.to_le_bytes());
-    out.extend_from_slice(&(header.len() as u32).to_le_bytes());
-    out.extend_from_slice(&(planes.len() as u64).to_le_bytes());
-    let checksum = checksum(&out, &header, planes);
-    out.extend_from_slice(&checksum.to_le_bytes());
-    out.extend_from_slice(&header);
-    Ok(out)
+    let header = encode_header(message)?;
+    let mut prefix = Prefix {
+        magic: Prefix::MAGIC,
+        version: PROTOCOL_VERSION,
+        kind: M::KIND as u16,
+        spec_hash,
+        header_bytes: header.len() as u32,
+        payload_bytes: payload.len() as u64,
+        checksum: 0,
+    };
+    let mut sum = prefix.checksum_begun();
+    sum.update(&header);
+    sum.update(payload);
+    prefix.checksum = sum.finalize();
+    Ok([&prefix.to_bytes()[..], &header].concat())
 }
 
 /// A whole message in one piece, for small ones and for tests.
 ///
 /// # Errors
 /// As [`seal`].
-pub fn encode<H: Serialize>(
-    kind: Kind,
+pub fn encode<M: Message>(
     spec_hash: u64,
-    header: &H,
-    planes: &[u8],
+    message: &M,
+    payload: &[u8],
 ) -> Result<Vec<u8>, CodecError> {
-    let mut out = seal(kind, spec_hash, header, planes)?;
-    out.extend_from_slice(planes);
+    let mut out = seal(spec_hash, message, payload)?;
+    out.extend_from_slice(payload);
     Ok(out)
 }
 
-/// Checks a message in one piece and gives its header and planes.
+/// Checks a message in one piece and gives it and its payload.
 ///
 /// `spec_hash` is the hash that this part runs, or `None` where any run is welcome (a part that joins to learn it).
 ///
 /// # Errors
 /// Anything that is not a whole, undamaged message of this kind, version and run.
-pub fn decode<H: DeserializeOwned>(
-    bytes: &[u8],
-    kind: Kind,
-    spec_hash: Option<u64>,
-) -> Result<(H, &[u8]), CodecError> {
+pub fn decode<M: Message>(bytes: &[u8], spec_hash: Option<u64>) -> Result<(M, &[u8]), CodecError> {
     let prefix = Prefix::read(bytes.first_chunk(), bytes.len())?;
-    let (header, planes) = bytes[PREFIX_BYTES..].split_at(prefix.header_len());
+    let (header, payload) = bytes[PREFIX_BYTES..].split_at(prefix.header_len());
     let mut sum = prefix.checksum_begun();
     sum.update(header);
-    sum.update(planes);
-    prefix.check(sum, kind, spec_hash)?;
-    Ok((decode_header(header)?, planes))
+    sum.update(payload);
+    prefix.check(sum, M::KIND, spec_hash)?;
+    let message: M = decode_header(header)?;
+    message.validate(payload)?;
+    Ok((message, payload))
 }
 
-/// Checks a message that came in `pieces`, `len` bytes in all, and copies its planes into own memory of `pool`.
+/// Checks a message that came in `pieces`, `len` bytes in all, and copies its payload into own memory of `pool`.
 ///
 /// The checksum is the copy's, so what was checked cannot change afterwards, even if it came through shared memory.
 ///
 /// # Errors
 /// As [`decode`].
-pub fn receive<'a, H: DeserializeOwned>(
+pub fn receive<'a, M: Message>(
     pieces: impl IntoIterator<Item = &'a [u8]>,
     len: usize,
-    pool: &PlanesPool,
-    kind: Kind,
+    pool: &BufferPool,
     spec_hash: Option<u64>,
-) -> Result<(H, Planes), CodecError> {
+) -> Result<(M, Buffer), CodecError> {
     let mut pieces = Pieces {
         current: &[],
         rest: pieces.into_iter(),
@@ -242,10 +129,12 @@ pub fn receive<'a, H: DeserializeOwned>(
     let mut sum = prefix.checksum_begun();
     let mut header = vec![0; prefix.header_len()];
     pieces.copy_to(&mut header, Some(&mut sum));
-    let mut planes = pool.take_own(prefix.planes_len());
-    pieces.copy_to(&mut planes, Some(&mut sum));
-    prefix.check(sum, kind, spec_hash)?;
-    Ok((decode_header(&header)?, planes))
+    let mut payload = pool.take_own(prefix.payload_len());
+    pieces.copy_to(&mut payload, Some(&mut sum));
+    prefix.check(sum, M::KIND, spec_hash)?;
+    let message: M = decode_header(&header)?;
+    message.validate(&payload)?;
+    Ok((message, payload))
 }
 
 /// Bytes that lie in several places.
@@ -280,55 +169,43 @@ impl<'a, I: Iterator<Item = &'a [u8]>> Pieces<'a, I> {
     }
 }
 
-/// The fixed first bytes of a message whose magic, version and lengths are in order.
-struct Prefix([u8; PREFIX_BYTES]);
-
 impl Prefix {
-    /// `len` is the whole message's length.
+    /// The prefix of a message of `len` bytes in all, if its magic, version and lengths are in order.
     fn read(bytes: Option<&[u8; PREFIX_BYTES]>, len: usize) -> Result<Self, CodecError> {
-        let this = Self(*bytes.ok_or(CodecError::Length {
+        let this = Self::from_bytes(bytes.ok_or(CodecError::Length {
             have: len,
             need: PREFIX_BYTES,
         })?);
-        let prefix = &this.0;
-        if prefix[0..4] != MAGIC {
+        if this.magic != Self::MAGIC {
             return Err(CodecError::Magic);
         }
-        let version = u16::from_le_bytes([prefix[4], prefix[5]]);
-        if version != PROTOCOL_VERSION {
+        if this.version != PROTOCOL_VERSION {
             return Err(CodecError::Version {
-                theirs: version,
+                theirs: this.version,
                 ours: PROTOCOL_VERSION,
             });
         }
         for (have, max) in [
             (this.header_len(), HEADER_BYTES_MAX),
-            (this.planes_len(), PLANES_BYTES_MAX),
+            (this.payload_len(), PAYLOAD_BYTES_MAX),
         ] {
             if have > max {
                 return Err(CodecError::TooLarge { have, max });
             }
         }
-        let need = PREFIX_BYTES + this.header_len() + this.planes_len();
+        let need = PREFIX_BYTES + this.header_len() + this.payload_len();
         if len != need {
             return Err(CodecError::Length { have: len, need });
         }
         Ok(this)
     }
 
-    fn header_len(&self) -> usize {
-        le_u32(&self.0[16..20]) as usize
+    const fn header_len(&self) -> usize {
+        self.header_bytes as usize
     }
 
-    fn planes_len(&self) -> usize {
-        usize::try_from(le_u64(&self.0[20..28])).unwrap_or(usize::MAX)
-    }
-
-    /// A checksum over the prefix, to which header and planes are to be added.
-    fn checksum_begun(&self) -> crc32fast::Hasher {
-        let mut sum = crc32fast::Hasher::new();
-        sum.update(&self.0[..28]);
-        sum
+    fn payload_len(&self) -> usize {
+        usize::try_from(self.payload_bytes).unwrap_or(usize::MAX)
     }
 
     fn check(
@@ -337,19 +214,20 @@ impl Prefix {
         kind: Kind,
         spec_hash: Option<u64>,
     ) -> Result<(), CodecError> {
-        if sum.finalize() != le_u32(&self.0[28..32]) {
+        if sum.finalize() != self.checksum {
             return Err(CodecError::Checksum);
         }
-        let theirs = u16::from_le_bytes([self.0[6], self.0[7]]);
-        if theirs != kind as u16 {
+        if self.kind != kind as u16 {
             return Err(CodecError::Kind {
-                theirs,
+                theirs: self.kind,
                 ours: kind as u16,
             });
         }
-        let theirs = le_u64(&self.0[8..16]);
         match spec_hash {
-            Some(ours) if ours != theirs => Err(CodecError::RunSpec { theirs, ours }),
+            Some(ours) if ours != self.spec_hash => Err(CodecError::RunSpec {
+                theirs: self.spec_hash,
+                ours,
+            }),
             _ => Ok(()),
         }
     }
@@ -363,20 +241,4 @@ fn decode_header<H: DeserializeOwned>(bytes: &[u8]) -> Result<H, CodecError> {
         0 => Ok(header),
         over => Err(CodecError::Header(format!("{over} bytes after its end"))),
     }
-}
-
-fn checksum(prefix: &[u8], header: &[u8], planes: &[u8]) -> u32 {
-    let mut hasher = crc32fast::Hasher::new();
-    hasher.update(prefix);
-    hasher.update(header);
-    hasher.update(planes);
-    hasher.finalize()
-}
-
-fn le_u32(bytes: &[u8]) -> u32 {
-    u32::from_le_bytes(bytes.try_into().expect("the caller slices four bytes"))
-}
-
-fn le_u64(bytes: &[u8]) -> u64 {
-    u64::from_le_bytes(bytes.try_into().expect("the caller slices eight bytes"))
 }

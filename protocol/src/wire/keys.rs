@@ -1,5 +1,7 @@
-//! Where each message travels: a small fixed set of key expressions.
+//! Where each message travels: its own key under the run's namespace, and one for each part that is connected.
 //! Identities of actors and versions are in the messages, never in a key.
+
+use super::message::Keyed;
 
 /// The key expressions of one run.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -30,79 +32,19 @@ impl Keys {
         format!("{}/{name}", self.namespace)
     }
 
-    /// Queries: a joining part to the replay server.
-    pub fn hello(&self) -> String {
-        self.key("hello")
+    /// Where messages of type `M` are asked, fetched or announced.
+    pub fn of<M: Keyed>(&self) -> String {
+        self.key(M::KEY)
     }
 
-    /// Queries: an actor that starts, to the replay server.
-    pub fn actor_join(&self) -> String {
-        self.key("join/actor")
-    }
-
-    /// Queries: a learner that starts, to the replay server.
-    pub fn learner_join(&self) -> String {
-        self.key("join/learner")
-    }
-
-    /// Queries: chunks, actor to replay server.
-    pub fn ingest(&self) -> String {
-        self.key("ingest")
-    }
-
-    /// Queries: what became of a chunk that has to wait, actor to replay server.
-    pub fn claim(&self) -> String {
-        self.key("claim")
-    }
-
-    /// Queries: an actor's goodbye to the replay server.
-    pub fn goodbye(&self) -> String {
-        self.key("goodbye")
-    }
-
-    /// Queries: batches, learner to replay server.
-    pub fn batch(&self) -> String {
-        self.key("batch")
-    }
-
-    /// Queries: the affinity matrix, learner to replay server.
-    pub fn affinity(&self) -> String {
-        self.key("affinity")
-    }
-
-    /// Queries: new weights, learner to replay server.
-    pub fn weights_upload(&self) -> String {
-        self.key("weights-upload")
-    }
-
-    /// Queries: pieces of the newest weights, actor to replay server.
-    pub fn weights(&self) -> String {
-        self.key("weights")
-    }
-
-    /// Puts: "newer weights exist", replay server to actors.
-    pub fn weights_version(&self) -> String {
-        self.key("weights-version")
-    }
-
-    /// Queries: the replay server's status.
-    pub fn replay_status(&self) -> String {
-        self.key("status/replay")
-    }
-
-    /// Queries: the learner's status.
-    pub fn learner_status(&self) -> String {
-        self.key("status/learner")
-    }
-
-    /// Liveliness token of one life of an actor.
-    pub fn actor_alive(&self, actor: u32, epoch: u64) -> String {
-        self.key(&format!("alive/actor/{actor}/{epoch:016x}"))
-    }
-
-    /// Liveliness token of one learner.
-    pub fn learner_alive(&self, learner: u64) -> String {
-        self.key(&format!("alive/learner/{learner:016x}"))
+    /// The key of the liveliness token of one life of an actor, or of a learner.
+    pub fn alive_key(&self, who: Alive) -> String {
+        match who {
+            Alive::Actor { actor, incarnation } => {
+                self.key(&format!("alive/actor/{actor}/{incarnation:016x}"))
+            }
+            Alive::Learner(learner) => self.key(&format!("alive/learner/{learner:016x}")),
+        }
     }
 
     /// Liveliness tokens of all actors and learners.
@@ -115,9 +57,9 @@ impl Keys {
         let rest = key.strip_prefix(&self.namespace)?.strip_prefix("/alive/")?;
         let hex = |text| u64::from_str_radix(text, 16).ok();
         match rest.split('/').collect::<Vec<_>>()[..] {
-            ["actor", actor, epoch] => Some(Alive::Actor {
+            ["actor", actor, incarnation] => Some(Alive::Actor {
                 actor: actor.parse().ok()?,
-                epoch: hex(epoch)?,
+                incarnation: hex(incarnation)?,
             }),
             ["learner", learner] => Some(Alive::Learner(hex(learner)?)),
             _ => None,
@@ -133,7 +75,7 @@ pub enum Alive {
         /// Which actor.
         actor: u32,
         /// Which life of it.
-        epoch: u64,
+        incarnation: u64,
     },
     /// A learner.
     Learner(u64),
@@ -148,10 +90,15 @@ mod tests {
         let keys = Keys::new("a/b").unwrap();
         let actor = Alive::Actor {
             actor: 7,
-            epoch: u64::MAX,
+            incarnation: u64::MAX,
         };
-        assert_eq!(keys.alive(&keys.actor_alive(7, u64::MAX)), Some(actor));
-        assert_eq!(keys.alive(&keys.learner_alive(9)), Some(Alive::Learner(9)));
+        assert_eq!(keys.alive(&keys.alive_key(actor)), Some(actor));
+        let learner = Alive::Learner(9);
+        assert_eq!(keys.alive(&keys.alive_key(learner)), Some(learner));
+        assert_eq!(
+            keys.alive_key(learner),
+            "a/b/alive/learner/0000000000000009"
+        );
         for strange in [
             "a/b/alive/actor/7",
             "a/alive/learner/9",

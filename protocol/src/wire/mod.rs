@@ -3,5 +3,8 @@
 
 pub(crate) mod buffers;
 pub mod codec;
+pub(crate) mod error;
 pub(crate) mod keys;
+pub(crate) mod message;
+mod prefix;
 pub mod shared_memory;

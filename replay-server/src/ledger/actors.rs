@@ -12,7 +12,7 @@ pub const ACTORS_MAX: usize = 4096;
 /// Most streams of one actor; a chunk with more is refused.
 pub const STREAMS_MAX: u32 = 4096;
 /// Past lives remembered for each actor; what an older one still says is ignored.
-const PAST_LIVES_MAX: usize = 64;
+const PAST_INCARNATIONS_MAX: usize = 64;
 
 /// One copy of an actor's world.
 pub(crate) struct Stream {
@@ -25,7 +25,7 @@ pub(crate) struct Stream {
 /// What is counted of one life of an actor.
 #[derive(Clone, Copy)]
 struct Count {
-    epoch: u64,
+    incarnation: u64,
     /// Transitions it has produced by its own account, as far as heard.
     produced: u64,
     said_goodbye: bool,
@@ -48,7 +48,7 @@ struct Actor {
     streams: Vec<Stream>,
     past: VecDeque<Count>,
     /// Lives before the current one, forgotten ones too.
-    earlier_lives: u32,
+    earlier_incarnations: u32,
 }
 
 /// What is to be done with a chunk.
@@ -89,29 +89,33 @@ pub(crate) struct Actors {
 }
 
 impl Actors {
-    /// Makes `join.epoch` the life that counts of its actor; the same one may be named again.
+    /// Makes `join.incarnation` the life that counts of its actor; the same one may be named again.
     ///
     /// # Errors
     /// One actor more than a run may have, or a life that another one has replaced; the reason, for a person.
     pub(crate) fn join(&mut self, join: ActorJoin) -> Result<(), String> {
-        let ActorJoin { actor, epoch } = join;
+        let ActorJoin { actor, incarnation } = join;
         let fresh = Count {
-            epoch,
+            incarnation,
             produced: 0,
             said_goodbye: false,
         };
         if let Some(known) = self.actors.get_mut(&actor) {
-            if known.current.epoch == epoch {
+            if known.current.incarnation == incarnation {
                 return Ok(());
             }
-            if known.past.iter().any(|past| past.epoch == epoch) {
+            if known
+                .past
+                .iter()
+                .any(|past| past.incarnation == incarnation)
+            {
                 return Err(replaced(actor));
             }
-            if known.past.len() == PAST_LIVES_MAX {
+            if known.past.len() == PAST_INCARNATIONS_MAX {
                 known.past.pop_front();
             }
             known.past.push_back(known.current);
-            known.earlier_lives = known.earlier_lives.saturating_add(1);
+            known.earlier_incarnations = known.earlier_incarnations.saturating_add(1);
             (known.current, known.expected) = (fresh, 0);
             known.streams.clear();
             return Ok(());
@@ -128,27 +132,34 @@ impl Actors {
                 expected: 0,
                 streams: Vec::new(),
                 past: VecDeque::new(),
-                earlier_lives: 0,
+                earlier_incarnations: 0,
             },
         );
         Ok(())
     }
 
     /// Lives of `actor` before the one that counts.
-    pub(crate) fn earlier_lives(&self, actor: u32) -> u32 {
-        self.actors.get(&actor).map_or(0, |it| it.earlier_lives)
+    pub(crate) fn earlier_incarnations(&self, actor: u32) -> u32 {
+        self.actors
+            .get(&actor)
+            .map_or(0, |it| it.earlier_incarnations)
     }
 
     /// The life of `actor` that counts; none before the first.
-    pub(crate) fn current_epoch(&self, actor: u32) -> Option<u64> {
-        self.actors.get(&actor).map(|it| it.current.epoch)
+    pub(crate) fn current_incarnation(&self, actor: u32) -> Option<u64> {
+        self.actors.get(&actor).map(|it| it.current.incarnation)
     }
 
     /// The actor, if this is the life of it that counts.
-    fn living(&self, actor: u32, epoch: u64) -> Result<&Actor, String> {
+    fn living(&self, actor: u32, incarnation: u64) -> Result<&Actor, String> {
         match self.actors.get(&actor) {
-            Some(known) if known.current.epoch == epoch => Ok(known),
-            Some(known) if known.past.iter().any(|past| past.epoch == epoch) => {
+            Some(known) if known.current.incarnation == incarnation => Ok(known),
+            Some(known)
+                if known
+                    .past
+                    .iter()
+                    .any(|past| past.incarnation == incarnation) =>
+            {
                 Err(replaced(actor))
             }
             _ => Err(format!(
@@ -160,7 +171,7 @@ impl Actors {
 
     /// Judges a chunk without changing anything.
     pub(crate) fn judge(&self, header: &ChunkHeader) -> Verdict {
-        let actor = match self.living(header.actor, header.epoch) {
+        let actor = match self.living(header.actor, header.incarnation) {
             Ok(actor) => actor,
             Err(why) => return Verdict::Refused(why),
         };
@@ -200,7 +211,7 @@ impl Actors {
     /// # Errors
     /// It is of no life that counts; the reason, for a person.
     pub(crate) fn is_stored(&self, claim: &Claim) -> Result<bool, String> {
-        let actor = self.living(claim.actor, claim.epoch)?;
+        let actor = self.living(claim.actor, claim.incarnation)?;
         Ok(claim.sequence < actor.expected)
     }
 
@@ -239,7 +250,7 @@ impl Actors {
             return Difference::default();
         };
         let mut lives = std::iter::once(&mut actor.current).chain(&mut actor.past);
-        let life = lives.find(|life| life.epoch == goodbye.epoch);
+        let life = lives.find(|life| life.incarnation == goodbye.incarnation);
         life.map_or_else(Difference::default, |life| life.goodbye(goodbye.produced))
     }
 }

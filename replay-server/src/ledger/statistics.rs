@@ -44,7 +44,7 @@ impl Statistics {
     }
 
     /// Counts rows that [`Statistics::served`] counted as not served.
-    pub(crate) fn taken_back(&mut self, ks: &[u32]) {
+    pub(crate) fn refund(&mut self, ks: &[u32]) {
         self.batches_retried += 1;
         for &k in ks {
             self.k_histogram[k as usize] -= 1;

@@ -33,12 +33,12 @@ impl Replay {
     /// Too many actors, or a life that another one has replaced; the reason, for a person.
     pub fn join_actor(&mut self, join: ActorJoin) -> Result<u32, String> {
         self.actors.join(join)?;
-        Ok(self.actors.earlier_lives(join.actor))
+        Ok(self.actors.earlier_incarnations(join.actor))
     }
 
     /// The life of `actor` whose chunks are stored; none before it joins.
-    pub fn actor_epoch(&self, actor: u32) -> Option<u64> {
-        self.actors.current_epoch(actor)
+    pub fn actor_incarnation(&self, actor: u32) -> Option<u64> {
+        self.actors.current_incarnation(actor)
     }
 
     /// Stores a chunk: [`Replay::packer`] and [`Replay::insert_packed`] in one.

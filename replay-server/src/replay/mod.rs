@@ -58,7 +58,7 @@ pub struct Replay {
     actors: Actors,
     requests: Requests,
     /// What was counted before the run was resumed.
-    before: Tally,
+    resume_point: Tally,
     limiter: RateLimiter,
     episodes: Episodes,
     anchors: Anchors,
@@ -123,7 +123,7 @@ impl Replay {
             ring,
             actors: Actors::default(),
             requests: Requests::default(),
-            before: Tally::default(),
+            resume_point: Tally::default(),
             limiter: RateLimiter::new(
                 config.replay_ratio,
                 config.warmup_transitions,
@@ -146,20 +146,20 @@ impl Replay {
     /// It counts on from the transitions that these updates used up. Then warmup_transitions of new ones come in before the
     /// next row is sampled, as at the start of the run; so the run steps its worlds that many times more than it counts.
     #[must_use]
-    pub fn going_on_after(mut self, updates: u64, shard: u32) -> Self {
+    pub fn resumed_at(mut self, updates: u64, shard: u32) -> Self {
         let rows = updates.saturating_mul(u64::from(self.batch_rows));
         let inserted = (rows as f64 / self.config.replay_ratio) as u64;
         let (shards, shard) = (u64::from(self.config.shards), u64::from(shard));
         let share = |total: u64| total / shards + u64::from(shard < total % shards);
-        self.before = Tally {
+        self.resume_point = Tally {
             inserted: share(inserted),
             rows_sampled: share(rows),
         };
-        let elsewhere = Tally {
-            inserted: inserted - self.before.inserted,
-            rows_sampled: rows - self.before.rows_sampled,
+        let other_shards = Tally {
+            inserted: inserted - self.resume_point.inserted,
+            rows_sampled: rows - self.resume_point.rows_sampled,
         };
-        self.limiter = self.limiter.going_on_after(self.before, elsewhere);
+        self.limiter = self.limiter.resumed_at(self.resume_point, other_shards);
         // Not the numbers of the run's start again.
         self.rng.set_stream(
             (RNG_STREAM + shard).wrapping_add(updates.wrapping_mul(u64::from(SHARDS_MAX))),

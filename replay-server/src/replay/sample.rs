@@ -2,13 +2,13 @@
 //! The rules of the return, of the anchors and of k are those of `sampling`.
 
 use driml_protocol::{
-    AffinityUpdate, Batch, BatchHeader, CodecError, Planes, RequestId, Tally, Waiting,
+    AffinityUpdate, Batch, BatchHeader, Buffer, CodecError, RequestId, Tally, Waiting,
 };
 
 use super::{Replay, Unready};
 use crate::{
     config,
-    ledger::requests::{Requests, Standing},
+    ledger::requests::{Dedup, Requests},
     sampling::packed_batch::{Draft, PackedStates},
 };
 
@@ -26,7 +26,7 @@ impl Replay {
                  --after-updates, as the run goes on"
             ));
         };
-        self.limiter.taken_back(unlearned);
+        self.limiter.refund(unlearned);
         self.statistics.rows_unlearned += unlearned;
         self.requests = Requests::default();
         self.affinity.expect_another_source();
@@ -47,7 +47,7 @@ impl Replay {
     /// # Errors
     /// The limiter or the lack of any valid anchor asks to wait; the run is over; `rows` can never be served.
     pub fn draw(&mut self, rows: u32) -> Result<Draft, Unready> {
-        self.draw_in(rows, Planes::zeroed)
+        self.draw_in(rows, Buffer::zeroed)
     }
 
     /// [`Replay::draw`] into memory that `memory` gives, so many bytes, all of which are written by the time it is unpacked.
@@ -57,7 +57,7 @@ impl Replay {
     pub fn draw_in(
         &mut self,
         rows: u32,
-        memory: impl FnOnce(usize) -> Planes,
+        memory: impl FnOnce(usize) -> Buffer,
     ) -> Result<Draft, Unready> {
         let rows_max = config::rows_max(&self.spec).min(self.limiter.rows_max());
         if rows == 0 || rows > rows_max {
@@ -74,7 +74,7 @@ impl Replay {
             return Err(Unready::Wait(self.limiter.waiting(rows)));
         }
         let mut header = self.batch_header(rows);
-        let mut batch = Batch::in_memory(header, memory(header.planes_bytes()));
+        let mut batch = Batch::in_memory(header, memory(header.payload_bytes()));
         let pixel_bytes = self.spec.frame_channels as usize;
         let mut packed = PackedStates::new(self.spec.frame_bytes(), pixel_bytes);
         let mut ks = Vec::with_capacity(rows as usize);
@@ -119,20 +119,20 @@ impl Replay {
         &mut self,
         id: RequestId,
         rows: u32,
-        memory: impl FnOnce(usize) -> Planes,
+        memory: impl FnOnce(usize) -> Buffer,
     ) -> Result<Draft, Unready> {
-        match self.requests.enter(id) {
-            Standing::Overtaken => return Err(Unready::Wait(self.limiter.waiting(rows))),
-            Standing::Open(lost) => {
+        match self.requests.begin(id) {
+            Dedup::Superseded => return Err(Unready::Wait(self.limiter.waiting(rows))),
+            Dedup::Fresh(lost) => {
                 if !lost.is_empty() {
                     tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
-                    self.limiter.taken_back(lost.len() as u64);
-                    self.statistics.taken_back(&lost);
+                    self.limiter.refund(lost.len() as u64);
+                    self.statistics.refund(&lost);
                 }
             }
         }
         let draft = self.draw_in(rows, memory)?;
-        self.requests.give(id.asker, draft.ks.clone());
+        self.requests.complete(id.client_id, draft.ks.clone());
         Ok(draft)
     }
 
@@ -171,19 +171,19 @@ impl Replay {
     ///
     /// # Errors
     /// More transitions than the run can ever have; the reason, for a person.
-    pub fn heard(&mut self, elsewhere: Tally) -> Result<(), String> {
+    pub fn set_other_shards(&mut self, other_shards: Tally) -> Result<(), String> {
         let config = &self.config;
         // Each shard takes what its limiter allows until it hears of the others, at most what it holds.
         let most = |max: u64| max.saturating_add(config.capacity_transitions);
         if let Some(most) = config.transitions_max.map(most)
-            && elsewhere.inserted > most
+            && other_shards.inserted > most
         {
             return Err(format!(
                 "the other shards are said to have stored {} transitions; this run has at most {most}",
-                elsewhere.inserted
+                other_shards.inserted
             ));
         }
-        self.limiter.heard(elsewhere);
+        self.limiter.set_other_shards(other_shards);
         Ok(())
     }
 }

@@ -92,13 +92,13 @@ impl Replay {
             "every transition stored has one action"
         );
         assert_eq!(
-            self.before.inserted + stored,
+            self.resume_point.inserted + stored,
             self.limiter.tally().inserted,
             "every transition stored is counted"
         );
         let served: u64 = self.statistics.k_histogram.iter().sum();
         assert_eq!(
-            self.before.rows_sampled + served,
+            self.resume_point.rows_sampled + served,
             self.limiter.tally().rows_sampled + self.statistics.rows_unlearned,
             "every row served has one k"
         );

@@ -47,10 +47,10 @@ impl RowStates {
         row: usize,
         mut write: impl FnMut(u64, &mut [u8]),
     ) {
-        write(self.t, rows.frame_t(row));
+        write(self.t, rows.state_t(row));
         match self.n {
-            Some(index) => write(index, rows.frame_n(row)),
-            None => rows.frame_n(row).fill(0),
+            Some(index) => write(index, rows.state_n(row)),
+            None => rows.state_n(row).fill(0),
         }
         for p in 0..rows.positives() {
             if p < self.positives {

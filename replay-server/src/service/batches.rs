@@ -3,8 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use driml_protocol::{BatchReply, BatchRequest, Kind, Planes, fault, session};
-use zenoh::query::Query;
+use driml_protocol::{BatchReply, BatchRequest, Buffer, Incoming, Responder, fault};
 
 use super::{
     parked::ParkedRequest,
@@ -22,11 +21,16 @@ const SHARD_HOLD_MAX: Duration = Duration::from_millis(50);
 /// How long a thread sleeps when nothing is parked; it is woken when something is.
 const IDLE: Duration = Duration::from_secs(60);
 
+/// A request that waits, and who for.
+type Parked = ParkedRequest<Responder<BatchReply>>;
+
 impl Service {
-    pub(super) fn request(&self, query: Query) {
-        let Some(request) = self.read::<BatchRequest>(&query, Kind::BatchRequest) else {
+    pub(super) fn request(&self, incoming: Incoming<BatchRequest>) {
+        let request = self.read(&incoming);
+        let responder = incoming.into_responder();
+        let Some(request) = request else {
             let why = "the request could not be read; the replay server's log says why".into();
-            return self.reply(&query, Kind::BatchReply, &BatchReply::Refused { why });
+            return responder.reply(&BatchReply::Refused { why });
         };
         let mut state = self.state();
         let is_allowed = state.members.check_learner(request.learner);
@@ -34,15 +38,15 @@ impl Service {
         if let Err(why) = heard {
             state.replay.note_refused_message();
             drop(state);
-            return self.reply(&query, Kind::BatchReply, &BatchReply::Refused { why });
+            return responder.reply(&BatchReply::Refused { why });
         }
-        let hold_max = match request.elsewhere {
+        let hold_max = match request.other_shards {
             Some(_) => SHARD_HOLD_MAX,
             None => HOLD_MAX,
         };
         state.requests.park(ParkedRequest {
             request,
-            question: query,
+            question: responder,
             arrived: Instant::now(),
             hold_max,
         });
@@ -53,14 +57,14 @@ impl Service {
     /// Takes what the learner says of the other shards.
     fn hear_of_others(&self, replay: &mut Replay, request: &BatchRequest) -> Result<(), String> {
         let (_, shards) = self.shard;
-        match request.elsewhere {
+        match request.other_shards {
             None if shards > 1 => Err(format!(
                 "a whole batch of one of {shards} shards: the learner must be connected to all of them"
             )),
             Some(_) if shards == 1 => {
                 Err("a part of a batch; this replay has one shard alone".into())
             }
-            Some(elsewhere) => replay.heard(elsewhere),
+            Some(other_shards) => replay.set_other_shards(other_shards),
             None => Ok(()),
         }
     }
@@ -83,18 +87,18 @@ impl Service {
             state.replay.note_learner_waited(waited.as_secs_f64());
             drop(state);
             self.changed.notify_all();
-            self.give_batch(&parked.question, drawn);
+            give_batch(parked.question, drawn);
         }
     }
+}
 
-    fn give_batch(&self, query: &Query, drawn: Result<Draft, Unready>) {
-        match drawn.map(|draft| draft.unpack().seal(self.spec_hash)) {
-            Ok(Ok((head, planes))) => {
-                session::answer(query, session::join_planes(head, planes.freeze()))
-            }
-            Ok(Err(e)) => tracing::error!("a batch was not sent: {e}"),
-            Err(unready) => self.reply(query, Kind::BatchReply, &BatchReply::from(unready)),
+fn give_batch(responder: Responder<BatchReply>, drawn: Result<Draft, Unready>) {
+    match drawn {
+        Ok(draft) => {
+            let (header, payload) = draft.unpack().into_payload();
+            responder.reply_with(&BatchReply::Batch(header), payload.freeze());
         }
+        Err(unready) => responder.reply(&unready.into()),
     }
 }
 
@@ -103,8 +107,8 @@ impl State {
     fn next_answer(
         &mut self,
         now: Instant,
-        memory: impl Fn(usize, bool) -> Planes,
-    ) -> Option<(ParkedRequest<Query>, Result<Draft, Unready>)> {
+        memory: impl Fn(usize, bool) -> Buffer,
+    ) -> Option<(Parked, Result<Draft, Unready>)> {
         let (mut waiting, mut found) = (Vec::new(), None);
         while let Some(parked) = self.requests.pop() {
             let BatchRequest {

@@ -6,8 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{Chunk, Claim, InsertReply, Kind, fault};
-use zenoh::{bytes::ZBytes, query::Query};
+use driml_protocol::{Chunk, ChunkHeader, Claim, Incoming, InsertReply, fault};
 
 use super::{
     parked::ParkedChunk,
@@ -22,32 +21,34 @@ const IDLE: Duration = Duration::from_secs(60);
 type Answers = Vec<(Question, InsertReply)>;
 
 impl Service {
-    pub(super) fn insert(&self, query: Query) {
+    pub(super) fn insert(&self, incoming: Incoming<ChunkHeader>) {
         let arrived = Instant::now();
-        let none = ZBytes::new();
-        let payload = query.payload().unwrap_or(&none);
-        let (pieces, len) = (payload.slices(), payload.len());
-        let chunk = match Chunk::receive(pieces, len, &self.pool, self.spec_hash, self.num_actions)
-        {
+        let chunk = incoming
+            .receive(&self.pool)
+            .and_then(|(header, payload)| Chunk::from_payload(header, payload, self.num_actions));
+        let responder = incoming.into_responder();
+        let chunk = match chunk {
             Ok(chunk) => chunk,
             Err(e) => {
                 self.refuse("a chunk", &e);
-                let refused = InsertReply::Refused { why: e.to_string() };
-                return self.reply(&query, Kind::InsertReply, &refused);
+                return responder.reply(&InsertReply::Refused { why: e.to_string() });
             }
         };
         let packed = self.packer.pack(Cow::Owned(chunk));
-        let answers = self.state().take_chunk(packed, Question { query, arrived });
+        let question = Question { responder, arrived };
+        let answers = self.state().take_chunk(packed, question);
         self.changed.notify_all();
         self.answer_all(answers);
     }
 
-    pub(super) fn claim(&self, query: Query) {
+    pub(super) fn claim(&self, incoming: Incoming<Claim>) {
         let arrived = Instant::now();
-        let Some(claim) = self.read::<Claim>(&query, Kind::Claim) else {
+        let Some(claim) = self.read(&incoming) else {
             return;
         };
-        let answers = self.state().take_claim(&claim, Question { query, arrived });
+        let responder = incoming.into_responder();
+        let question = Question { responder, arrived };
+        let answers = self.state().take_claim(&claim, question);
         self.changed.notify_all();
         self.answer_all(answers);
     }
@@ -79,8 +80,8 @@ impl Service {
     }
 
     fn answer_all(&self, answers: Answers) {
-        for (Question { query, arrived }, reply) in answers {
-            self.reply(&query, Kind::InsertReply, &reply);
+        for (Question { responder, arrived }, reply) in answers {
+            responder.reply(&reply);
             self.state().timings.answered(arrived.elapsed());
         }
     }

@@ -1,8 +1,8 @@
 //! Parts that join: what they are told of the run, and whether they are let in.
 //! Who is connected and who is served is kept in `members`.
 
-use driml_protocol::{ActorJoin, Alive, Hello, JoinReply, Kind, LearnerJoin};
-use zenoh::{query::Query, sample::SampleKind};
+use driml_protocol::{ActorJoin, Alive, Hello, Incoming, JoinReply, LearnerJoin, Responder};
+use zenoh::sample::SampleKind;
 
 use super::server::{Service, State};
 
@@ -13,7 +13,7 @@ impl Service {
         state.count_actors();
     }
 
-    pub(super) fn hello(&self, query: Query) {
+    pub(super) fn hello(&self, responder: Responder<Hello>) {
         let state = self.state();
         let (inserted_total, tally) = (state.replay.inserted_total(), state.replay.tally());
         drop(state);
@@ -25,31 +25,31 @@ impl Service {
             shard: self.shard,
             shared_memory: self.shared_memory,
         };
-        self.reply(&query, Kind::Hello, &hello);
+        responder.reply(&hello);
     }
 
-    pub(super) fn join_actor(&self, query: Query) {
-        if let Some(join) = self.read::<ActorJoin>(&query, Kind::ActorJoin) {
+    pub(super) fn join_actor(&self, incoming: Incoming<ActorJoin>) {
+        if let Some(join) = self.read(&incoming) {
             let reply = self.state().join_actor(join);
-            self.welcome(&query, reply);
+            self.welcome(incoming.into_responder(), reply);
         }
     }
 
-    pub(super) fn join_learner(&self, query: Query) {
-        if let Some(join) = self.read::<LearnerJoin>(&query, Kind::LearnerJoin) {
+    pub(super) fn join_learner(&self, incoming: Incoming<LearnerJoin>) {
+        if let Some(join) = self.read(&incoming) {
             let reply = self.state().join_learner(join);
             self.changed.notify_all();
-            self.welcome(&query, reply);
+            self.welcome(incoming.into_responder(), reply);
         }
     }
 
     /// Answers a part that joins: how many lives it had before, or why it is not taken.
-    fn welcome(&self, query: &Query, joined: Result<u32, Rejection>) {
+    fn welcome(&self, responder: Responder<JoinReply>, joined: Result<u32, Rejection>) {
         let reply = match joined {
-            Ok(earlier_lives) => JoinReply::Welcome {
+            Ok(earlier_incarnations) => JoinReply::Welcome {
                 inserted_total: self.state().replay.inserted_total(),
                 weights_version: self.weights().version(),
-                earlier_lives,
+                earlier_incarnations,
             },
             Err(Rejection::Taken(why)) => JoinReply::Taken { why },
             Err(Rejection::Refused(why)) => {
@@ -58,7 +58,7 @@ impl Service {
                 JoinReply::Refused { why }
             }
         };
-        self.reply(query, Kind::JoinReply, &reply);
+        responder.reply(&reply);
     }
 }
 
@@ -78,28 +78,28 @@ impl State {
 
     /// Takes an actor that may take part; gives the number of its earlier lives.
     fn join_actor(&mut self, join: ActorJoin) -> Result<u32, Rejection> {
-        let ActorJoin { actor, epoch } = join;
+        let ActorJoin { actor, incarnation } = join;
         let other = self
             .replay
-            .actor_epoch(actor)
-            .filter(|&other| other != epoch);
-        let connected = |epoch| {
+            .actor_incarnation(actor)
+            .filter(|&other| other != incarnation);
+        let connected = |incarnation| {
             self.members
                 .connected
-                .contains(&Alive::Actor { actor, epoch })
+                .contains(&Alive::Actor { actor, incarnation })
         };
         if other.is_some_and(connected) {
             return Err(Rejection::Taken(format!(
                 "another process is actor {actor} of this run: give each actor a number of its own (--id)"
             )));
         }
-        let earlier_lives = self.replay.join_actor(join).map_err(Rejection::Refused)?;
+        let earlier_incarnations = self.replay.join_actor(join).map_err(Rejection::Refused)?;
         self.count_actors();
         if other.is_some() {
             // A chunk that was left behind.
             self.chunks.take(actor);
         }
-        Ok(earlier_lives)
+        Ok(earlier_incarnations)
     }
 
     fn join_learner(&mut self, join: LearnerJoin) -> Result<u32, Rejection> {

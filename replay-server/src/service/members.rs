@@ -30,7 +30,9 @@ impl Members {
     /// Actors that are connected and have joined.
     pub(super) fn actors(&self, replay: &Replay) -> u32 {
         let takes_part = |who: &&Alive| match **who {
-            Alive::Actor { actor, epoch } => replay.actor_epoch(actor) == Some(epoch),
+            Alive::Actor { actor, incarnation } => {
+                replay.actor_incarnation(actor) == Some(incarnation)
+            }
             Alive::Learner(_) => false,
         };
         self.connected.iter().filter(takes_part).count() as u32

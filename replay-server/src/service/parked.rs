@@ -1,4 +1,4 @@
-//! What has to wait until the rate limiter opens: one chunk an actor and one request an asker, with whoever asked.
+//! What has to wait until the rate limiter opens: one chunk an actor and one request an client, with whoever asked.
 //! It neither stores, draws nor answers; `Q` is the question to be answered.
 
 use std::{
@@ -12,7 +12,7 @@ use crate::storage::frame_store::PackedChunk;
 
 /// Bytes of the chunks kept; whoever sends one more is told to send it again later.
 const CHUNK_BYTES_MAX: usize = 1 << 28;
-/// Requests kept; the one that has waited longest gives way to one more, and its asker asks again.
+/// Requests kept; the one that has waited longest gives way to one more, and its client asks again.
 const REQUESTS_MAX: usize = 1024;
 
 /// A chunk that is stored as soon as the limiter lets it pass.
@@ -85,14 +85,15 @@ impl<Q> ParkedChunks<Q> {
     pub(super) fn claimed(&mut self, claim: &Claim) -> Option<&mut ParkedChunk<Q>> {
         self.by_actor.get_mut(&claim.actor).filter(|parked| {
             let header = &parked.chunk.chunk.header;
-            (header.epoch, header.sequence) == (claim.epoch, claim.sequence)
+            (header.incarnation, header.sequence) == (claim.incarnation, claim.sequence)
         })
     }
 
     /// Takes the older copy of a chunk that has been stored out of the line; a later chunk of its actor stays.
     pub(super) fn take_copy(&mut self, stored: &ChunkHeader) -> Option<ParkedChunk<Q>> {
         let parked = &self.by_actor.get(&stored.actor)?.chunk.chunk.header;
-        let is_copy = parked.epoch == stored.epoch && parked.sequence <= stored.sequence;
+        let is_copy =
+            parked.incarnation == stored.incarnation && parked.sequence <= stored.sequence;
         if is_copy {
             self.take(stored.actor)
         } else {
@@ -160,7 +161,7 @@ impl<Q> ParkedRequest<Q> {
     }
 }
 
-/// The requests that wait, at most one an asker: the newest attempt. The oldest is first.
+/// The requests that wait, at most one an client: the newest attempt. The oldest is first.
 pub(super) struct ParkedRequests<Q>(VecDeque<ParkedRequest<Q>>);
 
 impl<Q> Default for ParkedRequests<Q> {
@@ -170,10 +171,10 @@ impl<Q> Default for ParkedRequests<Q> {
 }
 
 impl<Q> ParkedRequests<Q> {
-    /// Keeps a request in the place of an older one of its asker; nobody waits for the answer to that one any more.
+    /// Keeps a request in the place of an older one of its client; nobody waits for the answer to that one any more.
     pub(super) fn park(&mut self, parked: ParkedRequest<Q>) {
         let id = parked.request.id;
-        self.0.retain(|it| it.request.id.asker != id.asker);
+        self.0.retain(|it| it.request.id.client_id != id.client_id);
         if self.0.len() == REQUESTS_MAX {
             self.0.pop_front();
         }
@@ -214,7 +215,7 @@ mod tests {
     fn chunk(actor: u32, sequence: u64, steps: u32, frame_bytes: u32) -> PackedChunk<'static> {
         let chunk = Chunk::zeroed(ChunkHeader {
             actor,
-            epoch: 9,
+            incarnation: 9,
             sequence,
             first_transition: 0,
             weights_version: 0,
@@ -232,7 +233,7 @@ mod tests {
     fn claim(actor: u32, sequence: u64) -> Claim {
         Claim {
             actor,
-            epoch: 9,
+            incarnation: 9,
             sequence,
             leaving: false,
         }
@@ -308,21 +309,22 @@ mod tests {
     #[test]
     fn one_request_an_asker_waits() {
         let (mut parked, now) = (ParkedRequests::default(), Instant::now());
-        let request = |learner, asker, question| ParkedRequest {
+        let request = |learner, client_id, question| ParkedRequest {
             request: BatchRequest {
                 learner,
-                id: RequestId::first(asker),
+                id: RequestId::first(client_id),
                 rows: 1,
                 shared_memory: false,
-                elsewhere: None,
+                other_shards: None,
             },
             question,
             arrived: now,
-            hold_max: Duration::from_secs(asker),
+            hold_max: Duration::from_secs(client_id),
         };
-        for (learner, asker, question) in [(1, 1, "a"), (1, 2, "b"), (1, 1, "a again"), (2, 3, "c")]
+        for (learner, client_id, question) in
+            [(1, 1, "a"), (1, 2, "b"), (1, 1, "a again"), (2, 3, "c")]
         {
-            parked.park(request(learner, asker, question));
+            parked.park(request(learner, client_id, question));
         }
         assert_eq!(parked.due_in(now), Some(Duration::from_secs(1)));
         parked.keep_only(1);

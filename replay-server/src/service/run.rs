@@ -9,18 +9,14 @@ use std::{
 
 use anyhow::Context;
 use driml_protocol::{
-    Answering, BatchHeader, Keys, POOL_BATCHES, PlanesPool, RunSpec, Shutdown, TRANSITION_BYTES,
+    BatchHeader, BufferPool, Incoming, Keyed, Keys, POOL_BATCHES, QueryWorkers, Request, Responder,
+    RunClient, RunSpec, Shutdown, TRANSITION_BYTES,
     config::{Settings, TransportConfig},
     join_within,
     session::{self, Endpoints},
     shared_memory,
 };
-use zenoh::{
-    Session, Wait,
-    pubsub::{Publisher, Subscriber},
-    qos::{CongestionControl, Priority},
-    query::{Query, Queryable},
-};
+use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
 use super::{
     members::Members,
@@ -74,14 +70,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let ack_timeout = Duration::from_millis(number(&settings, "actor", "ack_timeout_ms")?.into());
     let mut replay = Replay::shard(&spec, &config, batch_rows, args.shard)?;
     if args.after_updates > 0 {
-        replay = replay.going_on_after(args.after_updates, args.shard);
+        replay = replay.resumed_at(args.after_updates, args.shard);
     }
     let transport: TransportConfig = settings.table("transport")?;
     let batch = BatchHeader::of(&spec, batch_rows);
     let pool = if transport.shared_memory {
-        PlanesPool::shared(SPARE_MAX, POOL_BATCHES, batch.planes_bytes())
+        BufferPool::shared(SPARE_MAX, POOL_BATCHES, batch.payload_bytes())
     } else {
-        PlanesPool::new(SPARE_MAX)
+        BufferPool::new(SPARE_MAX)
     };
     let reads_shared_memory = transport.shared_memory
         && match shared_memory::check_lockable(
@@ -98,10 +94,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         listen: args.listen.clone(),
         connect: args.connect,
     })?;
+    let client = RunClient::new(session, keys, spec.hash());
     let declaring =
         |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
     let service = Arc::new(Service {
-        spec_hash: spec.hash(),
         num_actions: spec.num_actions,
         shard: (args.shard, config.shards),
         after_updates: args.after_updates,
@@ -119,17 +115,21 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         }),
         changed: Condvar::new(),
         weights: Mutex::default(),
-        announcements: announcements(&session, &keys).map_err(declaring)?,
+        announcements: client.announce().map_err(declaring)?,
         shutdown: shutdown.clone(),
     });
-    let _alive = watch_members(&session, &keys, &service)
+    let _alive = watch_members(&client, &service)
         .map_err(|e| anyhow::anyhow!("watching for actors and learner: {e}"))?;
-    let (answering, mut threads) = declare(&session, &keys, &service).map_err(declaring)?;
+    let Answers {
+        queryables,
+        mut threads,
+        ..
+    } = Answers::declare(&client, &service).map_err(declaring)?;
     threads.extend(service.clone().start_working()?);
     tracing::info!(
         "replay server listens on {:?}, run {:016x}",
         args.listen,
-        service.spec_hash
+        client.spec_hash()
     );
     shutdown.wait();
     service.changed.notify_all();
@@ -138,8 +138,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         service.state().replay.inserted_total()
     );
     // Without the queryables no more comes, without the session nobody waits for a slow asker: the threads end.
-    drop(answering);
-    let closed = session.close().wait();
+    drop(queryables);
+    let closed = client.session().close().wait();
     join_within(threads, THREADS_END_MAX);
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
@@ -169,68 +169,74 @@ fn chunk_pools_bytes(settings: &Settings, spec: &RunSpec) -> anyhow::Result<usiz
 /// The threads that answer.
 type Threads = Vec<JoinHandle<()>>;
 
-/// Declares everything that the replay server answers; dropping the first ends it, and with it the threads.
-fn declare(
-    session: &Session,
-    keys: &Keys,
-    service: &Arc<Service>,
-) -> zenoh::Result<(Vec<Queryable<()>>, Threads)> {
-    type Answer = fn(&Service, Query);
-    let answers: [(String, &str, usize, Answer); 11] = [
-        (keys.ingest(), "insert", 1, Service::insert),
-        (keys.claim(), "claim", 1, Service::claim),
-        (keys.batch(), "request", 1, Service::request),
-        (keys.affinity(), "affinity", 1, Service::affinity),
-        (keys.hello(), "hello", 1, Service::hello),
-        (keys.actor_join(), "join-actor", 1, Service::join_actor),
-        (
-            keys.learner_join(),
-            "join-learner",
-            1,
-            Service::join_learner,
-        ),
-        (keys.goodbye(), "goodbye", 1, Service::goodbye),
-        (
-            keys.weights_upload(),
-            "weights-upload",
-            1,
-            Service::take_weights,
-        ),
-        (
-            keys.weights(),
-            "weights",
-            WEIGHTS_THREADS,
-            Service::give_weights,
-        ),
-        (keys.replay_status(), "status", 1, Service::status),
-    ];
-    let (mut queryables, mut threads) = (Vec::new(), Vec::new());
-    for (key, name, count, answer) in answers {
-        let service = service.clone();
-        let answering = Answering::start(name, count, move |query| answer(&service, query))?;
-        queryables.push(answering.declare(session, key)?);
-        threads.extend(answering.into_threads());
-    }
-    Ok((queryables, threads))
+/// Everything that the replay server answers: each message by threads of its own.
+struct Answers<'a> {
+    client: &'a RunClient,
+    service: &'a Arc<Service>,
+    /// Dropping them ends the answers, and with them the threads.
+    queryables: Vec<Queryable<()>>,
+    threads: Threads,
 }
 
-/// Where new weights are announced. An announcement that is dropped is made good by the next, or by the actors' own look.
-fn announcements(session: &Session, keys: &Keys) -> zenoh::Result<Publisher<'static>> {
-    session
-        .declare_publisher(keys.weights_version())
-        .congestion_control(CongestionControl::Drop)
-        .priority(Priority::InteractiveHigh)
-        .wait()
+impl<'a> Answers<'a> {
+    /// Declares all of it.
+    fn declare(client: &'a RunClient, service: &'a Arc<Service>) -> zenoh::Result<Self> {
+        let mut this = Self {
+            client,
+            service,
+            queryables: Vec::new(),
+            threads: Threads::new(),
+        };
+        this.answer("insert", 1, Service::insert)?;
+        this.answer("claim", 1, Service::claim)?;
+        this.answer("request", 1, Service::request)?;
+        this.answer("affinity", 1, Service::affinity)?;
+        this.offer("hello", 1, Service::hello)?;
+        this.answer("join-actor", 1, Service::join_actor)?;
+        this.answer("join-learner", 1, Service::join_learner)?;
+        this.answer("goodbye", 1, Service::goodbye)?;
+        this.answer("weights-upload", 1, Service::take_weights)?;
+        this.answer("weights", WEIGHTS_THREADS, Service::give_weights)?;
+        this.offer("status", 1, Service::status)?;
+        Ok(this)
+    }
+
+    /// Answers requests `R` with `answer`, on so many threads of this name.
+    fn answer<R: Request + 'static>(
+        &mut self,
+        name: &str,
+        threads: usize,
+        answer: fn(&Service, Incoming<R>),
+    ) -> zenoh::Result<()> {
+        let (service, spec_hash) = (self.service.clone(), self.client.spec_hash());
+        let answer = move |incoming| answer(&service, incoming);
+        self.add(QueryWorkers::answer(name, threads, spec_hash, answer)?)
+    }
+
+    /// Gives an `M` to whoever fetches it, on so many threads of this name.
+    fn offer<M: Keyed + 'static>(
+        &mut self,
+        name: &str,
+        threads: usize,
+        give: fn(&Service, Responder<M>),
+    ) -> zenoh::Result<()> {
+        let (service, spec_hash) = (self.service.clone(), self.client.spec_hash());
+        let give = move |responder| give(&service, responder);
+        self.add(QueryWorkers::offer(name, threads, spec_hash, give)?)
+    }
+
+    fn add<M: Keyed + 'static>(&mut self, workers: QueryWorkers<M>) -> zenoh::Result<()> {
+        self.queryables.push(workers.declare(self.client)?);
+        self.threads.extend(workers.into_threads());
+        Ok(())
+    }
 }
 
 /// Keeps track of who is connected.
-fn watch_members(
-    session: &Session,
-    keys: &Keys,
-    service: &Arc<Service>,
-) -> zenoh::Result<Subscriber<()>> {
-    let (service, keys) = (service.clone(), keys.clone());
-    session
+fn watch_members(client: &RunClient, service: &Arc<Service>) -> zenoh::Result<Subscriber<()>> {
+    let (service, keys) = (service.clone(), client.keys().clone());
+    client
+        .session()
         .liveliness()
         .declare_subscriber(keys.all_alive())
         .history(true)

@@ -6,8 +6,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{CodecError, Kind, PlanesPool, Shutdown, codec, session};
-use zenoh::{pubsub::Publisher, query::Query};
+use driml_protocol::{
+    Announcer, BatchReply, BufferPool, CodecError, Incoming, InsertReply, Request, Responder,
+    Shutdown, WeightsVersion,
+};
 
 use super::{
     members::Members,
@@ -19,7 +21,6 @@ use crate::{replay::Replay, storage::frame_store::Packer};
 
 /// What all threads share.
 pub(super) struct Service {
-    pub(super) spec_hash: u64,
     pub(super) num_actions: u32,
     pub(super) shard: (u32, u32),
     pub(super) after_updates: u64,
@@ -30,13 +31,13 @@ pub(super) struct Service {
     /// can tell a server that makes it wait from one that is silent.
     pub(super) hold_max: Duration,
     /// Memory for chunks that arrive and batches that leave.
-    pub(super) pool: PlanesPool,
+    pub(super) pool: BufferPool,
     pub(super) packer: Packer,
     pub(super) state: Mutex<State>,
     /// Something was stored, sampled or parked: whoever waits for the limiter looks again.
     pub(super) changed: Condvar,
     pub(super) weights: Mutex<WeightsStore>,
-    pub(super) announcements: Publisher<'static>,
+    pub(super) announcements: Announcer<WeightsVersion>,
     pub(super) shutdown: Shutdown,
 }
 
@@ -45,13 +46,13 @@ pub(super) struct State {
     pub(super) replay: Replay,
     pub(super) members: Members,
     pub(super) chunks: ParkedChunks<Question>,
-    pub(super) requests: ParkedRequests<Query>,
+    pub(super) requests: ParkedRequests<Responder<BatchReply>>,
     pub(super) timings: Timings,
 }
 
 /// Who asks about a chunk, and since when.
 pub(super) struct Question {
-    pub(super) query: Query,
+    pub(super) responder: Responder<InsertReply>,
     pub(super) arrived: Instant,
 }
 
@@ -60,36 +61,18 @@ impl Service {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(super) fn reply<H: serde::Serialize>(&self, query: &Query, kind: Kind, header: &H) {
-        match codec::encode(kind, self.spec_hash, header, &[]) {
-            Ok(bytes) => session::answer(query, bytes.into()),
-            Err(e) => tracing::error!("a reply of kind {kind:?} was not sent: {e}"),
-        }
-    }
-
     /// Counts and logs a message that cannot be read.
     pub(super) fn refuse(&self, what: &str, e: &CodecError) {
         tracing::warn!("{what} was refused: {e}");
         self.state().replay.note_refused_message();
     }
 
-    /// Decodes a small message, or counts it as refused.
-    pub(super) fn read<H: serde::de::DeserializeOwned>(
-        &self,
-        query: &Query,
-        kind: Kind,
-    ) -> Option<H> {
-        let payload = query
-            .payload()
-            .map(|payload| payload.to_bytes())
-            .unwrap_or_default();
-        match codec::decode(&payload, kind, Some(self.spec_hash)) {
-            Ok((header, _)) => Some(header),
-            Err(e) => {
-                self.refuse(&format!("a message of kind {kind:?}"), &e);
-                None
-            }
-        }
+    /// Reads a request without payload, or counts it as refused.
+    pub(super) fn read<R: Request>(&self, incoming: &Incoming<R>) -> Option<R> {
+        incoming
+            .read()
+            .inspect_err(|e| self.refuse(&format!("a message of kind {:?}", R::KIND), e))
+            .ok()
     }
 
     /// Waits until something has changed, or for `wait_max`.

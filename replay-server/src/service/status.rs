@@ -1,21 +1,20 @@
 //! The small messages that need no file of their own: an actor's goodbye, the learner's affinity, and the status.
 //! None of them ever waits.
 
-use driml_protocol::{AffinityUpdate, Goodbye, Kind};
-use zenoh::query::Query;
+use driml_protocol::{AffinityUpdate, Done, Goodbye, Incoming, ReplayStatus, Responder};
 
 use super::server::Service;
 
 impl Service {
-    pub(super) fn goodbye(&self, query: Query) {
-        if let Some(goodbye) = self.read::<Goodbye>(&query, Kind::Goodbye) {
+    pub(super) fn goodbye(&self, incoming: Incoming<Goodbye>) {
+        if let Some(goodbye) = self.read(&incoming) {
             self.state().replay.goodbye(&goodbye);
-            self.reply(&query, Kind::Done, &());
+            incoming.into_responder().reply(&Done);
         }
     }
 
-    pub(super) fn affinity(&self, query: Query) {
-        let Some(update) = self.read::<AffinityUpdate>(&query, Kind::Affinity) else {
+    pub(super) fn affinity(&self, incoming: Incoming<AffinityUpdate>) {
+        let Some(update) = self.read(&incoming) else {
             return;
         };
         let mut state = self.state();
@@ -31,12 +30,12 @@ impl Service {
         };
         drop(state);
         match set {
-            Ok(()) => self.reply(&query, Kind::Done, &()),
+            Ok(()) => incoming.into_responder().reply(&Done),
             Err(why) => tracing::warn!("an affinity matrix was refused: {why}"),
         }
     }
 
-    pub(super) fn status(&self, query: Query) {
+    pub(super) fn status(&self, responder: Responder<ReplayStatus>) {
         let state = self.state();
         let mut status = state.replay.status();
         status.actors_acting = state.members.actors_acting();
@@ -46,6 +45,6 @@ impl Service {
         status.weights_behind_s = state.timings.weights_behind_s();
         status.weights_behind_updates = state.timings.weights_behind_updates();
         drop(state);
-        self.reply(&query, Kind::ReplayStatus, &status);
+        responder.reply(&status);
     }
 }

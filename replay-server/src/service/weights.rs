@@ -7,9 +7,10 @@ use std::{
 };
 
 use driml_protocol::{
-    Kind, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec, session,
+    BufferPool, Done, Incoming, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload,
+    WeightsVersion,
 };
-use zenoh::{Wait, bytes::ZBytes, query::Query};
+use zenoh::bytes::ZBytes;
 
 use super::{server::Service, weights_store::WeightsStore};
 
@@ -18,23 +19,22 @@ impl Service {
         self.weights.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(super) fn take_weights(&self, query: Query) {
-        let payload = query.payload().map(|payload| payload.to_bytes());
-        let payload = payload.unwrap_or_default();
-        let (upload, safetensors) = match WeightsUpload::decode(&payload, self.spec_hash) {
+    pub(super) fn take_weights(&self, incoming: Incoming<WeightsUpload>) {
+        // Weights are kept for long, so their memory is not the pool's.
+        let (upload, safetensors) = match incoming.receive(&BufferPool::new(0)) {
             Ok(read) => read,
             Err(e) => return self.refuse("an upload of weights", &e),
         };
         let WeightsUpload { learner, weights } = upload;
         let allowed = self.state().members.check_learner(learner);
-        match allowed.and_then(|()| self.weights().put(weights, safetensors)) {
+        match allowed.and_then(|()| self.weights().put(weights, &safetensors)) {
             Ok(is_new) => {
                 if is_new {
                     let now = Instant::now();
                     self.state().timings.weights_came(&weights, now);
                     self.announce(weights.version);
                 }
-                self.reply(&query, Kind::Done, &());
+                incoming.into_responder().reply(&Done);
             }
             Err(why) => {
                 tracing::warn!("weights were refused: {why}");
@@ -44,25 +44,13 @@ impl Service {
     }
 
     fn announce(&self, version: u64) {
-        let announced = codec::encode(
-            Kind::WeightsVersion,
-            self.spec_hash,
-            &WeightsVersion { version },
-            &[],
-        );
-        let put = announced.map_err(|e| e.to_string()).and_then(|bytes| {
-            self.announcements
-                .put(bytes)
-                .wait()
-                .map_err(|e| e.to_string())
-        });
-        if let Err(why) = put {
+        if let Err(why) = self.announcements.put(&WeightsVersion { version }) {
             tracing::warn!("weights {version} were not announced: {why}");
         }
     }
 
-    pub(super) fn give_weights(&self, query: Query) {
-        let Some(request) = self.read::<WeightsRequest>(&query, Kind::WeightsRequest) else {
+    pub(super) fn give_weights(&self, incoming: Incoming<WeightsRequest>) {
+        let Some(request) = self.read(&incoming) else {
             return;
         };
         let found = self.weights().find(request, Instant::now());
@@ -78,12 +66,7 @@ impl Service {
             }
             Err(reply) => (*reply, &[][..]),
         };
-        match codec::seal(Kind::Weights, self.spec_hash, &reply, piece) {
-            Ok(head) => {
-                let piece = ZBytes::from(piece.to_vec());
-                session::answer(&query, session::join_planes(head, piece));
-            }
-            Err(e) => tracing::error!("weights were not sent: {e}"),
-        }
+        let piece = ZBytes::from(piece.to_vec());
+        incoming.into_responder().reply_with(&reply, piece);
     }
 }

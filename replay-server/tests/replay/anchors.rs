@@ -38,7 +38,7 @@ impl Setup {
         let chunk = self.history.next_chunk(
             ChunkHeader {
                 actor,
-                epoch: 1,
+                incarnation: 1,
                 sequence,
                 first_transition: sequence * u64::from(streams * steps),
                 weights_version: 0,
@@ -59,7 +59,7 @@ impl Setup {
         let bytes = self.history.spec.state_bytes();
         for _ in 0..anchors.len() * 2 {
             let batch = self.replay.sample(64).unwrap();
-            for state in batch.frames_t().chunks(bytes) {
+            for state in batch.states_t().chunks(bytes) {
                 *counts
                     .get_mut(&identity(&self.history.spec, state))
                     .unwrap() += 1;
@@ -121,7 +121,7 @@ fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
     join(&mut replay, 0, 1);
     let mut header = ChunkHeader {
         actor: 0,
-        epoch: 1,
+        incarnation: 1,
         sequence: 0,
         first_transition: 0,
         weights_version: 0,

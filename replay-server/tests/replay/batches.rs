@@ -22,7 +22,7 @@ fn check_batch(batch: &Batch, history: &History) {
     let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
     let (mut ages, mut versions) = (0, (0, u64::MAX));
     for row in 0..rows {
-        let (key, t) = identity(spec, &state(batch.frames_t(), row));
+        let (key, t) = identity(spec, &state(batch.states_t(), row));
         assert!(
             history.is_valid(key, t),
             "{key:?} step {t} is no valid anchor"
@@ -31,7 +31,7 @@ fn check_batch(batch: &Batch, history: &History) {
         let context = format!("{key:?} step {t}: {want:?}");
         let record = &history.streams[&key][t];
         assert_eq!(
-            state(batch.frames_t(), row),
+            state(batch.states_t(), row),
             history.state(key, t),
             "{context}"
         );
@@ -50,10 +50,10 @@ fn check_batch(batch: &Batch, history: &History) {
         let frame_n = want
             .bootstrap
             .map_or(vec![0; bytes], |i| history.state(key, t + i));
-        assert_eq!(state(batch.frames_n(), row), frame_n, "{context}");
+        assert_eq!(state(batch.states_n(), row), frame_n, "{context}");
         assert_eq!(batch.positives(), spec.horizon.positives());
         for p in 0..batch.positives() {
-            // Planes of positives are [P, B].
+            // Buffer of positives are [P, B].
             let at = p * rows + row;
             let k = usize::from(batch.ks()[at]);
             let right = match (spec.horizon, want.steps_left) {
@@ -69,7 +69,7 @@ fn check_batch(batch: &Batch, history: &History) {
             } else {
                 history.state(key, t + k)
             };
-            assert_eq!(state(batch.frames_k(), at), frame_k, "{context}: k = {k}");
+            assert_eq!(state(batch.states_k(), at), frame_k, "{context}: k = {k}");
         }
         ages += history.inserted - 1 - record.index;
         versions = (
@@ -134,21 +134,21 @@ proptest! {
         let (mut lost, mut retried, mut refused, mut rows_sampled) = (0, 0, 0, 0);
         for _ in 0..150 {
             let number = rng.random_range(0..actors);
-            let fresh = |epoch| Actor {
+            let fresh = |incarnation| Actor {
                 next: ChunkHeader {
-                    actor: number, epoch, sequence: 0, first_transition: 0, weights_version: 0, leaving: false,
+                    actor: number, incarnation, sequence: 0, first_transition: 0, weights_version: 0, leaving: false,
                     streams, steps: 1, frame_bytes: spec.frame_bytes() as u32,
                 },
                 part: 0,
             };
             let actor = known.entry(number).or_insert_with(|| fresh(1));
-            join(&mut replay, number, actor.next.epoch);
+            join(&mut replay, number, actor.next.incarnation);
             match rng.random_range(0..20) {
                 // The actor dies and starts anew; a straggler of its former life is refused.
                 0 => {
                     let old = actor.next;
-                    *actor = fresh(old.epoch + 1);
-                    join(&mut replay, number, actor.next.epoch);
+                    *actor = fresh(old.incarnation + 1);
+                    join(&mut replay, number, actor.next.incarnation);
                     let chunk = history.next_chunk(actor.next, 0, &mut rng);
                     let stored = stored(history.inserted);
                     prop_assert_eq!(replay.insert(&chunk), stored);
@@ -217,7 +217,7 @@ proptest! {
         }
         for (&actor, Actor { next, .. }) in &known {
             if next.sequence > 0 {
-                replay.goodbye(&Goodbye { actor, epoch: next.epoch, produced: next.first_transition });
+                replay.goodbye(&Goodbye { actor, incarnation: next.incarnation, produced: next.first_transition });
             }
         }
         let status = replay.status();

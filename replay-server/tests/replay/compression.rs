@@ -75,7 +75,7 @@ impl Actor {
         Self {
             next: ChunkHeader {
                 actor: 0,
-                epoch: 1,
+                incarnation: 1,
                 sequence: 0,
                 first_transition: 0,
                 weights_version: 1,
@@ -225,7 +225,7 @@ fn the_bytes_allowed_are_kept() {
         assert!(status.frame_bytes_held <= max + 64 * 2000);
         let oldest = status.transitions_inserted - status.transitions_held;
         let batch = replay.sample(16).unwrap();
-        for frame in batch.frames_t().chunks(spec.frame_bytes()) {
+        for frame in batch.states_t().chunks(spec.frame_bytes()) {
             let number = u64::from_le_bytes(frame[..8].try_into().unwrap());
             assert!((oldest..status.transitions_inserted).contains(&number));
         }

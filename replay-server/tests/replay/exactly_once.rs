@@ -3,8 +3,8 @@
 //! It does not look at rows.
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon, InsertReply,
-    Planes, RequestId, RunSpec, Waiting,
+    ActorJoin, AffinityUpdate, Buffer, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon,
+    InsertReply, RequestId, RunSpec, Waiting,
 };
 use driml_replay_server::{ACTORS_MAX, Replay, STREAMS_MAX, Unready};
 use proptest::prelude::*;
@@ -17,10 +17,15 @@ pub(crate) fn small_spec() -> RunSpec {
     spec(3, 1, 1, Horizon::None)
 }
 
-pub(crate) fn header(actor: u32, epoch: u64, sequence: u64, first_transition: u64) -> ChunkHeader {
+pub(crate) fn header(
+    actor: u32,
+    incarnation: u64,
+    sequence: u64,
+    first_transition: u64,
+) -> ChunkHeader {
     ChunkHeader {
         actor,
-        epoch,
+        incarnation,
         sequence,
         first_transition,
         weights_version: 0,
@@ -31,14 +36,14 @@ pub(crate) fn header(actor: u32, epoch: u64, sequence: u64, first_transition: u6
     }
 }
 
-pub(crate) fn join(replay: &mut Replay, actor: u32, epoch: u64) {
-    replay.join_actor(ActorJoin { actor, epoch }).unwrap();
+pub(crate) fn join(replay: &mut Replay, actor: u32, incarnation: u64) {
+    replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
 }
 
 /// Inserts a chunk; an actor that is new joins with it.
 pub(crate) fn insert(replay: &mut Replay, header: ChunkHeader) -> InsertReply {
-    if replay.actor_epoch(header.actor).is_none() {
-        join(replay, header.actor, header.epoch);
+    if replay.actor_incarnation(header.actor).is_none() {
+        join(replay, header.actor, header.incarnation);
     }
     let reply = replay.insert(&Chunk::zeroed(header));
     replay.check_valid();
@@ -106,7 +111,7 @@ proptest! {
         }
         let produced: Vec<u64> = (0..actors).map(|actor| first(actor, chunks)).collect();
         for (actor, &produced) in produced.iter().enumerate() {
-            replay.goodbye(&Goodbye { actor: actor as u32, epoch: 9, produced });
+            replay.goodbye(&Goodbye { actor: actor as u32, incarnation: 9, produced });
         }
         let status = replay.status();
         prop_assert_eq!(status.transitions_inserted, produced.iter().sum::<u64>());
@@ -115,7 +120,7 @@ proptest! {
     }
 
     #[test]
-    fn batches_that_do_not_arrive_do_not_count(seed in any::<u64>(), askers in 1u64..4, batches in 1u64..30) {
+    fn batches_that_do_not_arrive_do_not_count(seed in any::<u64>(), clients in 1u64..4, batches in 1u64..30) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut config = unlimited(10_000);
         (config.replay_ratio, config.slack_transitions) = (1.0, 10_000);
@@ -128,7 +133,7 @@ proptest! {
                 break;
             }
         }
-        let mut asked: Vec<_> = (0..askers).map(RequestId::first).collect();
+        let mut asked: Vec<_> = (0..clients).map(RequestId::first).collect();
         let mut ks = vec![0; 4];
         let (mut arrived, mut lost) = (0, 0);
         // What was sent, overtaken requests too, in the order of its arrival.
@@ -137,20 +142,20 @@ proptest! {
             if arrived == batches {
                 break;
             }
-            let asker = rng.random_range(0..askers) as usize;
-            asked[asker] = asked[asker].again();
-            in_flight.push(asked[asker]);
+            let client_id = rng.random_range(0..clients) as usize;
+            asked[client_id] = asked[client_id].again();
+            in_flight.push(asked[client_id]);
             let at = rng.random_range(0..in_flight.len());
             let id = in_flight.remove(at);
             in_flight.truncate(20);
-            let draft = replay.draw_for(id, 8, Planes::zeroed);
+            let draft = replay.draw_for(id, 8, Buffer::zeroed);
             replay.check_valid();
-            let is_awaited = asked[id.asker as usize] == id;
+            let is_awaited = asked[id.client_id as usize] == id;
             match draft {
                 Ok(draft) if is_awaited && rng.random_bool(0.7) => {
                     arrived += 1;
                     draft.unpack().ks().iter().for_each(|&k| ks[usize::from(k)] += 1);
-                    asked[id.asker as usize] = id.next();
+                    asked[id.client_id as usize] = id.next();
                 }
                 Ok(_) => lost += 1,
                 Err(Unready::Finished | Unready::Wait(_)) => {}
@@ -177,7 +182,7 @@ fn what_never_arrived_counts_as_lost_once() {
     assert_eq!(replay.status().transitions_lost, 5, "between chunks");
     let goodbye = Goodbye {
         actor: 0,
-        epoch: 1,
+        incarnation: 1,
         produced: 30,
     };
     replay.goodbye(&goodbye);
@@ -189,7 +194,7 @@ fn what_never_arrived_counts_as_lost_once() {
     );
     let nothing_arrived = Goodbye {
         actor: 1,
-        epoch: 1,
+        incarnation: 1,
         produced: 3,
     };
     replay.goodbye(&nothing_arrived);
@@ -216,7 +221,7 @@ fn what_was_stored_and_never_produced_counts_as_duplicated() {
     assert_eq!(replay.status().transitions_duplicated, 2);
     replay.goodbye(&Goodbye {
         actor: 0,
-        epoch: 1,
+        incarnation: 1,
         produced: 9,
     });
     assert_eq!(replay.status().transitions_duplicated, 3);
@@ -224,7 +229,7 @@ fn what_was_stored_and_never_produced_counts_as_duplicated() {
         join(&mut replay, actor, 0);
         replay.goodbye(&Goodbye {
             actor,
-            epoch: 0,
+            incarnation: 0,
             produced: u64::MAX,
         });
     }
@@ -241,7 +246,7 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
     insert(&mut replay, header(0, 1, 0, 0));
     replay.goodbye(&Goodbye {
         actor: 0,
-        epoch: 1,
+        incarnation: 1,
         produced: 6,
     });
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
@@ -253,7 +258,7 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
     // Nor does its goodbye make it one.
     let goodbye = Goodbye {
         actor: 0,
-        epoch: 2,
+        incarnation: 2,
         produced: 6,
     };
     replay.goodbye(&goodbye);
@@ -267,9 +272,15 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
         is_refused(&insert(&mut replay, header(0, 1, 0, 0))),
         "a past life"
     );
-    let again = replay.join_actor(ActorJoin { actor: 0, epoch: 2 });
+    let again = replay.join_actor(ActorJoin {
+        actor: 0,
+        incarnation: 2,
+    });
     assert_eq!(again, Ok(1), "one life before it");
-    let back = ActorJoin { actor: 0, epoch: 1 };
+    let back = ActorJoin {
+        actor: 0,
+        incarnation: 1,
+    };
     assert!(
         replay.join_actor(back).is_err(),
         "and it does not come back"
@@ -293,7 +304,7 @@ fn what_a_replaced_life_could_not_deliver_counts_as_lost() {
     assert!(is_refused(&insert(&mut replay, header(0, 1, 1, 6))));
     let last_word = Goodbye {
         actor: 0,
-        epoch: 1,
+        incarnation: 1,
         produced: 18,
     };
     replay.goodbye(&last_word);
@@ -307,9 +318,9 @@ fn a_claim_says_what_became_of_a_chunk() {
     let mut config = unlimited(1000);
     config.transitions_max = Some(12);
     let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
-    let claim = |epoch, sequence| Claim {
+    let claim = |incarnation, sequence| Claim {
         actor: 0,
-        epoch,
+        incarnation,
         sequence,
         leaving: false,
     };
@@ -449,7 +460,7 @@ fn actors_and_streams_are_bounded() {
     let one_more = ACTORS_MAX as u32;
     let join = ActorJoin {
         actor: one_more,
-        epoch: 1,
+        incarnation: 1,
     };
     assert!(replay.join_actor(join).is_err());
     assert!(is_refused(
@@ -457,7 +468,7 @@ fn actors_and_streams_are_bounded() {
     ));
     replay.goodbye(&Goodbye {
         actor: one_more,
-        epoch: 1,
+        incarnation: 1,
         produced: 6,
     });
     assert_eq!(replay.status().transitions_lost, 0);
@@ -526,7 +537,7 @@ fn the_run_ends_when_all_is_in_and_sampled() {
     );
     replay.goodbye(&Goodbye {
         actor: 0,
-        epoch: 1,
+        incarnation: 1,
         produced: 12,
     });
     assert_eq!(replay.status().transitions_lost, 0);

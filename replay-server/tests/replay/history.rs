@@ -18,7 +18,7 @@ pub(crate) struct Record {
     pub(crate) weights_version: u64,
 }
 
-/// (actor, epoch, stream, part): a part ends where transitions were lost.
+/// (actor, incarnation, stream, part): a part ends where transitions were lost.
 pub(crate) type StreamKey = (u8, u8, u8, u8);
 
 /// Everything that was stored.
@@ -123,7 +123,7 @@ impl History {
         self.inserted.saturating_sub(self.capacity)
     }
 
-    /// Makes the next chunk of an epoch, `part` of it, and writes it down as if stored.
+    /// Makes the next chunk of an incarnation, `part` of it, and writes it down as if stored.
     pub(crate) fn next_chunk(
         &mut self,
         header: ChunkHeader,
@@ -132,7 +132,12 @@ impl History {
     ) -> Chunk {
         let mut chunk = Chunk::zeroed(header);
         for stream in 0..header.streams {
-            let key = (header.actor as u8, header.epoch as u8, stream as u8, part);
+            let key = (
+                header.actor as u8,
+                header.incarnation as u8,
+                stream as u8,
+                part,
+            );
             let records = self.streams.entry(key).or_default();
             for step in 0..header.steps {
                 let row = (stream * header.steps + step) as usize;

@@ -201,7 +201,7 @@ fn the_k_served_follow_the_law() {
     for sequence in 0..20 {
         let header = ChunkHeader {
             actor: 0,
-            epoch: 1,
+            incarnation: 1,
             sequence,
             first_transition: sequence * 10,
             weights_version: 0,
@@ -231,7 +231,7 @@ fn the_k_served_follow_the_law() {
         let mut counts: HashMap<_, Vec<u64>> = HashMap::new();
         for _ in 0..600 {
             let batch = replay.sample(64).unwrap();
-            for (row, state) in batch.frames_t().chunks(spec.state_bytes()).enumerate() {
+            for (row, state) in batch.states_t().chunks(spec.state_bytes()).enumerate() {
                 let (key, t) = identity(&spec, state);
                 let h = history.row(key, t).steps_left;
                 assert_eq!(batch.ks()[row] > 0, h > 0);

@@ -15,9 +15,7 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
     (config.slack_transitions, config.transitions_max) = (12, Some(180));
     let spec = small_spec();
     // Updates of 8 rows, 2 transitions each: 60 + 2 * 30 = 120 of 180 transitions were in.
-    let mut replay = Replay::new(&spec, &config, 8)
-        .unwrap()
-        .going_on_after(30, 0);
+    let mut replay = Replay::new(&spec, &config, 8).unwrap().resumed_at(30, 0);
     let status = replay.status();
     assert_eq!(
         (status.transitions_inserted, status.rows_sampled),
@@ -62,7 +60,7 @@ fn shards_share_what_a_resumed_run_has_behind_it() {
     let spec = small_spec();
     let behind = |shard| {
         let replay = Replay::shard(&spec, &config, 8, shard).unwrap();
-        let replay = replay.going_on_after(100, shard);
+        let replay = replay.resumed_at(100, shard);
         assert_eq!(replay.inserted_total(), 200, "each knows of the others");
         let status = replay.status();
         (status.transitions_inserted, status.rows_sampled)

@@ -16,7 +16,7 @@ use driml_learner::{
     LearnerPart,
     remote::batch_source::{BatchSource, Next, Requests},
 };
-use driml_protocol::{Keys, Shutdown};
+use driml_protocol::{Keys, RunClient, Shutdown};
 use driml_settings::config::RunConfig;
 use zenoh::{Session, Wait};
 
@@ -60,12 +60,11 @@ impl Actor<'_> {
         let mut settings = ActorSettings::from_toml(&self.config.to_toml())?;
         settings.actor.envs = self.streams;
         let spec_hash = settings.spec.hash();
+        let client = RunClient::new(session, keys, spec_hash);
         let pool = settings.chunk_memory();
-        let alive = taking_part::join_as_actor(&session, &keys, spec_hash, self.actor)?;
+        let alive = taking_part::join_as_actor(&client, self.actor)?;
         let delivery = Delivery::start(
-            session.clone(),
-            keys.clone(),
-            spec_hash,
+            client.clone(),
             0,
             DeliveryLimits::of(&settings.actor),
             pool.clone(),
@@ -73,9 +72,7 @@ impl Actor<'_> {
         )?;
         let mut chunks = self.recording.chunks(self.actor, (self.streams, 1), pool);
         let source = WeightsSource {
-            session: session.clone(),
-            keys,
-            spec_hash,
+            client: client.clone(),
         };
         let newest = source.watch(0, stop.clone())?;
         let started = Instant::now();
@@ -105,7 +102,8 @@ impl Actor<'_> {
         }
         delivery.finish()?;
         drop(alive);
-        session
+        client
+            .session()
             .close()
             .wait()
             .map_err(|e| anyhow::anyhow!("closing an actor's session: {e}"))
@@ -140,8 +138,10 @@ impl Learner<'_> {
         } = LearnerPart::from_toml(&self.config.to_toml())?;
         let spec_hash = spec.hash();
         let mut alive = Vec::new();
-        for session in &sessions {
-            alive.push(taking_part::join_as_learner(session, &keys, spec_hash)?);
+        let client = |session: &Session| RunClient::new(session.clone(), keys.clone(), spec_hash);
+        let clients: Vec<_> = sessions.iter().map(client).collect();
+        for client in &clients {
+            alive.push(taking_part::join_as_learner(client)?);
         }
         let requests = Requests {
             learner: taking_part::LEARNER,
@@ -151,7 +151,7 @@ impl Learner<'_> {
             unreachable_max: ANSWER_MAX,
         };
         let weights = vec![0; self.weights_bytes];
-        let mut source = BatchSource::start(&sessions, &keys, spec_hash, requests, stop)?;
+        let mut source = BatchSource::start(&clients, requests, stop)?;
         let mut due = Instant::now();
         let mut updates = 0;
         while !stop.wait_timeout(due.saturating_duration_since(Instant::now())) {
@@ -159,8 +159,8 @@ impl Learner<'_> {
                 updates += 1;
                 count.fetch_add(1, Ordering::Relaxed);
                 if !weights.is_empty() && updates % PUBLISH_PERIOD == 1 {
-                    for session in &sessions {
-                        taking_part::upload_weights(session, &keys, spec_hash, updates, &weights)?;
+                    for client in &clients {
+                        taking_part::upload_weights(client, updates, &weights)?;
                     }
                 }
             }

@@ -61,7 +61,7 @@ impl PackedChunk<'_> {
     /// Bytes of memory that it takes, roughly.
     pub(crate) fn bytes(&self) -> usize {
         let packed: usize = self.packed.iter().map(|run| run.bytes.len()).sum();
-        self.chunk.header.planes_bytes().unwrap_or(usize::MAX) + packed
+        self.chunk.header.payload_bytes().unwrap_or(usize::MAX) + packed
     }
 
     /// The frames of each stream.

@@ -1,0 +1,298 @@
+//! One process's connection to a run: what it asks, answers, announces and hears, each message at its own key.
+//! It decides neither what is asked nor how often: timeouts and retries are the caller's.
+
+use std::{marker::PhantomData, time::Duration};
+
+use zenoh::{
+    Session, Wait,
+    bytes::ZBytes,
+    liveliness::LivelinessToken,
+    pubsub::{Publisher, Subscriber},
+    qos::CongestionControl,
+    sample::Sample,
+};
+
+use crate::{
+    session::{self, PendingBytes, SessionError},
+    wire::{
+        buffers::{Buffer, BufferPool},
+        codec,
+        error::CodecError,
+        keys::{Alive, Keys},
+        message::{Keyed, Message, Request},
+    },
+};
+
+/// A session with a part of the run, the run's keys and its hash: all that a message needs to get there and be understood.
+/// Clones share the session.
+#[derive(Clone, Debug)]
+pub struct RunClient {
+    session: Session,
+    keys: Keys,
+    spec_hash: u64,
+}
+
+/// A message of type `M` as it travels; it may be sent several times.
+#[derive(Debug)]
+pub struct Sealed<M> {
+    bytes: ZBytes,
+    message: PhantomData<fn() -> M>,
+}
+
+impl<M> Clone for Sealed<M> {
+    fn clone(&self) -> Self {
+        Self {
+            bytes: self.bytes.clone(),
+            message: PhantomData,
+        }
+    }
+}
+
+impl<M: Message> Sealed<M> {
+    /// A message without a payload, for the run with this hash.
+    ///
+    /// # Errors
+    /// A message over the codec's limits.
+    pub fn new(message: &M, spec_hash: u64) -> Result<Self, CodecError> {
+        let bytes = codec::encode(spec_hash, message, &[])?;
+        Ok(Self {
+            bytes: bytes.into(),
+            message: PhantomData,
+        })
+    }
+
+    /// A message with a payload, which is not copied.
+    ///
+    /// # Errors
+    /// A message over the codec's limits.
+    pub fn with_payload(message: &M, payload: ZBytes, spec_hash: u64) -> Result<Self, CodecError> {
+        let head = codec::seal(spec_hash, message, &payload.to_bytes())?;
+        let mut writer = ZBytes::writer();
+        writer.append(ZBytes::from(head));
+        writer.append(payload);
+        Ok(Self {
+            bytes: writer.finish(),
+            message: PhantomData,
+        })
+    }
+
+    /// The bytes of prefix, header and payload.
+    pub fn into_bytes(self) -> ZBytes {
+        self.bytes
+    }
+}
+
+impl RunClient {
+    /// A client of the run whose keys these are and whose spec has this hash.
+    pub const fn new(session: Session, keys: Keys, spec_hash: u64) -> Self {
+        Self {
+            session,
+            keys,
+            spec_hash,
+        }
+    }
+
+    /// The session, for what is no message: closing it, liveliness of others.
+    pub const fn session(&self) -> &Session {
+        &self.session
+    }
+
+    /// The run's keys.
+    pub const fn keys(&self) -> &Keys {
+        &self.keys
+    }
+
+    /// The hash of the run's spec.
+    pub const fn spec_hash(&self) -> u64 {
+        self.spec_hash
+    }
+
+    /// Asks a request without payload and waits for its reply.
+    ///
+    /// # Errors
+    /// Nobody there, no reply in time, or one that cannot be read. All but the last may be tried again.
+    pub fn ask<R: Request>(
+        &self,
+        request: &R,
+        timeout: Duration,
+    ) -> Result<R::Reply, SessionError> {
+        self.send(self.seal(request)?, timeout)?.wait()
+    }
+
+    /// Fetches what is given to whoever asks, such as a status.
+    ///
+    /// # Errors
+    /// As [`RunClient::ask`].
+    pub fn fetch<M: Keyed>(&self, timeout: Duration) -> Result<M, SessionError> {
+        self.query::<M, M>(ZBytes::new(), timeout)?.wait()
+    }
+
+    /// A request that is ready to be sent, as often as need be.
+    ///
+    /// # Errors
+    /// A request over the codec's limits.
+    pub fn seal<R: Request>(&self, request: &R) -> Result<Sealed<R>, SessionError> {
+        Sealed::new(request, self.spec_hash).map_err(|why| self.too_large::<R>(why))
+    }
+
+    /// A request with a payload, which is not copied.
+    ///
+    /// # Errors
+    /// As [`RunClient::seal`].
+    pub fn seal_with<R: Request>(
+        &self,
+        request: &R,
+        payload: ZBytes,
+    ) -> Result<Sealed<R>, SessionError> {
+        let sealed = Sealed::with_payload(request, payload, self.spec_hash);
+        sealed.map_err(|why| self.too_large::<R>(why))
+    }
+
+    fn too_large<R: Request>(&self, why: CodecError) -> SessionError {
+        let key = self.keys.of::<R>();
+        SessionError::TooLarge { key, why }
+    }
+
+    /// Sends a request; requests of one priority arrive in the order in which they were sent.
+    ///
+    /// # Errors
+    /// zenoh refused. It may be tried again.
+    pub fn send<R: Request>(
+        &self,
+        request: Sealed<R>,
+        timeout: Duration,
+    ) -> Result<PendingReply<R::Reply>, SessionError> {
+        self.query::<R, R::Reply>(request.bytes, timeout)
+    }
+
+    fn query<K: Keyed, M: Message>(
+        &self,
+        payload: ZBytes,
+        timeout: Duration,
+    ) -> Result<PendingReply<M>, SessionError> {
+        let key = self.keys.of::<K>();
+        let bytes = session::send(&self.session, &key, payload, K::PRIORITY, timeout)?;
+        Ok(PendingReply {
+            bytes,
+            spec_hash: self.spec_hash,
+            message: PhantomData,
+        })
+    }
+
+    /// Declares where `M` is announced.
+    ///
+    /// # Errors
+    /// zenoh refused.
+    pub fn announce<M: Keyed>(&self) -> zenoh::Result<Announcer<M>> {
+        let publisher = self
+            .session
+            .declare_publisher(self.keys.of::<M>())
+            .congestion_control(CongestionControl::Drop)
+            .priority(M::PRIORITY)
+            .wait()?;
+        Ok(Announcer {
+            publisher,
+            spec_hash: self.spec_hash,
+            message: PhantomData,
+        })
+    }
+
+    /// Calls `hear` at each announcement of `M`, until the result is dropped. It is called on the thread that reads the socket,
+    /// so it must not wait.
+    ///
+    /// # Errors
+    /// zenoh refused.
+    pub fn subscribe<M: Keyed>(
+        &self,
+        hear: impl Fn(Result<M, CodecError>) + Send + Sync + 'static,
+    ) -> zenoh::Result<Subscriber<()>> {
+        let spec_hash = self.spec_hash;
+        self.session
+            .declare_subscriber(self.keys.of::<M>())
+            .callback(move |sample: Sample| {
+                let bytes = sample.payload().to_bytes();
+                hear(codec::decode(&bytes, Some(spec_hash)).map(|(message, _)| message));
+            })
+            .wait()
+    }
+
+    /// Lets others see that `who` is connected, until the result is dropped.
+    ///
+    /// # Errors
+    /// zenoh refused.
+    pub fn declare_alive(&self, who: Alive) -> zenoh::Result<LivelinessToken> {
+        let token = self.session.liveliness();
+        token.declare_token(self.keys.alive_key(who)).wait()
+    }
+}
+
+/// Where messages of type `M` are announced. One that is dropped on the way is not sent again.
+#[derive(Debug)]
+pub struct Announcer<M> {
+    publisher: Publisher<'static>,
+    spec_hash: u64,
+    message: PhantomData<fn() -> M>,
+}
+
+impl<M: Message> Announcer<M> {
+    /// Announces a message to all who listen now.
+    ///
+    /// # Errors
+    /// A message over the codec's limits, or zenoh refused.
+    pub fn put(&self, message: &M) -> zenoh::Result<()> {
+        let sealed = Sealed::new(message, self.spec_hash)?;
+        self.publisher.put(sealed.bytes).wait()
+    }
+}
+
+/// A reply that is to come.
+#[derive(Debug)]
+pub struct PendingReply<M> {
+    bytes: PendingBytes,
+    spec_hash: u64,
+    message: PhantomData<fn() -> M>,
+}
+
+impl<M: Message> PendingReply<M> {
+    /// Waits for the reply, which has no payload.
+    ///
+    /// # Errors
+    /// As [`RunClient::ask`].
+    pub fn wait(self) -> Result<M, SessionError> {
+        let key = self.bytes.key().to_owned();
+        let bytes = self.bytes.wait()?;
+        decode(&key, &bytes, self.spec_hash)
+    }
+
+    /// Waits for the reply, at most for `wait_max`; `None` if it has not come by then.
+    ///
+    /// # Errors
+    /// As [`RunClient::ask`].
+    pub fn wait_within(&self, wait_max: Duration) -> Result<Option<M>, SessionError> {
+        let bytes = self.bytes.wait_within(wait_max)?;
+        bytes
+            .map(|bytes| decode(self.bytes.key(), &bytes, self.spec_hash))
+            .transpose()
+    }
+
+    /// Waits for the reply and copies its payload into own memory of `pool`.
+    ///
+    /// # Errors
+    /// As [`RunClient::ask`].
+    pub fn receive(self, pool: &BufferPool) -> Result<(M, Buffer), SessionError> {
+        let key = self.bytes.key().to_owned();
+        let bytes = self.bytes.wait()?;
+        codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))
+            .map_err(|why| SessionError::Unreadable { key, why })
+    }
+}
+
+fn decode<M: Message>(key: &str, bytes: &ZBytes, spec_hash: u64) -> Result<M, SessionError> {
+    match codec::decode(&bytes.to_bytes(), Some(spec_hash)) {
+        Ok((message, _)) => Ok(message),
+        Err(why) => Err(SessionError::Unreadable {
+            key: key.into(),
+            why,
+        }),
+    }
+}

@@ -1,0 +1,23 @@
+//! What each replay server counts and tells the others of, by way of the learner, so that their rate limiters decide as one.
+
+use serde::{Deserialize, Serialize};
+
+/// What the rate limiter counts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Tally {
+    /// Transitions stored.
+    pub inserted: u64,
+    /// Rows sampled.
+    pub rows_sampled: u64,
+}
+
+impl std::ops::Add for Tally {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            inserted: self.inserted.saturating_add(other.inserted),
+            rows_sampled: self.rows_sampled.saturating_add(other.rows_sampled),
+        }
+    }
+}

@@ -1,0 +1,66 @@
+//! Why bytes from another process were refused: each fault with a sentence, and what to do where something can be done.
+//! A refused message is never a panic.
+
+/// Why bytes were refused. None of these is ever a panic.
+#[derive(Debug, thiserror::Error, PartialEq, Eq)]
+pub enum CodecError {
+    /// Fewer or more bytes than the prefix promises.
+    #[error(
+        "the message has {have} bytes, not the {need} that it needs: it was cut off or padded on the way"
+    )]
+    Length {
+        /// Bytes at hand.
+        have: usize,
+        /// Bytes expected.
+        need: usize,
+    },
+    /// Not one of our messages.
+    #[error(
+        "the message does not start with DRML: the sender is not part of DRIML, or the bytes were damaged"
+    )]
+    Magic,
+    /// Another protocol version.
+    #[error(
+        "the sender speaks protocol version {theirs}, this part version {ours}: run the same build of driml everywhere"
+    )]
+    Version {
+        /// The sender's.
+        theirs: u16,
+        /// Ours.
+        ours: u16,
+    },
+    /// Another kind than this place takes.
+    #[error("a message of kind {theirs} came where kind {ours} is expected")]
+    Kind {
+        /// The sender's.
+        theirs: u16,
+        /// Ours.
+        ours: u16,
+    },
+    /// Another run.
+    #[error(
+        "the message belongs to run spec {theirs:016x}, this part runs {ours:016x}: start every part with the same settings, or let actors and learner fetch them with --connect"
+    )]
+    RunSpec {
+        /// The sender's hash.
+        theirs: u64,
+        /// Ours.
+        ours: u64,
+    },
+    /// Damaged bytes.
+    #[error("the message's checksum is wrong: it was damaged on the way")]
+    Checksum,
+    /// A header that does not decode, or is inconsistent with its payload.
+    #[error("the message's header makes no sense: {0}")]
+    Header(String),
+    /// Larger than a message may be.
+    #[error(
+        "the message has {have} bytes, more than the {max} allowed: use smaller chunks or batches"
+    )]
+    TooLarge {
+        /// Bytes at hand.
+        have: usize,
+        /// The limit.
+        max: usize,
+    },
+}
