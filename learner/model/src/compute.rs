@@ -1,14 +1,14 @@
 //! Where tensors live, and which operations compute them.
-//! It computes nothing: this project's kernels are in `conv` and `linear`, candle's own operations in `stock`.
+//! It computes nothing: what computes is in `kernels`.
 
 use std::{fmt, str::FromStr};
 
 use candle_core::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
-use crate::{
+use crate::kernels::{
+    candle::{self, ConvLayerTensors},
     conv, linear,
-    stock::{self, ConvLayerTensors},
 };
 
 /// Which operations the network and the losses are made of. Both give the same up to rounding, gradients included.
@@ -37,14 +37,14 @@ impl Operations {
     ) -> candle_core::Result<Tensor> {
         match self {
             Self::Own => conv::conv_stack(images, layers),
-            Self::Stock => stock::conv_stack(images, layers),
+            Self::Stock => candle::conv_stack(images, layers),
         }
     }
 
     pub(crate) fn linear(self, x: &Tensor, w: &Tensor, b: &Tensor) -> candle_core::Result<Tensor> {
         match self {
             Self::Own => linear::linear(x, w, b),
-            Self::Stock => stock::linear(x, w, b),
+            Self::Stock => candle::linear(x, w, b),
         }
     }
 
@@ -56,14 +56,14 @@ impl Operations {
     ) -> candle_core::Result<Tensor> {
         match self {
             Self::Own => linear::linear_relu(x, w, b),
-            Self::Stock => stock::relu(&stock::linear(x, w, b)?),
+            Self::Stock => candle::relu(&candle::linear(x, w, b)?),
         }
     }
 
     pub(crate) fn relu(self, x: &Tensor) -> candle_core::Result<Tensor> {
         match self {
             Self::Own => linear::relu(x),
-            Self::Stock => stock::relu(x),
+            Self::Stock => candle::relu(x),
         }
     }
 }

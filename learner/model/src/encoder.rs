@@ -5,10 +5,10 @@ use candle_core::Tensor;
 
 use crate::compute::Operations;
 use crate::config::ModelConfig;
-use crate::dim_head::Head;
 use crate::error::Result;
+use crate::heads::dim::Head;
+use crate::parameters::Parameters;
 use crate::torso::Torso;
-use crate::weights::Parameters;
 
 /// The part of a network that encodes a state as psi_4(f4).
 ///

@@ -3,13 +3,13 @@
 
 use candle_core::Tensor;
 
-use crate::c51_head::C51Head;
 use crate::compute::Operations;
 use crate::config::ModelConfig;
-use crate::dim_head::{ActionEmbedding, Head};
 use crate::error::{ModelError, Result};
+use crate::heads::c51::C51Head;
+use crate::heads::dim::{ActionEmbedding, Head};
+use crate::parameters::Parameters;
 use crate::torso::Torso;
-use crate::weights::Parameters;
 
 /// What the torso makes of a batch of frames.
 #[derive(Clone, Debug)]

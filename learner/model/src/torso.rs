@@ -7,8 +7,8 @@ use rayon::prelude::*;
 use crate::compute::Operations;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::linear::floats;
-use crate::weights::Parameters;
+use crate::kernels::linear::floats;
+use crate::parameters::Parameters;
 
 #[derive(Debug)]
 pub(crate) struct Torso {

@@ -4,7 +4,7 @@
 use candle_core::{Result, Tensor, bail};
 use driml_model::Operations;
 
-use super::{scalar_op::scalar_op, stock};
+use super::{candle, scalar_op::scalar_op};
 
 /// Mean over rows of `KL(target || softmax(logits of the taken action))`, and its gradient.
 ///
@@ -95,7 +95,7 @@ pub fn kl_loss(
         );
     }
     if operations == Operations::Stock {
-        return stock::kl_loss(logits, action, target);
+        return candle::kl_loss(logits, action, target);
     }
     let action = action.to_vec();
     scalar_op("c51-kl", logits, move |logits, gradient| {

@@ -5,7 +5,7 @@ use candle_core::{Result, Tensor, bail};
 use driml_model::Operations;
 use rayon::prelude::*;
 
-use super::{scalar_op::scalar_op, scores::Scores, stock};
+use super::{candle, scalar_op::scalar_op, scores::Scores};
 
 /// InfoNCE of every valid row against every valid row of its batch, at each location, and its gradient.
 ///
@@ -105,7 +105,7 @@ pub fn info_nce_loss(
         );
     }
     if operations == Operations::Stock {
-        return stock::info_nce_loss(dots, valid, scores);
+        return candle::info_nce_loss(dots, valid, scores);
     }
     let valid = valid.to_vec();
     scalar_op("info-nce", dots, move |dots, gradient| {

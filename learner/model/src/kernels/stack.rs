@@ -5,7 +5,7 @@ use std::cell::RefCell;
 use std::sync::{Mutex, PoisonError};
 
 use crate::geometry::ConvShape;
-use crate::im2col::{ConvGradients, ConvScratch, Images, backward, forward, grown};
+use crate::kernels::im2col::{ConvGradients, ConvScratch, Images, backward, forward, grown};
 
 /// Spare buffers kept for later passes; more are given back to the allocator.
 const SPARE_MAX: usize = 64;

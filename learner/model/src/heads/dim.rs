@@ -8,7 +8,7 @@ use candle_core::{DType, Tensor};
 use crate::compute::Operations;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::weights::Parameters;
+use crate::parameters::Parameters;
 
 /// A residual block on features, to which an action's embedding may be joined.
 #[derive(Debug)]

@@ -11,9 +11,11 @@ use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result, Shape, Tensor, b
 use rayon::prelude::*;
 
 use crate::geometry::{ConvLayer, ConvShape};
-use crate::im2col::Images;
-use crate::linear::{add_in_order, cpu, floats};
-use crate::stack::{Between, layers, parameters_len, stack_backward, stack_forward, unpacked};
+use crate::kernels::im2col::Images;
+use crate::kernels::linear::{add_in_order, cpu, floats};
+use crate::kernels::stack::{
+    Between, layers, parameters_len, stack_backward, stack_forward, unpacked,
+};
 
 /// Images that one task takes. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_IMAGES: usize = 16;

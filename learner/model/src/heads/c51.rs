@@ -10,8 +10,8 @@ use rayon::prelude::*;
 use crate::compute::Operations;
 use crate::config::ModelConfig;
 use crate::error::Result;
-use crate::linear::floats;
-use crate::weights::Parameters;
+use crate::kernels::linear::floats;
+use crate::parameters::Parameters;
 
 /// Distributions that one task takes.
 const TASK_DISTRIBUTIONS: usize = 256;
