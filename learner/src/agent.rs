@@ -136,11 +136,11 @@ impl Agent {
                 "the objective uses {needed:?}, the model builds {built:?}"
             )));
         }
-        let operations = compute.operations;
+        let kernels = compute.kernels;
         let auxiliary = settings.auxiliary()?;
         let key = match (auxiliary.key_tau(), key) {
             (None, None) => None,
-            (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, operations, key)?),
+            (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, kernels, key)?),
             (wanted, _) => {
                 let there = if wanted.is_some() { "missing" } else { "there" };
                 let objective = settings.objective.name();
@@ -150,10 +150,10 @@ impl Agent {
             }
         };
         Ok(Self {
-            online_network: Network::with_operations(&model, &online, operations)?,
-            target_network: Network::with_operations(&model.without_dim(), &target, operations)?,
+            online_network: Network::with_kernels(&model, &online, kernels)?,
+            target_network: Network::with_kernels(&model.without_dim(), &target, kernels)?,
             key,
-            adam: Adam::new(settings.adam, &online, operations)?,
+            adam: Adam::new(settings.adam, &online, kernels)?,
             compute: compute.clone(),
             auxiliary,
             updates: 0,
@@ -252,7 +252,7 @@ impl Agent {
             &logits,
             batch.action,
             target_projection.clone(),
-            self.compute.operations,
+            self.compute.kernels,
         )?;
         let auxiliary = self.auxiliary.losses(&LossInputs {
             online: &self.online_network,
@@ -290,7 +290,7 @@ impl Agent {
     /// # Errors
     /// As [`Agent::update`].
     pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
-        let norm = gradients.norm(self.compute.operations)?;
+        let norm = gradients.norm(self.compute.kernels)?;
         self.adam.step(
             &self.online,
             gradients,
@@ -304,8 +304,8 @@ impl Agent {
             .updates
             .is_multiple_of(self.settings.target_period_updates)
         {
-            let (tau, operations) = (self.settings.target_tau, self.compute.operations);
-            target::follow(&self.target, &self.online, tau, operations)?;
+            let (tau, kernels) = (self.settings.target_tau, self.compute.kernels);
+            target::follow(&self.target, &self.online, tau, kernels)?;
         }
         Ok(norm)
     }

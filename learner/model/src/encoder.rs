@@ -3,7 +3,7 @@
 
 use candle_core::Tensor;
 
-use crate::compute::Operations;
+use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::Result;
 use crate::heads::dim::Head;
@@ -29,15 +29,11 @@ impl Encoder {
     ///
     /// # Errors
     /// An invalid configuration, or a parameter that is missing.
-    pub fn new(
-        config: &ModelConfig,
-        parameters: &Parameters,
-        operations: Operations,
-    ) -> Result<Self> {
+    pub fn new(config: &ModelConfig, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         config.validate()?;
         Ok(Self {
-            torso: Torso::new(config, parameters, operations)?,
-            psi4: Head::new("dim.psi4", config.hidden, parameters, operations)?,
+            torso: Torso::new(config, parameters, kernels)?,
+            psi4: Head::new("dim.psi4", config.hidden, parameters, kernels)?,
         })
     }
 

@@ -19,7 +19,7 @@ mod parameters;
 mod policy;
 mod torso;
 
-pub use compute::{Compute, DeviceError, DeviceName, Operations};
+pub use compute::{Compute, DeviceError, DeviceName, Kernels};
 pub use config::{DimParts, ModelConfig};
 pub use encoder::Encoder;
 pub use error::{ModelError, Result};

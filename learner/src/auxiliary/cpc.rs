@@ -78,7 +78,7 @@ impl AuxiliaryLoss for Cpc {
             for ((sum, all_dots), dots) in sums.iter_mut().zip(&mut all_dots).zip(dots) {
                 if let Some(dots) = dots {
                     let scores = self.pairs.scores(dots.rkhs);
-                    let loss = info_nce_loss(&dots.dots, &all, scores, online.operations())?;
+                    let loss = info_nce_loss(&dots.dots, &all, scores, online.kernels())?;
                     *sum = Some(match sum.take() {
                         Some(sum) => (sum + loss)?,
                         None => loss,

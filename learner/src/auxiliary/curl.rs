@@ -102,7 +102,7 @@ impl AuxiliaryLoss for Curl {
         let dots = dim::global_dots(&query, &keys)?;
         let all = vec![1; inputs.batch.rows];
         let scores = Scores::new(dots.rkhs, self.tanh_clip);
-        let loss = info_nce_loss(&dots.dots, &all, scores, inputs.online.operations())?;
+        let loss = info_nce_loss(&dots.dots, &all, scores, inputs.online.kernels())?;
         Ok(vec![WeightedLoss {
             name: "curl",
             weight: self.weight,

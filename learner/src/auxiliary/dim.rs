@@ -81,7 +81,7 @@ impl Dim {
         valid: &[u8],
         network: &Network,
     ) -> candle_core::Result<Tensor> {
-        info_nce_loss(dots, valid, self.scores(*rkhs), network.operations())
+        info_nce_loss(dots, valid, self.scores(*rkhs), network.kernels())
     }
 
     /// How dot products of vectors of `rkhs` numbers become scores.

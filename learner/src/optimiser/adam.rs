@@ -10,7 +10,7 @@ use std::{
 };
 
 use candle_core::{CpuStorage, DType, Device, InplaceOp2, Layout, Tensor, Var, bail};
-use driml_model::{Operations, Parameters};
+use driml_model::{Kernels, Parameters};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -69,13 +69,13 @@ enum Moments {
 }
 
 impl Moments {
-    fn new(m: &Tensor, v: &Tensor, operations: Operations) -> candle_core::Result<Self> {
-        Ok(match operations {
-            Operations::Own => Self::Fused {
+    fn new(m: &Tensor, v: &Tensor, kernels: Kernels) -> candle_core::Result<Self> {
+        Ok(match kernels {
+            Kernels::Fused => Self::Fused {
                 m: m.flatten_all()?.to_vec1()?,
                 v: v.flatten_all()?.to_vec1()?,
             },
-            Operations::Stock => Self::Tensors {
+            Kernels::Candle => Self::Tensors {
                 m: m.clone(),
                 v: v.clone(),
             },
@@ -99,7 +99,7 @@ impl Moments {
 pub struct Adam {
     settings: AdamSettings,
     step: u64,
-    operations: Operations,
+    kernels: Kernels,
     /// By name, with the parameter's shape.
     moments: BTreeMap<String, (Vec<usize>, Moments)>,
 }
@@ -112,18 +112,18 @@ impl Adam {
     pub fn new(
         settings: AdamSettings,
         parameters: &Parameters,
-        operations: Operations,
+        kernels: Kernels,
     ) -> Result<Self, UpdateError> {
         let mut moments = BTreeMap::new();
         for (name, var) in parameters.iter() {
             let zeros = var.zeros_like()?;
-            let both = Moments::new(&zeros, &zeros, operations)?;
+            let both = Moments::new(&zeros, &zeros, kernels)?;
             moments.insert(name.to_owned(), (var.dims().to_vec(), both));
         }
         Ok(Self {
             settings,
             step: 0,
-            operations,
+            kernels,
             moments,
         })
     }
@@ -245,7 +245,7 @@ impl Adam {
                 }
                 Ok(tensor.to_device(device)?)
             };
-            *moments = Moments::new(&take("m")?, &take("v")?, self.operations)?;
+            *moments = Moments::new(&take("m")?, &take("v")?, self.kernels)?;
         }
         if let Some(name) = tensors.keys().min() {
             return Err(UpdateError::State(format!(

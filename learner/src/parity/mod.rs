@@ -263,12 +263,12 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
     // An objective that does not take every pair is taken as it is.
     let loss = objective.loss(&every).or_else(|_| settings.auxiliary())?;
     let model = case.model(loss.heads(settings.condition_on_action));
-    let (device, operations) = (&compute.device, compute.operations);
+    let (device, kernels) = (&compute.device, compute.kernels);
     let named = case.parameters("online.", &model);
     let parameters = Parameters::from_tensors(&model, named, device)?;
-    let online = Network::with_operations(&model, &parameters, operations)?;
+    let online = Network::with_kernels(&model, &parameters, kernels)?;
     let key = match (loss.key_tau(), key_parameters(case, &model, compute)?) {
-        (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, operations, key)?),
+        (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, kernels, key)?),
         _ => None,
     };
     let batch = case.batch();
