@@ -10,7 +10,7 @@ use driml_learner::{
     AdamSettings, Agent, Augment, AugmentSettings, Batch, Lambda, LearnerSettings, Objective,
     auxiliary::{cpc, curl, dim},
 };
-use driml_model::{Compute, ConvLayer, DimParts, ModelConfig};
+use driml_model::{Compute, ConvLayer, DimHeads, ModelConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -60,9 +60,9 @@ fn agent(objective: Objective, lambda: Lambda) -> Agent {
         hidden: 512,
         rkhs: 512,
         action_embed: 64,
-        dim: DimParts::NONE,
+        dim: DimHeads::NONE,
     };
-    model.dim = settings.dim_parts(ACTIONS);
+    model.dim = settings.dim_heads(ACTIONS);
     Agent::new(
         model,
         settings,
@@ -78,7 +78,7 @@ fn frames(rows: usize, seed: u64) -> Vec<u8> {
 }
 
 fn updates(criterion: &mut Criterion) {
-    let (frames_t, frames_k, frames_n) = (frames(ROWS, 2), frames(CPC * ROWS, 3), frames(ROWS, 4));
+    let (states_t, states_k, states_n) = (frames(ROWS, 2), frames(CPC * ROWS, 3), frames(ROWS, 4));
     let anchors = frames(ROWS, 5);
     let action: Vec<u8> = (0..ROWS).map(|row| (row % ACTIONS) as u8).collect();
     let n_step_return: Vec<f32> = (0..ROWS).map(|row| row as f32 / 64.0 - 2.0).collect();
@@ -116,11 +116,11 @@ fn updates(criterion: &mut Criterion) {
         );
         let batch = Batch {
             rows: ROWS,
-            frames_t: &frames_t,
+            states_t: &states_t,
             anchors: augmented.then_some(anchors.as_slice()),
             positives,
-            frames_k: &frames_k[..positives * ROWS * STATE_BYTES],
-            frames_n: &frames_n,
+            states_k: &states_k[..positives * ROWS * STATE_BYTES],
+            states_n: &states_n,
             action: &action,
             next_action: &action,
             n_step_return: &n_step_return,

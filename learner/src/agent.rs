@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use candle_core::Tensor;
-use driml_model::{Compute, DimParts, ModelConfig, Network, Parameters};
+use driml_model::{Compute, DimHeads, ModelConfig, Network, Parameters};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
@@ -126,11 +126,11 @@ impl Agent {
             target,
             key,
         } = parameters;
-        let built = DimParts {
+        let built = DimHeads {
             action: model.dim.embeds_action(),
             ..model.dim
         };
-        let needed = settings.dim_parts(model.num_actions);
+        let needed = settings.dim_heads(model.num_actions);
         if needed != built {
             return Err(UpdateError::Settings(format!(
                 "the objective uses {needed:?}, the model builds {built:?}"
@@ -245,7 +245,7 @@ impl Agent {
 
         let features_t = self
             .online_network
-            .features(&self.states(batch.frames_t)?)?;
+            .features(&self.states(batch.states_t)?)?;
         let logits = self.online_network.logits(&features_t.f4)?;
         let q_values_t = self.online_network.q_values(&logits.detach())?;
         let kl = kl_loss(
@@ -319,11 +319,11 @@ impl Agent {
             v_max,
             ..
         } = self.model;
-        let frames_n = self.states(batch.frames_n)?;
-        let target_logits = distribution(&self.target_network, &frames_n)?;
+        let states_n = self.states(batch.states_n)?;
+        let target_logits = distribution(&self.target_network, &states_n)?;
         let next_q_values = if self.settings.double_dqn {
             self.online_network
-                .q_values(&distribution(&self.online_network, &frames_n)?)?
+                .q_values(&distribution(&self.online_network, &states_n)?)?
         } else {
             self.target_network.q_values(&target_logits)?
         };

@@ -10,21 +10,21 @@ pub const NO_ACTION: u8 = 255;
 
 /// Rows (s_t, a_t, a_{t+1}, n-step return, discount, s_{t+k}, s_{t+n}), plane by plane; B rows each.
 ///
-/// For CURL, whose positive is no later state, `anchors` and `frames_k` are two views of s_t.
+/// For CURL, whose positive is no later state, `anchors` and `states_k` are two views of s_t.
 #[derive(Clone, Copy, Debug)]
 pub struct Batch<'a> {
     /// Rows, B, at least 1.
     pub rows: usize,
     /// s_t [B, H, W, C].
-    pub frames_t: &'a [u8],
-    /// s_t as the auxiliary objective sees it, augmented [B, H, W, C]; `None` where that is `frames_t`.
+    pub states_t: &'a [u8],
+    /// s_t as the auxiliary objective sees it, augmented [B, H, W, C]; `None` where that is `states_t`.
     pub anchors: Option<&'a [u8]>,
     /// Positives of a row, P; 0 where the agent has no use for any.
     pub positives: usize,
     /// s_{t+k} as the auxiliary objective sees it [P, B, H, W, C].
-    pub frames_k: &'a [u8],
+    pub states_k: &'a [u8],
     /// s_{t+n} [B, H, W, C].
-    pub frames_n: &'a [u8],
+    pub states_n: &'a [u8],
     /// a_t [B].
     pub action: &'a [u8],
     /// a_{t+1} [B], or [`NO_ACTION`].
@@ -56,12 +56,12 @@ impl Batch<'_> {
                 wants.wanted_words()
             ));
         }
-        let anchors = self.anchors.unwrap_or(self.frames_t);
+        let anchors = self.anchors.unwrap_or(self.states_t);
         for (name, length, row_length) in [
-            ("frames_t", self.frames_t.len(), state_bytes),
+            ("states_t", self.states_t.len(), state_bytes),
             ("anchors", anchors.len(), state_bytes),
-            ("frames_k", self.frames_k.len(), positives * state_bytes),
-            ("frames_n", self.frames_n.len(), state_bytes),
+            ("states_k", self.states_k.len(), positives * state_bytes),
+            ("states_n", self.states_n.len(), state_bytes),
             ("action", self.action.len(), 1),
             ("next_action", self.next_action.len(), 1),
             ("n_step_return", self.n_step_return.len(), 1),

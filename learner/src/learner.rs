@@ -170,7 +170,7 @@ impl Learner {
                 *states = larger;
             }
         }
-        let [frames_t, mut frames_k, frames_n] = frames;
+        let [states_t, mut states_k, states_n] = frames;
         let (mut positives, mut valid) = (batch.positives(), batch.positive_valid());
         let mut anchors = None;
         // Kept only if the update succeeds.
@@ -180,21 +180,21 @@ impl Learner {
             if self.part.learner.update.objective.positives() == Positives::OtherView {
                 // Two views of the same state; every row has them.
                 all_valid = vec![1; batch.rows()];
-                (frames_k, positives, valid) = (frames_t, 1, all_valid.as_slice());
+                (states_k, positives, valid) = (states_t, 1, all_valid.as_slice());
             }
             let [seen_t, seen_k] = &mut self.seen;
-            augment.apply(frames_t, seen_t, &mut rng);
-            augment.apply(frames_k, seen_k, &mut rng);
-            (anchors, frames_k) = (Some(seen_t.as_slice()), seen_k);
+            augment.apply(states_t, seen_t, &mut rng);
+            augment.apply(states_k, seen_k, &mut rng);
+            (anchors, states_k) = (Some(seen_t.as_slice()), seen_k);
         }
         let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
         let batch = Batch {
             rows: batch.rows(),
-            frames_t,
+            states_t,
             anchors,
             positives,
-            frames_k,
-            frames_n,
+            states_k,
+            states_n,
             action: batch.actions(),
             next_action: batch.next_actions(),
             n_step_return: &returns,

@@ -19,11 +19,11 @@
 //! let mut agent = Agent::new(model, settings, &Compute::CPU, rng)?;
 //! let report = agent.update(&Batch {
 //!     rows: 2,
-//!     frames_t: &[10; 2 * 8 * 8], // s_t, u8
+//!     states_t: &[10; 2 * 8 * 8], // s_t, u8
 //!     anchors: None,              // not augmented
 //!     positives: 1,
-//!     frames_k: &[20; 2 * 8 * 8], // s_{t+k}
-//!     frames_n: &[30; 2 * 8 * 8], // s_{t+n}
+//!     states_k: &[20; 2 * 8 * 8], // s_{t+k}
+//!     states_n: &[30; 2 * 8 * 8], // s_{t+n}
 //!     action: &[0, 1],
 //!     next_action: &[1, 1],
 //!     n_step_return: &[0.5, -0.5],

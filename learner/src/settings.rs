@@ -1,7 +1,7 @@
 //! Everything that one update depends on beside the network's sizes: the table `[learner.update]`.
 //! It fills in no number: presets do, with their sources.
 
-use driml_model::DimParts;
+use driml_model::DimHeads;
 use serde::{Deserialize, Deserializer, Serialize, de::Error};
 
 use crate::{
@@ -101,9 +101,9 @@ impl LearnerSettings {
 
     /// The heads that the online network needs in a world of `num_actions` actions; none where the settings cannot work, which
     /// [`LearnerSettings::validate`] says.
-    pub fn dim_parts(&self, num_actions: usize) -> DimParts {
+    pub fn dim_heads(&self, num_actions: usize) -> DimHeads {
         let action = self.condition_on_action && num_actions > 1;
         let loss = self.auxiliary();
-        loss.map_or(DimParts::NONE, |loss| loss.heads(action))
+        loss.map_or(DimHeads::NONE, |loss| loss.heads(action))
     }
 }

@@ -91,14 +91,14 @@ impl MadeUp {
     }
 
     pub(super) fn batch(&self) -> Batch<'_> {
-        let [frames_t, frames_k, frames_n] = &self.frames;
+        let [states_t, states_k, states_n] = &self.frames;
         Batch {
             rows: self.action.len(),
-            frames_t,
+            states_t,
             anchors: None,
             positives: 1,
-            frames_k,
-            frames_n,
+            states_k,
+            states_n,
             action: &self.action,
             next_action: &self.next_action,
             n_step_return: &self.n_step_return,

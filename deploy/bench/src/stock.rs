@@ -78,7 +78,7 @@ impl StockLearner {
     /// A batch that does not fit.
     pub(super) fn update(&mut self, batch: &Batch<'_>) -> anyhow::Result<f32> {
         let (target, entropy) = self.projected(batch)?;
-        let f4_t = self.f4(&self.online, batch.frames_t)?;
+        let f4_t = self.f4(&self.online, batch.states_t)?;
         let logits = self.logits(&self.online, &f4_t)?;
         let taken = batch
             .action
@@ -95,7 +95,7 @@ impl StockLearner {
             .affine(-1.0 / batch.rows as f64, 0.0)?;
         let kl = cross.affine(1.0, -entropy)?;
 
-        let f4_k = self.f4(&self.online, batch.frames_k)?;
+        let f4_k = self.f4(&self.online, batch.states_k)?;
         let psi = self.head(
             "dim.psi4",
             &Tensor::cat(&[&f4_t, &self.embedded(batch.action)?], 1)?,
@@ -180,7 +180,7 @@ impl StockLearner {
     /// The projected target distributions [B, N] and their mean entropy: the part of the KL without a gradient.
     fn projected(&self, batch: &Batch<'_>) -> Result<(Tensor, f64)> {
         let (rows, atoms) = (batch.rows, self.model.atoms);
-        let f4_n = self.f4(&self.target, batch.frames_n)?;
+        let f4_n = self.f4(&self.target, batch.states_n)?;
         let probs = softmax(&self.logits(&self.target, &f4_n)?, D::Minus1)?.detach();
         let values = probs.broadcast_mul(&self.support)?.sum(D::Minus1)?;
         let best = values.argmax(1)?.reshape((rows, 1, 1))?;

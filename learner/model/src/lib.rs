@@ -20,7 +20,7 @@ mod policy;
 mod torso;
 
 pub use compute::{Compute, DeviceError, DeviceName, Kernels};
-pub use config::{DimParts, ModelConfig};
+pub use config::{DimHeads, ModelConfig};
 pub use encoder::Encoder;
 pub use error::{ModelError, Result};
 pub use geometry::{ConvLayer, ConvShape};

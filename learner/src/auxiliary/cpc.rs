@@ -4,7 +4,7 @@
 use std::{borrow::Cow, ops::Range};
 
 use candle_core::Tensor;
-use driml_model::{DimParts, Features, Network};
+use driml_model::{DimHeads, Features, Network};
 
 use super::{
     dim::{Dim, Vectors},
@@ -48,7 +48,7 @@ struct Offset {
 }
 
 impl AuxiliaryLoss for Cpc {
-    fn heads(&self, action: bool) -> DimParts {
+    fn heads(&self, action: bool) -> DimHeads {
         self.pairs.heads(action)
     }
 
@@ -65,7 +65,7 @@ impl AuxiliaryLoss for Cpc {
         let (online, valid) = (inputs.online, inputs.batch.positive_valid);
         let anchors = inputs.anchors()?;
         let later = if valid.iter().any(|&valid| valid != 0) {
-            Some(inputs.features(present(inputs.batch.frames_k, valid))?)
+            Some(inputs.features(present(inputs.batch.states_k, valid))?)
         } else {
             None
         };

@@ -7,7 +7,7 @@
 //! "exactly the same networks for measuring similarity (i.e. one residual block for CURL and CPC)", hence no bilinear
 //! product and no second head.
 
-use driml_model::DimParts;
+use driml_model::DimHeads;
 use serde::{Deserialize, Serialize};
 
 use super::{
@@ -72,10 +72,10 @@ struct Curl {
 
 impl AuxiliaryLoss for Curl {
     /// One head, of which the key encoder has its copy.
-    fn heads(&self, _action: bool) -> DimParts {
-        DimParts {
+    fn heads(&self, _action: bool) -> DimHeads {
+        DimHeads {
             psi4: true,
-            ..DimParts::NONE
+            ..DimHeads::NONE
         }
     }
 

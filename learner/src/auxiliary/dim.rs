@@ -2,7 +2,7 @@
 //! It holds no parameters (the model does) and does not mask beyond `positive_valid`.
 
 use candle_core::Tensor;
-use driml_model::{DimParts, Features, Network};
+use driml_model::{DimHeads, Features, Network};
 
 use super::{
     loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
@@ -91,8 +91,8 @@ impl Dim {
 }
 
 impl AuxiliaryLoss for Dim {
-    fn heads(&self, action: bool) -> DimParts {
-        self.lambda.dim_parts(action)
+    fn heads(&self, action: bool) -> DimHeads {
+        self.lambda.dim_heads(action)
     }
 
     fn passes(&self, positives: usize, augmented: bool) -> Passes {
@@ -102,7 +102,7 @@ impl AuxiliaryLoss for Dim {
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
         let (online, batch) = (inputs.online, inputs.batch);
         let anchors = inputs.anchors()?;
-        let later = inputs.features(batch.frames_k)?;
+        let later = inputs.features(batch.states_k)?;
         let wanted = self.lambda.wanted();
         let dots = dots(online, &anchors, &later, &inputs.action()?, wanted)?;
         let mut losses = Vec::new();

@@ -4,7 +4,7 @@
 use std::{borrow::Cow, fmt};
 
 use candle_core::{Device, Tensor};
-use driml_model::{DimParts, Features, ModelConfig, Network};
+use driml_model::{DimHeads, Features, ModelConfig, Network};
 
 use super::{
     key_encoder::KeyEncoder,
@@ -29,7 +29,7 @@ pub struct MenuItem {
 /// What an agent learns beside the return.
 pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
     /// The heads that the online network needs; `action` says whether Psi is given a_t.
-    fn heads(&self, action: bool) -> DimParts;
+    fn heads(&self, action: bool) -> DimHeads;
 
     /// For a loss with a key encoder (a moving average of torso and Psi_4): the online network's share in its move after each
     /// update, in (0, 1].
@@ -133,7 +133,7 @@ impl LossInputs<'_> {
     /// If the loss has no [`AuxiliaryLoss::key_tau`].
     pub fn keys(&self) -> Result<Tensor, UpdateError> {
         let key = self.key.expect("a loss with key_tau is given its encoder");
-        key.keys(&self.tensor(self.batch.frames_k)?)
+        key.keys(&self.tensor(self.batch.states_k)?)
     }
 
     /// a_t [B], on the CPU, where the network looks at them.

@@ -1,7 +1,7 @@
 //! What auxiliary losses take from the settings: weights, the scores' clip, and a table of each loss's own numbers.
 //! Which loss there is stands in `super`.
 
-use driml_model::DimParts;
+use driml_model::DimHeads;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::error::UpdateError;
@@ -55,11 +55,11 @@ impl Lambda {
     }
 
     /// The heads that the pairs with a weight above 0 need; `action` says whether psi is given a_t.
-    pub fn dim_parts(&self, action: bool) -> DimParts {
+    pub fn dim_heads(&self, action: bool) -> DimHeads {
         let [local_local, local_global, global_local, global_global] = self.wanted();
         let psi3 = local_local || local_global;
         let psi4 = global_local || global_global;
-        DimParts {
+        DimHeads {
             psi3,
             phi3: local_local || global_local,
             psi4,
@@ -141,7 +141,7 @@ mod tests {
             l4t4,
         };
         let parts = |lambda: Lambda| {
-            let p = lambda.dim_parts(true);
+            let p = lambda.dim_heads(true);
             [p.psi3, p.phi3, p.psi4, p.phi4, p.action]
         };
         assert_eq!(parts(lambda(0.0, 0.0, 0.0, 0.0)), [false; 5]);

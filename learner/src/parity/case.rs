@@ -9,7 +9,7 @@ use std::{
 };
 
 use candle_core::{DType, Device, Tensor};
-use driml_model::{ConvLayer, DimParts, ModelConfig};
+use driml_model::{ConvLayer, DimHeads, ModelConfig};
 use safetensors::SafeTensors;
 use serde::Deserialize;
 
@@ -194,7 +194,7 @@ impl Case {
             Ok(tensor.flatten_all()?.to_vec1()?)
         };
         let (mut positives, mut anchors) = (1, None);
-        let (frames_k, valid) = if self.settings.objective.positives() == Positives::OtherView {
+        let (states_k, valid) = if self.settings.objective.positives() == Positives::OtherView {
             anchors = Some(bytes("input.view_query", &state)?);
             (bytes("input.view_key", &state)?, vec![1; rows])
         } else {
@@ -209,9 +209,9 @@ impl Case {
                 bytes("input.positive_valid", &valid)?,
             )
         };
-        let frames_t = bytes("input.frames_t", &state)?;
-        let frames_n = bytes("input.frames_n", &state)?;
-        self.frames = [frames_t, frames_k, frames_n];
+        let states_t = bytes("input.frames_t", &state)?;
+        let states_n = bytes("input.frames_n", &state)?;
+        self.frames = [states_t, states_k, states_n];
         (self.positives, self.anchors, self.positive_valid) = (positives, anchors, valid);
         let actions: Vec<i64> = self.input("input.action", DType::I64, &[rows])?.to_vec1()?;
         let action = |action: i64| {
@@ -234,7 +234,7 @@ impl Case {
         Ok(())
     }
 
-    pub(super) fn model(&self, dim: DimParts) -> ModelConfig {
+    pub(super) fn model(&self, dim: DimHeads) -> ModelConfig {
         let Config {
             obs,
             actions,
@@ -266,14 +266,14 @@ impl Case {
     }
 
     pub(super) fn batch(&self) -> Batch<'_> {
-        let [frames_t, frames_k, frames_n] = &self.frames;
+        let [states_t, states_k, states_n] = &self.frames;
         Batch {
             rows: self.rows,
-            frames_t,
+            states_t,
             anchors: self.anchors.as_deref(),
             positives: self.positives,
-            frames_k,
-            frames_n,
+            states_k,
+            states_n,
             action: &self.action,
             next_action: &self.next_action,
             n_step_return: &self.n_step_return,
@@ -291,7 +291,7 @@ impl Case {
 
     /// The parameters under `prefix` that `model` builds: heads that no lambda uses are left out.
     pub(super) fn parameters(&self, prefix: &str, model: &ModelConfig) -> HashMap<String, Tensor> {
-        let DimParts {
+        let DimHeads {
             psi3,
             phi3,
             psi4,

@@ -9,7 +9,7 @@ use std::{
 };
 
 use candle_core::Tensor;
-use driml_model::{Compute, DimParts, Encoder, ModelConfig, Network, Parameters};
+use driml_model::{Compute, DimHeads, Encoder, ModelConfig, Network, Parameters};
 
 use case::Case;
 pub use case::ParityError;
@@ -115,8 +115,8 @@ pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityRep
 }
 
 fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError> {
-    let sizes = case.model(DimParts::NONE);
-    let model = case.model(case.settings.dim_parts(sizes.num_actions));
+    let sizes = case.model(DimHeads::NONE);
+    let model = case.model(case.settings.dim_heads(sizes.num_actions));
     let slow = model.without_dim();
     let device = &compute.device;
     let parameters = NetworkParameters {
@@ -272,7 +272,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
         _ => None,
     };
     let batch = case.batch();
-    let features_t = online.features(&states(&model, batch.frames_t, device)?)?;
+    let features_t = online.features(&states(&model, batch.states_t, device)?)?;
     let losses = loss.losses(&LossInputs {
         online: &online,
         model: &model,

@@ -86,7 +86,7 @@ impl BatchSource {
         let (sender, fetched) = mpsc::sync_channel(0);
         // A batch a thread, and the one that is learned from.
         let pool = PlanesPool::new(requests.in_flight as usize + sessions.len());
-        let making = Arc::new(Mutex::new(Making::new(sessions.len())));
+        let partial = Arc::new(Mutex::new(PartialBatch::new(sessions.len())));
         let mut threads = Vec::new();
         for i in 0..requests.in_flight {
             // Which rows come from which shard follows from the order of answers, so this need not be the run's.
@@ -94,7 +94,7 @@ impl BatchSource {
             let fetcher = Fetcher {
                 sessions: sessions.to_vec(),
                 keys: keys.clone(),
-                making: making.clone(),
+                partial: partial.clone(),
                 id: RequestId::first(rng.random()),
                 rng,
                 spec_hash,
@@ -149,7 +149,7 @@ impl BatchSource {
 
 /// The one batch that is put together from the parts of several shards. It outlives a failed try, because a part that was
 /// given is counted as sampled.
-struct Making {
+struct PartialBatch {
     counts: Vec<Count>,
     /// Rows that are still to come from each shard.
     pending: Vec<u32>,
@@ -158,7 +158,7 @@ struct Making {
     parts: Vec<Batch>,
 }
 
-impl Making {
+impl PartialBatch {
     fn new(shards: usize) -> Self {
         Self {
             counts: vec![Count::default(); shards],
@@ -172,7 +172,7 @@ impl Making {
 struct Fetcher {
     sessions: Vec<Session>,
     keys: Keys,
-    making: Arc<Mutex<Making>>,
+    partial: Arc<Mutex<PartialBatch>>,
     /// The request for a whole batch that comes next.
     id: RequestId,
     rng: ChaCha8Rng,
@@ -219,7 +219,7 @@ impl Fetcher {
     /// One batch; `None` where the replay has nothing yet.
     fn fetch(&mut self) -> anyhow::Result<Option<Fetched>> {
         if self.sessions.len() > 1 {
-            return self.fetch_parts();
+            return self.fetch_from_shards();
         }
         self.id = self.id.again();
         let asked = self.ask(0, self.id, self.requests.rows, None)?;
@@ -235,15 +235,15 @@ impl Fetcher {
 
     /// One batch, put together from what the shards give. One is put together at a time: each shard is told what the others
     /// give, so that their rate limiters decide as one.
-    fn fetch_parts(&mut self) -> anyhow::Result<Option<Fetched>> {
-        let making = self.making.clone();
-        let mut making = making.lock().unwrap_or_else(PoisonError::into_inner);
-        let Making {
+    fn fetch_from_shards(&mut self) -> anyhow::Result<Option<Fetched>> {
+        let partial = self.partial.clone();
+        let mut partial = partial.lock().unwrap_or_else(PoisonError::into_inner);
+        let PartialBatch {
             counts,
             pending,
             ids,
             parts,
-        } = &mut *making;
+        } = &mut *partial;
         if parts.is_empty() && pending.iter().all(|&rows| rows == 0) {
             match shards::split(self.requests.rows, counts, &mut self.rng) {
                 Some(split) => *pending = split,

@@ -7,7 +7,7 @@ use driml_learner::{
     AffinityConfig, Agent, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner,
     LearnerPart, LearnerSettings, NetworkParameters, Objective, UpdateError,
 };
-use driml_model::{Compute, DimParts, ModelConfig, Parameters};
+use driml_model::{Compute, DimHeads, ModelConfig, Parameters};
 use driml_protocol::{
     Batch as WireBatch, BatchHeader, Horizon, RunSpec, Tally, TimeoutRule, config::TransportConfig,
 };
@@ -52,7 +52,7 @@ fn of(objective: Objective, lambda: Lambda) -> (ModelConfig, LearnerSettings) {
         ..settings(lambda)
     };
     let model = ModelConfig {
-        dim: settings.dim_parts(4),
+        dim: settings.dim_heads(4),
         ..model(lambda)
     };
     (model, settings)
@@ -70,10 +70,10 @@ fn agent(objective: Objective, lambda: Lambda) -> Agent {
 }
 
 /// `rows` with `POSITIVES` positives a row; the batch borrows what `later` makes of them.
-fn cpc<'a>(rows: &'a Rows, frames_k: &'a [u8], valid: &'a [u8]) -> Batch<'a> {
+fn cpc<'a>(rows: &'a Rows, states_k: &'a [u8], valid: &'a [u8]) -> Batch<'a> {
     Batch {
         positives: POSITIVES,
-        frames_k,
+        states_k,
         positive_valid: valid,
         ..rows.batch()
     }
@@ -86,7 +86,7 @@ fn later(rows: &Rows) -> Vec<u8> {
 fn curl(rows: &Rows) -> Batch<'_> {
     Batch {
         anchors: Some(&rows.frames[1]),
-        frames_k: &rows.frames[2],
+        states_k: &rows.frames[2],
         ..rows.batch()
     }
 }
@@ -108,15 +108,15 @@ fn cpc_with_one_offset_is_dim() {
 #[test]
 fn cpc_is_the_mean_over_its_offsets() {
     let rows = Rows::random(6, 3);
-    let frames_k = later(&rows);
+    let states_k = later(&rows);
     let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 0], [0, 0, 0, 1, 0, 0]].concat();
     let agent = agent(CPC, ALL_DIM);
-    let all = agent.evaluate(&cpc(&rows, &frames_k, &valid)).unwrap();
+    let all = agent.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
     let mut sums = [0.0; 4];
     for (frames, valid) in rows.frames.iter().zip(valid.chunks(6)) {
         let batch = Batch {
             positives: 1,
-            frames_k: frames,
+            states_k: frames,
             positive_valid: valid,
             ..rows.batch()
         };
@@ -135,27 +135,27 @@ fn cpc_is_the_mean_over_its_offsets() {
 #[test]
 fn positives_that_are_missing_change_nothing() {
     let rows = Rows::random(6, 4);
-    let mut frames_k = later(&rows);
+    let mut states_k = later(&rows);
     let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]].concat();
     let agent = agent(CPC, ALL_DIM);
-    let before = agent.evaluate(&cpc(&rows, &frames_k, &valid)).unwrap();
-    let bytes = frames_k.len() / valid.len();
+    let before = agent.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
+    let bytes = states_k.len() / valid.len();
     for at in (0..valid.len()).filter(|&at| valid[at] == 0) {
-        frames_k[at * bytes..(at + 1) * bytes].fill(99);
+        states_k[at * bytes..(at + 1) * bytes].fill(99);
     }
-    let after = agent.evaluate(&cpc(&rows, &frames_k, &valid)).unwrap();
+    let after = agent.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
     assert_eq!((before.losses, before.total), (after.losses, after.total));
 }
 
 #[test]
 fn without_any_positive_cpc_learns_the_return() {
     let rows = Rows::random(5, 5);
-    let frames_k = later(&rows);
+    let states_k = later(&rows);
     for there in 0..2 {
         let mut valid = [0; 5 * POSITIVES];
         valid[..there].fill(1);
         let mut agent = agent(CPC, GLOBAL);
-        let report = agent.update(&cpc(&rows, &frames_k, &valid)).unwrap();
+        let report = agent.update(&cpc(&rows, &states_k, &valid)).unwrap();
         assert_eq!(report.losses, [("cpc_4t4", 0.0)]);
         assert_eq!(report.total, report.c51_kl);
     }
@@ -164,8 +164,8 @@ fn without_any_positive_cpc_learns_the_return() {
 #[test]
 fn cpc_and_curl_bring_their_losses_down() {
     let rows = Rows::random(16, 6);
-    let (frames_k, valid) = (later(&rows), [1; 16 * POSITIVES]);
-    for (objective, batch) in [(CPC, cpc(&rows, &frames_k, &valid)), (CURL, curl(&rows))] {
+    let (states_k, valid) = (later(&rows), [1; 16 * POSITIVES]);
+    for (objective, batch) in [(CPC, cpc(&rows, &states_k, &valid)), (CURL, curl(&rows))] {
         let mut agent = agent(objective, GLOBAL);
         let first = only(&agent.update(&batch).unwrap().losses);
         for _ in 0..80 {
@@ -193,7 +193,7 @@ fn curl_compares_its_views_and_not_the_state() {
     let mut other = rows.clone();
     other.frames[2] = other.frames[1].clone();
     let batch = Batch {
-        frames_n: &rows.frames[2],
+        states_n: &rows.frames[2],
         ..curl(&other)
     };
     assert_ne!(loss(&batch), before, "the key's view");
@@ -267,7 +267,7 @@ fn c51_s_target_network_is_the_same_for_every_agent() {
         let batch = match objective.name() {
             "none" => Batch {
                 positives: 0,
-                frames_k: &[],
+                states_k: &[],
                 positive_valid: &[],
                 ..rows.batch()
             },
@@ -324,13 +324,13 @@ fn a_target_network_that_moves_leaves_curl_s_keys_where_they_are() {
 #[test]
 fn batches_that_an_agent_cannot_use_are_refused() {
     let rows = Rows::random(5, 9);
-    let (frames_k, valid) = (later(&rows), [1; 5 * POSITIVES]);
+    let (states_k, valid) = (later(&rows), [1; 5 * POSITIVES]);
     let said = |objective, batch: &Batch<'_>| {
         let error = agent(objective, GLOBAL).evaluate(batch).unwrap_err();
         assert!(matches!(error, UpdateError::Batch(_)));
         error.to_string()
     };
-    let several = cpc(&rows, &frames_k, &valid);
+    let several = cpc(&rows, &states_k, &valid);
     assert!(said(DIM, &several).contains("3 positives a row; this agent needs one"));
     let plain = rows.batch();
     assert!(said(CURL, &plain).contains("needs two views of each state"));
@@ -340,7 +340,7 @@ fn batches_that_an_agent_cannot_use_are_refused() {
     };
     assert!(said(CPC, &short).contains("positive_valid"));
     let short = Batch {
-        anchors: Some(&frames_k[..8]),
+        anchors: Some(&states_k[..8]),
         ..curl(&rows)
     };
     assert!(said(CURL, &short).contains("anchors"));
@@ -619,9 +619,9 @@ fn augmentation_and_objective_belong_together() {
     );
     assert_eq!(
         part(CURL, Some(NOTHING)).model.dim,
-        DimParts {
+        DimHeads {
             psi4: true,
-            ..DimParts::NONE
+            ..DimHeads::NONE
         }
     );
 }

@@ -45,7 +45,7 @@ pub(crate) fn model(lambda: Lambda) -> ModelConfig {
         hidden: 16,
         rkhs: 12,
         action_embed: 7,
-        dim: lambda.dim_parts(true),
+        dim: lambda.dim_heads(true),
     }
 }
 
@@ -131,11 +131,11 @@ impl Rows {
     pub(crate) fn batch(&self) -> Batch<'_> {
         Batch {
             rows: self.action.len(),
-            frames_t: &self.frames[0],
+            states_t: &self.frames[0],
             anchors: None,
             positives: 1,
-            frames_k: &self.frames[1],
-            frames_n: &self.frames[2],
+            states_k: &self.frames[1],
+            states_n: &self.frames[2],
             action: &self.action,
             next_action: &self.next_action,
             n_step_return: &self.n_step_return,

@@ -131,7 +131,7 @@ fn without_dim_no_positives_are_needed_and_no_heads_are_built() {
             .all(|(name, _)| !name.starts_with("dim."))
     );
     let mut batch = rows.batch();
-    (batch.positives, batch.frames_k, batch.positive_valid) = (0, &[], &[]);
+    (batch.positives, batch.states_k, batch.positive_valid) = (0, &[], &[]);
     let report = agent.update(&batch).unwrap();
     assert_eq!(report.losses, []);
     assert_eq!(report.total, report.c51_kl);
@@ -281,11 +281,11 @@ fn a_bad_batch_is_an_error_that_changes_nothing() {
     refused(|rows| rows.n_step_return[1] = f32::NAN, "row 1");
     refused(|rows| rows.n_step_return[1] = f32::INFINITY, "row 1");
     refused(|rows| rows.bootstrap_discount[1] = 1.5, "row 1");
-    refused(|rows| rows.frames[0].truncate(7), "frames_t");
-    refused(|rows| rows.frames[1].truncate(7), "frames_k");
+    refused(|rows| rows.frames[0].truncate(7), "states_t");
+    refused(|rows| rows.frames[1].truncate(7), "states_k");
     refused(|rows| rows.positive_valid.clear(), "positive_valid");
     let mut batch = good.batch();
-    (batch.positives, batch.frames_k, batch.positive_valid) = (0, &[], &[]);
+    (batch.positives, batch.states_k, batch.positive_valid) = (0, &[], &[]);
     assert!(agent.update(&batch).is_err());
     batch.rows = 0;
     assert!(agent.update(&batch).is_err());

@@ -174,7 +174,7 @@ impl Heads {
             hidden: states,
             rkhs: settings.rkhs,
             action_embed: 1,
-            dim: lambda.dim_parts(false),
+            dim: lambda.dim_heads(false),
         };
         let parameters = Parameters::init(&model, rng, &Device::Cpu)?;
         Ok(Self {

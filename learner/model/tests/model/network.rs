@@ -2,7 +2,7 @@
 //! Values against another framework are in `parity`.
 
 use candle_core::{DType, Device, Result, Tensor};
-use driml_model::{ConvLayer, DimParts, Kernels, ModelConfig, ModelError, Network, Parameters};
+use driml_model::{ConvLayer, DimHeads, Kernels, ModelConfig, ModelError, Network, Parameters};
 
 use crate::support::{assert_close, bits, frames, parameters, rng, small, values};
 
@@ -227,7 +227,7 @@ fn q_values_are_expectations_over_the_atoms() -> Result<()> {
 #[test]
 fn heads_that_are_left_out_are_not_there() {
     let config = ModelConfig {
-        dim: DimParts {
+        dim: DimHeads {
             psi3: false,
             phi4: false,
             ..small().dim
@@ -254,7 +254,7 @@ fn heads_that_are_left_out_are_not_there() {
     assert!(network.psi4(&features.f4, &actions).is_ok());
 
     let without_psi = ModelConfig {
-        dim: DimParts {
+        dim: DimHeads {
             psi3: false,
             psi4: false,
             ..small().dim
@@ -281,7 +281,7 @@ fn the_first_q_values_are_small() {
         v_min: -10.0,
         v_max: 10.0,
         hidden: 512,
-        dim: DimParts::NONE,
+        dim: DimHeads::NONE,
         ..small()
     };
     let support = config.atoms_support();
