@@ -27,7 +27,7 @@ use crate::{
     tensors::states,
 };
 
-/// What one update did, for a person to watch.
+/// What one update did: the numbers of a row of metrics.
 #[derive(Clone, Debug, PartialEq)]
 pub struct UpdateReport {
     /// Mean KL divergence of the prediction from the projected target, in nats.
@@ -164,12 +164,12 @@ impl Agent {
         })
     }
 
-    /// The network's sizes.
+    /// The online network's sizes, its auxiliary heads included.
     pub const fn model(&self) -> &ModelConfig {
         &self.model
     }
 
-    /// The settings.
+    /// The settings of its updates.
     pub const fn settings(&self) -> &LearnerSettings {
         &self.settings
     }

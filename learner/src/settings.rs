@@ -31,7 +31,7 @@ pub struct LearnerSettings {
     pub max_grad_norm: f64,
     /// The optimiser's numbers.
     pub adam: AdamSettings,
-    /// The target network moves once in so many updates, at least 1.
+    /// Updates from one move of the target network to the next, at least 1.
     pub target_period_updates: u64,
     /// Share of the online network in a move of the target network, in (0, 1].
     pub target_tau: f64,

@@ -139,13 +139,13 @@ pub fn dots(
 /// What the heads make of anchors (psi) and candidates (phi): [B, L, R] of local features, [B, R] of global ones.
 #[derive(Debug)]
 pub struct Vectors {
-    /// Of anchors, local.
+    /// Psi_3 of the anchors; there if a local anchor is compared.
     pub psi3: Option<Tensor>,
-    /// Of candidates, local.
+    /// Phi_3 of the candidates; there if a local candidate is compared.
     pub phi3: Option<Tensor>,
-    /// Of anchors, global.
+    /// Psi_4 of the anchors; there if a global anchor is compared.
     pub psi4: Option<Tensor>,
-    /// Of candidates, global.
+    /// Phi_4 of the candidates; there if a global candidate is compared.
     pub phi4: Option<Tensor>,
 }
 

@@ -38,7 +38,7 @@ impl KeyEncoder {
     /// What a key encoder has of `online`, copied: where it starts.
     ///
     /// # Errors
-    /// A failing copy.
+    /// A parameter could not be copied on its device.
     pub fn copy_of(online: &Parameters) -> Result<Parameters, UpdateError> {
         Ok(online.copy_part(Encoder::has)?)
     }

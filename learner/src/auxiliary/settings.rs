@@ -13,16 +13,16 @@ pub const PAIRS: [&str; 4] = ["3t3", "3t4", "4t3", "4t4"];
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Lambda {
-    /// Local against local.
+    /// Local features of (s_t, a_t) against local ones of s_{t+k}, at the same location.
     #[serde(rename = "3t3")]
     pub l3t3: f64,
-    /// Local against global.
+    /// Local features of (s_t, a_t) against global ones of s_{t+k}.
     #[serde(rename = "3t4")]
     pub l3t4: f64,
-    /// Global against local.
+    /// Global features of (s_t, a_t) against local ones of s_{t+k}.
     #[serde(rename = "4t3")]
     pub l4t3: f64,
-    /// Global against global.
+    /// Global features of (s_t, a_t) against global ones of s_{t+k}.
     #[serde(rename = "4t4")]
     pub l4t4: f64,
 }
@@ -36,7 +36,7 @@ impl Lambda {
         l4t4: 1.0,
     };
 
-    /// No pair.
+    /// No pair: every weight is 0.
     pub const NONE: Self = Self {
         l3t3: 0.0,
         l3t4: 0.0,
@@ -68,7 +68,7 @@ impl Lambda {
         }
     }
 
-    /// Checks the ranges.
+    /// Checks that every weight is a number of 0 or above.
     ///
     /// # Errors
     /// The first weight that is negative or not finite.

@@ -38,7 +38,7 @@ pub struct AdamSettings {
 }
 
 impl AdamSettings {
-    /// Checks the ranges.
+    /// Checks each number against its range.
     ///
     /// # Errors
     /// The first setting out of its range, with its value.
@@ -108,7 +108,7 @@ impl Adam {
     /// Moments of zero for each of `parameters`.
     ///
     /// # Errors
-    /// A failing allocation.
+    /// The device has no memory left for them.
     pub fn new(
         settings: AdamSettings,
         parameters: &Parameters,
@@ -128,7 +128,7 @@ impl Adam {
         })
     }
 
-    /// Steps taken.
+    /// Steps taken so far, which the bias correction counts.
     pub const fn step_count(&self) -> u64 {
         self.step
     }
@@ -385,7 +385,7 @@ mod tests {
         eps: 1e-8,
     };
 
-    /// Whether a step is fine at this parameter and gradient, in the last of so many elements.
+    /// Whether a step is fine at this parameter and gradient, in the last of that many `elements`.
     fn fine(settings: AdamSettings, elements: usize, parameter: f32, gradient: f32) -> bool {
         let rule = Rule::new(settings, 1, 1.0);
         let (mut p, mut g) = (vec![0.5; elements], vec![0.1; elements]);

@@ -27,17 +27,17 @@ pub enum ParityError {
     /// The file could not be read.
     #[error("cannot read {file}: {source}")]
     Read {
-        /// The case.
+        /// The case's file.
         file: PathBuf,
-        /// The reason.
+        /// What the file system said.
         source: io::Error,
     },
     /// The file was read, but cannot be checked.
     #[error("{file}: {why}")]
     InFile {
-        /// The case.
+        /// The case's file.
         file: PathBuf,
-        /// The reason.
+        /// What is wrong with it.
         why: Box<ParityError>,
     },
     /// Not a safetensors file, or not all of one.
@@ -65,7 +65,7 @@ pub enum ParityError {
     Candle(#[from] candle_core::Error),
 }
 
-/// The metadata's `config`.
+/// The metadata key `config` of a case: sizes and settings of the update that the reference computed.
 #[derive(Debug, Deserialize)]
 struct Config {
     obs: Observation,
@@ -102,7 +102,7 @@ struct Sizes {
     action_embed: usize,
 }
 
-/// One case.
+/// One case: a batch, all parameters before the update, and every tensor that must come out.
 pub(super) struct Case {
     config: Config,
     pub(super) settings: LearnerSettings,

@@ -29,7 +29,7 @@ use crate::{
 
 /// Values of s_t, in units of return, as a share of the support's width.
 const Q_VALUES: f64 = 1e-5;
-/// Probabilities.
+/// Projected target distributions, each probability.
 const PROJECTION: f64 = 5e-6;
 /// Losses, relative; the second where scores saturate; the third absolute.
 const LOSS: (f64, f64, f64) = (1e-5, 1e-4, 1e-6);
@@ -43,9 +43,9 @@ const UPDATED: f64 = 4e-6;
 pub struct ParityLine {
     /// The group; for groups of several tensors, with the tensor that is nearest to its tolerance.
     pub name: String,
-    /// Largest error found.
+    /// Largest error found among the group's numbers.
     pub error: f64,
-    /// Largest error allowed.
+    /// Largest error at which the group passes.
     pub tolerance: f64,
 }
 
@@ -56,10 +56,10 @@ impl ParityLine {
     }
 }
 
-/// A case's comparison.
+/// What came of one case: every group of tensors with its error and its tolerance.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ParityReport {
-    /// The case.
+    /// The case's file.
     pub file: PathBuf,
     /// One line a tensor group.
     pub lines: Vec<ParityLine>,

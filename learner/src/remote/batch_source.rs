@@ -63,16 +63,16 @@ pub struct BatchSource {
 
 /// What the learner gets when it asks for its next batch.
 pub enum Next {
-    /// One.
+    /// A batch to learn from.
     Batch(Batch),
-    /// None within the time given.
+    /// No batch came within the time given; ask again.
     NotYet,
-    /// None ever again.
+    /// The run is over: no further batch will come.
     Finished,
 }
 
 impl BatchSource {
-    /// Starts asking.
+    /// Starts the threads that request batches.
     ///
     /// # Errors
     /// The operating system gave no thread.
@@ -351,7 +351,7 @@ impl Fetcher {
     }
 
     fn answer(&mut self, (asked, shared_memory): (Asked, bool)) -> anyhow::Result<Answer> {
-        // Where this process may not map shared memory, the question seems to have been answered by nobody.
+        // A process that may not map shared memory never sees the reply: to it the request looks unanswered.
         let answer = asked.answer().inspect_err(|e| {
             let unheard = matches!(
                 e,
