@@ -23,7 +23,7 @@ use settings::AuxiliarySettings;
 use crate::error::UpdateError;
 
 /// Every auxiliary loss; a new one gets its line here.
-pub const MENU: [&MenuItem; 4] = [&none::NONE, &dim::DIM, &cpc::CPC, &curl::CURL];
+pub const MENU: &[&MenuItem] = &[&none::NONE, &dim::DIM, &cpc::CPC, &curl::CURL];
 
 /// The auxiliary loss of an agent: an item of the [`MENU`], by its name in settings.
 #[derive(Clone, Copy, Serialize, Deserialize)]
@@ -91,7 +91,7 @@ impl FromStr for Objective {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
-        let item = MENU.into_iter().find(|item| item.name == name);
+        let item = MENU.iter().copied().find(|item| item.name == name);
         item.map(Self).ok_or_else(|| {
             let known: Vec<_> = MENU.iter().map(|item| format!("`{}`", item.name)).collect();
             format!(
