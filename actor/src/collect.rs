@@ -61,13 +61,14 @@ impl Collector {
         let config = &settings.actor;
         let schedule = Schedule::new(config, life.actor)?;
         let world_seed = life.seed(spec, "world");
-        let world = driml_envs::make_world(
-            &settings.world,
-            config.envs as usize,
-            u64::from_le_bytes(world_seed[..8].try_into().expect("eight bytes")),
-            config.world_threads as usize,
-        )
-        .with_context(|| format!("making the world {}", spec.world))?;
+        let world = settings
+            .world
+            .build(
+                config.envs as usize,
+                u64::from_le_bytes(world_seed[..8].try_into().expect("eight bytes")),
+                config.world_threads as usize,
+            )
+            .with_context(|| format!("making the world {}", spec.world))?;
         let shape = world.frame_shape();
         let promised = (
             spec.frame_height,
@@ -140,7 +141,7 @@ impl Collector {
 
 #[cfg(test)]
 mod tests {
-    use driml_envs::{ChainConfig, WorldConfig};
+    use driml_envs::{CorridorConfig, WorldConfig};
     use driml_model::{Compute, ConvLayer, DimHeads, ModelConfig, Parameters};
     use driml_protocol::{Horizon, TimeoutRule, config::TransportConfig};
 
@@ -172,7 +173,7 @@ mod tests {
                 horizon: Horizon::None,
                 timeout: TimeoutRule::Terminal,
             },
-            world: WorldConfig::Chain(ChainConfig {
+            world: WorldConfig::Chain(CorridorConfig {
                 cells: 8,
                 height: 12,
                 width: 12,

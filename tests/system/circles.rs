@@ -17,7 +17,6 @@ use syn::{
 const NOT_YET: &[&str] = &[
     "protocol",
     "actor",
-    "actor/envs",
     "replay-server",
     "learner",
     "learner/model",

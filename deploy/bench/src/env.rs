@@ -1,7 +1,7 @@
 //! Procgen's steps through our wrapper, frames copied out after each as an actor does.
 //! No policy is measured: actions are drawn beforehand.
 
-use driml_envs::{StepEnd, make_world};
+use driml_envs::StepEnd;
 use driml_launch::console;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -27,7 +27,7 @@ pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
     for game in GAMES {
         for threads in ENGINE_THREADS {
             let config = settings::of_run(&format!("procgen:{game}"), "c51", "paper", &[])?;
-            let mut world = make_world(&config.world, ENVS, 1, threads)?;
+            let mut world = config.world.build(ENVS, 1, threads)?;
             let actions: Vec<[u8; ENVS]> = (0..STEPS)
                 .map(|_| std::array::from_fn(|_| rng.random_range(0..15)))
                 .collect();

@@ -7,7 +7,11 @@ use std::{
 };
 
 use anyhow::{Context, bail, ensure};
-use driml_launch::{endpoint::NAMESPACE, record::Summary, statuses::Statuses};
+use driml_launch::{
+    endpoint::NAMESPACE,
+    run_folder::{RunFolder, Summary},
+    statuses::Statuses,
+};
 use driml_protocol::{
     Keys, LearnerStatus, ReplayStatus,
     session::{self, Endpoints},
@@ -146,7 +150,7 @@ impl Launched {
     fn end(&mut self, code: i32) -> anyhow::Result<Summary> {
         let status = self.launcher.wait().context("waiting for the run")?;
         ensure!(status.code() == Some(code), "the run failed: {status}");
-        Summary::read(&self.folder.path().join("run"))
+        Summary::read(&RunFolder::new(self.folder.path().join("run")))
     }
 }
 

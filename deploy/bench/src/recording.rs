@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use driml_envs::{StepEnd, make_world};
+use driml_envs::StepEnd;
 use driml_launch::console;
 use driml_protocol::{Chunk, ChunkHeader, End, PlanesPool};
 use rand::{Rng, SeedableRng};
@@ -34,7 +34,7 @@ impl Recording {
     pub(super) fn play() -> anyhow::Result<Self> {
         procgen_sys::Engine::install(&mut console::line)?;
         let config = settings::of_run(settings::WORLD, "c51", "paper", &[])?;
-        let mut world = make_world(&config.world, STREAMS, 1, 0)?;
+        let mut world = config.world.build(STREAMS, 1, 0)?;
         let frame_bytes = world.frame_shape().bytes();
         let mut frames = vec![0; STEPS * STREAMS * frame_bytes];
         let mut steps = Vec::with_capacity(STEPS * STREAMS);

@@ -1,7 +1,7 @@
 //! The page that an experiment leaves: claim, command, time, expected, got, differences.
 //! It is made from results alone, so that no number in it can be stale.
 
-use super::progress::duration;
+use driml_machine::units::rough_duration;
 
 /// Numbers in rows and columns.
 #[derive(Debug, Default)]
@@ -69,7 +69,7 @@ impl Page {
         out += &format!("**Command.** `{}`\n\n", self.command);
         out += &format!(
             "**Time.** {}{at_once} on a machine with {cores} cores.\n\n",
-            duration(seconds)
+            rough_duration(seconds)
         );
         for (head, items) in [("Expected", &self.expected), ("Got", &self.got)] {
             out += &format!("**{head}.**\n\n{}\n", list(items));

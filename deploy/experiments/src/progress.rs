@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant};
 
 use driml_launch::{console::Screen, interrupts::Interrupts};
-use driml_machine::error::Interrupted;
+use driml_machine::{error::Interrupted, units::rough_duration};
 
 /// How often a line is written where there is no terminal.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
@@ -99,7 +99,7 @@ impl Progress {
 
     fn show(&self) {
         let left = match self.seconds_left(self.started.elapsed().as_secs_f64()) {
-            Some(seconds) => format!("about {} left", duration(seconds)),
+            Some(seconds) => format!("about {} left", rough_duration(seconds)),
             None => "the time left is not known yet".to_owned(),
         };
         let line = format!("{}, {left}", self.what);
@@ -123,17 +123,6 @@ impl Progress {
     }
 }
 
-/// Seconds as a person says them.
-pub(super) fn duration(seconds: f64) -> String {
-    if seconds < 99.5 {
-        format!("{seconds:.0} s")
-    } else if seconds < 5_970.0 {
-        format!("{:.0} min", seconds / 60.0)
-    } else {
-        format!("{:.1} h", seconds / 3_600.0)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -146,11 +135,5 @@ mod tests {
         progress.advance(10).unwrap();
         assert_eq!(progress.seconds_left(5.0), Some(25.0));
         assert!(indicatif::ProgressStyle::with_template(TEMPLATE).is_ok());
-    }
-
-    #[test]
-    fn durations_read_well() {
-        let texts = [3.2, 99.0, 100.0, 3_600.0, 9_000.0].map(duration);
-        assert_eq!(texts, ["3 s", "99 s", "2 min", "60 min", "2.5 h"]);
     }
 }

@@ -15,8 +15,10 @@ use std::{
 use anyhow::Context;
 use driml_launch::{
     child::exit_with_this_process,
-    record::{Outcome, Summary, write_whole},
     resume,
+    run_folder::{
+        Outcome, Progress as HowFar, RunFolder, Summary, progress as how_far, write_whole,
+    },
 };
 use driml_machine::{
     error::{EXIT_USAGE, usage},
@@ -38,8 +40,6 @@ const RUNS: &str = "runs";
 const POLL: Duration = Duration::from_millis(250);
 /// How long children may take to save once they were asked to stop; after that they are killed.
 const DRAIN_MAX: Duration = Duration::from_secs(240);
-/// Bytes at the end of `metrics.csv` in which its last row lies.
-const LAST_ROW_BYTES: u64 = 4096;
 /// Bytes at the end of a run's output that are shown if it fails.
 const LAST_WORDS_BYTES: u64 = 1200;
 
@@ -61,7 +61,7 @@ pub(super) struct Plan {
 /// A finished run.
 #[derive(Clone, Debug)]
 pub(super) struct Ran {
-    pub(super) folder: PathBuf,
+    pub(super) folder: RunFolder,
     pub(super) summary: Summary,
 }
 
@@ -144,10 +144,9 @@ impl Queue {
         if !self.is_made_by(plan) {
             return None;
         }
-        let folder = self.root.join(&plan.name);
-        last_row(&folder)?;
-        let text = fs::read(folder.join("summary.json")).ok()?;
-        let summary: Summary = serde_json::from_slice(&text).ok()?;
+        let folder = self.folder(plan);
+        how_far(&folder)?;
+        let summary = Summary::read(&folder).ok()?;
         let enough = plan.episodes.is_some_and(|all| summary.episodes >= all);
         let good = match summary.outcome {
             Outcome::Finished => true,
@@ -194,7 +193,8 @@ impl Queue {
         while at < self.running.len() {
             let running = &mut self.running[at];
             let plan = &running.plan;
-            let (frames, episodes) = last_row(&self.root.join(&plan.name)).unwrap_or_default();
+            let folder = RunFolder::new(self.root.join(&plan.name));
+            let HowFar { frames, episodes } = how_far(&folder).unwrap_or_default();
             let share = |part: u64, all: u64| part as f64 / all.max(1) as f64;
             let share = plan
                 .episodes
@@ -247,6 +247,10 @@ impl Queue {
         Ok(())
     }
 
+    fn folder(&self, plan: &Plan) -> RunFolder {
+        RunFolder::new(self.root.join(&plan.name))
+    }
+
     /// Where the arguments are that a run was made with.
     fn call(&self, plan: &Plan) -> PathBuf {
         self.root.join(format!("{}.call.json", plan.name))
@@ -267,7 +271,7 @@ impl Queue {
             .with_context(doing)?;
         self.wait_for_the_last(&log, &plan, progress)?;
         log.set_len(0).with_context(doing)?;
-        let folder = self.root.join(&plan.name);
+        let folder = self.folder(&plan).path().to_owned();
         let resumed = folder.exists() && self.can_go_on(&plan, tried, progress)?;
         if !resumed && let Some(aside) = move_aside(&folder)? {
             progress.line(&format!(
@@ -306,7 +310,7 @@ impl Queue {
 
     /// Whether what lies in the plan's folder goes on: at the first try alone, as its checkpoint may be what fails.
     fn can_go_on(&self, plan: &Plan, tried: u32, progress: &mut Progress) -> anyhow::Result<bool> {
-        let folder = self.root.join(&plan.name);
+        let folder = self.folder(plan);
         resume::wait_until_free(&folder)?;
         if tried > 1 || !self.is_made_by(plan) {
             return Ok(false);
@@ -412,15 +416,6 @@ fn move_aside(folder: &Path) -> anyhow::Result<Option<PathBuf>> {
     Ok(Some(aside))
 }
 
-/// Frames and episodes of a run so far.
-fn last_row(folder: &Path) -> Option<(u64, u64)> {
-    let text = tail(&folder.join("metrics.csv"), LAST_ROW_BYTES)?;
-    // What follows the last line's end is still being written.
-    let row = text.get(..text.rfind('\n')?)?.lines().last()?;
-    let cells: Vec<&str> = row.split(',').collect();
-    Some((cells.get(1)?.parse().ok()?, cells.get(6)?.parse().ok()?))
-}
-
 fn last_words(log: &Path) -> String {
     tail(log, LAST_WORDS_BYTES).unwrap_or_default()
 }
@@ -442,18 +437,7 @@ mod tests {
 
     use super::*;
     use crate::made_up;
-    use driml_launch::record::Recorder;
-
-    #[test]
-    fn the_last_whole_row_counts() {
-        let folder = tempfile::tempdir().unwrap();
-        let write = |text: &str| fs::write(folder.path().join("metrics.csv"), text).unwrap();
-        assert_eq!(last_row(folder.path()), None);
-        write("seconds,frames,updates,a,b,c,episodes\n");
-        assert_eq!(last_row(folder.path()), None);
-        write("seconds,frames,updates,a,b,c,episodes\n1,200,3,,,,7\n2,30");
-        assert_eq!(last_row(folder.path()), Some((200, 7)));
-    }
+    use driml_launch::run_folder::Recorder;
 
     #[test]
     fn a_run_counts_for_the_plan_that_made_it_alone() {
@@ -472,7 +456,7 @@ mod tests {
             units: frames,
         };
         let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
-        let folder = queue.root.join("run");
+        let folder = RunFolder::new(queue.root.join("run"));
         let mut recorder = Recorder::create(&folder, "", &[], &[]).unwrap();
         recorder.record(std::slice::from_ref(&replay), &learner, &[]);
         let summary = recorder.summarise(Outcome::Finished, &made_up::spec(), &replay, &learner);
@@ -482,7 +466,7 @@ mod tests {
         fs::write(queue.call(&plan(10)), call).unwrap();
         assert!(queue.finished(&plan(10)).is_some());
         assert!(queue.finished(&plan(20)).is_none());
-        fs::write(folder.join("metrics.csv"), "seconds,frames\n").unwrap();
+        fs::write(folder.metrics(), "seconds,frames\n").unwrap();
         assert!(queue.finished(&plan(10)).is_none(), "its metrics are gone");
     }
 

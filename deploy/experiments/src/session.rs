@@ -12,7 +12,7 @@ use driml_figure::Figure;
 use driml_launch::{
     console::{self, print},
     interrupts::Interrupts,
-    record::write_whole,
+    run_folder::write_whole,
 };
 use driml_machine::error::{Interrupted, usage};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};

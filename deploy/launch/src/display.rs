@@ -1,17 +1,17 @@
 //! The live view of a run: one progress display on a terminal, a plain line now and then elsewhere.
 //! It asks nobody: the launcher and the lockstep mode tell it.
 
-use std::{
-    collections::VecDeque,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
+use driml_machine::units::duration;
 use driml_protocol::{LearnerStatus, ReplayStatus, Waiting};
 
-use crate::{console::Screen, record::Episodes, resume::Behind};
+use crate::{
+    console::Screen,
+    rates::Rates,
+    run_folder::{Behind, Episodes},
+};
 
-/// Rates are means over the last so much time.
-const RATE_WINDOW: Duration = Duration::from_secs(20);
 /// How often a line is written where there is no terminal.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
 /// The progress display: how far, then two lines of numbers.
@@ -22,37 +22,6 @@ pub fn loss_title(name: &str) -> String {
     match name.split_once('_') {
         Some((kind, of_what)) => format!("{} {of_what}", kind.to_uppercase()),
         None => name.to_uppercase(),
-    }
-}
-
-/// Frames and updates a second, over the last while.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Rates {
-    samples: VecDeque<(Instant, u64, u64)>,
-}
-
-impl Rates {
-    /// Takes the counts at `now`.
-    pub(crate) fn add(&mut self, now: Instant, frames: u64, updates: u64) {
-        self.samples.push_back((now, frames, updates));
-        while self.samples.len() > 2 && now - self.samples[1].0 >= RATE_WINDOW {
-            self.samples.pop_front();
-        }
-    }
-
-    /// Frames a second and updates a second; 0 before the second sample.
-    pub(crate) fn per_second(&self) -> (f64, f64) {
-        let (Some(first), Some(last)) = (self.samples.front(), self.samples.back()) else {
-            return (0.0, 0.0);
-        };
-        let seconds = (last.0 - first.0).as_secs_f64();
-        if seconds <= 0.0 {
-            return (0.0, 0.0);
-        }
-        (
-            last.1.saturating_sub(first.1) as f64 / seconds,
-            last.2.saturating_sub(first.2) as f64 / seconds,
-        )
     }
 }
 
@@ -167,23 +136,12 @@ fn time_left(frames: (u64, f64), updates: (u64, f64)) -> Option<Duration> {
     Duration::try_from_secs_f64(longer).ok()
 }
 
-/// A time for a person: two units at most.
-pub fn duration(time: Duration) -> String {
-    let seconds = time.as_secs();
-    match seconds {
-        0..60 => format!("{seconds} s"),
-        60..3600 => format!("{} min {} s", seconds / 60, seconds % 60),
-        3600..86_400 => format!("{} h {} min", seconds / 3600, seconds % 3600 / 60),
-        _ => format!("{} d {} h", seconds / 86_400, seconds % 86_400 / 3600),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use expect_test::expect;
 
     use super::*;
-    use crate::record::MeanReturn;
+    use crate::run_folder::MeanReturn;
 
     #[test]
     fn the_view_says_what_a_person_wants_to_know() {
@@ -236,24 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn rates_forget_what_is_long_ago() {
-        let (mut rates, start) = (Rates::default(), Instant::now());
-        assert_eq!(rates.per_second(), (0.0, 0.0));
-        for second in 0..100 {
-            rates.add(
-                start + Duration::from_secs(second),
-                if second < 50 { 0 } else { (second - 50) * 10 },
-                0,
-            );
-        }
-        assert_eq!(rates.per_second().0, 10.0);
-        assert!(rates.samples.len() <= 22);
-    }
-
-    #[test]
-    fn times_have_two_units_at_most() {
-        let texts = [5, 65, 3_660, 90_000].map(|seconds| duration(Duration::from_secs(seconds)));
-        assert_eq!(texts, ["5 s", "1 min 5 s", "1 h 1 min", "1 d 1 h"]);
+    fn no_time_is_left_to_guess_while_nothing_happens() {
         assert_eq!(time_left((10, 0.0), (0, 0.0)), None);
     }
 

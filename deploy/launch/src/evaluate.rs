@@ -1,8 +1,6 @@
 //! Whole episodes with a run's newest checkpoint, and a random policy's beside them.
 //! It trains nothing and changes nothing in the run folder.
 
-use std::path::Path;
-
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_actor::{
@@ -16,14 +14,14 @@ use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
+use crate::run_folder::RunFolder;
+
 /// Probability of a random action. Source: section 2 of the project's specification, after rlpyt.
 const EPSILON: f64 = 0.001;
 /// Copies of the world that are played at once.
 const COPIES_MAX: usize = 32;
 /// Steps of each copy after which an evaluation is given up; Procgen's longest episode has 6,000.
 const STEPS_A_ROUND_MAX: u64 = 20_000;
-/// Levels to draw unseen ones from, right after those trained on.
-const UNSEEN_LEVELS: u32 = 100_000;
 /// The stream of the exploring policy's generator. A world seeded alike gives its copies streams that count from 0.
 const POLICY_STREAM: u64 = u64::MAX;
 
@@ -62,8 +60,8 @@ impl Player {
     ///
     /// # Errors
     /// A folder that is no run's or has no checkpoint, a damaged checkpoint.
-    pub fn load(folder: &Path) -> anyhow::Result<Self> {
-        let path = folder.join("config.toml");
+    pub fn load(folder: &RunFolder) -> anyhow::Result<Self> {
+        let path = folder.config();
         let text = std::fs::read_to_string(&path).map_err(|e| {
             usage!(
                 "{} is not the folder of a run: reading {}: {e}",
@@ -73,7 +71,7 @@ impl Player {
         })?;
         let config = RunConfig::parse(&path.display().to_string(), &text)?;
         let restored = checkpoint::load_latest(
-            &folder.join("checkpoints"),
+            &folder.checkpoints(),
             &config.model,
             &config.learner.update,
             &Compute::CPU,
@@ -135,7 +133,7 @@ impl Player {
         let copies = episodes.min(COPIES_MAX);
         let rounds = episodes.div_ceil(copies) as u64;
         episode_returns(
-            driml_envs::make_world(world, copies, seed, 0)?,
+            world.build(copies, seed, 0)?,
             spec.frame_stack as usize,
             policy.as_mut(),
             EPSILON,
@@ -159,25 +157,12 @@ fn policy_rng(seed: u64) -> ChaCha8Rng {
 /// # Errors
 /// The world does not have them.
 pub fn levels(world: &WorldConfig, levels: Levels) -> Result<WorldConfig, Usage> {
-    let mut world = world.clone();
-    match (&mut world, levels) {
-        (_, Levels::Train) => {}
-        (WorldConfig::Procgen(procgen), Levels::TrainSingle) => {
-            procgen.use_sequential_levels = false;
-        }
-        (WorldConfig::Procgen(procgen), Levels::Unseen) => {
-            if procgen.num_levels == 0 {
-                return Err(usage!(
-                    "this run trained on all levels there are: none is unseen"
-                ));
-            }
-            procgen.start_level += procgen.num_levels;
-            procgen.num_levels = UNSEEN_LEVELS;
-            procgen.use_sequential_levels = false;
-        }
-        _ => return Err(usage!("this run's world has no levels: use --levels train")),
-    }
-    Ok(world)
+    let levels = match levels {
+        Levels::Train => driml_envs::Levels::Train,
+        Levels::TrainSingle => driml_envs::Levels::TrainSingle,
+        Levels::Unseen => driml_envs::Levels::Unseen,
+    };
+    world.with_levels(levels).map_err(|e| usage!("{e}"))
 }
 
 /// Mean and sample standard deviation; 0 for a single value.
@@ -197,7 +182,6 @@ pub fn mean_and_deviation(values: &[f64]) -> (f64, f64) {
 
 #[cfg(test)]
 mod tests {
-    use driml_envs::{ChainConfig, ProcgenConfig};
     use rand::Rng;
 
     use super::*;
@@ -218,67 +202,6 @@ mod tests {
                 copy.set_stream(stream);
                 assert_ne!(copy.random::<u64>(), first, "stream {stream}");
             }
-        }
-    }
-
-    fn procgen(start_level: u32, num_levels: u32) -> WorldConfig {
-        WorldConfig::Procgen(ProcgenConfig {
-            game: "coinrun".parse().unwrap(),
-            distribution_mode: "easy".parse().unwrap(),
-            num_levels,
-            start_level,
-            use_sequential_levels: true,
-            paint_vel_info: true,
-            use_backgrounds: true,
-            center_agent: true,
-            restrict_themes: false,
-        })
-    }
-
-    /// The levels of a world, and whether an episode goes on from one to the next.
-    fn levels_of(world: &WorldConfig, which: Levels) -> (std::ops::Range<u32>, bool) {
-        match levels(world, which).unwrap() {
-            WorldConfig::Procgen(it) => {
-                let levels = it.start_level..it.start_level + it.num_levels;
-                (levels, it.use_sequential_levels)
-            }
-            other => panic!("{other:?}"),
-        }
-    }
-
-    #[test]
-    fn unseen_levels_are_none_of_those_trained_on() {
-        for (start, count) in [(0, 500), (70, 1), (1000, 200)] {
-            let world = procgen(start, count);
-            let (train, goes_on) = levels_of(&world, Levels::Train);
-            assert_eq!((train.clone(), goes_on), (start..start + count, true));
-            let (single, goes_on) = levels_of(&world, Levels::TrainSingle);
-            assert_eq!((single, goes_on), (train.clone(), false));
-            let (unseen, goes_on) = levels_of(&world, Levels::Unseen);
-            assert!(
-                unseen.start >= train.end && unseen.len() == 100_000,
-                "{unseen:?}"
-            );
-            assert!(!goes_on);
-        }
-    }
-
-    #[test]
-    fn levels_that_a_world_does_not_have_are_refused() {
-        let all = levels(&procgen(0, 0), Levels::Unseen).unwrap_err();
-        assert!(all.to_string().contains("none is unseen"), "{all}");
-        let chain = WorldConfig::Chain(ChainConfig {
-            cells: 8,
-            height: 12,
-            width: 12,
-            step_limit: 30,
-            reward_left: 0.1,
-            reward_right: 1.0,
-        });
-        assert!(levels(&chain, Levels::Train).is_ok());
-        for which in [Levels::TrainSingle, Levels::Unseen] {
-            let said = levels(&chain, which).unwrap_err().to_string();
-            assert!(said.contains("has no levels"), "{said}");
         }
     }
 

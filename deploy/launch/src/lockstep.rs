@@ -1,10 +1,7 @@
 //! All parts in one process, one after the other in a fixed order: the same code as the processes run, without sockets.
 //! The same seed gives the same weights, bit for bit, on the same machine; it is for tests and debugging, not for speed.
 
-use std::{
-    path::Path,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use driml_actor::{ActorSettings, Collector, Life};
@@ -17,9 +14,7 @@ use driml_settings::config::RunConfig;
 use crate::{
     console::{self, Screen, print},
     display::{Display, TEMPLATE},
-    processes::describe,
-    record::{Outcome, Recorder},
-    resume::Behind,
+    run_folder::{Behind, Outcome, Recorder, RunFolder},
 };
 
 /// How often progress is shown and recorded.
@@ -35,7 +30,7 @@ const LEARNER: u64 = 1;
 /// A part that failed, a file system that refuses; [`Interrupted`] if a person ended the run.
 pub fn run(
     config: &RunConfig,
-    run_dir: &Path,
+    run_dir: &RunFolder,
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(exit_with_parent).context("listening for signals")?;
@@ -54,7 +49,7 @@ pub fn run(
         Behind::default(),
     );
     let mut shown = Instant::now();
-    let folder = run_dir.join("checkpoints");
+    let folder = run_dir.checkpoints();
 
     let mut outcome = Outcome::Finished;
     let mut saved = u64::MAX;
@@ -85,7 +80,7 @@ pub fn run(
     let missing = recorder.missing();
     missing.iter().for_each(|line| console::line(line));
     let summary = recorder.summarise(outcome, &config.run, &replay, &parts.status);
-    print(&describe(&summary, run_dir))?;
+    print(&summary.describe(run_dir))?;
     summary.write(run_dir)?;
     if outcome == Outcome::Interrupted {
         Err(Interrupted.into())

@@ -1,14 +1,14 @@
 //! What a run will do and about how long it takes, for a person to read before it starts.
 //! It decides nothing, and its time is an estimate from the network's arithmetic, not a promise.
 
-use std::{path::Path, time::Duration};
+use std::time::Duration;
 
 use driml_learner::{DeviceName, auxiliary::loss::Passes};
-use driml_machine::resources::Machine;
+use driml_machine::{resources::Machine, units::duration};
 use driml_model::ModelConfig;
 use driml_settings::config::{COMPRESSED_FIELDS_BYTES, RunConfig, replay_bytes_each};
 
-use crate::{display::duration, resume::Behind};
+use crate::run_folder::{Behind, RunFolder};
 
 /// Arithmetic that a core sustains over a whole run, learner and actors together, in GFLOP/s.
 ///
@@ -95,7 +95,7 @@ pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
 pub fn describe(
     config: &RunConfig,
     from: &str,
-    run_dir: &Path,
+    run_dir: &RunFolder,
     lockstep: bool,
     behind: Behind,
     machine: &Machine,
@@ -221,7 +221,7 @@ mod tests {
         let plan = describe(
             &config,
             "preset paper",
-            Path::new("runs/x"),
+            &RunFolder::new("runs/x"),
             false,
             Behind::default(),
             &MACHINE,

@@ -7,7 +7,10 @@ use std::{
 };
 
 use anyhow::{Context, bail};
-use driml_machine::error::{Interrupted, Usage};
+use driml_machine::{
+    error::{Interrupted, Usage},
+    units::duration,
+};
 use driml_protocol::{
     Keys, fault,
     session::{self, Endpoints},
@@ -17,12 +20,12 @@ use driml_settings::config::RunConfig;
 use crate::{
     child::{Part, Surroundings},
     console::{self, Screen, print},
-    display::{Display, TEMPLATE, duration},
+    display::{Display, TEMPLATE},
     endpoint::NAMESPACE,
     interrupts::Interrupts,
     meeting::Meeting,
-    record::{Outcome, Recorder, Summary},
-    resume::{self, Behind},
+    resume,
+    run_folder::{Behind, Outcome, Recorder, RunFolder, Summary},
     statuses::Statuses,
 };
 
@@ -53,7 +56,7 @@ const PART_THREADS: u32 = 1;
 /// A part that failed or went silent, a file system that refuses; [`Interrupted`] if a person ended the run.
 pub fn run(
     config: &RunConfig,
-    run_dir: &Path,
+    run_dir: &RunFolder,
     resumed: Option<Behind>,
     listen: Option<String>,
     exit_with_parent: Option<u32>,
@@ -112,7 +115,7 @@ pub fn run(
         }
         return Err(failed);
     }
-    print(&describe(&summary, run_dir))?;
+    print(&summary.describe(run_dir))?;
     written.with_context(|| {
         format!(
             "the run is over and its checkpoint saved, but there is no summary of it: make room on the disk, then `driml local --resume {}` \
@@ -136,7 +139,7 @@ pub fn run(
 /// A run's processes and what is known of them.
 struct Launch<'a> {
     config: &'a RunConfig,
-    run_dir: &'a Path,
+    run_dir: &'a RunFolder,
     behind: Behind,
     /// Names of the replay servers, one a shard, and where each listens.
     servers: Vec<String>,
@@ -178,7 +181,7 @@ impl Launch<'_> {
     }
 
     fn start_and_watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
-        let logs = self.run_dir.join("logs");
+        let logs = self.run_dir.logs();
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
         let config = recorder.config_path().display().to_string();
         let part = |words: &[&str]| {
@@ -340,7 +343,7 @@ impl Launch<'_> {
                     counts.0,
                     counts.1,
                     replay.waiting,
-                    self.run_dir.join("logs").display()
+                    self.run_dir.logs().display()
                 );
             }
         }
@@ -483,27 +486,4 @@ impl Launch<'_> {
         let written = summary.write(self.run_dir);
         (summary, written)
     }
-}
-
-/// What a person reads at the end.
-pub fn describe(summary: &Summary, run_dir: &Path) -> String {
-    let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
-    let how = if summary.outcome == Outcome::Finished {
-        "finished"
-    } else {
-        "interrupted"
-    };
-    format!(
-        "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, mean return {} over the last {} of {} episodes\n{}\n",
-        summary.frames,
-        summary.updates,
-        duration(Duration::from_secs_f64(summary.wall_seconds)),
-        summary.frames_per_second,
-        summary.updates_per_second,
-        number(summary.replay_ratio),
-        number(summary.mean_return),
-        summary.mean_return_of,
-        summary.episodes,
-        run_dir.display()
-    )
 }

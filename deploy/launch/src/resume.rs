@@ -1,10 +1,7 @@
 //! `driml local --resume`: the settings of an interrupted run, and what it has behind it.
 //! It changes nothing in the run's folder, and waits there for whoever still saves.
 
-use std::{
-    path::Path,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use driml_envs::WorldConfig;
@@ -12,42 +9,28 @@ use driml_learner::checkpoint::{self, CheckpointError};
 use driml_machine::{error::usage, resources::Machine};
 use driml_settings::config::{Flags, RunConfig, Source, resolve};
 
-use crate::{console, record};
+use crate::{
+    console,
+    run_folder::{Behind, RunFolder, Summary},
+};
 
 /// How long the learner of a launcher that was killed may take to save.
 const SAVING_MAX: Duration = Duration::from_secs(120);
 
-/// Where a run's checkpoints lie in its folder.
-const CHECKPOINTS: &str = "checkpoints";
-
-/// What a run has behind it when it starts: nothing, or what its newest checkpoint has learned.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Behind {
-    /// Updates done.
-    pub updates: u64,
-    /// Frames that these updates needed, the warm-up included.
-    pub frames: u64,
-}
-
 /// Whether the run in `folder`, which is in this world, can be resumed: it has a checkpoint, which holds nothing of a world's own
 /// progress.
-pub fn can_go_on(world: &WorldConfig, folder: &Path) -> bool {
-    let saved = checkpoint::list(&folder.join(CHECKPOINTS));
-    keeps_nothing(world) && saved.is_ok_and(|all| !all.is_empty())
-}
-
-/// Whether the world's episodes do not depend on how many were played before.
-const fn keeps_nothing(world: &WorldConfig) -> bool {
-    !matches!(world, WorldConfig::MsPacman(world) if world.lethal_schedule.is_some())
+pub fn can_go_on(world: &WorldConfig, folder: &RunFolder) -> bool {
+    let saved = checkpoint::list(&folder.checkpoints());
+    world.is_resumable() && saved.is_ok_and(|all| !all.is_empty())
 }
 
 /// Waits until the learner of the run in `folder` has saved, if the run was ended.
 ///
 /// # Errors
 /// The run is still going on, or its learner takes too long.
-pub fn wait_until_free(folder: &Path) -> anyhow::Result<()> {
-    record::lock(folder)?;
-    let checkpoints = folder.join(CHECKPOINTS);
+pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
+    folder.lock()?;
+    let checkpoints = folder.checkpoints();
     let started = Instant::now();
     let mut said = false;
     while checkpoints.is_dir() {
@@ -75,11 +58,11 @@ pub fn wait_until_free(folder: &Path) -> anyhow::Result<()> {
 /// # Errors
 /// A folder that is no run's, settings that cannot work, no checkpoint, nothing left to do, somebody who is at it.
 pub fn find(
-    folder: &Path,
+    folder: &RunFolder,
     flags: &Flags,
     machine: &Machine,
 ) -> anyhow::Result<(RunConfig, Behind)> {
-    let path = folder.join("config.toml");
+    let path = folder.config();
     let name = path.display().to_string();
     let text = std::fs::read_to_string(&path).map_err(|e| {
         usage!(
@@ -93,14 +76,14 @@ pub fn find(
         ..flags.clone()
     };
     let config = resolve(&Source::File(name, text), &flags, machine)?;
-    if !keeps_nothing(&config.world) {
+    if !config.world.is_resumable() {
         return Err(usage!(
             "the ghosts of the run in {} change as episodes pass, and a checkpoint does not hold how far they are: start it anew",
             folder.display()
         )
         .into());
     }
-    let checkpoints = folder.join(CHECKPOINTS);
+    let checkpoints = folder.checkpoints();
     let all = checkpoint::list(&checkpoints).context("looking for checkpoints")?;
     let Some(&(updates, _)) = all.last() else {
         return Err(usage!(
@@ -110,7 +93,7 @@ pub fn find(
         .into());
     };
     // One that has all its updates and did not come to its end does so now.
-    if updates >= config.updates() && record::is_finished(folder) {
+    if updates >= config.updates() && Summary::is_finished(folder) {
         return Err(usage!(
             "the run in {} is finished, {updates} updates for {} frames: to train on, add --frames with more than these",
             folder.display(),

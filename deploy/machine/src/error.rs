@@ -29,7 +29,7 @@ pub struct Interrupted;
 
 /// ` (did you mean "..."?)` with the candidate most like `name`, or nothing if none is near.
 pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> String {
-    let distance = |candidate: &str| edit_distance(name, candidate);
+    let distance = |candidate: &str| strsim::levenshtein(name, candidate);
     match candidates
         .into_iter()
         .min_by_key(|candidate| distance(candidate))
@@ -39,30 +39,12 @@ pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) ->
     }
 }
 
-/// Characters to insert, delete or replace to make `b` of `a` (Levenshtein).
-pub fn edit_distance(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, x) in a.chars().enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, &y) in b.iter().enumerate() {
-            let replaced = diagonal + usize::from(x != y);
-            diagonal = row[j + 1];
-            row[j + 1] = replaced.min(row[j] + 1).min(diagonal + 1);
-        }
-    }
-    row[b.len()]
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn near_names_are_offered_and_far_ones_are_not() {
-        assert_eq!(edit_distance("kitten", "sitting"), 3);
-        assert_eq!(edit_distance("", "abc"), 3);
         assert_eq!(
             nearest("drimlada", ["c51", "driml-ada"]),
             " (did you mean \"driml-ada\"?)"

@@ -9,3 +9,4 @@ pub mod doctor;
 pub mod driml_cuda;
 pub mod error;
 pub mod resources;
+pub mod units;

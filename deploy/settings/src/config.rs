@@ -6,6 +6,7 @@ use driml_learner::{DeviceName, EstimatorKind};
 use driml_machine::{
     error::{Usage, usage},
     resources::{self, Machine},
+    units::gib,
 };
 use driml_model::ModelConfig;
 use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
@@ -200,11 +201,10 @@ fn fit_memory(
     let run: RunSpec = read(&derived, "run")?;
     let replay: driml_replay_server::Config = read(&derived, "replay")?;
     let local: LocalConfig = read(&derived, "local")?;
-    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
     let actors = resources::actors_bytes(local.actors, &run.world);
     if machine.beside_actors(actors) == 0 {
         return Err(usage!(
-            "{} actors of {} take about {:.1} GiB, and {:.1} GiB are free: use fewer --actors, with more --envs each",
+            "{} actors of {} take about {}, and {} are free: use fewer --actors, with more --envs each",
             local.actors,
             run.world,
             gib(actors),
@@ -220,7 +220,7 @@ fn fit_memory(
     let asked = replay.capacity_transitions;
     if capacity_set && asked > fits(machine.replay_bytes_max(actors)) {
         return Err(usage!(
-            "replay.capacity_transitions = {asked} needs {:.1} GiB, and {free:.1} GiB are free: --set replay.capacity_transitions={}",
+            "replay.capacity_transitions = {asked} needs {}, and {free} are free: --set replay.capacity_transitions={}",
             gib(asked.saturating_mul(bytes_each)),
             fits(machine.replay_bytes(actors))
         ));
@@ -236,7 +236,7 @@ fn fit_memory(
         .is_none_or(|frames| frames > capacity);
     Ok(matters.then(|| {
         format!(
-            "the replay holds the newest {capacity} transitions instead of {asked}: {free:.1} GiB of memory are free, and it takes half, or what actors and learner leave"
+            "the replay holds the newest {capacity} transitions instead of {asked}: {free} of memory are free, and it takes half, or what actors and learner leave"
         )
     }))
 }
@@ -250,7 +250,6 @@ fn fit_compressed(
     replay: &driml_replay_server::Config,
     (machine, actors): (&Machine, u64),
 ) -> Result<Option<String>, Usage> {
-    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
     let free = gib(machine.memory_bytes);
     let asked = replay.capacity_transitions;
     let fields = asked.saturating_mul(COMPRESSED_FIELDS_BYTES);
@@ -258,14 +257,14 @@ fn fit_compressed(
     let bytes = machine.replay_bytes(actors).saturating_sub(fields);
     if fields > machine.replay_bytes(actors) / 2 {
         return Err(usage!(
-            "replay.capacity_transitions = {asked} needs {:.1} GiB beside the frames, and {free:.1} GiB are free: --set replay.capacity_transitions={}",
+            "replay.capacity_transitions = {asked} needs {} beside the frames, and {free} are free: --set replay.capacity_transitions={}",
             gib(fields),
             machine.replay_bytes(actors) / 2 / COMPRESSED_FIELDS_BYTES
         ));
     }
     match replay.compressed_bytes_max {
         Some(max) if max.min(frames) > machine.replay_bytes_max(actors) => Err(usage!(
-            "replay.compressed_bytes_max = {max} is {:.1} GiB, and {free:.1} GiB are free: --set replay.compressed_bytes_max={bytes}",
+            "replay.compressed_bytes_max = {max} is {}, and {free} are free: --set replay.compressed_bytes_max={bytes}",
             gib(max)
         )),
         Some(_) => Ok(None),
@@ -276,7 +275,7 @@ fn fit_compressed(
             let matters = run_frames.saturating_mul(run.frame_bytes() as u64) > bytes;
             Ok(matters.then(|| {
                 format!(
-                    "compressed frames may take {:.1} GiB, as {free:.1} GiB of memory are free; if they compress badly, the replay holds fewer than {asked} transitions",
+                    "compressed frames may take {}, as {free} of memory are free; if they compress badly, the replay holds fewer than {asked} transitions",
                     gib(bytes)
                 )
             }))

@@ -6,7 +6,7 @@ use driml_learner::LearnerSettings;
 use driml_machine::error::{Usage, usage};
 use toml::{Table, Value};
 
-use crate::{overrides::inline, presets};
+use crate::overrides::inline;
 
 /// What follows, and from what.
 const FOLLOWS: [(&str, &str); 14] = [
@@ -71,17 +71,19 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     let world: WorldName = text(table, "run.world")?
         .parse()
         .map_err(|e| usage!("run.world: {e}"))?;
-    put(table, "world.kind", Value::String(presets::family(world)));
-    if let WorldName::Procgen(game) = world {
-        put(table, "world.game", Value::String(game.name().into()));
+    put(table, "world.kind", Value::String(world.kind().into()));
+    if let Some((key, variant)) = world.variant() {
+        put(
+            table,
+            &format!("world.{key}"),
+            Value::String(variant.into()),
+        );
     }
     let config: WorldConfig = part(table, "world")?;
     let update: LearnerSettings = part(table, "learner.update")?;
-    let shape = driml_envs::frame_shape(&config);
-    let (num_actions, stack) = (
-        driml_envs::num_actions(&config),
-        whole(table, "run.frame_stack")?,
-    );
+    let shape = config.frame_shape();
+    let num_actions = config.num_actions();
+    let stack = whole(table, "run.frame_stack")?;
     let dim = update.dim_heads(num_actions);
     let size = |value: usize| Value::Integer(value as i64);
     let dim = Value::try_from(dim).map_err(|e| usage!("the DIM heads as TOML: {e}"))?;
@@ -104,7 +106,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     ] {
         put(table, path, value);
     }
-    visible_actions(table, world, num_actions);
+    visible_actions(table, &config);
     ladder(table);
     Ok(())
 }
@@ -121,18 +123,11 @@ fn ladder(table: &mut Table) {
 }
 
 /// Fills in what each action amounts to in the world, where that is asked for and not given.
-fn visible_actions(table: &mut Table, world: WorldName, num_actions: usize) {
+fn visible_actions(table: &mut Table, world: &WorldConfig) {
     let asked = find(table, "learner.affinity.alphabet").and_then(Value::as_str) == Some("visible");
     if asked && find(table, "learner.affinity.visible").is_none() {
-        let map: Vec<u8> = match world {
-            WorldName::Procgen(game) => driml_envs::visible_actions(game).into(),
-            // In the other worlds every action does something of its own; each has fewer than 256.
-            _ => (0..num_actions).map(|action| action as u8).collect(),
-        };
-        let map = map
-            .into_iter()
-            .map(|action| Value::Integer(action.into()))
-            .collect();
+        let map = world.visible_actions().into_iter();
+        let map = map.map(|action| Value::Integer(action.into())).collect();
         put(table, "learner.affinity.visible", Value::Array(map));
     }
 }

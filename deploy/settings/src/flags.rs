@@ -22,7 +22,7 @@ const AGENT: &str = "driml-ada";
 /// What to train, and with which settings.
 #[derive(Clone, Debug, Args)]
 pub struct RunFlags {
-    /// World: procgen:GAME, mspacman, chain or ising [default: procgen:bigfish]
+    /// World, such as procgen:coinrun or mspacman; `driml presets` lists them [default: procgen:bigfish]
     #[arg(long, value_name = "WORLD")]
     pub env: Option<String>,
     /// Agent: c51, driml-fix, driml-ada, driml-randk, driml-noact, cpc or curl [default: driml-ada]

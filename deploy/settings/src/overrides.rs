@@ -1,7 +1,7 @@
 //! `--set key=value`: one value of the settings, by its dotted path.
 //! It knows keys and types by what is already in the settings, and no range: the parts' own checks follow.
 
-use driml_machine::error::{Usage, edit_distance, nearest, usage};
+use driml_machine::error::{Usage, nearest, usage};
 use toml::{Table, Value};
 
 /// A parsed `--set`.
@@ -102,7 +102,7 @@ impl Override {
         let paths = leaves(table);
         let key = |path: &str| path.rsplit('.').next().map(str::to_owned);
         let elsewhere = paths.iter().filter(|path| key(path) == key(&self.path));
-        let near = match elsewhere.min_by_key(|path| edit_distance(&self.path, path)) {
+        let near = match elsewhere.min_by_key(|path| strsim::levenshtein(&self.path, path)) {
             Some(path) => format!(" (did you mean {path:?}?)"),
             None => nearest(&self.path, paths.iter().map(String::as_str)),
         };

@@ -117,21 +117,18 @@ pub const AGENTS: [Agent; 7] = [
     },
 ];
 
-fn world_layer(world: WorldName) -> Layer {
-    match world {
-        WorldName::Procgen(_) => layer!("world/procgen"),
-        WorldName::MsPacman => layer!("world/mspacman"),
-        WorldName::Chain => layer!("world/chain"),
-        WorldName::Ising => layer!("world/ising"),
-    }
-}
+/// One for each kind of world in the registry of worlds.
+const WORLDS: [Layer; 4] = [
+    layer!("world/procgen"),
+    layer!("world/mspacman"),
+    layer!("world/chain"),
+    layer!("world/ising"),
+];
 
-/// The kind of a world, as `world.kind` has it: its name without the game.
-pub(crate) fn family(world: WorldName) -> String {
-    let name = world.to_string();
-    name.split_once(':')
-        .map_or(name.as_str(), |(family, _)| family)
-        .to_owned()
+fn world_layer(world: WorldName) -> Layer {
+    let name = format!("world/{}", world.kind());
+    let found = WORLDS.into_iter().find(|layer| layer.name == name);
+    found.expect("a test looks for a layer of each kind")
 }
 
 /// A world by its name, or by its game's.
@@ -184,7 +181,7 @@ pub fn preset(name: &str) -> Result<&'static Preset, Usage> {
 /// # Errors
 /// A preset that is not made for the world.
 pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result<Table, Usage> {
-    if !preset.families.is_empty() && !preset.families.contains(&family(world).as_str()) {
+    if !preset.families.is_empty() && !preset.families.contains(&world.kind()) {
         return Err(usage!(
             "preset {:?} is for {} only, not for {world}; take --preset paper",
             preset.name,
@@ -300,6 +297,13 @@ mod tests {
     }
 
     #[test]
+    fn every_kind_of_world_has_a_layer() {
+        for world in WorldName::all() {
+            assert!(world_layer(world).name.ends_with(world.kind()));
+        }
+    }
+
+    #[test]
     fn every_only_block_names_worlds_that_exist() {
         let worlds: BTreeSet<_> = WorldName::all().map(|world| world.to_string()).collect();
         for layer in all_layers() {
@@ -340,7 +344,10 @@ mod tests {
         let augments = |table: &Table| table["learner"].get("augment").is_some();
         expect_test::expect!["procgen:bigfish procgen:bossfight procgen:chaser procgen:coinrun procgen:jumper procgen:leaper procgen:ninja"]
             .assert_eq(&worlds("driml-fix", augments));
-        assert_eq!(worlds("curl", augments).split(' ').count(), 19);
+        assert_eq!(
+            worlds("curl", augments).split(' ').count(),
+            WorldName::all().count()
+        );
         for name in ["c51", "driml-ada", "driml-randk", "driml-noact", "cpc"] {
             assert_eq!(worlds(name, augments), "", "{name}");
         }

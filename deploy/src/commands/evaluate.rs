@@ -6,6 +6,7 @@ use clap::Args;
 use driml_launch::{
     console::print,
     evaluate::{Levels, Player, Who, levels, mean_and_deviation},
+    run_folder::RunFolder,
 };
 
 #[derive(Debug, Args)]
@@ -29,7 +30,7 @@ pub(crate) struct EvaluateArgs {
 /// # Errors
 /// A folder that is no run's, a damaged checkpoint, levels that the world does not have.
 pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
-    let player = Player::load(&args.run)?;
+    let player = Player::load(&RunFolder::new(&args.run))?;
     let world = levels(&player.config.world, args.levels)?;
     let spec = &player.config.run;
     let which = match args.levels {

@@ -1,17 +1,14 @@
 //! `driml local`: settings, plan, engine, run folder, and then the processes, as processes or in lockstep.
 //! Starting and ending processes is for `processes`.
 
-use std::{
-    path::PathBuf,
-    time::{SystemTime, UNIX_EPOCH},
-};
+use std::path::PathBuf;
 
 use clap::Args;
-use driml_envs::WorldConfig;
 use driml_launch::{
     console::{self, print},
     endpoint::check_endpoints,
-    lockstep, plan, processes, record, resume,
+    lockstep, plan, processes, resume,
+    run_folder::RunFolder,
 };
 use driml_learner::DeviceName;
 use driml_machine::{
@@ -76,7 +73,8 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
     }
     let (config, from, behind) = match &args.resume {
         Some(folder) => {
-            let (config, behind) = resume::find(folder, &flags(&args.run), &machine)?;
+            let (config, behind) =
+                resume::find(&RunFolder::new(folder), &flags(&args.run), &machine)?;
             let from = format!("its checkpoint after {} updates", behind.updates);
             (config, from, Some(behind))
         }
@@ -96,10 +94,11 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
     }
     check_ladder(&config)?;
     let run_dir = match args.resume {
-        Some(folder) => folder,
+        Some(folder) => RunFolder::new(folder),
         None => {
             let run_dir = args.run_dir.unwrap_or_else(|| default_run_dir(&config.run));
-            record::check_free(&run_dir)?;
+            let run_dir = RunFolder::new(run_dir);
+            run_dir.check_free()?;
             run_dir
         }
     };
@@ -111,9 +110,7 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
         behind.unwrap_or_default(),
         &machine,
     ))?;
-    if matches!(config.world, WorldConfig::Procgen(_)) {
-        procgen_sys::Engine::install(&mut console::line)?;
-    }
+    config.world.install(&mut console::line)?;
     if args.lockstep {
         if shards > 1 {
             return Err(usage!(
@@ -146,41 +143,18 @@ fn check_ladder(config: &RunConfig) -> Result<(), Usage> {
 }
 
 fn default_run_dir(run: &RunSpec) -> PathBuf {
-    let since = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .map_or(0, |since| since.as_secs());
     let world = run.world.replace(':', "-");
     PathBuf::from("runs").join(format!(
         "{world}-{}-seed{}-{}",
         run.agent,
         run.seed,
-        timestamp(since)
+        timestamp(jiff::Timestamp::now())
     ))
 }
 
-/// `20260131-235959` in UTC, from seconds since 1970.
-///
-/// Source: Howard Hinnant's `civil_from_days`, for days since 1970 that are not negative.
-fn timestamp(seconds: u64) -> String {
-    let (days, second) = (seconds / 86_400 + 719_468, seconds % 86_400);
-    let (era, day_of_era) = (days / 146_097, days % 146_097);
-    let year_of_era =
-        (day_of_era - day_of_era / 1_460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
-    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
-    let march_month = (5 * day_of_year + 2) / 153;
-    let day = day_of_year - (153 * march_month + 2) / 5 + 1;
-    let month = if march_month < 10 {
-        march_month + 3
-    } else {
-        march_month - 9
-    };
-    let year = year_of_era + era * 400 + u64::from(month <= 2);
-    format!(
-        "{year:04}{month:02}{day:02}-{:02}{:02}{:02}",
-        second / 3600,
-        second % 3600 / 60,
-        second % 60
-    )
+/// `20260131-235959`, in UTC.
+fn timestamp(time: jiff::Timestamp) -> String {
+    time.strftime("%Y%m%d-%H%M%S").to_string()
 }
 
 #[cfg(test)]
@@ -189,9 +163,10 @@ mod tests {
 
     #[test]
     fn timestamps_are_the_calendars() {
-        assert_eq!(timestamp(0), "19700101-000000");
-        assert_eq!(timestamp(951_782_399), "20000228-235959");
-        assert_eq!(timestamp(951_782_400), "20000229-000000");
-        assert_eq!(timestamp(1_767_225_599), "20251231-235959");
+        let of = |seconds| timestamp(jiff::Timestamp::from_second(seconds).unwrap());
+        assert_eq!(of(0), "19700101-000000");
+        assert_eq!(of(951_782_399), "20000228-235959");
+        assert_eq!(of(951_782_400), "20000229-000000");
+        assert_eq!(of(1_767_225_599), "20251231-235959");
     }
 }

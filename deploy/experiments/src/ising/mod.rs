@@ -52,7 +52,8 @@ struct Settings {
 fn task(settings: &Settings) -> anyhow::Result<Task> {
     // DIM with k = 1; what else distinguishes the agents is not used here.
     let agent = "driml-fix";
-    let source = Source::Layers(&presets::PRESETS[0], WorldName::Ising, agent);
+    let world: WorldName = "ising".parse().expect("it is in the registry of worlds");
+    let source = Source::Layers(&presets::PRESETS[0], world, agent);
     let flags = Flags {
         sets: settings.sets.clone(),
         ..Flags::default()

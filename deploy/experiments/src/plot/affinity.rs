@@ -1,10 +1,9 @@
 //! The action affinity A of runs as heat maps, from their newest checkpoints.
 //! It computes nothing: A is what the learner last sent to the replay server.
 
-use std::path::{Path, PathBuf};
-
 use anyhow::Context;
 use driml_figure::{Figure, Heat, Panel};
+use driml_launch::run_folder::RunFolder;
 use driml_learner::{AffinityEstimator, checkpoint};
 use driml_machine::error::usage;
 use driml_settings::config::RunConfig;
@@ -15,7 +14,7 @@ use super::runs::folder_name;
 ///
 /// # Errors
 /// A folder without settings or checkpoint, a run whose agent does not learn A.
-pub(crate) fn figure(folders: &[PathBuf]) -> anyhow::Result<Figure> {
+pub(crate) fn figure(folders: &[RunFolder]) -> anyhow::Result<Figure> {
     let panels = folders
         .iter()
         .map(|folder| heat(folder).map(Panel::Heat))
@@ -33,8 +32,8 @@ pub(crate) fn figure(folders: &[PathBuf]) -> anyhow::Result<Figure> {
     })
 }
 
-fn heat(folder: &Path) -> anyhow::Result<Heat> {
-    let checkpoints = checkpoint::list(&folder.join("checkpoints"))?;
+fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
+    let checkpoints = checkpoint::list(&folder.checkpoints())?;
     let (updates, path) = checkpoints.last().ok_or_else(|| {
         usage!(
             "{} has no checkpoint, from which A is read: name the folder of a run that has one",
@@ -51,7 +50,7 @@ fn heat(folder: &Path) -> anyhow::Result<Heat> {
         .ok_or_else(|| usage!("{} has no A: only driml-ada learns one", folder.display()))?;
     let side = affinity.num_actions();
     let values = affinity.matrix().iter().map(|&a| Some(f64::from(a)));
-    let title = format!("{}, {updates} updates", folder_name(folder));
+    let title = format!("{}, {updates} updates", folder_name(folder.path()));
     Ok(Heat {
         names: action_names(folder, side),
         labels: ("next action".into(), "action".into()),
@@ -62,12 +61,12 @@ fn heat(folder: &Path) -> anyhow::Result<Heat> {
 }
 
 /// The actions' names, or their numbers where the settings cannot be read.
-fn action_names(folder: &Path, side: usize) -> Vec<String> {
-    let path = folder.join("config.toml");
+fn action_names(folder: &RunFolder, side: usize) -> Vec<String> {
+    let path = folder.config();
     let config = std::fs::read_to_string(&path)
         .ok()
         .and_then(|text| RunConfig::parse("config.toml", &text).ok());
-    let names = config.map(|config| driml_envs::action_names(&config.world));
+    let names = config.map(|config| config.world.action_names());
     match names {
         Some(names) if names.len() == side => names.iter().map(|&name| name.to_owned()).collect(),
         _ => (0..side).map(|action| action.to_string()).collect(),

@@ -9,7 +9,7 @@ mod runs;
 use std::collections::BTreeSet;
 
 use driml_figure::{Axis, Chart, Figure, Format, Panel, Series};
-use driml_launch::{console::print, display::loss_title};
+use driml_launch::{console::print, display::loss_title, run_folder::RunFolder};
 use driml_machine::error::usage;
 
 pub(crate) use self::{
@@ -39,7 +39,10 @@ const OVERVIEW: [&str; 6] = [
 pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
     Format::of(&args.out).map_err(|e| usage!("{e}"))?;
     let figure = if args.affinity {
-        affinity::figure(&args.runs)?
+        {
+            let folders: Vec<_> = args.runs.iter().map(RunFolder::new).collect();
+            affinity::figure(&folders)?
+        }
     } else {
         charts(args)?
     };
@@ -68,7 +71,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         .iter()
         // A folder given twice is one run, not two seeds.
         .filter(|folder| seen.insert(folder.canonicalize().unwrap_or_else(|_| (*folder).clone())))
-        .map(|folder| Run::read(folder))
+        .map(|folder| Run::read(&RunFolder::new(folder)))
         .collect::<anyhow::Result<Vec<_>>>()?;
     let columns = if args.column.is_empty() {
         overview(&runs)
@@ -225,7 +228,9 @@ mod tests {
         let a = run_folder(root.path(), "a-1", "c51", 1, METRICS);
         let b = run_folder(root.path(), "a-2", "c51", 2, &other);
         let c = run_folder(root.path(), "c", "driml-ada", 1, METRICS);
-        let runs: Vec<_> = [&a, &b, &c].map(|run| Run::read(run).unwrap()).into();
+        let runs: Vec<_> = [&a, &b, &c]
+            .map(|run| Run::read(&RunFolder::new(run)).unwrap())
+            .into();
         let groups = groups::of(&runs, true);
         let names: Vec<_> = groups.iter().map(|group| group.name.as_str()).collect();
         assert_eq!(names, ["chain c51, 2 seeds", "c"]);
@@ -248,7 +253,10 @@ mod tests {
     fn a_row_that_was_cut_off_is_left_out_and_a_folder_given_twice_is_one_run() {
         let root = tempfile::tempdir().unwrap();
         let a = run_folder(root.path(), "a", "c51", 1, &format!("{METRICS}4,3"));
-        let values = Run::read(&a).unwrap().values("mean_return").unwrap();
+        let values = Run::read(&RunFolder::new(&a))
+            .unwrap()
+            .values("mean_return")
+            .unwrap();
         assert_eq!(values, [(10.0, 1.5), (20.0, 2.5)]);
         let again = root.path().join(".").join("a");
         let out = root.path().join("twice.svg");
@@ -261,7 +269,7 @@ mod tests {
     fn smoothing_is_a_mean_over_the_frames_before_and_said() {
         let root = tempfile::tempdir().unwrap();
         let a = run_folder(root.path(), "a", "c51", 1, METRICS);
-        let runs = [Run::read(&a).unwrap()];
+        let runs = [Run::read(&RunFolder::new(&a)).unwrap()];
         let groups = groups::of(&runs, true);
         let curve = groups[0]
             .curve("mean_return", Some(15), Band::Range)

@@ -1,9 +1,10 @@
 //! A run's folder as a plot needs it: the columns of `metrics.csv`, and the settings without the seed.
 //! It judges no value.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::Context;
+use driml_launch::run_folder::{Columns, RunFolder};
 use driml_machine::error::{Usage, nearest, usage};
 
 /// The column with the standard deviation of k; runs recorded by older programs lack it.
@@ -17,16 +18,16 @@ const WORDS: [&str; 1] = ["waiting"];
 /// A run.
 #[derive(Debug)]
 pub(crate) struct Run {
-    folder: PathBuf,
+    folder: RunFolder,
     /// The folder's name.
     pub(super) name: String,
     /// World and agent, if the settings say.
     pub(super) what: Option<String>,
     /// The settings without seed and without what the machine decides; none if there are none.
     pub(super) settings: Option<toml::Table>,
-    header: Vec<String>,
+    columns: Columns,
+    /// The place of the column `frames`.
     frames: usize,
-    rows: Vec<csv::StringRecord>,
 }
 
 impl Run {
@@ -34,44 +35,30 @@ impl Run {
     ///
     /// # Errors
     /// A folder without `metrics.csv`, or with one that is no run's.
-    pub(crate) fn read(folder: &Path) -> anyhow::Result<Self> {
-        let path = folder.join("metrics.csv");
+    pub(crate) fn read(folder: &RunFolder) -> anyhow::Result<Self> {
+        let path = folder.metrics();
         let text = std::fs::read(&path)
             .map_err(|e| usage!("{} is not the folder of a run: {e}", folder.display()))?;
-        // What follows the last line's end is still being written, or was cut off.
-        let whole = text
-            .iter()
-            .rposition(|&byte| byte == b'\n')
-            .map_or(0, |end| end + 1);
-        let mut file = csv::Reader::from_reader(&text[..whole]);
-        let reading = || format!("reading {}", path.display());
-        let header: Vec<String> = file
-            .headers()
-            .with_context(reading)?
-            .iter()
-            .map(String::from)
-            .collect();
-        let frames = header.iter().position(|name| name == "frames");
-        let frames = frames.ok_or_else(|| {
+        let columns =
+            Columns::parse(&text).with_context(|| format!("reading {}", path.display()))?;
+        let frames = columns.place("frames").ok_or_else(|| {
             usage!(
                 "{} has no column \"frames\": it is no run's",
                 path.display()
             )
         })?;
-        let rows = file.records().collect::<Result<_, _>>();
-        let settings = settings(&folder.join("config.toml"));
+        let settings = settings(&folder.config());
         let run = settings.as_ref().and_then(|table| table.get("run"));
         let word = |key: &str| run.and_then(|run| run.get(key)?.as_str());
         Ok(Self {
-            name: folder_name(folder),
+            name: folder_name(folder.path()),
             what: word("world")
                 .zip(word("agent"))
                 .map(|(world, agent)| format!("{world} {agent}")),
             settings,
-            folder: folder.to_owned(),
-            header,
+            folder: folder.clone(),
+            columns,
             frames,
-            rows: rows.with_context(reading)?,
         })
     }
 
@@ -80,11 +67,11 @@ impl Run {
     /// # Errors
     /// A column that is not there, or holds words.
     pub(crate) fn values(&self, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
-        let place = self.header.iter().position(|name| name == column);
-        let path = self.folder.join("metrics.csv");
+        let place = self.columns.place(column);
+        let path = self.folder.metrics();
         let place = place.filter(|_| !WORDS.contains(&column)).ok_or_else(|| {
             let numbers = || {
-                let all = self.header.iter().map(String::as_str);
+                let all = self.columns.header.iter().map(String::as_str);
                 all.filter(|name| !WORDS.contains(name))
             };
             usage!(
@@ -95,7 +82,7 @@ impl Run {
             )
         })?;
         let mut values = Vec::new();
-        for (line, row) in self.rows.iter().enumerate() {
+        for (line, row) in self.columns.rows.iter().enumerate() {
             let number = |text: &str| {
                 text.parse::<f64>().map_err(|_| {
                     usage!(
@@ -115,17 +102,17 @@ impl Run {
 
     /// The columns of auxiliary losses: those between C51's loss and the total.
     pub(super) fn auxiliary_losses(&self) -> &[String] {
-        let place = |name: &str| self.header.iter().position(|it| it == name);
+        let place = |name: &str| self.columns.header.iter().position(|it| it == name);
         let between = place(C51_LOSS).zip(place(TOTAL_LOSS));
         between
-            .and_then(|(first, last)| self.header.get(first + 1..last))
+            .and_then(|(first, last)| self.columns.header.get(first + 1..last))
             .unwrap_or_default()
     }
 
     /// Whether the column is there and not empty.
     pub(crate) fn has_values(&self, column: &str) -> bool {
-        let place = self.header.iter().position(|name| name == column);
-        place.is_some_and(|place| self.rows.iter().any(|row| !row[place].is_empty()))
+        let place = self.columns.place(column);
+        place.is_some_and(|place| self.columns.rows.iter().any(|row| !row[place].is_empty()))
     }
 }
 

@@ -2,7 +2,7 @@
 //! It reads the run's metrics and summary alone.
 
 use driml_envs::{WorldName, visible_actions};
-use driml_launch::record::Summary;
+use driml_launch::run_folder::Summary;
 
 use crate::plot::Run;
 
@@ -45,20 +45,21 @@ pub(super) fn kinds(world: WorldName, summary: &Summary) -> [f64; 3] {
 
 /// 0 a movement, 1 no-op, 2 special.
 fn kind(world: WorldName, action: usize) -> usize {
-    match world {
-        WorldName::Procgen(game) => match visible_actions(game).get(action) {
+    match world.variant().and_then(|(_, game)| game.parse().ok()) {
+        Some(game) => match visible_actions(game).get(action) {
             Some(4) => 1,
             Some(0..9) => 0,
             _ => 2,
         },
-        // Ms. PacMan's first action is its no-op, Ising's its only one; the chain has none.
-        WorldName::MsPacman | WorldName::Ising => usize::from(action == 0),
-        WorldName::Chain => 0,
+        // Every other world's first action is its no-op.
+        None => usize::from(action == 0),
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use driml_launch::run_folder::RunFolder;
+
     use super::*;
 
     #[test]
@@ -72,7 +73,7 @@ mod tests {
             text += &format!("1,{},{updates},{mean}\n", updates * 32);
         }
         std::fs::write(folder.path().join("metrics.csv"), text).unwrap();
-        let points = windowed(&Run::read(folder.path()).unwrap()).unwrap();
+        let points = windowed(&Run::read(&RunFolder::new(folder.path())).unwrap()).unwrap();
         assert_eq!(points.len(), 10);
         for (frames, k) in points {
             let expected = if frames <= 3_200.0 { 1.0 } else { 3.0 };
@@ -92,6 +93,6 @@ mod tests {
             [3, 4, 9, 14].map(|action| kind(world, action)),
             [0, 1, 2, 2]
         );
-        assert_eq!(kind(WorldName::MsPacman, 0), 1);
+        assert_eq!(kind("mspacman".parse().unwrap(), 0), 1);
     }
 }

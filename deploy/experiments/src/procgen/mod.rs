@@ -324,7 +324,7 @@ fn worlds(names: &[String]) -> Result<Vec<String>, Usage> {
     let mut found = Vec::new();
     for name in names {
         if name == "all" {
-            let games = WorldName::all().filter(|it| matches!(it, WorldName::Procgen(_)));
+            let games = WorldName::all().filter(|it| it.kind() == "procgen");
             found.extend(games.map(|world| world.to_string()));
         } else {
             let world = presets::world(name).map_err(|e| usage!("--games: {e}"))?;

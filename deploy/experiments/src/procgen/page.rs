@@ -2,7 +2,7 @@
 //! Every number is made here from the runs.
 
 use driml_envs::WorldName;
-use driml_launch::record::Summary;
+use driml_launch::run_folder::Summary;
 use driml_protocol::RETURNS_OF;
 
 use super::{

@@ -242,6 +242,8 @@ fn page(results: &Results, screened: &[Screened]) -> Page {
 
 #[cfg(test)]
 mod tests {
+    use driml_launch::run_folder::RunFolder;
+
     use super::*;
 
     #[test]
@@ -251,7 +253,7 @@ mod tests {
         let read = |text: &str| {
             let text = format!("seconds,frames,episodes,mean_return\n{text}");
             std::fs::write(folder.path().join("metrics.csv"), text).unwrap();
-            soonest(&Run::read(folder.path()).unwrap(), &random).unwrap()
+            soonest(&Run::read(&RunFolder::new(folder.path())).unwrap(), &random).unwrap()
         };
         // Chance is 0.5 with 0.58; three standard errors of 100 episodes are 0.17.
         let rows = "1,0,0,\n2,100,30,2\n3,200,100,0.6\n4,300,100,0.7\n5,400,100,0.8\n";
@@ -261,7 +263,7 @@ mod tests {
         // 30 episodes, though the run has had 200: three standard errors are 0.32.
         let text = "seconds,frames,episodes,mean_return,mean_return_of\n1,100,200,0.8,30\n2,200,210,0.9,40\n";
         std::fs::write(folder.path().join("metrics.csv"), text).unwrap();
-        let found = soonest(&Run::read(folder.path()).unwrap(), &random).unwrap();
+        let found = soonest(&Run::read(&RunFolder::new(folder.path())).unwrap(), &random).unwrap();
         assert_eq!(found, Some(200.0));
     }
 }

@@ -266,7 +266,7 @@ fn device(
     let context = CudaContext::new(ordinal)?;
     let (name, (major, minor)) = (context.name()?, context.compute_capability()?);
     let (free, total) = context.mem_get_info()?;
-    let [free, total] = [free, total].map(|bytes| super::fact::gib(bytes as u64));
+    let [free, total] = [free, total].map(|bytes| crate::units::gib(bytes as u64));
     let text = format!("{name}, compute capability {major}.{minor}, {total}, {free} free");
     let built = option_env!("CUDA_COMPUTE_CAP").and_then(|it| it.parse().ok());
     Ok(match built {

@@ -62,11 +62,6 @@ impl fmt::Display for Fact {
     }
 }
 
-/// Bytes as a person reads them.
-pub(super) fn gib(bytes: u64) -> String {
-    format!("{:.1} GiB", bytes as f64 / f64::from(1 << 30))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -81,6 +76,5 @@ mod tests {
         let json = serde_json::to_string(&fact).unwrap();
         assert!(json.contains(r#""state":"missing""#), "{json}");
         assert_eq!(serde_json::from_str::<Fact>(&json).unwrap(), fact);
-        assert_eq!(gib(3 << 29), "1.5 GiB");
     }
 }

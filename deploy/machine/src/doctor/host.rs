@@ -6,8 +6,8 @@ use std::path::Path;
 use driml_protocol::shared_memory::lockable_bytes;
 use nix::sys::statvfs::statvfs;
 
-use super::fact::{Fact, State, gib};
-use crate::resources::Machine;
+use super::fact::{Fact, State};
+use crate::{resources::Machine, units::gib};
 
 /// Below this a run's three processes do not fit, bytes: they take 0.9 GiB with a small replay.
 const MEMORY_MIN: u64 = 1 << 30;

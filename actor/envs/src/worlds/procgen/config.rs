@@ -3,7 +3,7 @@
 
 use procgen_sys::{DistributionMode, Game, Options, ProcgenError};
 
-use crate::EnvError;
+use crate::error::EnvError;
 
 /// Which levels of which game, and how they look.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]

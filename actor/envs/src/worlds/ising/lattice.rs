@@ -4,7 +4,7 @@
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::EnvError;
+use crate::error::EnvError;
 
 /// Neighbours of one site: up, down, left, right.
 const NEIGHBOURS: usize = 4;

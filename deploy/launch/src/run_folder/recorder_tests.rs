@@ -53,7 +53,7 @@ fn statuses() -> (ReplayStatus, LearnerStatus) {
 #[test]
 fn a_run_leaves_settings_metrics_and_a_summary() {
     let folder = tempfile::tempdir().unwrap();
-    let run = folder.path().join("run");
+    let run = RunFolder::new(folder.path().join("run"));
     let mut recorder = Recorder::create(
         &run,
         "[run]\n",
@@ -72,20 +72,20 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
     assert!(recorder.missing().is_empty());
     let summary = recorder.summarise(Outcome::Finished, &spec(), &replay, &learner);
     summary.write(&run).unwrap();
-    assert!(is_finished(&run));
+    assert!(Summary::is_finished(&run));
     assert_eq!(
         (summary.frames, summary.replay_ratio, summary.mean_k),
         (2_000, Some(8.0), Some(1.5))
     );
 
-    let csv = fs::read_to_string(run.join("metrics.csv")).unwrap();
+    let csv = fs::read_to_string(run.metrics()).unwrap();
     let columns: Vec<_> = csv.lines().map(|line| line.split(',').count()).collect();
     assert_eq!(columns, [26, 26, 26], "{csv}");
     expect!["seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,mean_return_of,c51_kl,dim_3t3,dim_3t4,dim_4t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,sd_k,mean_age,weights_version,affinity_version,actors,waiting,rss_mib_replay_server,rss_mib_actor_0"]
         .assert_eq(csv.lines().next().unwrap());
 
     let json: serde_json::Value =
-        serde_json::from_slice(&fs::read(run.join("summary.json")).unwrap()).unwrap();
+        serde_json::from_slice(&fs::read(run.summary()).unwrap()).unwrap();
     for key in [
         "frames",
         "updates",
@@ -112,7 +112,7 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
 #[test]
 fn a_resumed_run_goes_on_in_its_metrics() {
     let folder = tempfile::tempdir().unwrap();
-    let run = folder.path().join("run");
+    let run = RunFolder::new(folder.path().join("run"));
     let processes = ["replay-server".into()];
     let mut recorder = Recorder::create(&run, "[run]\n", &LOSSES, &processes).unwrap();
     let (mut replay, mut learner) = statuses();
@@ -132,7 +132,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     summary.write(&run).unwrap();
     drop(recorder);
     // A launcher that was killed while it wrote.
-    let path = run.join("metrics.csv");
+    let path = run.metrics();
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, format!("{text}9.0,40")).unwrap();
 
@@ -141,7 +141,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     assert!(said.to_string().contains("has other columns"), "{said}");
     let mut recorder =
         Recorder::go_on(&run, "[new]\n", &LOSSES, &processes, behind, 9_999).unwrap();
-    assert!(!run.join("summary.json").exists());
+    assert!(!run.summary().exists());
     // While the replay fills again nothing is new.
     (replay.transitions_inserted, replay.episodes) = (1_500, 1);
     learner.updates = 31;
@@ -160,7 +160,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
         ..behind
     };
     let read =
-        |frames_max| Rows::read(&path, header(&LOSSES, &processes), all, frames_max).unwrap();
+        |frames_max| rows_up_to(&path, header(&LOSSES, &processes), all, frames_max).unwrap();
     assert_eq!(read(2_050).rows.len(), 2);
     let rows = read(9_999);
     let column = |name| -> Vec<f64> {
@@ -173,17 +173,4 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     // Squares: 2.5 and 4 are 3.25 in the mean, 1.75^2 is 3.0625.
     assert_eq!(column("sd_k"), [0.5, 0.5, 0.433013]);
     assert!(column("seconds").is_sorted());
-}
-
-#[test]
-fn a_folder_in_use_is_refused_and_an_empty_one_is_not() {
-    let folder = tempfile::tempdir().unwrap();
-    assert!(check_free(folder.path()).is_ok());
-    fs::write(folder.path().join("x"), "").unwrap();
-    let said = check_free(folder.path()).unwrap_err().to_string();
-    assert!(
-        said.contains("exists and is not empty: choose another --run-dir"),
-        "{said}"
-    );
-    assert!(check_free(&folder.path().join("x")).is_err());
 }

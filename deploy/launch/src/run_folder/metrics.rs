@@ -1,14 +1,20 @@
 //! The table of `metrics.csv`: its columns, a row, and the rows that a resumed run keeps.
 //! It writes no file: the recorder does.
 
-use std::{fs, io::ErrorKind, path::Path};
+use std::{
+    fs::{self, File},
+    io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom},
+    path::Path,
+};
 
 use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{LearnerStatus, ReplayStatus};
 
-use super::Episodes;
-use crate::resume::Behind;
+use super::{columns::Columns, folder::RunFolder, resume_point::Behind, returns::Episodes};
+
+/// Bytes at the end of the file in which its last row lies.
+const LAST_ROW_BYTES: u64 = 4096;
 
 /// The columns of the metrics: the auxiliary `losses` stand between C51's and the total.
 pub(super) fn header(losses: &[&str], processes: &[String]) -> Vec<String> {
@@ -104,73 +110,92 @@ impl Moment<'_> {
     }
 }
 
-/// Rows of metrics that a run begins with.
-pub(super) struct Rows {
-    pub(super) header: Vec<String>,
-    pub(super) rows: Vec<csv::StringRecord>,
+/// The rows of an interrupted run up to what it has `behind` it, of no more than `frames_max` frames; none where there is no
+/// such file.
+pub(super) fn rows_up_to(
+    path: &Path,
+    header: Vec<String>,
+    behind: Behind,
+    frames_max: u64,
+) -> anyhow::Result<Columns> {
+    let reading = || format!("reading {}", path.display());
+    let none = |header| Columns {
+        header,
+        rows: Vec::new(),
+    };
+    let text = match fs::read(path) {
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(none(header)),
+        read => read.with_context(reading)?,
+    };
+    let found = Columns::parse(&text).with_context(reading)?;
+    if !found.header.is_empty() && found.header != header {
+        return Err(usage!(
+            "{} has other columns than a run of several processes by this version of driml: go on with the version that began it; a \
+             run in --lockstep is repeated, not resumed",
+            path.display()
+        )
+        .into());
+    }
+    let mut kept = none(header);
+    for row in found.rows {
+        let count = |name| kept.value::<u64>(&row, name);
+        let (Some(updates), Some(frames)) = (count("updates"), count("frames")) else {
+            return Err(usage!("{}: {row:?} is no row of metrics", path.display()).into());
+        };
+        // Actors run ahead: without the second condition a run that now ends sooner would end before its rows.
+        if updates <= behind.updates && frames <= frames_max {
+            kept.rows.push(row);
+        }
+    }
+    Ok(kept)
 }
 
-impl Rows {
-    pub(super) const fn none(header: Vec<String>) -> Self {
-        Self {
-            header,
-            rows: Vec::new(),
-        }
-    }
+/// How far a run is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Progress {
+    /// Frames of the last row of metrics.
+    pub frames: u64,
+    /// Episodes of the last row of metrics.
+    pub episodes: u64,
+}
 
-    /// The rows of an interrupted run up to what it has `behind` it, of no more than `frames_max` frames.
-    pub(super) fn read(
-        path: &Path,
-        header: Vec<String>,
-        behind: Behind,
-        frames_max: u64,
-    ) -> anyhow::Result<Self> {
-        let reading = || format!("reading {}", path.display());
-        let text = match fs::read(path) {
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(Self::none(header)),
-            read => read.with_context(reading)?,
+/// How far the run in `folder` is; none before its first row of metrics. Only the file's ends are read.
+pub fn progress(folder: &RunFolder) -> Option<Progress> {
+    let mut file = File::open(folder.metrics()).ok()?;
+    let mut header = String::new();
+    BufReader::new(&file).read_line(&mut header).ok()?;
+    let length = file.metadata().ok()?.len();
+    let start = length.saturating_sub(LAST_ROW_BYTES);
+    file.seek(SeekFrom::Start(start)).ok()?;
+    let mut end = Vec::new();
+    file.read_to_end(&mut end).ok()?;
+    let end = String::from_utf8_lossy(&end);
+    // What follows the last line's end is still being written.
+    let row = end.get(..end.rfind('\n')?)?.lines().last()?;
+    let last = Columns::parse(format!("{header}{row}\n").as_bytes()).ok()?;
+    Some(Progress {
+        frames: last.last("frames")?,
+        episodes: last.last("episodes")?,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_last_whole_row_counts() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        let write = |text: &str| fs::write(folder.metrics(), text).unwrap();
+        assert_eq!(progress(&folder), None);
+        write("seconds,frames,updates,a,b,c,episodes\n");
+        assert_eq!(progress(&folder), None);
+        write("seconds,frames,updates,a,b,c,episodes\n1,200,3,,,,7\n2,30");
+        let found = Progress {
+            frames: 200,
+            episodes: 7,
         };
-        // What follows the last line's end was cut off.
-        let whole = text.iter().rposition(|&byte| byte == b'\n');
-        let mut reader = csv::Reader::from_reader(&text[..whole.map_or(0, |end| end + 1)]);
-        let found = reader.headers().with_context(reading)?;
-        if !found.is_empty() && found != header {
-            return Err(usage!(
-                "{} has other columns than a run of several processes by this version of driml: go on with the version that began it; a \
-                 run in --lockstep is repeated, not resumed",
-                path.display()
-            )
-            .into());
-        }
-        let mut this = Self::none(header);
-        let rows: Vec<_> = reader
-            .records()
-            .collect::<Result<_, _>>()
-            .with_context(reading)?;
-        for row in rows {
-            let count = |name| this.value::<u64>(&row, name);
-            let (Some(updates), Some(frames)) = (count("updates"), count("frames")) else {
-                return Err(usage!("{}: {row:?} is no row of metrics", path.display()).into());
-            };
-            // Actors run ahead: without the second condition a run that now ends sooner would end before its rows.
-            if updates <= behind.updates && frames <= frames_max {
-                this.rows.push(row);
-            }
-        }
-        Ok(this)
-    }
-
-    pub(super) fn value<T: std::str::FromStr>(
-        &self,
-        row: &csv::StringRecord,
-        name: &str,
-    ) -> Option<T> {
-        let column = self.header.iter().position(|it| it == name)?;
-        row.get(column)?.parse().ok()
-    }
-
-    /// What the last row has in the column `name`.
-    pub(super) fn last<T: std::str::FromStr>(&self, name: &str) -> Option<T> {
-        self.value(self.rows.last()?, name)
+        assert_eq!(progress(&folder), Some(found));
     }
 }

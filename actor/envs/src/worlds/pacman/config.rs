@@ -4,8 +4,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::maze::{GHOSTS, HEIGHT, WIDTH};
-use crate::ising::{Boundary, IsingLattice};
-use crate::{EnvError, FrameShape};
+use crate::environment::FrameShape;
+use crate::error::EnvError;
+use crate::worlds::ising::{Boundary, IsingLattice};
 
 /// The settings of Ms. PacMan. Ghosts 0 to 3 are red, cyan, orange and green.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -93,7 +94,7 @@ impl PacmanConfig {
             return Err(invalid("step_limit must be at least 1, got 0".into()));
         }
         if let Some(ising) = &self.ising {
-            crate::ising::check_temperature(ising.temperature)?;
+            crate::worlds::ising::check_temperature(ising.temperature)?;
             if ising.sweeps_per_step == 0 {
                 return Err(invalid(
                     "ising.sweeps_per_step must be at least 1, got 0".into(),

@@ -7,7 +7,9 @@ use serde::{Deserialize, Serialize};
 
 use super::lattice::{Boundary, IsingLattice, check_temperature};
 use crate::copies::{RngUse, check_num_envs, check_step, copy_rng};
-use crate::{EnvError, Environment, FrameShape, StepEnd};
+use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::error::EnvError;
+use crate::settings::WorldSettings;
 
 /// The settings of the Ising world. The paper: lattice 84, patch 42, temperature 0.4.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -117,6 +119,29 @@ impl IsingWorld {
     /// Row and column of the first site of copy `env`'s patch in the current episode; `None` if there is no such copy.
     pub fn patch_origin(&self, env: usize) -> Option<(usize, usize)> {
         self.copies.get(env).map(|field| field.origin)
+    }
+}
+
+impl WorldSettings for IsingConfig {
+    fn validate(&self) -> Result<(), EnvError> {
+        IsingConfig::validate(self)
+    }
+
+    fn frame_shape(&self) -> FrameShape {
+        IsingConfig::frame_shape(self)
+    }
+
+    fn action_names(&self) -> &'static [&'static str] {
+        &IsingWorld::ACTION_NAMES
+    }
+
+    fn build(
+        &self,
+        num_envs: usize,
+        seed: u64,
+        _threads: usize,
+    ) -> Result<Box<dyn Environment>, EnvError> {
+        Ok(Box::new(IsingWorld::new(self, num_envs, seed)?))
     }
 }
 

@@ -5,15 +5,14 @@
 //! those of which all was seen; `return`, undiscounted. Of a shard in which more than 100 episodes ended between two looks
 //! only the last 100 are here, and the numbers of the others are missing; the mean of the last 100 is right all the same.
 
-use std::{collections::VecDeque, fs, io::ErrorKind, path::Path};
+use std::{collections::VecDeque, fs, io::ErrorKind};
 
 use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{RETURNS_OF, ReplayStatus, Returns};
 
-use super::table::Table;
+use super::{columns::Columns, folder::RunFolder, table::Table};
 
-const FILE: &str = "returns.csv";
 const HEADER: [&str; 3] = ["frames", "episode", "return"];
 
 /// A mean, and of how many returns it is.
@@ -53,7 +52,7 @@ impl TrainingReturns {
     ///
     /// # Errors
     /// A file system that refuses.
-    pub(super) fn create(folder: &Path) -> anyhow::Result<Self> {
+    pub(super) fn create(folder: &RunFolder) -> anyhow::Result<Self> {
         Self::begin(folder, &[])
     }
 
@@ -62,19 +61,15 @@ impl TrainingReturns {
     ///
     /// # Errors
     /// A file that is none of this kind, a file system that refuses.
-    pub(super) fn go_on(folder: &Path, frames_max: u64) -> anyhow::Result<Self> {
-        let path = folder.join(FILE);
+    pub(super) fn go_on(folder: &RunFolder, frames_max: u64) -> anyhow::Result<Self> {
+        let path = folder.returns();
         let reading = || format!("reading {}", path.display());
         let text = match fs::read(&path) {
             Err(e) if e.kind() == ErrorKind::NotFound => Vec::new(),
             read => read.with_context(reading)?,
         };
-        // What follows the last line's end was cut off.
-        let whole = text.iter().rposition(|&byte| byte == b'\n');
         let mut rows = Vec::new();
-        for row in csv::Reader::from_reader(&text[..whole.map_or(0, |end| end + 1)]).into_records()
-        {
-            let row = row.with_context(reading)?;
+        for row in Columns::parse(&text).with_context(reading)?.rows {
             let (frames, ..) = read(&row)
                 .ok_or_else(|| usage!("{}: {row:?} is no row of returns", path.display()))?;
             if frames <= frames_max {
@@ -84,8 +79,8 @@ impl TrainingReturns {
         Self::begin(folder, &rows)
     }
 
-    fn begin(folder: &Path, rows: &[csv::StringRecord]) -> anyhow::Result<Self> {
-        let table = Table::create(&folder.join(FILE), &HEADER.map(String::from), rows)?;
+    fn begin(folder: &RunFolder, rows: &[csv::StringRecord]) -> anyhow::Result<Self> {
+        let table = Table::create(&folder.returns(), &HEADER.map(String::from), rows)?;
         let known: Vec<_> = rows.iter().filter_map(read).collect();
         let newest = known.iter().rev().take(RETURNS_OF).rev();
         let (frames, episode, _) = known.last().copied().unwrap_or_default();
@@ -176,23 +171,21 @@ mod tests {
         }
     }
 
-    fn rows(folder: &Path) -> Vec<String> {
-        let text = fs::read_to_string(folder.join(FILE)).unwrap();
+    fn rows(folder: &RunFolder) -> Vec<String> {
+        let text = fs::read_to_string(folder.returns()).unwrap();
         text.lines().skip(1).map(str::to_owned).collect()
     }
 
     #[test]
     fn every_return_is_taken_once_from_every_shard() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut returns = TrainingReturns::create(folder.path()).unwrap();
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        let mut returns = TrainingReturns::create(&folder).unwrap();
         assert_eq!(returns.mean(), None);
         returns.hear(&[shard(10, 1, 0), shard(5, 0, 50)]);
         returns.hear(&[shard(20, 3, 0), shard(5, 1, 50)]);
         returns.hear(&[shard(20, 3, 0), shard(5, 1, 50)]);
-        assert_eq!(
-            rows(folder.path()),
-            ["15,1,0", "25,2,1", "25,3,2", "25,4,50"]
-        );
+        assert_eq!(rows(&folder), ["15,1,0", "25,2,1", "25,3,2", "25,4,50"]);
         let mean = MeanReturn {
             mean: 53.0 / 4.0,
             of: 4,
@@ -202,8 +195,9 @@ mod tests {
 
     #[test]
     fn the_mean_is_of_the_last_100_though_more_ended_at_once() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut returns = TrainingReturns::create(folder.path()).unwrap();
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        let mut returns = TrainingReturns::create(&folder).unwrap();
         returns.hear(&[shard(10, 5, 0)]);
         returns.hear(&[shard(90, 255, 0)]);
         let mean = MeanReturn {
@@ -211,7 +205,7 @@ mod tests {
             of: 100,
         };
         assert_eq!(returns.mean(), Some(mean));
-        let rows = rows(folder.path());
+        let rows = rows(&folder);
         assert_eq!(rows.len(), 105);
         // 150 of them are in no row, but they have numbers.
         assert_eq!([&rows[5], &rows[104]], ["90,156,155", "90,255,254"]);
@@ -219,17 +213,18 @@ mod tests {
 
     #[test]
     fn a_run_that_goes_on_has_the_returns_before() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut returns = TrainingReturns::create(folder.path()).unwrap();
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        let mut returns = TrainingReturns::create(&folder).unwrap();
         returns.hear(&[shard(1_000, 60, 0)]);
         returns.hear(&[shard(2_000, 70, 0)]);
         // What came after the checkpoint does not count, nor what was cut off.
         returns.hear(&[shard(3_000, 90, 0)]);
-        let path = folder.path().join(FILE);
+        let path = folder.returns();
         let text = fs::read_to_string(&path).unwrap();
         fs::write(&path, text + "3000,91").unwrap();
 
-        let mut returns = TrainingReturns::go_on(folder.path(), 2_500).unwrap();
+        let mut returns = TrainingReturns::go_on(&folder, 2_500).unwrap();
         assert_eq!(returns.mean().unwrap(), MeanReturn { mean: 34.5, of: 70 });
         // Another server, which counts from the start; the replay fills again.
         returns.hear(&[shard(1_500, 40, 1_000)]);
@@ -241,15 +236,12 @@ mod tests {
                 of: 100
             }
         );
-        assert_eq!(rows(folder.path()).last().unwrap(), "2000,110,1039");
+        assert_eq!(rows(&folder).last().unwrap(), "2000,110,1039");
 
         fs::remove_file(&path).unwrap();
-        assert_eq!(
-            TrainingReturns::go_on(folder.path(), 9).unwrap().mean(),
-            None
-        );
+        assert_eq!(TrainingReturns::go_on(&folder, 9).unwrap().mean(), None);
         fs::write(&path, "a,b,c\n1,x,3\n").unwrap();
-        let said = TrainingReturns::go_on(folder.path(), 9).unwrap_err();
+        let said = TrainingReturns::go_on(&folder, 9).unwrap_err();
         assert!(said.to_string().contains("is no row of returns"), "{said}");
     }
 }

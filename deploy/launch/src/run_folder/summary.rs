@@ -1,13 +1,14 @@
 //! `summary.json`: how a run ended and what it counted, in one object.
 //! It computes nothing; the recorder fills it in.
 
-use std::{fs, path::Path};
+use std::{fs, time::Duration};
 
 use anyhow::Context;
+use driml_machine::units::duration;
 use driml_protocol::{Quantiles, whole_file};
 use serde::{Deserialize, Serialize};
 
-const FILE: &str = "summary.json";
+use super::folder::RunFolder;
 
 /// How a run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -106,8 +107,8 @@ impl Summary {
     ///
     /// # Errors
     /// A file system that refuses.
-    pub fn write(&self, folder: &Path) -> anyhow::Result<()> {
-        let path = folder.join(FILE);
+    pub fn write(&self, folder: &RunFolder) -> anyhow::Result<()> {
+        let path = folder.summary();
         let doing = || format!("writing {}", path.display());
         let mut text = serde_json::to_vec_pretty(self).with_context(doing)?;
         text.push(b'\n');
@@ -118,8 +119,8 @@ impl Summary {
     ///
     /// # Errors
     /// There is none, or it is not one.
-    pub fn read(folder: &Path) -> anyhow::Result<Self> {
-        let path = folder.join(FILE);
+    pub fn read(folder: &RunFolder) -> anyhow::Result<Self> {
+        let path = folder.summary();
         let doing = || format!("reading {}", path.display());
         let text = fs::read(&path).with_context(doing)?;
         serde_json::from_slice(&text).with_context(doing)
@@ -129,8 +130,8 @@ impl Summary {
     ///
     /// # Errors
     /// A file system that refuses.
-    pub(super) fn remove(folder: &Path) -> anyhow::Result<()> {
-        let path = folder.join(FILE);
+    pub(super) fn remove(folder: &RunFolder) -> anyhow::Result<()> {
+        let path = folder.summary();
         match fs::remove_file(&path) {
             Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
                 Err(e).with_context(|| format!("removing {}", path.display()))
@@ -138,9 +139,32 @@ impl Summary {
             _ => Ok(()),
         }
     }
-}
 
-/// Whether the run in `folder` came to its end.
-pub fn is_finished(folder: &Path) -> bool {
-    Summary::read(folder).is_ok_and(|it| it.outcome == Outcome::Finished)
+    /// Whether the run in `folder` came to its end.
+    pub fn is_finished(folder: &RunFolder) -> bool {
+        Self::read(folder).is_ok_and(|it| it.outcome == Outcome::Finished)
+    }
+
+    /// What a person reads at the end.
+    pub fn describe(&self, run_dir: &RunFolder) -> String {
+        let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
+        let how = if self.outcome == Outcome::Finished {
+            "finished"
+        } else {
+            "interrupted"
+        };
+        format!(
+            "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, mean return {} over the last {} of {} episodes\n{}\n",
+            self.frames,
+            self.updates,
+            duration(Duration::from_secs_f64(self.wall_seconds)),
+            self.frames_per_second,
+            self.updates_per_second,
+            number(self.replay_ratio),
+            number(self.mean_return),
+            self.mean_return_of,
+            self.episodes,
+            run_dir.display()
+        )
+    }
 }

@@ -24,8 +24,10 @@ use ghost::{Chance, Ghost};
 use maze::{GHOSTS, Item, Maze, Place};
 
 use crate::copies::{RngUse, check_num_envs, check_step, copy_rng};
-use crate::ising::IsingLattice;
-use crate::{EnvError, Environment, FrameShape, StepEnd};
+use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::error::EnvError;
+use crate::settings::WorldSettings;
+use crate::worlds::ising::IsingLattice;
 
 /// N games of Ms. PacMan. Frames [21, 19, 3] RGB, one pixel a cell; actions 0 no-op, 1 up, 2 down, 3 left, 4 right.
 ///
@@ -91,6 +93,34 @@ impl PacmanWorld {
     /// Which ghosts are lethal in copy `env`'s current episode; `None` if there is no such copy.
     pub fn lethal(&self, env: usize) -> Option<[bool; GHOSTS]> {
         self.copies.get(env).map(|game| game.lethal)
+    }
+}
+
+impl WorldSettings for PacmanConfig {
+    fn validate(&self) -> Result<(), EnvError> {
+        PacmanConfig::validate(self)
+    }
+
+    fn frame_shape(&self) -> FrameShape {
+        PacmanConfig::frame_shape(self)
+    }
+
+    fn action_names(&self) -> &'static [&'static str] {
+        &PacmanWorld::ACTION_NAMES
+    }
+
+    fn build(
+        &self,
+        num_envs: usize,
+        seed: u64,
+        _threads: usize,
+    ) -> Result<Box<dyn Environment>, EnvError> {
+        Ok(Box::new(PacmanWorld::new(self, num_envs, seed)?))
+    }
+
+    fn is_resumable(&self) -> bool {
+        // Which ghost is lethal depends on how many episodes were played.
+        self.lethal_schedule.is_none()
     }
 }
 

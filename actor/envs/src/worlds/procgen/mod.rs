@@ -32,13 +32,20 @@ mod config;
 mod tests;
 mod visible_actions;
 
-use procgen_sys::{Engine, FRAME_BYTES, FRAME_SIDE, NUM_ACTIONS, ProcgenError, RESET, VecGame};
+use procgen_sys::{
+    Engine, FRAME_BYTES, FRAME_SIDE, Game, NUM_ACTIONS, ProcgenError, RESET, VecGame,
+};
 
 use crate::copies::check_step;
-use crate::{EnvError, Environment, FrameShape, StepEnd};
+use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::error::EnvError;
+use crate::settings::{Levels, Variants, WorldSettings};
 
 pub use config::ProcgenConfig;
 pub use visible_actions::visible_actions;
+
+/// Levels to draw unseen ones from, right after those trained on.
+const UNSEEN_LEVELS: u32 = 100_000;
 
 /// Resets in a row that may fail to draw a level of the set before it is an error. One is enough unless the game's
 /// no-op completes the drawn level in its first step.
@@ -179,6 +186,68 @@ impl LevelSet {
             self.levels
         );
         Err(ProcgenError::Unexpected(text))
+    }
+}
+
+impl WorldSettings for ProcgenConfig {
+    fn validate(&self) -> Result<(), EnvError> {
+        ProcgenConfig::validate(self)
+    }
+
+    fn frame_shape(&self) -> FrameShape {
+        ProcgenWorld::FRAME_SHAPE
+    }
+
+    fn action_names(&self) -> &'static [&'static str] {
+        &ProcgenWorld::ACTION_NAMES
+    }
+
+    fn build(
+        &self,
+        num_envs: usize,
+        seed: u64,
+        threads: usize,
+    ) -> Result<Box<dyn Environment>, EnvError> {
+        Ok(Box::new(ProcgenWorld::new(self, num_envs, seed, threads)?))
+    }
+
+    fn variants() -> Variants {
+        Variants {
+            key: "game",
+            names: &Game::NAMES,
+        }
+    }
+
+    fn variant(&self) -> Option<&'static str> {
+        Some(self.game.name())
+    }
+
+    fn visible_actions(&self) -> Vec<u8> {
+        visible_actions(self.game).into()
+    }
+
+    fn with_levels(&self, levels: Levels) -> Result<Self, EnvError> {
+        let mut changed = self.clone();
+        match levels {
+            Levels::Train => return Ok(changed),
+            Levels::TrainSingle => {}
+            Levels::Unseen if self.num_levels == 0 => {
+                return Err(EnvError::Config(
+                    "this run trained on all levels there are: none is unseen".into(),
+                ));
+            }
+            Levels::Unseen => {
+                changed.start_level += self.num_levels;
+                changed.num_levels = UNSEEN_LEVELS;
+            }
+        }
+        changed.use_sequential_levels = false;
+        Ok(changed)
+    }
+
+    fn install(&self, progress: &mut dyn FnMut(&str)) -> Result<(), EnvError> {
+        Engine::install(progress).map_err(ProcgenError::from)?;
+        Ok(())
     }
 }
 

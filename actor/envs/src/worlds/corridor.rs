@@ -4,7 +4,9 @@
 use serde::{Deserialize, Serialize};
 
 use crate::copies::{check_num_envs, check_step};
-use crate::{EnvError, Environment, FrameShape, StepEnd};
+use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::error::EnvError;
+use crate::settings::WorldSettings;
 
 /// The cell in which every episode starts: beside the near end.
 const START_CELL: usize = 1;
@@ -12,7 +14,7 @@ const START_CELL: usize = 1;
 /// The settings of the corridor.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct ChainConfig {
+pub struct CorridorConfig {
     /// Cells, both ends included; at least 3. More make the far end harder to find: a uniform random walk gets there
     /// before the near end with probability 1 / (`cells` - 1).
     pub cells: usize,
@@ -28,7 +30,7 @@ pub struct ChainConfig {
     pub reward_right: f32,
 }
 
-impl ChainConfig {
+impl CorridorConfig {
     /// # Errors
     /// Says which setting cannot work.
     pub fn validate(&self) -> Result<(), EnvError> {
@@ -67,7 +69,7 @@ impl ChainConfig {
 }
 
 /// The best undiscounted return of one episode: `optimal_discounted_return` with gamma = 1.
-pub fn optimal_return(config: &ChainConfig) -> f64 {
+pub fn optimal_return(config: &CorridorConfig) -> f64 {
     optimal_discounted_return(config, 1.0)
 }
 
@@ -75,7 +77,7 @@ pub fn optimal_return(config: &ChainConfig) -> f64 {
 ///
 /// The right end is `cells` - 2 steps away, so its reward is the (`cells` - 2)-th, and it counts only if the step limit
 /// allows it; 0 is what waiting for the limit earns.
-pub fn optimal_discounted_return(config: &ChainConfig, gamma: f64) -> f64 {
+pub fn optimal_discounted_return(config: &CorridorConfig, gamma: f64) -> f64 {
     let steps_right = (config.cells - 1 - START_CELL) as u32;
     let left = f64::from(config.reward_left);
     let right = gamma.powi(steps_right as i32 - 1) * f64::from(config.reward_right);
@@ -90,13 +92,13 @@ pub fn optimal_discounted_return(config: &ChainConfig, gamma: f64) -> f64 {
 /// N corridors. A frame is black but for the band of columns that belongs to the agent's cell, which is white.
 ///
 /// Actions: 0 no-op, 1 left, 2 right. Reaching an end is `Terminal`, also in the last step that the limit allows.
-pub struct ChainWorld {
-    config: ChainConfig,
+pub struct CorridorWorld {
+    config: CorridorConfig,
     cells: Vec<usize>,
     episode_steps: Vec<u32>,
 }
 
-impl ChainWorld {
+impl CorridorWorld {
     /// The actions, in their order.
     pub const ACTION_NAMES: [&str; 3] = ["no-op", "left", "right"];
 
@@ -104,7 +106,7 @@ impl ChainWorld {
     ///
     /// # Errors
     /// Settings that cannot work.
-    pub fn new(config: &ChainConfig, num_envs: usize) -> Result<Self, EnvError> {
+    pub fn new(config: &CorridorConfig, num_envs: usize) -> Result<Self, EnvError> {
         config.validate()?;
         check_num_envs(num_envs)?;
         Ok(Self {
@@ -115,7 +117,30 @@ impl ChainWorld {
     }
 }
 
-impl Environment for ChainWorld {
+impl WorldSettings for CorridorConfig {
+    fn validate(&self) -> Result<(), EnvError> {
+        CorridorConfig::validate(self)
+    }
+
+    fn frame_shape(&self) -> FrameShape {
+        CorridorConfig::frame_shape(self)
+    }
+
+    fn action_names(&self) -> &'static [&'static str] {
+        &CorridorWorld::ACTION_NAMES
+    }
+
+    fn build(
+        &self,
+        num_envs: usize,
+        _seed: u64,
+        _threads: usize,
+    ) -> Result<Box<dyn Environment>, EnvError> {
+        Ok(Box::new(CorridorWorld::new(self, num_envs)?))
+    }
+}
+
+impl Environment for CorridorWorld {
     fn frame_shape(&self) -> FrameShape {
         self.config.frame_shape()
     }
@@ -179,8 +204,8 @@ impl Environment for ChainWorld {
 mod tests {
     use super::*;
 
-    fn config() -> ChainConfig {
-        ChainConfig {
+    fn config() -> CorridorConfig {
+        CorridorConfig {
             cells: 8,
             height: 12,
             width: 12,
@@ -191,8 +216,8 @@ mod tests {
     }
 
     /// Return and end of the first episode under a fixed action, with discount `gamma`.
-    fn play(config: &ChainConfig, action: u8, gamma: f64) -> (f64, StepEnd) {
-        let mut world = ChainWorld::new(config, 1).unwrap();
+    fn play(config: &CorridorConfig, action: u8, gamma: f64) -> (f64, StepEnd) {
+        let mut world = CorridorWorld::new(config, 1).unwrap();
         let (mut total, mut discount) = (0.0, 1.0);
         loop {
             let (mut reward, mut end) = ([0.0], [StepEnd::Running]);
@@ -216,7 +241,7 @@ mod tests {
             (3, 1, 2.0),
             (5, 9, -1.0),
         ] {
-            let config = ChainConfig {
+            let config = CorridorConfig {
                 cells,
                 step_limit,
                 reward_left,
@@ -245,7 +270,7 @@ mod tests {
         assert_eq!(play(&config(), 2, 1.0), (1.0, StepEnd::Terminal));
         assert_eq!(
             play(
-                &ChainConfig {
+                &CorridorConfig {
                     step_limit: 6,
                     ..config()
                 },
@@ -257,7 +282,7 @@ mod tests {
         );
         assert_eq!(
             play(
-                &ChainConfig {
+                &CorridorConfig {
                     step_limit: 5,
                     ..config()
                 },
@@ -271,7 +296,7 @@ mod tests {
 
     #[test]
     fn each_cell_has_its_own_frame() {
-        let mut world = ChainWorld::new(&config(), 2).unwrap();
+        let mut world = CorridorWorld::new(&config(), 2).unwrap();
         let mut seen = std::collections::BTreeSet::new();
         let mut frames = vec![0; 2 * 144];
         for _ in 1..7 {
@@ -292,7 +317,7 @@ mod tests {
 
     #[test]
     fn bad_actions_and_settings_are_errors() {
-        let mut world = ChainWorld::new(&config(), 1).unwrap();
+        let mut world = CorridorWorld::new(&config(), 1).unwrap();
         assert!(
             world
                 .step(&[3], &mut [0.0], &mut [StepEnd::Running])
@@ -304,28 +329,28 @@ mod tests {
                 .is_err()
         );
         for bad in [
-            ChainConfig {
+            CorridorConfig {
                 cells: 2,
                 ..config()
             },
-            ChainConfig {
+            CorridorConfig {
                 width: 7,
                 ..config()
             },
-            ChainConfig {
+            CorridorConfig {
                 height: 0,
                 ..config()
             },
-            ChainConfig {
+            CorridorConfig {
                 step_limit: 0,
                 ..config()
             },
-            ChainConfig {
+            CorridorConfig {
                 reward_right: f32::NAN,
                 ..config()
             },
         ] {
-            assert!(ChainWorld::new(&bad, 1).is_err(), "{bad:?}");
+            assert!(CorridorWorld::new(&bad, 1).is_err(), "{bad:?}");
         }
     }
 }

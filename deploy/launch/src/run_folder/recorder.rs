@@ -1,33 +1,32 @@
-//! The run folder: `config.toml`, `metrics.csv`, `returns.csv`, `summary.json`, `logs/`; the learner adds `checkpoints/`.
+//! What is written into the run folder while a run goes on: settings, metrics, returns, and the summary at its end.
 //! It reads no status from anywhere: whoever runs the parts hands them over.
 
-mod metrics;
-mod returns;
-mod summary;
-mod table;
-
 use std::{
-    fs::{self, File, TryLockError},
-    path::{Path, PathBuf},
+    fs::{self, File},
+    path::PathBuf,
     time::Instant,
 };
 
 use anyhow::Context;
-use driml_machine::error::{Usage, usage};
-use driml_protocol::{LearnerStatus, ReplayStatus, whole_file};
+use driml_protocol::{LearnerStatus, ReplayStatus, RunSpec};
 
-use self::{
-    metrics::{Moment, Rows, header},
-    returns::TrainingReturns,
+use super::{
+    columns::Columns,
+    folder::RunFolder,
+    metrics::{Moment, header, rows_up_to},
+    resume_point::Behind,
+    returns::{Episodes, TrainingReturns},
+    summary::{Outcome, Summary},
     table::Table,
 };
-pub use self::{
-    returns::{Episodes, MeanReturn},
-    summary::{Outcome, Summary, is_finished},
-};
-use crate::{display::Rates, resume::Behind};
+use crate::rates::Rates;
 
-const METRICS: &str = "metrics.csv";
+const fn none(header: Vec<String>) -> Columns {
+    Columns {
+        header,
+        rows: Vec::new(),
+    }
+}
 
 /// Writes a run folder.
 #[derive(Debug)]
@@ -41,7 +40,7 @@ pub struct Recorder {
     episodes_before: u64,
     /// Mean and standard deviation of k up to there.
     k_before: Option<(f64, f64)>,
-    folder: PathBuf,
+    folder: RunFolder,
     metrics: Table,
     returns: TrainingReturns,
     losses: &'static [&'static str],
@@ -51,24 +50,6 @@ pub struct Recorder {
     rates: Rates,
 }
 
-/// Refuses a folder in which something lies.
-///
-/// # Errors
-/// Says what to do.
-pub fn check_free(folder: &Path) -> Result<(), Usage> {
-    let taken = match fs::read_dir(folder) {
-        Ok(mut entries) => entries.next().is_some(),
-        Err(_) => folder.exists(),
-    };
-    if taken {
-        return Err(usage!(
-            "the run folder {} exists and is not empty: choose another --run-dir, or remove it",
-            folder.display()
-        ));
-    }
-    Ok(())
-}
-
 impl Recorder {
     /// Makes the folder and writes the settings; the clock starts. `losses` are the agent's auxiliary losses,
     /// `processes` those whose memory is recorded.
@@ -76,17 +57,17 @@ impl Recorder {
     /// # Errors
     /// A folder in which something lies, or a file system that refuses.
     pub fn create(
-        folder: &Path,
+        folder: &RunFolder,
         config_toml: &str,
         losses: &'static [&'static str],
         processes: &[String],
     ) -> anyhow::Result<Self> {
-        check_free(folder)?;
-        fs::create_dir_all(folder)
+        folder.check_free()?;
+        fs::create_dir_all(folder.path())
             .with_context(|| format!("making the run folder {}", folder.display()))?;
-        let lock = lock(folder)?;
-        write_settings(folder, config_toml)?;
-        let rows = Rows::none(header(losses, processes));
+        let lock = folder.lock()?;
+        folder.write_config(config_toml)?;
+        let rows = none(header(losses, processes));
         let returns = TrainingReturns::create(folder)?;
         Self::begin(
             folder,
@@ -105,31 +86,31 @@ impl Recorder {
     /// # Errors
     /// A run that is still going on, metrics of other columns, or a file system that refuses.
     pub(crate) fn go_on(
-        folder: &Path,
+        folder: &RunFolder,
         config_toml: &str,
         losses: &'static [&'static str],
         processes: &[String],
         behind: Behind,
         frames_max: u64,
     ) -> anyhow::Result<Self> {
-        let lock = lock(folder)?;
+        let lock = folder.lock()?;
         let head = header(losses, processes);
         let rows = match behind.updates {
-            0 => Rows::none(head),
-            _ => Rows::read(&folder.join(METRICS), head, behind, frames_max)?,
+            0 => none(head),
+            _ => rows_up_to(&folder.metrics(), head, behind, frames_max)?,
         };
         let returns = TrainingReturns::go_on(folder, rows.last("frames").unwrap_or(0))?;
         Summary::remove(folder)?;
-        write_settings(folder, config_toml)?;
+        folder.write_config(config_toml)?;
         Self::begin(folder, losses, processes, lock, rows, returns, behind)
     }
 
     fn begin(
-        folder: &Path,
+        folder: &RunFolder,
         losses: &'static [&'static str],
         processes: &[String],
         lock: File,
-        rows: Rows,
+        rows: Columns,
         returns: TrainingReturns,
         behind: Behind,
     ) -> anyhow::Result<Self> {
@@ -140,8 +121,8 @@ impl Recorder {
             frames_before: rows.last("frames").unwrap_or(0),
             episodes_before: rows.last("episodes").unwrap_or(0),
             k_before: rows.last("mean_k").zip(rows.last("sd_k")),
-            folder: folder.to_owned(),
-            metrics: Table::create(&folder.join(METRICS), &rows.header, &rows.rows)?,
+            folder: folder.clone(),
+            metrics: Table::create(&folder.metrics(), &rows.header, &rows.rows)?,
             returns,
             losses,
             processes: processes.to_vec(),
@@ -155,7 +136,7 @@ impl Recorder {
 
     /// The settings' file, for parts that read it.
     pub(crate) fn config_path(&self) -> PathBuf {
-        self.folder.join("config.toml")
+        self.folder.config()
     }
 
     /// Mean and standard deviation of k over all `updates` of the run, before it was resumed too.
@@ -236,7 +217,7 @@ impl Recorder {
     pub fn summarise(
         &self,
         outcome: Outcome,
-        run: &driml_protocol::RunSpec,
+        run: &RunSpec,
         replay: &ReplayStatus,
         learner: &LearnerStatus,
     ) -> Summary {
@@ -285,45 +266,6 @@ impl Recorder {
     }
 }
 
-/// Writes `config.toml`.
-fn write_settings(folder: &Path, config_toml: &str) -> anyhow::Result<()> {
-    let head = "# The resolved settings of this run; `driml local --config` with this file repeats it.\n\n";
-    write_whole(
-        &folder.join("config.toml"),
-        format!("{head}{config_toml}").as_bytes(),
-    )
-}
-
-/// Keeps other launchers out of a run folder as long as the file is held.
-pub fn lock(folder: &Path) -> anyhow::Result<File> {
-    let path = folder.join(".lock");
-    let doing = || format!("locking {}", path.display());
-    let file = File::create(&path).with_context(doing)?;
-    match file.try_lock() {
-        Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => Err(usage!(
-            "the run in {} is still going on: end it first, or wait",
-            folder.display()
-        )
-        .into()),
-        Err(TryLockError::Error(e)) => {
-            // Not every file system of a cluster has locks, and runs were made without them before.
-            tracing::warn!(
-                "{} cannot be locked: {e}; start no other run there",
-                path.display()
-            );
-            Ok(file)
-        }
-    }
-}
-
-/// Writes a file whole or not at all.
-///
-/// # Errors
-/// A file system that refuses.
-pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    whole_file::write(path, bytes).with_context(|| format!("writing {}", path.display()))
-}
-
 #[cfg(test)]
+#[path = "recorder_tests.rs"]
 mod tests;
