@@ -142,7 +142,7 @@ impl Collector {
 #[cfg(test)]
 mod tests {
     use driml_envs::{CorridorConfig, WorldConfig};
-    use driml_model::{Compute, ConvLayer, DimParts, ModelConfig, Parameters};
+    use driml_model::{Compute, ConvLayer, DimHeads, ModelConfig, Parameters};
     use driml_protocol::{Horizon, TimeoutRule, config::TransportConfig};
 
     use super::*;
@@ -201,7 +201,7 @@ mod tests {
                 hidden: 4,
                 rkhs: 4,
                 action_embed: 4,
-                dim: DimParts::NONE,
+                dim: DimHeads::NONE,
             },
             actor: Config {
                 envs: ENVS,

@@ -114,7 +114,7 @@ impl Policy for NetworkPolicy {
 
 #[cfg(test)]
 mod tests {
-    use driml_model::{Compute, ConvLayer, DimParts, Parameters};
+    use driml_model::{Compute, ConvLayer, DimHeads, Parameters};
     use rand::SeedableRng;
 
     use super::*;
@@ -139,7 +139,7 @@ mod tests {
             hidden: 4,
             rkhs: 4,
             action_embed: 4,
-            dim: DimParts::NONE,
+            dim: DimHeads::NONE,
         };
         let rng = &mut ChaCha8Rng::seed_from_u64(1);
         let weights = Parameters::init(&model, rng, &Compute::CPU.device).unwrap();

@@ -10,7 +10,7 @@ use driml_learner::{
     AdamSettings, Agent, Augment, AugmentSettings, Batch, Lambda, LearnerSettings, Objective,
     auxiliary::{cpc, curl, dim},
 };
-use driml_model::{Compute, ConvLayer, DimParts, ModelConfig};
+use driml_model::{Compute, ConvLayer, DimHeads, ModelConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -60,9 +60,9 @@ fn agent(objective: Objective, lambda: Lambda) -> Agent {
         hidden: 512,
         rkhs: 512,
         action_embed: 64,
-        dim: DimParts::NONE,
+        dim: DimHeads::NONE,
     };
-    model.dim = settings.dim_parts(ACTIONS);
+    model.dim = settings.dim_heads(ACTIONS);
     Agent::new(
         model,
         settings,

@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use candle_core::Tensor;
-use driml_model::{Compute, DimParts, ModelConfig, Network, Parameters};
+use driml_model::{Compute, DimHeads, ModelConfig, Network, Parameters};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
@@ -27,7 +27,7 @@ use crate::{
     tensors::states,
 };
 
-/// What one update did, for a person to watch.
+/// What one update did: the numbers of a row of metrics.
 #[derive(Clone, Debug, PartialEq)]
 pub struct UpdateReport {
     /// Mean KL divergence of the prediction from the projected target, in nats.
@@ -126,21 +126,21 @@ impl Agent {
             target,
             key,
         } = parameters;
-        let built = DimParts {
+        let built = DimHeads {
             action: model.dim.embeds_action(),
             ..model.dim
         };
-        let needed = settings.dim_parts(model.num_actions);
+        let needed = settings.dim_heads(model.num_actions);
         if needed != built {
             return Err(UpdateError::Settings(format!(
                 "the objective uses {needed:?}, the model builds {built:?}"
             )));
         }
-        let operations = compute.operations;
+        let kernels = compute.kernels;
         let auxiliary = settings.auxiliary()?;
         let key = match (auxiliary.key_tau(), key) {
             (None, None) => None,
-            (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, operations, key)?),
+            (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, kernels, key)?),
             (wanted, _) => {
                 let there = if wanted.is_some() { "missing" } else { "there" };
                 let objective = settings.objective.name();
@@ -150,10 +150,10 @@ impl Agent {
             }
         };
         Ok(Self {
-            online_network: Network::with_operations(&model, &online, operations)?,
-            target_network: Network::with_operations(&model.without_dim(), &target, operations)?,
+            online_network: Network::with_kernels(&model, &online, kernels)?,
+            target_network: Network::with_kernels(&model.without_dim(), &target, kernels)?,
             key,
-            adam: Adam::new(settings.adam, &online, operations)?,
+            adam: Adam::new(settings.adam, &online, kernels)?,
             compute: compute.clone(),
             auxiliary,
             updates: 0,
@@ -164,12 +164,12 @@ impl Agent {
         })
     }
 
-    /// The network's sizes.
+    /// The online network's sizes, its auxiliary heads included.
     pub const fn model(&self) -> &ModelConfig {
         &self.model
     }
 
-    /// The settings.
+    /// The settings of its updates.
     pub const fn settings(&self) -> &LearnerSettings {
         &self.settings
     }
@@ -252,7 +252,7 @@ impl Agent {
             &logits,
             batch.action,
             target_projection.clone(),
-            self.compute.operations,
+            self.compute.kernels,
         )?;
         let auxiliary = self.auxiliary.losses(&LossInputs {
             online: &self.online_network,
@@ -290,7 +290,7 @@ impl Agent {
     /// # Errors
     /// As [`Agent::update`].
     pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
-        let norm = gradients.norm(self.compute.operations)?;
+        let norm = gradients.norm(self.compute.kernels)?;
         self.adam.step(
             &self.online,
             gradients,
@@ -304,8 +304,8 @@ impl Agent {
             .updates
             .is_multiple_of(self.settings.target_period_updates)
         {
-            let (tau, operations) = (self.settings.target_tau, self.compute.operations);
-            target::follow(&self.target, &self.online, tau, operations)?;
+            let (tau, kernels) = (self.settings.target_tau, self.compute.kernels);
+            target::follow(&self.target, &self.online, tau, kernels)?;
         }
         Ok(norm)
     }

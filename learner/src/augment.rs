@@ -29,7 +29,7 @@ pub struct AugmentSettings {
 }
 
 impl AugmentSettings {
-    /// Checks the ranges.
+    /// Checks each strength against its range.
     ///
     /// # Errors
     /// The first setting out of its range: its name, its value, the range.

@@ -45,9 +45,9 @@ pub enum CheckpointError {
     Io {
         /// What was being done.
         what: &'static str,
-        /// To what.
+        /// The file or folder to which it was being done.
         path: PathBuf,
-        /// The reason.
+        /// What the file system said.
         why: io::Error,
     },
     /// A file is not what was written.
@@ -56,7 +56,7 @@ pub enum CheckpointError {
          to begin anew, remove all checkpoint-* folders beside it"
     )]
     Damaged {
-        /// The file.
+        /// The damaged file.
         file: PathBuf,
         /// What is wrong with it.
         why: String,
@@ -67,7 +67,7 @@ pub enum CheckpointError {
          resume with the settings it was made with, or choose another folder"
     )]
     OtherRun {
-        /// The checkpoint.
+        /// The folder of the checkpoint.
         folder: PathBuf,
         /// Hash of the run that wrote it.
         found: String,
@@ -101,7 +101,7 @@ pub struct RunState<'a> {
     pub agent: &'a Agent,
     /// The affinity estimate, if the run has one.
     pub affinity: Option<&'a AffinityEstimator>,
-    /// The learner's generator.
+    /// The generator behind augmentation and affinity.
     pub rng: &'a ChaCha8Rng,
     /// Newest version of the weights that was published.
     pub weights_version: u64,
@@ -116,13 +116,13 @@ pub struct Restored {
     pub agent: Agent,
     /// The affinity estimate, if the run had one.
     pub affinity: Option<AffinityEstimator>,
-    /// The learner's generator.
+    /// The generator behind augmentation and affinity.
     pub rng: ChaCha8Rng,
     /// Newest version of the weights that had been published.
     pub weights_version: u64,
 }
 
-/// `state.json`.
+/// The contents of `state.json`: all of a checkpoint that is not a tensor.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct StateFile {

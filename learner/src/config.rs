@@ -20,7 +20,7 @@ use crate::{
     settings::LearnerSettings,
 };
 
-/// The `[learner]` table.
+/// The `[learner]` table: batches, publication, checkpoints, and what an update does.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
@@ -42,7 +42,7 @@ pub struct Config {
     pub update: LearnerSettings,
     /// What is done to the states that the auxiliary objective sees; nothing if it is not there.
     pub augment: Option<AugmentSettings>,
-    /// Action affinity.
+    /// How the action affinity A is estimated, if the horizon follows it.
     pub affinity: AffinityConfig,
 }
 
@@ -54,7 +54,7 @@ const fn a_minute_ms() -> u64 {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EstimatorKind {
-    /// Not at all.
+    /// No affinity is estimated; the horizon does not follow it.
     None,
     /// By a small network (the paper).
     Learned,
@@ -260,11 +260,11 @@ pub enum LearnerPartError {
 pub struct LearnerPart {
     /// What all parts agree on.
     pub spec: RunSpec,
-    /// The network.
+    /// The network's sizes: the `[model]` table.
     pub model: ModelConfig,
-    /// The learner's own.
+    /// The learner's own numbers: the `[learner]` table.
     pub learner: Config,
-    /// How messages travel.
+    /// How messages travel: the `[transport]` table.
     pub transport: TransportConfig,
 }
 

@@ -30,10 +30,10 @@ pub enum UpdateError {
     Diverged {
         /// The first parameter in which it showed.
         name: String,
-        /// The learning rate.
+        /// The learning rate of that step.
         lr: f64,
     },
-    /// The model refused.
+    /// The model refused its sizes, parameters or inputs.
     #[error(transparent)]
     Model(#[from] driml_model::ModelError),
     /// The tensor library refused.

@@ -152,7 +152,7 @@ impl Learner {
         self.spec_hash
     }
 
-    /// Updates taken.
+    /// Updates taken since the run began, those before a restart included.
     pub const fn updates(&self) -> u64 {
         self.agent.updates()
     }

@@ -1,7 +1,7 @@
 //! Everything that one update depends on beside the network's sizes: the table `[learner.update]`.
 //! It fills in no number: presets do, with their sources.
 
-use driml_model::DimParts;
+use driml_model::DimHeads;
 use serde::{Deserialize, Deserializer, Serialize, de::Error};
 
 use crate::{
@@ -31,7 +31,7 @@ pub struct LearnerSettings {
     pub max_grad_norm: f64,
     /// The optimiser's numbers.
     pub adam: AdamSettings,
-    /// The target network moves once in so many updates, at least 1.
+    /// Updates from one move of the target network to the next, at least 1.
     pub target_period_updates: u64,
     /// Share of the online network in a move of the target network, in (0, 1].
     pub target_tau: f64,
@@ -101,9 +101,9 @@ impl LearnerSettings {
 
     /// The heads that the online network needs in a world of `num_actions` actions; none where the settings cannot work, which
     /// [`LearnerSettings::validate`] says.
-    pub fn dim_parts(&self, num_actions: usize) -> DimParts {
+    pub fn dim_heads(&self, num_actions: usize) -> DimHeads {
         let action = self.condition_on_action && num_actions > 1;
         let loss = self.auxiliary();
-        loss.map_or(DimParts::NONE, |loss| loss.heads(action))
+        loss.map_or(DimHeads::NONE, |loss| loss.heads(action))
     }
 }

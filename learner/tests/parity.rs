@@ -6,7 +6,7 @@
 use std::{fs, path::PathBuf};
 
 use driml_learner::{
-    Compute, Operations,
+    Compute, Kernels,
     parity::{ParityReport, check_file},
 };
 
@@ -44,7 +44,7 @@ fn every_open_case_is_within_tolerance() {
 #[test]
 fn so_it_is_with_candle_s_own_operations() {
     all_within_tolerance(&Compute {
-        operations: Operations::Stock,
+        kernels: Kernels::Candle,
         ..Compute::CPU
     });
 }

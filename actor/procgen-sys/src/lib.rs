@@ -5,7 +5,7 @@
 //! It is a C++ library that ends the whole process on a bad option, so everything is checked here first.
 
 // The engine is a C library: calling it and owning the memory it writes to cannot be done in safe Rust. The other `unsafe` of the
-// workspace is in `learner/model/src/gemm.rs`.
+// workspace is in `learner/model/src/kernels/gemm.rs`.
 #![allow(unsafe_code)]
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 

@@ -84,7 +84,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     let shape = config.frame_shape();
     let num_actions = config.num_actions();
     let stack = whole(table, "run.frame_stack")?;
-    let dim = update.dim_parts(num_actions);
+    let dim = update.dim_heads(num_actions);
     let size = |value: usize| Value::Integer(value as i64);
     let dim = Value::try_from(dim).map_err(|e| usage!("the DIM heads as TOML: {e}"))?;
     for (path, value) in [

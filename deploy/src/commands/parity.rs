@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use driml_launch::console::print;
-use driml_learner::Operations;
+use driml_learner::Kernels;
 use driml_machine::device::{DeviceFlag, ready_for};
 
 #[derive(Debug, Args)]
@@ -28,7 +28,7 @@ pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
     let mut failed = 0;
     let mut compute = args.on.device.open()?;
     if args.stock {
-        compute.operations = Operations::Stock;
+        compute.kernels = Kernels::Candle;
     }
     for file in &args.files {
         let report = driml_learner::parity::check_file(file, &compute)?;

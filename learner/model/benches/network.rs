@@ -4,13 +4,13 @@
 
 use candle_core::{Device, Tensor};
 use criterion::{Criterion, criterion_group, criterion_main};
-use driml_model::{ConvLayer, DimParts, ModelConfig, Network, Parameters, PolicyNetwork};
+use driml_model::{ConvLayer, DimHeads, ModelConfig, Network, Parameters, PolicyNetwork};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
 const SIZES: [(usize, usize); 2] = [(64, 64), (104, 80)];
 
-fn config((height, width): (usize, usize), dim: DimParts) -> ModelConfig {
+fn config((height, width): (usize, usize), dim: DimHeads) -> ModelConfig {
     let layer = |out, kernel, stride| ConvLayer {
         out,
         kernel,
@@ -48,7 +48,7 @@ fn learner(criterion: &mut Criterion) {
         let mut group =
             criterion.benchmark_group(format!("network {}x{}x3 batch {BATCH}", size.0, size.1));
         group.sample_size(20);
-        let heads = DimParts {
+        let heads = DimHeads {
             psi3: true,
             phi3: true,
             psi4: true,
@@ -114,7 +114,7 @@ fn actor(criterion: &mut Criterion) {
     for size in SIZES {
         let mut group = criterion.benchmark_group(format!("policy {}x{}x3", size.0, size.1));
         group.sample_size(50);
-        let config = config(size, DimParts::NONE);
+        let config = config(size, DimHeads::NONE);
         let mut policy = PolicyNetwork::new(
             &config,
             &parameters(&config).to_safetensors(|_| true).unwrap(),

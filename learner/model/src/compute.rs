@@ -1,32 +1,32 @@
-//! Where tensors live, and which operations compute them.
-//! It computes nothing: this project's kernels are in `conv` and `linear`, candle's own operations in `stock`.
+//! Where tensors live, and which kernels compute with them.
+//! It computes nothing: what computes is in `kernels`.
 
 use std::{fmt, str::FromStr};
 
 use candle_core::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
-use crate::{
+use crate::kernels::{
+    candle::{self, ConvLayerTensors},
     conv, linear,
-    stock::{self, ConvLayerTensors},
 };
 
-/// Which operations the network and the losses are made of. Both give the same up to rounding, gradients included.
+/// What the network and the losses are computed with. Both give the same up to rounding, gradients included.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Operations {
+pub enum Kernels {
     /// This project's kernels, fused and blocked for the CPU, and there alone.
-    Own,
+    Fused,
     /// Compositions of candle's own operations: any device, several times slower on the CPU.
-    Stock,
+    Candle,
 }
 
-impl Operations {
+impl Kernels {
     /// The faster ones of those that a device has.
     pub fn of(device: &Device) -> Self {
         if device.is_cpu() {
-            Self::Own
+            Self::Fused
         } else {
-            Self::Stock
+            Self::Candle
         }
     }
 
@@ -36,15 +36,15 @@ impl Operations {
         layers: &[ConvLayerTensors<'_>],
     ) -> candle_core::Result<Tensor> {
         match self {
-            Self::Own => conv::conv_stack(images, layers),
-            Self::Stock => stock::conv_stack(images, layers),
+            Self::Fused => conv::conv_stack(images, layers),
+            Self::Candle => candle::conv_stack(images, layers),
         }
     }
 
     pub(crate) fn linear(self, x: &Tensor, w: &Tensor, b: &Tensor) -> candle_core::Result<Tensor> {
         match self {
-            Self::Own => linear::linear(x, w, b),
-            Self::Stock => stock::linear(x, w, b),
+            Self::Fused => linear::linear(x, w, b),
+            Self::Candle => candle::linear(x, w, b),
         }
     }
 
@@ -55,40 +55,40 @@ impl Operations {
         b: &Tensor,
     ) -> candle_core::Result<Tensor> {
         match self {
-            Self::Own => linear::linear_relu(x, w, b),
-            Self::Stock => stock::relu(&stock::linear(x, w, b)?),
+            Self::Fused => linear::linear_relu(x, w, b),
+            Self::Candle => candle::relu(&candle::linear(x, w, b)?),
         }
     }
 
     pub(crate) fn relu(self, x: &Tensor) -> candle_core::Result<Tensor> {
         match self {
-            Self::Own => linear::relu(x),
-            Self::Stock => stock::relu(x),
+            Self::Fused => linear::relu(x),
+            Self::Candle => candle::relu(x),
         }
     }
 }
 
-/// A device and the operations used on it.
+/// A device and the kernels used on it.
 #[derive(Clone, Debug)]
 pub struct Compute {
     /// Where parameters, batches and losses live.
     pub device: Device,
     /// How they are computed there.
-    pub operations: Operations,
+    pub kernels: Kernels,
 }
 
 impl Compute {
     /// The CPU with this project's kernels.
     pub const CPU: Self = Self {
         device: Device::Cpu,
-        operations: Operations::Own,
+        kernels: Kernels::Fused,
     };
 
-    /// A device with the faster operations that it has.
+    /// A device with the faster kernels that it has.
     pub fn on(device: &Device) -> Self {
         Self {
             device: device.clone(),
-            operations: Operations::of(device),
+            kernels: Kernels::of(device),
         }
     }
 }
@@ -120,7 +120,7 @@ pub enum DeviceError {
 }
 
 impl DeviceName {
-    /// The device with the faster operations that it has.
+    /// The device with the faster kernels that it has.
     ///
     /// # Errors
     /// A GPU that is not there, or a program that was built without the feature `cuda`.

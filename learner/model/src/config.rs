@@ -41,13 +41,13 @@ pub struct ModelConfig {
     /// Width of the embedded action.
     pub action_embed: usize,
     /// Which DIM heads exist.
-    pub dim: DimParts,
+    pub dim: DimHeads,
 }
 
 /// Which DIM heads exist. Nothing is built that no lambda needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct DimParts {
+pub struct DimHeads {
     /// Psi over the locations of f3(s_t).
     pub psi3: bool,
     /// Phi over the locations of f3(s_{t+k}).
@@ -60,7 +60,7 @@ pub struct DimParts {
     pub action: bool,
 }
 
-impl DimParts {
+impl DimHeads {
     /// No DIM head at all: the C51 agent, target networks and actors.
     pub const NONE: Self = Self {
         psi3: false,
@@ -155,7 +155,7 @@ impl ModelConfig {
     /// The same network without its DIM heads: what target networks and actors hold.
     pub fn without_dim(&self) -> Self {
         Self {
-            dim: DimParts::NONE,
+            dim: DimHeads::NONE,
             ..self.clone()
         }
     }

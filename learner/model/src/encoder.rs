@@ -3,12 +3,12 @@
 
 use candle_core::Tensor;
 
-use crate::compute::Operations;
+use crate::compute::Kernels;
 use crate::config::ModelConfig;
-use crate::dim_head::Head;
 use crate::error::Result;
+use crate::heads::dim::Head;
+use crate::parameters::Parameters;
 use crate::torso::Torso;
-use crate::weights::Parameters;
 
 /// The part of a network that encodes a state as psi_4(f4).
 ///
@@ -29,15 +29,11 @@ impl Encoder {
     ///
     /// # Errors
     /// An invalid configuration, or a parameter that is missing.
-    pub fn new(
-        config: &ModelConfig,
-        parameters: &Parameters,
-        operations: Operations,
-    ) -> Result<Self> {
+    pub fn new(config: &ModelConfig, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         config.validate()?;
         Ok(Self {
-            torso: Torso::new(config, parameters, operations)?,
-            psi4: Head::new("dim.psi4", config.hidden, parameters, operations)?,
+            torso: Torso::new(config, parameters, kernels)?,
+            psi4: Head::new("dim.psi4", config.hidden, parameters, kernels)?,
         })
     }
 

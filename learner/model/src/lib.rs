@@ -5,34 +5,28 @@
 //! a graph. [`Parameters`] hold the weights under PyTorch's names and shapes.
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
-mod c51_head;
 mod compute;
 mod config;
-mod conv;
-mod dim_head;
 mod encoder;
 mod error;
-mod gemm;
 mod geometry;
-mod im2col;
+mod heads;
 mod init;
 mod input;
-mod linear;
+mod kernels;
 mod network;
+mod parameters;
 mod policy;
-mod stack;
-mod stock;
 mod torso;
-mod weights;
 
-pub use compute::{Compute, DeviceError, DeviceName, Operations};
-pub use config::{DimParts, ModelConfig};
-pub use conv::{conv_stack, conv2d_relu};
+pub use compute::{Compute, DeviceError, DeviceName, Kernels};
+pub use config::{DimHeads, ModelConfig};
 pub use encoder::Encoder;
 pub use error::{ModelError, Result};
 pub use geometry::{ConvLayer, ConvShape};
 pub use input::Enlarge;
-pub use linear::{linear, linear_relu, relu};
+pub use kernels::conv::{conv_stack, conv2d_relu};
+pub use kernels::linear::{linear, linear_relu, relu};
 pub use network::{Features, Network};
+pub use parameters::Parameters;
 pub use policy::PolicyNetwork;
-pub use weights::Parameters;

@@ -3,13 +3,13 @@
 
 use candle_core::Tensor;
 
-use crate::c51_head::C51Head;
-use crate::compute::Operations;
+use crate::compute::Kernels;
 use crate::config::ModelConfig;
-use crate::dim_head::{ActionEmbedding, Head};
 use crate::error::{ModelError, Result};
+use crate::heads::c51::C51Head;
+use crate::heads::dim::{ActionEmbedding, Head};
+use crate::parameters::Parameters;
 use crate::torso::Torso;
-use crate::weights::Parameters;
 
 /// What the torso makes of a batch of frames.
 #[derive(Clone, Debug)]
@@ -25,7 +25,7 @@ pub struct Features {
 /// It shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes this network.
 #[derive(Debug)]
 pub struct Network {
-    operations: Operations,
+    kernels: Kernels,
     torso: Torso,
     head: C51Head,
     action: Option<ActionEmbedding>,
@@ -43,34 +43,34 @@ impl Network {
     /// An invalid configuration, or a parameter that is missing.
     pub fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
         let device = parameters.device();
-        Self::with_operations(config, parameters, Operations::of(&device))
+        Self::with_kernels(config, parameters, Kernels::of(&device))
     }
 
-    /// [`Network::new`] from these operations, not the faster ones of the parameters' device.
+    /// [`Network::new`] with these kernels, not the faster ones of the parameters' device.
     ///
     /// # Errors
     /// As [`Network::new`].
-    pub fn with_operations(
+    pub fn with_kernels(
         config: &ModelConfig,
         parameters: &Parameters,
-        operations: Operations,
+        kernels: Kernels,
     ) -> Result<Self> {
         config.validate()?;
         let channels = config.local_shape().2;
         let head = |exists: bool, name: &str, features: usize| {
             exists
-                .then(|| Head::new(name, features, parameters, operations))
+                .then(|| Head::new(name, features, parameters, kernels))
                 .transpose()
         };
         let action = config
             .dim
             .embeds_action()
-            .then(|| ActionEmbedding::new(config, parameters, operations))
+            .then(|| ActionEmbedding::new(config, parameters, kernels))
             .transpose()?;
         Ok(Self {
-            operations,
-            torso: Torso::new(config, parameters, operations)?,
-            head: C51Head::new(config, parameters, operations)?,
+            kernels,
+            torso: Torso::new(config, parameters, kernels)?,
+            head: C51Head::new(config, parameters, kernels)?,
             action,
             psi3: head(config.dim.psi3, "dim.psi3", channels)?,
             phi3: head(config.dim.phi3, "dim.phi3", channels)?,
@@ -80,8 +80,8 @@ impl Network {
     }
 
     /// What it is made of.
-    pub const fn operations(&self) -> Operations {
-        self.operations
+    pub const fn kernels(&self) -> Kernels {
+        self.kernels
     }
 
     /// f3 and f4 of `frames` [B, H, W, C] u8, which are scaled by 1/255.

@@ -8,14 +8,14 @@ use std::fmt;
 
 use rayon::prelude::*;
 
-use crate::c51_head::expected_returns;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::gemm::Matrix;
 use crate::geometry::ConvShape;
-use crate::im2col::{ConvScratch, Images, forward, grown};
-use crate::linear::{self, relu_in_place};
-use crate::weights::{decode, is_dim};
+use crate::heads::c51::expected_returns;
+use crate::kernels::gemm::Matrix;
+use crate::kernels::im2col::{ConvScratch, Images, forward, grown};
+use crate::kernels::linear::{self, relu_in_place};
+use crate::parameters::{decode, is_dim};
 
 /// Frames that go through the network together on one thread.
 const TILE_FRAMES: usize = 32;

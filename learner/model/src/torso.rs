@@ -4,15 +4,15 @@
 use candle_core::{CpuStorage, CustomOp1, DType, Layout, Shape, Tensor};
 use rayon::prelude::*;
 
-use crate::compute::Operations;
+use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::linear::floats;
-use crate::weights::Parameters;
+use crate::kernels::linear::floats;
+use crate::parameters::Parameters;
 
 #[derive(Debug)]
 pub(crate) struct Torso {
-    operations: Operations,
+    kernels: Kernels,
     /// Height, width and channels of a frame.
     input: [usize; 3],
     /// Weight, bias and stride of each convolution.
@@ -25,7 +25,7 @@ impl Torso {
     pub(crate) fn new(
         config: &ModelConfig,
         parameters: &Parameters,
-        operations: Operations,
+        kernels: Kernels,
     ) -> Result<Self> {
         let convolutions = config.conv.iter().enumerate().map(|(index, layer)| {
             let name = format!("torso.conv{}", index + 1);
@@ -36,7 +36,7 @@ impl Torso {
             ))
         });
         Ok(Self {
-            operations,
+            kernels,
             input: [config.height, config.width, config.channels],
             convolutions: convolutions.collect::<Result<_>>()?,
             fc_weight: parameters.tensor("torso.fc", "weight")?,
@@ -57,14 +57,12 @@ impl Torso {
             .iter()
             .map(|(weight, bias, stride)| (weight, bias, *stride))
             .collect();
-        let maps = self.operations.conv_stack(frames, &layers)?;
-        let flat = match self.operations {
-            Operations::Own => maps.apply_op1(ChannelsFirst)?,
-            Operations::Stock => maps.permute((0, 3, 1, 2))?.flatten_from(1)?,
+        let maps = self.kernels.conv_stack(frames, &layers)?;
+        let flat = match self.kernels {
+            Kernels::Fused => maps.apply_op1(ChannelsFirst)?,
+            Kernels::Candle => maps.permute((0, 3, 1, 2))?.flatten_from(1)?,
         };
-        let f4 = self
-            .operations
-            .linear(&flat, &self.fc_weight, &self.fc_bias)?;
+        let f4 = self.kernels.linear(&flat, &self.fc_weight, &self.fc_bias)?;
         Ok((maps, f4))
     }
 }

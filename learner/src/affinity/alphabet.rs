@@ -10,7 +10,7 @@ use super::error::AffinityError;
 pub struct Alphabet {
     /// Dense index of each raw action's visible action [n], below `len`.
     index: Vec<u8>,
-    /// Visible actions, m.
+    /// Number of visible actions, m.
     len: usize,
 }
 
@@ -58,13 +58,13 @@ impl Alphabet {
         Self::new(&map)
     }
 
-    /// Visible actions, m.
+    /// Number of visible actions, m.
     #[allow(clippy::len_without_is_empty)] // Never empty.
     pub const fn len(&self) -> usize {
         self.len
     }
 
-    /// Raw actions, n.
+    /// Number of raw actions, n.
     pub fn num_actions(&self) -> usize {
         self.index.len()
     }

@@ -20,7 +20,7 @@ pub(super) fn check_array<T: Copy + Into<f64>>(
     }
 }
 
-/// [`check_array`] for probabilities.
+/// [`check_array`], and that every number is a probability.
 pub(super) fn check_probabilities<T: Copy + Into<f64>>(
     name: &str,
     array: &[T],

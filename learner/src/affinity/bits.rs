@@ -5,9 +5,9 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer, de::DeserializeOwn
 
 /// A float with an integer of its size.
 pub(super) trait Bits: Copy {
-    /// The integer.
+    /// The integer type of the float's size.
     type Word: Serialize + DeserializeOwned;
-    /// Its bits.
+    /// The float's bits as an integer.
     fn word(self) -> Self::Word;
     /// The float of these bits.
     fn of(word: Self::Word) -> Self;

@@ -10,7 +10,7 @@ use super::{
     error::AffinityError,
 };
 
-/// The counts' numbers.
+/// Decay and smoothing of the pair counts.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ExactSettings {

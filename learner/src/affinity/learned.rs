@@ -12,7 +12,7 @@ use super::{
     error::AffinityError,
 };
 
-/// The estimator's numbers.
+/// Sizes, optimiser and smoothing of the learned estimate.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LearnedSettings {
@@ -194,7 +194,7 @@ impl LearnedAffinity {
         p[i * hidden + h] + p[to + j * hidden + h] + p[b + h]
     }
 
-    /// q [m, m].
+    /// The network's output q(i, j) for every pair of visible actions, [m, m].
     fn q(&self) -> Vec<f64> {
         let (m, [_, _, out, c]) = (self.alphabet.len(), self.offsets());
         let weights = &self.parameters[out..c];

@@ -4,7 +4,7 @@
 use std::{borrow::Cow, ops::Range};
 
 use candle_core::Tensor;
-use driml_model::{DimParts, Features, Network};
+use driml_model::{DimHeads, Features, Network};
 
 use super::{
     dim::{Dim, Vectors},
@@ -48,7 +48,7 @@ struct Offset {
 }
 
 impl AuxiliaryLoss for Cpc {
-    fn heads(&self, action: bool) -> DimParts {
+    fn heads(&self, action: bool) -> DimHeads {
         self.pairs.heads(action)
     }
 
@@ -78,7 +78,7 @@ impl AuxiliaryLoss for Cpc {
             for ((sum, all_dots), dots) in sums.iter_mut().zip(&mut all_dots).zip(dots) {
                 if let Some(dots) = dots {
                     let scores = self.pairs.scores(dots.rkhs);
-                    let loss = info_nce_loss(&dots.dots, &all, scores, online.operations())?;
+                    let loss = info_nce_loss(&dots.dots, &all, scores, online.kernels())?;
                     *sum = Some(match sum.take() {
                         Some(sum) => (sum + loss)?,
                         None => loss,

@@ -7,7 +7,7 @@
 //! "exactly the same networks for measuring similarity (i.e. one residual block for CURL and CPC)", hence no bilinear
 //! product and no second head.
 
-use driml_model::DimParts;
+use driml_model::DimHeads;
 use serde::{Deserialize, Serialize};
 
 use super::{
@@ -72,10 +72,10 @@ struct Curl {
 
 impl AuxiliaryLoss for Curl {
     /// One head, of which the key encoder has its copy.
-    fn heads(&self, _action: bool) -> DimParts {
-        DimParts {
+    fn heads(&self, _action: bool) -> DimHeads {
+        DimHeads {
             psi4: true,
-            ..DimParts::NONE
+            ..DimHeads::NONE
         }
     }
 
@@ -102,7 +102,7 @@ impl AuxiliaryLoss for Curl {
         let dots = dim::global_dots(&query, &keys)?;
         let all = vec![1; inputs.batch.rows];
         let scores = Scores::new(dots.rkhs, self.tanh_clip);
-        let loss = info_nce_loss(&dots.dots, &all, scores, inputs.online.operations())?;
+        let loss = info_nce_loss(&dots.dots, &all, scores, inputs.online.kernels())?;
         Ok(vec![WeightedLoss {
             name: "curl",
             weight: self.weight,

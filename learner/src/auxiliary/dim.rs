@@ -2,7 +2,7 @@
 //! It holds no parameters (the model does) and does not mask beyond `positive_valid`.
 
 use candle_core::Tensor;
-use driml_model::{DimParts, Features, Network};
+use driml_model::{DimHeads, Features, Network};
 
 use super::{
     loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
@@ -81,7 +81,7 @@ impl Dim {
         valid: &[u8],
         network: &Network,
     ) -> candle_core::Result<Tensor> {
-        info_nce_loss(dots, valid, self.scores(*rkhs), network.operations())
+        info_nce_loss(dots, valid, self.scores(*rkhs), network.kernels())
     }
 
     /// How dot products of vectors of `rkhs` numbers become scores.
@@ -91,8 +91,8 @@ impl Dim {
 }
 
 impl AuxiliaryLoss for Dim {
-    fn heads(&self, action: bool) -> DimParts {
-        self.lambda.dim_parts(action)
+    fn heads(&self, action: bool) -> DimHeads {
+        self.lambda.dim_heads(action)
     }
 
     fn passes(&self, positives: usize, augmented: bool) -> Passes {
@@ -139,13 +139,13 @@ pub fn dots(
 /// What the heads make of anchors (psi) and candidates (phi): [B, L, R] of local features, [B, R] of global ones.
 #[derive(Debug)]
 pub struct Vectors {
-    /// Of anchors, local.
+    /// Psi_3 of the anchors; there if a local anchor is compared.
     pub psi3: Option<Tensor>,
-    /// Of candidates, local.
+    /// Phi_3 of the candidates; there if a local candidate is compared.
     pub phi3: Option<Tensor>,
-    /// Of anchors, global.
+    /// Psi_4 of the anchors; there if a global anchor is compared.
     pub psi4: Option<Tensor>,
-    /// Of candidates, global.
+    /// Phi_4 of the candidates; there if a global candidate is compared.
     pub phi4: Option<Tensor>,
 }
 

@@ -2,7 +2,7 @@
 //! It is apart from C51's target network, which is the same for every agent and would move once in hundreds of updates.
 
 use candle_core::Tensor;
-use driml_model::{Encoder, ModelConfig, Operations, Parameters};
+use driml_model::{Encoder, Kernels, ModelConfig, Parameters};
 
 use crate::{error::UpdateError, optimiser::target};
 
@@ -10,7 +10,7 @@ use crate::{error::UpdateError, optimiser::target};
 #[derive(Debug)]
 pub struct KeyEncoder {
     tau: f64,
-    operations: Operations,
+    kernels: Kernels,
     parameters: Parameters,
     encoder: Encoder,
 }
@@ -24,13 +24,13 @@ impl KeyEncoder {
     pub fn new(
         model: &ModelConfig,
         tau: f64,
-        operations: Operations,
+        kernels: Kernels,
         parameters: Parameters,
     ) -> Result<Self, UpdateError> {
         Ok(Self {
-            encoder: Encoder::new(model, &parameters, operations)?,
+            encoder: Encoder::new(model, &parameters, kernels)?,
             tau,
-            operations,
+            kernels,
             parameters,
         })
     }
@@ -38,7 +38,7 @@ impl KeyEncoder {
     /// What a key encoder has of `online`, copied: where it starts.
     ///
     /// # Errors
-    /// A failing copy.
+    /// A parameter could not be copied on its device.
     pub fn copy_of(online: &Parameters) -> Result<Parameters, UpdateError> {
         Ok(online.copy_part(Encoder::has)?)
     }
@@ -61,6 +61,6 @@ impl KeyEncoder {
     /// # Errors
     /// An online network that lacks a parameter of it.
     pub fn follow(&self, online: &Parameters) -> Result<(), UpdateError> {
-        target::follow(&self.parameters, online, self.tau, self.operations)
+        target::follow(&self.parameters, online, self.tau, self.kernels)
     }
 }

@@ -4,7 +4,7 @@
 use std::{borrow::Cow, fmt};
 
 use candle_core::{Device, Tensor};
-use driml_model::{DimParts, Features, ModelConfig, Network};
+use driml_model::{DimHeads, Features, ModelConfig, Network};
 
 use super::{
     key_encoder::KeyEncoder,
@@ -29,7 +29,7 @@ pub struct MenuItem {
 /// What an agent learns beside the return.
 pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
     /// The heads that the online network needs; `action` says whether Psi is given a_t.
-    fn heads(&self, action: bool) -> DimParts;
+    fn heads(&self, action: bool) -> DimHeads;
 
     /// For a loss with a key encoder (a moving average of torso and Psi_4): the online network's share in its move after each
     /// update, in (0, 1].
@@ -50,9 +50,9 @@ pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
 /// Passes through parts of the network beyond C51's, a row; one with its backward pass counts three times.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Passes {
-    /// Through the torso.
+    /// Passes through the torso, f4 included.
     pub torso: f64,
-    /// Through all heads.
+    /// Passes through all heads that the loss needs.
     pub heads: f64,
     /// Matrices of scores [B, B], a location.
     pub scores: f64,
@@ -92,9 +92,9 @@ pub struct WeightedLoss {
 pub struct LossInputs<'a> {
     /// The network that learns.
     pub online: &'a Network,
-    /// The network's sizes.
+    /// Sizes of the online network.
     pub model: &'a ModelConfig,
-    /// The batch.
+    /// The rows that are learned from, checked.
     pub batch: &'a Batch<'a>,
     /// The online network's features of s_t, not augmented.
     pub features_t: &'a Features,
@@ -108,7 +108,7 @@ impl LossInputs<'_> {
     /// The online network's features of s_t as the loss sees it: augmented, if the batch is.
     ///
     /// # Errors
-    /// A failing operation.
+    /// The tensor library refused.
     pub fn anchors(&self) -> Result<Features, UpdateError> {
         match self.batch.anchors {
             Some(anchors) => self.features(anchors),
@@ -119,7 +119,7 @@ impl LossInputs<'_> {
     /// The online network's features of `states` [.., H, W, C], as many as there are.
     ///
     /// # Errors
-    /// A failing operation.
+    /// The tensor library refused.
     pub fn features<'s>(&self, states: impl Into<Cow<'s, [u8]>>) -> Result<Features, UpdateError> {
         Ok(self.online.features(&self.tensor(states)?)?)
     }
@@ -127,7 +127,7 @@ impl LossInputs<'_> {
     /// The key encoder's vectors [B, rkhs] of the batch's positives, without a gradient.
     ///
     /// # Errors
-    /// A failing operation.
+    /// The tensor library refused.
     ///
     /// # Panics
     /// If the loss has no [`AuxiliaryLoss::key_tau`].

@@ -22,8 +22,8 @@ use settings::AuxiliarySettings;
 
 use crate::error::UpdateError;
 
-/// Every auxiliary loss.
-pub const MENU: [&MenuItem; 4] = [&none::NONE, &dim::DIM, &cpc::CPC, &curl::CURL];
+/// Every auxiliary loss; a new one gets its line here.
+pub const MENU: &[&MenuItem] = &[&none::NONE, &dim::DIM, &cpc::CPC, &curl::CURL];
 
 /// The auxiliary loss of an agent: an item of the [`MENU`], by its name in settings.
 #[derive(Clone, Copy, Serialize, Deserialize)]
@@ -31,7 +31,7 @@ pub const MENU: [&MenuItem; 4] = [&none::NONE, &dim::DIM, &cpc::CPC, &curl::CURL
 pub struct Objective(&'static MenuItem);
 
 impl Objective {
-    /// The return alone.
+    /// No auxiliary loss: the agent learns the return alone.
     pub const NONE: Self = Self(&none::NONE);
 
     /// The objective of this item of the menu.
@@ -39,7 +39,7 @@ impl Objective {
         Self(item)
     }
 
-    /// The name.
+    /// Its name in settings, such as `dim`.
     pub const fn name(self) -> &'static str {
         self.0.name
     }
@@ -54,7 +54,7 @@ impl Objective {
         self.0.losses
     }
 
-    /// The loss.
+    /// Makes the loss from settings.
     ///
     /// # Errors
     /// Settings that are at odds with each other or out of their ranges, and what to do.
@@ -91,7 +91,7 @@ impl FromStr for Objective {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
-        let item = MENU.into_iter().find(|item| item.name == name);
+        let item = MENU.iter().copied().find(|item| item.name == name);
         item.map(Self).ok_or_else(|| {
             let known: Vec<_> = MENU.iter().map(|item| format!("`{}`", item.name)).collect();
             format!(

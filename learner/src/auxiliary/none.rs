@@ -1,6 +1,6 @@
 //! No auxiliary loss: the agent learns the return alone, without a second pass and without heads.
 
-use driml_model::DimParts;
+use driml_model::DimHeads;
 
 use super::{
     loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
@@ -31,8 +31,8 @@ fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, Upda
 struct ReturnAlone;
 
 impl AuxiliaryLoss for ReturnAlone {
-    fn heads(&self, _action: bool) -> DimParts {
-        DimParts::NONE
+    fn heads(&self, _action: bool) -> DimHeads {
+        DimHeads::NONE
     }
 
     fn passes(&self, _positives: usize, _augmented: bool) -> Passes {

@@ -1,7 +1,7 @@
 //! What auxiliary losses take from the settings: weights, the scores' clip, and a table of each loss's own numbers.
 //! Which loss there is stands in `super`.
 
-use driml_model::DimParts;
+use driml_model::DimHeads;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::error::UpdateError;
@@ -13,16 +13,16 @@ pub const PAIRS: [&str; 4] = ["3t3", "3t4", "4t3", "4t4"];
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Lambda {
-    /// Local against local.
+    /// Local features of (s_t, a_t) against local ones of s_{t+k}, at the same location.
     #[serde(rename = "3t3")]
     pub l3t3: f64,
-    /// Local against global.
+    /// Local features of (s_t, a_t) against global ones of s_{t+k}.
     #[serde(rename = "3t4")]
     pub l3t4: f64,
-    /// Global against local.
+    /// Global features of (s_t, a_t) against local ones of s_{t+k}.
     #[serde(rename = "4t3")]
     pub l4t3: f64,
-    /// Global against global.
+    /// Global features of (s_t, a_t) against global ones of s_{t+k}.
     #[serde(rename = "4t4")]
     pub l4t4: f64,
 }
@@ -36,7 +36,7 @@ impl Lambda {
         l4t4: 1.0,
     };
 
-    /// No pair.
+    /// No pair: every weight is 0.
     pub const NONE: Self = Self {
         l3t3: 0.0,
         l3t4: 0.0,
@@ -55,11 +55,11 @@ impl Lambda {
     }
 
     /// The heads that the pairs with a weight above 0 need; `action` says whether psi is given a_t.
-    pub fn dim_parts(&self, action: bool) -> DimParts {
+    pub fn dim_heads(&self, action: bool) -> DimHeads {
         let [local_local, local_global, global_local, global_global] = self.wanted();
         let psi3 = local_local || local_global;
         let psi4 = global_local || global_global;
-        DimParts {
+        DimHeads {
             psi3,
             phi3: local_local || global_local,
             psi4,
@@ -68,7 +68,7 @@ impl Lambda {
         }
     }
 
-    /// Checks the ranges.
+    /// Checks that every weight is a number of 0 or above.
     ///
     /// # Errors
     /// The first weight that is negative or not finite.
@@ -141,7 +141,7 @@ mod tests {
             l4t4,
         };
         let parts = |lambda: Lambda| {
-            let p = lambda.dim_parts(true);
+            let p = lambda.dim_heads(true);
             [p.psi3, p.phi3, p.psi4, p.phi4, p.action]
         };
         assert_eq!(parts(lambda(0.0, 0.0, 0.0, 0.0)), [false; 5]);

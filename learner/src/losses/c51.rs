@@ -2,9 +2,9 @@
 //! It does not make the target (`projection` does) and sends no gradient into it.
 
 use candle_core::{Result, Tensor, bail};
-use driml_model::Operations;
+use driml_model::Kernels;
 
-use super::{scalar_op::scalar_op, stock};
+use super::{candle, scalar_op::scalar_op};
 
 /// Mean over rows of `KL(target || softmax(logits of the taken action))`, and its gradient.
 ///
@@ -84,7 +84,7 @@ pub fn kl_loss(
     logits: &Tensor,
     action: &[u8],
     target: Vec<f32>,
-    operations: Operations,
+    kernels: Kernels,
 ) -> Result<Tensor> {
     let (rows, num_actions, atoms) = logits.dims3()?;
     if rows != action.len() || target.len() != rows * atoms {
@@ -94,8 +94,8 @@ pub fn kl_loss(
             target.len()
         );
     }
-    if operations == Operations::Stock {
-        return stock::kl_loss(logits, action, target);
+    if kernels == Kernels::Candle {
+        return candle::kl_loss(logits, action, target);
     }
     let action = action.to_vec();
     scalar_op("c51-kl", logits, move |logits, gradient| {
@@ -159,7 +159,7 @@ mod tests {
     #[test]
     fn the_operation_gives_the_function() -> Result<()> {
         let logits = Var::from_slice(&LOGITS, (2, ACTIONS, 3), &Device::Cpu)?;
-        let loss = kl_loss(&logits, &[1, 0], TARGET.to_vec(), Operations::Own)?;
+        let loss = kl_loss(&logits, &[1, 0], TARGET.to_vec(), Kernels::Fused)?;
         let grads = loss.affine(3.0, 0.0)?.backward()?;
         let mut gradient = [0f32; 12];
         let expected = kl(&LOGITS, &[1, 0], ACTIONS, &TARGET, &mut gradient);
@@ -178,7 +178,7 @@ mod tests {
         for scale in [1.0, 1e4] {
             let logits = LOGITS.map(|logit| logit * scale);
             let var = Var::from_slice(&logits, (2, ACTIONS, 3), &Device::Cpu)?;
-            let loss = kl_loss(&var, &[1, 0], TARGET.to_vec(), Operations::Stock)?;
+            let loss = kl_loss(&var, &[1, 0], TARGET.to_vec(), Kernels::Candle)?;
             let mut gradient = [0f32; 12];
             let expected = kl(&logits, &[1, 0], ACTIONS, &TARGET, &mut gradient);
             let error = f64::from(loss.to_scalar::<f32>()?) - expected;

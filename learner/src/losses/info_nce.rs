@@ -2,10 +2,10 @@
 //! It does not compute the scores, and does not know which features they compare.
 
 use candle_core::{Result, Tensor, bail};
-use driml_model::Operations;
+use driml_model::Kernels;
 use rayon::prelude::*;
 
-use super::{scalar_op::scalar_op, scores::Scores, stock};
+use super::{candle, scalar_op::scalar_op, scores::Scores};
 
 /// InfoNCE of every valid row against every valid row of its batch, at each location, and its gradient.
 ///
@@ -95,7 +95,7 @@ pub fn info_nce_loss(
     dots: &Tensor,
     valid: &[u8],
     scores: Scores,
-    operations: Operations,
+    kernels: Kernels,
 ) -> Result<Tensor> {
     let (_, anchors, candidates) = dots.dims3()?;
     if anchors != valid.len() || candidates != valid.len() {
@@ -104,8 +104,8 @@ pub fn info_nce_loss(
             valid.len()
         );
     }
-    if operations == Operations::Stock {
-        return stock::info_nce_loss(dots, valid, scores);
+    if kernels == Kernels::Candle {
+        return candle::info_nce_loss(dots, valid, scores);
     }
     let valid = valid.to_vec();
     scalar_op("info-nce", dots, move |dots, gradient| {
@@ -210,7 +210,7 @@ mod tests {
     #[test]
     fn the_operation_gives_the_function() -> Result<()> {
         let var = Var::from_vec(dots(), (LOCATIONS, ROWS, ROWS), &Device::Cpu)?;
-        let loss = info_nce_loss(&var, &[1, 1, 1], SCORES, Operations::Own)?;
+        let loss = info_nce_loss(&var, &[1, 1, 1], SCORES, Kernels::Fused)?;
         let grads = loss.affine(2.0, 0.0)?.backward()?;
         let (expected, gradient) = loss_of(&dots(), &[1, 1, 1]);
         assert_eq!(loss.to_scalar::<f32>()?, expected as f32);
@@ -227,7 +227,7 @@ mod tests {
     fn candle_s_own_operations_give_it_too() -> Result<()> {
         for valid in [[1, 1, 1], [1, 0, 1], [0, 1, 0], [0, 0, 0]] {
             let var = Var::from_vec(dots(), (LOCATIONS, ROWS, ROWS), &Device::Cpu)?;
-            let loss = info_nce_loss(&var, &valid, SCORES, Operations::Stock)?;
+            let loss = info_nce_loss(&var, &valid, SCORES, Kernels::Candle)?;
             let (expected, gradient) = loss_of(&dots(), &valid);
             let error = f64::from(loss.to_scalar::<f32>()?) - expected;
             assert!(error.abs() < 1e-5, "{valid:?}: {error}");

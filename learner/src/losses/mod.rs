@@ -2,8 +2,8 @@
 //! They do not know networks, batches or which of them a run uses.
 
 pub mod c51;
+mod candle;
 pub mod info_nce;
 pub mod projection;
 mod scalar_op;
 pub mod scores;
-mod stock;

@@ -10,7 +10,7 @@ use std::{
 };
 
 use candle_core::{CpuStorage, DType, Device, InplaceOp2, Layout, Tensor, Var, bail};
-use driml_model::{Operations, Parameters};
+use driml_model::{Kernels, Parameters};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -38,7 +38,7 @@ pub struct AdamSettings {
 }
 
 impl AdamSettings {
-    /// Checks the ranges.
+    /// Checks each number against its range.
     ///
     /// # Errors
     /// The first setting out of its range, with its value.
@@ -69,13 +69,13 @@ enum Moments {
 }
 
 impl Moments {
-    fn new(m: &Tensor, v: &Tensor, operations: Operations) -> candle_core::Result<Self> {
-        Ok(match operations {
-            Operations::Own => Self::Fused {
+    fn new(m: &Tensor, v: &Tensor, kernels: Kernels) -> candle_core::Result<Self> {
+        Ok(match kernels {
+            Kernels::Fused => Self::Fused {
                 m: m.flatten_all()?.to_vec1()?,
                 v: v.flatten_all()?.to_vec1()?,
             },
-            Operations::Stock => Self::Tensors {
+            Kernels::Candle => Self::Tensors {
                 m: m.clone(),
                 v: v.clone(),
             },
@@ -99,7 +99,7 @@ impl Moments {
 pub struct Adam {
     settings: AdamSettings,
     step: u64,
-    operations: Operations,
+    kernels: Kernels,
     /// By name, with the parameter's shape.
     moments: BTreeMap<String, (Vec<usize>, Moments)>,
 }
@@ -108,27 +108,27 @@ impl Adam {
     /// Moments of zero for each of `parameters`.
     ///
     /// # Errors
-    /// A failing allocation.
+    /// The device has no memory left for them.
     pub fn new(
         settings: AdamSettings,
         parameters: &Parameters,
-        operations: Operations,
+        kernels: Kernels,
     ) -> Result<Self, UpdateError> {
         let mut moments = BTreeMap::new();
         for (name, var) in parameters.iter() {
             let zeros = var.zeros_like()?;
-            let both = Moments::new(&zeros, &zeros, operations)?;
+            let both = Moments::new(&zeros, &zeros, kernels)?;
             moments.insert(name.to_owned(), (var.dims().to_vec(), both));
         }
         Ok(Self {
             settings,
             step: 0,
-            operations,
+            kernels,
             moments,
         })
     }
 
-    /// Steps taken.
+    /// Steps taken so far, which the bias correction counts.
     pub const fn step_count(&self) -> u64 {
         self.step
     }
@@ -245,7 +245,7 @@ impl Adam {
                 }
                 Ok(tensor.to_device(device)?)
             };
-            *moments = Moments::new(&take("m")?, &take("v")?, self.operations)?;
+            *moments = Moments::new(&take("m")?, &take("v")?, self.kernels)?;
         }
         if let Some(name) = tensors.keys().min() {
             return Err(UpdateError::State(format!(
@@ -385,7 +385,7 @@ mod tests {
         eps: 1e-8,
     };
 
-    /// Whether a step is fine at this parameter and gradient, in the last of so many elements.
+    /// Whether a step is fine at this parameter and gradient, in the last of that many `elements`.
     fn fine(settings: AdamSettings, elements: usize, parameter: f32, gradient: f32) -> bool {
         let rule = Rule::new(settings, 1, 1.0);
         let (mut p, mut g) = (vec![0.5; elements], vec![0.1; elements]);

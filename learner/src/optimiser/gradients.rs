@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Storage, Tensor, backprop::GradStore, bail};
-use driml_model::{Operations, Parameters};
+use driml_model::{Kernels, Parameters};
 use rayon::prelude::*;
 
 use crate::{error::UpdateError, tensors::slice};
@@ -43,13 +43,13 @@ impl Gradients {
     ///
     /// # Errors
     /// [`UpdateError::NonFinite`] with the first parameter whose gradient is infinite or NaN.
-    pub fn norm(&self, operations: Operations) -> Result<f64, UpdateError> {
-        let squares: Vec<f64> = match operations {
-            Operations::Own => {
+    pub fn norm(&self, kernels: Kernels) -> Result<f64, UpdateError> {
+        let squares: Vec<f64> = match kernels {
+            Kernels::Fused => {
                 let each = self.by_name.values().map(squares_on_cpu);
                 each.collect::<Result<_, _>>()?
             }
-            Operations::Stock => {
+            Kernels::Candle => {
                 let squares = |g: &Tensor| g.to_dtype(DType::F64)?.sqr()?.sum_all();
                 let each = self.by_name.values().map(squares);
                 let each = each.collect::<candle_core::Result<Vec<_>>>()?;

@@ -2,7 +2,7 @@
 //! When they do is for `update` to say.
 
 use candle_core::{CpuStorage, InplaceOp2, Layout, bail};
-use driml_model::{Operations, Parameters};
+use driml_model::{Kernels, Parameters};
 
 use crate::{
     error::UpdateError,
@@ -22,7 +22,7 @@ pub fn follow(
     target: &Parameters,
     online: &Parameters,
     tau: f64,
-    operations: Operations,
+    kernels: Kernels,
 ) -> Result<(), UpdateError> {
     for (name, var) in target.iter() {
         let Some(source) = online.get(name) else {
@@ -30,9 +30,9 @@ pub fn follow(
                 "the online network has no {name}"
             )));
         };
-        match operations {
-            Operations::Own => var.inplace_op2(source, &Follow { tau: tau as f32 })?,
-            Operations::Stock => {
+        match kernels {
+            Kernels::Fused => var.inplace_op2(source, &Follow { tau: tau as f32 })?,
+            Kernels::Candle => {
                 let (kept, taken) = (var.affine(1.0 - tau, 0.0)?, source.affine(tau, 0.0)?);
                 var.set(&(kept + taken)?)?;
             }

@@ -9,7 +9,7 @@ use std::{
 };
 
 use candle_core::{DType, Device, Tensor};
-use driml_model::{ConvLayer, DimParts, ModelConfig};
+use driml_model::{ConvLayer, DimHeads, ModelConfig};
 use safetensors::SafeTensors;
 use serde::Deserialize;
 
@@ -27,17 +27,17 @@ pub enum ParityError {
     /// The file could not be read.
     #[error("cannot read {file}: {source}")]
     Read {
-        /// The case.
+        /// The case's file.
         file: PathBuf,
-        /// The reason.
+        /// What the file system said.
         source: io::Error,
     },
     /// The file was read, but cannot be checked.
     #[error("{file}: {why}")]
     InFile {
-        /// The case.
+        /// The case's file.
         file: PathBuf,
-        /// The reason.
+        /// What is wrong with it.
         why: Box<ParityError>,
     },
     /// Not a safetensors file, or not all of one.
@@ -65,7 +65,7 @@ pub enum ParityError {
     Candle(#[from] candle_core::Error),
 }
 
-/// The metadata's `config`.
+/// The metadata key `config` of a case: sizes and settings of the update that the reference computed.
 #[derive(Debug, Deserialize)]
 struct Config {
     obs: Observation,
@@ -102,7 +102,7 @@ struct Sizes {
     action_embed: usize,
 }
 
-/// One case.
+/// One case: a batch, all parameters before the update, and every tensor that must come out.
 pub(super) struct Case {
     config: Config,
     pub(super) settings: LearnerSettings,
@@ -234,7 +234,7 @@ impl Case {
         Ok(())
     }
 
-    pub(super) fn model(&self, dim: DimParts) -> ModelConfig {
+    pub(super) fn model(&self, dim: DimHeads) -> ModelConfig {
         let Config {
             obs,
             actions,
@@ -291,7 +291,7 @@ impl Case {
 
     /// The parameters under `prefix` that `model` builds: heads that no lambda uses are left out.
     pub(super) fn parameters(&self, prefix: &str, model: &ModelConfig) -> HashMap<String, Tensor> {
-        let DimParts {
+        let DimHeads {
             psi3,
             phi3,
             psi4,

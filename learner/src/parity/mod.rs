@@ -9,7 +9,7 @@ use std::{
 };
 
 use candle_core::Tensor;
-use driml_model::{Compute, DimParts, Encoder, ModelConfig, Network, Parameters};
+use driml_model::{Compute, DimHeads, Encoder, ModelConfig, Network, Parameters};
 
 use case::Case;
 pub use case::ParityError;
@@ -29,7 +29,7 @@ use crate::{
 
 /// Values of s_t, in units of return, as a share of the support's width.
 const Q_VALUES: f64 = 1e-5;
-/// Probabilities.
+/// Projected target distributions, each probability.
 const PROJECTION: f64 = 5e-6;
 /// Losses, relative; the second where scores saturate; the third absolute.
 const LOSS: (f64, f64, f64) = (1e-5, 1e-4, 1e-6);
@@ -43,9 +43,9 @@ const UPDATED: f64 = 4e-6;
 pub struct ParityLine {
     /// The group; for groups of several tensors, with the tensor that is nearest to its tolerance.
     pub name: String,
-    /// Largest error found.
+    /// Largest error found among the group's numbers.
     pub error: f64,
-    /// Largest error allowed.
+    /// Largest error at which the group passes.
     pub tolerance: f64,
 }
 
@@ -56,10 +56,10 @@ impl ParityLine {
     }
 }
 
-/// A case's comparison.
+/// What came of one case: every group of tensors with its error and its tolerance.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ParityReport {
-    /// The case.
+    /// The case's file.
     pub file: PathBuf,
     /// One line a tensor group.
     pub lines: Vec<ParityLine>,
@@ -115,8 +115,8 @@ pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityRep
 }
 
 fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError> {
-    let sizes = case.model(DimParts::NONE);
-    let model = case.model(case.settings.dim_parts(sizes.num_actions));
+    let sizes = case.model(DimHeads::NONE);
+    let model = case.model(case.settings.dim_heads(sizes.num_actions));
     let slow = model.without_dim();
     let device = &compute.device;
     let parameters = NetworkParameters {
@@ -263,12 +263,12 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
     // An objective that does not take every pair is taken as it is.
     let loss = objective.loss(&every).or_else(|_| settings.auxiliary())?;
     let model = case.model(loss.heads(settings.condition_on_action));
-    let (device, operations) = (&compute.device, compute.operations);
+    let (device, kernels) = (&compute.device, compute.kernels);
     let named = case.parameters("online.", &model);
     let parameters = Parameters::from_tensors(&model, named, device)?;
-    let online = Network::with_operations(&model, &parameters, operations)?;
+    let online = Network::with_kernels(&model, &parameters, kernels)?;
     let key = match (loss.key_tau(), key_parameters(case, &model, compute)?) {
-        (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, operations, key)?),
+        (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, kernels, key)?),
         _ => None,
     };
     let batch = case.batch();

@@ -61,16 +61,16 @@ pub struct BatchSource {
 
 /// What the learner gets when it asks for its next batch.
 pub enum Next {
-    /// One.
+    /// A batch to learn from.
     Batch(Batch),
-    /// None within the time given.
+    /// No batch came within the time given; ask again.
     NotYet,
-    /// None ever again.
+    /// The run is over: no further batch will come.
     Finished,
 }
 
 impl BatchSource {
-    /// Starts asking.
+    /// Starts the threads that request batches.
     ///
     /// # Errors
     /// The operating system gave no thread.
@@ -82,14 +82,14 @@ impl BatchSource {
         let (sender, fetched) = mpsc::sync_channel(0);
         // A batch a thread, and the one that is learned from.
         let pool = BufferPool::new(requests.in_flight as usize + clients.len());
-        let making = Arc::new(Mutex::new(Making::new(clients.len())));
+        let partial = Arc::new(Mutex::new(PartialBatch::new(clients.len())));
         let mut threads = Vec::new();
         for i in 0..requests.in_flight {
             // Which rows come from which shard follows from the order of answers, so this need not be the run's.
             let mut rng = ChaCha8Rng::from_os_rng();
             let fetcher = Fetcher {
                 clients: clients.to_vec(),
-                making: making.clone(),
+                partial: partial.clone(),
                 id: RequestId::first(rng.random()),
                 rng,
                 requests,
@@ -143,7 +143,7 @@ impl BatchSource {
 
 /// The one batch that is put together from the parts of several shards. It outlives a failed try, because a part that was
 /// given is counted as sampled.
-struct Making {
+struct PartialBatch {
     counts: Vec<Count>,
     /// Rows that are still to come from each shard.
     pending: Vec<u32>,
@@ -152,7 +152,7 @@ struct Making {
     parts: Vec<Batch>,
 }
 
-impl Making {
+impl PartialBatch {
     fn new(shards: usize) -> Self {
         Self {
             counts: vec![Count::default(); shards],
@@ -165,7 +165,7 @@ impl Making {
 
 struct Fetcher {
     clients: Vec<RunClient>,
-    making: Arc<Mutex<Making>>,
+    partial: Arc<Mutex<PartialBatch>>,
     /// The request for a whole batch that comes next.
     id: RequestId,
     rng: ChaCha8Rng,
@@ -211,7 +211,7 @@ impl Fetcher {
     /// One batch; `None` where the replay has nothing yet.
     fn fetch(&mut self) -> anyhow::Result<Option<Fetched>> {
         if self.clients.len() > 1 {
-            return self.fetch_parts();
+            return self.fetch_from_shards();
         }
         self.id = self.id.again();
         let asked = self.ask(0, self.id, self.requests.rows, None)?;
@@ -227,15 +227,15 @@ impl Fetcher {
 
     /// One batch, put together from what the shards give. One is put together at a time: each shard is told what the others
     /// give, so that their rate limiters decide as one.
-    fn fetch_parts(&mut self) -> anyhow::Result<Option<Fetched>> {
-        let making = self.making.clone();
-        let mut making = making.lock().unwrap_or_else(PoisonError::into_inner);
-        let Making {
+    fn fetch_from_shards(&mut self) -> anyhow::Result<Option<Fetched>> {
+        let partial = self.partial.clone();
+        let mut partial = partial.lock().unwrap_or_else(PoisonError::into_inner);
+        let PartialBatch {
             counts,
             pending,
             ids,
             parts,
-        } = &mut *making;
+        } = &mut *partial;
         if parts.is_empty() && pending.iter().all(|&rows| rows == 0) {
             match shards::split(self.requests.rows, counts, &mut self.rng) {
                 Some(split) => *pending = split,
@@ -330,7 +330,7 @@ impl Fetcher {
         &mut self,
         (asked, shared_memory): (PendingReply<BatchReply>, bool),
     ) -> anyhow::Result<Answer> {
-        // Where this process may not map shared memory, the question seems to have been answered by nobody.
+        // A process that may not map shared memory never sees the reply: to it the request looks unanswered.
         let (reply, payload) = asked.receive(&self.pool).inspect_err(|e| {
             let unheard = matches!(
                 e,

@@ -1,5 +1,5 @@
-//! What the learner tells others: its newest weights, once a version, and its affinity to the replay server; its status to
-//! whoever asks. It computes none of it, and no update waits for any of it.
+//! What the learner publishes: each version of its weights and of its affinity to the replay server, its status on request.
+//! No update waits for any of it.
 
 use std::{
     sync::{

@@ -35,7 +35,7 @@ pub struct RunArgs {
     pub namespace: String,
     /// Where checkpoints go: `RUN_DIR/checkpoints`.
     pub run_dir: PathBuf,
-    /// What computes.
+    /// The device on which updates are computed.
     pub device: DeviceName,
 }
 
@@ -43,7 +43,7 @@ pub struct RunArgs {
 /// before, it saves what it has learned.
 ///
 /// # Errors
-/// A device that is not there, nobody to join, settings that cannot work, an update that failed, a disk that refuses.
+/// A device that is not there, no replay server to join, settings that cannot work, an update that failed, a disk that refuses.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let compute = args.device.open()?;

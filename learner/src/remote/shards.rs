@@ -202,7 +202,7 @@ pub(crate) fn split(rows: u32, counts: &[Count], rng: &mut impl Rng) -> Option<V
     Some(split)
 }
 
-/// What all shards but `this` have counted once they have given `pending` rows more, so many each.
+/// What all shards but `this` will have counted once each has given its `pending` rows.
 pub(crate) fn other_shards(counts: &[Count], pending: &[u32], this: usize) -> Tally {
     let others = counts.iter().zip(pending).enumerate();
     others.filter(|(at, _)| *at != this).fold(

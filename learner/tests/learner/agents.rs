@@ -7,7 +7,7 @@ use driml_learner::{
     AffinityConfig, Agent, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner,
     LearnerPart, LearnerSettings, NetworkParameters, Objective, UpdateError,
 };
-use driml_model::{Compute, DimParts, ModelConfig, Parameters};
+use driml_model::{Compute, DimHeads, ModelConfig, Parameters};
 use driml_protocol::{
     Batch as WireBatch, BatchHeader, Horizon, RunSpec, Tally, TimeoutRule, config::TransportConfig,
 };
@@ -52,7 +52,7 @@ fn of(objective: Objective, lambda: Lambda) -> (ModelConfig, LearnerSettings) {
         ..settings(lambda)
     };
     let model = ModelConfig {
-        dim: settings.dim_parts(4),
+        dim: settings.dim_heads(4),
         ..model(lambda)
     };
     (model, settings)
@@ -619,9 +619,9 @@ fn augmentation_and_objective_belong_together() {
     );
     assert_eq!(
         part(CURL, Some(NOTHING)).model.dim,
-        DimParts {
+        DimHeads {
             psi4: true,
-            ..DimParts::NONE
+            ..DimHeads::NONE
         }
     );
 }

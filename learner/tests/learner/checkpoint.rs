@@ -18,7 +18,7 @@ use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
 
 use crate::{
-    made_up::{ACTIONS, ALL_DIM, Rows, STOCK, agent, agent_on, model, settings},
+    made_up::{ACTIONS, ALL_DIM, CANDLE, Rows, agent, agent_on, model, settings},
     update::diverged,
 };
 
@@ -123,7 +123,7 @@ fn load(folder: &Path) -> Result<Option<driml_learner::checkpoint::Restored>, Ch
 
 #[test]
 fn a_checkpoint_goes_on_with_other_operations_than_it_was_saved_by() {
-    for (saver, loader) in [(&Compute::CPU, &STOCK), (&STOCK, &Compute::CPU)] {
+    for (saver, loader) in [(&Compute::CPU, &CANDLE), (&CANDLE, &Compute::CPU)] {
         let folder = Folder::new("operations");
         let mut run = Run::new();
         run.agent = agent_on(saver, ALL_DIM, 1);
@@ -336,7 +336,7 @@ fn a_checkpoint_of_the_first_format_is_read_bit_for_bit() {
 /// With one checkpoint kept, a save of what cannot be gone on from would remove the last good one.
 #[test]
 fn a_state_that_is_not_finite_is_not_saved() {
-    for compute in [&Compute::CPU, &STOCK] {
+    for compute in [&Compute::CPU, &CANDLE] {
         let folder = Folder::new("not-finite");
         let mut run = Run::new();
         run.save(&folder.0, 1);

@@ -5,7 +5,7 @@ use driml_learner::{
     AdamSettings, Agent, Batch, Lambda, LearnerSettings, NO_ACTION, Objective,
     auxiliary::{cpc, curl, dim},
 };
-use driml_model::{Compute, ConvLayer, ModelConfig, Operations};
+use driml_model::{Compute, ConvLayer, Kernels, ModelConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -45,7 +45,7 @@ pub(crate) fn model(lambda: Lambda) -> ModelConfig {
         hidden: 16,
         rkhs: 12,
         action_embed: 7,
-        dim: lambda.dim_parts(true),
+        dim: lambda.dim_heads(true),
     }
 }
 
@@ -83,8 +83,8 @@ pub(crate) fn agent_on(compute: &Compute, lambda: Lambda, seed: u64) -> Agent {
 }
 
 /// The operations of a GPU, on the CPU.
-pub(crate) const STOCK: Compute = Compute {
-    operations: Operations::Stock,
+pub(crate) const CANDLE: Compute = Compute {
+    kernels: Kernels::Candle,
     ..Compute::CPU
 };
 

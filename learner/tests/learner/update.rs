@@ -9,7 +9,7 @@ use driml_model::{Compute, Parameters};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::made_up::{ALL_DIM, NO_DIM, Rows, STOCK, agent, agent_on, model, settings};
+use crate::made_up::{ALL_DIM, CANDLE, NO_DIM, Rows, agent, agent_on, model, settings};
 
 type Values = HashMap<String, Vec<f32>>;
 
@@ -327,7 +327,7 @@ fn fast(compute: &Compute, lr: f64) -> Agent {
 
 #[test]
 fn a_step_size_beyond_the_finite_numbers_is_an_error_that_changes_nothing() {
-    for compute in [&Compute::CPU, &STOCK] {
+    for compute in [&Compute::CPU, &CANDLE] {
         let mut agent = fast(compute, 1e38);
         let before = values(agent.online());
         let error = agent.update(&Rows::random(6, 30).batch()).unwrap_err();
@@ -366,7 +366,7 @@ fn parameters_that_a_step_took_beyond_the_finite_numbers_are_not_published() {
         let said = agent.weights().unwrap_err().to_string();
         assert!(said.contains(name) && said.contains("inf"), "{said}");
         // Elsewhere than on the CPU it shows when the weights are asked for.
-        let (agent, said) = diverged(&STOCK, name);
+        let (agent, said) = diverged(&CANDLE, name);
         said.unwrap();
         let said = agent.weights().unwrap_err().to_string();
         assert!(said.contains(name) && said.contains("inf"), "{said}");
@@ -395,7 +395,7 @@ fn actors_get_torso_and_head_and_nothing_else() {
 #[test]
 fn candle_s_own_operations_learn_the_same() {
     for lambda in [ALL_DIM, NO_DIM] {
-        let (mut ours, mut theirs) = (agent(lambda, 1), agent_on(&STOCK, lambda, 1));
+        let (mut ours, mut theirs) = (agent(lambda, 1), agent_on(&CANDLE, lambda, 1));
         // Past the third update the target network has moved.
         for update in 0..5 {
             let rows = Rows::random(8, update);
@@ -424,7 +424,7 @@ fn candle_s_own_operations_learn_the_same() {
 
 #[test]
 fn with_candle_s_own_operations_bad_arithmetic_changes_nothing_either() {
-    let mut agent = agent_on(&STOCK, ALL_DIM, 1);
+    let mut agent = agent_on(&CANDLE, ALL_DIM, 1);
     let var = agent.online().get("head.bias").unwrap();
     let poison = Tensor::full(f32::NAN, var.dims(), &Device::Cpu).unwrap();
     var.set(&poison).unwrap();
@@ -447,7 +447,7 @@ fn gradients_hold_nothing_of_the_pass_that_they_come_from() {
         (layer.kernel, layer.stride) = (kernel, 2);
     }
     let rng = &mut ChaCha8Rng::seed_from_u64(1);
-    let agent = Agent::new(model, settings(NO_DIM), &STOCK, rng).unwrap();
+    let agent = Agent::new(model, settings(NO_DIM), &CANDLE, rng).unwrap();
     let evaluation = agent.evaluate(&Rows::random(4, 1).batch()).unwrap();
     for (name, _) in agent.online().iter() {
         assert!(

@@ -11,7 +11,7 @@ use driml_learner::{
         gradients::{Gradients, clip_factor},
     },
 };
-use driml_model::{ModelConfig, Network, Operations, Parameters};
+use driml_model::{Kernels, ModelConfig, Network, Parameters};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -67,7 +67,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let parameters = Parameters::init(&task.model, &mut rng, &Device::Cpu)?;
     let network = Network::new(&task.model, &parameters)?;
-    let mut adam = Adam::new(task.learner.adam, &parameters, Operations::Own)?;
+    let mut adam = Adam::new(task.learner.adam, &parameters, Kernels::Fused)?;
     let scorer = Scorer {
         task,
         network: &network,
@@ -87,7 +87,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
         let value = scorer.loss(&now, &next)?;
         loss.push(value.to_scalar::<f32>()?);
         let gradients = Gradients::take(&parameters, value.backward()?)?;
-        let factor = clip_factor(gradients.norm(Operations::Own)?, task.learner.max_grad_norm);
+        let factor = clip_factor(gradients.norm(Kernels::Fused)?, task.learner.max_grad_norm);
         adam.step(&parameters, &gradients, factor)?;
         progress.advance(1)?;
     }

@@ -10,7 +10,7 @@ use driml_learner::{
         gradients::{Gradients, clip_factor},
     },
 };
-use driml_model::{ConvLayer, Features, ModelConfig, Network, Operations, Parameters};
+use driml_model::{ConvLayer, Features, Kernels, ModelConfig, Network, Parameters};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -174,12 +174,12 @@ impl Heads {
             hidden: states,
             rkhs: settings.rkhs,
             action_embed: 1,
-            dim: lambda.dim_parts(false),
+            dim: lambda.dim_heads(false),
         };
         let parameters = Parameters::init(&model, rng, &Device::Cpu)?;
         Ok(Self {
             network: Network::new(&model, &parameters)?,
-            adam: Adam::new(settings.adam, &parameters, Operations::Own)?,
+            adam: Adam::new(settings.adam, &parameters, Kernels::Fused)?,
             parameters,
             dim: Dim {
                 lambda,
@@ -214,7 +214,7 @@ impl Heads {
             .pair_losses(&self.network, &now, &next, &action, &valid)?;
         for loss in losses.iter().flatten() {
             let gradients = Gradients::take(&self.parameters, loss.backward()?)?;
-            let factor = clip_factor(gradients.norm(Operations::Own)?, self.max_grad_norm);
+            let factor = clip_factor(gradients.norm(Kernels::Fused)?, self.max_grad_norm);
             self.adam.step(&self.parameters, &gradients, factor)?;
         }
         Ok(())

@@ -98,13 +98,13 @@ fn the_default_run_is_the_papers() {
 fn what_nobody_uses_is_not_there() {
     let config = with("mspacman", "c51", &[]).unwrap();
     assert_eq!(config.run.horizon, Horizon::None);
-    assert_eq!(config.model.dim, driml_model::DimParts::NONE);
+    assert_eq!(config.model.dim, driml_model::DimHeads::NONE);
     assert_eq!(config.learner.affinity.learned, None);
     let curl = with("mspacman", "curl", &[]).unwrap();
     assert_eq!(curl.run.horizon, Horizon::None);
-    let heads = driml_model::DimParts {
+    let heads = driml_model::DimHeads {
         psi4: true,
-        ..driml_model::DimParts::NONE
+        ..driml_model::DimHeads::NONE
     };
     assert_eq!(curl.model.dim, heads);
     assert!(!with("mspacman", "cpc", &[]).unwrap().model.dim.action);

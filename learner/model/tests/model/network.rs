@@ -2,7 +2,7 @@
 //! Values against another framework are in `parity`.
 
 use candle_core::{DType, Device, Result, Tensor};
-use driml_model::{ConvLayer, DimParts, ModelConfig, ModelError, Network, Operations, Parameters};
+use driml_model::{ConvLayer, DimHeads, Kernels, ModelConfig, ModelError, Network, Parameters};
 
 use crate::support::{assert_close, bits, frames, parameters, rng, small, values};
 
@@ -41,9 +41,9 @@ fn with_biases(config: &ModelConfig) -> Parameters {
 fn outputs_and_gradients(
     config: &ModelConfig,
     parameters: &Parameters,
-    operations: Operations,
+    kernels: Kernels,
 ) -> Result<(Vec<Tensor>, candle_core::backprop::GradStore)> {
-    let network = Network::with_operations(config, parameters, operations).unwrap();
+    let network = Network::with_kernels(config, parameters, kernels).unwrap();
     let features = network.features(&frames(config, 6, &mut rng(1))).unwrap();
     let actions = Tensor::new(&[0u32, 4, 2, 2, 1, 3], &Device::Cpu)?;
     let logits = network.logits(&features.f4).unwrap();
@@ -82,9 +82,9 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
     };
     for config in [odd, even] {
         let parameters = with_biases(&config);
-        let (ours, our_gradients) = outputs_and_gradients(&config, &parameters, Operations::Own)?;
+        let (ours, our_gradients) = outputs_and_gradients(&config, &parameters, Kernels::Fused)?;
         let (theirs, their_gradients) =
-            outputs_and_gradients(&config, &parameters, Operations::Stock)?;
+            outputs_and_gradients(&config, &parameters, Kernels::Candle)?;
         for (index, (ours, theirs)) in ours.iter().zip(&theirs).enumerate() {
             assert_close(&format!("output {index}"), theirs, ours, 1e-6);
         }
@@ -227,7 +227,7 @@ fn q_values_are_expectations_over_the_atoms() -> Result<()> {
 #[test]
 fn heads_that_are_left_out_are_not_there() {
     let config = ModelConfig {
-        dim: DimParts {
+        dim: DimHeads {
             psi3: false,
             phi4: false,
             ..small().dim
@@ -254,7 +254,7 @@ fn heads_that_are_left_out_are_not_there() {
     assert!(network.psi4(&features.f4, &actions).is_ok());
 
     let without_psi = ModelConfig {
-        dim: DimParts {
+        dim: DimHeads {
             psi3: false,
             psi4: false,
             ..small().dim
@@ -281,7 +281,7 @@ fn the_first_q_values_are_small() {
         v_min: -10.0,
         v_max: 10.0,
         hidden: 512,
-        dim: DimParts::NONE,
+        dim: DimHeads::NONE,
         ..small()
     };
     let support = config.atoms_support();

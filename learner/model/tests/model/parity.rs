@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use candle_core::{Device, Tensor};
-use driml_model::{ConvLayer, DimParts, ModelConfig, Network, Parameters, PolicyNetwork};
+use driml_model::{ConvLayer, DimHeads, ModelConfig, Network, Parameters, PolicyNetwork};
 use serde_json::Value;
 
 use crate::support::values;
@@ -52,7 +52,7 @@ fn config(bytes: &[u8]) -> ModelConfig {
         rkhs: size(&model["rkhs"]),
         action_embed: size(&model["action_embed"]),
         // What the cases have of heads differs; expected returns need none.
-        dim: DimParts::NONE,
+        dim: DimHeads::NONE,
     }
 }
 

@@ -2,7 +2,7 @@
 //! No test lives here.
 
 use candle_core::{DType, Device, Result, Tensor, Var};
-use driml_model::{ConvLayer, DimParts, ModelConfig, Parameters};
+use driml_model::{ConvLayer, DimHeads, ModelConfig, Parameters};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 
@@ -99,7 +99,7 @@ pub(crate) fn small() -> ModelConfig {
         hidden: 19,
         rkhs: 13,
         action_embed: 9,
-        dim: DimParts {
+        dim: DimHeads {
             psi3: true,
             phi3: true,
             psi4: true,

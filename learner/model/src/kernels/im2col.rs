@@ -4,9 +4,9 @@
 //! Images and maps are channels-last, so each row of a window is one run of kernel * channels_in values, and im2col is a
 //! series of plain copies. A patch is a window laid out as [kernel row, kernel column, channel in].
 
-use crate::gemm::{Matrix, Output, Threads, multiply};
 use crate::geometry::ConvShape;
-use crate::linear::{relu_gradient, relu_of};
+use crate::kernels::gemm::{Matrix, Output, Threads, multiply};
+use crate::kernels::linear::{relu_gradient, relu_of};
 
 /// Scalars of patches held at a time; more images share a tile while they fit. 384 KiB: a part of the second-level cache.
 const TILE_LEN: usize = 96 * 1024;

@@ -11,9 +11,11 @@ use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result, Shape, Tensor, b
 use rayon::prelude::*;
 
 use crate::geometry::{ConvLayer, ConvShape};
-use crate::im2col::Images;
-use crate::linear::{add_in_order, cpu, floats};
-use crate::stack::{Between, layers, parameters_len, stack_backward, stack_forward, unpacked};
+use crate::kernels::im2col::Images;
+use crate::kernels::linear::{add_in_order, cpu, floats};
+use crate::kernels::stack::{
+    SavedActivations, layers, parameters_len, stack_backward, stack_forward, unpacked,
+};
 
 /// Images that one task takes. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_IMAGES: usize = 16;
@@ -72,7 +74,7 @@ pub fn conv_stack(images: &Tensor, layers: &[(&Tensor, &Tensor, usize)]) -> Resu
         &parameters,
         ConvStack {
             shapes,
-            between: Mutex::default(),
+            saved: Mutex::default(),
         },
     )
 }
@@ -80,7 +82,7 @@ pub fn conv_stack(images: &Tensor, layers: &[(&Tensor, &Tensor, usize)]) -> Resu
 struct ConvStack {
     shapes: Vec<ConvShape>,
     /// Of each task, the maps of all layers but the last: what the forward pass leaves to the backward pass.
-    between: Mutex<Vec<Between>>,
+    saved: Mutex<Vec<SavedActivations>>,
 }
 
 impl ConvStack {
@@ -119,10 +121,10 @@ impl CustomOp2 for ConvStack {
         let tasks = maps
             .par_chunks_mut(TASK_IMAGES * last.map_len())
             .enumerate();
-        let between = tasks
+        let saved = tasks
             .map(|(task, maps)| stack_forward(&layers, self.task_images(images, task), maps))
             .collect();
-        *self.between.lock().unwrap_or_else(PoisonError::into_inner) = between;
+        *self.saved.lock().unwrap_or_else(PoisonError::into_inner) = saved;
         let dims = (
             batch,
             last.out_height(),
@@ -153,22 +155,21 @@ impl CustomOp2 for ConvStack {
         );
         let map_values = floats(cpu(&maps_storage)?, maps_layout)?;
         let grad_values = floats(cpu(&grad_storage)?, grad_layout)?;
-        let between = self.between.lock().unwrap_or_else(PoisonError::into_inner);
+        let saved = self.saved.lock().unwrap_or_else(PoisonError::into_inner);
 
         let mut grad_images = vec![0.0f32; if needs_images { image_values.len() } else { 0 }];
         let mut grad_parts = grad_images.chunks_mut(TASK_IMAGES * self.first().image_len());
-        let grad_parts: Vec<Option<&mut [f32]>> =
-            between.iter().map(|_| grad_parts.next()).collect();
+        let grad_parts: Vec<Option<&mut [f32]>> = saved.iter().map(|_| grad_parts.next()).collect();
         let task_len = TASK_IMAGES * self.last().map_len();
         let sums = map_values
             .par_chunks(task_len)
             .zip(grad_values.par_chunks(task_len))
-            .zip(between.par_iter())
+            .zip(saved.par_iter())
             .zip(grad_parts)
             .enumerate()
-            .map(|(task, (((maps, grad_maps), between), grad_images))| {
+            .map(|(task, (((maps, grad_maps), saved), grad_images))| {
                 let images = self.task_images(image_values, task);
-                stack_backward(&layers, images, between, maps, grad_maps, grad_images)
+                stack_backward(&layers, images, saved, maps, grad_maps, grad_images)
             });
         let sum = add_in_order(sums.collect(), parameters_len(&self.shapes));
 

@@ -5,10 +5,10 @@
 
 use candle_core::{DType, Tensor};
 
-use crate::compute::Operations;
+use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::weights::Parameters;
+use crate::parameters::Parameters;
 
 /// A residual block on features, to which an action's embedding may be joined.
 #[derive(Debug)]
@@ -20,7 +20,7 @@ pub(crate) struct Head {
 /// The block's parameters; `out_bias` is the sum of the biases of `out` and, where it has one, `skip`.
 #[derive(Debug)]
 struct Block {
-    operations: Operations,
+    kernels: Kernels,
     hidden_weight: Tensor,
     hidden_bias: Tensor,
     out_weight: Tensor,
@@ -29,14 +29,14 @@ struct Block {
 }
 
 impl Block {
-    fn new(name: &str, parameters: &Parameters, operations: Operations) -> Result<Self> {
+    fn new(name: &str, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         let (hidden, out, skip) = (
             format!("{name}.hidden"),
             format!("{name}.out"),
             format!("{name}.skip"),
         );
         Ok(Self {
-            operations,
+            kernels,
             hidden_weight: parameters.tensor(&hidden, "weight")?,
             hidden_bias: parameters.tensor(&hidden, "bias")?,
             out_weight: parameters.tensor(&out, "weight")?,
@@ -47,7 +47,7 @@ impl Block {
 
     /// The block without a joined input. The skip's result is the bias of `out`, so nothing is added separately.
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let with = self.operations;
+        let with = self.kernels;
         let hidden = with.linear_relu(x, &self.hidden_weight, &self.hidden_bias)?;
         let skip = with.linear(x, &self.skip_weight, &self.out_bias)?;
         Ok(with.linear(&hidden, &self.out_weight, &skip)?)
@@ -58,7 +58,7 @@ impl Block {
     /// `joined` [B, e] serves all locations of its row, so its products become biases of one group a row, and the tiled
     /// concatenation is never built.
     fn forward_joined(&self, features: &Tensor, joined: &Tensor, split: usize) -> Result<Tensor> {
-        let with = self.operations;
+        let with = self.kernels;
         let parts = |weight: &Tensor| -> Result<(Tensor, Tensor)> {
             let joined_len = weight.dim(1)? - split;
             Ok((
@@ -82,10 +82,10 @@ impl Head {
         name: &str,
         features: usize,
         parameters: &Parameters,
-        operations: Operations,
+        kernels: Kernels,
     ) -> Result<Self> {
         Ok(Self {
-            block: Block::new(name, parameters, operations)?,
+            block: Block::new(name, parameters, kernels)?,
             features,
         })
     }
@@ -111,10 +111,10 @@ impl ActionEmbedding {
     pub(crate) fn new(
         config: &ModelConfig,
         parameters: &Parameters,
-        operations: Operations,
+        kernels: Kernels,
     ) -> Result<Self> {
         Ok(Self {
-            block: Block::new("dim.action", parameters, operations)?,
+            block: Block::new("dim.action", parameters, kernels)?,
             skip_bias: parameters.tensor("dim.action.skip", "bias")?,
             num_actions: config.num_actions,
         })
@@ -124,7 +124,7 @@ impl ActionEmbedding {
     pub(crate) fn forward(&self, actions: &Tensor) -> Result<Tensor> {
         let one_hot = self.one_hot(actions)?;
         let block = &self.block;
-        let with = block.operations;
+        let with = block.kernels;
         let hidden = with.linear_relu(&one_hot, &block.hidden_weight, &block.hidden_bias)?;
         let bias = (&block.out_bias + &self.skip_bias)?;
         let skip = with.linear(&one_hot, &block.skip_weight, &bias)?;

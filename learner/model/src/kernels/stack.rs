@@ -5,7 +5,7 @@ use std::cell::RefCell;
 use std::sync::{Mutex, PoisonError};
 
 use crate::geometry::ConvShape;
-use crate::im2col::{ConvGradients, ConvScratch, Images, backward, forward, grown};
+use crate::kernels::im2col::{ConvGradients, ConvScratch, Images, backward, forward, grown};
 
 /// Spare buffers kept for later passes; more are given back to the allocator.
 const SPARE_MAX: usize = 64;
@@ -35,9 +35,9 @@ pub(crate) struct Layer<'a> {
 }
 
 /// The maps of all layers but the last, one layer after the other: what forward leaves to backward.
-pub(crate) struct Between(Vec<f32>);
+pub(crate) struct SavedActivations(Vec<f32>);
 
-impl Between {
+impl SavedActivations {
     fn new(len: usize) -> Self {
         let spare = SPARE.lock().unwrap_or_else(PoisonError::into_inner).pop();
         let mut maps = spare.unwrap_or_default();
@@ -46,7 +46,7 @@ impl Between {
     }
 }
 
-impl Drop for Between {
+impl Drop for SavedActivations {
     fn drop(&mut self) {
         let mut spare = SPARE.lock().unwrap_or_else(PoisonError::into_inner);
         if spare.len() < SPARE_MAX {
@@ -91,14 +91,18 @@ pub(crate) fn unpacked(shapes: &[ConvShape], mut sums: &[f32]) -> Vec<f32> {
 }
 
 /// Runs `images` through the layers into `maps`, the last layer's output.
-pub(crate) fn stack_forward(layers: &[Layer<'_>], images: Images<'_>, maps: &mut [f32]) -> Between {
+pub(crate) fn stack_forward(
+    layers: &[Layer<'_>],
+    images: Images<'_>,
+    maps: &mut [f32],
+) -> SavedActivations {
     let Some((last, inner)) = layers.split_last() else {
         unreachable!("a stack has at least one layer")
     };
     let count = maps.len() / last.shape.map_len();
     let map_lens = inner.iter().map(|layer| count * layer.shape.map_len());
-    let mut between = Between::new(map_lens.sum());
-    let (mut input, mut free) = (images, &mut between.0[..]);
+    let mut saved = SavedActivations::new(map_lens.sum());
+    let (mut input, mut free) = (images, &mut saved.0[..]);
     with_scratch(|Scratch { conv, .. }| {
         for Layer {
             shape,
@@ -112,17 +116,17 @@ pub(crate) fn stack_forward(layers: &[Layer<'_>], images: Images<'_>, maps: &mut
         }
         forward(&last.shape, input, &last.packed, last.bias, maps, conv);
     });
-    between
+    saved
 }
 
-/// Gradients for `grad_maps`, the gradient of the last layer's output `maps`; `between` is from `stack_forward`.
+/// Gradients for `grad_maps`, the gradient of the last layer's output `maps`; `saved` is from `stack_forward`.
 ///
 /// The result is the parameters' gradients, for each layer the weight's [k, k, in, out], then the bias's. The images' are
 /// added to `grad_images`, if it is there.
 pub(crate) fn stack_backward(
     layers: &[Layer<'_>],
     images: Images<'_>,
-    between: &Between,
+    saved: &SavedActivations,
     maps: &[f32],
     grad_maps: &[f32],
     mut grad_images: Option<&mut [f32]>,
@@ -134,7 +138,7 @@ pub(crate) fn stack_backward(
             .map(|layer| layer.shape.parameters_len())
             .sum()
     ];
-    let (mut sums_left, mut between) = (&mut sums[..], &between.0[..]);
+    let (mut sums_left, mut saved) = (&mut sums[..], &saved.0[..]);
     with_scratch(|scratch| {
         let Scratch {
             conv,
@@ -160,8 +164,8 @@ pub(crate) fn stack_backward(
                 backward(shape, images, packed, output, grad, grads, conv);
             } else {
                 let input_len = output.len() / shape.map_len() * shape.image_len();
-                let (earlier, input) = between.split_at(between.len() - input_len);
-                between = earlier;
+                let (earlier, input) = saved.split_at(saved.len() - input_len);
+                saved = earlier;
                 let input_sum = grown(grad_input, input_len);
                 input_sum.fill(0.0);
                 let grads = ConvGradients {

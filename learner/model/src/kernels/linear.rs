@@ -7,7 +7,7 @@
 use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
 use rayon::prelude::*;
 
-use crate::gemm::{Matrix, Output, Threads, multiply};
+use crate::kernels::gemm::{Matrix, Output, Threads, multiply};
 
 /// Rows that one task sums. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_ROWS: usize = 256;

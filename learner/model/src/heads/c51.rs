@@ -7,18 +7,18 @@ use candle_core::{CpuStorage, CustomOp1, D, Layout, Shape, Tensor};
 use candle_nn::ops::softmax;
 use rayon::prelude::*;
 
-use crate::compute::Operations;
+use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::Result;
-use crate::linear::floats;
-use crate::weights::Parameters;
+use crate::kernels::linear::floats;
+use crate::parameters::Parameters;
 
 /// Distributions that one task takes.
 const TASK_DISTRIBUTIONS: usize = 256;
 
 #[derive(Debug)]
 pub(crate) struct C51Head {
-    operations: Operations,
+    kernels: Kernels,
     weight: Tensor,
     bias: Tensor,
     actions: usize,
@@ -30,10 +30,10 @@ impl C51Head {
     pub(crate) fn new(
         config: &ModelConfig,
         parameters: &Parameters,
-        operations: Operations,
+        kernels: Kernels,
     ) -> Result<Self> {
         Ok(Self {
-            operations,
+            kernels,
             weight: parameters.tensor("head", "weight")?,
             bias: parameters.tensor("head", "bias")?,
             actions: config.num_actions,
@@ -44,18 +44,18 @@ impl C51Head {
 
     /// Logits [B, A, atoms] of f4 [B, hidden] before its ReLU.
     pub(crate) fn logits(&self, f4: &Tensor) -> Result<Tensor> {
-        let active = self.operations.relu(f4)?;
-        let logits = self.operations.linear(&active, &self.weight, &self.bias)?;
+        let active = self.kernels.relu(f4)?;
+        let logits = self.kernels.linear(&active, &self.weight, &self.bias)?;
         Ok(logits.reshape(((), self.actions, self.atoms))?)
     }
 
     /// Expected returns [B, A] of logits [B, A, atoms]; no gradient flows.
     pub(crate) fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
-        match self.operations {
-            Operations::Own => Ok(logits.contiguous()?.apply_op1_no_bwd(&Expectation {
+        match self.kernels {
+            Kernels::Fused => Ok(logits.contiguous()?.apply_op1_no_bwd(&Expectation {
                 support: self.support.clone(),
             })?),
-            Operations::Stock => {
+            Kernels::Candle => {
                 let support = Tensor::new(self.support.as_slice(), logits.device())?;
                 let probs = softmax(&logits.detach(), D::Minus1)?;
                 Ok(probs.broadcast_mul(&support)?.sum(D::Minus1)?)

@@ -1,0 +1,4 @@
+//! The heads on the torso: C51's distribution of returns, and DIM's vectors that are compared.
+
+pub(crate) mod c51;
+pub(crate) mod dim;
