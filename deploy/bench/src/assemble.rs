@@ -13,8 +13,7 @@ use crate::{
     effort::Effort,
     figures::Figure,
     recording::Recording,
-    replay::{AGENT, CAPACITY, SETTINGS},
-    settings,
+    settings::{self, AGENT, CAPACITY},
     taking_part::INCARNATION,
 };
 
@@ -23,7 +22,7 @@ use crate::{
 /// # Errors
 /// A replay that does not store or sample.
 pub(super) fn measure(recording: &Recording, effort: &Effort) -> anyhow::Result<[Figure; 2]> {
-    let config = settings::of_run(settings::WORLD, AGENT, "paper", &SETTINGS)?;
+    let config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
     let (rows, frame_bytes) = (config.learner.batch_rows, recording.frame_bytes());
     let mut replay = Replay::new(&config.run, &config.replay, rows)?;
     let join = ActorJoin {

@@ -31,20 +31,6 @@ use crate::{
     assemble, effort::Effort, figures::Figure, recording::Recording, settings, taking_part,
 };
 
-/// Settings that leave the limiter out of what is measured, and a replay that is soon full. `bench peers` gives Reverb a
-/// table of the same size.
-pub(super) const SETTINGS: [&str; 5] = [
-    "replay.capacity_transitions=20000",
-    "replay.replay_ratio=1e9",
-    "replay.slack_transitions=1000000000000",
-    "replay.transitions_max=1000000000000",
-    "replay.warmup_transitions=1000",
-];
-/// What the first of them says.
-pub(super) const CAPACITY: u64 = 20_000;
-/// The agent whose k is drawn along the stored actions.
-pub(super) const AGENT: &str = "driml-ada";
-
 /// Transitions of a chunk: streams and steps of each. An actor of 16 copies sends the last size.
 const CHUNKS: [(u32, u32); 4] = [(4, 1), (8, 4), (8, 16), (8, 32)];
 /// How long the server may take to listen, and a batch or an insert to come.
@@ -66,7 +52,7 @@ pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
     ];
     for (wire, endpoint, shared_memory) in wires {
         let mut run = Run::start(&endpoint, shared_memory, folder.path())?;
-        run.deliver(&recording, CHUNKS[3], |sent, _| sent >= CAPACITY)?;
+        run.deliver(&recording, CHUNKS[3], |sent, _| sent >= settings::CAPACITY)?;
         for chunk in CHUNKS {
             let transitions = chunk.0 * chunk.1;
             let rate = run.deliver(&recording, chunk, |_, started| effort.is_spent(started))?;
@@ -100,9 +86,9 @@ struct Run {
 impl Run {
     fn start(endpoint: &str, shared_memory: bool, folder: &Path) -> anyhow::Result<Self> {
         let words = ["replay-server", "--listen", endpoint];
-        let run = ["--env", settings::WORLD, "--agent", AGENT];
+        let run = ["--env", settings::WORLD, "--agent", settings::AGENT];
         let transport = format!("transport.shared_memory={shared_memory}");
-        let sets = SETTINGS.into_iter().chain([transport.as_str()]);
+        let sets = settings::REPLAY.into_iter().chain([transport.as_str()]);
         let words = words.into_iter().chain(run);
         let args: Vec<String> = words
             .chain(sets.flat_map(|set| ["--set", set]))

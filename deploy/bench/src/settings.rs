@@ -1,5 +1,5 @@
 //! The settings that benches take from the presets, so that they measure what a run does.
-//! It holds no number of its own.
+//! Its own numbers are those of a replay that is soon full.
 
 use driml_machine::{error::Usage, resources::Machine};
 use driml_settings::{
@@ -9,6 +9,20 @@ use driml_settings::{
 
 /// The world where it does not matter which.
 pub(super) const WORLD: &str = "procgen:bigfish";
+
+/// Settings that leave the limiter out of what is measured, and a replay that is soon full. `bench peers` gives Reverb a
+/// table of the same size.
+pub(super) const REPLAY: [&str; 5] = [
+    "replay.capacity_transitions=20000",
+    "replay.replay_ratio=1e9",
+    "replay.slack_transitions=1000000000000",
+    "replay.transitions_max=1000000000000",
+    "replay.warmup_transitions=1000",
+];
+/// What the first of them says.
+pub(super) const CAPACITY: u64 = 20_000;
+/// The agent whose k is drawn along the stored actions.
+pub(super) const AGENT: &str = "driml-ada";
 
 /// A run's settings: world, agent and preset, and single settings over them.
 ///

@@ -1,9 +1,10 @@
 //! The command line of `driml experiment`.
-//! What a value means is for the experiment that takes it.
+//! What a value means is for the experiment that takes it; the settings of its full or smoke length are chosen here.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
+use serde::de::DeserializeOwned;
 
 /// The paper's experiments.
 #[derive(Debug, Subcommand)]
@@ -89,4 +90,35 @@ pub struct ProcgenArgs {
     /// Instead: short runs of c51 on every game, to see on which it learns soonest
     #[arg(long)]
     pub(crate) screen: bool,
+}
+
+/// The settings of an experiment, of its full or its smoke length; both are built in.
+pub(crate) fn settings<T: DeserializeOwned>(
+    name: &str,
+    full: &str,
+    smoke: &str,
+    flags: &ExperimentFlags,
+) -> T {
+    let (file, text) = match flags.smoke {
+        true => ("smoke.toml", smoke),
+        false => ("config.toml", full),
+    };
+    toml::from_str(text).unwrap_or_else(|e| {
+        panic!("experiments/{name}/{file} is built in, and a test reads it: {e}")
+    })
+}
+
+/// The command that repeats an experiment, as its page has it.
+pub(crate) fn command_line(name: &str, flags: &ExperimentFlags, out: &Path) -> String {
+    let mut words = format!("driml experiment {name}");
+    if flags.smoke {
+        words += " --smoke";
+    }
+    if let Some(seeds) = flags.seeds {
+        words += &format!(" --seeds {seeds}");
+    }
+    if flags.out.is_some() {
+        words += &format!(" --out {}", out.display());
+    }
+    words
 }

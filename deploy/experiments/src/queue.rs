@@ -30,7 +30,7 @@ use nix::{
     unistd::Pid,
 };
 
-use super::{Progress, Session};
+use crate::{progress::Progress, session::Session};
 
 /// Times that a run is tried in one call. A run may lose contact with its parts on a machine that is busy with much else.
 const TRIES: u32 = 2;

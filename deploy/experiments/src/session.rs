@@ -17,8 +17,7 @@ use driml_launch::{
 use driml_machine::error::{Interrupted, usage};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
-use super::{Page, Progress};
-use crate::flags::ExperimentFlags;
+use crate::{flags::ExperimentFlags, page::Page, progress::Progress};
 
 /// Finished pieces, one file each, and the settings they were made with. Git does not keep it.
 const PIECES: &str = "pieces";

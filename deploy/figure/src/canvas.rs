@@ -1,7 +1,10 @@
 //! A list of shapes in figure units: what a figure is before it becomes SVG or PNG.
 //! It knows no axis and no file.
 
-use super::{colours::Colour, font::Weight};
+use super::{
+    colours::{Colour, INK},
+    font::{self, Weight},
+};
 
 /// A point: x to the right, y downwards.
 pub(super) type Point = (f64, f64);
@@ -171,4 +174,23 @@ fn circle((x, y): Point, radius: f64) -> impl Iterator<Item = Point> {
         let angle = f64::from(i) * std::f64::consts::TAU / 16.0;
         (x + radius * angle.cos(), y + radius * angle.sin())
     })
+}
+
+/// Draws a panel's title and returns what is left below it.
+pub(super) fn titled(canvas: &mut Canvas, place: Rect, title: &str) -> Rect {
+    const SIZE: f64 = 14.0;
+    let style = TextStyle {
+        size: SIZE,
+        weight: Weight::Bold,
+        colour: INK,
+        anchor: Anchor::Start,
+        upright: false,
+    };
+    let lines = font::wrap(title, SIZE, place.width);
+    for (index, line) in lines.iter().enumerate() {
+        let y = place.y + SIZE + index as f64 * (SIZE + 4.0);
+        canvas.text((place.x, y), line, style);
+    }
+    let used = lines.len() as f64 * (SIZE + 4.0) + 6.0;
+    Rect::new(place.x, place.y + used, place.width, place.height - used)
 }

@@ -2,10 +2,10 @@
 //! It computes no statistics; what a band means is for the caller to say.
 
 use super::{
-    canvas::{Anchor, Canvas, Point, Rect, Stroke, TextStyle},
+    canvas::{Anchor, Canvas, Point, Rect, Stroke, TextStyle, titled},
     colours::{Colour, GRID, INK, INK_SOFT, series_colour},
     font::{self, Weight},
-    ticks, titled,
+    ticks,
 };
 
 const LABEL_SIZE: f64 = 12.5;

@@ -2,10 +2,10 @@
 //! It scales no number by itself beyond the range it is given or finds.
 
 use super::{
-    canvas::{Anchor, Canvas, Rect, Stroke, TextStyle},
+    canvas::{Anchor, Canvas, Rect, Stroke, TextStyle, titled},
     colours::{CELL_LIGHT, INK, INK_SOFT, NO_VALUE, OUTLINE, heat_colour, ink_on},
     font::{self, Weight},
-    ticks, titled,
+    ticks,
 };
 
 const TICK_SIZE: f64 = 11.5;

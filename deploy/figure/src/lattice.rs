@@ -2,10 +2,9 @@
 //! Runs of dark cells are one rectangle, so that a picture of thousands of cells stays small.
 
 use super::{
-    canvas::{Canvas, Rect, Stroke},
+    canvas::{Canvas, Rect, Stroke, titled},
     colours::{CARD_BORDER, CELL_DARK, CELL_LIGHT},
     heat::{Outline, point_out},
-    titled,
 };
 
 /// A field of cells.

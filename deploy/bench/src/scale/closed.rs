@@ -7,15 +7,14 @@ use driml_launch::statuses::Statuses;
 use driml_protocol::{Quantiles, Shutdown};
 
 use super::{
-    Table, actors, seconds,
+    cases::{Table, actors, seconds},
     servers::{self, Servers, Watched},
     synthetic::{self, Actor, Learner, Pace},
 };
 use crate::{
     flags::BenchScaleArgs,
     recording::{Recording, STREAMS},
-    replay::AGENT,
-    settings,
+    settings::{self, AGENT},
 };
 
 pub(super) const TITLE: &str = "Closed: replay ratio 8, actors as fast as they may, the learner at its pace with 4 MB of weights \

@@ -7,15 +7,14 @@ use driml_launch::statuses::Statuses;
 use driml_protocol::Shutdown;
 
 use super::{
-    Table, actors, seconds,
+    cases::{Table, actors, seconds},
     servers::{Servers, Watched},
     synthetic::{self, Learner, Pace},
 };
 use crate::{
     flags::BenchScaleArgs,
     recording::Recording,
-    replay::{AGENT, SETTINGS},
-    settings,
+    settings::{self, AGENT, REPLAY},
 };
 
 pub(super) const TITLE: &str =
@@ -105,7 +104,7 @@ fn watch(
     actors: u32,
 ) -> anyhow::Result<Watched> {
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
-    let sets: Vec<_> = SETTINGS
+    let sets: Vec<_> = REPLAY
         .iter()
         .map(|&set| set.to_owned())
         .chain([format!("replay.shards={shards}")])

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use driml_protocol::Quantiles;
 
-use super::{Table, actors, seconds};
+use super::cases::{Table, actors, seconds};
 use crate::{
     flags::BenchScaleArgs,
     launched::{Launched, Moment},

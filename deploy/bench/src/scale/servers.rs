@@ -23,8 +23,8 @@ use nix::unistd::{SysconfVar, sysconf};
 use zenoh::{Session, Wait};
 
 use crate::{
-    replay::{AGENT, reach},
-    settings,
+    replay::reach,
+    settings::{self, AGENT},
 };
 
 /// How often a server is asked that does not answer.

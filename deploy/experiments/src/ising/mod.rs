@@ -1,6 +1,7 @@
 //! Fig. 2: local DIM on a patch of an Ising model in noise scores high where the future can be predicted.
 //! Learning and measuring are in `training`; here the seeds, the figures and the page.
 
+mod settings;
 mod training;
 
 use driml_envs::{WorldConfig, WorldName};
@@ -10,40 +11,21 @@ use driml_settings::{
     config::{self, Flags, Source},
     presets,
 };
-use serde::{Deserialize, Serialize};
 
-use self::training::{Episodes, Measured, Task, Trained, View, train};
-use super::{Page, Session, command_line, settings, statistics::Spread};
-use crate::flags::ExperimentFlags;
+use self::{
+    settings::Settings,
+    training::{Episodes, Measured, Task, Trained, View, train},
+};
+use crate::{
+    flags::{self, ExperimentFlags, command_line},
+    page::Page,
+    session::Session,
+    statistics::Spread,
+};
 
 const NAME: &str = "ising";
 /// Updates over which the drawn loss is averaged.
 const LOSS_WINDOW: usize = 10;
-
-/// `deploy/experiments/src/ising/*.toml`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Settings {
-    /// What differs from the settings of a run in this world, as `--set` has it.
-    sets: Vec<String>,
-    /// Seeds 1 to this. No piece depends on it, so that more can be added later.
-    #[serde(skip_serializing)]
-    seeds: u32,
-    /// Updates of a training.
-    updates: u64,
-    /// Pairs in a batch, each with all others as negatives.
-    batch_rows: usize,
-    /// Measurements before the end.
-    checks: u64,
-    /// Episodes of each.
-    check_episodes: usize,
-    /// Episodes of the measurement at the end.
-    episodes: usize,
-    /// Scores are those from this environment step to the next.
-    from_t: u32,
-    /// The environment step of the late lattices.
-    late_t: u32,
-}
 
 /// World, network and optimiser as a run has them.
 ///
@@ -74,17 +56,17 @@ fn task(settings: &Settings) -> anyhow::Result<Task> {
 ///
 /// # Errors
 /// A folder of other settings, an interrupt, a file system that refuses.
-pub(super) fn run(flags: &ExperimentFlags) -> anyhow::Result<()> {
-    let mut settings: Settings = settings(
+pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
+    let mut settings: Settings = flags::settings(
         NAME,
         include_str!("config.toml"),
         include_str!("smoke.toml"),
-        flags,
+        args,
     );
-    settings.seeds = flags.seeds.unwrap_or(settings.seeds);
+    settings.seeds = args.seeds.unwrap_or(settings.seeds);
     let task = task(&settings)?;
     let units = u64::from(settings.seeds) * settings.updates;
-    let mut session = Session::open(NAME, flags, &task, units)?;
+    let mut session = Session::open(NAME, args, &task, units)?;
     let mut trained = Vec::new();
     for seed in 1..=settings.seeds {
         let key = format!("seed{seed}");
@@ -95,8 +77,8 @@ pub(super) fn run(flags: &ExperimentFlags) -> anyhow::Result<()> {
     write_data(&session, &trained)?;
     session.figure("fig2", &fig2(&task, &trained[0])?)?;
     session.figure("learning", &learning(&task, &trained))?;
-    let command = command_line(NAME, flags, session.folder());
-    session.finish(&page(&task, &trained, command, flags.smoke))
+    let command = command_line(NAME, args, session.folder());
+    session.finish(&page(&task, &trained, command, args.smoke))
 }
 
 fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {

@@ -16,7 +16,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::{Progress, statistics::auc};
+use crate::{progress::Progress, statistics::auc};
 
 /// What one training depends on.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -24,7 +24,7 @@ pub(super) struct Task {
     pub(super) world: IsingConfig,
     pub(super) model: ModelConfig,
     pub(super) learner: LearnerSettings,
-    pub(super) settings: super::Settings,
+    pub(super) settings: super::settings::Settings,
 }
 
 /// Seed of the worlds that are measured on: the same for every training, and of none that is trained on.

@@ -3,8 +3,8 @@
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 
 use super::{
-    Continual, Results,
-    report::{LOSSES, RETURNS_OF, Trace, loss_of},
+    results::{LOSSES, RETURNS_OF, Results, Trace, loss_of},
+    settings::Continual,
 };
 use crate::{
     plot::{over_seeds, smoothed},

@@ -27,7 +27,7 @@ pub(crate) struct Curve {
 
 /// The runs, those that differ in their seed alone together if `together`; in the order in which they were named.
 ///
-/// Settings that only the machine decides (processes, threads, size of the replay) do not part them.
+/// Settings that only the machine decides (threads, sizes, the replay's capacity) do not part them; the number of actors does.
 pub(super) fn of(runs: &[Run], together: bool) -> Vec<Group<'_>> {
     let mut groups: Vec<Group<'_>> = Vec::new();
     for run in runs {

@@ -126,7 +126,11 @@ pub(super) fn folder_name(folder: &Path) -> String {
 /// Settings without the seed and without what differs between machines alone. A run without settings stands for itself.
 fn settings(path: &Path) -> Option<toml::Table> {
     let mut table: toml::Table = std::fs::read_to_string(path).ok()?.parse().ok()?;
-    table.remove("local");
+    // The machine decides most of how a run is launched, but what is learned depends on how many actors there are.
+    let actors = table
+        .remove("local")
+        .and_then(|local| local.get("actors").cloned());
+    table.extend(actors.map(|actors| ("actors".to_owned(), actors)));
     table.remove("transport");
     table.get_mut("run")?.as_table_mut()?.remove("seed");
     if let Some(actor) = table.get_mut("actor").and_then(toml::Value::as_table_mut) {

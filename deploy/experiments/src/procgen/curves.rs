@@ -3,10 +3,14 @@
 
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 
-use super::{Kind, Results, k, published, short};
+use super::{
+    grid::short,
+    k, published,
+    results::{Kind, Results},
+};
 use crate::{
-    Session,
     plot::{Curve, Run, over_seeds},
+    session::Session,
     statistics::Spread,
 };
 

@@ -6,11 +6,16 @@ use driml_launch::run_folder::Summary;
 use driml_protocol::RETURNS_OF;
 
 use super::{
-    Cell, Kind, Results, k, published,
+    grid::short,
+    k, published,
+    results::{Cell, Kind, Results},
     scores::{Aggregate, baseline},
-    short,
 };
-use crate::{Page, aggregate, page::Table, statistics::Spread};
+use crate::{
+    aggregate,
+    page::{Page, Table},
+    statistics::Spread,
+};
 
 /// Frames of the paper's runs.
 const PAPER_FRAMES: f64 = 50e6;

@@ -2,7 +2,10 @@
 
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 
-use super::{Kind, Results, published};
+use super::{
+    published,
+    results::{Kind, Results},
+};
 use crate::aggregate::{self, Estimate, Scores};
 
 /// Scores over all games.

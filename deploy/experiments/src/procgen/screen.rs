@@ -3,11 +3,14 @@
 
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 
-use super::{Cell, Kind, Results, short};
+use super::{
+    grid::short,
+    results::{Cell, Kind, Results},
+};
 use crate::{
-    Page, Session,
-    page::Table,
+    page::{Page, Table},
     plot::{Run, over_seeds},
+    session::Session,
     statistics::Spread,
 };
 

@@ -3,7 +3,11 @@
 
 use driml_figure::{Axis, Chart, Figure, GREY, Heat, Mark, Panel, Series};
 
-use super::{Measure, Results, Sampling, Trained, chain::Chain};
+use super::{
+    chain::Chain,
+    results::{Measure, Results, Trained},
+    training::Sampling,
+};
 use crate::statistics::Spread;
 
 /// The paper's four panels.

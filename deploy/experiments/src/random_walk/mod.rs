@@ -3,152 +3,40 @@
 
 mod chain;
 mod figures;
+mod results;
+mod settings;
 mod training;
-
-use driml_learner::AdamSettings;
-use serde::{Deserialize, Serialize};
 
 use self::{
     chain::Chain,
-    training::{Learnt, Sampling, train},
+    results::{Measure, Results, Trained},
+    settings::Settings,
+    training::{Sampling, train},
 };
-use super::{
-    Page, Session, command_line, settings,
-    statistics::{Spread, rank_correlation},
+use crate::{
+    flags::{self, ExperimentFlags, command_line},
+    page::Page,
+    session::Session,
+    statistics::Spread,
 };
-use crate::flags::ExperimentFlags;
 
 const NAME: &str = "random-walk";
-
-/// `deploy/experiments/src/random_walk/*.toml`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Settings {
-    /// States of the chain.
-    states: usize,
-    /// Probabilities of a step up.
-    alphas: Vec<f64>,
-    /// The one of the matrices; among `alphas`.
-    figure_alpha: f64,
-    /// Seeds 1 to this. No piece depends on it, so that more can be added later.
-    #[serde(skip_serializing)]
-    seeds: u32,
-    /// Updates of a training.
-    updates: u64,
-    /// Pairs in a batch, each with all others as negatives.
-    batch_rows: usize,
-    /// Width of the heads.
-    rkhs: usize,
-    /// Rows sampled per transition of a single walker.
-    replay_ratio: f64,
-    /// Bound of the scores' soft clip.
-    tanh_clip: f64,
-    /// Global 2-norm to which gradients are clipped.
-    max_grad_norm: f64,
-    /// Error of the next state's law at which a training counts as converged, a probability.
-    #[serde(skip_serializing)]
-    tv_reached: f64,
-    /// Share of the mutual information that is still missed when a training counts as converged.
-    #[serde(skip_serializing)]
-    share_reached: f64,
-    /// The optimiser's numbers.
-    adam: AdamSettings,
-}
-
-/// One piece of the grid.
-struct Trained {
-    chain: Chain,
-    sampling: Sampling,
-    seed: u32,
-    learnt: Learnt,
-}
-
-impl Trained {
-    fn final_tv(&self) -> f64 {
-        self.learnt.tv.last().copied().unwrap_or(f64::NAN)
-    }
-
-    fn final_excess(&self) -> f64 {
-        self.learnt.excess.last().copied().unwrap_or(f64::NAN)
-    }
-}
-
-/// All trainings, and what was asked for.
-struct Results {
-    settings: Settings,
-    trained: Vec<Trained>,
-}
-
-impl Results {
-    /// Those of one sampling and bias, over seeds.
-    fn of(&self, sampling: Sampling, alpha: f64) -> impl Iterator<Item = &Trained> {
-        let all = self.trained.iter();
-        all.filter(move |one| one.sampling == sampling && one.chain.alpha == alpha)
-    }
-
-    fn chain(&self, alpha: f64) -> Chain {
-        Chain {
-            states: self.settings.states,
-            alpha,
-        }
-    }
-
-    /// Updates until a training's error is small; none where it never was.
-    fn time(&self, one: &Trained, measure: Measure) -> Option<u64> {
-        let learnt = &one.learnt;
-        match measure {
-            Measure::Tv => learnt.updates_to(&learnt.tv, self.settings.tv_reached),
-            Measure::Share => {
-                let all = one.chain.mutual_information();
-                learnt.updates_to(&learnt.excess, self.settings.share_reached * all)
-            }
-        }
-    }
-
-    /// Of each seed, the rank correlation over alpha between 1 / gap and the updates until the error is small.
-    ///
-    /// A training that never got there counts as one update more than the longest.
-    fn gap_correlations(&self, sampling: Sampling, measure: Measure) -> Option<Spread> {
-        let of_seed = |seed: u32| {
-            let one = self.trained.iter();
-            let pairs: Vec<(f64, f64)> = one
-                .filter(|one| one.sampling == sampling && one.seed == seed)
-                .map(|one| {
-                    let time = self.time(one, measure);
-                    let time = time.unwrap_or(self.settings.updates + 1);
-                    (1.0 / one.chain.spectral_gap(), time as f64)
-                })
-                .collect();
-            rank_correlation(&pairs)
-        };
-        Spread::of((1..=self.settings.seeds).filter_map(of_seed))
-    }
-}
-
-/// When a training counts as converged.
-#[derive(Clone, Copy, PartialEq)]
-enum Measure {
-    /// The law of the next state is near the true one, however near a blind guess is.
-    Tv,
-    /// Most of what there is to learn is learnt, however little that is.
-    Share,
-}
 
 /// Runs the experiment.
 ///
 /// # Errors
 /// A folder of other settings, an interrupt, a file system that refuses.
-pub(super) fn run(flags: &ExperimentFlags) -> anyhow::Result<()> {
-    let mut settings: Settings = settings(
+pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
+    let mut settings: Settings = flags::settings(
         NAME,
         include_str!("config.toml"),
         include_str!("smoke.toml"),
-        flags,
+        args,
     );
-    settings.seeds = flags.seeds.unwrap_or(settings.seeds);
+    settings.seeds = args.seeds.unwrap_or(settings.seeds);
     let pieces = settings.alphas.len() * Sampling::ALL.len() * settings.seeds as usize;
     let units = pieces as u64 * settings.updates;
-    let mut session = Session::open(NAME, flags, &settings, units)?;
+    let mut session = Session::open(NAME, args, &settings, units)?;
 
     let mut trained = Vec::with_capacity(pieces);
     for sampling in Sampling::ALL {
@@ -175,8 +63,8 @@ pub(super) fn run(flags: &ExperimentFlags) -> anyhow::Result<()> {
     write_data(&session, &results)?;
     session.figure("fig1", &figures::fig1(&results))?;
     session.figure("convergence", &figures::convergence(&results))?;
-    let command = command_line(NAME, flags, session.folder());
-    session.finish(&page(&results, command, flags.smoke))
+    let command = command_line(NAME, args, session.folder());
+    session.finish(&page(&results, command, args.smoke))
 }
 
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {

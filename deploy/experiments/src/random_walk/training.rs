@@ -15,8 +15,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{Settings, chain::Chain};
-use crate::Progress;
+use super::{chain::Chain, settings::Settings};
+use crate::progress::Progress;
 
 /// Ratio between the updates of two measurements.
 const MEASURE_GROWTH: f64 = 1.04;
