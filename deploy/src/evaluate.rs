@@ -4,10 +4,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use driml_actor::{
-    evaluate::episode_returns,
-    policy::{NetworkPolicy, Policy, RandomPolicy},
-};
+use driml_actor::{NetworkPolicy, Policy, RandomPolicy, episode_returns};
 use driml_envs::WorldConfig;
 use driml_learner::{Compute, checkpoint};
 use rand::SeedableRng;
