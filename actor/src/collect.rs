@@ -60,16 +60,17 @@ impl Collector {
         let config = &settings.actor;
         let schedule = Schedule::new(config, life.actor)?;
         let world_seed = life.seed(spec, "world");
-        let world = driml_envs::make_world(
-            &settings.world,
-            config.envs as usize,
-            u64::from_le_bytes(world_seed[..8].try_into().expect("eight bytes")),
-            config.world_threads as usize,
-        )
-        .map_err(|source| ActError::NoWorld {
-            world: spec.world.clone(),
-            source,
-        })?;
+        let world = settings
+            .world
+            .build(
+                config.envs as usize,
+                u64::from_le_bytes(world_seed[..8].try_into().expect("eight bytes")),
+                config.world_threads as usize,
+            )
+            .map_err(|source| ActError::NoWorld {
+                world: spec.world.clone(),
+                source,
+            })?;
         let shape = world.frame_shape();
         let promised = (
             spec.frame_height,
@@ -143,7 +144,7 @@ impl Collector {
 
 #[cfg(test)]
 mod tests {
-    use driml_envs::{ChainConfig, WorldConfig};
+    use driml_envs::{CorridorConfig, WorldConfig};
     use driml_model::{Compute, ConvLayer, DimParts, ModelConfig, Parameters};
     use driml_protocol::{Horizon, TimeoutRule, config::TransportConfig};
 
@@ -175,7 +176,7 @@ mod tests {
                 horizon: Horizon::None,
                 timeout: TimeoutRule::Terminal,
             },
-            world: WorldConfig::Chain(ChainConfig {
+            world: WorldConfig::Chain(CorridorConfig {
                 cells: 8,
                 height: 12,
                 width: 12,

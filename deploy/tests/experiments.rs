@@ -1,5 +1,5 @@
 //! The experiments from end to end, in their smoke length: every file there, the same every time, resumed and refused.
-//! What their numbers mean at full length is on the pages in `deploy/experiments/`.
+//! What their numbers mean at full length is on the pages in `deploy/experiments/results/`.
 
 #![allow(clippy::unwrap_used)]
 

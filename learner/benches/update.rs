@@ -7,8 +7,8 @@ use std::{hint::black_box, time::Duration};
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use driml_learner::{
-    AdamSettings, Augment, AugmentSettings, Batch, CurlSettings, Lambda, Learner, LearnerSettings,
-    Objective,
+    AdamSettings, Agent, Augment, AugmentSettings, Batch, Lambda, LearnerSettings, Objective,
+    auxiliary::{cpc, curl, dim},
 };
 use driml_model::{Compute, ConvLayer, DimParts, ModelConfig};
 use rand::{Rng, SeedableRng};
@@ -20,7 +20,7 @@ const STATE_BYTES: usize = 64 * 64 * 3;
 /// Positives a row of the agent cpc.
 const CPC: usize = 5;
 
-fn learner(objective: Objective, lambda: Lambda) -> Learner {
+fn agent(objective: Objective, lambda: Lambda) -> Agent {
     let layer = |out, kernel, stride| ConvLayer {
         out,
         kernel,
@@ -29,7 +29,7 @@ fn learner(objective: Objective, lambda: Lambda) -> Learner {
     let settings = LearnerSettings {
         double_dqn: false,
         objective,
-        condition_on_action: objective == Objective::Dim,
+        condition_on_action: objective == Objective::of(&dim::DIM),
         lambda,
         tanh_clip: 20.0,
         max_grad_norm: 10.0,
@@ -41,7 +41,12 @@ fn learner(objective: Objective, lambda: Lambda) -> Learner {
         },
         target_period_updates: 312,
         target_tau: 0.95,
-        curl: (objective == Objective::Curl).then_some(CurlSettings { key_tau: 0.001 }),
+        own: if objective == Objective::of(&curl::CURL) {
+            let table = toml::Table::from_iter([("key_tau".to_owned(), 0.001.into())]);
+            toml::Table::from_iter([("curl".to_owned(), table.into())])
+        } else {
+            toml::Table::new()
+        },
     };
     let mut model = ModelConfig {
         height: 64,
@@ -58,7 +63,7 @@ fn learner(objective: Objective, lambda: Lambda) -> Learner {
         dim: DimParts::NONE,
     };
     model.dim = settings.dim_parts(ACTIONS);
-    Learner::new(
+    Agent::new(
         model,
         settings,
         &Compute::CPU,
@@ -86,14 +91,21 @@ fn updates(criterion: &mut Criterion) {
         .sample_size(20)
         .measurement_time(Duration::from_secs(10));
     for (name, objective, l3t3, l4t4, positives, augmented) in [
-        ("c51", Objective::None, 0.0, 0.0, 0, false),
-        ("c51+4t4", Objective::Dim, 0.0, 1.0, 1, false),
-        ("c51+3t3+4t4", Objective::Dim, 1.0, 1.0, 1, false),
-        ("c51+4t4, augmented", Objective::Dim, 0.0, 1.0, 1, true),
-        ("cpc", Objective::Cpc, 0.0, 1.0, CPC, false),
-        ("curl", Objective::Curl, 0.0, 1.0, 1, true),
+        ("c51", Objective::NONE, 0.0, 0.0, 0, false),
+        ("c51+4t4", Objective::of(&dim::DIM), 0.0, 1.0, 1, false),
+        ("c51+3t3+4t4", Objective::of(&dim::DIM), 1.0, 1.0, 1, false),
+        (
+            "c51+4t4, augmented",
+            Objective::of(&dim::DIM),
+            0.0,
+            1.0,
+            1,
+            true,
+        ),
+        ("cpc", Objective::of(&cpc::CPC), 0.0, 1.0, CPC, false),
+        ("curl", Objective::of(&curl::CURL), 0.0, 1.0, 1, true),
     ] {
-        let mut learner = learner(
+        let mut agent = agent(
             objective,
             Lambda {
                 l3t3,
@@ -119,7 +131,7 @@ fn updates(criterion: &mut Criterion) {
             },
         };
         group.bench_function(name, |bencher| {
-            bencher.iter(|| black_box(learner.update(&batch).expect("a good batch")));
+            bencher.iter(|| black_box(agent.update(&batch).expect("a good batch")));
         });
     }
     group.finish();

@@ -3,7 +3,7 @@
 
 use driml_model::ModelConfig;
 
-use crate::{auxiliary::Auxiliary, update::UpdateError};
+use crate::{auxiliary::positives::Positives, error::UpdateError};
 
 /// Stands in `next_action` where a row has none: its transition ended the episode or the level.
 pub const NO_ACTION: u8 = 255;
@@ -38,27 +38,22 @@ pub struct Batch<'a> {
 }
 
 impl Batch<'_> {
-    /// Checks lengths against `model`, positives against `auxiliary`, actions, returns and discounts.
+    /// Checks lengths against `model`, positives against what the auxiliary loss `wants`, actions, returns and discounts.
     ///
     /// # Errors
     /// [`UpdateError::Batch`] with the first fault found.
-    pub fn validate(&self, model: &ModelConfig, auxiliary: &Auxiliary) -> Result<(), UpdateError> {
+    pub fn validate(&self, model: &ModelConfig, wants: Positives) -> Result<(), UpdateError> {
         let fault = |what: String| Err(UpdateError::Batch(what));
         let rows = self.rows;
         if rows == 0 {
             return fault("it has no rows".to_owned());
         }
         let state_bytes = model.height * model.width * model.channels;
-        let (positives, views) = (self.positives, self.anchors.is_some());
-        let (fits, wants) = match auxiliary {
-            Auxiliary::None => (true, "any number"),
-            Auxiliary::Dim(_) => (positives == 1, "one"),
-            Auxiliary::Cpc(_) => (positives >= 1, "one or more"),
-            Auxiliary::Curl(_) => (positives == 1 && views, "two views of each state"),
-        };
-        if !fits {
+        let positives = self.positives;
+        if !wants.fit(positives, self.anchors.is_some()) {
             return fault(format!(
-                "it has {positives} positives a row; this agent needs {wants}"
+                "it has {positives} positives a row; this agent needs {}",
+                wants.wanted_words()
             ));
         }
         let anchors = self.anchors.unwrap_or(self.states_t);

@@ -16,7 +16,9 @@ use sha2::{Digest, Sha256};
 
 use crate::{
     affinity::AffinityEstimator,
-    update::{Learner, LearnerSettings, NetworkParameters, UpdateError},
+    agent::{Agent, NetworkParameters},
+    error::UpdateError,
+    settings::LearnerSettings,
 };
 
 /// 2: CURL's key encoder has a file of its own. All else is as in 1.
@@ -96,7 +98,7 @@ pub enum CheckpointError {
 #[derive(Clone, Copy, Debug)]
 pub struct RunState<'a> {
     /// Networks, optimiser, count of updates.
-    pub learner: &'a Learner,
+    pub agent: &'a Agent,
     /// The affinity estimate, if the run has one.
     pub affinity: Option<&'a AffinityEstimator>,
     /// The learner's generator.
@@ -111,7 +113,7 @@ pub struct RunState<'a> {
 #[derive(Debug)]
 pub struct Restored {
     /// Networks, optimiser, count of updates.
-    pub learner: Learner,
+    pub agent: Agent,
     /// The affinity estimate, if the run had one.
     pub affinity: Option<AffinityEstimator>,
     /// The learner's generator.
@@ -167,7 +169,7 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
     }
     fs::create_dir_all(folder).map_err(io_error("create", folder))?;
     tidy(folder)?;
-    let name = format!("{PREFIX}{:012}", state.learner.updates());
+    let name = format!("{PREFIX}{:012}", state.agent.updates());
     let (path, aside) = (folder.join(&name), folder.join(format!("{name}.tmp")));
     let saved = write(&aside, state).and_then(|()| put_in_place(&aside, &path));
     if let Err(error) = saved {
@@ -186,8 +188,8 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
 
 /// Writes a checkpoint's files into the folder `aside`, which is made.
 fn write(aside: &Path, state: &RunState<'_>) -> Result<(), CheckpointError> {
-    let learner = state.learner;
-    let files = tensor_files(learner).map_err(CheckpointError::Unsound)?;
+    let agent = state.agent;
+    let files = tensor_files(agent).map_err(CheckpointError::Unsound)?;
     fs::create_dir(aside).map_err(io_error("create", aside))?;
     let mut sha256 = BTreeMap::new();
     for (name, bytes) in files {
@@ -197,8 +199,8 @@ fn write(aside: &Path, state: &RunState<'_>) -> Result<(), CheckpointError> {
     let file = StateFile {
         format: FORMAT,
         run_spec_hash: hex_of(state.run_spec_hash),
-        updates: learner.updates(),
-        adam_step: learner.adam.step_count(),
+        updates: agent.updates(),
+        adam_step: agent.adam.step_count(),
         weights_version: state.weights_version,
         rng: state.rng.clone(),
         affinity: state.affinity.cloned(),
@@ -252,16 +254,16 @@ fn tidy(folder: &Path) -> Result<(), CheckpointError> {
 }
 
 /// The files of tensors and their names, all finite.
-fn tensor_files(learner: &Learner) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
+fn tensor_files(agent: &Agent) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
     let everything = |parameters: &Parameters| parameters.to_safetensors(|_| true);
-    let moments = learner.adam.to_tensors()?;
+    let moments = agent.adam.to_tensors()?;
     let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from)?;
     let mut files = vec![
-        (ONLINE, everything(learner.online())?),
-        (TARGET, everything(learner.target())?),
+        (ONLINE, everything(agent.online())?),
+        (TARGET, everything(agent.target())?),
         (OPTIMIZER, moments),
     ];
-    if let Some(key) = learner.key() {
+    if let Some(key) = agent.key() {
         files.push((KEY, everything(key)?));
     }
     Ok(files)
@@ -381,7 +383,8 @@ pub fn load(
             expected,
         });
     }
-    if state.format == 1 && settings.curl.is_some() {
+    let has_key = settings.auxiliary()?.key_tau().is_some();
+    if state.format == 1 && has_key {
         return Err(CheckpointError::WithoutKeyEncoder(path.to_owned()));
     }
     state
@@ -404,21 +407,21 @@ pub fn load(
         let loaded = Parameters::load_part(model, part, &tensors(name)?, &compute.device);
         loaded.map_err(|why| damaged(path, name, why.to_string()))
     };
-    let key = || parameters(model, Encoder::has, KEY);
+    let key = has_key.then(|| parameters(model, Encoder::has, KEY));
     let networks = NetworkParameters {
         online: parameters(model, |_| true, ONLINE)?,
         target: parameters(&model.without_dim(), |_| true, TARGET)?,
-        key: settings.curl.map(|_| key()).transpose()?,
+        key: key.transpose()?,
     };
     let moments = candle_core::safetensors::load_buffer(&tensors(OPTIMIZER)?, &Device::Cpu)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
     let (model, settings) = (model.clone(), settings.clone());
-    let mut learner = Learner::from_parameters(model, settings, compute, networks)?;
-    learner
+    let mut agent = Agent::from_parameters(model, settings, compute, networks)?;
+    agent
         .restore_progress(state.updates, state.adam_step, moments)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
     Ok(Restored {
-        learner,
+        agent,
         affinity: state.affinity,
         rng: state.rng,
         weights_version: state.weights_version,

@@ -3,7 +3,7 @@
 
 use driml_model::ModelConfig;
 use driml_protocol::{
-    RunSpec,
+    RunSpec, RunSpecError,
     config::{Settings, TransportConfig},
 };
 use rand_chacha::ChaCha8Rng;
@@ -15,8 +15,9 @@ use crate::{
         LearnedSettings,
     },
     augment::AugmentSettings,
-    auxiliary::Objective,
-    update::LearnerSettings,
+    auxiliary::positives::Positives,
+    error::UpdateError,
+    settings::LearnerSettings,
 };
 
 /// The `[learner]` table.
@@ -202,12 +203,17 @@ impl Config {
                 why: why.into(),
             })
         };
-        match (self.update.objective, self.augment) {
-            (Objective::Curl, None) => bad(
+        let objective = self.update.objective;
+        match (objective.positives(), self.augment) {
+            (Positives::OtherView, None) => bad(
                 "(missing)",
-                "CURL compares two augmentations of a state: take the agent curl, or set all of learner.augment",
+                &format!(
+                    "{} compares two augmentations of a state: take the agent {}, or set all of learner.augment",
+                    objective.name().to_uppercase(),
+                    objective.name()
+                ),
             ),
-            (Objective::None, Some(_)) => bad(
+            (Positives::None, Some(_)) => bad(
                 "(there)",
                 "nothing but an auxiliary objective sees augmented states, and this agent has none",
             ),
@@ -222,6 +228,31 @@ impl Config {
 struct InputSize {
     height: usize,
     width: usize,
+}
+
+/// Why a run's settings are none that a learner can work with.
+#[derive(Debug, thiserror::Error)]
+pub enum LearnerPartError {
+    /// Not TOML, or a table that is missing or does not fit.
+    #[error(transparent)]
+    Tables(#[from] driml_protocol::config::ConfigError),
+    /// What all processes agree on cannot work.
+    #[error(transparent)]
+    Spec(#[from] RunSpecError),
+    /// The network cannot exist.
+    #[error(transparent)]
+    Model(#[from] driml_model::ModelError),
+    /// The `[learner]` table cannot work.
+    #[error(transparent)]
+    Learner(#[from] ConfigError),
+    /// The `[learner.update]` table cannot work.
+    #[error(transparent)]
+    Update(#[from] UpdateError),
+    /// Two tables are at odds.
+    #[error(
+        "the [model] table's sizes do not follow from [run] and [input]: write the settings anew with `driml local`"
+    )]
+    Sizes,
 }
 
 /// Everything a learner needs to know of a run.
@@ -242,7 +273,7 @@ impl LearnerPart {
     ///
     /// # Errors
     /// A table that is missing or does not fit, or values that cannot work.
-    pub fn from_toml(text: &str) -> anyhow::Result<Self> {
+    pub fn from_toml(text: &str) -> Result<Self, LearnerPartError> {
         let settings = Settings::parse(text)?;
         let this = Self {
             spec: settings.table("run")?,
@@ -256,12 +287,12 @@ impl LearnerPart {
         this.learner.validate()?;
         this.learner.update.validate()?;
         let states = (this.spec.frame_channels * this.spec.frame_stack) as usize;
-        anyhow::ensure!(
-            (this.model.height, this.model.width, this.model.channels)
-                == (input.height, input.width, states)
-                && this.model.num_actions == this.spec.num_actions as usize,
-            "the [model] table's sizes do not follow from [run] and [input]: write the settings anew with `driml local`"
-        );
+        let sizes = (this.model.height, this.model.width, this.model.channels);
+        let follows = sizes == (input.height, input.width, states)
+            && this.model.num_actions == this.spec.num_actions as usize;
+        if !follows {
+            return Err(LearnerPartError::Sizes);
+        }
         Ok(this)
     }
 }

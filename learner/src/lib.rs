@@ -1,36 +1,80 @@
-//! The learner's library: losses, optimiser, one update, affinity, checkpoints and the parity check.
-//! The arithmetic here knows no network connection, no replay and no world.
+//! The learner: from batches of replayed transitions to better weights, for C51 and one auxiliary loss beside it.
+//!
+//! Start at [`Agent`]: the networks, their optimiser, and one update. It needs no other process:
+//!
+//! ```
+//! use driml_learner::{Agent, Batch, Compute, LearnerSettings};
+//! use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! // The tables [model] and [learner.update] of a run's config.toml.
+//! # const MODEL: &str = "height = 8\nwidth = 8\nchannels = 1\nnum_actions = 2\natoms = 5\nv_min = -1.0\nv_max = 1.0\n\
+//! #     conv = [{ out = 4, kernel = 4, stride = 2 }]\nhidden = 8\nrkhs = 8\naction_embed = 2\n\
+//! #     dim = { psi3 = false, phi3 = false, psi4 = true, phi4 = true, action = true }";
+//! # const UPDATE: &str = "double_dqn = false\nobjective = \"dim\"\ncondition_on_action = true\ntanh_clip = 20.0\n\
+//! #     lambda = { 3t3 = 0.0, 3t4 = 0.0, 4t3 = 0.0, 4t4 = 1.0 }\nmax_grad_norm = 10.0\ntarget_period_updates = 312\n\
+//! #     target_tau = 0.95\nadam = { lr = 1e-3, beta1 = 0.9, beta2 = 0.999, eps = 1e-8 }";
+//! let (model, settings): (_, LearnerSettings) = (toml::from_str(MODEL)?, toml::from_str(UPDATE)?);
+//! let rng = &mut ChaCha8Rng::seed_from_u64(1);
+//! let mut agent = Agent::new(model, settings, &Compute::CPU, rng)?;
+//! let report = agent.update(&Batch {
+//!     rows: 2,
+//!     states_t: &[10; 2 * 8 * 8], // s_t, u8
+//!     anchors: None,              // not augmented
+//!     positives: 1,
+//!     states_k: &[20; 2 * 8 * 8], // s_{t+k}
+//!     states_n: &[30; 2 * 8 * 8], // s_{t+n}
+//!     action: &[0, 1],
+//!     next_action: &[1, 1],
+//!     n_step_return: &[0.5, -0.5],
+//!     bootstrap_discount: &[0.9, 0.0],
+//!     positive_valid: &[1, 1],
+//! })?;
+//! assert_eq!(report.losses[0].0, "dim_4t4");
+//! assert!(report.total.is_finite() && agent.updates() == 1);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! [`Learner`] is an agent in a run: it takes the replay server's batches, enlarges and augments states, estimates the action
+//! affinity ([`affinity`]), counts versions of the weights and keeps [`checkpoint`]s; lockstep mode runs it as it is.
+//! [`run`] is the process around a learner; what it says to other processes stands in [`remote`], and nothing else here knows
+//! zenoh.
+//!
+//! To change what is learned: a loss beside C51 is a file in [`auxiliary`] and a line in its menu; the pure losses are in
+//! [`losses`], Adam and the target network in [`optimiser`]; [`parity`] compares one update with PyTorch's in float64.
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 pub mod affinity;
+mod agent;
 pub mod augment;
 pub mod auxiliary;
-pub mod batch;
-pub mod batch_source;
+mod batch;
 pub mod checkpoint;
 mod config;
-pub mod gradients;
-mod learning;
-pub mod loss;
-pub mod optim;
-mod outlets;
+mod error;
+mod learner;
+pub mod losses;
+pub mod optimiser;
 pub mod parity;
-mod run;
-mod shards;
-pub mod target;
-pub mod update;
+pub mod remote;
+mod settings;
+mod tensors;
 
 pub use affinity::{
     AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
 };
+pub use agent::{Agent, Evaluation, NetworkParameters, UpdateReport};
 pub use augment::{Augment, AugmentSettings};
-pub use auxiliary::{Objective, curl::CurlSettings, dim::Lambda};
+pub use auxiliary::{Objective, positives::Positives, settings::Lambda};
 pub use batch::{Batch, NO_ACTION};
+pub use config::{
+    AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart, LearnerPartError,
+};
 pub use driml_model::{Compute, DeviceName, Operations};
-
-pub use config::{AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart};
-pub use learning::{Learning, Weights};
-pub use optim::AdamSettings;
-pub use run::{RunArgs, run};
-pub use update::{Learner, LearnerSettings, NetworkParameters, UpdateError, UpdateReport};
+pub use error::UpdateError;
+pub use learner::{Learner, LearnerError, Weights};
+pub use optimiser::adam::AdamSettings;
+pub use remote::run::{RunArgs, run};
+pub use settings::LearnerSettings;

@@ -172,7 +172,7 @@ fn samples() -> Vec<Sample> {
     };
     let learner = LearnerStatus {
         updates: 3,
-        dim: [Some(0.5), None, None, Some(1.5)],
+        losses: vec![("dim_3t3".into(), 0.5), ("dim_4t4".into(), 1.5)],
         ..LearnerStatus::default()
     };
     let affinity = AffinityUpdate {

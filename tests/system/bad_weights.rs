@@ -1,7 +1,7 @@
 //! Weights that a replay server must not take and an actor must not act with, and greetings that no part must follow: of other
 //! runs and versions, of strangers, damaged. The learner, or the replay server, is played by the test itself.
 
-use driml_learner::{Compute, LearnerPart, Learning};
+use driml_learner::{Compute, Learner, LearnerPart};
 use driml_protocol::{
     Hello, Keys, PROTOCOL_VERSION, Tally, WeightsHeader, WeightsUpload, WeightsVersion, codec,
     session::{self, Endpoints},
@@ -64,7 +64,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     let client = system.connect();
     let hash = client.spec.hash();
     let part = LearnerPart::from_toml(&client.config_toml).unwrap();
-    let (_, good) = Learning::new(part, &Compute::CPU)
+    let (_, good) = Learner::new(part, &Compute::CPU)
         .unwrap()
         .next_weights()
         .unwrap();

@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-use driml_learner::batch_source::{BatchSource, Next, Requests};
+use driml_learner::remote::batch_source::{BatchSource, Next, Requests};
 use driml_protocol::{
     ActorJoin, BatchReply, BatchRequest, Buffer, Chunk, ChunkHeader, Horizon, InsertReply, Keys,
     ReplayStatus, RunClient, RunSpec, Shutdown, TimeoutRule, codec,

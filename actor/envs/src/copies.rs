@@ -4,7 +4,8 @@
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::{EnvError, StepEnd};
+use crate::environment::StepEnd;
+use crate::error::EnvError;
 
 /// What a copy's generator is used for; each use has its own stream, so adding one leaves the others as they were.
 #[derive(Clone, Copy)]

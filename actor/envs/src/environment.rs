@@ -1,7 +1,7 @@
 //! What a world is: many copies of one game, stepped together, written straight into the caller's buffers.
 //! It does not stack, enlarge or convert frames, and it keeps no statistics; those live where they are used.
 
-use crate::EnvError;
+use crate::error::EnvError;
 
 /// The shape of one frame, channels last: `height` x `width` x `channels` bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

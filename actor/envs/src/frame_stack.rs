@@ -1,7 +1,8 @@
 //! The newest few frames of each copy, as one image with more channels.
 //! It keeps no history beyond the stack, and it does not enlarge or convert pixels.
 
-use crate::{EnvError, FrameShape};
+use crate::environment::FrameShape;
+use crate::error::EnvError;
 
 /// Most frames in a stack; more are rejected.
 const STACK_MAX: usize = 64;

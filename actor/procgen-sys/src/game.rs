@@ -4,6 +4,8 @@
 use std::fmt;
 use std::str::FromStr;
 
+use strsim::levenshtein;
+
 /// One of Procgen's games.
 #[derive(
     Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, serde::Serialize, serde::Deserialize,
@@ -49,6 +51,17 @@ impl Game {
         Game::Plunder,
         Game::Starpilot,
     ];
+
+    /// Their names, in the same order.
+    pub const NAMES: [&str; Self::ALL.len()] = {
+        let mut names = [""; Self::ALL.len()];
+        let mut i = 0;
+        while i < names.len() {
+            names[i] = Self::ALL[i].name();
+            i += 1;
+        }
+        names
+    };
 
     /// The engine's name of the game.
     pub const fn name(self) -> &'static str {
@@ -151,32 +164,15 @@ impl fmt::Display for ParseGameError {
         let name = self.name.to_lowercase();
         let nearest = Game::ALL
             .into_iter()
-            .min_by_key(|game| edits(&name, game.name()));
-        if let Some(game) = nearest.filter(|game| edits(&name, game.name()) <= 3) {
+            .min_by_key(|game| levenshtein(&name, game.name()));
+        if let Some(game) = nearest.filter(|game| levenshtein(&name, game.name()) <= 3) {
             write!(f, "; did you mean \"{game}\"?")?;
         }
-        let names: Vec<&str> = Game::ALL.iter().map(|game| game.name()).collect();
-        write!(f, " (the games: {})", names.join(", "))
+        write!(f, " (the games: {})", Game::NAMES.join(", "))
     }
 }
 
 impl std::error::Error for ParseGameError {}
-
-/// The number of letters to insert, remove or change to turn `a` into `b` (Levenshtein's distance).
-fn edits(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, letter) in a.chars().enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, other) in b.iter().enumerate() {
-            let change = diagonal + usize::from(letter != *other);
-            diagonal = row[j + 1];
-            row[j + 1] = change.min(row[j] + 1).min(diagonal + 1);
-        }
-    }
-    row[b.len()]
-}
 
 /// How hard the levels are, and of which kind.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
@@ -269,12 +265,5 @@ mod tests {
         assert!(text.contains("did you mean \"bigfish\"?"), "{text}");
         let text = "montezuma_revenge".parse::<Game>().unwrap_err().to_string();
         assert!(!text.contains("did you mean"), "{text}");
-    }
-
-    #[test]
-    fn edits_are_counted() {
-        assert_eq!(edits("", "maze"), 4);
-        assert_eq!(edits("maze", "maze"), 0);
-        assert_eq!(edits("kitten", "sitting"), 3);
     }
 }

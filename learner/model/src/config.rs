@@ -4,6 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::error::{ModelError, Result};
+use crate::geometry::{ConvLayer, ConvShape};
 use crate::init::InitialLaw;
 
 /// Largest size of any one dimension; a configuration beyond it is rejected.
@@ -41,18 +42,6 @@ pub struct ModelConfig {
     pub action_embed: usize,
     /// Which DIM heads exist.
     pub dim: DimParts,
-}
-
-/// One convolution: square kernel, no padding, then ReLU.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ConvLayer {
-    /// Output channels.
-    pub out: usize,
-    /// Side of the square kernel in pixels.
-    pub kernel: usize,
-    /// Step between two windows in pixels, the same in both directions.
-    pub stride: usize,
 }
 
 /// Which DIM heads exist. Nothing is built that no lambda needs.
@@ -128,7 +117,7 @@ impl ModelConfig {
         if self.conv.is_empty() {
             return fail("conv is empty, at least one convolution is needed".to_owned());
         }
-        let (mut height, mut width) = (self.height, self.width);
+        let mut input = (self.height, self.width, self.channels);
         for (index, layer) in self.conv.iter().enumerate() {
             for (name, size) in [
                 ("out", layer.out),
@@ -141,13 +130,14 @@ impl ModelConfig {
                     ));
                 }
             }
-            if layer.kernel > height || layer.kernel > width {
+            let Some(shape) = ConvShape::new(input, *layer) else {
+                let (height, width, _) = input;
                 return fail(format!(
                     "conv[{index}].kernel {} exceeds its input {height}x{width}",
                     layer.kernel
                 ));
-            }
-            (height, width) = (layer.output_side(height), layer.output_side(width));
+            };
+            input = shape.output();
         }
         for (name, shape) in self.parameter_shapes() {
             let len = shape
@@ -170,18 +160,21 @@ impl ModelConfig {
         }
     }
 
+    /// Sizes of the convolutions, first to last. Of a configuration that is not valid, those before the first that does not fit.
+    pub fn conv_shapes(&self) -> Vec<ConvShape> {
+        let mut input = (self.height, self.width, self.channels);
+        let shapes = self.conv.iter().map_while(|layer| {
+            let shape = ConvShape::new(input, *layer)?;
+            input = shape.output();
+            Some(shape)
+        });
+        shapes.collect()
+    }
+
     /// Shape of f3: height, width, channels of the last convolution's output. Meaningful for a valid configuration.
     pub fn local_shape(&self) -> (usize, usize, usize) {
-        self.conv.iter().fold(
-            (self.height, self.width, self.channels),
-            |(height, width, _), layer| {
-                (
-                    layer.output_side(height),
-                    layer.output_side(width),
-                    layer.out,
-                )
-            },
-        )
+        let input = (self.height, self.width, self.channels);
+        self.conv_shapes().last().map_or(input, ConvShape::output)
     }
 
     /// Bytes of one input frame: height * width * channels.
@@ -311,12 +304,5 @@ impl LayerShape {
 
     pub(crate) fn bias_name(&self) -> String {
         format!("{}.bias", self.name)
-    }
-}
-
-impl ConvLayer {
-    /// Side of the output map for an input of this side; 1 where the kernel would not fit.
-    fn output_side(&self, input: usize) -> usize {
-        input.saturating_sub(self.kernel) / self.stride.max(1) + 1
     }
 }

@@ -10,7 +10,8 @@ use std::sync::{Mutex, PoisonError};
 use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
-use crate::im2col::{ConvShape, Images};
+use crate::geometry::{ConvLayer, ConvShape};
+use crate::im2col::Images;
 use crate::linear::{add_in_order, cpu, floats};
 use crate::stack::{Between, layers, parameters_len, stack_backward, stack_forward, unpacked};
 
@@ -39,35 +40,29 @@ pub fn conv2d_relu(
 /// # Errors
 /// No layer, shapes that do not match, a kernel that is not square or larger than its input, a stride of 0, other types.
 pub fn conv_stack(images: &Tensor, layers: &[(&Tensor, &Tensor, usize)]) -> Result<Tensor> {
-    let (_, mut height, mut width, mut channels_in) = images.dims4()?;
+    let (_, height, width, channels) = images.dims4()?;
     if layers.is_empty() {
         bail!("a stack of no convolutions");
     }
+    let mut input = (height, width, channels);
     let (mut shapes, mut parameters) = (Vec::new(), Vec::new());
     for &(weight, bias, stride) in layers {
-        let (channels_out, weight_in, kernel, kernel_width) = weight.dims4()?;
-        let fits =
-            weight_in == channels_in && kernel == kernel_width && bias.dims() == [channels_out];
-        let exists = stride > 0
-            && kernel > 0
-            && kernel <= height.min(width)
-            && channels_in * channels_out > 0;
-        if !fits || !exists {
-            let (input, weight, bias) =
-                ([height, width, channels_in], weight.shape(), bias.shape());
-            bail!(
-                "convolution of images {input:?} with weight {weight:?}, bias {bias:?} and stride {stride}"
-            );
-        }
-        let shape = ConvShape {
-            height,
-            width,
-            channels_in,
-            channels_out,
+        let (out, weight_in, kernel, kernel_width) = weight.dims4()?;
+        let fits = weight_in == input.2 && kernel == kernel_width && bias.dims() == [out];
+        let layer = ConvLayer {
+            out,
             kernel,
             stride,
         };
-        (height, width, channels_in) = (shape.out_height(), shape.out_width(), channels_out);
+        let Some(shape) = ConvShape::new(input, layer).filter(|_| fits) else {
+            let (height, width, channels) = input;
+            let (weight, bias) = (weight.shape(), bias.shape());
+            bail!(
+                "convolution of images {:?} with weight {weight:?}, bias {bias:?} and stride {stride}",
+                [height, width, channels]
+            );
+        };
+        input = shape.output();
         shapes.push(shape);
         parameters.extend([weight.flatten_all()?, bias.clone()]);
     }

@@ -5,61 +5,13 @@
 //! series of plain copies. A patch is a window laid out as [kernel row, kernel column, channel in].
 
 use crate::gemm::{Matrix, Output, Threads, multiply};
+use crate::geometry::ConvShape;
 use crate::linear::{relu_gradient, relu_of};
 
 /// Scalars of patches held at a time; more images share a tile while they fit. 384 KiB: a part of the second-level cache.
 const TILE_LEN: usize = 96 * 1024;
 
-/// Shapes of one convolution without padding.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct ConvShape {
-    pub(crate) height: usize,
-    pub(crate) width: usize,
-    pub(crate) channels_in: usize,
-    pub(crate) channels_out: usize,
-    pub(crate) kernel: usize,
-    pub(crate) stride: usize,
-}
-
 impl ConvShape {
-    pub(crate) fn out_height(&self) -> usize {
-        (self.height - self.kernel) / self.stride + 1
-    }
-
-    pub(crate) fn out_width(&self) -> usize {
-        (self.width - self.kernel) / self.stride + 1
-    }
-
-    /// Windows in one image.
-    pub(crate) fn locations(&self) -> usize {
-        self.out_height() * self.out_width()
-    }
-
-    /// Scalars in one window.
-    pub(crate) fn patch_len(&self) -> usize {
-        self.kernel * self.kernel * self.channels_in
-    }
-
-    /// Scalars in one input image.
-    pub(crate) fn image_len(&self) -> usize {
-        self.height * self.width * self.channels_in
-    }
-
-    /// Scalars in one output map.
-    pub(crate) fn map_len(&self) -> usize {
-        self.locations() * self.channels_out
-    }
-
-    /// Scalars in the weight.
-    pub(crate) fn weight_len(&self) -> usize {
-        self.patch_len() * self.channels_out
-    }
-
-    /// Scalars in weight and bias.
-    pub(crate) fn parameters_len(&self) -> usize {
-        self.weight_len() + self.channels_out
-    }
-
     fn tile_images(&self) -> usize {
         (TILE_LEN / (self.locations() * self.patch_len())).max(1)
     }

@@ -12,7 +12,8 @@ use crate::c51_head::expected_returns;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
 use crate::gemm::Matrix;
-use crate::im2col::{ConvScratch, ConvShape, Images, forward, grown};
+use crate::geometry::ConvShape;
+use crate::im2col::{ConvScratch, Images, forward, grown};
 use crate::linear::{self, relu_in_place};
 use crate::weights::{decode, is_dim};
 
@@ -172,30 +173,17 @@ impl PolicyWeights {
                 .expect("decode returns every parameter of the configuration");
             values
         };
-        let (mut height, mut width, mut channels_in) =
-            (config.height, config.width, config.channels);
-        let mut convolutions = Vec::with_capacity(config.conv.len());
-        for (index, layer) in config.conv.iter().enumerate() {
-            let (channels_out, kernel, stride) = (layer.out, layer.kernel, layer.stride);
-            let shape = ConvShape {
-                height,
-                width,
-                channels_in,
-                channels_out,
-                kernel,
-                stride,
-            };
-            let packed = shape.pack_weight(&take(&format!("torso.conv{}.weight", index + 1)));
-            let bias = take(&format!("torso.conv{}.bias", index + 1));
-            convolutions.push(Convolution {
+        let convolutions = (1..)
+            .zip(config.conv_shapes())
+            .map(|(number, shape)| Convolution {
                 shape,
-                packed,
-                bias,
+                packed: shape.pack_weight(&take(&format!("torso.conv{number}.weight"))),
+                bias: take(&format!("torso.conv{number}.bias")),
             });
-            (height, width, channels_in) = (shape.out_height(), shape.out_width(), channels_out);
-        }
+        let convolutions = convolutions.collect();
+        let (height, width, channels) = config.local_shape();
         // The inputs in our maps' order, row, column, channel, instead of PyTorch's channel, row, column.
-        let column = |input: usize| input % channels_in * height * width + input / channels_in;
+        let column = |input: usize| input % channels * height * width + input / channels;
         let fc_weight = transposed(&take("torso.fc.weight"), config.hidden, column);
         let fc = Dense {
             weight: fc_weight,

@@ -4,7 +4,8 @@
 use std::cell::RefCell;
 use std::sync::{Mutex, PoisonError};
 
-use crate::im2col::{ConvGradients, ConvScratch, ConvShape, Images, backward, forward, grown};
+use crate::geometry::ConvShape;
+use crate::im2col::{ConvGradients, ConvScratch, Images, backward, forward, grown};
 
 /// Spare buffers kept for later passes; more are given back to the allocator.
 const SPARE_MAX: usize = 64;

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::AffinityError;
+use super::error::AffinityError;
 
 /// A map from raw to visible actions, and the visible ones numbered without gaps.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

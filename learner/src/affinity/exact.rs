@@ -3,7 +3,12 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{AffinityError, Alphabet, bits, check_array, check_probabilities, row_softmax};
+use super::{
+    alphabet::Alphabet,
+    arrays::{check_array, check_probabilities, row_softmax},
+    bits,
+    error::AffinityError,
+};
 
 /// The counts' numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

@@ -5,7 +5,12 @@ use rand::{Rng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{AffinityError, Alphabet, bits, check_array, check_probabilities, row_softmax};
+use super::{
+    alphabet::Alphabet,
+    arrays::{check_array, check_probabilities, row_softmax},
+    bits,
+    error::AffinityError,
+};
 
 /// The estimator's numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

@@ -2,7 +2,9 @@
 //! It does not draw k (the replay server does) and does not send A.
 
 pub mod alphabet;
+mod arrays;
 mod bits;
+mod error;
 pub mod exact;
 pub mod learned;
 
@@ -10,6 +12,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 pub use alphabet::Alphabet;
+pub use error::AffinityError;
 pub use exact::{ExactAffinity, ExactSettings};
 pub use learned::{LearnedAffinity, LearnedSettings};
 
@@ -22,11 +25,6 @@ pub enum AffinityEstimator {
     /// Closed form from decayed pair counts.
     Exact(ExactAffinity),
 }
-
-/// A fault in settings or pairs.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[error("action affinity: {0}")]
-pub struct AffinityError(String);
 
 impl AffinityEstimator {
     /// Learns from one batch's pairs of raw actions, none of which crosses an episode's end. No pairs: no change.
@@ -83,51 +81,6 @@ impl AffinityEstimator {
             Self::Exact(exact) => exact.alphabet().num_actions(),
         }
     }
-}
-
-/// Checks the length of an array by name, and that its numbers are finite.
-fn check_array<T: Copy + Into<f64>>(
-    name: &str,
-    array: &[T],
-    len: usize,
-) -> Result<(), AffinityError> {
-    if array.len() != len {
-        let found = array.len();
-        return Err(AffinityError(format!(
-            "{name} has {found} numbers, not {len}"
-        )));
-    }
-    match array.iter().position(|&value| !value.into().is_finite()) {
-        Some(at) => Err(AffinityError(format!("{name} is not finite at index {at}"))),
-        None => Ok(()),
-    }
-}
-
-/// [`check_array`] for probabilities.
-fn check_probabilities<T: Copy + Into<f64>>(
-    name: &str,
-    array: &[T],
-    len: usize,
-) -> Result<(), AffinityError> {
-    check_array(name, array, len)?;
-    let probability = |&value: &T| (0.0..=1.0 + 1e-6).contains(&value.into());
-    match array.iter().position(|value| !probability(value)) {
-        Some(at) => Err(AffinityError(format!(
-            "{name} is no probability at index {at}"
-        ))),
-        None => Ok(()),
-    }
-}
-
-/// Row-wise softmax of `q` [m, m].
-fn row_softmax(q: &[f64], m: usize) -> Vec<f64> {
-    let mut matrix = Vec::with_capacity(q.len());
-    for row in q.chunks_exact(m) {
-        let max = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let sum: f64 = row.iter().map(|q| (q - max).exp()).sum();
-        matrix.extend(row.iter().map(|q| (q - max).exp() / sum));
-    }
-    matrix
 }
 
 #[cfg(test)]
@@ -226,7 +179,7 @@ mod tests {
         }
     }
 
-    /// The preset's numbers (`deploy/presets/agent/driml-ada.toml`) on a source as skewed as a game's.
+    /// The preset's numbers (`deploy/settings/presets/agent/driml-ada.toml`) on a source as skewed as a game's.
     const PRESET: LearnedSettings = LearnedSettings {
         hidden: 32,
         lr: 2e-3,

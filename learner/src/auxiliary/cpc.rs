@@ -4,78 +4,117 @@
 use std::{borrow::Cow, ops::Range};
 
 use candle_core::Tensor;
-use driml_model::{Features, Network};
+use driml_model::{DimParts, Features, Network};
 
-use super::dim::{Dim, Dots, Vectors};
-use crate::{loss::info_nce::info_nce_loss, update::UpdateError};
+use super::{
+    dim::{Dim, Vectors},
+    loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
+    positives::Positives,
+};
+use crate::{
+    error::UpdateError,
+    losses::{info_nce::info_nce_loss, scores::Dots},
+};
+
+/// Its line of the menu.
+pub const CPC: MenuItem = MenuItem {
+    name: "cpc",
+    positives: Positives::Several,
+    losses: &NAMES,
+    make: |settings| {
+        settings.check_weighted()?;
+        let pairs = Dim::new(settings);
+        Ok(Box::new(Cpc { pairs }))
+    },
+};
+
+/// What each pair's loss is reported as, in the order of `settings::PAIRS`.
+const NAMES: [&str; 4] = ["cpc_3t3", "cpc_3t4", "cpc_4t3", "cpc_4t4"];
 
 /// The CPC objective's settings: those of the pairs of levels.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Cpc {
+struct Cpc {
     /// Weights of the pairs, and how dot products become scores.
-    pub pairs: Dim,
+    pairs: Dim,
 }
 
-/// The dot products of one offset, in the order of `dim::PAIRS`, and the rows that have a positive there.
+/// The dot products of one offset, in the order of `settings::PAIRS`, and the rows that have a positive there.
 #[derive(Debug)]
-pub struct Offset {
+struct Offset {
     /// Rows with a positive, at least two.
-    pub rows: usize,
+    rows: usize,
     /// [L, rows, rows] for the pairs with a weight above 0.
-    pub dots: [Option<Dots>; 4],
+    dots: [Option<Dots>; 4],
 }
 
-impl Cpc {
-    /// Losses of the pairs with a weight above 0, each a scalar, before their weights: the mean over the P offsets of the
-    /// InfoNCE of the rows that have a positive there, 0 where fewer than two have.
+impl AuxiliaryLoss for Cpc {
+    fn heads(&self, action: bool) -> DimParts {
+        self.pairs.heads(action)
+    }
+
+    fn passes(&self, positives: usize, augmented: bool) -> Passes {
+        Passes::of_pairs(self.pairs.lambda, positives, augmented)
+    }
+
+    /// For each pair with a weight above 0 the mean over the P offsets of the InfoNCE of the rows that have a positive there, 0
+    /// where fewer than two have. A mean, so that lambda weighs as much as DIM's.
     ///
-    /// `features_t` of s_t, B rows; `features_k` of the positives that exist, offset by offset, none if there are none;
-    /// `action` [B]; `valid` [P, B]: 0 where a row has no positive. A mean, so that lambda weighs as much as DIM's.
     /// Source: van den Oord et al. 2018, section 2.3, with the heads of Mazoure et al. 2020 ("exactly the same networks
     /// for measuring similarity").
-    ///
-    /// # Errors
-    /// A head that such a pair needs and `network` lacks, or rows that do not fit.
-    pub fn losses(
-        &self,
-        network: &Network,
-        features_t: &Features,
-        features_k: Option<&Features>,
-        action: &Tensor,
-        valid: &[u8],
-    ) -> Result<[Option<Tensor>; 4], UpdateError> {
-        let offsets = self.offsets(network, features_t, features_k, action, valid)?;
-        let positives = valid.len() / action.elem_count().max(1);
+    fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
+        let (online, valid) = (inputs.online, inputs.batch.positive_valid);
+        let anchors = inputs.anchors()?;
+        let later = if valid.iter().any(|&valid| valid != 0) {
+            Some(inputs.features(present(inputs.batch.states_k, valid))?)
+        } else {
+            None
+        };
+        let action = inputs.action()?;
+        let offsets = self.offsets(online, &anchors, later.as_ref(), &action, valid)?;
         let mut sums = [const { None::<Tensor> }; 4];
+        let mut all_dots = [const { Vec::new() }; 4];
         for Offset { rows, dots } in offsets {
             let all = vec![1; rows];
-            for (sum, dots) in sums.iter_mut().zip(dots) {
-                if let Some(Dots { dots, rkhs }) = dots {
-                    let loss =
-                        info_nce_loss(&dots, &all, self.pairs.scores(rkhs), network.operations())?;
+            for ((sum, all_dots), dots) in sums.iter_mut().zip(&mut all_dots).zip(dots) {
+                if let Some(dots) = dots {
+                    let scores = self.pairs.scores(dots.rkhs);
+                    let loss = info_nce_loss(&dots.dots, &all, scores, online.operations())?;
                     *sum = Some(match sum.take() {
                         Some(sum) => (sum + loss)?,
                         None => loss,
                     });
+                    all_dots.push(dots);
                 }
             }
         }
-        let mut losses = [const { None }; 4];
-        for ((loss, sum), wanted) in losses.iter_mut().zip(sums).zip(self.pairs.lambda.wanted()) {
-            *loss = match (sum, wanted) {
-                (Some(sum), _) => Some(sum.affine(1.0 / positives as f64, 0.0)?),
-                (None, true) => Some(Tensor::new(0f32, features_t.f4.device())?),
-                (None, false) => None,
+        let lambda = self.pairs.lambda.values();
+        let mut losses = Vec::new();
+        for (((name, weight), sum), dots) in NAMES.into_iter().zip(lambda).zip(sums).zip(all_dots) {
+            let loss = match sum {
+                Some(sum) => sum.affine(1.0 / inputs.batch.positives as f64, 0.0)?,
+                None if weight > 0.0 => Tensor::new(0f32, anchors.f4.device())?,
+                None => continue,
             };
+            losses.push(WeightedLoss {
+                name,
+                weight,
+                loss,
+                dots,
+            });
         }
         Ok(losses)
     }
+}
 
-    /// The dot products of each offset at which two rows or more have a positive; arguments as in [`Cpc::losses`].
+impl Cpc {
+    /// The dot products of each offset at which two rows or more have a positive.
+    ///
+    /// `features_t` of s_t, B rows; `features_k` of the positives that exist, offset by offset, none if there are none;
+    /// `action` [B]; `valid` [P, B]: 0 where a row has no positive.
     ///
     /// # Errors
-    /// As [`Cpc::losses`].
-    pub fn offsets(
+    /// A head that a pair needs and `network` lacks, or rows that do not fit.
+    fn offsets(
         &self,
         network: &Network,
         features_t: &Features,
@@ -139,7 +178,7 @@ fn of_offset(
 }
 
 /// Of the positives' states [P, B, ..] those that exist, offset by offset: nothing is computed for the others.
-pub fn present<'a>(states: &'a [u8], valid: &[u8]) -> Cow<'a, [u8]> {
+fn present<'a>(states: &'a [u8], valid: &[u8]) -> Cow<'a, [u8]> {
     if valid.iter().all(|&valid| valid != 0) {
         return Cow::Borrowed(states);
     }

@@ -7,27 +7,29 @@
 //! "exactly the same networks for measuring similarity (i.e. one residual block for CURL and CPC)", hence no bilinear
 //! product and no second head.
 
-use candle_core::Tensor;
-use driml_model::{DimParts, Encoder, Features, ModelConfig, Network, Operations, Parameters};
+use driml_model::DimParts;
 use serde::{Deserialize, Serialize};
 
-use super::dim::{self, Dots};
+use super::{
+    dim,
+    loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
+    positives::Positives,
+    settings::AuxiliarySettings,
+};
 use crate::{
-    loss::info_nce::{Scores, info_nce_loss},
-    target,
-    update::UpdateError,
+    error::UpdateError,
+    losses::{info_nce::info_nce_loss, scores::Scores},
 };
 
-/// The one head; the key encoder has its copy.
-pub const HEADS: DimParts = DimParts {
-    psi3: false,
-    phi3: false,
-    psi4: true,
-    phi4: false,
-    action: false,
+/// Its line of the menu.
+pub const CURL: MenuItem = MenuItem {
+    name: "curl",
+    positives: Positives::OtherView,
+    losses: &["curl"],
+    make,
 };
 
-/// The key encoder's pace.
+/// Its own table, `[learner.update.curl]`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurlSettings {
@@ -35,106 +37,77 @@ pub struct CurlSettings {
     pub key_tau: f64,
 }
 
-impl CurlSettings {
-    /// Checks the range.
-    ///
-    /// # Errors
-    /// A share out of it, with its value.
-    pub fn validate(&self) -> Result<(), UpdateError> {
-        let Self { key_tau } = *self;
-        if key_tau > 0.0 && key_tau <= 1.0 {
-            return Ok(());
-        }
-        Err(UpdateError::Settings(format!("curl.key_tau = {key_tau}")))
+fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+    settings.check_weighted()?;
+    let fault = |what: &str| Err(UpdateError::Objective(format!("objective = curl {what}")));
+    if settings.lambda.wanted() != [false, false, false, true] {
+        return fault("compares whole states, so lambda.4t4 alone may be above 0");
     }
+    if settings.condition_on_action {
+        return fault(
+            "compares views of one state, which no action parts: set condition_on_action to false",
+        );
+    }
+    let Some(CurlSettings { key_tau }) = settings.own()? else {
+        return fault(
+            "encodes its keys by a moving average of the network, whose pace is missing (earlier versions had none): take the agent curl, or --set learner.update.curl.key_tau=0.001",
+        );
+    };
+    if !(key_tau > 0.0 && key_tau <= 1.0) {
+        return Err(UpdateError::Settings(format!("curl.key_tau = {key_tau}")));
+    }
+    Ok(Box::new(Curl {
+        weight: settings.lambda.l4t4,
+        tanh_clip: settings.tanh_clip,
+        key_tau,
+    }))
 }
 
-/// The CURL objective's settings.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Curl {
-    /// Bound c of the scores' soft clip `c * tanh(x / c)`.
-    pub tanh_clip: f64,
+struct Curl {
+    weight: f64,
+    tanh_clip: f64,
+    key_tau: f64,
 }
 
-impl Curl {
-    /// The loss, a scalar, before its weight, in the place of the pair 4t4.
-    ///
-    /// `query` are the online network's features of one view, `keys` [B, rkhs] the key encoder's vectors of the other;
-    /// `action` [B] gives the rows, all of which take part: a state needs no successor here.
-    ///
-    /// # Errors
-    /// A network without the head.
-    pub fn losses(
-        &self,
-        online: &Network,
-        query: &Features,
-        keys: &Tensor,
-        action: &Tensor,
-    ) -> Result<[Option<Tensor>; 4], UpdateError> {
-        let query = online.psi4(&query.f4, action)?;
-        let Dots { dots, rkhs } = dim::global_dots(&query, keys)?;
-        let scores = Scores::new(rkhs, self.tanh_clip);
-        let all = vec![1; action.elem_count()];
-        let loss = info_nce_loss(&dots, &all, scores, online.operations())?;
-        Ok([None, None, None, Some(loss)])
-    }
-}
-
-/// A slow copy of the online network's torso and Psi_4.
-#[derive(Debug)]
-pub struct KeyEncoder {
-    settings: CurlSettings,
-    operations: Operations,
-    parameters: Parameters,
-    encoder: Encoder,
-}
-
-impl KeyEncoder {
-    /// The key encoder of a network of `model` on these parameters, of which it must have all.
-    ///
-    /// # Errors
-    /// A parameter that is missing.
-    pub fn new(
-        model: &ModelConfig,
-        settings: CurlSettings,
-        operations: Operations,
-        parameters: Parameters,
-    ) -> Result<Self, UpdateError> {
-        Ok(Self {
-            encoder: Encoder::new(model, &parameters, operations)?,
-            settings,
-            operations,
-            parameters,
-        })
+impl AuxiliaryLoss for Curl {
+    /// One head, of which the key encoder has its copy.
+    fn heads(&self, _action: bool) -> DimParts {
+        DimParts {
+            psi4: true,
+            ..DimParts::NONE
+        }
     }
 
-    /// What a key encoder has of `online`, copied: where it starts.
-    ///
-    /// # Errors
-    /// A failing copy.
-    pub fn copy_of(online: &Parameters) -> Result<Parameters, UpdateError> {
-        Ok(online.copy_part(Encoder::has)?)
+    fn key_tau(&self) -> Option<f64> {
+        Some(self.key_tau)
     }
 
-    /// Its parameters, under the online network's names.
-    pub const fn parameters(&self) -> &Parameters {
-        &self.parameters
+    /// The query forward and backward, the key forward.
+    fn passes(&self, _positives: usize, _augmented: bool) -> Passes {
+        Passes {
+            torso: 4.0,
+            heads: 4.0,
+            scores: 1.0,
+            local: false,
+        }
     }
 
-    /// Keys [B, rkhs] of `frames` [B, H, W, C] u8, without a gradient.
-    ///
-    /// # Errors
-    /// Frames of another size.
-    pub fn keys(&self, frames: &Tensor) -> Result<Tensor, UpdateError> {
-        Ok(self.encoder.encode(frames)?)
-    }
-
-    /// Moves after an update: `key <- key_tau * online + (1 - key_tau) * key`.
-    ///
-    /// # Errors
-    /// An online network that lacks a parameter of it.
-    pub fn follow(&self, online: &Parameters) -> Result<(), UpdateError> {
-        let tau = self.settings.key_tau;
-        target::follow(&self.parameters, online, tau, self.operations)
+    /// InfoNCE of the online network's vectors of one view with the key encoder's of the other. All rows take part: a state
+    /// needs no successor here.
+    fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
+        let keys = inputs.keys()?;
+        let anchors = inputs.anchors()?;
+        let query = inputs.online.psi4(&anchors.f4, &inputs.action()?)?;
+        let dots = dim::global_dots(&query, &keys)?;
+        let all = vec![1; inputs.batch.rows];
+        let scores = Scores::new(dots.rkhs, self.tanh_clip);
+        let loss = info_nce_loss(&dots.dots, &all, scores, inputs.online.operations())?;
+        Ok(vec![WeightedLoss {
+            name: "curl",
+            weight: self.weight,
+            loss,
+            dots: vec![dots],
+        }])
     }
 }

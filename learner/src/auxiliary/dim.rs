@@ -3,72 +3,33 @@
 
 use candle_core::Tensor;
 use driml_model::{DimParts, Features, Network};
-use serde::{Deserialize, Serialize};
 
+use super::{
+    loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
+    positives::Positives,
+    settings::{AuxiliarySettings, Lambda},
+};
 use crate::{
-    loss::info_nce::{Scores, info_nce_loss},
-    update::UpdateError,
+    error::UpdateError,
+    losses::{
+        info_nce::info_nce_loss,
+        scores::{Dots, Scores},
+    },
 };
 
-/// The pairs NtM in the order of every array of four here: features N of (s_t, a_t) against features M of s_{t+k}.
-pub const PAIRS: [&str; 4] = ["3t3", "3t4", "4t3", "4t4"];
+/// Its line of the menu.
+pub const DIM: MenuItem = MenuItem {
+    name: "dim",
+    positives: Positives::One,
+    losses: &NAMES,
+    make: |settings| {
+        settings.check_weighted()?;
+        Ok(Box::new(Dim::new(settings)))
+    },
+};
 
-/// Weight of each pair's loss in the total, 0 or above; a pair at 0 is not computed.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Lambda {
-    /// Local against local.
-    #[serde(rename = "3t3")]
-    pub l3t3: f64,
-    /// Local against global.
-    #[serde(rename = "3t4")]
-    pub l3t4: f64,
-    /// Global against local.
-    #[serde(rename = "4t3")]
-    pub l4t3: f64,
-    /// Global against global.
-    #[serde(rename = "4t4")]
-    pub l4t4: f64,
-}
-
-impl Lambda {
-    /// In the order of [`PAIRS`].
-    pub const fn values(&self) -> [f64; 4] {
-        [self.l3t3, self.l3t4, self.l4t3, self.l4t4]
-    }
-
-    /// The pairs with a weight above 0.
-    pub fn wanted(&self) -> [bool; 4] {
-        self.values().map(|lambda| lambda > 0.0)
-    }
-
-    /// The heads that the pairs with a weight above 0 need; `action` says whether psi is given a_t.
-    pub fn dim_parts(&self, action: bool) -> DimParts {
-        let [local_local, local_global, global_local, global_global] = self.wanted();
-        let psi3 = local_local || local_global;
-        let psi4 = global_local || global_global;
-        DimParts {
-            psi3,
-            phi3: local_local || global_local,
-            psi4,
-            phi4: local_global || global_global,
-            action: action && (psi3 || psi4),
-        }
-    }
-
-    /// Checks the ranges.
-    ///
-    /// # Errors
-    /// The first weight that is negative or not finite.
-    pub fn validate(&self) -> Result<(), UpdateError> {
-        for (name, value) in PAIRS.iter().zip(self.values()) {
-            if !(value >= 0.0 && value.is_finite()) {
-                return Err(UpdateError::Settings(format!("lambda.{name} = {value}")));
-            }
-        }
-        Ok(())
-    }
-}
+/// What each pair's loss is reported as, in the order of `settings::PAIRS`.
+const NAMES: [&str; 4] = ["dim_3t3", "dim_3t4", "dim_4t3", "dim_4t4"];
 
 /// The DIM objective's settings.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -80,14 +41,22 @@ pub struct Dim {
 }
 
 impl Dim {
+    /// The objective of these settings.
+    pub const fn new(settings: &AuxiliarySettings<'_>) -> Self {
+        Self {
+            lambda: settings.lambda,
+            tanh_clip: settings.tanh_clip,
+        }
+    }
+
     /// Losses of the pairs with a weight above 0, each a scalar, before their weights.
     ///
     /// `features_t` of s_t, `features_k` of s_{t+k}, `action` [B], `valid` [B]: a row with 0 is neither anchor nor
-    /// candidate. Source: Mazoure et al. 2020, section 4; InfoNCE, scale and clip are `loss::info_nce`'s.
+    /// candidate. Source: Mazoure et al. 2020, section 4; InfoNCE, scale and clip are `losses::info_nce`'s.
     ///
     /// # Errors
     /// A head that such a pair needs and `network` lacks.
-    pub fn losses(
+    pub fn pair_losses(
         &self,
         network: &Network,
         features_t: &Features,
@@ -95,25 +64,24 @@ impl Dim {
         action: &Tensor,
         valid: &[u8],
     ) -> Result<[Option<Tensor>; 4], UpdateError> {
+        let wanted = self.lambda.wanted();
+        let dots = dots(network, features_t, features_k, action, wanted)?;
         let mut losses = [const { None }; 4];
-        let dots = dots(
-            network,
-            features_t,
-            features_k,
-            action,
-            self.lambda.wanted(),
-        )?;
-        for (loss, dots) in losses.iter_mut().zip(dots) {
-            if let Some(Dots { dots, rkhs }) = dots {
-                *loss = Some(info_nce_loss(
-                    &dots,
-                    valid,
-                    self.scores(rkhs),
-                    network.operations(),
-                )?);
+        for (loss, dots) in losses.iter_mut().zip(&dots) {
+            if let Some(dots) = dots {
+                *loss = Some(self.info_nce(dots, valid, network)?);
             }
         }
         Ok(losses)
+    }
+
+    fn info_nce(
+        &self,
+        Dots { dots, rkhs }: &Dots,
+        valid: &[u8],
+        network: &Network,
+    ) -> candle_core::Result<Tensor> {
+        info_nce_loss(dots, valid, self.scores(*rkhs), network.operations())
     }
 
     /// How dot products of vectors of `rkhs` numbers become scores.
@@ -122,16 +90,37 @@ impl Dim {
     }
 }
 
-/// Dot products of every anchor with every candidate.
-#[derive(Debug)]
-pub struct Dots {
-    /// [L, B, B]: location, anchor, candidate; L = 1 where both features are global.
-    pub dots: Tensor,
-    /// Numbers in each vector.
-    pub rkhs: usize,
+impl AuxiliaryLoss for Dim {
+    fn heads(&self, action: bool) -> DimParts {
+        self.lambda.dim_parts(action)
+    }
+
+    fn passes(&self, positives: usize, augmented: bool) -> Passes {
+        Passes::of_pairs(self.lambda, positives, augmented)
+    }
+
+    fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
+        let (online, batch) = (inputs.online, inputs.batch);
+        let anchors = inputs.anchors()?;
+        let later = inputs.features(batch.states_k)?;
+        let wanted = self.lambda.wanted();
+        let dots = dots(online, &anchors, &later, &inputs.action()?, wanted)?;
+        let mut losses = Vec::new();
+        for ((name, weight), dots) in NAMES.into_iter().zip(self.lambda.values()).zip(dots) {
+            if let Some(dots) = dots {
+                losses.push(WeightedLoss {
+                    name,
+                    weight,
+                    loss: self.info_nce(&dots, batch.positive_valid, online)?,
+                    dots: vec![dots],
+                });
+            }
+        }
+        Ok(losses)
+    }
 }
 
-/// Dot products for the `wanted` pairs, in the order of [`PAIRS`].
+/// Dot products for the `wanted` pairs, in the order of `settings::PAIRS`.
 ///
 /// Local features meet local ones at the same location; a global feature meets every location.
 ///
@@ -187,7 +176,7 @@ impl Vectors {
         })
     }
 
-    /// Dot products for the `wanted` pairs whose vectors are there, in the order of [`PAIRS`]; as many anchors as candidates.
+    /// Dot products for the `wanted` pairs whose vectors are there, in the order of `settings::PAIRS`; as many anchors as candidates.
     ///
     /// # Errors
     /// Vectors that do not fit each other.
@@ -328,29 +317,5 @@ mod tests {
         let once = plain(|i, _| g(&p4, i), |j, _| g(&q4, j))[..9].to_vec();
         assert_eq!(got(global_global_dots(&psi4, &phi4)?), once);
         Ok(())
-    }
-
-    #[test]
-    fn only_the_heads_of_weighted_pairs_are_needed() {
-        let lambda = |l3t3, l3t4, l4t3, l4t4| Lambda {
-            l3t3,
-            l3t4,
-            l4t3,
-            l4t4,
-        };
-        let parts = |lambda: Lambda| {
-            let p = lambda.dim_parts(true);
-            [p.psi3, p.phi3, p.psi4, p.phi4, p.action]
-        };
-        assert_eq!(parts(lambda(0.0, 0.0, 0.0, 0.0)), [false; 5]);
-        assert_eq!(
-            parts(lambda(0.0, 0.0, 0.0, 1.0)),
-            [false, false, true, true, true]
-        );
-        assert_eq!(
-            parts(lambda(0.0, 0.5, 0.0, 0.0)),
-            [true, false, false, true, true]
-        );
-        assert_eq!(parts(lambda(1.0, 0.0, 0.0, 1.0)), [true; 5]);
     }
 }

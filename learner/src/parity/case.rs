@@ -14,10 +14,11 @@ use safetensors::SafeTensors;
 use serde::Deserialize;
 
 use crate::{
-    auxiliary::{Objective, curl::CurlSettings, dim::Lambda},
+    auxiliary::{Objective, dim::DIM, positives::Positives, settings::Lambda},
     batch::{Batch, NO_ACTION},
-    optim::AdamSettings,
-    update::{LearnerSettings, UpdateError},
+    error::UpdateError,
+    optimiser::adam::AdamSettings,
+    settings::LearnerSettings,
 };
 
 /// Why a case could not be checked.
@@ -81,7 +82,7 @@ struct Config {
     tanh_clip: f64,
     max_grad_norm: f64,
     adam: AdamSettings,
-    /// Pace of CURL's key encoder; not there for other objectives.
+    /// Pace of the key encoder; not there for an objective without one.
     key_tau: Option<f64>,
     model: Sizes,
 }
@@ -119,17 +120,6 @@ pub(super) struct Case {
     used: RefCell<BTreeSet<String>>,
 }
 
-/// Every head of the DIM objective.
-pub(super) const fn all_parts(action: bool) -> DimParts {
-    DimParts {
-        psi3: true,
-        phi3: true,
-        psi4: true,
-        phi4: true,
-        action,
-    }
-}
-
 impl Case {
     pub(super) fn parse(bytes: &[u8]) -> Result<Self, ParityError> {
         let format = |why: String| ParityError::Format(why);
@@ -148,13 +138,19 @@ impl Case {
                 .into_iter()
                 .collect();
         let by_lambda = if config.lambda.wanted().contains(&true) {
-            Objective::Dim
+            Objective::of(&DIM)
         } else {
-            Objective::None
+            Objective::NONE
         };
+        let objective = config.objective.unwrap_or(by_lambda);
+        // The one number of its own that an objective in the cases has.
+        let own = config.key_tau.map(|key_tau| {
+            let table = toml::Table::from_iter([("key_tau".to_owned(), key_tau.into())]);
+            (objective.name().to_owned(), table.into())
+        });
         let settings = LearnerSettings {
             double_dqn: config.double_dqn,
-            objective: config.objective.unwrap_or(by_lambda),
+            objective,
             condition_on_action: config.condition_on_action.unwrap_or(true),
             lambda: config.lambda,
             tanh_clip: config.tanh_clip,
@@ -163,7 +159,7 @@ impl Case {
             // One update: the target network does not move.
             target_period_updates: u64::MAX,
             target_tau: 1.0,
-            curl: config.key_tau.map(|key_tau| CurlSettings { key_tau }),
+            own: own.into_iter().collect(),
         };
         let mut case = Self {
             rows: 0,
@@ -198,27 +194,23 @@ impl Case {
             Ok(tensor.flatten_all()?.to_vec1()?)
         };
         let (mut positives, mut anchors) = (1, None);
-        let (states_k, valid) = match self.settings.objective {
-            Objective::None | Objective::Dim => (
-                bytes("input.states_k", &state)?,
-                bytes("input.positive_valid", &[rows])?,
-            ),
-            Objective::Cpc => {
-                let valid = self.tensor("input.positive_valid")?.dims();
-                positives = valid.first().copied().unwrap_or(0);
-                let later = [&[positives], &state[..]].concat();
-                (
-                    bytes("input.states_k", &later)?,
-                    bytes("input.positive_valid", &[positives, rows])?,
-                )
-            }
-            Objective::Curl => {
-                anchors = Some(bytes("input.view_query", &state)?);
-                (bytes("input.view_key", &state)?, vec![1; rows])
-            }
+        let (states_k, valid) = if self.settings.objective.positives() == Positives::OtherView {
+            anchors = Some(bytes("input.view_query", &state)?);
+            (bytes("input.view_key", &state)?, vec![1; rows])
+        } else {
+            // [B] where a row has one positive, else [P, B].
+            let dims = self.tensor("input.positive_valid")?.dims();
+            let several = if dims.len() > 1 { &dims[..1] } else { &[] };
+            positives = several.iter().product();
+            let later = [several, &state[..]].concat();
+            let valid = [several, &[rows]].concat();
+            (
+                bytes("input.frames_k", &later)?,
+                bytes("input.positive_valid", &valid)?,
+            )
         };
-        let states_t = bytes("input.states_t", &state)?;
-        let states_n = bytes("input.states_n", &state)?;
+        let states_t = bytes("input.frames_t", &state)?;
+        let states_n = bytes("input.frames_n", &state)?;
         self.frames = [states_t, states_k, states_n];
         (self.positives, self.anchors, self.positive_valid) = (positives, anchors, valid);
         let actions: Vec<i64> = self.input("input.action", DType::I64, &[rows])?.to_vec1()?;

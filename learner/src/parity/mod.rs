@@ -8,21 +8,23 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use candle_core::{Device, Tensor};
-use driml_model::{Compute, DimParts, Encoder, Features, ModelConfig, Network, Parameters};
+use candle_core::Tensor;
+use driml_model::{Compute, DimParts, Encoder, ModelConfig, Network, Parameters};
 
+use case::Case;
 pub use case::ParityError;
-use case::{Case, all_parts};
 
 use crate::{
+    agent::{Agent, NetworkParameters},
     auxiliary::{
         Objective,
-        cpc::{self, Cpc},
-        curl::{self, Curl},
-        dim::{self, Dim, Dots, Lambda, PAIRS},
+        dim::DIM,
+        key_encoder::KeyEncoder,
+        loss::{LossInputs, WeightedLoss},
+        settings::{AuxiliarySettings, Lambda},
     },
-    loss::info_nce::info_nce_loss,
-    update::{Learner, NetworkParameters},
+    losses::scores::{Dots, Scores},
+    tensors::states,
 };
 
 /// Values of s_t, in units of return, as a share of the support's width.
@@ -122,12 +124,12 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
         target: Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?,
         key: key_parameters(case, &model, compute)?,
     };
-    let mut learner =
-        Learner::from_parameters(model.clone(), case.settings.clone(), compute, parameters)?;
+    let mut agent =
+        Agent::from_parameters(model.clone(), case.settings.clone(), compute, parameters)?;
 
     let mut lines = Vec::new();
-    let pairs = forward_losses(case, compute)?;
-    let evaluation = learner.evaluate(&case.batch())?;
+    let forward = forward_losses(case, compute)?;
+    let evaluation = agent.evaluate(&case.batch())?;
 
     let width = f64::from(model.v_max - model.v_min);
     let (rows, num_actions, atoms) = (case.rows, model.num_actions, model.atoms);
@@ -160,14 +162,14 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
     };
     loss_line("loss.c51_kl", evaluation.c51_kl, false)?;
     let mut total_saturates = false;
-    for (i, pair) in pairs.into_iter().enumerate() {
-        let Some((forward_only, saturates)) = pair else {
-            continue;
-        };
-        // A pair of weight 0 is not in the update; its loss comes from the forward pass alone.
-        let got = evaluation.dim[i].unwrap_or(forward_only);
-        loss_line(&format!("loss.dim.{}", PAIRS[i]), got, saturates)?;
-        total_saturates |= saturates && evaluation.dim[i].is_some();
+    for alone in forward {
+        // A loss of weight 0 is not in the update: its value comes from the forward pass alone.
+        let in_update = evaluation.losses.iter().find(|it| it.0 == alone.name);
+        let got = in_update.map_or(alone.value, |it| it.1);
+        // The cases call every loss after the pair of levels that it compares; one that does not say compares global features.
+        let pair = alone.name.split_once('_').map_or("4t4", |it| it.1);
+        loss_line(&format!("loss.dim.{pair}"), got, alone.saturates)?;
+        total_saturates |= alone.saturates && in_update.is_some();
     }
     loss_line("loss.total", evaluation.total, total_saturates)?;
 
@@ -188,7 +190,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
         worst.add("grad", name, difference, tolerance);
     }
     lines.extend(worst.lines);
-    let got = learner.apply(&evaluation.gradients)?;
+    let got = agent.apply(&evaluation.gradients)?;
     lines.push(line(
         "grad_norm",
         (got - global_norm).abs(),
@@ -200,7 +202,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
         let expected = case.expected(&format!("updated.{name}"), tensor.dims())?;
         // What no lambda uses is not built, so it stays as the file gives it.
         let got = values(
-            learner
+            agent
                 .online()
                 .get(name)
                 .map_or(tensor, |var| var.as_tensor()),
@@ -209,7 +211,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
     }
     lines.extend(worst.lines);
     let mut worst = Worst::default();
-    for (name, var) in learner.key().iter().flat_map(|key| key.iter()) {
+    for (name, var) in agent.key().iter().flat_map(|key| key.iter()) {
         let expected = case.expected(&format!("updated_key.{name}"), var.dims())?;
         worst.add(
             "updated_key",
@@ -229,7 +231,7 @@ fn key_parameters(
     model: &ModelConfig,
     compute: &Compute,
 ) -> Result<Option<Parameters>, ParityError> {
-    if case.settings.curl.is_none() {
+    if case.settings.auxiliary()?.key_tau().is_none() {
         return Ok(None);
     }
     let named = case.parameters("key.", model);
@@ -237,100 +239,72 @@ fn key_parameters(
     Ok(Some(key))
 }
 
-/// The auxiliary losses of all pairs that the case speaks of, forward only and untouched by lambda, and whether the scores
-/// of each saturate.
-fn forward_losses(case: &Case, compute: &Compute) -> Result<[Option<(f32, bool)>; 4], ParityError> {
+/// An auxiliary loss by a forward pass alone.
+struct Forward {
+    name: &'static str,
+    value: f32,
+    /// Whether a score is past the clip's bound, where its slope is below 0.42.
+    saturates: bool,
+}
+
+/// The auxiliary losses of all pairs that the case speaks of, forward only and untouched by lambda.
+fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, ParityError> {
     let settings = &case.settings;
-    let heads = match settings.objective {
-        Objective::Curl => curl::HEADS,
-        _ => all_parts(settings.condition_on_action),
+    let objective = if settings.objective == Objective::NONE {
+        Objective::of(&DIM)
+    } else {
+        settings.objective
     };
-    let model = case.model(heads);
+    let every = AuxiliarySettings {
+        objective: objective.name(),
+        lambda: Lambda::EVERY,
+        ..settings.auxiliary_settings()
+    };
+    // An objective that does not take every pair is taken as it is.
+    let loss = objective.loss(&every).or_else(|_| settings.auxiliary())?;
+    let model = case.model(loss.heads(settings.condition_on_action));
+    let (device, operations) = (&compute.device, compute.operations);
     let named = case.parameters("online.", &model);
-    let parameters = Parameters::from_tensors(&model, named, &compute.device)?;
-    let online = Network::with_operations(&model, &parameters, compute.operations)?;
-    let states = |frames: &[u8]| -> Result<Tensor, ParityError> {
-        let ModelConfig {
-            height,
-            width,
-            channels,
-            ..
-        } = model;
-        let shape = (frames.len() / model.frame_len(), height, width, channels);
-        Ok(Tensor::from_slice(frames, shape, &compute.device)?)
+    let parameters = Parameters::from_tensors(&model, named, device)?;
+    let online = Network::with_operations(&model, &parameters, operations)?;
+    let key = match (loss.key_tau(), key_parameters(case, &model, compute)?) {
+        (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, operations, key)?),
+        _ => None,
     };
-    let features =
-        |frames: &[u8]| -> Result<Features, ParityError> { Ok(online.features(&states(frames)?)?) };
     let batch = case.batch();
-    let valid = batch.positive_valid;
-    let anchors = features(batch.anchors.unwrap_or(batch.states_t))?;
-    let action = Tensor::from_slice(batch.action, case.rows, &Device::Cpu)?;
-    let every = Lambda {
-        l3t3: 1.0,
-        l3t4: 1.0,
-        l4t3: 1.0,
-        l4t4: 1.0,
-    };
-    let pairs = Dim {
-        lambda: every,
-        tanh_clip: settings.tanh_clip,
-    };
-    // Past c the slope of the clip is below 0.42.
-    let saturates = |dots: &Dots| -> Result<bool, ParityError> {
-        let scores = pairs.scores(dots.rkhs);
-        let dots = values(&dots.dots)?;
+    let features_t = online.features(&states(&model, batch.states_t, device)?)?;
+    let losses = loss.losses(&LossInputs {
+        online: &online,
+        model: &model,
+        batch: &batch,
+        features_t: &features_t,
+        key: key.as_ref(),
+        device,
+    })?;
+    let saturates = |Dots { dots, rkhs }: &Dots| -> Result<bool, ParityError> {
+        let scores = Scores::new(*rkhs, settings.tanh_clip);
+        let dots = values(dots)?;
         let largest = dots
             .iter()
             .fold(0.0, |largest: f64, dot| largest.max(dot.abs()));
         Ok(largest * scores.scale > scores.tanh_clip)
     };
-    let mut losses = [None; 4];
-    match settings.objective {
-        Objective::None | Objective::Dim => {
-            let later = features(batch.states_k)?;
-            let all = dim::dots(&online, &anchors, &later, &action, [true; 4])?;
-            for (loss, dots) in losses.iter_mut().zip(all.iter().flatten()) {
-                let value = info_nce_loss(
-                    &dots.dots,
-                    valid,
-                    pairs.scores(dots.rkhs),
-                    compute.operations,
-                )?;
-                *loss = Some((value.to_scalar()?, saturates(dots)?));
-            }
+    let mut forward = Vec::new();
+    for WeightedLoss {
+        name, loss, dots, ..
+    } in losses
+    {
+        let mut any = false;
+        for dots in &dots {
+            any |= saturates(dots)?;
         }
-        Objective::Cpc => {
-            let later = features(&cpc::present(batch.states_k, valid))?;
-            let cpc = Cpc { pairs };
-            let all = cpc.losses(&online, &anchors, Some(&later), &action, valid)?;
-            for (loss, value) in losses.iter_mut().zip(all.iter().flatten()) {
-                *loss = Some((value.to_scalar()?, false));
-            }
-            for offset in cpc.offsets(&online, &anchors, Some(&later), &action, valid)? {
-                for (loss, dots) in losses.iter_mut().zip(offset.dots.iter().flatten()) {
-                    if let Some((_, saturated)) = loss {
-                        *saturated |= saturates(dots)?;
-                    }
-                }
-            }
-        }
-        Objective::Curl => {
-            let curl = Curl {
-                tanh_clip: settings.tanh_clip,
-            };
-            let key = key_parameters(case, &model, compute)?;
-            let key = key.ok_or_else(|| ParityError::Config("key_tau is missing".to_owned()))?;
-            let encoder = Encoder::new(&model, &key, compute.operations)?;
-            let keys = encoder.encode(&states(batch.states_k)?)?;
-            let all = curl.losses(&online, &anchors, &keys, &action)?;
-            for (loss, value) in losses.iter_mut().zip(all) {
-                if let Some(value) = value {
-                    *loss = Some((value.to_scalar()?, false));
-                }
-            }
-        }
+        forward.push(Forward {
+            name,
+            value: loss.to_scalar()?,
+            saturates: any,
+        });
     }
-    Ok(losses)
+    Ok(forward)
 }
 
 fn line(name: &str, error: f64, tolerance: f64) -> ParityLine {

@@ -4,8 +4,8 @@
 use std::{collections::BTreeMap, fs};
 
 use driml_learner::{
-    AffinityConfig, AugmentSettings, Batch, Config, CurlSettings, EstimatorKind, Lambda, Learner,
-    LearnerPart, LearnerSettings, Learning, NetworkParameters, Objective, UpdateError,
+    AffinityConfig, Agent, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner,
+    LearnerPart, LearnerSettings, NetworkParameters, Objective, UpdateError,
 };
 use driml_model::{Compute, DimParts, ModelConfig, Parameters};
 use driml_protocol::{
@@ -16,7 +16,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     checkpoint::{Folder, change_state},
-    made_up::{ALL_DIM, NO_DIM, Rows, model, settings},
+    made_up::{ALL_DIM, CPC, CURL, DIM, NO_DIM, Rows, model, settings},
 };
 
 const GLOBAL: Lambda = Lambda {
@@ -26,11 +26,29 @@ const GLOBAL: Lambda = Lambda {
 const POSITIVES: usize = 3;
 const KEY_TAU: f64 = 0.25;
 
+/// The table `curl` with this pace, or nothing.
+fn curl_table(key_tau: Option<f64>) -> toml::Table {
+    let table = key_tau.map(|it| toml::Table::from_iter([("key_tau".to_owned(), it.into())]));
+    table
+        .map(|it| ("curl".to_owned(), it.into()))
+        .into_iter()
+        .collect()
+}
+
+/// The names and values of auxiliary losses.
+type Losses = Vec<(&'static str, f32)>;
+
+/// The one loss of an agent that has one.
+fn only(losses: &Losses) -> f32 {
+    assert_eq!(losses.len(), 1, "{losses:?}");
+    losses[0].1
+}
+
 fn of(objective: Objective, lambda: Lambda) -> (ModelConfig, LearnerSettings) {
     let settings = LearnerSettings {
         objective,
         condition_on_action: false,
-        curl: (objective == Objective::Curl).then_some(CurlSettings { key_tau: KEY_TAU }),
+        own: curl_table((objective == CURL).then_some(KEY_TAU)),
         ..settings(lambda)
     };
     let model = ModelConfig {
@@ -40,9 +58,9 @@ fn of(objective: Objective, lambda: Lambda) -> (ModelConfig, LearnerSettings) {
     (model, settings)
 }
 
-fn learner(objective: Objective, lambda: Lambda) -> Learner {
+fn agent(objective: Objective, lambda: Lambda) -> Agent {
     let (model, settings) = of(objective, lambda);
-    Learner::new(
+    Agent::new(
         model,
         settings,
         &Compute::CPU,
@@ -76,11 +94,13 @@ fn curl(rows: &Rows) -> Batch<'_> {
 #[test]
 fn cpc_with_one_offset_is_dim() {
     let rows = Rows::random(7, 2);
-    let one = learner(Objective::Cpc, ALL_DIM).evaluate(&rows.batch());
-    let dim = learner(Objective::Dim, ALL_DIM).evaluate(&rows.batch());
+    let one = agent(CPC, ALL_DIM).evaluate(&rows.batch());
+    let dim = agent(DIM, ALL_DIM).evaluate(&rows.batch());
     let (one, dim) = (one.unwrap(), dim.unwrap());
-    for (a, b) in one.dim.iter().zip(dim.dim) {
-        assert!((a.unwrap() - b.unwrap()).abs() < 1e-5, "{a:?} {b:?}");
+    assert_eq!((one.losses.len(), dim.losses.len()), (4, 4));
+    for ((cpc, a), (dim, b)) in one.losses.iter().zip(&dim.losses) {
+        assert_eq!(cpc.strip_prefix("cpc_"), dim.strip_prefix("dim_"));
+        assert!((a - b).abs() < 1e-5, "{cpc} {a} {b}");
     }
     assert!((one.total - dim.total).abs() < 1e-4);
 }
@@ -90,8 +110,8 @@ fn cpc_is_the_mean_over_its_offsets() {
     let rows = Rows::random(6, 3);
     let states_k = later(&rows);
     let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 0], [0, 0, 0, 1, 0, 0]].concat();
-    let learner = learner(Objective::Cpc, ALL_DIM);
-    let all = learner.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
+    let agent = agent(CPC, ALL_DIM);
+    let all = agent.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
     let mut sums = [0.0; 4];
     for (frames, valid) in rows.frames.iter().zip(valid.chunks(6)) {
         let batch = Batch {
@@ -100,13 +120,15 @@ fn cpc_is_the_mean_over_its_offsets() {
             positive_valid: valid,
             ..rows.batch()
         };
-        let one = learner.evaluate(&batch).unwrap();
-        for (sum, loss) in sums.iter_mut().zip(one.dim) {
-            *sum += loss.unwrap();
+        let one = agent.evaluate(&batch).unwrap();
+        assert_eq!(one.losses.len(), 4);
+        for (sum, (_, loss)) in sums.iter_mut().zip(one.losses) {
+            *sum += loss;
         }
     }
-    for (loss, sum) in all.dim.iter().zip(sums) {
-        assert!((loss.unwrap() - sum / 3.0).abs() < 1e-5, "{loss:?} {sum}");
+    assert_eq!(all.losses.len(), 4);
+    for ((_, loss), sum) in all.losses.iter().zip(sums) {
+        assert!((loss - sum / 3.0).abs() < 1e-5, "{loss} {sum}");
     }
 }
 
@@ -115,14 +137,14 @@ fn positives_that_are_missing_change_nothing() {
     let rows = Rows::random(6, 4);
     let mut states_k = later(&rows);
     let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]].concat();
-    let learner = learner(Objective::Cpc, ALL_DIM);
-    let before = learner.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
+    let agent = agent(CPC, ALL_DIM);
+    let before = agent.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
     let bytes = states_k.len() / valid.len();
     for at in (0..valid.len()).filter(|&at| valid[at] == 0) {
         states_k[at * bytes..(at + 1) * bytes].fill(99);
     }
-    let after = learner.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
-    assert_eq!((before.dim, before.total), (after.dim, after.total));
+    let after = agent.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
+    assert_eq!((before.losses, before.total), (after.losses, after.total));
 }
 
 #[test]
@@ -132,9 +154,9 @@ fn without_any_positive_cpc_learns_the_return() {
     for there in 0..2 {
         let mut valid = [0; 5 * POSITIVES];
         valid[..there].fill(1);
-        let mut learner = learner(Objective::Cpc, GLOBAL);
-        let report = learner.update(&cpc(&rows, &states_k, &valid)).unwrap();
-        assert_eq!(report.dim, [None, None, None, Some(0.0)]);
+        let mut agent = agent(CPC, GLOBAL);
+        let report = agent.update(&cpc(&rows, &states_k, &valid)).unwrap();
+        assert_eq!(report.losses, [("cpc_4t4", 0.0)]);
         assert_eq!(report.total, report.c51_kl);
     }
 }
@@ -143,16 +165,13 @@ fn without_any_positive_cpc_learns_the_return() {
 fn cpc_and_curl_bring_their_losses_down() {
     let rows = Rows::random(16, 6);
     let (states_k, valid) = (later(&rows), [1; 16 * POSITIVES]);
-    for (objective, batch) in [
-        (Objective::Cpc, cpc(&rows, &states_k, &valid)),
-        (Objective::Curl, curl(&rows)),
-    ] {
-        let mut learner = learner(objective, GLOBAL);
-        let first = learner.update(&batch).unwrap().dim[3].unwrap();
+    for (objective, batch) in [(CPC, cpc(&rows, &states_k, &valid)), (CURL, curl(&rows))] {
+        let mut agent = agent(objective, GLOBAL);
+        let first = only(&agent.update(&batch).unwrap().losses);
         for _ in 0..80 {
-            learner.update(&batch).unwrap();
+            agent.update(&batch).unwrap();
         }
-        let last = learner.update(&batch).unwrap().dim[3].unwrap();
+        let last = only(&agent.update(&batch).unwrap().losses);
         assert!(last < 0.7 * first, "{objective:?}: {first} to {last}");
     }
 }
@@ -160,8 +179,8 @@ fn cpc_and_curl_bring_their_losses_down() {
 #[test]
 fn curl_compares_its_views_and_not_the_state() {
     let rows = Rows::random(8, 7);
-    let learner = learner(Objective::Curl, GLOBAL);
-    let loss = |batch: &Batch<'_>| learner.evaluate(batch).unwrap().dim[3].unwrap();
+    let agent = agent(CURL, GLOBAL);
+    let loss = |batch: &Batch<'_>| only(&agent.evaluate(batch).unwrap().losses);
     let before = loss(&curl(&rows));
     let mut other = rows.clone();
     other.frames[0].fill(3);
@@ -199,23 +218,23 @@ fn part_of(values: &Values, part: impl Fn(&str) -> bool) -> Values {
 #[test]
 fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
     let rows = Rows::random(6, 8);
-    let mut learner = learner(Objective::Curl, GLOBAL);
-    let key = |learner: &Learner| values(learner.key().unwrap());
+    let mut agent = agent(CURL, GLOBAL);
+    let key = |agent: &Agent| values(agent.key().unwrap());
     let encoder = |name: &str| name.starts_with("torso.") || name.starts_with("dim.psi4.");
-    let start = part_of(&values(learner.online()), encoder);
-    assert_eq!(key(&learner), start, "torso and psi_4, and nothing else");
+    let start = part_of(&values(agent.online()), encoder);
+    assert_eq!(key(&agent), start, "torso and psi_4, and nothing else");
     let mut average = start.clone();
     // The target network moves once, at the third.
     for _ in 0..4 {
-        learner.update(&curl(&rows)).unwrap();
-        let online = values(learner.online());
+        agent.update(&curl(&rows)).unwrap();
+        let online = values(agent.online());
         for (name, values) in &mut average {
             for (value, online) in values.iter_mut().zip(&online[name]) {
                 *value =
                     (KEY_TAU * f64::from(*online) + (1.0 - KEY_TAU) * f64::from(*value)) as f32;
             }
         }
-        for (name, found) in key(&learner) {
+        for (name, found) in key(&agent) {
             for (found, wanted) in found.iter().zip(&average[&name]) {
                 assert!((found - wanted).abs() < 1e-6, "{name}");
             }
@@ -223,8 +242,8 @@ fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
     }
     assert_ne!(average, start);
     // Actors get none of it.
-    let acting = learner.model().without_dim();
-    let weights = learner.weights().unwrap();
+    let acting = agent.model().without_dim();
+    let weights = agent.weights().unwrap();
     let device = candle_core::Device::Cpu;
     Parameters::load_safetensors(&acting, &weights, &device).unwrap();
 }
@@ -234,35 +253,34 @@ fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
 fn c51_s_target_network_is_the_same_for_every_agent() {
     let rows = Rows::random(6, 8);
     for (objective, lambda) in [
-        (Objective::None, NO_DIM),
-        (Objective::Dim, GLOBAL),
-        (Objective::Cpc, GLOBAL),
-        (Objective::Curl, GLOBAL),
+        (Objective::NONE, NO_DIM),
+        (DIM, GLOBAL),
+        (CPC, GLOBAL),
+        (CURL, GLOBAL),
     ] {
-        let mut learner = learner(objective, lambda);
-        assert_eq!(learner.key().is_some(), objective == Objective::Curl);
-        let online = |learner: &Learner| {
-            part_of(&values(learner.online()), |name| !name.starts_with("dim."))
-        };
-        let start = online(&learner);
-        assert_eq!(values(learner.target()), start, "{objective:?}");
-        let batch = match objective {
-            Objective::None => Batch {
+        let mut agent = agent(objective, lambda);
+        assert_eq!(agent.key().is_some(), objective == CURL);
+        let online =
+            |agent: &Agent| part_of(&values(agent.online()), |name| !name.starts_with("dim."));
+        let start = online(&agent);
+        assert_eq!(values(agent.target()), start, "{objective:?}");
+        let batch = match objective.name() {
+            "none" => Batch {
                 positives: 0,
                 states_k: &[],
                 positive_valid: &[],
                 ..rows.batch()
             },
-            Objective::Curl => curl(&rows),
+            "curl" => curl(&rows),
             _ => rows.batch(),
         };
         for _ in 0..2 {
-            learner.update(&batch).unwrap();
-            assert_eq!(values(learner.target()), start, "its turn has not come");
+            agent.update(&batch).unwrap();
+            assert_eq!(values(agent.target()), start, "its turn has not come");
         }
-        learner.update(&batch).unwrap();
-        let online = online(&learner);
-        for (name, slow) in values(learner.target()) {
+        agent.update(&batch).unwrap();
+        let online = online(&agent);
+        for (name, slow) in values(agent.target()) {
             for ((slow, online), start) in slow.iter().zip(&online[&name]).zip(&start[&name]) {
                 assert!(
                     (slow - (0.95 * online + 0.05 * start)).abs() < 1e-6,
@@ -277,28 +295,27 @@ fn c51_s_target_network_is_the_same_for_every_agent() {
 fn a_target_network_that_moves_leaves_curl_s_keys_where_they_are() {
     let rows = Rows::random(8, 12);
     let loss = |target_tau| {
-        let (model, mut settings) = of(Objective::Curl, GLOBAL);
+        let (model, mut settings) = of(CURL, GLOBAL);
         (settings.target_period_updates, settings.target_tau) = (1, target_tau);
         // So small a step that the key encoder stands still.
         settings.adam.lr = 1e-30;
         let rng = &mut ChaCha8Rng::seed_from_u64(1);
-        let mut parameters = Learner::new(model.clone(), settings.clone(), &Compute::CPU, rng)
-            .map(|learner| NetworkParameters {
-                online: learner.online().copy().unwrap(),
-                target: learner.target().copy().unwrap(),
-                key: learner.key().map(|key| key.copy().unwrap()),
+        let mut parameters = Agent::new(model.clone(), settings.clone(), &Compute::CPU, rng)
+            .map(|agent| NetworkParameters {
+                online: agent.online().copy().unwrap(),
+                target: agent.target().copy().unwrap(),
+                key: agent.key().map(|key| key.copy().unwrap()),
             })
             .unwrap();
         // A target network of another seed.
         let rng = &mut ChaCha8Rng::seed_from_u64(2);
         parameters.target =
             Parameters::init(&model.without_dim(), rng, &Compute::CPU.device).unwrap();
-        let mut learner =
-            Learner::from_parameters(model, settings, &Compute::CPU, parameters).unwrap();
-        let first = learner.update(&curl(&rows)).unwrap();
-        let second = learner.update(&curl(&rows)).unwrap();
+        let mut agent = Agent::from_parameters(model, settings, &Compute::CPU, parameters).unwrap();
+        let first = agent.update(&curl(&rows)).unwrap();
+        let second = agent.update(&curl(&rows)).unwrap();
         assert_ne!(first.c51_kl, second.c51_kl, "the target network has moved");
-        (first.dim, second.dim)
+        (first.losses, second.losses)
     };
     let (first, second) = loss(1.0);
     assert_eq!(first, second);
@@ -309,24 +326,24 @@ fn batches_that_an_agent_cannot_use_are_refused() {
     let rows = Rows::random(5, 9);
     let (states_k, valid) = (later(&rows), [1; 5 * POSITIVES]);
     let said = |objective, batch: &Batch<'_>| {
-        let error = learner(objective, GLOBAL).evaluate(batch).unwrap_err();
+        let error = agent(objective, GLOBAL).evaluate(batch).unwrap_err();
         assert!(matches!(error, UpdateError::Batch(_)));
         error.to_string()
     };
     let several = cpc(&rows, &states_k, &valid);
-    assert!(said(Objective::Dim, &several).contains("3 positives a row; this agent needs one"));
+    assert!(said(DIM, &several).contains("3 positives a row; this agent needs one"));
     let plain = rows.batch();
-    assert!(said(Objective::Curl, &plain).contains("needs two views of each state"));
+    assert!(said(CURL, &plain).contains("needs two views of each state"));
     let short = Batch {
         positive_valid: &valid[1..],
         ..several
     };
-    assert!(said(Objective::Cpc, &short).contains("positive_valid"));
+    assert!(said(CPC, &short).contains("positive_valid"));
     let short = Batch {
         anchors: Some(&states_k[..8]),
         ..curl(&rows)
     };
-    assert!(said(Objective::Curl, &short).contains("anchors"));
+    assert!(said(CURL, &short).contains("anchors"));
 }
 
 #[test]
@@ -334,22 +351,22 @@ fn objectives_at_odds_with_their_settings_are_refused() {
     let with = |objective, lambda, condition_on_action, key_tau: Option<f64>| LearnerSettings {
         objective,
         condition_on_action,
-        curl: key_tau.map(|key_tau| CurlSettings { key_tau }),
+        own: curl_table(key_tau),
         ..settings(lambda)
     };
     let said = |objective, lambda, condition_on_action| {
         let settings = with(objective, lambda, condition_on_action, Some(0.1));
         settings.validate().unwrap_err().to_string()
     };
-    assert!(said(Objective::None, GLOBAL, false).contains("but lambda.4t4 is above 0"));
-    for objective in [Objective::Dim, Objective::Cpc, Objective::Curl] {
+    assert!(said(Objective::NONE, GLOBAL, false).contains("but lambda.4t4 is above 0"));
+    for objective in [DIM, CPC, CURL] {
         assert!(said(objective, NO_DIM, false).contains("but all lambdas are 0"));
     }
-    assert!(said(Objective::Curl, ALL_DIM, false).contains("lambda.4t4 alone"));
-    assert!(said(Objective::Curl, GLOBAL, true).contains("condition_on_action"));
-    assert!(said(Objective::Dim, GLOBAL, true).contains("has no keys to encode"));
-    assert!(said(Objective::None, NO_DIM, true).contains("has no keys to encode"));
-    let curl = |key_tau| with(Objective::Curl, GLOBAL, false, key_tau).validate();
+    assert!(said(CURL, ALL_DIM, false).contains("lambda.4t4 alone"));
+    assert!(said(CURL, GLOBAL, true).contains("condition_on_action"));
+    assert!(said(DIM, GLOBAL, true).contains("has no use for the table curl"));
+    assert!(said(Objective::NONE, NO_DIM, true).contains("has no use for the table curl"));
+    let curl = |key_tau| with(CURL, GLOBAL, false, key_tau).validate();
     let missing = curl(None).unwrap_err().to_string();
     assert!(
         missing.contains("--set learner.update.curl.key_tau="),
@@ -365,20 +382,20 @@ fn objectives_at_odds_with_their_settings_are_refused() {
 #[test]
 fn a_psi_that_is_not_given_the_action_does_not_see_it() {
     let mut rows = Rows::random(6, 10);
-    let learner = learner(Objective::Dim, ALL_DIM);
-    assert!(!learner.model().dim.action);
-    let before = learner.evaluate(&rows.batch()).unwrap().dim;
+    let agent = agent(DIM, ALL_DIM);
+    assert!(!agent.model().dim.action);
+    let before = agent.evaluate(&rows.batch()).unwrap().losses;
     rows.action.rotate_left(1);
-    assert_eq!(learner.evaluate(&rows.batch()).unwrap().dim, before);
+    assert_eq!(agent.evaluate(&rows.batch()).unwrap().losses, before);
 }
 
 const STATE: usize = 20 * 24 * 2;
 
 fn part(objective: Objective, augment: Option<AugmentSettings>) -> LearnerPart {
     let (model, update) = of(objective, GLOBAL);
-    let horizon = match objective {
-        Objective::Cpc => Horizon::All { k_max: 3 },
-        Objective::Dim => Horizon::Fixed { k: 1 },
+    let horizon = match objective.name() {
+        "cpc" => Horizon::All { k_max: 3 },
+        "dim" => Horizon::Fixed { k: 1 },
         _ => Horizon::None,
     };
     LearnerPart {
@@ -466,28 +483,31 @@ const NOTHING: AugmentSettings = AugmentSettings {
 
 #[test]
 fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
-    for objective in [Objective::Dim, Objective::Cpc] {
+    for objective in [DIM, CPC] {
         let report = |augment| {
             let part = part(objective, augment);
             let batch = served(&part, 1);
-            Learning::new(part, &Compute::CPU)
+            Learner::new(part, &Compute::CPU)
                 .unwrap()
                 .update(&batch)
                 .unwrap()
         };
         let (plain, identity, strong) = (report(None), report(Some(NOTHING)), report(Some(STRONG)));
         // The augmented states go through a pass of their own, so the sum of gradients may round otherwise.
-        assert_eq!((plain.c51_kl, plain.dim), (identity.c51_kl, identity.dim));
+        assert_eq!(
+            (plain.c51_kl, &plain.losses),
+            (identity.c51_kl, &identity.losses)
+        );
         assert!((plain.grad_norm - identity.grad_norm).abs() < 1e-5 * plain.grad_norm);
         assert_eq!((plain.c51_kl, plain.q_mean), (strong.c51_kl, strong.q_mean));
-        assert_ne!(plain.dim, strong.dim);
+        assert_ne!(plain.losses, strong.losses);
     }
 }
 
 /// The draws and the key encoder are part of a checkpoint: half a run and the other half are the run.
 #[test]
 fn an_augmenting_run_resumes_bit_for_bit() {
-    for objective in [Objective::Curl, Objective::Dim] {
+    for objective in [CURL, DIM] {
         let folder = std::env::temp_dir().join(format!(
             "driml-agents-{}-{}",
             objective.name(),
@@ -495,17 +515,17 @@ fn an_augmenting_run_resumes_bit_for_bit() {
         ));
         let _ = fs::remove_dir_all(&folder);
         let part = part(objective, Some(STRONG));
-        let learn = |learning: &mut Learning, updates: std::ops::Range<u64>| {
+        let learn = |learner: &mut Learner, updates: std::ops::Range<u64>| {
             for seed in updates {
-                learning.update(&served(&part, seed)).unwrap();
+                learner.update(&served(&part, seed)).unwrap();
             }
         };
-        let mut straight = Learning::new(part.clone(), &Compute::CPU).unwrap();
+        let mut straight = Learner::new(part.clone(), &Compute::CPU).unwrap();
         learn(&mut straight, 0..8);
-        let mut half = Learning::new(part.clone(), &Compute::CPU).unwrap();
+        let mut half = Learner::new(part.clone(), &Compute::CPU).unwrap();
         learn(&mut half, 0..4);
         half.save(&folder).unwrap();
-        let mut resumed = Learning::resume(part.clone(), &Compute::CPU, &folder).unwrap();
+        let mut resumed = Learner::resume(part.clone(), &Compute::CPU, &folder).unwrap();
         assert_eq!(resumed.updates(), 4);
         learn(&mut resumed, 4..8);
         let (mut a, mut b) = (folder.join("a"), folder.join("b"));
@@ -516,7 +536,7 @@ fn an_augmenting_run_resumes_bit_for_bit() {
             "target.safetensors",
             "optimizer.safetensors",
         ];
-        if objective == Objective::Curl {
+        if objective == CURL {
             files.push("key.safetensors");
         }
         for file in files {
@@ -533,12 +553,12 @@ fn an_augmenting_run_resumes_bit_for_bit() {
 #[test]
 fn a_curl_checkpoint_without_a_key_encoder_is_refused() {
     let folder = Folder::new("old-curl");
-    let part = part(Objective::Curl, Some(STRONG));
-    let learning = Learning::new(part.clone(), &Compute::CPU).unwrap();
-    learning.save(&folder.0).unwrap();
+    let part = part(CURL, Some(STRONG));
+    let learner = Learner::new(part.clone(), &Compute::CPU).unwrap();
+    learner.save(&folder.0).unwrap();
     let path = folder.0.join("checkpoint-000000000000");
     change_state(&path, |state| state["format"] = 1.into());
-    let resume = || Learning::resume(part.clone(), &Compute::CPU, &folder.0).map(|_| ());
+    let resume = || Learner::resume(part.clone(), &Compute::CPU, &folder.0).map(|_| ());
     let said = resume().unwrap_err().to_string();
     assert!(
         said.contains("keys came from the target network") && said.contains("begin anew"),
@@ -558,16 +578,16 @@ fn a_curl_checkpoint_without_a_key_encoder_is_refused() {
 /// A refused batch leaves the generator where it was.
 #[test]
 fn a_refused_batch_draws_nothing() {
-    let part = part(Objective::Curl, Some(STRONG));
+    let part = part(CURL, Some(STRONG));
     let good = served(&part, 1);
     let mut bad = served(&part, 2);
     bad.rows_mut().set(0, 77, 0, 0.0, 0.9);
-    let mut learning = Learning::new(part.clone(), &Compute::CPU).unwrap();
-    assert!(learning.update(&bad).is_err());
-    let after = learning.update(&good).unwrap();
+    let mut learner = Learner::new(part.clone(), &Compute::CPU).unwrap();
+    assert!(learner.update(&bad).is_err());
+    let after = learner.update(&good).unwrap();
     assert_eq!(
         after,
-        Learning::new(part, &Compute::CPU)
+        Learner::new(part, &Compute::CPU)
             .unwrap()
             .update(&good)
             .unwrap()
@@ -583,9 +603,9 @@ fn augmentation_and_objective_belong_together() {
             .unwrap_err()
             .to_string()
     };
-    assert!(said(Objective::Curl, None).contains("take the agent curl"));
-    let mut c51 = part(Objective::Dim, Some(STRONG)).learner;
-    c51.update.objective = Objective::None;
+    assert!(said(CURL, None).contains("take the agent curl"));
+    let mut c51 = part(DIM, Some(STRONG)).learner;
+    c51.update.objective = Objective::NONE;
     assert!(
         c51.validate()
             .unwrap_err()
@@ -594,11 +614,11 @@ fn augmentation_and_objective_belong_together() {
     );
     let wild = AugmentSettings { hue: 0.7, ..STRONG };
     assert_eq!(
-        said(Objective::Dim, Some(wild)),
+        said(DIM, Some(wild)),
         "learner.augment.hue = 0.7 cannot work: it must lie between 0 and 0.5, half a turn either way"
     );
     assert_eq!(
-        part(Objective::Curl, Some(NOTHING)).model.dim,
+        part(CURL, Some(NOTHING)).model.dim,
         DimParts {
             psi4: true,
             ..DimParts::NONE

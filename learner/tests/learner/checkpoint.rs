@@ -8,8 +8,8 @@ use std::{
 
 use candle_core::{Device, Tensor};
 use driml_learner::{
-    AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
-    Learner,
+    AffinityEstimator, Agent, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity,
+    LearnedSettings,
     checkpoint::{CheckpointError, RunState, list, load_latest, lock, save},
 };
 use driml_model::{Compute, Parameters};
@@ -18,7 +18,7 @@ use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
 
 use crate::{
-    made_up::{ACTIONS, ALL_DIM, Rows, STOCK, learner, learner_on, model, settings},
+    made_up::{ACTIONS, ALL_DIM, Rows, STOCK, agent, agent_on, model, settings},
     update::diverged,
 };
 
@@ -43,7 +43,7 @@ impl Drop for Folder {
 }
 
 struct Run {
-    learner: Learner,
+    agent: Agent,
     affinity: AffinityEstimator,
     rng: ChaCha8Rng,
 }
@@ -62,7 +62,7 @@ impl Run {
         let affinity =
             LearnedAffinity::new(Alphabet::raw(ACTIONS).unwrap(), settings, &mut rng).unwrap();
         Self {
-            learner: learner(ALL_DIM, 1),
+            agent: agent(ALL_DIM, 1),
             affinity: AffinityEstimator::Learned(affinity),
             rng,
         }
@@ -70,8 +70,8 @@ impl Run {
 
     fn updates(&mut self, count: u64) {
         for _ in 0..count {
-            let rows = Rows::random(6, self.learner.updates());
-            self.learner.update(&rows.batch()).unwrap();
+            let rows = Rows::random(6, self.agent.updates());
+            self.agent.update(&rows.batch()).unwrap();
             self.affinity
                 .observe(&rows.batch().action_pairs(), &mut self.rng)
                 .unwrap();
@@ -80,12 +80,12 @@ impl Run {
 
     fn save(&self, folder: &Path, keep: usize) -> PathBuf {
         let Self {
-            learner,
+            agent,
             affinity,
             rng,
         } = self;
         let state = RunState {
-            learner,
+            agent,
             affinity: Some(affinity),
             rng,
             weights_version: 7,
@@ -99,7 +99,7 @@ impl Run {
         assert_eq!(restored.weights_version, 7);
         let affinity = restored.affinity.expect("an estimate");
         Self {
-            learner: restored.learner,
+            agent: restored.agent,
             affinity,
             rng: restored.rng,
         }
@@ -107,7 +107,7 @@ impl Run {
 
     fn bytes(&self) -> [Vec<u8>; 2] {
         let all = |parameters: &Parameters| parameters.to_safetensors(|_| true).unwrap();
-        [all(self.learner.online()), all(self.learner.target())]
+        [all(self.agent.online()), all(self.agent.target())]
     }
 }
 
@@ -126,23 +126,23 @@ fn a_checkpoint_goes_on_with_other_operations_than_it_was_saved_by() {
     for (saver, loader) in [(&Compute::CPU, &STOCK), (&STOCK, &Compute::CPU)] {
         let folder = Folder::new("operations");
         let mut run = Run::new();
-        run.learner = learner_on(saver, ALL_DIM, 1);
+        run.agent = agent_on(saver, ALL_DIM, 1);
         run.updates(4);
         run.save(&folder.0, 1);
         let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
         let restored = load_latest(&folder.0, &model, &settings, loader, SPEC).unwrap();
-        let mut resumed = restored.expect("a checkpoint").learner;
+        let mut resumed = restored.expect("a checkpoint").agent;
         assert!(
-            run.learner.weights().unwrap() == resumed.weights().unwrap(),
+            run.agent.weights().unwrap() == resumed.weights().unwrap(),
             "the weights are the same bits"
         );
         let rows = Rows::random(6, 9);
         let (a, b) = (
-            run.learner.update(&rows.batch()).unwrap(),
+            run.agent.update(&rows.batch()).unwrap(),
             resumed.update(&rows.batch()).unwrap(),
         );
         assert!((a.total - b.total).abs() < 1e-4 * a.total, "{a:?}\n{b:?}");
-        for (name, var) in run.learner.online().iter() {
+        for (name, var) in run.agent.online().iter() {
             let other = resumed.online().get(name).unwrap();
             let difference = (var.as_tensor() - other.as_tensor()).unwrap().abs();
             let largest = difference.unwrap().max_all().unwrap();
@@ -163,7 +163,7 @@ fn a_resumed_run_is_the_same_run_bit_for_bit() {
     first_half.save(&folder.0, 2);
     drop(first_half);
     let mut resumed = Run::resume(&folder.0);
-    assert_eq!(resumed.learner.updates(), 4);
+    assert_eq!(resumed.agent.updates(), 4);
     resumed.updates(4);
 
     assert!(straight.bytes() == resumed.bytes(), "the networks differ");
@@ -198,7 +198,7 @@ fn the_newest_are_kept_and_an_unfinished_save_is_no_checkpoint() {
         .map(|(updates, _)| *updates)
         .collect();
     assert_eq!(kept, [2, 3]);
-    assert_eq!(load(&folder.0).unwrap().unwrap().learner.updates(), 3);
+    assert_eq!(load(&folder.0).unwrap().unwrap().agent.updates(), 3);
 }
 
 #[test]
@@ -341,9 +341,9 @@ fn a_state_that_is_not_finite_is_not_saved() {
         let mut run = Run::new();
         run.save(&folder.0, 1);
         for name in ["head.bias", "dim.psi4.out.weight"] {
-            run.learner = diverged(compute, name).0;
+            run.agent = diverged(compute, name).0;
             let state = RunState {
-                learner: &run.learner,
+                agent: &run.agent,
                 affinity: None,
                 rng: &run.rng,
                 weights_version: 8,
@@ -356,7 +356,7 @@ fn a_state_that_is_not_finite_is_not_saved() {
             );
             let left: Vec<_> = fs::read_dir(&folder.0).unwrap().collect();
             assert_eq!(left.len(), 1, "{left:?}");
-            assert_eq!(load(&folder.0).unwrap().unwrap().learner.updates(), 0);
+            assert_eq!(load(&folder.0).unwrap().unwrap().agent.updates(), 0);
         }
     }
 }

@@ -1,18 +1,19 @@
 //! Small networks, settings and batches for these tests.
 //! Nothing here is measured or asserted.
 
-use driml_learner::{AdamSettings, Batch, Lambda, Learner, LearnerSettings, NO_ACTION, Objective};
+use driml_learner::{
+    AdamSettings, Agent, Batch, Lambda, LearnerSettings, NO_ACTION, Objective,
+    auxiliary::{cpc, curl, dim},
+};
 use driml_model::{Compute, ConvLayer, ModelConfig, Operations};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 pub(crate) const ACTIONS: usize = 4;
-pub(crate) const NO_DIM: Lambda = Lambda {
-    l3t3: 0.0,
-    l3t4: 0.0,
-    l4t3: 0.0,
-    l4t4: 0.0,
-};
+pub(crate) const DIM: Objective = Objective::of(&dim::DIM);
+pub(crate) const CPC: Objective = Objective::of(&cpc::CPC);
+pub(crate) const CURL: Objective = Objective::of(&curl::CURL);
+pub(crate) const NO_DIM: Lambda = Lambda::NONE;
 pub(crate) const ALL_DIM: Lambda = Lambda {
     l3t3: 1.0,
     l3t4: 0.5,
@@ -52,9 +53,9 @@ pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
     LearnerSettings {
         double_dqn: false,
         objective: if lambda == NO_DIM {
-            Objective::None
+            Objective::NONE
         } else {
-            Objective::Dim
+            DIM
         },
         condition_on_action: true,
         lambda,
@@ -68,17 +69,17 @@ pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
         },
         target_period_updates: 3,
         target_tau: 0.95,
-        curl: None,
+        own: toml::Table::new(),
     }
 }
 
-pub(crate) fn learner(lambda: Lambda, seed: u64) -> Learner {
-    learner_on(&Compute::CPU, lambda, seed)
+pub(crate) fn agent(lambda: Lambda, seed: u64) -> Agent {
+    agent_on(&Compute::CPU, lambda, seed)
 }
 
-pub(crate) fn learner_on(compute: &Compute, lambda: Lambda, seed: u64) -> Learner {
+pub(crate) fn agent_on(compute: &Compute, lambda: Lambda, seed: u64) -> Agent {
     let rng = &mut ChaCha8Rng::seed_from_u64(seed);
-    Learner::new(model(lambda), settings(lambda), compute, rng).unwrap()
+    Agent::new(model(lambda), settings(lambda), compute, rng).unwrap()
 }
 
 /// The operations of a GPU, on the CPU.

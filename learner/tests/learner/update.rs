@@ -4,12 +4,12 @@
 use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
-use driml_learner::{Learner, NetworkParameters, UpdateError};
+use driml_learner::{Agent, NetworkParameters, UpdateError};
 use driml_model::{Compute, Parameters};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::made_up::{ALL_DIM, NO_DIM, Rows, STOCK, learner, learner_on, model, settings};
+use crate::made_up::{ALL_DIM, NO_DIM, Rows, STOCK, agent, agent_on, model, settings};
 
 type Values = HashMap<String, Vec<f32>>;
 
@@ -22,7 +22,7 @@ fn values(parameters: &Parameters) -> Values {
 }
 
 /// `learner` with its online parameters changed.
-fn changed(learner: &Learner, change: impl Fn(&str, &mut [f32])) -> Learner {
+fn changed(agent: &Agent, change: impl Fn(&str, &mut [f32])) -> Agent {
     let tensors = |parameters: &Parameters, change: &dyn Fn(&str, &mut [f32])| {
         let mut tensors = HashMap::new();
         for (name, var) in parameters.iter() {
@@ -36,25 +36,25 @@ fn changed(learner: &Learner, change: impl Fn(&str, &mut [f32])) -> Learner {
         tensors
     };
     let device = Device::Cpu;
-    let model = learner.model();
+    let model = agent.model();
     let online =
-        Parameters::from_tensors(model, tensors(learner.online(), &change), &device).unwrap();
+        Parameters::from_tensors(model, tensors(agent.online(), &change), &device).unwrap();
     let acting = model.without_dim();
     let target =
-        Parameters::from_tensors(&acting, tensors(learner.target(), &|_, _| ()), &device).unwrap();
+        Parameters::from_tensors(&acting, tensors(agent.target(), &|_, _| ()), &device).unwrap();
     let parameters = NetworkParameters {
         online,
         target,
         key: None,
     };
-    let settings = learner.settings().clone();
-    Learner::from_parameters(model.clone(), settings, &Compute::CPU, parameters).unwrap()
+    let settings = agent.settings().clone();
+    Agent::from_parameters(model.clone(), settings, &Compute::CPU, parameters).unwrap()
 }
 
 #[test]
 fn the_gradient_is_the_slope_of_the_total_in_every_part() {
-    let (learner, rows) = (learner(ALL_DIM, 1), Rows::random(9, 2));
-    let evaluation = learner.evaluate(&rows.batch()).unwrap();
+    let (agent, rows) = (agent(ALL_DIM, 1), Rows::random(9, 2));
+    let evaluation = agent.evaluate(&rows.batch()).unwrap();
     for part in [
         "torso.conv1",
         "torso.conv2",
@@ -67,7 +67,7 @@ fn the_gradient_is_the_slope_of_the_total_in_every_part() {
         "dim.phi4",
     ] {
         let mut direction = Values::new();
-        for (name, _) in learner
+        for (name, _) in agent
             .online()
             .iter()
             .filter(|(name, _)| name.starts_with(part))
@@ -86,7 +86,7 @@ fn the_gradient_is_the_slope_of_the_total_in_every_part() {
         assert!(norm > 1e-5, "{part} has a gradient of {norm}");
         let step = 2e-3;
         let total = |by: f64| {
-            let moved = changed(&learner, |name, values| {
+            let moved = changed(&agent, |name, values| {
                 if let Some(gradient) = direction.get(name) {
                     values
                         .iter_mut()
@@ -106,10 +106,10 @@ fn the_gradient_is_the_slope_of_the_total_in_every_part() {
 
 #[test]
 fn repeated_updates_on_one_batch_bring_the_losses_down() {
-    let (mut learner, rows) = (learner(ALL_DIM, 3), Rows::random(16, 4));
-    let first = learner.update(&rows.batch()).unwrap();
+    let (mut agent, rows) = (agent(ALL_DIM, 3), Rows::random(16, 4));
+    let first = agent.update(&rows.batch()).unwrap();
     let last = (0..60)
-        .map(|_| learner.update(&rows.batch()).unwrap())
+        .map(|_| agent.update(&rows.batch()).unwrap())
         .last()
         .unwrap();
     assert!(
@@ -118,22 +118,22 @@ fn repeated_updates_on_one_batch_bring_the_losses_down() {
         first.total,
         last.total
     );
-    assert_eq!(learner.updates(), 61);
+    assert_eq!(agent.updates(), 61);
 }
 
 #[test]
 fn without_dim_no_positives_are_needed_and_no_heads_are_built() {
-    let (mut learner, rows) = (learner(NO_DIM, 5), Rows::random(6, 6));
+    let (mut agent, rows) = (agent(NO_DIM, 5), Rows::random(6, 6));
     assert!(
-        learner
+        agent
             .online()
             .iter()
             .all(|(name, _)| !name.starts_with("dim."))
     );
     let mut batch = rows.batch();
     (batch.positives, batch.states_k, batch.positive_valid) = (0, &[], &[]);
-    let report = learner.update(&batch).unwrap();
-    assert_eq!(report.dim, [None; 4]);
+    let report = agent.update(&batch).unwrap();
+    assert_eq!(report.losses, []);
     assert_eq!(report.total, report.c51_kl);
 }
 
@@ -142,9 +142,10 @@ fn one_valid_positive_or_none_gives_dim_losses_of_zero() {
     for valid in 0..2 {
         let mut rows = Rows::random(7, 7);
         rows.positive_valid = (0..7).map(|row| u8::from(row < valid)).collect();
-        let with_dim = learner(ALL_DIM, 8);
+        let with_dim = agent(ALL_DIM, 8);
         let evaluation = with_dim.evaluate(&rows.batch()).unwrap();
-        assert_eq!(evaluation.dim, [Some(0.0); 4]);
+        let losses = ["dim_3t3", "dim_3t4", "dim_4t3", "dim_4t4"].map(|name| (name, 0.0));
+        assert_eq!(evaluation.losses, losses);
         assert_eq!(evaluation.total, evaluation.c51_kl);
         for (name, _) in with_dim
             .online()
@@ -167,10 +168,10 @@ fn one_valid_positive_or_none_gives_dim_losses_of_zero() {
 fn an_all_terminal_batch_ignores_what_comes_after() {
     let mut rows = Rows::random(6, 9);
     rows.bootstrap_discount.fill(0.0);
-    let learner = learner(NO_DIM, 10);
-    let first = learner.evaluate(&rows.batch()).unwrap();
+    let agent = agent(NO_DIM, 10);
+    let first = agent.evaluate(&rows.batch()).unwrap();
     rows.frames[2].fill(0);
-    let second = learner.evaluate(&rows.batch()).unwrap();
+    let second = agent.evaluate(&rows.batch()).unwrap();
     let close = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-6;
     assert!(
         first
@@ -187,14 +188,14 @@ fn an_all_terminal_batch_ignores_what_comes_after() {
 fn rows_without_a_positive_are_out_of_dim_altogether() {
     let mut rows = Rows::random(8, 11);
     rows.positive_valid = vec![1, 0, 1, 1, 0, 1, 1, 1];
-    let learner = learner(ALL_DIM, 12);
-    let before = learner.evaluate(&rows.batch()).unwrap();
+    let agent = agent(ALL_DIM, 12);
+    let before = agent.evaluate(&rows.batch()).unwrap();
     let row_bytes = rows.frames[1].len() / 8;
     for row in [1, 4] {
         rows.frames[1][row * row_bytes..(row + 1) * row_bytes].fill(200);
     }
-    let after = learner.evaluate(&rows.batch()).unwrap();
-    assert_eq!(before.dim, after.dim);
+    let after = agent.evaluate(&rows.batch()).unwrap();
+    assert_eq!(before.losses, after.losses);
 }
 
 #[test]
@@ -202,7 +203,7 @@ fn saturated_scores_and_extreme_returns_stay_finite() {
     let mut rows = Rows::random(6, 13);
     rows.n_step_return
         .copy_from_slice(&[1e30, -1e30, 5.0, -5.0, 0.0, 1e-30]);
-    let mut learner = changed(&learner(ALL_DIM, 14), |name, values| {
+    let mut agent = changed(&agent(ALL_DIM, 14), |name, values| {
         if name.starts_with("dim.") {
             values.iter_mut().for_each(|v| *v *= 30.0);
         }
@@ -211,11 +212,11 @@ fn saturated_scores_and_extreme_returns_stay_finite() {
         }
     });
     for _ in 0..5 {
-        let report = learner.update(&rows.batch()).unwrap();
+        let report = agent.update(&rows.batch()).unwrap();
         assert!(report.total.is_finite() && report.grad_norm.is_finite());
     }
     assert!(
-        values(learner.online())
+        values(agent.online())
             .values()
             .flatten()
             .all(|v| v.is_finite())
@@ -230,15 +231,14 @@ fn double_dqn_chooses_by_the_online_network() {
     for double_dqn in [false, true] {
         settings.double_dqn = double_dqn;
         let mut rng = rand_chacha::rand_core::SeedableRng::seed_from_u64(16);
-        let learner =
-            Learner::new(model(NO_DIM), settings.clone(), &Compute::CPU, &mut rng).unwrap();
+        let agent = Agent::new(model(NO_DIM), settings.clone(), &Compute::CPU, &mut rng).unwrap();
         // The online network alone turns to action 2.
-        let learner = changed(&learner, |name, values| {
+        let agent = changed(&agent, |name, values| {
             if name == "head.bias" {
                 values[2 * 21 + 20] += 50.0;
             }
         });
-        chosen.push(learner.evaluate(&rows.batch()).unwrap().next_greedy_action);
+        chosen.push(agent.evaluate(&rows.batch()).unwrap().next_greedy_action);
     }
     assert!(chosen[0].iter().any(|&action| action != 2));
     assert_eq!(chosen[1], [2; 12]);
@@ -246,14 +246,14 @@ fn double_dqn_chooses_by_the_online_network() {
 
 #[test]
 fn the_target_network_follows_once_a_period() {
-    let (mut learner, rows) = (learner(NO_DIM, 17), Rows::random(4, 18));
-    let start = values(learner.target());
+    let (mut agent, rows) = (agent(NO_DIM, 17), Rows::random(4, 18));
+    let start = values(agent.target());
     for _ in 0..2 {
-        learner.update(&rows.batch()).unwrap();
-        assert_eq!(values(learner.target()), start);
+        agent.update(&rows.batch()).unwrap();
+        assert_eq!(values(agent.target()), start);
     }
-    learner.update(&rows.batch()).unwrap();
-    let (online, target) = (values(learner.online()), values(learner.target()));
+    agent.update(&rows.batch()).unwrap();
+    let (online, target) = (values(agent.online()), values(agent.target()));
     for (name, values) in &target {
         for (i, value) in values.iter().enumerate() {
             let expected = 0.95 * online[name][i] + 0.05 * start[name][i];
@@ -264,13 +264,13 @@ fn the_target_network_follows_once_a_period() {
 
 #[test]
 fn a_bad_batch_is_an_error_that_changes_nothing() {
-    let mut learner = learner(ALL_DIM, 19);
-    let before = values(learner.online());
+    let mut agent = agent(ALL_DIM, 19);
+    let before = values(agent.online());
     let good = Rows::random(5, 20);
     let mut refused = |change: fn(&mut Rows), said: &str| {
         let mut rows = good.clone();
         change(&mut rows);
-        let error = learner.update(&rows.batch()).expect_err(said);
+        let error = agent.update(&rows.batch()).expect_err(said);
         assert!(
             matches!(error, UpdateError::Batch(_)) && error.to_string().contains(said),
             "{error}"
@@ -286,11 +286,11 @@ fn a_bad_batch_is_an_error_that_changes_nothing() {
     refused(|rows| rows.positive_valid.clear(), "positive_valid");
     let mut batch = good.batch();
     (batch.positives, batch.states_k, batch.positive_valid) = (0, &[], &[]);
-    assert!(learner.update(&batch).is_err());
+    assert!(agent.update(&batch).is_err());
     batch.rows = 0;
-    assert!(learner.update(&batch).is_err());
-    assert_eq!(values(learner.online()), before);
-    assert_eq!(learner.updates(), 0);
+    assert!(agent.update(&batch).is_err());
+    assert_eq!(values(agent.online()), before);
+    assert_eq!(agent.updates(), 0);
 }
 
 #[test]
@@ -302,60 +302,60 @@ fn arithmetic_that_is_not_finite_is_an_error_that_changes_nothing() {
         "dim.psi3.out.weight",
         "dim.phi4.hidden.bias",
     ] {
-        let mut learner = learner(ALL_DIM, 22);
-        let var = learner.online().get(poisoned).unwrap();
+        let mut agent = agent(ALL_DIM, 22);
+        let var = agent.online().get(poisoned).unwrap();
         let mut values: Vec<f32> = var.flatten_all().unwrap().to_vec1().unwrap();
         values[0] = f32::NAN;
         var.set(&Tensor::from_vec(values, var.dims(), &Device::Cpu).unwrap())
             .unwrap();
-        let error = learner.update(&rows.batch()).expect_err(poisoned);
+        let error = agent.update(&rows.batch()).expect_err(poisoned);
         assert!(
             matches!(error, UpdateError::NonFinite { .. }),
             "{poisoned}: {error}"
         );
-        assert_eq!(learner.updates(), 0);
+        assert_eq!(agent.updates(), 0);
     }
 }
 
 /// A learner whose step size is `lr`.
-fn fast(compute: &Compute, lr: f64) -> Learner {
+fn fast(compute: &Compute, lr: f64) -> Agent {
     let mut settings = settings(ALL_DIM);
     settings.adam.lr = lr;
     let rng = &mut ChaCha8Rng::seed_from_u64(1);
-    Learner::new(model(ALL_DIM), settings, compute, rng).unwrap()
+    Agent::new(model(ALL_DIM), settings, compute, rng).unwrap()
 }
 
 #[test]
 fn a_step_size_beyond_the_finite_numbers_is_an_error_that_changes_nothing() {
     for compute in [&Compute::CPU, &STOCK] {
-        let mut learner = fast(compute, 1e38);
-        let before = values(learner.online());
-        let error = learner.update(&Rows::random(6, 30).batch()).unwrap_err();
+        let mut agent = fast(compute, 1e38);
+        let before = values(agent.online());
+        let error = agent.update(&Rows::random(6, 30).batch()).unwrap_err();
         let said = "a step of Adam with lr = 1e38 is not finite";
         assert!(error.to_string().contains(said), "{error}");
-        assert_eq!(values(learner.online()), before);
-        assert_eq!(learner.updates(), 0);
-        learner.weights().unwrap();
+        assert_eq!(values(agent.online()), before);
+        assert_eq!(agent.updates(), 0);
+        agent.weights().unwrap();
     }
 }
 
 /// A learner whose parameter `name` a step has just taken beyond the finite numbers, and what that step said.
-pub(crate) fn diverged(compute: &Compute, name: &str) -> (Learner, Result<f64, UpdateError>) {
-    let mut learner = fast(compute, 3e37);
-    let evaluation = learner.evaluate(&Rows::random(6, 31).batch()).unwrap();
+pub(crate) fn diverged(compute: &Compute, name: &str) -> (Agent, Result<f64, UpdateError>) {
+    let mut agent = fast(compute, 3e37);
+    let evaluation = agent.evaluate(&Rows::random(6, 31).batch()).unwrap();
     let gradient = evaluation.gradients.get(name).unwrap();
     // As large as numbers get, and where the next step goes on.
     let direction = gradient.sign().unwrap().affine(-f64::from(f32::MAX), 0.0);
-    let var = learner.online().get(name).unwrap();
+    let var = agent.online().get(name).unwrap();
     var.set(&direction.unwrap()).unwrap();
-    let said = learner.apply(&evaluation.gradients);
-    (learner, said)
+    let said = agent.apply(&evaluation.gradients);
+    (agent, said)
 }
 
 #[test]
 fn parameters_that_a_step_took_beyond_the_finite_numbers_are_not_published() {
     for name in ["torso.conv1.weight", "torso.fc.bias", "head.weight"] {
-        let (learner, said) = diverged(&Compute::CPU, name);
+        let (agent, said) = diverged(&Compute::CPU, name);
         let said = said.unwrap_err();
         assert!(matches!(said, UpdateError::Diverged { .. }), "{said}");
         let said = said.to_string();
@@ -363,12 +363,12 @@ fn parameters_that_a_step_took_beyond_the_finite_numbers_are_not_published() {
             said.contains(name) && said.contains("newest checkpoint"),
             "{said}"
         );
-        let said = learner.weights().unwrap_err().to_string();
+        let said = agent.weights().unwrap_err().to_string();
         assert!(said.contains(name) && said.contains("inf"), "{said}");
         // Elsewhere than on the CPU it shows when the weights are asked for.
-        let (learner, said) = diverged(&STOCK, name);
+        let (agent, said) = diverged(&STOCK, name);
         said.unwrap();
-        let said = learner.weights().unwrap_err().to_string();
+        let said = agent.weights().unwrap_err().to_string();
         assert!(said.contains(name) && said.contains("inf"), "{said}");
     }
 }
@@ -376,18 +376,18 @@ fn parameters_that_a_step_took_beyond_the_finite_numbers_are_not_published() {
 #[test]
 fn a_model_whose_heads_the_lambdas_do_not_use_is_refused() {
     let mut rng = rand_chacha::rand_core::SeedableRng::seed_from_u64(23);
-    let error = Learner::new(model(ALL_DIM), settings(NO_DIM), &Compute::CPU, &mut rng)
+    let error = Agent::new(model(ALL_DIM), settings(NO_DIM), &Compute::CPU, &mut rng)
         .expect_err("unused heads");
     assert!(matches!(error, UpdateError::Settings(_)), "{error}");
 }
 
 #[test]
 fn actors_get_torso_and_head_and_nothing_else() {
-    let learner = learner(ALL_DIM, 24);
-    let bytes = learner.weights().unwrap();
-    let acting = learner.model().without_dim();
+    let agent = agent(ALL_DIM, 24);
+    let bytes = agent.weights().unwrap();
+    let acting = agent.model().without_dim();
     let loaded = Parameters::load_safetensors(&acting, &bytes, &Device::Cpu).unwrap();
-    let mut expected = values(learner.online());
+    let mut expected = values(agent.online());
     expected.retain(|name, _| !name.starts_with("dim."));
     assert_eq!(values(&loaded), expected);
 }
@@ -395,7 +395,7 @@ fn actors_get_torso_and_head_and_nothing_else() {
 #[test]
 fn candle_s_own_operations_learn_the_same() {
     for lambda in [ALL_DIM, NO_DIM] {
-        let (mut ours, mut theirs) = (learner(lambda, 1), learner_on(&STOCK, lambda, 1));
+        let (mut ours, mut theirs) = (agent(lambda, 1), agent_on(&STOCK, lambda, 1));
         // Past the third update the target network has moved.
         for update in 0..5 {
             let rows = Rows::random(8, update);
@@ -424,19 +424,19 @@ fn candle_s_own_operations_learn_the_same() {
 
 #[test]
 fn with_candle_s_own_operations_bad_arithmetic_changes_nothing_either() {
-    let mut learner = learner_on(&STOCK, ALL_DIM, 1);
-    let var = learner.online().get("head.bias").unwrap();
+    let mut agent = agent_on(&STOCK, ALL_DIM, 1);
+    let var = agent.online().get("head.bias").unwrap();
     let poison = Tensor::full(f32::NAN, var.dims(), &Device::Cpu).unwrap();
     var.set(&poison).unwrap();
-    let all_bits = |learner: &Learner| -> HashMap<String, Vec<u32>> {
+    let all_bits = |agent: &Agent| -> HashMap<String, Vec<u32>> {
         let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect();
-        let all = values(learner.online()).into_iter();
+        let all = values(agent.online()).into_iter();
         all.map(|(name, values)| (name, bits(values))).collect()
     };
-    let before = all_bits(&learner);
-    let error = learner.update(&Rows::random(4, 1).batch()).unwrap_err();
+    let before = all_bits(&agent);
+    let error = agent.update(&Rows::random(4, 1).batch()).unwrap_err();
     assert!(matches!(error, UpdateError::NonFinite { .. }), "{error}");
-    assert!(before == all_bits(&learner) && learner.updates() == 0);
+    assert!(before == all_bits(&agent) && agent.updates() == 0);
 }
 
 #[test]
@@ -447,9 +447,9 @@ fn gradients_hold_nothing_of_the_pass_that_they_come_from() {
         (layer.kernel, layer.stride) = (kernel, 2);
     }
     let rng = &mut ChaCha8Rng::seed_from_u64(1);
-    let learner = Learner::new(model, settings(NO_DIM), &STOCK, rng).unwrap();
-    let evaluation = learner.evaluate(&Rows::random(4, 1).batch()).unwrap();
-    for (name, _) in learner.online().iter() {
+    let agent = Agent::new(model, settings(NO_DIM), &STOCK, rng).unwrap();
+    let evaluation = agent.evaluate(&Rows::random(4, 1).batch()).unwrap();
+    for (name, _) in agent.online().iter() {
         assert!(
             !evaluation.gradients.get(name).unwrap().track_op(),
             "{name}"

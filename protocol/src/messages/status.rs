@@ -280,8 +280,8 @@ pub struct LearnerStatus {
     pub updates: u64,
     /// C51 loss of the last update.
     pub c51_kl: f32,
-    /// DIM losses of the last update, 3t3, 3t4, 4t3, 4t4; none where lambda is 0.
-    pub dim: [Option<f32>; 4],
+    /// Auxiliary losses of the last update by name; those that the agent has no weight for are not there.
+    pub losses: Vec<(String, f32)>,
     /// Total loss of the last update.
     pub total: f32,
     /// Global gradient norm of the last update, before clipping.
@@ -298,6 +298,14 @@ pub struct LearnerStatus {
     pub waiting_s: f64,
     /// The last checkpoint is written and nothing is left to do.
     pub finished: bool,
+}
+
+impl LearnerStatus {
+    /// The auxiliary loss of this name, if the last update had one.
+    pub fn loss(&self, name: &str) -> Option<f32> {
+        let found = self.losses.iter().find(|(known, _)| known == name);
+        found.map(|(_, loss)| *loss)
+    }
 }
 
 impl Message for LearnerStatus {

@@ -1,0 +1,32 @@
+//! Why a world could not be made or stepped.
+
+/// Why a world could not be made or stepped.
+#[derive(Debug, thiserror::Error)]
+pub enum EnvError {
+    /// The settings cannot work; the message says which and what to do.
+    #[error("{0}")]
+    Config(String),
+    /// Procgen's engine could not be had, or refused something.
+    #[error(transparent)]
+    Procgen(#[from] procgen_sys::ProcgenError),
+    /// A step was asked for with an action that the world does not have.
+    #[error("action {action} of copy {env} is out of range: this world has {num_actions} actions")]
+    ActionOutOfRange {
+        /// The copy, counted from 0.
+        env: usize,
+        /// The action given.
+        action: u8,
+        /// The world's number of actions; valid ones are below it.
+        num_actions: usize,
+    },
+    /// A step was asked for with a buffer of the wrong length.
+    #[error("{name} has {got} entries, but the world has {num_envs} copies")]
+    BufferLength {
+        /// Which buffer.
+        name: &'static str,
+        /// Its entries.
+        got: usize,
+        /// The world's copies.
+        num_envs: usize,
+    },
+}

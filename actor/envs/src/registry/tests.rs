@@ -1,0 +1,199 @@
+//! Names, reading settings, and what each world says of itself before it is built.
+
+use super::*;
+use crate::worlds::ising::Boundary;
+
+#[test]
+fn names_go_there_and_back() {
+    for name in WorldName::all() {
+        assert_eq!(name.to_string().parse(), Ok(name));
+    }
+}
+
+#[test]
+fn a_wrong_name_is_answered_with_the_nearest_and_the_list() {
+    let error = |text: &str| text.parse::<WorldName>().unwrap_err().to_string();
+    for (text, meant) in [
+        ("MsPacman", "mspacman"),
+        ("ms-pacman", "mspacman"),
+        ("pacman", "mspacman"),
+        ("coinrun", "procgen:coinrun"),
+        ("procgen:starpillot", "procgen:starpilot"),
+        ("izing", "ising"),
+        ("chian", "chain"),
+    ] {
+        assert!(
+            error(text).contains(&format!("did you mean \"{meant}\"?")),
+            "{}",
+            error(text)
+        );
+    }
+    let text = error("montezuma_revenge");
+    assert!(!text.contains("did you mean"), "{text}");
+    assert!(
+        text.contains("procgen:GAME, mspacman, ising, chain"),
+        "{text}"
+    );
+    assert!(!error(&"x".repeat(10_000)).contains("did you mean"));
+}
+
+#[test]
+fn settings_are_read_by_kind_and_unknown_keys_are_rejected() {
+    let chain = "kind = 'chain'\ncells = 8\nheight = 12\nwidth = 12\nstep_limit = 30\nreward_left = 0.1\nreward_right = 1\n";
+    let config: WorldConfig = toml::from_str(chain).unwrap();
+    assert_eq!(config.name(), "chain".parse().unwrap());
+    assert_eq!(
+        toml::from_str::<WorldConfig>(&toml::to_string(&config).unwrap()).unwrap(),
+        config
+    );
+
+    let pacman = "kind = 'mspacman'\nepsilon = 0\nswitch_probability = 0.5\nlethal = [true, false, false, false]\n\
+        boost_steps = 10\nstep_limit = 500\nreward_pellet = 1\nreward_boost = 0\nreward_ghost = 5\n\
+        reward_death = -10\nreward_cleared = 50\nlethal_schedule = { episodes_per_task = 10, order = [0, 1] }\n\
+        ising = { temperature = 0.4, sweeps_per_step = 1 }\n";
+    let config: WorldConfig = toml::from_str(pacman).unwrap();
+    assert_eq!(config.name(), "mspacman".parse().unwrap());
+    assert_eq!(
+        toml::from_str::<WorldConfig>(&toml::to_string(&config).unwrap()).unwrap(),
+        config
+    );
+
+    for (wrong, word) in [
+        (format!("{chain}colour = 1"), "colour"),
+        (chain.replace("cells = 8\n", ""), "cells"),
+        (chain.replace("'chain'", "'chian'"), "chian"),
+        (pacman.replace("order", "ordre"), "ordre"),
+    ] {
+        let error = toml::from_str::<WorldConfig>(&wrong)
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains(word), "{error}");
+    }
+}
+
+/// One set of settings for each world that needs no engine.
+fn configs() -> [WorldConfig; 3] {
+    [
+        WorldConfig::Chain(CorridorConfig {
+            cells: 8,
+            height: 9,
+            width: 12,
+            step_limit: 30,
+            reward_left: 0.1,
+            reward_right: 1.0,
+        }),
+        WorldConfig::Ising(IsingConfig {
+            lattice_size: 84,
+            patch_size: 42,
+            temperature: 0.4,
+            boundary: Boundary::Free,
+            sweeps_per_step: 1,
+            episode_steps: 32,
+        }),
+        WorldConfig::MsPacman(PacmanConfig {
+            epsilon: 0.0,
+            switch_probability: 0.5,
+            lethal: [true; 4],
+            lethal_schedule: None,
+            boost_steps: 10,
+            step_limit: 100,
+            reward_pellet: 1.0,
+            reward_boost: 1.0,
+            reward_ghost: 1.0,
+            reward_death: -1.0,
+            reward_cleared: 1.0,
+            ising: None,
+        }),
+    ]
+}
+
+#[test]
+fn shapes_and_actions_are_those_of_the_built_world() {
+    for config in configs() {
+        let mut world = config.build(3, 1, 0).unwrap();
+        assert_eq!(
+            (world.frame_shape(), world.num_actions()),
+            (config.frame_shape(), config.num_actions())
+        );
+        assert_eq!(world.num_envs(), 3);
+        world.observe(&mut vec![0; 3 * config.frame_shape().bytes()]);
+    }
+}
+
+#[test]
+fn no_copies_and_wrong_buffers_are_errors() {
+    for config in configs() {
+        assert!(config.build(0, 1, 0).is_err());
+        let mut world = config.build(2, 1, 0).unwrap();
+        let (mut rewards, mut ends) = ([0.0; 2], [Default::default(); 2]);
+        let error = world
+            .step(&[0], &mut rewards, &mut ends)
+            .unwrap_err()
+            .to_string();
+        assert_eq!(error, "actions has 1 entries, but the world has 2 copies");
+        assert!(world.step(&[0; 2], &mut rewards[..1], &mut ends).is_err());
+        assert!(world.step(&[0; 2], &mut rewards, &mut ends[..1]).is_err());
+        assert!(world.step(&[0, 200], &mut rewards, &mut ends).is_err());
+    }
+}
+
+fn procgen(start_level: u32, num_levels: u32) -> WorldConfig {
+    WorldConfig::Procgen(ProcgenConfig {
+        game: "coinrun".parse().unwrap(),
+        distribution_mode: "easy".parse().unwrap(),
+        num_levels,
+        start_level,
+        use_sequential_levels: true,
+        paint_vel_info: true,
+        use_backgrounds: true,
+        center_agent: true,
+        restrict_themes: false,
+    })
+}
+
+/// The levels of a world, and whether an episode goes on from one to the next.
+fn levels_of(world: &WorldConfig, which: Levels) -> (std::ops::Range<u32>, bool) {
+    match world.with_levels(which).unwrap() {
+        WorldConfig::Procgen(it) => {
+            let levels = it.start_level..it.start_level + it.num_levels;
+            (levels, it.use_sequential_levels)
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn unseen_levels_are_none_of_those_trained_on() {
+    for (start, count) in [(0, 500), (70, 1), (1000, 200)] {
+        let world = procgen(start, count);
+        let (train, goes_on) = levels_of(&world, Levels::Train);
+        assert_eq!((train.clone(), goes_on), (start..start + count, true));
+        let (single, goes_on) = levels_of(&world, Levels::TrainSingle);
+        assert_eq!((single, goes_on), (train.clone(), false));
+        let (unseen, goes_on) = levels_of(&world, Levels::Unseen);
+        assert!(
+            unseen.start >= train.end && unseen.len() == 100_000,
+            "{unseen:?}"
+        );
+        assert!(!goes_on);
+    }
+}
+
+#[test]
+fn levels_that_a_world_does_not_have_are_refused() {
+    let all = procgen(0, 0).with_levels(Levels::Unseen).unwrap_err();
+    assert!(all.to_string().contains("none is unseen"), "{all}");
+    let chain = WorldConfig::Chain(CorridorConfig {
+        cells: 8,
+        height: 12,
+        width: 12,
+        step_limit: 30,
+        reward_left: 0.1,
+        reward_right: 1.0,
+    });
+    assert!(chain.with_levels(Levels::Train).is_ok());
+    for which in [Levels::TrainSingle, Levels::Unseen] {
+        let said = chain.with_levels(which).unwrap_err().to_string();
+        assert!(said.contains("has no levels"), "{said}");
+    }
+}

@@ -1,0 +1,111 @@
+//! What a run must know of a world before it is built, and how it is built.
+//! Which worlds there are is for `registry`.
+
+use crate::environment::{Environment, FrameShape};
+use crate::error::EnvError;
+
+/// Levels that a trained policy is judged on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Levels {
+    /// As trained on.
+    Train,
+    /// Those trained on, and each episode is one level.
+    TrainSingle,
+    /// Levels that training has not seen; each episode is one.
+    Unseen,
+}
+
+/// The settings of one world.
+///
+/// They are read from TOML, where unknown keys are errors, and have no defaults. A world without a seed, threads, levels or
+/// variants implements the first four methods only.
+pub trait WorldSettings {
+    /// # Errors
+    /// Says which setting cannot work, and what would.
+    fn validate(&self) -> Result<(), EnvError>;
+
+    /// The shape of one frame.
+    fn frame_shape(&self) -> FrameShape;
+
+    /// The names of the actions; an action is a place in this list, so there are at most 256.
+    fn action_names(&self) -> &'static [&'static str];
+
+    /// Builds `num_envs` copies. Copy i depends on (`seed`, i) and its actions only. `threads` is how many threads of its own
+    /// the world may start, 0 for none.
+    ///
+    /// # Errors
+    /// Settings that cannot work, or an engine that cannot be had.
+    fn build(
+        &self,
+        num_envs: usize,
+        seed: u64,
+        threads: usize,
+    ) -> Result<Box<dyn Environment>, EnvError>;
+
+    /// The kinds of this world that are worlds of their own on a command line, such as a suite's games.
+    fn variants() -> Variants
+    where
+        Self: Sized,
+    {
+        Variants::NONE
+    }
+
+    /// Which of [`variants`](Self::variants) this is.
+    fn variant(&self) -> Option<&'static str> {
+        None
+    }
+
+    /// For each action, the one that it amounts to; an action that stands for itself maps to itself.
+    fn visible_actions(&self) -> Vec<u8> {
+        (0..self.action_names().len())
+            .map(|action| action as u8)
+            .collect()
+    }
+
+    /// Whether a run in this world can be resumed, which begins its episodes anew: false where the world goes on from one
+    /// episode to the next.
+    fn is_resumable(&self) -> bool {
+        true
+    }
+
+    /// The same world with other levels.
+    ///
+    /// # Errors
+    /// A world without levels, or without unseen ones; says what to ask for.
+    fn with_levels(&self, levels: Levels) -> Result<Self, EnvError>
+    where
+        Self: Clone + Sized,
+    {
+        match levels {
+            Levels::Train => Ok(self.clone()),
+            _ => Err(EnvError::Config(
+                "this run's world has no levels: use --levels train".into(),
+            )),
+        }
+    }
+
+    /// Puts what the world needs onto this machine; `progress` is told what is being done, a line at a time.
+    ///
+    /// # Errors
+    /// What is missing, and how to get it.
+    fn install(&self, _progress: &mut dyn FnMut(&str)) -> Result<(), EnvError> {
+        Ok(())
+    }
+}
+
+/// Kinds of one world, each named on a command line as `world:variant`.
+#[derive(Clone, Copy, Debug)]
+pub struct Variants {
+    /// The setting that says which; its capitals stand for the variant in help texts.
+    pub key: &'static str,
+    /// Their names; none for a world that is only one.
+    pub names: &'static [&'static str],
+}
+
+impl Variants {
+    /// The world is only one.
+    pub const NONE: Self = Self {
+        key: "",
+        names: &[],
+    };
+}

@@ -1,0 +1,354 @@
+//! A square of Ising spins hidden in a field of noise: predictable inside the patch, unpredictable outside it.
+//! There is nothing to decide and nothing to earn in it; it exists to show what DIM learns to predict.
+
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::lattice::{Boundary, IsingLattice, check_temperature};
+use crate::copies::{RngUse, check_num_envs, check_step, copy_rng};
+use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::error::EnvError;
+use crate::settings::WorldSettings;
+
+/// The settings of the Ising world. The paper: lattice 84, patch 42, temperature 0.4.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct IsingConfig {
+    /// Side of the frame, in pixels = spins.
+    pub lattice_size: usize,
+    /// Side of the patch, in spins; at least 3, at most `lattice_size`.
+    pub patch_size: usize,
+    /// Temperature of the patch, in units of J / k_B, above 0; low means nearly deterministic.
+    pub temperature: f64,
+    /// Whether the patch's rim has neighbours on the far side (`periodic`) or none beyond it (`free`).
+    pub boundary: Boundary,
+    /// Metropolis sweeps over the patch in one env step, at least 1; more make the patch change faster.
+    pub sweeps_per_step: u32,
+    /// Env steps in an episode, at least 1; after them the patch moves and both fields are drawn afresh.
+    pub episode_steps: u32,
+}
+
+impl IsingConfig {
+    /// # Errors
+    /// Says which setting cannot work.
+    pub fn validate(&self) -> Result<(), EnvError> {
+        check_temperature(self.temperature)?;
+        if self.patch_size < 3 || self.patch_size > self.lattice_size || self.lattice_size > 1024 {
+            return Err(EnvError::Config(format!(
+                "the Ising world needs 3 <= patch_size <= lattice_size <= 1024, got patch_size = {} and lattice_size = {}",
+                self.patch_size, self.lattice_size
+            )));
+        }
+        for (name, value) in [
+            ("sweeps_per_step", self.sweeps_per_step),
+            ("episode_steps", self.episode_steps),
+        ] {
+            if value == 0 {
+                return Err(EnvError::Config(format!(
+                    "the Ising world's {name} must be at least 1, got 0"
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    /// `lattice_size` x `lattice_size` x 1.
+    pub fn frame_shape(&self) -> FrameShape {
+        FrameShape {
+            height: self.lattice_size,
+            width: self.lattice_size,
+            channels: 1,
+        }
+    }
+}
+
+/// N fields of spins drawn afresh at each step (0 is -1, 255 is +1, even odds), each with a patch that obeys the Ising
+/// model. One action, no reward; an episode ends `TimedOut`.
+///
+/// The patch's place is uniform in each episode: for 42 in 84 its centre, row and column, is uniform on 21..=63.
+/// Source: the paper's appendix on the Ising model, with the place held for an episode as its main text has it.
+pub struct IsingWorld {
+    config: IsingConfig,
+    copies: Vec<Field>,
+}
+
+struct Field {
+    rng: ChaCha8Rng,
+    /// Row and column of the patch's first site.
+    origin: (usize, usize),
+    patch: IsingLattice,
+    frame: Vec<u8>,
+    episode_step: u32,
+}
+
+impl IsingWorld {
+    /// The only action.
+    pub const ACTION_NAMES: [&str; 1] = ["no-op"];
+
+    /// `num_envs` fields; copy i depends on (`seed`, i) only.
+    ///
+    /// # Errors
+    /// Settings that cannot work.
+    pub fn new(config: &IsingConfig, num_envs: usize, seed: u64) -> Result<Self, EnvError> {
+        config.validate()?;
+        check_num_envs(num_envs)?;
+        let field = |env| {
+            let mut rng = copy_rng(seed, env, RngUse::Game);
+            let side = config.patch_size;
+            let patch =
+                IsingLattice::random(side, side, config.temperature, config.boundary, &mut rng)?;
+            let frame = vec![0; config.frame_shape().bytes()];
+            let mut field = Field {
+                rng,
+                origin: (0, 0),
+                patch,
+                frame,
+                episode_step: 0,
+            };
+            field.reset(config);
+            Ok(field)
+        };
+        let copies = (0..num_envs).map(field).collect::<Result<_, EnvError>>()?;
+        Ok(Self {
+            config: config.clone(),
+            copies,
+        })
+    }
+
+    /// Row and column of the first site of copy `env`'s patch in the current episode; `None` if there is no such copy.
+    pub fn patch_origin(&self, env: usize) -> Option<(usize, usize)> {
+        self.copies.get(env).map(|field| field.origin)
+    }
+}
+
+impl WorldSettings for IsingConfig {
+    fn validate(&self) -> Result<(), EnvError> {
+        IsingConfig::validate(self)
+    }
+
+    fn frame_shape(&self) -> FrameShape {
+        IsingConfig::frame_shape(self)
+    }
+
+    fn action_names(&self) -> &'static [&'static str] {
+        &IsingWorld::ACTION_NAMES
+    }
+
+    fn build(
+        &self,
+        num_envs: usize,
+        seed: u64,
+        _threads: usize,
+    ) -> Result<Box<dyn Environment>, EnvError> {
+        Ok(Box::new(IsingWorld::new(self, num_envs, seed)?))
+    }
+}
+
+impl Environment for IsingWorld {
+    fn frame_shape(&self) -> FrameShape {
+        self.config.frame_shape()
+    }
+
+    fn num_actions(&self) -> usize {
+        Self::ACTION_NAMES.len()
+    }
+
+    fn num_envs(&self) -> usize {
+        self.copies.len()
+    }
+
+    fn observe(&mut self, frames: &mut [u8]) {
+        let bytes = self.config.frame_shape().bytes();
+        assert_eq!(
+            frames.len(),
+            bytes * self.copies.len(),
+            "observe needs room for every copy's frame"
+        );
+        for (field, out) in self.copies.iter().zip(frames.chunks_exact_mut(bytes)) {
+            out.copy_from_slice(&field.frame);
+        }
+    }
+
+    fn step(
+        &mut self,
+        actions: &[u8],
+        rewards: &mut [f32],
+        ends: &mut [StepEnd],
+    ) -> Result<(), EnvError> {
+        check_step(self.num_envs(), self.num_actions(), actions, rewards, ends)?;
+        rewards.fill(0.0);
+        for (field, end) in self.copies.iter_mut().zip(ends) {
+            *end = field.step(&self.config);
+        }
+        Ok(())
+    }
+}
+
+impl Field {
+    fn reset(&mut self, config: &IsingConfig) {
+        let origin_max = config.lattice_size - config.patch_size;
+        self.origin = (
+            self.rng.random_range(0..=origin_max),
+            self.rng.random_range(0..=origin_max),
+        );
+        self.patch.randomise(&mut self.rng);
+        self.episode_step = 0;
+        self.draw(config);
+    }
+
+    fn step(&mut self, config: &IsingConfig) -> StepEnd {
+        self.episode_step += 1;
+        if self.episode_step >= config.episode_steps {
+            self.reset(config);
+            return StepEnd::TimedOut;
+        }
+        for _ in 0..config.sweeps_per_step {
+            self.patch.sweep(&mut self.rng);
+        }
+        self.draw(config);
+        StepEnd::Running
+    }
+
+    fn draw(&mut self, config: &IsingConfig) {
+        for pixels in self.frame.chunks_mut(64) {
+            let bits: u64 = self.rng.random();
+            for (bit, pixel) in pixels.iter_mut().enumerate() {
+                *pixel = (bits >> bit & 1) as u8 * 255;
+            }
+        }
+        let (top, left) = self.origin;
+        for (row, spins) in self
+            .patch
+            .spins()
+            .chunks_exact(config.patch_size)
+            .enumerate()
+        {
+            let start = (top + row) * config.lattice_size + left;
+            for (pixel, &spin) in self.frame[start..start + config.patch_size]
+                .iter_mut()
+                .zip(spins)
+            {
+                *pixel = if spin > 0 { 255 } else { 0 };
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn paper() -> IsingConfig {
+        IsingConfig {
+            lattice_size: 84,
+            patch_size: 42,
+            temperature: 0.4,
+            boundary: Boundary::Free,
+            sweeps_per_step: 1,
+            episode_steps: 16,
+        }
+    }
+
+    fn run(world: &mut IsingWorld, steps: usize) -> (Vec<Vec<u8>>, Vec<StepEnd>) {
+        let n = world.num_envs();
+        let (mut frames, mut all_ends) = (vec![], vec![]);
+        let (mut rewards, mut ends) = (vec![1.0; n], vec![StepEnd::Running; n]);
+        for _ in 0..steps {
+            let mut frame = vec![0; n * world.frame_shape().bytes()];
+            world.observe(&mut frame);
+            frames.push(frame);
+            world.step(&vec![0; n], &mut rewards, &mut ends).unwrap();
+            assert_eq!(rewards, vec![0.0; n]);
+            all_ends.extend(ends.clone());
+        }
+        (frames, all_ends)
+    }
+
+    #[test]
+    fn noise_is_fresh_and_the_patch_persists() {
+        let mut world = IsingWorld::new(&paper(), 1, 7).unwrap();
+        let (top, left) = world.patch_origin(0).unwrap();
+        let (frames, _) = run(&mut world, 12);
+        let (mut noise, mut patch) = ((0, 0), (0, 0));
+        for (i, (a, b)) in frames[10].iter().zip(&frames[11]).enumerate() {
+            let inside =
+                (top..top + 42).contains(&(i / 84)) && (left..left + 42).contains(&(i % 84));
+            let tally = if inside { &mut patch } else { &mut noise };
+            *tally = (tally.0 + i32::from(a == b), tally.1 + 1);
+        }
+        assert_eq!(patch.1, 42 * 42);
+        // Even odds over 5292 pixels: 5 standard deviations are 0.034. The coarsening patch keeps most of its spins.
+        assert!((f64::from(noise.0) / f64::from(noise.1) - 0.5).abs() < 0.034);
+        assert!(f64::from(patch.0) / f64::from(patch.1) > 0.8, "{patch:?}");
+    }
+
+    #[test]
+    fn episodes_time_out_and_the_patch_moves_uniformly() {
+        let config = IsingConfig {
+            episode_steps: 1,
+            patch_size: 3,
+            lattice_size: 6,
+            ..paper()
+        };
+        let mut world = IsingWorld::new(&config, 1, 8).unwrap();
+        let mut counts = [0i32; 16];
+        for _ in 0..16_000 {
+            let (row, column) = world.patch_origin(0).unwrap();
+            counts[row * 4 + column] += 1;
+            let (_, ends) = run(&mut world, 1);
+            assert_eq!(ends, [StepEnd::TimedOut]);
+        }
+        let chi: f64 = counts
+            .iter()
+            .map(|c| f64::from(c - 1000).powi(2) / 1000.0)
+            .sum();
+        assert!(
+            chi < 37.7,
+            "chi-square {chi} on 15 degrees of freedom, p = 0.001 at 37.7"
+        );
+        let (_, ends) = run(&mut IsingWorld::new(&paper(), 1, 8).unwrap(), 32);
+        let timed_out: Vec<usize> = (0..32).filter(|&i| ends[i] == StepEnd::TimedOut).collect();
+        assert_eq!(timed_out, [15, 31]);
+    }
+
+    #[test]
+    fn a_copy_depends_on_seed_and_index_only() {
+        let bytes = paper().frame_shape().bytes();
+        let (one, _) = run(&mut IsingWorld::new(&paper(), 1, 9).unwrap(), 20);
+        let (three, _) = run(&mut IsingWorld::new(&paper(), 3, 9).unwrap(), 20);
+        for (a, b) in one.iter().zip(&three) {
+            assert_eq!(a[..], b[..bytes]);
+            assert_ne!(b[..bytes], b[bytes..2 * bytes]);
+        }
+    }
+
+    #[test]
+    fn unusable_settings_are_errors() {
+        for bad in [
+            IsingConfig {
+                patch_size: 85,
+                ..paper()
+            },
+            IsingConfig {
+                patch_size: 2,
+                ..paper()
+            },
+            IsingConfig {
+                temperature: 0.0,
+                ..paper()
+            },
+            IsingConfig {
+                sweeps_per_step: 0,
+                ..paper()
+            },
+            IsingConfig {
+                episode_steps: 0,
+                ..paper()
+            },
+        ] {
+            assert!(IsingWorld::new(&bad, 1, 0).is_err(), "{bad:?}");
+        }
+        assert!(IsingWorld::new(&paper(), 0, 0).is_err());
+    }
+}

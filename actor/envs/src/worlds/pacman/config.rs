@@ -1,0 +1,168 @@
+//! The settings of Ms. PacMan, and which ghosts are lethal when.
+//! It holds no defaults: every number that affects learning is written, with its source, in a preset.
+
+use serde::{Deserialize, Serialize};
+
+use super::maze::{GHOSTS, HEIGHT, WIDTH};
+use crate::environment::FrameShape;
+use crate::error::EnvError;
+use crate::worlds::ising::{Boundary, IsingLattice};
+
+/// The settings of Ms. PacMan. Ghosts 0 to 3 are red, cyan, orange and green.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PacmanConfig {
+    /// Probability, 0 to 1, that a ghost takes a random move instead of its behaviour's, at each step and for each
+    /// ghost. The paper's epsilon: higher makes the ghosts harder to predict.
+    pub epsilon: f64,
+    /// Probability, 0 to 1, that a ghost whose behaviour is not the one its situation asks for changes over to it, at
+    /// each step and for each ghost. 1: at once; lower: a ghost notices the agent later and chases it longer out of
+    /// sight. The paper does not give it.
+    pub switch_probability: f64,
+    /// Which ghosts are lethal. The others behave the same, but touching them does nothing and earns nothing.
+    /// Ignored where `lethal_schedule` is set.
+    pub lethal: [bool; GHOSTS],
+    /// One lethal ghost at a time, changed as episodes pass; absent: `lethal` throughout.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lethal_schedule: Option<LethalSchedule>,
+    /// Env steps that the agent is invincible after the one in which it took a boost. The paper: 10.
+    pub boost_steps: u32,
+    /// Env steps after which an episode is cut off (`TimedOut`), at least 1.
+    pub step_limit: u32,
+    /// Reward of a food pellet. The paper gives no reward sizes, here and below.
+    pub reward_pellet: f32,
+    /// Reward of a boost.
+    pub reward_boost: f32,
+    /// Reward of destroying a lethal ghost while boosted.
+    pub reward_ghost: f32,
+    /// Reward of being caught, usually negative or 0; the episode ends.
+    pub reward_death: f32,
+    /// Reward of the last pellet, beside its own; the episode ends.
+    pub reward_cleared: f32,
+    /// An Ising model in the walls, as a distractor; absent: plain walls.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ising: Option<IsingOverlay>,
+}
+
+/// A change of the lethal ghost after every so many episodes, for continual learning.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LethalSchedule {
+    /// Episodes of one copy until the next ghost, at least 1. N copies pass N times as many episodes in a task: for the
+    /// paper's 5000 in all, set 5000 / N.
+    pub episodes_per_task: u64,
+    /// The lethal ghost (0 to 3) of each task; after the last the first again.
+    pub order: Vec<u8>,
+}
+
+/// The Ising model in the walls: fuchsia where a spin is +1. Drawn at random at the start of each episode.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct IsingOverlay {
+    /// Temperature, in units of J / k_B, above 0. The paper: 0.4, nearly deterministic.
+    pub temperature: f64,
+    /// Metropolis sweeps over the walls in one env step, at least 1.
+    pub sweeps_per_step: u32,
+}
+
+impl PacmanConfig {
+    /// # Errors
+    /// Says which setting cannot work.
+    pub fn validate(&self) -> Result<(), EnvError> {
+        for (name, value) in [
+            ("epsilon", self.epsilon),
+            ("switch_probability", self.switch_probability),
+        ] {
+            if !(0.0..=1.0).contains(&value) {
+                return Err(invalid(format!(
+                    "{name} is a probability and must be within 0 and 1, got {value}"
+                )));
+            }
+        }
+        for (name, value) in [
+            ("reward_pellet", self.reward_pellet),
+            ("reward_boost", self.reward_boost),
+            ("reward_ghost", self.reward_ghost),
+            ("reward_death", self.reward_death),
+            ("reward_cleared", self.reward_cleared),
+        ] {
+            if !value.is_finite() {
+                return Err(invalid(format!("{name} must be finite, got {value}")));
+            }
+        }
+        if self.step_limit == 0 {
+            return Err(invalid("step_limit must be at least 1, got 0".into()));
+        }
+        if let Some(ising) = &self.ising {
+            crate::worlds::ising::check_temperature(ising.temperature)?;
+            if ising.sweeps_per_step == 0 {
+                return Err(invalid(
+                    "ising.sweeps_per_step must be at least 1, got 0".into(),
+                ));
+            }
+        }
+        self.lethal_schedule
+            .as_ref()
+            .map_or(Ok(()), LethalSchedule::validate)
+    }
+
+    /// 21 x 19 x 3.
+    pub const fn frame_shape(&self) -> FrameShape {
+        FrameShape {
+            height: HEIGHT,
+            width: WIDTH,
+            channels: super::render::CHANNELS,
+        }
+    }
+
+    /// Which ghosts are lethal in a copy's episode number `episode`, counted from 0.
+    pub fn lethal_in(&self, episode: u64) -> [bool; GHOSTS] {
+        match &self.lethal_schedule {
+            None => self.lethal,
+            Some(schedule) => std::array::from_fn(|ghost| ghost == schedule.ghost_in(episode)),
+        }
+    }
+}
+
+impl LethalSchedule {
+    fn validate(&self) -> Result<(), EnvError> {
+        if self.episodes_per_task == 0 {
+            return Err(invalid(
+                "lethal_schedule.episodes_per_task must be at least 1, got 0".into(),
+            ));
+        }
+        let unknown = self
+            .order
+            .iter()
+            .find(|&&ghost| usize::from(ghost) >= GHOSTS);
+        match unknown {
+            Some(ghost) => Err(invalid(format!(
+                "lethal_schedule.order names ghost {ghost}, but they are 0 to 3"
+            ))),
+            None if self.order.is_empty() => Err(invalid(
+                "lethal_schedule.order must name at least one ghost".into(),
+            )),
+            None => Ok(()),
+        }
+    }
+
+    /// The lethal ghost of a copy's episode number `episode`, counted from 0; the schedule must be a valid one.
+    pub fn ghost_in(&self, episode: u64) -> usize {
+        self.order[(episode / self.episodes_per_task % self.order.len() as u64) as usize].into()
+    }
+}
+
+impl IsingOverlay {
+    /// The lattice of one copy: a site in each wall, free boundary.
+    pub(super) fn lattice(
+        &self,
+        walls: &[bool],
+        rng: &mut impl rand::Rng,
+    ) -> Result<IsingLattice, EnvError> {
+        IsingLattice::masked(HEIGHT, WIDTH, walls, self.temperature, Boundary::Free, rng)
+    }
+}
+
+fn invalid(what: String) -> EnvError {
+    EnvError::Config(format!("mspacman: {what}"))
+}

@@ -1,0 +1,88 @@
+//! The settings of the Procgen world, as a preset or a command line gives them.
+//! There are no defaults: every field affects what is learned, so a preset says each with its source.
+
+use procgen_sys::{DistributionMode, Game, Options, ProcgenError};
+
+use crate::error::EnvError;
+
+/// Which levels of which game, and how they look.
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ProcgenConfig {
+    /// The game, by its name: bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist,
+    /// jumper, leaper, maze, miner, ninja, plunder or starpilot.
+    pub game: Game,
+    /// How hard the levels are: `easy`, `hard`, `extreme` (chaser, dodgeball, leaper, starpilot) or `memory`
+    /// (caveflyer, dodgeball, heist, jumper, maze, miner). It also decides a few time limits.
+    pub distribution_mode: DistributionMode,
+    /// Size of the set from which levels are drawn, in levels: `start_level..start_level + num_levels`. Few levels can
+    /// be learned by heart, many cannot. 0 means all levels, `0..2^31 - 1`, and needs `start_level = 0`.
+    pub num_levels: u32,
+    /// Number of the first level of the set; test sets start where training sets end.
+    pub start_level: u32,
+    /// Whether a completed level is followed by another without ending the episode, so that the return goes on. The
+    /// level that follows is kept within the set; see this module's documentation.
+    pub use_sequential_levels: bool,
+    /// Whether the agent's velocity is painted as two grey squares into the upper left corner, in the games in which one
+    /// frame does not show it. It stands in for a stack of frames.
+    pub paint_vel_info: bool,
+    /// Whether backgrounds are pictures, which vary from level to level, rather than black.
+    pub use_backgrounds: bool,
+    /// Whether the view follows the agent, in the games whose levels are larger than the view; otherwise the whole level
+    /// is shown, smaller.
+    pub center_agent: bool,
+    /// Whether each kind of thing always looks the same, rather than differently from level to level.
+    pub restrict_themes: bool,
+}
+
+impl ProcgenConfig {
+    /// Says why a world with these settings cannot be made; needs no engine.
+    ///
+    /// # Errors
+    /// Numbers out of range, or a mode that the game does not have.
+    pub fn validate(&self) -> Result<(), EnvError> {
+        self.options(1, 0, 0).map(drop)
+    }
+
+    /// The engine's settings, checked.
+    pub(super) fn options(
+        &self,
+        num_envs: usize,
+        seed: u64,
+        threads: usize,
+    ) -> Result<Options, EnvError> {
+        let level = |name: &str, number: u32| {
+            i32::try_from(number).map_err(|_| {
+                EnvError::Config(format!(
+                    "{name} = {number}; levels are numbered below 2147483647"
+                ))
+            })
+        };
+        let options = Options {
+            game: self.game,
+            num_envs,
+            num_levels: level("num_levels", self.num_levels)?,
+            start_level: level("start_level", self.start_level)?,
+            rand_seed: rand_seed(seed),
+            num_threads: threads,
+            distribution_mode: self.distribution_mode,
+            use_sequential_levels: self.use_sequential_levels,
+            paint_vel_info: self.paint_vel_info,
+            use_backgrounds: self.use_backgrounds,
+            center_agent: self.center_agent,
+            restrict_themes: self.restrict_themes,
+        };
+        options.validate().map_err(ProcgenError::from)?;
+        Ok(options)
+    }
+}
+
+/// The engine's 31-bit seed for a 64-bit one, well mixed, so that neighbouring seeds draw unrelated levels.
+///
+/// Source: the output function of SplitMix64 (Steele, Lea and Flood 2014).
+fn rand_seed(seed: u64) -> i32 {
+    let mut z = seed.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    ((z ^ (z >> 31)) >> 33) as i32
+}

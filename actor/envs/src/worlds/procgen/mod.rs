@@ -1,0 +1,302 @@
+//! The Procgen world: what the engine's flags mean for episodes and levels.
+//! It does not fetch or load the engine itself (`procgen-sys` does), nor enlarge or stack frames.
+//!
+//! # Ends
+//! After a step the engine shows the next episode's first frame at once, so the terminal frame is never seen.
+//!
+//! | `first` | level completed | steps | end |
+//! | --- | --- | --- | --- |
+//! | 0 | no | | `Running` |
+//! | 0 | yes (sequential levels only) | | `LevelChange` |
+//! | 1 | no | the game's limit | `TimedOut` |
+//! | 1 | otherwise | | `Terminal` |
+//!
+//! The engine does not say which episodes its limit cut off, so steps are counted here. The limits are exact (they are
+//! read out of the engine's saved states in the tests of `procgen-sys`). What remains unknowable is an episode that was
+//! lost in the very step at which the limit strikes: it is reported as `TimedOut`.
+//!
+//! # Sequential levels
+//! With `use_sequential_levels` the engine follows a completed level s by level s + 997, without `first`, the return
+//! going on. With 500 levels this leaves the training set at the first completed level, and the agent trains on ever
+//! new levels until it dies; only a lost or timed-out episode draws from the set again.
+//!
+//! Here a completed level is followed by one **of the set**: when the engine has left it, the copy's complete state is
+//! moved to a spare copy of the game, reset there, and moved back. The spare's reset draws the level with the copy's
+//! own generator, as every lost episode does, so the law of levels is uniform over the set, the result depends on the
+//! seed and the copy's own actions only, no other copy is stepped, and no transition is made up: the step that completed
+//! the level keeps its reward and is a `LevelChange`, and the next frame is the first of the drawn level. Where s + 997
+//! lies in the set (sets of more than 997 levels, or all levels), the engine's own choice stays.
+
+mod config;
+#[cfg(test)]
+mod tests;
+mod visible_actions;
+
+use procgen_sys::{
+    Engine, FRAME_BYTES, FRAME_SIDE, Game, NUM_ACTIONS, ProcgenError, RESET, VecGame,
+};
+
+use crate::copies::check_step;
+use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::error::EnvError;
+use crate::settings::{Levels, Variants, WorldSettings};
+
+pub use config::ProcgenConfig;
+pub use visible_actions::visible_actions;
+
+/// Levels to draw unseen ones from, right after those trained on.
+const UNSEEN_LEVELS: u32 = 100_000;
+
+/// Resets in a row that may fail to draw a level of the set before it is an error. One is enough unless the game's
+/// no-op completes the drawn level in its first step.
+const REDRAWS_MAX: usize = 16;
+
+/// Copies of one of Procgen's games.
+pub struct ProcgenWorld {
+    game: VecGame,
+    /// Steps taken in the current level or episode [N].
+    steps_taken: Vec<u32>,
+    /// Steps after which the engine ends an episode.
+    time_limit_steps: u32,
+    /// The engine's actions of the step in progress [N].
+    actions: Vec<i32>,
+    /// What keeps sequential levels in their set; `None` where the engine does so itself.
+    levels: Option<LevelSet>,
+}
+
+/// The set of levels, and the spare copy of the game in which a copy that has left it is reset.
+struct LevelSet {
+    levels: std::ops::Range<i32>,
+    spare: VecGame,
+}
+
+impl ProcgenWorld {
+    /// The shape of one frame, in every game.
+    pub const FRAME_SHAPE: FrameShape = FrameShape {
+        height: FRAME_SIDE,
+        width: FRAME_SIDE,
+        channels: 3,
+    };
+
+    /// What each action presses, by the engine's numbering. Source: `get_combos` in `procgen/env.py`.
+    pub const ACTION_NAMES: [&'static str; NUM_ACTIONS] = [
+        "left+down",
+        "left",
+        "left+up",
+        "down",
+        "no-op",
+        "up",
+        "right+down",
+        "right",
+        "right+up",
+        "d",
+        "a",
+        "w",
+        "s",
+        "q",
+        "e",
+    ];
+
+    /// Makes `num_envs` copies. Fetches the engine if it is not installed; see [`Engine::install`] for how to do that
+    /// beforehand and watch it.
+    ///
+    /// `seed` decides which levels are drawn; `threads` is the number of threads that step, 0 for the calling one.
+    ///
+    /// # Errors
+    /// Settings that the engine does not take, or an engine that cannot be fetched or loaded.
+    pub fn new(
+        config: &ProcgenConfig,
+        num_envs: usize,
+        seed: u64,
+        threads: usize,
+    ) -> Result<ProcgenWorld, EnvError> {
+        config.options(num_envs, seed, threads)?;
+        let engine = Engine::install(&mut |_| {}).map_err(ProcgenError::from)?;
+        ProcgenWorld::with_engine(&engine, config, num_envs, seed, threads)
+    }
+
+    /// As `new`, with an engine that is known to be installed.
+    ///
+    /// # Errors
+    /// Settings that the engine does not take, or an engine that cannot be loaded.
+    pub fn with_engine(
+        engine: &Engine,
+        config: &ProcgenConfig,
+        num_envs: usize,
+        seed: u64,
+        threads: usize,
+    ) -> Result<ProcgenWorld, EnvError> {
+        let options = config.options(num_envs, seed, threads)?;
+        let levels = if config.use_sequential_levels {
+            let spare = procgen_sys::Options {
+                num_envs: 1,
+                num_threads: 0,
+                ..options
+            };
+            let end = if options.num_levels == 0 {
+                i32::MAX
+            } else {
+                options.start_level + options.num_levels
+            };
+            Some(LevelSet {
+                levels: options.start_level..end,
+                spare: VecGame::new(engine, &spare)?,
+            })
+        } else {
+            None
+        };
+        Ok(ProcgenWorld {
+            game: VecGame::new(engine, &options)?,
+            steps_taken: vec![0; num_envs],
+            time_limit_steps: config.game.time_limit_steps(config.distribution_mode),
+            actions: vec![0; num_envs],
+            levels,
+        })
+    }
+
+    /// The level that each copy's current frame shows [N].
+    pub fn levels(&self) -> &[i32] {
+        self.game.level_seed()
+    }
+
+    /// What the last step ended in copy `env`, whose steps were counted including it.
+    fn end_of(&self, env: usize) -> StepEnd {
+        let completed = self.game.prev_level_complete()[env] != 0;
+        match (self.game.first()[env] != 0, completed) {
+            (false, false) => StepEnd::Running,
+            (false, true) => StepEnd::LevelChange,
+            (true, false) if self.steps_taken[env] >= self.time_limit_steps => StepEnd::TimedOut,
+            (true, _) => StepEnd::Terminal,
+        }
+    }
+}
+
+impl LevelSet {
+    /// Moves copy `env` of `game` to the first frame of a level of the set, drawn by the copy's own generator.
+    fn redraw(&mut self, game: &mut VecGame, env: usize) -> Result<(), ProcgenError> {
+        self.spare.set_state(0, &game.state(env)?)?;
+        for _ in 0..REDRAWS_MAX {
+            self.spare.act(&[RESET])?;
+            if self.levels.contains(&self.spare.level_seed()[0]) {
+                return game.set_state(env, &self.spare.state(0)?);
+            }
+        }
+        let text = format!(
+            "{REDRAWS_MAX} resets in a row drew no level of {:?}",
+            self.levels
+        );
+        Err(ProcgenError::Unexpected(text))
+    }
+}
+
+impl WorldSettings for ProcgenConfig {
+    fn validate(&self) -> Result<(), EnvError> {
+        ProcgenConfig::validate(self)
+    }
+
+    fn frame_shape(&self) -> FrameShape {
+        ProcgenWorld::FRAME_SHAPE
+    }
+
+    fn action_names(&self) -> &'static [&'static str] {
+        &ProcgenWorld::ACTION_NAMES
+    }
+
+    fn build(
+        &self,
+        num_envs: usize,
+        seed: u64,
+        threads: usize,
+    ) -> Result<Box<dyn Environment>, EnvError> {
+        Ok(Box::new(ProcgenWorld::new(self, num_envs, seed, threads)?))
+    }
+
+    fn variants() -> Variants {
+        Variants {
+            key: "game",
+            names: &Game::NAMES,
+        }
+    }
+
+    fn variant(&self) -> Option<&'static str> {
+        Some(self.game.name())
+    }
+
+    fn visible_actions(&self) -> Vec<u8> {
+        visible_actions(self.game).into()
+    }
+
+    fn with_levels(&self, levels: Levels) -> Result<Self, EnvError> {
+        let mut changed = self.clone();
+        match levels {
+            Levels::Train => return Ok(changed),
+            Levels::TrainSingle => {}
+            Levels::Unseen if self.num_levels == 0 => {
+                return Err(EnvError::Config(
+                    "this run trained on all levels there are: none is unseen".into(),
+                ));
+            }
+            Levels::Unseen => {
+                changed.start_level += self.num_levels;
+                changed.num_levels = UNSEEN_LEVELS;
+            }
+        }
+        changed.use_sequential_levels = false;
+        Ok(changed)
+    }
+
+    fn install(&self, progress: &mut dyn FnMut(&str)) -> Result<(), EnvError> {
+        Engine::install(progress).map_err(ProcgenError::from)?;
+        Ok(())
+    }
+}
+
+impl Environment for ProcgenWorld {
+    fn frame_shape(&self) -> FrameShape {
+        Self::FRAME_SHAPE
+    }
+
+    fn num_actions(&self) -> usize {
+        NUM_ACTIONS
+    }
+
+    fn num_envs(&self) -> usize {
+        self.game.num_envs()
+    }
+
+    fn observe(&mut self, frames: &mut [u8]) {
+        assert_eq!(
+            frames.len(),
+            self.num_envs() * FRAME_BYTES,
+            "the buffer holds one frame for each copy"
+        );
+        frames.copy_from_slice(self.game.frames());
+    }
+
+    fn step(
+        &mut self,
+        actions: &[u8],
+        rewards: &mut [f32],
+        ends: &mut [StepEnd],
+    ) -> Result<(), EnvError> {
+        check_step(self.num_envs(), NUM_ACTIONS, actions, rewards, ends)?;
+        for (to, from) in self.actions.iter_mut().zip(actions) {
+            *to = i32::from(*from);
+        }
+        self.game.act(&self.actions)?;
+        rewards.copy_from_slice(self.game.rewards());
+        for (env, end) in ends.iter_mut().enumerate() {
+            self.steps_taken[env] += 1;
+            *end = self.end_of(env);
+            if *end != StepEnd::Running {
+                self.steps_taken[env] = 0;
+            }
+            if let Some(levels) = &mut self.levels
+                && !levels.levels.contains(&self.game.level_seed()[env])
+            {
+                levels.redraw(&mut self.game, env)?;
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,47 @@
+//! A bench in a process of its own, with the environment that the launcher gives the parts of a run.
+//! It measures nothing itself.
+
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, ensure};
+use driml_launch::child;
+use driml_learner::DeviceName;
+
+use crate::{
+    figures::{Figure, Report},
+    flags::{BenchFlags, BenchPart},
+};
+
+/// Runs this program again for one part's figures. Its progress goes to stderr.
+///
+/// # Errors
+/// A process that could not be started or failed.
+pub(super) fn figures(
+    part: BenchPart,
+    flags: &BenchFlags,
+    device: DeviceName,
+) -> anyhow::Result<Vec<Figure>> {
+    let program = std::env::current_exe().context("finding this program's own file")?;
+    let mut command = Command::new(program);
+    command
+        .args(["bench", part.name(), "--here", "--json", "-"])
+        .args(["--threads", &flags.threads.to_string()])
+        .args(flags.quick.then_some("--quick"))
+        .args(match device {
+            DeviceName::Cpu => Vec::new(),
+            gpu => vec!["--device".to_owned(), gpu.to_string()],
+        })
+        .stdin(Stdio::null())
+        .stderr(Stdio::inherit());
+    child::suit_candle(&mut command, flags.threads);
+    let doing = || format!("measuring the {}", part.name());
+    let output = command.output().with_context(doing)?;
+    ensure!(
+        output.status.success(),
+        "{} failed: {}",
+        doing(),
+        output.status
+    );
+    let report: Report = serde_json::from_slice(&output.stdout).with_context(doing)?;
+    Ok(report.figures)
+}

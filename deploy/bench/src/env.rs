@@ -1,0 +1,49 @@
+//! Procgen's steps through our wrapper, frames copied out after each as an actor does.
+//! No policy is measured: actions are drawn beforehand.
+
+use driml_envs::StepEnd;
+use driml_launch::console;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::{effort::Effort, figures::Figure, settings};
+
+const GAMES: [&str; 4] = ["bigfish", "coinrun", "maze", "starpilot"];
+/// Copies of the game.
+const ENVS: usize = 32;
+/// The engine's own threads; with 0 the caller's steps every copy.
+const ENGINE_THREADS: [usize; 2] = [0, 2];
+/// Steps of which a call that is timed consists.
+const STEPS: usize = 64;
+
+/// Steps a second, each copy's counted.
+///
+/// # Errors
+/// An engine that cannot be had or fails.
+pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
+    procgen_sys::Engine::install(&mut console::line)?;
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let mut figures = Vec::new();
+    for game in GAMES {
+        for threads in ENGINE_THREADS {
+            let config = settings::of_run(&format!("procgen:{game}"), "c51", "paper", &[])?;
+            let mut world = config.world.build(ENVS, 1, threads)?;
+            let actions: Vec<[u8; ENVS]> = (0..STEPS)
+                .map(|_| std::array::from_fn(|_| rng.random_range(0..15)))
+                .collect();
+            let mut frames = vec![0; ENVS * world.frame_shape().bytes()];
+            let (mut rewards, mut ends) = ([0.0; ENVS], [StepEnd::Running; ENVS]);
+            // A step that starts episodes takes longer than others, so the mean counts.
+            let rate = effort.rate_overall(|| {
+                actions.iter().try_for_each(|actions| {
+                    world.step(actions, &mut rewards, &mut ends)?;
+                    world.observe(&mut frames);
+                    Ok::<_, driml_envs::EnvError>(())
+                })
+            })?;
+            let name = format!("{game}, {ENVS} copies, {threads} engine threads");
+            figures.push(Figure::found(name, rate * (STEPS * ENVS) as f64, "steps/s"));
+        }
+    }
+    Ok(figures)
+}

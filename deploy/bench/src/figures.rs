@@ -1,0 +1,190 @@
+//! What a bench found, for a person and as JSON.
+//! It measures nothing and compares nothing.
+
+use std::{fs, path::Path};
+
+use anyhow::Context;
+use driml_launch::console::{self, print};
+use driml_learner::DeviceName;
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+
+use crate::{flags::BenchFlags, table};
+
+/// One thing that was measured.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Figure {
+    /// What, unique in its bench.
+    pub(super) what: String,
+    /// How much of the unit.
+    pub(super) value: f64,
+    /// The unit, such as `updates/s`.
+    pub(super) unit: String,
+}
+
+impl Figure {
+    /// A figure, which is told to whoever watches stderr.
+    pub(super) fn found(what: impl Into<String>, value: f64, unit: &str) -> Self {
+        let (what, unit) = (what.into(), unit.to_owned());
+        console::line(&format!("  {what}: {} {unit}", table::number(value)));
+        Self { what, value, unit }
+    }
+}
+
+/// The machine that measured, as far as figures depend on it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct MachineNote {
+    /// The processor's name.
+    pub(super) processor: String,
+    /// Cores that this process may use.
+    pub(super) cores: u32,
+    /// Mean number of tasks that wanted a core in the minute before.
+    pub(super) load: f64,
+    /// The GPU that computed, with its memory; none if the processor did.
+    #[serde(default)]
+    pub(super) gpu: Option<String>,
+}
+
+impl MachineNote {
+    /// This one.
+    pub(super) fn this() -> Self {
+        let cpuinfo = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+        Self {
+            processor: processor(&cpuinfo).unwrap_or("unknown").to_owned(),
+            cores: driml_machine::resources::Machine::this().cores,
+            load: load(&fs::read_to_string("/proc/loadavg").unwrap_or_default()).unwrap_or(0.0),
+            gpu: None,
+        }
+    }
+
+    /// The same, of figures that were computed on `device`.
+    pub(super) fn computing_on(&self, device: DeviceName) -> Self {
+        let gpu = match device {
+            DeviceName::Cpu => None,
+            #[cfg(not(feature = "cuda"))]
+            DeviceName::Cuda(_) => None,
+            #[cfg(feature = "cuda")]
+            DeviceName::Cuda(ordinal) => Some(driml_machine::doctor::cuda::name(ordinal)),
+        };
+        Self {
+            gpu,
+            ..self.clone()
+        }
+    }
+}
+
+/// The mean over the last minute in the kernel's table.
+fn load(loadavg: &str) -> Option<f64> {
+    loadavg.split_whitespace().next()?.parse().ok()
+}
+
+/// The processor's name in the kernel's table.
+fn processor(cpuinfo: &str) -> Option<&str> {
+    let mut lines = cpuinfo.lines();
+    let (_, name) = lines
+        .find(|line| line.starts_with("model name"))?
+        .split_once(':')?;
+    Some(name.trim())
+}
+
+/// A bench's figures as JSON has them.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Report {
+    /// Which bench.
+    pub(super) bench: String,
+    /// Whether it took a few iterations only.
+    pub(super) quick: bool,
+    /// Threads for arithmetic.
+    pub(super) threads: u32,
+    /// Where, as it was before the first measurement.
+    pub(super) machine: MachineNote,
+    /// What was found.
+    pub(super) figures: Vec<Figure>,
+}
+
+/// Prints the figures as a table, or writes them as the flags ask for.
+///
+/// # Errors
+/// A file that cannot be written.
+pub(super) fn report(
+    bench: &str,
+    figures: &[Figure],
+    machine: MachineNote,
+    flags: &BenchFlags,
+) -> anyhow::Result<()> {
+    let rows = figures
+        .iter()
+        .map(|it| vec![it.what.clone(), table::number(it.value), it.unit.clone()]);
+    let table = table::aligned(&rows.collect::<Vec<_>>(), &[1]);
+    report_as(bench, figures, &table, machine, flags)
+}
+
+/// [`report`] with another table.
+///
+/// # Errors
+/// As there.
+pub(super) fn report_as(
+    bench: &str,
+    figures: &[Figure],
+    table: &str,
+    machine: MachineNote,
+    flags: &BenchFlags,
+) -> anyhow::Result<()> {
+    let report = Report {
+        bench: bench.to_owned(),
+        quick: flags.quick,
+        threads: flags.threads,
+        machine,
+        figures: figures.to_vec(),
+    };
+    publish(&report, table, flags.json.as_deref())
+}
+
+/// Prints `table` and writes `report` to `json`; to stdout, alone, if that is `-`.
+///
+/// # Errors
+/// A file that cannot be written.
+pub(super) fn publish(
+    report: &(impl Serialize + DeserializeOwned),
+    table: &str,
+    json: Option<&Path>,
+) -> anyhow::Result<()> {
+    let mut text = serde_json::to_string_pretty(report).context("writing the figures as JSON")?;
+    text.push('\n');
+    match json {
+        Some(path) if path == Path::new("-") => print(&text),
+        Some(path) => {
+            fs::write(path, text).with_context(|| format!("writing {}", path.display()))?;
+            print(table)
+        }
+        None => print(table),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_machine_is_described() {
+        let cpuinfo = "processor\t: 0\nmodel name\t: AMD EPYC 9999\nflags\t: fpu\n";
+        assert_eq!(processor(cpuinfo), Some("AMD EPYC 9999"));
+        assert_eq!(processor(""), None);
+        assert_eq!(load("6.60 5.35 4.10 3/200 1234"), Some(6.6));
+    }
+
+    #[test]
+    fn a_report_reads_back_as_it_was_written() {
+        let report = Report {
+            bench: "learner".into(),
+            quick: true,
+            threads: 2,
+            machine: MachineNote::this(),
+            figures: vec![Figure::found("an update", 5.25, "updates/s")],
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("figures.json");
+        publish(&report, "", Some(&file)).unwrap();
+        let read: Report = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
+        assert_eq!(read, report);
+    }
+}

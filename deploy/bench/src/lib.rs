@@ -1,0 +1,69 @@
+//! `driml bench`: how fast the parts are, alone and beside what others use for the same work.
+//! Nothing here passes or fails by its speed; a folder's file is one bench, and each figure says what it is of.
+
+#![cfg_attr(test, allow(clippy::unwrap_used))]
+
+mod alone;
+mod assemble;
+mod effort;
+mod env;
+mod figures;
+pub mod flags;
+mod launched;
+mod learner;
+mod peers;
+mod policy;
+mod recording;
+mod replay;
+mod scale;
+mod settings;
+mod stock;
+mod system;
+mod table;
+mod taking_part;
+
+use driml_learner::DeviceName;
+use driml_machine::device::ready_for;
+
+use crate::{
+    effort::Effort,
+    figures::{Figure, MachineNote},
+    flags::{BenchCommand, BenchFlags, BenchPart},
+};
+
+/// Runs one bench and reports its figures.
+///
+/// # Errors
+/// A part that failed, an engine that cannot be had, a file that cannot be written.
+pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
+    let machine = MachineNote::this();
+    let part = |part, flags: &BenchFlags, device: DeviceName| {
+        ready_for(device)?;
+        let figures = if flags.here {
+            measure(part, &Effort::new(flags), device)?
+        } else {
+            alone::figures(part, flags, device)?
+        };
+        figures::report(part.name(), &figures, machine.computing_on(device), flags)
+    };
+    match command {
+        BenchCommand::Learner(args) => part(BenchPart::Learner, &args.flags, args.on.device),
+        BenchCommand::Policy(flags) => part(BenchPart::Policy, flags, DeviceName::Cpu),
+        BenchCommand::Replay(flags) => part(BenchPart::Replay, flags, DeviceName::Cpu),
+        BenchCommand::Env(flags) => part(BenchPart::Env, flags, DeviceName::Cpu),
+        BenchCommand::System(args) => {
+            figures::report("system", &system::measure(args)?, machine, &args.flags)
+        }
+        BenchCommand::Scale(args) => scale::run(args, machine),
+        BenchCommand::Peers(args) => peers::run(args),
+    }
+}
+
+fn measure(part: BenchPart, effort: &Effort, device: DeviceName) -> anyhow::Result<Vec<Figure>> {
+    match part {
+        BenchPart::Learner => learner::measure(effort, device),
+        BenchPart::Policy => policy::measure(effort),
+        BenchPart::Replay => replay::measure(effort),
+        BenchPart::Env => env::measure(effort),
+    }
+}

@@ -1,0 +1,36 @@
+//! Frames through an actor's policy, forward only.
+//! It takes no action in a world.
+
+use driml_model::{Parameters, PolicyNetwork};
+use rand::{RngCore, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::{effort::Effort, figures::Figure, settings};
+
+/// Frames that are given to the policy at once.
+const BATCHES: [usize; 2] = [32, 256];
+/// The two sizes of a frame, by their presets.
+const PRESETS: [&str; 2] = ["paper", "paper-observation"];
+
+/// Frames a second.
+///
+/// # Errors
+/// A network that failed.
+pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
+    let mut figures = Vec::new();
+    for preset in PRESETS {
+        let model = settings::of_run(settings::WORLD, "c51", preset, &[])?.model;
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let parameters = Parameters::init(&model, &mut rng, &candle_core::Device::Cpu)?;
+        let mut policy = PolicyNetwork::new(&model, &parameters.to_safetensors(|_| true)?)?;
+        for batch in BATCHES {
+            let mut frames = vec![0; batch * model.frame_len()];
+            rng.fill_bytes(&mut frames);
+            let mut actions = vec![0; batch];
+            let rate = effort.rate_by_median(|| policy.greedy_actions(&frames, &mut actions))?;
+            let name = format!("{batch} frames of {}x{}x3", model.height, model.width);
+            figures.push(Figure::found(name, rate * batch as f64, "frames/s"));
+        }
+    }
+    Ok(figures)
+}

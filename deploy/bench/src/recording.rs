@@ -1,0 +1,175 @@
+//! Real frames of Procgen, recorded once, from which benches make transitions.
+//! It keeps no time: recording is not measured.
+
+use std::path::Path;
+
+use anyhow::Context;
+use driml_envs::StepEnd;
+use driml_launch::console;
+use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::{settings, taking_part::INCARNATION};
+
+/// Copies of the game, each a stream of transitions.
+pub(super) const STREAMS: usize = 8;
+/// Steps of each copy; then the recording begins again.
+pub(super) const STEPS: usize = 256;
+
+/// Transitions of [`STREAMS`] copies of bigfish under a random policy, for [`STEPS`] steps.
+pub(super) struct Recording {
+    frame_bytes: usize,
+    /// [STEPS, STREAMS, frame bytes].
+    frames: Vec<u8>,
+    /// [STEPS, STREAMS].
+    steps: Vec<(u8, f32, End)>,
+}
+
+impl Recording {
+    /// Plays.
+    ///
+    /// # Errors
+    /// An engine that cannot be had or fails.
+    pub(super) fn play() -> anyhow::Result<Self> {
+        procgen_sys::Engine::install(&mut console::line)?;
+        let config = settings::of_run(settings::WORLD, "c51", "paper", &[])?;
+        let mut world = config.world.build(STREAMS, 1, 0)?;
+        let frame_bytes = world.frame_shape().bytes();
+        let mut frames = vec![0; STEPS * STREAMS * frame_bytes];
+        let mut steps = Vec::with_capacity(STEPS * STREAMS);
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let (mut rewards, mut ends) = ([0.0; STREAMS], [StepEnd::Running; STREAMS]);
+        for frames in frames.chunks_exact_mut(STREAMS * frame_bytes) {
+            world.observe(frames);
+            let actions: [u8; STREAMS] =
+                std::array::from_fn(|_| rng.random_range(0..world.num_actions()) as u8);
+            world.step(&actions, &mut rewards, &mut ends)?;
+            for ((action, reward), end) in actions.into_iter().zip(rewards).zip(ends) {
+                let end = End::from_byte(end as u8).expect("both enums have the same ends");
+                steps.push((action, reward, end));
+            }
+        }
+        Ok(Self {
+            frame_bytes,
+            frames,
+            steps,
+        })
+    }
+
+    /// Writes the frames, raw, for a process that is not ours.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub(super) fn write_frames(&self, path: &Path) -> anyhow::Result<()> {
+        std::fs::write(path, &self.frames).with_context(|| format!("writing {}", path.display()))
+    }
+
+    /// Bytes of one frame.
+    pub(super) const fn frame_bytes(&self) -> usize {
+        self.frame_bytes
+    }
+
+    /// Chunk after chunk of one actor, so many steps of the first so many streams each, in memory of `pool`; the recording
+    /// plays round and round.
+    pub(super) fn chunks(
+        &self,
+        actor: u32,
+        (streams, steps): (u32, u32),
+        pool: BufferPool,
+    ) -> Chunks<'_> {
+        assert!(
+            streams as usize <= STREAMS,
+            "{streams} of {STREAMS} streams"
+        );
+        Chunks {
+            recording: self,
+            pool,
+            next: ChunkHeader {
+                actor,
+                incarnation: INCARNATION,
+                sequence: 0,
+                first_transition: 0,
+                weights_version: 1,
+                leaving: false,
+                streams,
+                steps,
+                frame_bytes: self.frame_bytes as u32,
+            },
+        }
+    }
+}
+
+/// An actor's chunks without end, each filled anew as a real actor's are.
+pub(super) struct Chunks<'a> {
+    recording: &'a Recording,
+    pool: BufferPool,
+    next: ChunkHeader,
+}
+
+impl Chunks<'_> {
+    /// Transitions in all chunks so far.
+    pub(super) const fn transitions(&self) -> u64 {
+        self.next.first_transition
+    }
+
+    /// Chunks say from now on that weights of `version` acted.
+    pub(super) const fn act_with(&mut self, version: u64) {
+        self.next.weights_version = version;
+    }
+
+    /// The next chunk, of so many steps.
+    pub(super) fn next_of(&mut self, steps: u32) -> Chunk {
+        self.next.steps = steps;
+        let Recording {
+            frame_bytes,
+            frames,
+            steps: recorded,
+        } = self.recording;
+        let bytes = self.next.payload_bytes();
+        let bytes = bytes.expect("a chunk of a bench is far below the address space");
+        let mut chunk = Chunk::in_memory(self.next, self.pool.take(bytes));
+        let (streams, steps) = (self.next.streams as usize, steps as usize);
+        let first_step = self.next.first_transition as usize / streams;
+        for row in 0..streams * steps {
+            let step = first_step + row % steps;
+            let from = step % STEPS * STREAMS + row / steps;
+            let frame = &frames[from * frame_bytes..(from + 1) * frame_bytes];
+            chunk.frame_mut(row).copy_from_slice(frame);
+            let (action, reward, end) = recorded[from];
+            chunk.set(row, action, reward, end);
+        }
+        self.next.sequence += 1;
+        self.next.first_transition += chunk.header.transitions() as u64;
+        chunk
+    }
+}
+
+impl Iterator for Chunks<'_> {
+    type Item = Chunk;
+
+    fn next(&mut self) -> Option<Chunk> {
+        Some(self.next_of(self.next.steps))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn chunks_are_consecutive_steps_of_each_stream() {
+        let place = |i: usize| [(i / STREAMS) as u8, (i % STREAMS) as u8];
+        let recording = Recording {
+            frame_bytes: 2,
+            frames: (0..STEPS * STREAMS).flat_map(place).collect(),
+            steps: vec![(1, 0.5, End::Running); STEPS * STREAMS],
+        };
+        let mut chunks = recording.chunks(3, (2, 3), BufferPool::new(1));
+        let (first, second) = (chunks.next().unwrap(), chunks.next().unwrap());
+        assert_eq!(first.frames(), [0, 0, 1, 0, 2, 0, 0, 1, 1, 1, 2, 1]);
+        assert_eq!(second.frames(), [3, 0, 4, 0, 5, 0, 3, 1, 4, 1, 5, 1]);
+        let numbers = [first, second].map(|it| (it.header.sequence, it.header.first_transition));
+        assert_eq!((numbers, chunks.transitions()), ([(0, 0), (1, 6)], 12));
+    }
+}

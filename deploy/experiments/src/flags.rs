@@ -1,0 +1,92 @@
+//! The command line of `driml experiment`.
+//! What a value means is for the experiment that takes it.
+
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand};
+
+/// The paper's experiments.
+#[derive(Debug, Subcommand)]
+pub enum ExperimentCommand {
+    /// Fig. 1: InfoNCE learns the transition ratio of a biased random walk; does it converge with the spectral gap?
+    RandomWalk(ExperimentFlags),
+    /// Fig. 2: local DIM finds the patch of an Ising model in noise
+    Ising(ExperimentFlags),
+    /// Fig. 3: Ms. PacMan's ghosts, predictable or not, and one lethal ghost that changes; C51 beside DRIML
+    Pacman(PacmanArgs),
+    /// Table 1: agents on Procgen's games, from a queue of whole runs
+    Procgen(ProcgenArgs),
+}
+
+/// What every experiment takes.
+#[derive(Clone, Debug, Args)]
+pub struct ExperimentFlags {
+    /// The same in seconds: shows that everything works, and nothing else
+    #[arg(long)]
+    pub(crate) smoke: bool,
+    /// Where figures, data and page go; an experiment that was stopped goes on there [default: experiments/NAME]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+    /// Seeds 1 to N [default: as the experiment's settings say]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub(crate) seeds: Option<u32>,
+}
+
+/// What the experiments that are made of whole runs take.
+#[derive(Clone, Debug, Args)]
+pub struct QueueFlags {
+    /// Runs at once [default: as the experiment's settings say]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub(crate) jobs: Option<u32>,
+    /// Start nothing: figures, data and page of the runs that are finished
+    #[arg(long)]
+    pub(crate) report: bool,
+    /// One setting of every run, as `driml local` takes it; may be given several times
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub(crate) sets: Vec<String>,
+}
+
+/// What `driml experiment pacman` takes.
+#[derive(Clone, Debug, Args)]
+pub struct PacmanArgs {
+    #[command(flatten)]
+    pub(crate) flags: ExperimentFlags,
+    #[command(flatten)]
+    pub(crate) queue: QueueFlags,
+    /// Agents of the continual tasks; the first is what the others are compared with [default: c51,driml-fix]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) agents: Vec<String>,
+    /// Frames of each run with ghosts that move at random (a)
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1_000..=1_000_000_000))]
+    pub(crate) frames: Option<u64>,
+    /// Episodes until the next ghost is the lethal one (b, c); the paper's are 5000
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
+    pub(crate) episodes_per_task: Option<u64>,
+}
+
+/// What `driml experiment procgen` takes.
+#[derive(Clone, Debug, Args)]
+pub struct ProcgenArgs {
+    #[command(flatten)]
+    pub(crate) flags: ExperimentFlags,
+    #[command(flatten)]
+    pub(crate) queue: QueueFlags,
+    /// Games, such as bigfish,starpilot; or all [default: as the experiment's settings say]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) games: Vec<String>,
+    /// Agents, driml-fix and driml-noact also with a k, as in driml-noact-k5; or all [default: c51,driml-fix,driml-ada]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) agents: Vec<String>,
+    /// Frames of each run; the paper's are 50000000
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(500..=1_000_000_000))]
+    pub(crate) frames: Option<u64>,
+    /// Episodes played with each run's weights on each kind of levels
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub(crate) episodes: Option<u32>,
+    /// Named settings of every run; `driml presets` lists them
+    #[arg(long, value_name = "NAME")]
+    pub(crate) preset: Option<String>,
+    /// Instead: short runs of c51 on every game, to see on which it learns soonest
+    #[arg(long)]
+    pub(crate) screen: bool,
+}

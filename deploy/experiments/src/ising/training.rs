@@ -1,0 +1,471 @@
+//! Local DIM on the Ising world: training on pairs of successive frames, and measuring what the scores tell.
+//! Network, loss and optimiser are the learner's own; there is no C51 part, as nothing is earned in this world.
+
+use candle_core::{DType, Device, Tensor};
+use driml_envs::{Environment, IsingConfig, IsingWorld, StepEnd};
+use driml_learner::{
+    LearnerSettings,
+    auxiliary::dim::{Dim, dots},
+    optimiser::{
+        adam::Adam,
+        gradients::{Gradients, clip_factor},
+    },
+};
+use driml_model::{ModelConfig, Network, Operations, Parameters};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use crate::{Progress, statistics::auc};
+
+/// What one training depends on.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub(super) struct Task {
+    pub(super) world: IsingConfig,
+    pub(super) model: ModelConfig,
+    pub(super) learner: LearnerSettings,
+    pub(super) settings: super::Settings,
+}
+
+/// Seed of the worlds that are measured on: the same for every training, and of none that is trained on.
+const MEASURED_SEED: u64 = 1 << 40;
+
+/// What one training left.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct Trained {
+    /// InfoNCE's loss at each update, in nats.
+    pub(super) loss: Vec<f32>,
+    /// Measurements on the way: after how many updates, and what.
+    pub(super) checks: Vec<(u64, Measured)>,
+    /// The measurement at the end, on more episodes.
+    pub(super) last: Measured,
+    /// Scores at each location of the first episodes of the last measurement, in nats: log-softmax of the true pair plus ln B.
+    pub(super) maps: Vec<Vec<f64>>,
+}
+
+/// What the scores from `from_t` to the step after tell. Areas under ROC curves: 0.5 is nothing, 1 everything.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Measured {
+    /// Whether a location looks at the patch: the centre of its receptive field lies in it or not.
+    pub(super) auc: f64,
+    /// The same by the raw score, without the softmax over other episodes.
+    pub(super) auc_raw: f64,
+    /// The same among the locations whose receptive field lies wholly inside or wholly outside the patch.
+    pub(super) auc_clear: f64,
+    /// Inside the patch: true pairs against pairs of two episodes whose patches both cover the location.
+    pub(super) auc_pairs: f64,
+    /// InfoNCE's loss, in nats.
+    pub(super) loss: f64,
+}
+
+/// Trains once.
+///
+/// # Errors
+/// A failing tensor operation, an interrupt.
+pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::Result<Trained> {
+    let settings = &task.settings;
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let parameters = Parameters::init(&task.model, &mut rng, &Device::Cpu)?;
+    let network = Network::new(&task.model, &parameters)?;
+    let mut adam = Adam::new(task.learner.adam, &parameters, Operations::Own)?;
+    let scorer = Scorer {
+        task,
+        network: &network,
+        dim: Dim {
+            lambda: task.learner.lambda,
+            tanh_clip: task.learner.tanh_clip,
+        },
+    };
+    let mut pairs = Pairs::new(task, &mut rng)?;
+    let (mut loss, mut checks) = (Vec::new(), Vec::new());
+    let period = (settings.updates / settings.checks.max(1)).max(1);
+    for update in 0..settings.updates {
+        if update.is_multiple_of(period) {
+            checks.push((update, scorer.measure(settings.check_episodes)?.0));
+        }
+        let (now, next) = pairs.batch(&mut rng)?;
+        let value = scorer.loss(&now, &next)?;
+        loss.push(value.to_scalar::<f32>()?);
+        let gradients = Gradients::take(&parameters, value.backward()?)?;
+        let factor = clip_factor(gradients.norm(Operations::Own)?, task.learner.max_grad_norm);
+        adam.step(&parameters, &gradients, factor)?;
+        progress.advance(1)?;
+    }
+    let (last, maps) = scorer.measure(settings.episodes)?;
+    checks.push((settings.updates, last));
+    Ok(Trained {
+        loss,
+        checks,
+        last,
+        maps,
+    })
+}
+
+/// Frames [T, N, H * W] of whole episodes of N copies, and the patches' first rows and columns.
+pub(super) struct Episodes {
+    pub(super) frames: Vec<Vec<u8>>,
+    pub(super) origins: Vec<(usize, usize)>,
+}
+
+impl Episodes {
+    /// `steps` + 1 frames of each of `copies` episodes.
+    ///
+    /// # Errors
+    /// A world that cannot be.
+    pub(super) fn play(
+        config: &IsingConfig,
+        copies: usize,
+        steps: u32,
+        seed: u64,
+    ) -> anyhow::Result<Self> {
+        let config = IsingConfig {
+            episode_steps: steps + 1,
+            ..config.clone()
+        };
+        let mut world = IsingWorld::new(&config, copies, seed)?;
+        let bytes = config.frame_shape().bytes();
+        let (mut rewards, mut ends) = (vec![0.0; copies], vec![StepEnd::Running; copies]);
+        let mut frames = Vec::new();
+        for step in 0..=steps {
+            let mut frame = vec![0; copies * bytes];
+            world.observe(&mut frame);
+            frames.push(frame);
+            if step < steps {
+                world.step(&vec![0; copies], &mut rewards, &mut ends)?;
+            }
+        }
+        let origins = (0..copies).filter_map(|copy| world.patch_origin(copy));
+        Ok(Self {
+            frames,
+            origins: origins.collect(),
+        })
+    }
+
+    /// The episodes that `Scorer::measure` looks at first.
+    ///
+    /// # Errors
+    /// A world that cannot be.
+    pub(super) fn measured(task: &Task, steps: u32) -> anyhow::Result<Self> {
+        let seed = MEASURED_SEED;
+        Self::play(&task.world, task.settings.batch_rows, steps, seed)
+    }
+}
+
+/// Batches of pairs (s_t, s_{t+1}): each row another episode, at its own t.
+struct Pairs<'a> {
+    task: &'a Task,
+    episodes: Episodes,
+    batches_left: u32,
+}
+
+impl<'a> Pairs<'a> {
+    fn new(task: &'a Task, rng: &mut ChaCha8Rng) -> anyhow::Result<Self> {
+        let mut this = Self {
+            task,
+            episodes: Episodes {
+                frames: vec![],
+                origins: vec![],
+            },
+            batches_left: 0,
+        };
+        this.renew(rng)?;
+        Ok(this)
+    }
+
+    fn renew(&mut self, rng: &mut ChaCha8Rng) -> anyhow::Result<()> {
+        let Task {
+            world, settings, ..
+        } = self.task;
+        let steps = (world.episode_steps - 1).max(1);
+        // Below the measured worlds' seeds.
+        let seed = rng.random_range(0..MEASURED_SEED);
+        self.episodes = Episodes::play(world, settings.batch_rows, steps, seed)?;
+        // As many batches as there are pairs in an episode: each is used once, on average.
+        self.batches_left = steps;
+        Ok(())
+    }
+
+    fn batch(&mut self, rng: &mut ChaCha8Rng) -> anyhow::Result<(Vec<u8>, Vec<u8>)> {
+        if self.batches_left == 0 {
+            self.renew(rng)?;
+        }
+        self.batches_left -= 1;
+        let bytes = self.task.world.frame_shape().bytes();
+        let frames = &self.episodes.frames;
+        let (mut now, mut next) = (Vec::new(), Vec::new());
+        for row in 0..self.task.settings.batch_rows {
+            let t = rng.random_range(0..frames.len() - 1);
+            let place = row * bytes..(row + 1) * bytes;
+            now.extend_from_slice(&frames[t][place.clone()]);
+            next.extend_from_slice(&frames[t + 1][place]);
+        }
+        Ok((now, next))
+    }
+}
+
+/// The network with the objective.
+struct Scorer<'a> {
+    task: &'a Task,
+    network: &'a Network,
+    dim: Dim,
+}
+
+impl Scorer<'_> {
+    fn tensor(&self, frames: &[u8]) -> anyhow::Result<Tensor> {
+        let ModelConfig {
+            height,
+            width,
+            channels,
+            ..
+        } = self.task.model;
+        let rows = frames.len() / (height * width * channels);
+        let shape = (rows, height, width, channels);
+        Ok(Tensor::from_slice(frames, shape, &Device::Cpu)?)
+    }
+
+    /// InfoNCE of a batch, with its graph.
+    fn loss(&self, now: &[u8], next: &[u8]) -> anyhow::Result<Tensor> {
+        let features_t = self.network.features(&self.tensor(now)?)?;
+        let features_k = self.network.features(&self.tensor(next)?)?;
+        let rows = features_t.f3.dim(0)?;
+        let action = Tensor::zeros(rows, DType::U8, &Device::Cpu)?;
+        let valid = vec![1; rows];
+        let losses =
+            self.dim
+                .pair_losses(self.network, &features_t, &features_k, &action, &valid)?;
+        let [local, ..] = losses;
+        local.ok_or_else(|| anyhow::anyhow!("lambda.3t3 is 0, so there is no local DIM to learn"))
+    }
+
+    /// Clipped scores [L, B, B] of every anchor with every candidate, at each location.
+    fn scores(&self, now: &[u8], next: &[u8]) -> anyhow::Result<Vec<f64>> {
+        let features_t = self.network.features(&self.tensor(now)?)?;
+        let features_k = self.network.features(&self.tensor(next)?)?;
+        let action = Tensor::zeros(features_t.f3.dim(0)?, DType::U8, &Device::Cpu)?;
+        let wanted = [true, false, false, false];
+        let [local, ..] = dots(self.network, &features_t, &features_k, &action, wanted)?;
+        let local = local.expect("the first pair is wanted");
+        let scores = self.dim.scores(local.rkhs);
+        let values = local.dots.flatten_all()?.to_vec1::<f32>()?;
+        Ok(values.iter().map(|&dot| scores.score(dot)).collect())
+    }
+
+    /// Measures on whole batches of episodes, at least one, and gives the first three episodes' maps.
+    fn measure(&self, episodes: usize) -> anyhow::Result<(Measured, Vec<Vec<f64>>)> {
+        let Task {
+            world,
+            model,
+            settings,
+            ..
+        } = self.task;
+        let rows = settings.batch_rows;
+        let t = settings.from_t as usize;
+        let view = View::of(model);
+        let mut tally = Tally::default();
+        let mut maps = Vec::new();
+        for batch in 0..episodes.div_ceil(rows).max(1) {
+            let seed = MEASURED_SEED + batch as u64;
+            let played = Episodes::play(world, rows, settings.from_t + 1, seed)?;
+            let scores = self.scores(&played.frames[t], &played.frames[t + 1])?;
+            let logs = log_softmax(&scores, rows);
+            let locations = scores.len() / (rows * rows);
+            for location in 0..locations {
+                let place = (location / view.columns, location % view.columns);
+                let side = world.patch_size;
+                let cover: Vec<Cover> = played
+                    .origins
+                    .iter()
+                    .map(|origin| view.cover(place, *origin, side))
+                    .collect();
+                tally.add(location, &cover, &scores, &logs, rows);
+            }
+            if batch == 0 {
+                maps = (0..rows.min(3))
+                    .map(|row| {
+                        let at = |location: usize| logs[(location * rows + row) * rows + row];
+                        (0..locations)
+                            .map(|location| at(location) + (rows as f64).ln())
+                            .collect()
+                    })
+                    .collect();
+            }
+        }
+        Ok((tally.measured(), maps))
+    }
+}
+
+/// Scores normalised over the candidates of each anchor, [L, B, B].
+///
+/// A positive's log-softmax plus ln B estimates the pointwise mutual information of its two views, in nats; it is at
+/// most ln B. Source: the paper's listing "DIM objective scores".
+fn log_softmax(scores: &[f64], rows: usize) -> Vec<f64> {
+    let normalise = |row: &[f64]| -> Vec<f64> {
+        let largest = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let sum: f64 = row.iter().map(|score| (score - largest).exp()).sum();
+        let log = largest + sum.ln();
+        row.iter().map(|score| score - log).collect()
+    };
+    scores.chunks(rows).flat_map(normalise).collect()
+}
+
+/// How a location's receptive field lies to the patch.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Cover {
+    /// Its centre is in the patch.
+    centre: bool,
+    /// All of it is.
+    whole: bool,
+    /// None of it is.
+    none: bool,
+}
+
+/// What the locations of the last convolution look at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct View {
+    /// Side of a receptive field, in pixels.
+    pub(super) side: usize,
+    /// Pixels from one location's field to the next one's.
+    pub(super) step: usize,
+    /// Locations in a row.
+    pub(super) columns: usize,
+}
+
+impl View {
+    /// Of a network's f3.
+    pub(super) fn of(model: &ModelConfig) -> Self {
+        let (mut side, mut step) = (1, 1);
+        for layer in &model.conv {
+            side += (layer.kernel - 1) * step;
+            step *= layer.stride;
+        }
+        Self {
+            side,
+            step,
+            columns: model.local_shape().1,
+        }
+    }
+
+    fn cover(&self, place: (usize, usize), origin: (usize, usize), patch: usize) -> Cover {
+        let along = |place: usize, origin: usize| {
+            let (start, end) = (place * self.step, place * self.step + self.side);
+            let centre = start + self.side / 2;
+            let last = origin + patch;
+            [
+                (origin..last).contains(&centre),
+                origin <= start && end <= last,
+                end <= origin || last <= start,
+            ]
+        };
+        let (rows, columns) = (along(place.0, origin.0), along(place.1, origin.1));
+        Cover {
+            centre: rows[0] && columns[0],
+            whole: rows[1] && columns[1],
+            none: rows[2] || columns[2],
+        }
+    }
+}
+
+/// Scores by what they belong to.
+#[derive(Default)]
+struct Tally {
+    inside: Vec<f64>,
+    outside: Vec<f64>,
+    inside_raw: Vec<f64>,
+    outside_raw: Vec<f64>,
+    whole: Vec<f64>,
+    none: Vec<f64>,
+    true_pairs: Vec<f64>,
+    other_pairs: Vec<f64>,
+}
+
+impl Tally {
+    /// Adds a location's true pairs, and inside the patch each anchor with the next episode as well.
+    fn add(&mut self, location: usize, cover: &[Cover], scores: &[f64], logs: &[f64], rows: usize) {
+        for row in 0..rows {
+            let at = (location * rows + row) * rows;
+            let (raw, log) = (scores[at + row], logs[at + row]);
+            if cover[row].centre {
+                self.inside.push(log);
+                self.inside_raw.push(raw);
+            } else {
+                self.outside.push(log);
+                self.outside_raw.push(raw);
+            }
+            if cover[row].whole {
+                self.whole.push(log);
+            }
+            if cover[row].none {
+                self.none.push(log);
+            }
+            let other = (row + 1) % rows;
+            if other != row && cover[row].centre && cover[other].centre {
+                self.true_pairs.push(log);
+                self.other_pairs.push(logs[at + other]);
+            }
+        }
+    }
+
+    /// 0.5 where a kind has no example, as only a very short measurement leaves it.
+    fn measured(&self) -> Measured {
+        let area = |yes: &[f64], no: &[f64]| auc(yes, no).unwrap_or(0.5);
+        let all = self.inside.iter().chain(&self.outside);
+        let count = (self.inside.len() + self.outside.len()) as f64;
+        Measured {
+            auc: area(&self.inside, &self.outside),
+            auc_raw: area(&self.inside_raw, &self.outside_raw),
+            auc_clear: area(&self.whole, &self.none),
+            auc_pairs: area(&self.true_pairs, &self.other_pairs),
+            loss: -all.sum::<f64>() / count,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn views_of_the_dqn_network_tile_the_paper_s_frame() {
+        let layer = |out, kernel, stride| driml_model::ConvLayer {
+            out,
+            kernel,
+            stride,
+        };
+        let task = super::super::task(&super::super::tests::smoke()).unwrap();
+        let model = ModelConfig {
+            conv: vec![layer(32, 8, 4), layer(64, 4, 2), layer(64, 3, 1)],
+            ..task.model
+        };
+        let view = View::of(&model);
+        assert_eq!((view.side, view.step, view.columns), (36, 8, 7));
+        assert_eq!(6 * view.step + view.side, 84);
+        let cover = view.cover((0, 6), (0, 42), 42);
+        assert_eq!((cover.centre, cover.whole, cover.none), (true, true, false));
+        let cover = view.cover((6, 6), (0, 42), 42);
+        assert_eq!(
+            (cover.centre, cover.whole, cover.none),
+            (false, false, true)
+        );
+        let cover = view.cover((2, 6), (0, 42), 42);
+        assert_eq!((cover.centre, cover.whole), (true, false));
+    }
+
+    #[test]
+    fn the_softmax_is_over_candidates() {
+        let logs = log_softmax(&[1.0, 1.0, 0.0, 3f64.ln()], 2);
+        let probabilities: Vec<f64> = logs.iter().map(|log| log.exp()).collect();
+        for (p, expected) in probabilities.iter().zip([0.5, 0.5, 0.25, 0.75]) {
+            assert!((p - expected).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn episodes_are_whole_and_their_patch_stays() {
+        let task = super::super::task(&super::super::tests::smoke()).unwrap();
+        let played = Episodes::measured(&task, 32).unwrap();
+        assert_eq!(played.frames.len(), 33);
+        let shorter = Episodes::measured(&task, 3).unwrap();
+        assert_eq!(shorter.origins, played.origins);
+        assert_eq!(shorter.frames[3], played.frames[3]);
+    }
+}

@@ -1,0 +1,29 @@
+//! What a run leaves that never was, for tests.
+
+use driml_launch::run_folder::{Outcome, Recorder, RunFolder, Summary};
+use driml_protocol::{Horizon, LearnerStatus, ReplayStatus, RunSpec, TimeoutRule};
+
+pub(crate) fn spec() -> RunSpec {
+    RunSpec {
+        world: "chain".into(),
+        agent: "driml-ada".into(),
+        seed: 3,
+        frame_height: 12,
+        frame_width: 12,
+        frame_channels: 1,
+        frame_stack: 1,
+        num_actions: 3,
+        n_step: 7,
+        gamma: 0.99,
+        horizon: Horizon::Nhg { k_max: 5 },
+        timeout: TimeoutRule::Terminal,
+    }
+}
+
+/// What a run leaves that did nothing.
+pub(crate) fn summary() -> Summary {
+    let folder = tempfile::tempdir().unwrap();
+    let recorder = Recorder::create(&RunFolder::new(folder.path()), "", &[], &[]).unwrap();
+    let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
+    recorder.summarise(Outcome::Finished, &spec(), &replay, &learner)
+}

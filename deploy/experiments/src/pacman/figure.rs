@@ -1,0 +1,118 @@
+//! The picture of Fig. 3. It draws nothing beyond the episodes and frames that the settings ask for.
+
+use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
+
+use super::{
+    Continual, Results,
+    report::{LOSSES, RETURNS_OF, Trace, loss_of},
+};
+use crate::{
+    plot::{over_seeds, smoothed},
+    statistics::Spread,
+};
+
+/// Share of a run over which the drawn loss is averaged.
+const SMOOTH: f64 = 0.1;
+
+/// The DIM losses by epsilon, and the returns under one lethal ghost after another.
+pub(super) fn figure(
+    results: &Results,
+    ghosts: &[Trace],
+    noise: &[Trace],
+) -> anyhow::Result<Figure> {
+    let settings = &results.settings;
+    let mut panels = Vec::new();
+    for (column, what) in LOSSES {
+        let mut series = Vec::new();
+        for (index, &epsilon) in settings.predictability.epsilons.iter().enumerate() {
+            let window = settings.predictability.frames as f64 * SMOOTH;
+            let mut each = Vec::new();
+            for (_, points) in loss_of(results, epsilon, column)? {
+                let mut points = smoothed(&points, window);
+                // While the learner catches up at the end, several rows have the same frames.
+                points.dedup_by_key(|point| point.0);
+                each.push(points);
+            }
+            let curve = over_seeds(&each);
+            series.push(
+                Series::line(&format!("epsilon {epsilon}"), index, curve.points).banded(curve.band),
+            );
+        }
+        panels.push(Panel::Chart(Chart::new(
+            &format!("(a) DIM loss, {what} features"),
+            Axis::linear("frames"),
+            Axis::log("InfoNCE [nats]"),
+            series,
+        )));
+    }
+    for (title, continual, traces) in [
+        (
+            "(b) One lethal ghost after another",
+            &settings.continual,
+            ghosts,
+        ),
+        (
+            "(c) The same with Ising noise in the walls",
+            &settings.noise,
+            noise,
+        ),
+    ] {
+        panels.push(Panel::Chart(Chart::new(
+            title,
+            Axis::linear("episodes"),
+            Axis::linear("mean return"),
+            task_series(results, continual, traces),
+        )));
+    }
+    Ok(Figure {
+        title: "Ms. PacMan: what DIM finds, and what it is good for".into(),
+        notes: vec![format!(
+            "(a) Mean over a tenth of the run; mean and range over seeds. (b, c) Training return, mean of the last {RETURNS_OF} \
+             episodes; mean and range over seeds; vertical lines: another ghost becomes the lethal one; dashed: where {} stood at the \
+             end of each task.",
+            settings.agents.first().map_or("", String::as_str)
+        )],
+        columns: 2,
+        panel_size: (430.0, 320.0),
+        panels,
+    })
+}
+
+fn task_series(results: &Results, continual: &Continual, traces: &[Trace]) -> Vec<Series> {
+    let mut series = Vec::new();
+    let values = || {
+        traces
+            .iter()
+            .flat_map(|trace| &trace.points)
+            .map(|point| point.1)
+    };
+    let (low, high) = (
+        values().fold(f64::INFINITY, f64::min),
+        values().fold(f64::NEG_INFINITY, f64::max),
+    );
+    let length = continual.episodes_per_task as f64;
+    if low <= high {
+        for task in 1..continual.tasks {
+            let x = length * task as f64;
+            let line = Series::line("", 0, vec![(x, low), (x, high)]);
+            series.push(line.coloured(GREY).marked(Mark::Line));
+        }
+    }
+    for (index, agent) in results.settings.agents.iter().enumerate() {
+        let own = || traces.iter().filter(|trace| trace.agent == *agent);
+        let each: Vec<_> = own().map(|trace| trace.points.clone()).collect();
+        let curve = over_seeds(&each);
+        series.push(Series::line(agent, index, curve.points).banded(curve.band));
+        if index == 0 {
+            for task in 0..continual.tasks {
+                let ends = own().filter_map(|trace| trace.task(continual, task));
+                if let Some(end) = Spread::of(ends.map(|it| it.0)) {
+                    let x = length * task as f64;
+                    let line = vec![(x, end.mean), (x + length, end.mean)];
+                    series.push(Series::line("", 0, line).marked(Mark::Dashed));
+                }
+            }
+        }
+    }
+    series
+}

@@ -1,0 +1,74 @@
+//! The action affinity A of runs as heat maps, from their newest checkpoints.
+//! It computes nothing: A is what the learner last sent to the replay server.
+
+use anyhow::Context;
+use driml_figure::{Figure, Heat, Panel};
+use driml_launch::run_folder::RunFolder;
+use driml_learner::{AffinityEstimator, checkpoint};
+use driml_machine::error::usage;
+use driml_settings::config::RunConfig;
+
+use super::runs::folder_name;
+
+/// One heat map a run.
+///
+/// # Errors
+/// A folder without settings or checkpoint, a run whose agent does not learn A.
+pub(crate) fn figure(folders: &[RunFolder]) -> anyhow::Result<Figure> {
+    let panels = folders
+        .iter()
+        .map(|folder| heat(folder).map(Panel::Heat))
+        .collect::<anyhow::Result<Vec<_>>>()?;
+    Ok(Figure {
+        title: "Action affinity A of the newest checkpoint".into(),
+        notes: vec![
+            "A[i, j]: how much likelier action j follows action i than it is at all, as a softmax over j. \
+             The sampler looks one step further ahead with probability A."
+                .into(),
+        ],
+        columns: panels.len().min(2),
+        panel_size: (520.0, 440.0),
+        panels,
+    })
+}
+
+fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
+    let checkpoints = checkpoint::list(&folder.checkpoints())?;
+    let (updates, path) = checkpoints.last().ok_or_else(|| {
+        usage!(
+            "{} has no checkpoint, from which A is read: name the folder of a run that has one",
+            folder.display()
+        )
+    })?;
+    let path = path.join("state.json");
+    let doing = || format!("reading {}", path.display());
+    let text = std::fs::read_to_string(&path).with_context(doing)?;
+    let mut state: serde_json::Value = serde_json::from_str(&text).with_context(doing)?;
+    let affinity: Option<AffinityEstimator> =
+        serde_json::from_value(state["affinity"].take()).with_context(doing)?;
+    let affinity = affinity
+        .ok_or_else(|| usage!("{} has no A: only driml-ada learns one", folder.display()))?;
+    let side = affinity.num_actions();
+    let values = affinity.matrix().iter().map(|&a| Some(f64::from(a)));
+    let title = format!("{}, {updates} updates", folder_name(folder.path()));
+    Ok(Heat {
+        names: action_names(folder, side),
+        labels: ("next action".into(), "action".into()),
+        unit: "A [probability]".into(),
+        decimals: Some(2),
+        ..Heat::new(&title, side, values.collect())
+    })
+}
+
+/// The actions' names, or their numbers where the settings cannot be read.
+fn action_names(folder: &RunFolder, side: usize) -> Vec<String> {
+    let path = folder.config();
+    let config = std::fs::read_to_string(&path)
+        .ok()
+        .and_then(|text| RunConfig::parse("config.toml", &text).ok());
+    let names = config.map(|config| config.world.action_names());
+    match names {
+        Some(names) if names.len() == side => names.iter().map(|&name| name.to_owned()).collect(),
+        _ => (0..side).map(|action| action.to_string()).collect(),
+    }
+}

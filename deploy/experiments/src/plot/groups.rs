@@ -1,0 +1,226 @@
+//! Runs of one configuration and several seeds as one curve with a band.
+//! Between two recorded values it takes the straight line.
+
+use std::collections::VecDeque;
+
+use super::runs::{Run, SPREAD_OF_K};
+use crate::plot::flags::Band;
+
+/// Points of a curve over several runs.
+const GRID_POINTS: usize = 240;
+/// Most points of a single run's curve; of a longer one every second, third, ... is drawn.
+const POINTS_MAX: usize = 600;
+
+/// What is drawn as one line.
+#[derive(Debug)]
+pub(super) struct Group<'a> {
+    pub(super) name: String,
+    pub(super) runs: Vec<&'a Run>,
+}
+
+/// A line and its band over frames.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Curve {
+    pub(crate) points: Vec<(f64, f64)>,
+    pub(crate) band: Vec<(f64, f64, f64)>,
+}
+
+/// The runs, those that differ in their seed alone together if `together`; in the order in which they were named.
+///
+/// Settings that only the machine decides (processes, threads, size of the replay) do not part them.
+pub(super) fn of(runs: &[Run], together: bool) -> Vec<Group<'_>> {
+    let mut groups: Vec<Group<'_>> = Vec::new();
+    for run in runs {
+        let same = |group: &&mut Group<'_>| {
+            together && run.settings.is_some() && group.runs[0].settings == run.settings
+        };
+        match groups.iter_mut().find(same) {
+            Some(group) => group.runs.push(run),
+            None => groups.push(Group {
+                name: String::new(),
+                runs: vec![run],
+            }),
+        }
+    }
+    let names: Vec<String> = groups.iter().map(plain_name).collect();
+    for (group, name) in groups.iter_mut().zip(&names) {
+        let clashes = names.iter().filter(|other| *other == name).count() > 1;
+        group.name = if clashes && group.runs.len() > 1 {
+            format!("{name} ({}, ...)", group.runs[0].name)
+        } else {
+            name.clone()
+        };
+    }
+    groups
+}
+
+fn plain_name(group: &Group<'_>) -> String {
+    match &group.runs[..] {
+        [only] => only.name.clone(),
+        runs => {
+            let what = runs[0].what.as_deref().unwrap_or(&runs[0].name);
+            format!("{what}, {} seeds", runs.len())
+        }
+    }
+}
+
+impl Group<'_> {
+    /// The group's mean of a column, and its band.
+    ///
+    /// # Errors
+    /// A column that a run does not have.
+    pub(super) fn curve(
+        &self,
+        column: &str,
+        smooth: Option<u64>,
+        band: Band,
+    ) -> anyhow::Result<Curve> {
+        let mean = self.over_seeds(column, smooth, band)?;
+        let has_spread = self.runs.iter().all(|run| run.has_values(SPREAD_OF_K));
+        if column != "mean_k" || !has_spread {
+            return Ok(mean);
+        }
+        let spread = self.over_seeds(SPREAD_OF_K, smooth, band)?;
+        let around = mean.points.iter().map(|&(x, k)| {
+            let sd = between(&spread.points, x);
+            (x, k - sd, k + sd)
+        });
+        Ok(Curve {
+            band: around.collect(),
+            points: mean.points.clone(),
+        })
+    }
+
+    fn over_seeds(&self, column: &str, smooth: Option<u64>, band: Band) -> anyhow::Result<Curve> {
+        let mut each = Vec::new();
+        for run in &self.runs {
+            let mut values = run.values(column)?;
+            if let Some(frames) = smooth {
+                values = smoothed(&values, frames as f64);
+            }
+            if !values.is_empty() {
+                each.push(values);
+            }
+        }
+        Ok(match &each[..] {
+            [] => Curve::default(),
+            [only] => Curve {
+                points: thinned(only),
+                band: Vec::new(),
+            },
+            many => together(many, band),
+        })
+    }
+}
+
+/// One or several curves as one, with a band of their range if there are several.
+pub(crate) fn over_seeds(each: &[Vec<(f64, f64)>]) -> Curve {
+    let each: Vec<_> = each.iter().filter(|it| !it.is_empty()).cloned().collect();
+    match &each[..] {
+        [] => Curve::default(),
+        [only] => Curve {
+            points: thinned(only),
+            band: Vec::new(),
+        },
+        many => together(many, Band::Range),
+    }
+}
+
+/// Mean over the points of the last `frames` frames, at each point.
+pub(crate) fn smoothed(points: &[(f64, f64)], frames: f64) -> Vec<(f64, f64)> {
+    let mut window = VecDeque::new();
+    let mut smooth = Vec::with_capacity(points.len());
+    for &(x, y) in points {
+        window.push_back((x, y));
+        while window
+            .front()
+            .is_some_and(|(first, _)| *first <= x - frames)
+            && window.len() > 1
+        {
+            window.pop_front();
+        }
+        let sum: f64 = window.iter().map(|(_, y)| y).sum();
+        smooth.push((x, sum / window.len() as f64));
+    }
+    smooth
+}
+
+fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let step = points.len().div_ceil(POINTS_MAX).max(1);
+    let last = points.len().saturating_sub(1);
+    let kept = points.iter().enumerate();
+    kept.filter(|(index, _)| index % step == 0 || *index == last)
+        .map(|(_, point)| *point)
+        .collect()
+}
+
+/// Mean and band of several curves, over the frames that all of them have.
+fn together(curves: &[Vec<(f64, f64)>], band: Band) -> Curve {
+    let first = |curve: &Vec<(f64, f64)>| curve[0].0;
+    let last = |curve: &Vec<(f64, f64)>| curve[curve.len() - 1].0;
+    let start = curves.iter().map(first).fold(f64::NEG_INFINITY, f64::max);
+    let end = curves.iter().map(last).fold(f64::INFINITY, f64::min);
+    let mut curve = Curve::default();
+    if start > end {
+        return curve;
+    }
+    for i in 0..=GRID_POINTS {
+        let x = start + (end - start) * i as f64 / GRID_POINTS as f64;
+        let values: Vec<f64> = curves.iter().map(|points| between(points, x)).collect();
+        let n = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        let (low, high) = match band {
+            Band::Range => (
+                values.iter().copied().fold(f64::INFINITY, f64::min),
+                values.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+            ),
+            Band::Sd => {
+                let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+                let sd = (squares / (n - 1.0)).sqrt();
+                (mean - sd, mean + sd)
+            }
+        };
+        curve.points.push((x, mean));
+        curve.band.push((x, low, high));
+        if start == end {
+            break;
+        }
+    }
+    curve
+}
+
+/// The value at `x` on the line through `points`, which are in the order of x and not empty; beyond its ends, theirs.
+fn between(points: &[(f64, f64)], x: f64) -> f64 {
+    let after = points.partition_point(|point| point.0 < x);
+    match (after.checked_sub(1).map(|i| points[i]), points.get(after)) {
+        (Some((x0, y0)), Some(&(x1, y1))) => y0 + (y1 - y0) * (x - x0) / (x1 - x0),
+        (Some((_, y)), None) | (None, Some(&(_, y))) => y,
+        (None, None) => f64::NAN,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn between_points_lies_the_line() {
+        let points = [(0.0, 1.0), (10.0, 3.0), (10.0, 5.0), (20.0, 6.0)];
+        let at = |x| between(&points, x);
+        assert_eq!(
+            [at(-1.0), at(0.0), at(5.0), at(15.0), at(99.0)],
+            [1.0, 1.0, 2.0, 5.5, 6.0]
+        );
+    }
+
+    #[test]
+    fn a_band_of_standard_deviations() {
+        let curves = [vec![(0.0, 1.0), (10.0, 1.0)], vec![(0.0, 3.0), (10.0, 3.0)]];
+        let curve = together(&curves, Band::Sd);
+        let root = 2f64.sqrt();
+        assert_eq!(curve.points[0], (0.0, 2.0));
+        assert!((curve.band[0].1 - (2.0 - root)).abs() < 1e-12);
+        let apart = [vec![(0.0, 1.0)], vec![(5.0, 1.0)]];
+        assert!(together(&apart, Band::Sd).points.is_empty());
+    }
+}

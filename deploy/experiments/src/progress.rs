@@ -1,0 +1,139 @@
+//! How far an experiment is and how long the rest will take: a bar on a terminal, a line now and then elsewhere.
+//! It also hears Ctrl-C, as it is asked after every unit of work.
+
+use std::time::{Duration, Instant};
+
+use driml_launch::{console::Screen, interrupts::Interrupts};
+use driml_machine::{error::Interrupted, units::rough_duration};
+
+/// How often a line is written where there is no terminal.
+const PLAIN_PERIOD: Duration = Duration::from_secs(10);
+/// How often the bar is redrawn.
+const BAR_PERIOD: Duration = Duration::from_millis(200);
+const TEMPLATE: &str = "{bar:40} {percent:>3}%  {msg}";
+
+/// Counts units of work, such as updates.
+#[derive(Debug)]
+pub(super) struct Progress {
+    total: u64,
+    done: u64,
+    /// Done before this start: known, so no measure of speed.
+    found: u64,
+    started: Instant,
+    shown: Instant,
+    what: String,
+    screen: Screen,
+    interrupts: Interrupts,
+}
+
+impl Progress {
+    /// Of `total` units; listens for interrupts from now on.
+    pub(super) fn new(total: u64, interrupts: Interrupts) -> Self {
+        Self {
+            total,
+            done: 0,
+            found: 0,
+            started: Instant::now(),
+            shown: Instant::now(),
+            what: String::new(),
+            screen: Screen::new(total, TEMPLATE),
+            interrupts,
+        }
+    }
+
+    /// Says what is being done.
+    pub(super) fn begin(&mut self, what: &str) {
+        self.what = what.to_owned();
+    }
+
+    /// Counts work that an earlier start did.
+    pub(super) fn find(&mut self, units: u64) {
+        self.done += units;
+        self.found += units;
+    }
+
+    /// Counts work that was done in vain and has to be done again.
+    pub(super) fn again(&mut self, units: u64) {
+        self.total += units;
+        if let Some(bar) = self.screen.bar() {
+            bar.set_length(self.total);
+        }
+    }
+
+    /// Counts work done.
+    ///
+    /// # Errors
+    /// [`Interrupted`] if a person has asked to stop.
+    pub(super) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
+        self.done += units;
+        let period = if self.screen.bar().is_some() {
+            BAR_PERIOD
+        } else {
+            PLAIN_PERIOD
+        };
+        if self.shown.elapsed() >= period {
+            self.shown = Instant::now();
+            self.show();
+        }
+        if self.interrupts.count() > 0 {
+            self.clear();
+            return Err(Interrupted);
+        }
+        Ok(())
+    }
+
+    /// Writes a line above the bar.
+    pub(super) fn line(&self, line: &str) {
+        self.screen.line(line);
+    }
+
+    /// How often a person has asked to stop.
+    pub(super) fn wishes(&self) -> u32 {
+        self.interrupts.count()
+    }
+
+    /// Takes the bar away.
+    pub(super) fn clear(&self) {
+        self.screen.clear();
+    }
+
+    fn show(&self) {
+        let left = match self.seconds_left(self.started.elapsed().as_secs_f64()) {
+            Some(seconds) => format!("about {} left", rough_duration(seconds)),
+            None => "the time left is not known yet".to_owned(),
+        };
+        let line = format!("{}, {left}", self.what);
+        match self.screen.bar() {
+            Some(bar) => {
+                bar.set_position(self.done.min(self.total));
+                bar.set_message(line);
+            }
+            None => {
+                let percent = 100 * self.done / self.total.max(1);
+                self.screen.line(&format!("{percent:>3}%  {line}"));
+            }
+        }
+    }
+
+    /// At the speed so far; none before there is one.
+    fn seconds_left(&self, elapsed: f64) -> Option<f64> {
+        let fresh = self.done - self.found;
+        let left = self.total.saturating_sub(self.done);
+        (fresh > 0).then(|| elapsed / fresh as f64 * left as f64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_time_left_follows_from_the_work_of_this_start() {
+        let mut progress = Progress::new(100, Interrupts::default());
+        progress.find(40);
+        assert_eq!(progress.seconds_left(5.0), None);
+        progress.advance(10).unwrap();
+        assert_eq!(progress.seconds_left(5.0), Some(25.0));
+        assert!(indicatif::ProgressStyle::with_template(TEMPLATE).is_ok());
+    }
+}

@@ -1,0 +1,484 @@
+//! Whole runs as pieces of an experiment: `driml local` as child processes, a few at once, each in a folder of its own.
+//! A finished run is not run again; an unfinished one is resumed, or moved aside and started anew if it cannot be. It knows no
+//! experiment.
+
+use std::{
+    collections::VecDeque,
+    fs::{self, File, TryLockError},
+    io::{Read, Seek, SeekFrom},
+    os::unix::process::CommandExt,
+    path::{Path, PathBuf},
+    process::{Child, Command, Stdio},
+    time::{Duration, Instant},
+};
+
+use anyhow::Context;
+use driml_launch::{
+    child::exit_with_this_process,
+    resume,
+    run_folder::{
+        Outcome, Progress as HowFar, RunFolder, Summary, progress as how_far, write_whole,
+    },
+};
+use driml_machine::{
+    error::{EXIT_USAGE, usage},
+    resources::Machine,
+};
+use driml_settings::config::Flags;
+use nix::{
+    sys::signal::{Signal, kill},
+    unistd::Pid,
+};
+
+use super::{Progress, Session};
+
+/// Times that a run is tried in one call. A run may lose contact with its parts on a machine that is busy with much else.
+const TRIES: u32 = 2;
+/// Where the runs lie in an experiment's folder. Git does not keep them.
+const RUNS: &str = "runs";
+/// How often running children are looked at.
+const POLL: Duration = Duration::from_millis(250);
+/// How long children may take to save once they were asked to stop; after that they are killed.
+const DRAIN_MAX: Duration = Duration::from_secs(240);
+/// Bytes at the end of a run's output that are shown if it fails.
+const LAST_WORDS_BYTES: u64 = 1200;
+
+/// A run to be made.
+#[derive(Clone, Debug)]
+pub(super) struct Plan {
+    /// Its folder's name.
+    pub(super) name: String,
+    /// What follows `driml local`.
+    pub(super) args: Vec<String>,
+    /// Its length.
+    pub(super) frames: u64,
+    /// Episodes after which it is long enough, if that comes first.
+    pub(super) episodes: Option<u64>,
+    /// Its share of the experiment's work.
+    pub(super) units: u64,
+}
+
+/// A finished run.
+#[derive(Clone, Debug)]
+pub(super) struct Ran {
+    pub(super) folder: RunFolder,
+    pub(super) summary: Summary,
+}
+
+/// Makes all runs, `jobs` at once, in the order of `plans`; with `report` it makes none. The result has a place for each
+/// plan: none where the run is missing or failed.
+///
+/// # Errors
+/// An interrupt, after the running ones were stopped; settings that cannot work; a file system that refuses.
+pub(super) fn run_all(
+    session: &mut Session,
+    plans: &[Plan],
+    jobs: u32,
+    report: bool,
+) -> anyhow::Result<Vec<Option<Ran>>> {
+    let (folder, progress) = session.work();
+    let root = folder.join(RUNS);
+    fs::create_dir_all(&root).with_context(|| format!("making {}", root.display()))?;
+    let mut queue = Queue {
+        root,
+        jobs,
+        waiting: VecDeque::new(),
+        running: Vec::new(),
+    };
+    for plan in plans {
+        if queue.finished(plan).is_some() {
+            progress.find(plan.units);
+        } else if !report {
+            queue.waiting.push_back((0, plan.clone()));
+        }
+    }
+    let made = queue.make(progress);
+    if made.is_err() {
+        queue.stop(progress);
+    }
+    made?;
+    let ran: Vec<_> = plans.iter().map(|plan| queue.finished(plan)).collect();
+    let seconds = ran.iter().flatten().map(|it| it.summary.wall_seconds);
+    session.spend(seconds.sum(), jobs);
+    Ok(ran)
+}
+
+/// Makes sure that no run is missing, unless a report of what there is was asked for.
+///
+/// # Errors
+/// The names of those that are.
+pub(super) fn check_made(missing: &[String], report_only: bool) -> anyhow::Result<()> {
+    anyhow::ensure!(
+        missing.is_empty() || report_only,
+        "these runs failed and are in no number of the page; the same command tries them again: {}",
+        missing.join(", ")
+    );
+    Ok(())
+}
+
+struct Queue {
+    root: PathBuf,
+    /// Runs at once.
+    jobs: u32,
+    /// How often each was tried, and its plan.
+    waiting: VecDeque<(u32, Plan)>,
+    running: Vec<Running>,
+}
+
+/// A child and how far it is.
+struct Running {
+    plan: Plan,
+    /// Which try this is, from 1.
+    tried: u32,
+    resumed: bool,
+    child: Child,
+    /// Of the plan's units.
+    done: u64,
+    /// Asked to stop, as it is long enough.
+    enough: bool,
+}
+
+impl Queue {
+    /// The plan's run, if it is there, was made by this plan, and is whole and long enough.
+    fn finished(&self, plan: &Plan) -> Option<Ran> {
+        if !self.is_made_by(plan) {
+            return None;
+        }
+        let folder = self.folder(plan);
+        how_far(&folder)?;
+        let summary = Summary::read(&folder).ok()?;
+        let enough = plan.episodes.is_some_and(|all| summary.episodes >= all);
+        let good = match summary.outcome {
+            Outcome::Finished => true,
+            Outcome::Interrupted => enough,
+            Outcome::Failed => false,
+        };
+        good.then_some(Ran { folder, summary })
+    }
+
+    /// Whether what lies in the plan's folder was begun by this very plan.
+    fn is_made_by(&self, plan: &Plan) -> bool {
+        let call = fs::read(self.call(plan)).ok();
+        let call = call.and_then(|text| serde_json::from_slice::<Vec<String>>(&text).ok());
+        call.is_some_and(|args| args == plan.args)
+    }
+
+    /// Starts and watches until nothing waits or runs.
+    fn make(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
+        loop {
+            while self.running.len() < self.jobs as usize
+                && let Some((tried, plan)) = self.waiting.pop_front()
+            {
+                let running = self.start(plan, tried + 1, progress)?;
+                self.running.push(running);
+            }
+            if self.running.is_empty() {
+                return Ok(());
+            }
+            let names = self.running.iter().map(|it| it.plan.name.as_str());
+            let waiting = self.waiting.len();
+            progress.begin(&format!(
+                "{}; {waiting} waiting",
+                names.collect::<Vec<_>>().join(", ")
+            ));
+            std::thread::sleep(POLL);
+            self.look(progress)?;
+            progress.advance(0)?;
+        }
+    }
+
+    /// Counts what the children did, and sees to those that ended.
+    fn look(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
+        let mut at = 0;
+        while at < self.running.len() {
+            let running = &mut self.running[at];
+            let plan = &running.plan;
+            let folder = RunFolder::new(self.root.join(&plan.name));
+            let HowFar { frames, episodes } = how_far(&folder).unwrap_or_default();
+            let share = |part: u64, all: u64| part as f64 / all.max(1) as f64;
+            let share = plan
+                .episodes
+                .map_or(0.0, |all| share(episodes, all))
+                .max(share(frames, plan.frames));
+            let done = (share.min(1.0) * plan.units as f64) as u64;
+            let fresh = done.saturating_sub(running.done);
+            running.done += fresh;
+            progress.advance(fresh)?;
+            if plan.episodes.is_some_and(|all| episodes >= all) && !running.enough {
+                running.enough = true;
+                signal(&running.child, Signal::SIGTERM);
+            }
+            let ended = running.child.try_wait();
+            match ended.with_context(|| format!("waiting for {}", running.plan.name))? {
+                None => at += 1,
+                Some(status) => {
+                    let Running {
+                        plan,
+                        tried,
+                        resumed,
+                        done,
+                        ..
+                    } = self.running.remove(at);
+                    if self.finished(&plan).is_some() {
+                        progress.advance(plan.units - done)?;
+                        continue;
+                    }
+                    let words = last_words(&self.log(&plan));
+                    let name = &plan.name;
+                    // Settings that cannot work will not work for the others either.
+                    if status.code() == Some(EXIT_USAGE.into()) && !resumed {
+                        return Err(usage!("the run {name} cannot be made:\n{words}").into());
+                    }
+                    if tried < TRIES {
+                        progress.line(&format!(
+                            "the run {name} failed ({status}) and is tried once more. Its last words:\n{words}"
+                        ));
+                        progress.again(done);
+                        self.waiting.push_back((tried, plan));
+                    } else {
+                        progress.line(&format!(
+                            "the run {name} failed again ({status}) and is left out. Its last words:\n{words}"
+                        ));
+                        progress.advance(plan.units - done)?;
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn folder(&self, plan: &Plan) -> RunFolder {
+        RunFolder::new(self.root.join(&plan.name))
+    }
+
+    /// Where the arguments are that a run was made with.
+    fn call(&self, plan: &Plan) -> PathBuf {
+        self.root.join(format!("{}.call.json", plan.name))
+    }
+
+    fn log(&self, plan: &Plan) -> PathBuf {
+        self.root.join(format!("{}.log", plan.name))
+    }
+
+    /// Starts a run in a process group of its own, so that Ctrl-C reaches it through us alone.
+    fn start(&self, plan: Plan, tried: u32, progress: &mut Progress) -> anyhow::Result<Running> {
+        let path = self.log(&plan);
+        let doing = || format!("making {}", path.display());
+        let log = File::options()
+            .create(true)
+            .append(true)
+            .open(&path)
+            .with_context(doing)?;
+        self.wait_for_the_last(&log, &plan, progress)?;
+        log.set_len(0).with_context(doing)?;
+        let folder = self.folder(&plan).path().to_owned();
+        let resumed = folder.exists() && self.can_go_on(&plan, tried, progress)?;
+        if !resumed && let Some(aside) = move_aside(&folder)? {
+            progress.line(&format!(
+                "{} was not finished, or is of another call: it is now {}, and the run starts anew",
+                folder.display(),
+                aside.display()
+            ));
+        }
+        let call = serde_json::to_vec(&plan.args).context("writing down a call")?;
+        write_whole(&self.call(&plan), &call)?;
+        let program = std::env::current_exe().context("finding this program's own file")?;
+        let mut command = Command::new(program);
+        command.arg("local").args(exit_with_this_process());
+        if resumed {
+            command.arg("--resume").arg(&folder);
+        } else {
+            command.arg("--run-dir").arg(&folder);
+            command.args(self.threads()).args(&plan.args);
+        }
+        command
+            .stdin(Stdio::null())
+            .stdout(log.try_clone().with_context(doing)?)
+            .stderr(log)
+            .process_group(0);
+        let starting = || format!("starting the run {}", plan.name);
+        let child = command.spawn().with_context(starting)?;
+        Ok(Running {
+            plan,
+            tried,
+            resumed,
+            child,
+            done: 0,
+            enough: false,
+        })
+    }
+
+    /// Whether what lies in the plan's folder goes on: at the first try alone, as its checkpoint may be what fails.
+    fn can_go_on(&self, plan: &Plan, tried: u32, progress: &mut Progress) -> anyhow::Result<bool> {
+        let folder = self.folder(plan);
+        resume::wait_until_free(&folder)?;
+        if tried > 1 || !self.is_made_by(plan) {
+            return Ok(false);
+        }
+        match resume::find(&folder, &Flags::default(), &Machine::this()) {
+            Ok(_) => {
+                progress.line(&format!("{} goes on from its checkpoint", folder.display()));
+                Ok(true)
+            }
+            Err(e) => {
+                progress.line(&format!("{} cannot go on: {e:#}", folder.display()));
+                Ok(false)
+            }
+        }
+    }
+
+    /// The cores shared out among the runs at once, so that their learners do not get in each other's way.
+    fn threads(&self) -> Vec<String> {
+        if self.jobs == 1 {
+            return Vec::new();
+        }
+        let threads = (Machine::this().cores / self.jobs).max(1);
+        vec!["--set".into(), format!("local.learner_threads={threads}")]
+    }
+
+    /// A run whose parent was killed still saves what it has. It holds its log's lock, as a child shares our open file, so
+    /// that two never write into one folder.
+    fn wait_for_the_last(
+        &self,
+        log: &File,
+        plan: &Plan,
+        progress: &mut Progress,
+    ) -> anyhow::Result<()> {
+        let mut said = false;
+        loop {
+            match log.try_lock() {
+                Ok(()) => return Ok(()),
+                Err(TryLockError::Error(e)) => {
+                    return Err(e).context("locking a run's log");
+                }
+                Err(TryLockError::WouldBlock) => {}
+            }
+            if !said {
+                said = true;
+                let name = &plan.name;
+                progress.line(&format!(
+                    "an earlier {name} still runs or saves: waiting for it"
+                ));
+            }
+            std::thread::sleep(POLL);
+            progress.advance(0)?;
+        }
+    }
+
+    /// Asks all children to stop and waits until they have saved; a second wish, or too long a time, kills them.
+    fn stop(&mut self, progress: &Progress) {
+        if self.running.is_empty() {
+            return;
+        }
+        progress
+            .line("stopping the runs; the same command goes on with those that are not finished");
+        for running in &self.running {
+            signal(&running.child, Signal::SIGTERM);
+        }
+        let wishes = progress.wishes().max(1);
+        let deadline = Instant::now() + DRAIN_MAX;
+        while !self.running.is_empty() {
+            if progress.wishes() > wishes || Instant::now() > deadline {
+                for running in &mut self.running {
+                    // It may have ended by itself in this moment.
+                    let _ = running.child.kill();
+                    let _ = running.child.wait();
+                }
+                return;
+            }
+            self.running
+                .retain_mut(|running| matches!(running.child.try_wait(), Ok(None)));
+            std::thread::sleep(POLL);
+        }
+    }
+}
+
+fn signal(child: &Child, signal: Signal) {
+    // It was not waited for yet, so the number is its own.
+    if let Err(e) = kill(Pid::from_raw(child.id() as i32), signal) {
+        tracing::debug!("sending {signal}: {e}");
+    }
+}
+
+/// Renames what lies at `folder`, if anything does; says where it is now.
+fn move_aside(folder: &Path) -> anyhow::Result<Option<PathBuf>> {
+    if !folder.exists() {
+        return Ok(None);
+    }
+    let name = |number: u32| {
+        let mut name = folder.as_os_str().to_owned();
+        name.push(format!(".unfinished-{number}"));
+        PathBuf::from(name)
+    };
+    let free = (1..).map(name).find(|path| !path.exists());
+    let aside = free.expect("there are more numbers than folders");
+    fs::rename(folder, &aside).with_context(|| format!("moving {} aside", folder.display()))?;
+    Ok(Some(aside))
+}
+
+fn last_words(log: &Path) -> String {
+    tail(log, LAST_WORDS_BYTES).unwrap_or_default()
+}
+
+/// The end of a file.
+fn tail(path: &Path, bytes: u64) -> Option<String> {
+    let mut file = File::open(path).ok()?;
+    let length = file.metadata().ok()?.len();
+    file.seek(SeekFrom::Start(length.saturating_sub(bytes)))
+        .ok()?;
+    let mut end = Vec::new();
+    file.read_to_end(&mut end).ok()?;
+    Some(String::from_utf8_lossy(&end).into_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_protocol::{LearnerStatus, ReplayStatus};
+
+    use super::*;
+    use crate::made_up;
+    use driml_launch::run_folder::Recorder;
+
+    #[test]
+    fn a_run_counts_for_the_plan_that_made_it_alone() {
+        let root = tempfile::tempdir().unwrap();
+        let queue = Queue {
+            root: root.path().to_owned(),
+            jobs: 1,
+            waiting: VecDeque::new(),
+            running: Vec::new(),
+        };
+        let plan = |frames: u64| Plan {
+            name: "run".into(),
+            args: vec!["--frames".into(), frames.to_string()],
+            frames,
+            episodes: None,
+            units: frames,
+        };
+        let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
+        let folder = RunFolder::new(queue.root.join("run"));
+        let mut recorder = Recorder::create(&folder, "", &[], &[]).unwrap();
+        recorder.record(std::slice::from_ref(&replay), &learner, &[]);
+        let summary = recorder.summarise(Outcome::Finished, &made_up::spec(), &replay, &learner);
+        summary.write(&folder).unwrap();
+        assert!(queue.finished(&plan(10)).is_none(), "nobody knows its call");
+        let call = serde_json::to_vec(&plan(10).args).unwrap();
+        fs::write(queue.call(&plan(10)), call).unwrap();
+        assert!(queue.finished(&plan(10)).is_some());
+        assert!(queue.finished(&plan(20)).is_none());
+        fs::write(folder.metrics(), "seconds,frames\n").unwrap();
+        assert!(queue.finished(&plan(10)).is_none(), "its metrics are gone");
+    }
+
+    #[test]
+    fn what_is_in_the_way_is_moved_and_kept() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("run");
+        assert_eq!(move_aside(&folder).unwrap(), None);
+        for number in 1..3 {
+            fs::create_dir(&folder).unwrap();
+            let aside = move_aside(&folder).unwrap().unwrap();
+            assert!(aside.ends_with(format!("run.unfinished-{number}")) && aside.exists());
+        }
+    }
+}

@@ -1,0 +1,387 @@
+//! The global DIM heads on one-hot states, trained by InfoNCE on pairs of successive states.
+//! Heads, loss and optimiser are the learner's own; there is no torso, action or return.
+
+use candle_core::{Device, Tensor};
+use driml_learner::{
+    Lambda,
+    auxiliary::dim::{Dim, dots},
+    optimiser::{
+        adam::Adam,
+        gradients::{Gradients, clip_factor},
+    },
+};
+use driml_model::{ConvLayer, Features, ModelConfig, Network, Operations, Parameters};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::{Settings, chain::Chain};
+use crate::Progress;
+
+/// Ratio between the updates of two measurements.
+const MEASURE_GROWTH: f64 = 1.04;
+/// Rows in the replay before the first update, where one walker fills it.
+const WARMUP_TRANSITIONS: usize = 16;
+
+/// Where the pairs come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum Sampling {
+    /// Independent, the first state from the stationary law: no mixing to wait for.
+    Stationary,
+    /// Many walkers that all start in the lowest state; update t learns from their t-th step. The paper's proposition.
+    FromOneEnd,
+    /// One walker fills a replay, a few steps an update, and batches are drawn from all of it: as in a run.
+    OneWalker,
+}
+
+impl Sampling {
+    pub(super) const ALL: [Self; 3] = [Self::Stationary, Self::FromOneEnd, Self::OneWalker];
+
+    /// As figures and files name it.
+    pub(super) const fn name(self) -> &'static str {
+        match self {
+            Self::Stationary => "stationary",
+            Self::FromOneEnd => "from-one-end",
+            Self::OneWalker => "one-walker",
+        }
+    }
+}
+
+/// What a training left, measured without noise: from the scores of all K * K pairs.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct Learnt {
+    /// When it was measured.
+    pub(super) updates: Vec<u64>,
+    /// How far InfoNCE's loss with ever so many negatives is above its minimum, in nats: E_rho KL(T_i || learnt T_i).
+    pub(super) excess: Vec<f64>,
+    /// Error of the law of the next state, a probability: E_rho of the total variation between T_i and learnt T_i.
+    pub(super) tv: Vec<f64>,
+    /// The learnt ratio [K, K] at the end.
+    pub(super) ratio: Vec<f64>,
+}
+
+/// Trains once.
+///
+/// # Errors
+/// A failing tensor operation, an interrupt.
+pub(super) fn train(
+    chain: &Chain,
+    settings: &Settings,
+    sampling: Sampling,
+    seed: u64,
+    progress: &mut Progress,
+) -> anyhow::Result<Learnt> {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut heads = Heads::new(chain.states, settings, &mut rng)?;
+    let mut source = Source::new(chain, settings, sampling, &mut rng);
+    let (mut learnt, mut measure_next) = (
+        Learnt {
+            updates: vec![],
+            excess: vec![],
+            tv: vec![],
+            ratio: vec![],
+        },
+        0,
+    );
+    for update in 0..=settings.updates {
+        if update >= measure_next || update == settings.updates {
+            learnt.measure(update, chain, heads.scores()?);
+            measure_next = ((update as f64 * MEASURE_GROWTH).ceil() as u64).max(update + 1);
+        }
+        if update < settings.updates {
+            let pairs = source.batch(chain, &mut rng);
+            heads.learn(&pairs)?;
+            progress.advance(1)?;
+        }
+    }
+    Ok(learnt)
+}
+
+impl Learnt {
+    /// Adds a measurement of the scores [K, K].
+    ///
+    /// At its optimum InfoNCE's score is ln(T_ij / rho_j) up to a number for each i, which the softmax cannot see; it is
+    /// fixed by sum_j rho_j ratio_ij = 1, which T / rho fulfils.
+    fn measure(&mut self, update: u64, chain: &Chain, scores: Vec<f64>) {
+        let k = chain.states;
+        let (t, rho) = (chain.transitions(), chain.stationary());
+        let mut ratio = Vec::with_capacity(k * k);
+        for row in scores.chunks(k) {
+            let largest = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            let weights = row.iter().map(|score| (score - largest).exp());
+            let weights: Vec<f64> = weights.collect();
+            let sum: f64 = weights.iter().zip(&rho).map(|(w, rho)| w * rho).sum();
+            ratio.extend(weights.iter().map(|w| w / sum));
+        }
+        let (mut excess, mut tv) = (0.0, 0.0);
+        for at in 0..k * k {
+            let (i, j) = (at / k, at % k);
+            let learnt = rho[j] * ratio[at];
+            if t[at] > 0.0 {
+                excess += rho[i] * t[at] * (t[at] / learnt).ln();
+            }
+            tv += 0.5 * rho[i] * (t[at] - learnt).abs();
+        }
+        self.updates.push(update);
+        // Rounding can take a perfect fit a hair below 0.
+        self.excess.push(excess.max(0.0));
+        self.tv.push(tv);
+        self.ratio = ratio;
+    }
+
+    /// The first measured update at which `measure` is at `reached` or below; none if it never was.
+    pub(super) fn updates_to(&self, measure: &[f64], reached: f64) -> Option<u64> {
+        let at = measure.iter().position(|value| *value <= reached)?;
+        Some(self.updates[at])
+    }
+}
+
+/// The heads Psi_4 and Phi_4 with their optimiser.
+struct Heads {
+    parameters: Parameters,
+    network: Network,
+    adam: Adam,
+    dim: Dim,
+    max_grad_norm: f64,
+    states: usize,
+    rkhs: usize,
+}
+
+impl Heads {
+    fn new(states: usize, settings: &Settings, rng: &mut ChaCha8Rng) -> anyhow::Result<Self> {
+        let lambda = Lambda {
+            l3t3: 0.0,
+            l3t4: 0.0,
+            l4t3: 0.0,
+            l4t4: 1.0,
+        };
+        // The heads read f4, which is here the one-hot state itself; torso and C51 head are as small as can be, and
+        // no loss reaches them.
+        let model = ModelConfig {
+            height: 1,
+            width: 1,
+            channels: 1,
+            num_actions: 1,
+            atoms: 2,
+            v_min: 0.0,
+            v_max: 1.0,
+            conv: vec![ConvLayer {
+                out: 1,
+                kernel: 1,
+                stride: 1,
+            }],
+            hidden: states,
+            rkhs: settings.rkhs,
+            action_embed: 1,
+            dim: lambda.dim_parts(false),
+        };
+        let parameters = Parameters::init(&model, rng, &Device::Cpu)?;
+        Ok(Self {
+            network: Network::new(&model, &parameters)?,
+            adam: Adam::new(settings.adam, &parameters, Operations::Own)?,
+            parameters,
+            dim: Dim {
+                lambda,
+                tanh_clip: settings.tanh_clip,
+            },
+            max_grad_norm: settings.max_grad_norm,
+            states,
+            rkhs: settings.rkhs,
+        })
+    }
+
+    fn features(&self, states: impl ExactSizeIterator<Item = usize>) -> anyhow::Result<Features> {
+        let rows = states.len();
+        let mut one_hot = vec![0f32; rows * self.states];
+        for (row, state) in states.enumerate() {
+            one_hot[row * self.states + state] = 1.0;
+        }
+        Ok(Features {
+            f3: Tensor::zeros((rows, 1, 1, 1), candle_core::DType::F32, &Device::Cpu)?,
+            f4: Tensor::from_vec(one_hot, (rows, self.states), &Device::Cpu)?,
+        })
+    }
+
+    /// One update on pairs (s_t, s_{t+1}).
+    fn learn(&mut self, pairs: &[(usize, usize)]) -> anyhow::Result<()> {
+        let now = self.features(pairs.iter().map(|pair| pair.0))?;
+        let next = self.features(pairs.iter().map(|pair| pair.1))?;
+        let action = Tensor::zeros(pairs.len(), candle_core::DType::U8, &Device::Cpu)?;
+        let valid = vec![1; pairs.len()];
+        let losses = self
+            .dim
+            .pair_losses(&self.network, &now, &next, &action, &valid)?;
+        for loss in losses.iter().flatten() {
+            let gradients = Gradients::take(&self.parameters, loss.backward()?)?;
+            let factor = clip_factor(gradients.norm(Operations::Own)?, self.max_grad_norm);
+            self.adam.step(&self.parameters, &gradients, factor)?;
+        }
+        Ok(())
+    }
+
+    /// Scores [K, K] of each state with each.
+    fn scores(&self) -> anyhow::Result<Vec<f64>> {
+        let all = self.features(0..self.states)?;
+        let action = Tensor::zeros(self.states, candle_core::DType::U8, &Device::Cpu)?;
+        let wanted = self.dim.lambda.wanted();
+        let [_, _, _, global] = dots(&self.network, &all, &all, &action, wanted)?;
+        let global = global.expect("lambda_4t4 is above 0");
+        let values = global.dots.flatten_all()?.to_vec1::<f32>()?;
+        let scores = self.dim.scores(self.rkhs);
+        Ok(values.iter().map(|&dot| scores.score(dot)).collect())
+    }
+}
+
+/// Draws batches of pairs.
+struct Source {
+    sampling: Sampling,
+    rows: usize,
+    steps_per_update: usize,
+    stationary: Vec<f64>,
+    walkers: Vec<usize>,
+    replay: Vec<(usize, usize)>,
+}
+
+impl Source {
+    fn new(chain: &Chain, settings: &Settings, sampling: Sampling, rng: &mut ChaCha8Rng) -> Self {
+        let rows = settings.batch_rows;
+        let mut this = Self {
+            sampling,
+            rows,
+            steps_per_update: ((rows as f64 / settings.replay_ratio).round() as usize).max(1),
+            stationary: chain.stationary(),
+            walkers: vec![0; rows],
+            replay: Vec::new(),
+        };
+        if sampling == Sampling::OneWalker {
+            this.walk(chain, WARMUP_TRANSITIONS, rng);
+        }
+        this
+    }
+
+    fn walk(&mut self, chain: &Chain, steps: usize, rng: &mut ChaCha8Rng) {
+        for _ in 0..steps {
+            let state = self.walkers[0];
+            self.walkers[0] = chain.step(state, rng);
+            self.replay.push((state, self.walkers[0]));
+        }
+    }
+
+    fn batch(&mut self, chain: &Chain, rng: &mut ChaCha8Rng) -> Vec<(usize, usize)> {
+        match self.sampling {
+            Sampling::Stationary => (0..self.rows)
+                .map(|_| {
+                    let state = draw(&self.stationary, rng);
+                    (state, chain.step(state, rng))
+                })
+                .collect(),
+            Sampling::FromOneEnd => self
+                .walkers
+                .iter_mut()
+                .map(|walker| {
+                    let state = *walker;
+                    *walker = chain.step(state, rng);
+                    (state, *walker)
+                })
+                .collect(),
+            Sampling::OneWalker => {
+                self.walk(chain, self.steps_per_update, rng);
+                let all = &self.replay;
+                (0..self.rows)
+                    .map(|_| all[rng.random_range(0..all.len())])
+                    .collect()
+            }
+        }
+    }
+}
+
+/// An index drawn by its probability.
+fn draw(law: &[f64], rng: &mut ChaCha8Rng) -> usize {
+    let mut left: f64 = rng.random();
+    for (index, p) in law.iter().enumerate() {
+        left -= p;
+        if left < 0.0 {
+            return index;
+        }
+    }
+    law.len() - 1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use driml_launch::interrupts::Interrupts;
+
+    fn settings() -> Settings {
+        let text = include_str!("config.toml");
+        toml::from_str(text).unwrap()
+    }
+
+    #[test]
+    fn true_ratios_measure_as_no_error() {
+        let chain = Chain {
+            states: 6,
+            alpha: 0.3,
+        };
+        let (t, rho) = (chain.transitions(), chain.stationary());
+        // Any number may be added to a row; a pair that never comes has a score far below the others.
+        let scores = (0..36)
+            .map(|at| (t[at] / rho[at % 6]).max(1e-300).ln() + (at / 6) as f64)
+            .collect();
+        let mut learnt = Learnt {
+            updates: vec![],
+            excess: vec![],
+            tv: vec![],
+            ratio: vec![],
+        };
+        learnt.measure(3, &chain, scores);
+        assert!(learnt.excess[0] < 1e-12 && learnt.tv[0] < 1e-12);
+        for (at, ratio) in learnt.ratio.iter().enumerate() {
+            assert!((ratio - t[at] / rho[at % 6]).abs() < 1e-9);
+        }
+        assert_eq!(learnt.updates_to(&learnt.tv, 0.1), Some(3));
+        assert_eq!(learnt.updates_to(&learnt.tv, -1.0), None);
+    }
+
+    #[test]
+    fn constant_scores_miss_exactly_the_mutual_information() {
+        let chain = Chain {
+            states: 6,
+            alpha: 0.3,
+        };
+        let mut learnt = Learnt {
+            updates: vec![],
+            excess: vec![],
+            tv: vec![],
+            ratio: vec![],
+        };
+        learnt.measure(0, &chain, vec![0.5; 36]);
+        assert!((learnt.excess[0] - chain.mutual_information()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn every_sampling_learns_the_ratios_and_repeats_by_its_seed() {
+        let settings = Settings {
+            updates: 300,
+            ..settings()
+        };
+        let chain = Chain {
+            states: 4,
+            alpha: 0.4,
+        };
+        for sampling in Sampling::ALL {
+            let train = || {
+                let mut progress = Progress::new(1, Interrupts::default());
+                train(&chain, &settings, sampling, 5, &mut progress).unwrap()
+            };
+            let learnt = train();
+            let (first, last) = (learnt.tv[0], learnt.tv[learnt.tv.len() - 1]);
+            assert!(
+                last < 0.1 && last < first / 3.0,
+                "{sampling:?}: {first} to {last}"
+            );
+            assert_eq!(train().ratio, learnt.ratio);
+        }
+    }
+}

@@ -1,0 +1,264 @@
+//! An experiment's folder: finished pieces of its grid, its data and its figures.
+//! It knows no experiment; what a piece is and what follows from all of them is theirs.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    time::Instant,
+};
+
+use anyhow::Context;
+use driml_figure::Figure;
+use driml_launch::{
+    console::{self, print},
+    interrupts::Interrupts,
+    run_folder::write_whole,
+};
+use driml_machine::error::{Interrupted, usage};
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+
+use super::{Page, Progress};
+use crate::flags::ExperimentFlags;
+
+/// Finished pieces, one file each, and the settings they were made with. Git does not keep it.
+const PIECES: &str = "pieces";
+const SETTINGS: &str = "settings.json";
+
+/// A finished piece as it is kept.
+#[derive(Serialize, Deserialize)]
+struct Kept<T> {
+    /// Of what it was made, such as the hash of weights; empty if of the settings alone.
+    #[serde(default)]
+    of: String,
+    seconds: f64,
+    result: T,
+}
+
+/// An experiment under way.
+#[derive(Debug)]
+pub(super) struct Session {
+    folder: PathBuf,
+    progress: Progress,
+    seconds: f64,
+    /// Of how many pieces at once this is the sum.
+    at_once: u32,
+}
+
+impl Session {
+    /// Opens the folder, or makes it. `units` is the work of all pieces together.
+    ///
+    /// # Errors
+    /// A folder whose pieces were made with other settings, a file system that refuses.
+    pub(super) fn open(
+        name: &str,
+        flags: &ExperimentFlags,
+        settings: &impl Serialize,
+        units: u64,
+    ) -> anyhow::Result<Self> {
+        let folder = folder(name, flags);
+        let pieces = folder.join(PIECES);
+        fs::create_dir_all(&pieces).with_context(|| format!("making {}", pieces.display()))?;
+        let settings = serde_json::to_vec_pretty(settings).context("writing down the settings")?;
+        let path = pieces.join(SETTINGS);
+        match fs::read(&path) {
+            Ok(found) if found == settings => {}
+            Ok(_) => {
+                return Err(usage!(
+                    "{} holds what was made with other settings: choose another --out, or remove that folder",
+                    folder.display()
+                )
+                .into());
+            }
+            Err(_) => write_whole(&path, &settings)?,
+        }
+        let interrupts = Interrupts::listen(None).context("listening for interrupts")?;
+        Ok(Self {
+            folder,
+            progress: Progress::new(units, interrupts),
+            seconds: 0.0,
+            at_once: 1,
+        })
+    }
+
+    /// [`Session::open`] of an experiment that is a queue of runs. For a report alone it makes no folder.
+    ///
+    /// # Errors
+    /// A report where nothing was made yet; as for [`Session::open`].
+    pub(super) fn open_queue(
+        name: &str,
+        flags: &ExperimentFlags,
+        settings: &impl Serialize,
+        units: u64,
+        report_only: bool,
+    ) -> anyhow::Result<Self> {
+        let folder = folder(name, flags);
+        if report_only && !folder.join(PIECES).join(SETTINGS).is_file() {
+            return Err(usage!(
+                "nothing was made in {} yet: there is nothing to report",
+                folder.display()
+            )
+            .into());
+        }
+        Self::open(name, flags, settings, units)
+    }
+
+    /// Where everything goes.
+    pub(super) fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// The folder, and the progress of work that keeps itself there.
+    pub(super) fn work(&mut self) -> (&Path, &mut Progress) {
+        (&self.folder, &mut self.progress)
+    }
+
+    /// Counts the time that such work took, added up over runs of which so many are made at once.
+    pub(super) fn spend(&mut self, seconds: f64, at_once: u32) {
+        self.seconds += seconds;
+        self.at_once = at_once;
+    }
+
+    /// The piece of this name, which is `units` of work: read if it is there, else made and kept.
+    ///
+    /// # Errors
+    /// What `make` says; an interrupt; a file system that refuses.
+    pub(super) fn piece<T: Serialize + DeserializeOwned>(
+        &mut self,
+        key: &str,
+        units: u64,
+        make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
+        self.piece_of("", key, units, make)
+    }
+
+    /// [`Session::piece`] that was made of something which may have changed since, and then is made anew: `of` names it.
+    ///
+    /// # Errors
+    /// As for [`Session::piece`].
+    pub(super) fn piece_of<T: Serialize + DeserializeOwned>(
+        &mut self,
+        of: &str,
+        key: &str,
+        units: u64,
+        make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
+        let path = self.folder.join(PIECES).join(format!("{key}.json"));
+        let found: Option<Kept<T>> = fs::read(&path)
+            .ok()
+            .and_then(|text| serde_json::from_slice(&text).ok());
+        // A piece that cannot be read is made again.
+        if let Some(kept) = found.filter(|kept| kept.of == of) {
+            self.progress.find(units);
+            self.seconds += kept.seconds;
+            return Ok(kept.result);
+        }
+        self.progress.begin(key);
+        let started = Instant::now();
+        let result = make(&mut self.progress).inspect_err(|e| {
+            if e.is::<Interrupted>() {
+                console::line("stopped; the same command goes on from the last whole piece");
+            }
+        })?;
+        let kept = Kept {
+            of: of.into(),
+            seconds: started.elapsed().as_secs_f64(),
+            result,
+        };
+        write_whole(
+            &path,
+            &serde_json::to_vec(&kept).context("keeping a piece")?,
+        )?;
+        self.seconds += kept.seconds;
+        Ok(kept.result)
+    }
+
+    /// Writes rows of data as `name.csv`.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn csv(
+        &self,
+        name: &str,
+        header: &[&str],
+        rows: impl IntoIterator<Item = Vec<String>>,
+    ) -> anyhow::Result<()> {
+        let path = self.folder.join(format!("{name}.csv"));
+        let doing = || format!("writing {}", path.display());
+        let mut file = csv::Writer::from_path(&path).with_context(doing)?;
+        file.write_record(header).with_context(doing)?;
+        for row in rows {
+            file.write_record(&row).with_context(doing)?;
+        }
+        file.flush().with_context(doing)
+    }
+
+    /// Writes a figure as SVG and PNG.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn figure(&self, stem: &str, figure: &Figure) -> anyhow::Result<()> {
+        Ok(figure.save_both(&self.folder, stem)?)
+    }
+
+    /// Writes the page, says where it is, and ends.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn finish(self, page: &Page) -> anyhow::Result<()> {
+        self.progress.clear();
+        let text = page.text(self.seconds, self.at_once);
+        write_whole(&self.folder.join("README.md"), text.as_bytes())?;
+        print(&format!(
+            "{}{}\n",
+            page.summary(),
+            self.folder.join("README.md").display()
+        ))
+    }
+}
+
+/// The folder of the experiment `name`, by what the flags say.
+fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
+    let default = || Path::new("experiments").join(name);
+    flags.out.clone().unwrap_or_else(default)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use driml_machine::error::Usage;
+
+    #[test]
+    fn a_piece_is_made_once_and_other_settings_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let flags = ExperimentFlags {
+            smoke: true,
+            out: Some(folder.path().join("walk")),
+            seeds: None,
+        };
+        let open = |settings: &str| Session::open("walk", &flags, &settings, 4);
+        let report = || Session::open_queue("walk", &flags, &"a", 4, true);
+        assert!(report().unwrap_err().is::<Usage>());
+        assert!(!folder.path().join("walk").exists());
+        let mut session = open("a").unwrap();
+        let made = session.piece("one", 2, |_| Ok(7)).unwrap();
+        assert_eq!(made, 7);
+        let failed = session.piece::<u32>("two", 2, |_| anyhow::bail!("stopped"));
+        assert!(failed.is_err());
+
+        let mut again = open("a").unwrap();
+        let found = again.piece("one", 2, |_| -> anyhow::Result<i32> { panic!("is kept") });
+        assert_eq!(found.unwrap(), 7);
+        assert_eq!(again.piece("two", 2, |_| Ok(8)).unwrap(), 8);
+        // Cut off in the middle of a write by a crash of the machine.
+        fs::write(folder.path().join("walk/pieces/one.json"), "{\"seconds\":").unwrap();
+        assert_eq!(open("a").unwrap().piece("one", 2, |_| Ok(9)).unwrap(), 9);
+        assert!(open("b").unwrap_err().is::<Usage>());
+        // What it was made of has changed.
+        let mut of = |of: &str, made: u32| session.piece_of(of, "played", 1, |_| Ok(made)).unwrap();
+        assert_eq!(
+            (of("x", 1), of("x", 2), of("y", 3), of("y", 4)),
+            (1, 1, 3, 3)
+        );
+        assert!(report().is_ok());
+    }
+}

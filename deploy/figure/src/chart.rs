@@ -1,0 +1,429 @@
+//! A chart: series as lines, points and bands over two axes, with its legend above the plot so that it hides nothing.
+//! It computes no statistics; what a band means is for the caller to say.
+
+use super::{
+    canvas::{Anchor, Canvas, Point, Rect, Stroke, TextStyle},
+    colours::{Colour, GRID, INK, INK_SOFT, series_colour},
+    font::{self, Weight},
+    ticks, titled,
+};
+
+const LABEL_SIZE: f64 = 12.5;
+const TICK_SIZE: f64 = 11.5;
+const LEGEND_SIZE: f64 = 12.0;
+const LEGEND_LEADING: f64 = 18.0;
+const LEGEND_MARK: f64 = 22.0;
+const BAND_ALPHA: f32 = 0.18;
+const DOT_RADIUS: f64 = 3.0;
+const RING_RADIUS: f64 = 5.0;
+/// Share of an axis's range that is left free at its ends.
+const SLACK: f64 = 0.05;
+
+/// How an axis spreads its values.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Scale {
+    /// Evenly.
+    Linear,
+    /// By their logarithm; values of 0 and below are left out.
+    Log,
+}
+
+/// An axis.
+#[derive(Clone, Debug)]
+pub struct Axis {
+    /// What it counts, with its unit.
+    pub label: String,
+    /// How it spreads its values.
+    pub(super) scale: Scale,
+    /// Values that it shows whatever the series have.
+    pub shows: Vec<f64>,
+    /// Names of 0, 1, 2, ... instead of numbers; empty for numbers.
+    names: Vec<String>,
+}
+
+impl Axis {
+    /// An even axis.
+    pub fn linear(label: &str) -> Self {
+        Self {
+            label: label.to_owned(),
+            scale: Scale::Linear,
+            shows: Vec::new(),
+            names: Vec::new(),
+        }
+    }
+
+    /// An axis of things: the first at 0, the next at 1.
+    pub fn names(label: &str, names: &[String]) -> Self {
+        let last = names.len().saturating_sub(1) as f64;
+        Self {
+            names: names.to_vec(),
+            ..Self::linear(label).showing(&[-0.5, last + 0.5])
+        }
+    }
+
+    /// A logarithmic axis.
+    pub fn log(label: &str) -> Self {
+        Self {
+            scale: Scale::Log,
+            ..Self::linear(label)
+        }
+    }
+
+    /// The same axis, showing these values too.
+    pub fn showing(mut self, values: &[f64]) -> Self {
+        self.shows.extend(values);
+        self
+    }
+
+    fn keeps(&self, value: f64) -> bool {
+        value.is_finite() && (self.scale == Scale::Linear || value > 0.0)
+    }
+
+    /// Evenly spread.
+    fn spread(&self, value: f64) -> f64 {
+        match self.scale {
+            Scale::Linear => value,
+            Scale::Log => value.log10(),
+        }
+    }
+
+    /// First and last value, evenly spread, with slack; none if there is no value.
+    fn range(&self, values: impl Iterator<Item = f64>, slack: f64) -> Option<(f64, f64)> {
+        let all = values.chain(self.shows.iter().copied());
+        let all = all
+            .filter(|value| self.keeps(*value))
+            .map(|value| self.spread(value));
+        let (low, high) = all.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
+            (low.min(value), high.max(value))
+        });
+        if !(low.is_finite() && high.is_finite()) {
+            return None;
+        }
+        let least = if low == high {
+            low.abs().max(1.0) * 0.05
+        } else {
+            0.0
+        };
+        let by = ((high - low) * slack).max(least);
+        Some((low - by, high + by))
+    }
+
+    fn ticks(&self, (low, high): (f64, f64), length: f64, each: f64) -> Vec<f64> {
+        if !self.names.is_empty() {
+            return (0..self.names.len()).map(|place| place as f64).collect();
+        }
+        match self.scale {
+            Scale::Linear => ticks::linear(low, high, (length / each).max(2.0) as usize),
+            Scale::Log => ticks::log(10f64.powf(low), 10f64.powf(high)),
+        }
+    }
+}
+
+/// How a series is drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mark {
+    /// A line through the points.
+    Line,
+    /// A dashed line through the points.
+    Dashed,
+    /// Open circles, which leave another point on them visible.
+    Rings,
+    /// The points, each with a vertical bar from its band's low to its high.
+    Bars,
+}
+
+/// A series.
+#[derive(Clone, Debug)]
+pub struct Series {
+    /// As the legend has it; empty for none.
+    pub name: String,
+    /// Its colour.
+    pub colour: Colour,
+    /// How it is drawn.
+    pub mark: Mark,
+    /// (x, y) in the order of x.
+    pub points: Vec<(f64, f64)>,
+    /// (x, low, high) in the order of x; empty for no band.
+    pub band: Vec<(f64, f64, f64)>,
+}
+
+impl Series {
+    /// A line in the colour of this index.
+    pub fn line(name: &str, index: usize, points: Vec<(f64, f64)>) -> Self {
+        Self {
+            name: name.to_owned(),
+            colour: series_colour(index),
+            mark: Mark::Line,
+            points,
+            band: Vec::new(),
+        }
+    }
+
+    /// The same series, drawn otherwise.
+    pub fn marked(mut self, mark: Mark) -> Self {
+        self.mark = mark;
+        self
+    }
+
+    /// The same series in another colour.
+    pub fn coloured(mut self, colour: Colour) -> Self {
+        self.colour = colour;
+        self
+    }
+
+    /// The same series with a band.
+    pub fn banded(mut self, band: Vec<(f64, f64, f64)>) -> Self {
+        self.band = band;
+        self
+    }
+}
+
+/// A chart.
+#[derive(Debug)]
+pub struct Chart {
+    title: String,
+    x: Axis,
+    y: Axis,
+    series: Vec<Series>,
+}
+
+impl Chart {
+    /// A chart of these series; later ones lie on top.
+    pub fn new(title: &str, x: Axis, y: Axis, series: Vec<Series>) -> Self {
+        Self {
+            title: title.to_owned(),
+            x,
+            y,
+            series,
+        }
+    }
+
+    pub(super) fn draw(&self, canvas: &mut Canvas, place: Rect) {
+        let place = titled(canvas, place, &self.title);
+        let place = self.legend(canvas, place);
+        let points = || self.series.iter().flat_map(|series| &series.points);
+        let bands = || self.series.iter().flat_map(|series| &series.band);
+        let xs = points().map(|point| point.0);
+        let ys = points()
+            .map(|point| point.1)
+            .chain(bands().flat_map(|(_, low, high)| [*low, *high]));
+        let (Some(x_range), Some(y_range)) =
+            (self.x.range(xs, SLACK / 2.0), self.y.range(ys, SLACK))
+        else {
+            let middle = (place.x + place.width / 2.0, place.y + place.height / 2.0);
+            canvas.text(middle, "no values yet", style(LABEL_SIZE, Anchor::Middle));
+            return;
+        };
+
+        let below = TICK_SIZE + LABEL_SIZE + 16.0;
+        let y_ticks = self.y.ticks(y_range, place.height - below, 42.0);
+        let y_labels = ticks::labels(&y_ticks);
+        let label_width = y_labels
+            .iter()
+            .map(|label| font::width(label, TICK_SIZE, Weight::Regular))
+            .fold(0.0, f64::max);
+        let left = label_width + LABEL_SIZE + 18.0;
+        let plot = Rect::new(
+            place.x + left,
+            place.y + 4.0,
+            place.width - left - 8.0,
+            place.height - below - 4.0,
+        );
+        let frame = Plot {
+            rect: plot,
+            x: (&self.x, x_range),
+            y: (&self.y, y_range),
+        };
+        self.axes(canvas, &frame, &y_ticks, &y_labels, place.x);
+        for series in &self.series {
+            draw_series(canvas, &frame, series);
+        }
+    }
+
+    fn axes(
+        &self,
+        canvas: &mut Canvas,
+        frame: &Plot<'_>,
+        y_ticks: &[f64],
+        y_labels: &[String],
+        left: f64,
+    ) {
+        let plot = frame.rect;
+        let x_ticks = self.x.ticks(frame.x.1, plot.width, 74.0);
+        let x_labels = match &self.x.names[..] {
+            [] => ticks::labels(&x_ticks),
+            names => {
+                let room = plot.width / names.len() as f64 - 4.0;
+                let fit = |name: &String| font::fit(name, TICK_SIZE, Weight::Regular, room);
+                names.iter().map(fit).collect()
+            }
+        };
+        for (tick, label) in x_ticks.iter().zip(x_labels) {
+            let x = frame.at(*tick, 1.0).0;
+            let line = vec![(x, plot.y), (x, plot.bottom())];
+            canvas.line(line, Stroke::solid(GRID, 1.0));
+            let at = (x, plot.bottom() + TICK_SIZE + 5.0);
+            canvas.text(at, &label, style(TICK_SIZE, Anchor::Middle));
+        }
+        for (tick, label) in y_ticks.iter().zip(y_labels) {
+            let y = frame.y_of(*tick);
+            let line = vec![(plot.x, y), (plot.right(), y)];
+            canvas.line(line, Stroke::solid(GRID, 1.0));
+            let at = (plot.x - 6.0, y + TICK_SIZE * 0.36);
+            canvas.text(at, label, style(TICK_SIZE, Anchor::End));
+        }
+        let corner = vec![
+            (plot.x, plot.y),
+            (plot.x, plot.bottom()),
+            (plot.right(), plot.bottom()),
+        ];
+        canvas.line(corner, Stroke::solid(INK_SOFT, 1.2));
+        let x_at = (
+            plot.x + plot.width / 2.0,
+            plot.bottom() + TICK_SIZE + LABEL_SIZE + 12.0,
+        );
+        let label = |text: &str, room: f64| font::fit(text, LABEL_SIZE, Weight::Regular, room);
+        let ink = TextStyle {
+            colour: INK,
+            ..style(LABEL_SIZE, Anchor::Middle)
+        };
+        canvas.text(x_at, &label(&self.x.label, plot.width), ink);
+        let y_at = (left + LABEL_SIZE - 2.0, plot.y + plot.height / 2.0);
+        let upright = TextStyle {
+            upright: true,
+            ..ink
+        };
+        canvas.text(y_at, &label(&self.y.label, plot.height), upright);
+    }
+
+    /// Draws the legend in as many rows as it needs; returns what is left below it.
+    fn legend(&self, canvas: &mut Canvas, place: Rect) -> Rect {
+        let named = || self.series.iter().filter(|series| !series.name.is_empty());
+        if named().next().is_none() {
+            return place;
+        }
+        let (mut x, mut y) = (place.x, place.y);
+        for series in named() {
+            let room = place.width - LEGEND_MARK - 6.0;
+            let name = font::fit(&series.name, LEGEND_SIZE, Weight::Regular, room);
+            let width = LEGEND_MARK + 6.0 + font::width(&name, LEGEND_SIZE, Weight::Regular) + 16.0;
+            if x > place.x && x + width - 16.0 > place.right() {
+                x = place.x;
+                y += LEGEND_LEADING;
+            }
+            let middle = y + LEGEND_LEADING / 2.0;
+            if !series.band.is_empty() && series.mark != Mark::Bars {
+                let patch = Rect::new(x, middle - 5.0, LEGEND_MARK, 10.0);
+                canvas.rects(vec![patch], series.colour.with_alpha(BAND_ALPHA));
+            }
+            match series.mark {
+                Mark::Line | Mark::Dashed => canvas.line(
+                    vec![(x, middle), (x + LEGEND_MARK, middle)],
+                    pen(series.colour, series.mark),
+                ),
+                Mark::Rings => {
+                    canvas.ring((x + LEGEND_MARK / 2.0, middle), RING_RADIUS, series.colour)
+                }
+                Mark::Bars => {
+                    canvas.dot((x + LEGEND_MARK / 2.0, middle), DOT_RADIUS, series.colour);
+                }
+            }
+            let at = (x + LEGEND_MARK + 6.0, middle + LEGEND_SIZE * 0.36);
+            let ink = TextStyle {
+                colour: INK,
+                ..style(LEGEND_SIZE, Anchor::Start)
+            };
+            canvas.text(at, &name, ink);
+            x += width;
+        }
+        let used = y + LEGEND_LEADING + 4.0 - place.y;
+        Rect::new(place.x, place.y + used, place.width, place.height - used)
+    }
+}
+
+/// The plot's place, and the ranges that its sides stand for.
+struct Plot<'a> {
+    rect: Rect,
+    x: (&'a Axis, (f64, f64)),
+    y: (&'a Axis, (f64, f64)),
+}
+
+impl Plot<'_> {
+    fn at(&self, x: f64, y: f64) -> Point {
+        let (axis, (low, high)) = self.x;
+        let share = (axis.spread(x) - low) / (high - low);
+        (self.rect.x + share * self.rect.width, self.y_of(y))
+    }
+
+    fn y_of(&self, y: f64) -> f64 {
+        let (axis, (low, high)) = self.y;
+        let share = (axis.spread(y) - low) / (high - low);
+        self.rect.bottom() - share * self.rect.height
+    }
+
+    fn keeps(&self, x: f64, y: f64) -> bool {
+        self.x.0.keeps(x) && self.y.0.keeps(y)
+    }
+}
+
+fn draw_series(canvas: &mut Canvas, plot: &Plot<'_>, series: &Series) {
+    let band: Vec<_> = series
+        .band
+        .iter()
+        .filter(|(x, low, high)| plot.keeps(*x, *low) && plot.keeps(*x, *high))
+        .collect();
+    if series.mark == Mark::Bars {
+        for (x, low, high) in band {
+            let bar = vec![plot.at(*x, *low), plot.at(*x, *high)];
+            canvas.line(bar, Stroke::solid(series.colour, 1.4));
+        }
+    } else {
+        let low = band.iter().map(|(x, low, _)| plot.at(*x, *low));
+        let high = band.iter().rev().map(|(x, _, high)| plot.at(*x, *high));
+        let rim = low.chain(high).collect();
+        canvas.area(rim, series.colour.with_alpha(BAND_ALPHA));
+    }
+    let points: Vec<Point> = series
+        .points
+        .iter()
+        .filter(|(x, y)| plot.keeps(*x, *y))
+        .map(|(x, y)| plot.at(*x, *y))
+        .collect();
+    match series.mark {
+        Mark::Line | Mark::Dashed => {
+            // A line of one point would be invisible.
+            if let [only] = points[..] {
+                canvas.dot(only, DOT_RADIUS, series.colour);
+            }
+            canvas.line(points, pen(series.colour, series.mark));
+        }
+        Mark::Rings => {
+            for point in points {
+                canvas.ring(point, RING_RADIUS, series.colour);
+            }
+        }
+        Mark::Bars => {
+            for point in points {
+                canvas.dot(point, DOT_RADIUS, series.colour);
+            }
+        }
+    }
+}
+
+const fn pen(colour: Colour, mark: Mark) -> Stroke {
+    Stroke {
+        colour,
+        width: 1.8,
+        dashed: matches!(mark, Mark::Dashed),
+    }
+}
+
+const fn style(size: f64, anchor: Anchor) -> TextStyle {
+    TextStyle {
+        size,
+        weight: Weight::Regular,
+        colour: INK_SOFT,
+        anchor,
+        upright: false,
+    }
+}

@@ -1,0 +1,106 @@
+//! Colours that stay apart in print and for colour-blind readers, on a light card.
+//! It draws nothing.
+
+/// A colour and how much it covers, in 0..=1.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Colour {
+    pub(super) rgb: [u8; 3],
+    pub(super) alpha: f32,
+}
+
+impl Colour {
+    const fn new(r: u8, g: u8, b: u8) -> Self {
+        Self {
+            rgb: [r, g, b],
+            alpha: 1.0,
+        }
+    }
+
+    pub(super) const fn with_alpha(self, alpha: f32) -> Self {
+        Self { alpha, ..self }
+    }
+}
+
+/// The card under a figure: light, so that a figure reads the same on a dark page and on paper.
+pub(super) const CARD: Colour = Colour::new(255, 255, 255);
+pub(super) const CARD_BORDER: Colour = Colour::new(208, 213, 221);
+/// Text and axes.
+pub(super) const INK: Colour = Colour::new(26, 30, 36);
+/// Notes and tick labels.
+pub(super) const INK_SOFT: Colour = Colour::new(72, 80, 92);
+/// Lines across a chart.
+pub(super) const GRID: Colour = Colour::new(228, 231, 236);
+/// What a chart compares with.
+pub const GREY: Colour = Colour::new(120, 126, 135);
+/// Dark cells of a lattice, and the outline on top of it.
+pub(super) const CELL_DARK: Colour = Colour::new(38, 42, 48);
+pub(super) const CELL_LIGHT: Colour = Colour::new(246, 247, 249);
+pub(super) const OUTLINE: Colour = Colour::new(213, 94, 0);
+/// A cell of a heat map without a value.
+pub(super) const NO_VALUE: Colour = Colour::new(220, 222, 226);
+
+/// Colours of series. Source: Okabe and Ito 2008, without the yellow, which is faint on white.
+const SERIES: [Colour; 7] = [
+    Colour::new(0, 114, 178),
+    Colour::new(213, 94, 0),
+    Colour::new(0, 158, 115),
+    Colour::new(204, 121, 167),
+    Colour::new(230, 159, 0),
+    Colour::new(86, 180, 233),
+    Colour::new(0, 0, 0),
+];
+
+/// The colour of the series with this index; after seven they come again.
+pub(crate) const fn series_colour(index: usize) -> Colour {
+    SERIES[index % SERIES.len()]
+}
+
+/// Nine colours of viridis, evenly spaced. Source: matplotlib's viridis, by van der Walt and Smith, CC0.
+const VIRIDIS: [[u8; 3]; 9] = [
+    [68, 1, 84],
+    [71, 44, 122],
+    [59, 81, 139],
+    [44, 113, 142],
+    [33, 144, 141],
+    [39, 173, 129],
+    [92, 200, 99],
+    [170, 220, 50],
+    [253, 231, 37],
+];
+
+/// The colour of `share` in 0..=1: dark to light, of even steps to the eye, apart for colour-blind readers.
+pub(super) fn heat_colour(share: f64) -> Colour {
+    let place = share.clamp(0.0, 1.0) * (VIRIDIS.len() - 1) as f64;
+    let low = (place as usize).min(VIRIDIS.len() - 2);
+    let part = place - low as f64;
+    let mix = |i: usize| {
+        let (a, b) = (f64::from(VIRIDIS[low][i]), f64::from(VIRIDIS[low + 1][i]));
+        (a + (b - a) * part).round() as u8
+    };
+    Colour::new(mix(0), mix(1), mix(2))
+}
+
+/// Black or white, whichever reads better on `colour`.
+pub(super) fn ink_on(colour: Colour) -> Colour {
+    let [r, g, b] = colour.rgb.map(f64::from);
+    if 0.299 * r + 0.587 * g + 0.114 * b > 140.0 {
+        INK
+    } else {
+        CARD
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_scale_ends_where_it_should() {
+        assert_eq!(heat_colour(0.0).rgb, VIRIDIS[0]);
+        assert_eq!(heat_colour(1.0).rgb, VIRIDIS[8]);
+        assert_eq!(heat_colour(7.0), heat_colour(1.0));
+        assert_eq!(heat_colour(0.5).rgb, VIRIDIS[4]);
+        assert_eq!(ink_on(heat_colour(0.0)), CARD);
+        assert_eq!(ink_on(heat_colour(1.0)), INK);
+    }
+}

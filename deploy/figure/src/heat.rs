@@ -1,0 +1,255 @@
+//! A matrix as a heat map with square cells, its scale beside it.
+//! It scales no number by itself beyond the range it is given or finds.
+
+use super::{
+    canvas::{Anchor, Canvas, Rect, Stroke, TextStyle},
+    colours::{CELL_LIGHT, INK, INK_SOFT, NO_VALUE, OUTLINE, heat_colour, ink_on},
+    font::{self, Weight},
+    ticks, titled,
+};
+
+const TICK_SIZE: f64 = 11.5;
+const LABEL_SIZE: f64 = 12.5;
+const BAR_WIDTH: f64 = 12.0;
+/// Smallest side of a cell in which its value is written.
+const CELL_TEXT_MIN: f64 = 25.0;
+/// Steps of colour along the scale.
+const BAR_STEPS: usize = 64;
+
+/// A square to point out, in cells, or in units of the field: left, top, side.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Outline {
+    /// Cells left of it.
+    pub left: f64,
+    /// Cells above it.
+    pub top: f64,
+    /// Cells along a side.
+    pub side: f64,
+}
+
+/// Where the cells lie in a larger square field, such as the places of a feature map in the picture it looks at.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Field {
+    /// Side of the field.
+    pub side: f64,
+    /// From the field's edge to the first cell.
+    pub first: f64,
+    /// Side of a cell.
+    pub cell: f64,
+}
+
+/// A square matrix.
+#[derive(Clone, Debug)]
+pub struct Heat {
+    /// Over the panel.
+    pub title: String,
+    /// Cells in a row and in a column.
+    pub side: usize,
+    /// Row by row; a cell without a value is grey.
+    pub values: Vec<Option<f64>>,
+    /// Names of rows and columns, from the first; empty for none.
+    pub names: Vec<String>,
+    /// Under the columns, beside the rows.
+    pub labels: (String, String),
+    /// Beside the scale: what a value is, with its unit.
+    pub unit: String,
+    /// The ends of the scale; none for the smallest and largest value.
+    pub range: Option<(f64, f64)>,
+    /// Decimals of the values written into cells that are large enough; none to write none.
+    pub decimals: Option<usize>,
+    /// The field in which the cells lie; none if they fill the map.
+    pub field: Option<Field>,
+    /// A square to point out.
+    pub outline: Option<Outline>,
+}
+
+impl Heat {
+    /// A heat map without names.
+    pub fn new(title: &str, side: usize, values: Vec<Option<f64>>) -> Self {
+        assert_eq!(values.len(), side * side, "a square matrix");
+        Self {
+            title: title.to_owned(),
+            side,
+            values,
+            names: Vec::new(),
+            labels: (String::new(), String::new()),
+            unit: String::new(),
+            range: None,
+            decimals: None,
+            field: None,
+            outline: None,
+        }
+    }
+
+    fn ends(&self) -> (f64, f64) {
+        let values = self
+            .values
+            .iter()
+            .flatten()
+            .filter(|value| value.is_finite());
+        let found = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
+            (low.min(*value), high.max(*value))
+        });
+        let (low, high) = self.range.unwrap_or(found);
+        match low.is_finite() && high.is_finite() {
+            true if high > low => (low, high),
+            true => (low, low + 1.0),
+            false => (0.0, 1.0),
+        }
+    }
+
+    pub(super) fn draw(&self, canvas: &mut Canvas, place: Rect) {
+        let place = titled(canvas, place, &self.title);
+        let (low, high) = self.ends();
+        let bar_ticks = ticks::linear(low, high, 5);
+        let bar_labels = ticks::labels(&bar_ticks);
+        let widest = |texts: &[String]| {
+            let widths = texts
+                .iter()
+                .map(|text| font::width(text, TICK_SIZE, Weight::Regular));
+            widths.fold(0.0, f64::max)
+        };
+        let names_width = widest(&self.names);
+        let left = match (self.names.is_empty(), self.labels.1.is_empty()) {
+            (true, true) => 0.0,
+            (false, true) => names_width + 6.0,
+            (_, false) => names_width + LABEL_SIZE + 12.0,
+        };
+        let right = 14.0 + BAR_WIDTH + 6.0 + widest(&bar_labels) + LABEL_SIZE + 8.0;
+        // Names of columns stand upright if they are longer than a cell is wide.
+        let cell_guess = (place.width - left - right) / self.side as f64;
+        let turned = names_width > cell_guess - 2.0;
+        let names_below = match (self.names.is_empty(), turned) {
+            (true, _) => 0.0,
+            (false, true) => names_width + 6.0,
+            (false, false) => TICK_SIZE + 6.0,
+        };
+        let label_below = if self.labels.0.is_empty() {
+            0.0
+        } else {
+            LABEL_SIZE + 6.0
+        };
+        let below = names_below + label_below + 4.0;
+        let room = (place.width - left - right)
+            .min(place.height - below)
+            .max(10.0);
+        let cell = room / self.side as f64;
+        let map = Rect::new(place.x + left, place.y, room, room);
+
+        let unit = self.field.map_or(cell, |field| room / field.side);
+        let cells = match self.field {
+            Some(field) => {
+                canvas.rects(vec![map], CELL_LIGHT);
+                let size = field.cell * self.side as f64 * unit;
+                let first = field.first * unit;
+                Rect::new(map.x + first, map.y + first, size, size)
+            }
+            None => map,
+        };
+        self.cells(canvas, cells, cells.width / self.side as f64, (low, high));
+        self.names(canvas, map, cell, turned);
+        let label = |text: &str| font::fit(text, LABEL_SIZE, Weight::Regular, room);
+        let middle = (
+            map.x + room / 2.0,
+            map.bottom() + names_below + LABEL_SIZE + 3.0,
+        );
+        canvas.text(
+            middle,
+            &label(&self.labels.0),
+            style(LABEL_SIZE, Anchor::Middle),
+        );
+        let upright = TextStyle {
+            upright: true,
+            ..style(LABEL_SIZE, Anchor::Middle)
+        };
+        let beside = (place.x + LABEL_SIZE - 2.0, map.y + room / 2.0);
+        canvas.text(beside, &label(&self.labels.1), upright);
+        if let Some(outline) = self.outline {
+            point_out(canvas, map, unit, outline);
+        }
+
+        let bar = Rect::new(map.right() + 14.0, map.y, BAR_WIDTH, room);
+        let step = room / BAR_STEPS as f64;
+        for i in 0..BAR_STEPS {
+            let colour = heat_colour(1.0 - i as f64 / (BAR_STEPS - 1) as f64);
+            let y = bar.y + i as f64 * step;
+            canvas.rects(vec![Rect::new(bar.x, y, BAR_WIDTH, step + 0.3)], colour);
+        }
+        for (tick, text) in bar_ticks.iter().zip(&bar_labels) {
+            let y = bar.bottom() - (tick - low) / (high - low) * room;
+            canvas.line(
+                vec![(bar.right(), y), (bar.right() + 3.0, y)],
+                Stroke::solid(INK_SOFT, 1.0),
+            );
+            let at = (bar.right() + 6.0, y + TICK_SIZE * 0.36);
+            canvas.text(at, text, style(TICK_SIZE, Anchor::Start));
+        }
+        let far = bar.right() + 6.0 + widest(&bar_labels) + LABEL_SIZE + 4.0;
+        canvas.text((far, bar.y + room / 2.0), &label(&self.unit), upright);
+    }
+
+    fn cells(&self, canvas: &mut Canvas, map: Rect, cell: f64, (low, high): (f64, f64)) {
+        for (index, value) in self.values.iter().enumerate() {
+            let (row, column) = (index / self.side, index % self.side);
+            let (x, y) = (map.x + column as f64 * cell, map.y + row as f64 * cell);
+            let colour = match value.filter(|value| value.is_finite()) {
+                Some(value) => heat_colour((value - low) / (high - low)),
+                None => NO_VALUE,
+            };
+            // A little over the next cell, so that no line shows between them.
+            canvas.rects(vec![Rect::new(x, y, cell + 0.3, cell + 0.3)], colour);
+            if let (Some(value), Some(decimals)) = (value, self.decimals)
+                && cell >= CELL_TEXT_MIN
+            {
+                let size = (cell * 0.36).min(TICK_SIZE);
+                let style = TextStyle {
+                    colour: ink_on(colour),
+                    ..style(size, Anchor::Middle)
+                };
+                let at = (x + cell / 2.0, y + cell / 2.0 + size * 0.36);
+                canvas.text(at, &format!("{value:.decimals$}"), style);
+            }
+        }
+    }
+
+    fn names(&self, canvas: &mut Canvas, map: Rect, cell: f64, turned: bool) {
+        for (index, name) in self.names.iter().enumerate() {
+            let middle = (index as f64 + 0.5) * cell;
+            let at = (map.x - 5.0, map.y + middle + TICK_SIZE * 0.36);
+            canvas.text(at, name, style(TICK_SIZE, Anchor::End));
+            if turned {
+                let at = (map.x + middle + TICK_SIZE * 0.36, map.bottom() + 5.0);
+                let upright = TextStyle {
+                    upright: true,
+                    ..style(TICK_SIZE, Anchor::End)
+                };
+                canvas.text(at, name, upright);
+            } else {
+                let at = (map.x + middle, map.bottom() + TICK_SIZE + 3.0);
+                canvas.text(at, name, style(TICK_SIZE, Anchor::Middle));
+            }
+        }
+    }
+}
+
+/// Draws an outline over a map of square cells.
+pub(super) fn point_out(canvas: &mut Canvas, map: Rect, cell: f64, outline: Outline) {
+    let rect = Rect::new(
+        map.x + outline.left * cell,
+        map.y + outline.top * cell,
+        outline.side * cell,
+        outline.side * cell,
+    );
+    canvas.frame(rect, Stroke::solid(super::colours::CARD, 4.0));
+    canvas.frame(rect, Stroke::solid(OUTLINE, 2.2));
+}
+
+const fn style(size: f64, anchor: Anchor) -> TextStyle {
+    TextStyle {
+        size,
+        weight: Weight::Regular,
+        colour: INK,
+        anchor,
+        upright: false,
+    }
+}

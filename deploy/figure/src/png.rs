@@ -1,0 +1,155 @@
+//! A canvas as PNG, text included, without any font of the machine.
+//! It draws what `svg` writes, in the same places.
+
+use tiny_skia::{
+    FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, StrokeDash, Transform,
+};
+
+use super::{
+    canvas::{Anchor, CARD_RADIUS, Canvas, DASH, Point, Rect, Shape, Stroke, TextStyle},
+    colours::Colour,
+    font,
+};
+
+/// The picture, `zoom` pixels to a unit; what no shape covers is transparent.
+///
+/// # Errors
+/// A canvas without area, or too large for memory.
+pub(super) fn encode(canvas: &Canvas, zoom: f32) -> Result<Vec<u8>, String> {
+    let pixels = |length: f64| (length as f32 * zoom).ceil() as u32;
+    let (width, height) = (pixels(canvas.width), pixels(canvas.height));
+    let mut pixmap = Pixmap::new(width, height)
+        .ok_or_else(|| format!("a picture of {width} x {height} pixels cannot be made"))?;
+    let scale = Transform::from_scale(zoom, zoom);
+    for shape in &canvas.shapes {
+        draw(&mut pixmap, shape, scale);
+    }
+    pixmap
+        .encode_png()
+        .map_err(|e| format!("encoding a picture: {e}"))
+}
+
+fn draw(pixmap: &mut Pixmap, shape: &Shape, scale: Transform) {
+    let mut fill = |path: Option<Path>, colour: Colour, smooth: bool, at: Transform| {
+        if let Some(path) = path {
+            let paint = paint(colour, smooth);
+            pixmap.fill_path(&path, &paint, FillRule::Winding, at, None);
+        }
+    };
+    match shape {
+        Shape::Line { points, stroke } => {
+            stroke_path(pixmap, polygon(points, false), *stroke, scale);
+        }
+        Shape::Area { points, fill: with } => fill(polygon(points, true), *with, true, scale),
+        Shape::Rects { rects, fill: with } => {
+            let mut path = PathBuilder::new();
+            for rect in rects {
+                path.push_rect(path_rect(*rect));
+            }
+            fill(path.finish(), *with, false, scale);
+        }
+        Shape::Frame { rect, stroke } => {
+            let path = PathBuilder::from_rect(path_rect(*rect));
+            stroke_path(pixmap, Some(path), *stroke, scale);
+        }
+        Shape::Card {
+            rect,
+            fill: with,
+            border,
+        } => {
+            let path = rounded(*rect);
+            fill(path.clone(), *with, true, scale);
+            stroke_path(pixmap, path, Stroke::solid(*border, 1.0), scale);
+        }
+        Shape::Text { at, text, style } => {
+            let (path, place) = text_path(*at, text, *style);
+            fill(path, style.colour, true, place.post_concat(scale));
+        }
+    }
+}
+
+fn stroke_path(pixmap: &mut Pixmap, path: Option<Path>, stroke: Stroke, scale: Transform) {
+    let Some(path) = path else { return };
+    let dash = if stroke.dashed {
+        StrokeDash::new(DASH.map(|length| length as f32).to_vec(), 0.0)
+    } else {
+        None
+    };
+    let pen = tiny_skia::Stroke {
+        width: stroke.width as f32,
+        line_cap: LineCap::Butt,
+        line_join: LineJoin::Round,
+        dash,
+        ..tiny_skia::Stroke::default()
+    };
+    pixmap.stroke_path(&path, &paint(stroke.colour, true), &pen, scale, None);
+}
+
+fn paint(colour: Colour, smooth: bool) -> Paint<'static> {
+    let [r, g, b] = colour.rgb;
+    let mut paint = Paint::default();
+    paint.set_color_rgba8(r, g, b, (colour.alpha * 255.0).round() as u8);
+    paint.anti_alias = smooth;
+    paint
+}
+
+fn polygon(points: &[Point], closed: bool) -> Option<Path> {
+    let mut path = PathBuilder::new();
+    for (index, &(x, y)) in points.iter().enumerate() {
+        match index {
+            0 => path.move_to(x as f32, y as f32),
+            _ => path.line_to(x as f32, y as f32),
+        }
+    }
+    if closed {
+        path.close();
+    }
+    path.finish()
+}
+
+fn path_rect(rect: Rect) -> tiny_skia::Rect {
+    let (x, y) = (rect.x as f32, rect.y as f32);
+    // A side of 0 is drawn as nothing; sides are sums of finite, ordered numbers.
+    tiny_skia::Rect::from_xywh(
+        x,
+        y,
+        rect.width.max(0.0) as f32,
+        rect.height.max(0.0) as f32,
+    )
+    .unwrap_or_else(|| tiny_skia::Rect::from_xywh(0.0, 0.0, 0.0, 0.0).expect("0 is finite"))
+}
+
+fn rounded(rect: Rect) -> Option<Path> {
+    let r = CARD_RADIUS as f32;
+    let (left, top) = (rect.x as f32, rect.y as f32);
+    let (right, bottom) = (rect.right() as f32, rect.bottom() as f32);
+    let mut path = PathBuilder::new();
+    path.move_to(left + r, top);
+    path.line_to(right - r, top);
+    path.quad_to(right, top, right, top + r);
+    path.line_to(right, bottom - r);
+    path.quad_to(right, bottom, right - r, bottom);
+    path.line_to(left + r, bottom);
+    path.quad_to(left, bottom, left, bottom - r);
+    path.line_to(left, top + r);
+    path.quad_to(left, top, left + r, top);
+    path.close();
+    path.finish()
+}
+
+/// Outlines of a text from (0, 0), and where they go.
+fn text_path((x, y): Point, text: &str, style: TextStyle) -> (Option<Path>, Transform) {
+    let mut path = PathBuilder::new();
+    font::outline(text, style.size, style.weight, &mut path);
+    let width = font::width(text, style.size, style.weight) as f32;
+    let back = match style.anchor {
+        Anchor::Start => 0.0,
+        Anchor::Middle => width / 2.0,
+        Anchor::End => width,
+    };
+    let mut place = Transform::from_translate(-back, 0.0);
+    if style.upright {
+        place = place.post_rotate(-90.0);
+    }
+    (path.finish(), place.post_translate(x as f32, y as f32))
+}

@@ -1,0 +1,230 @@
+//! One part of a run as a child process: started, watched, asked to stop.
+//! It does not know what the parts do or in which order they end.
+
+use std::{
+    os::unix::process::{CommandExt, ExitStatusExt},
+    path::Path,
+    process::{Child, Command, ExitStatus, Stdio},
+    time::{Duration, Instant},
+};
+
+use anyhow::Context;
+use nix::{
+    sys::signal::{Signal, kill},
+    unistd::Pid,
+};
+
+use crate::{console::Screen, meeting::Meeting, part_log::PartLog};
+
+/// How often a part that should end is looked at.
+const POLL: Duration = Duration::from_millis(20);
+
+/// A started part.
+#[derive(Debug)]
+pub struct Part {
+    /// Its name: `replay-server`, `learner`, `actor-0`.
+    pub name: String,
+    child: Child,
+    end: Option<ExitStatus>,
+    log: PartLog,
+}
+
+/// What all parts of a run have in common when they start.
+#[derive(Clone, Copy, Debug)]
+pub struct Surroundings<'a> {
+    /// The folder of their logs.
+    pub logs: &'a Path,
+    /// Where their warnings are shown.
+    pub screen: &'a Screen,
+    /// Where they meet, if it is to stay there as long as any of them lives.
+    pub meeting: Option<&'a Meeting>,
+}
+
+/// What suits candle in every part: its second pool spins while it waits, which costs more than it gives on busy cores, and
+/// glibc returns each large tensor to the system and faults it in again unless told to keep it.
+const FOR_CANDLE: [(&str, &str); 3] = [
+    ("CANDLE_NUM_THREADS", "1"),
+    ("MALLOC_MMAP_THRESHOLD_", "1000000000"),
+    ("MALLOC_TRIM_THRESHOLD_", "10000000000"),
+];
+
+/// Gives a process the environment of every part, with so many threads for arithmetic.
+pub fn suit_candle(command: &mut Command, threads: u32) {
+    command
+        .env("RAYON_NUM_THREADS", threads.to_string())
+        .envs(FOR_CANDLE);
+}
+
+/// Flags for a child that is to end when this process does. They name this process, as it may have died before the child looks
+/// who its parent is.
+pub fn exit_with_this_process() -> [String; 2] {
+    ["--exit-with-parent".into(), std::process::id().to_string()]
+}
+
+impl Part {
+    /// Starts this program with other arguments, in a process group of its own so that Ctrl-C does not reach it. It ends when
+    /// this process does.
+    ///
+    /// # Errors
+    /// The log cannot be written, or the process not started.
+    pub fn start(
+        name: &str,
+        args: &[String],
+        threads: u32,
+        surroundings: Surroundings<'_>,
+    ) -> anyhow::Result<Self> {
+        let Surroundings {
+            logs,
+            screen,
+            meeting,
+        } = surroundings;
+        let mut log = PartLog::open(name, logs)?;
+        let program = std::env::current_exe().context("finding this program's own file")?;
+        let starting = || format!("starting {name}");
+        let stdin = match meeting {
+            Some(meeting) => meeting.hold().with_context(starting)?.into(),
+            None => Stdio::null(),
+        };
+        let mut command = Command::new(program);
+        suit_candle(&mut command, threads);
+        let mut child = command
+            .args(args)
+            .args(exit_with_this_process())
+            .stdin(stdin)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .process_group(0)
+            .spawn()
+            .with_context(starting)?;
+        let (out, err) = (child.stdout.take(), child.stderr.take());
+        if let Some(pipe) = out {
+            log.follow(pipe, screen)?;
+        }
+        if let Some(pipe) = err {
+            log.follow(pipe, screen)?;
+        }
+        Ok(Self {
+            name: name.into(),
+            child,
+            end: None,
+            log,
+        })
+    }
+
+    /// The process's number.
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// How it ended, if it has.
+    pub fn end(&mut self) -> Option<ExitStatus> {
+        if self.end.is_none() {
+            // An error here means that there is no such child any more, which cannot be before it was waited for.
+            self.end = self.child.try_wait().ok().flatten();
+        }
+        self.end
+    }
+
+    /// Asks it to drain and end.
+    pub fn ask_to_stop(&mut self) {
+        self.signal(Signal::SIGTERM);
+    }
+
+    /// Ends it at once.
+    pub fn kill(&mut self) {
+        self.signal(Signal::SIGKILL);
+    }
+
+    fn signal(&mut self, signal: Signal) {
+        // Once it was waited for, its number may belong to another process.
+        if self.end().is_none() {
+            let pid = Pid::from_raw(self.child.id() as i32);
+            if let Err(e) = kill(pid, signal) {
+                tracing::debug!("sending {signal} to {}: {e}", self.name);
+            }
+        }
+    }
+
+    /// Waits for its end until `deadline`, or until `hurry` says that there is no time for that.
+    pub fn wait_until(
+        &mut self,
+        deadline: Instant,
+        hurry: impl Fn() -> bool,
+    ) -> Option<ExitStatus> {
+        while self.end().is_none() && Instant::now() < deadline && !hurry() {
+            std::thread::sleep(POLL);
+        }
+        if self.end.is_some() {
+            self.log.finish();
+        }
+        self.end
+    }
+
+    /// Resident memory, MiB; none once it has ended.
+    pub fn rss_mib(&mut self) -> Option<f64> {
+        if self.end().is_some() {
+            return None;
+        }
+        rss_mib(&std::fs::read_to_string(format!("/proc/{}/status", self.pid())).ok()?)
+    }
+
+    /// Lines of its log that could not be written, for a person; none if all were.
+    pub(crate) fn missing_log_lines(&self) -> Option<String> {
+        self.log.missing()
+    }
+
+    /// How and with which last words it ended, for a person.
+    pub fn obituary(&mut self) -> String {
+        self.wait_until(Instant::now(), || false);
+        let how = match self.end {
+            None => "is still running".into(),
+            Some(status) => match (status.code(), status.signal()) {
+                (Some(code), _) => format!("ended with exit code {code}"),
+                (None, Some(signal)) => {
+                    let name = Signal::try_from(signal).map_or("", Signal::as_str);
+                    format!("was ended by signal {signal} {name}")
+                }
+                (None, None) => "ended".into(),
+            },
+        };
+        let tail = self.log.tail();
+        let lines: String = tail.iter().map(|line| format!("\n  {line}")).collect();
+        let last = if lines.is_empty() {
+            String::new()
+        } else {
+            format!("; its last lines:{lines}")
+        };
+        format!(
+            "{} {how} (log: {}){last}",
+            self.name,
+            self.log.path().display()
+        )
+    }
+}
+
+impl Drop for Part {
+    fn drop(&mut self) {
+        self.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Resident memory in MiB from `/proc/PID/status`.
+pub fn rss_mib(status: &str) -> Option<f64> {
+    let line = status
+        .lines()
+        .find_map(|line| line.strip_prefix("VmRSS:"))?;
+    let kib: f64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kib / 1024.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn resident_memory_is_read_from_the_kernels_table() {
+        assert_eq!(rss_mib("Name:\tdriml\nVmRSS:\t    2048 kB\n"), Some(2.0));
+        assert_eq!(rss_mib("Name:\tdriml\n"), None);
+    }
+}

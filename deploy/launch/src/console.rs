@@ -1,0 +1,224 @@
+//! Everything that this program writes to stdout and stderr: lines for a person, the log, progress bars, results.
+//! A terminal or pipe that is gone takes nothing and is no error here; `driml_protocol::end_signs` notices it.
+
+use std::io::{self, ErrorKind, IsTerminal, Write, stderr};
+
+use anyhow::Context;
+use console::Term;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
+use tracing_subscriber::EnvFilter;
+
+/// How often a progress bar is drawn at most, times a second.
+const DRAWS_PER_SECOND: u8 = 20;
+
+/// Writes a line to stderr. What cannot be written is dropped: nobody reads it, or the disk is full, and a run goes on.
+pub fn line(text: &str) {
+    // In one write, so that lines of several threads do not mix.
+    let _ = stderr().write_all(format!("{text}\n").as_bytes());
+}
+
+/// Writes a command's result to stdout; a reader that has gone away is no error.
+///
+/// # Errors
+/// A full disk, for example.
+pub fn print(text: &str) -> anyhow::Result<()> {
+    let mut out = io::stdout().lock();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        Err(e) if !is_gone(&e) => Err(e).context("writing to stdout"),
+        _ => Ok(()),
+    }
+}
+
+/// Whether writing failed because the pipe's reader has ended or the terminal was closed.
+fn is_gone(e: &io::Error) -> bool {
+    e.kind() == ErrorKind::BrokenPipe || e.raw_os_error() == Some(nix::libc::EIO)
+}
+
+/// An error with its causes, each said once: many errors name their cause in their own text too.
+pub fn describe(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain() {
+        let cause = cause.to_string();
+        if text.is_empty() {
+            text = cause;
+        } else if !text.ends_with(&cause) {
+            text = format!("{text}: {cause}");
+        }
+    }
+    text
+}
+
+/// Sends the log to stderr. `DRIML_LOG` says what is logged, in the form of `RUST_LOG`.
+///
+/// zenoh warns of each try to reach a part that is not there yet or any more, which is ours to judge: so only its errors are
+/// logged, and of those neither what its session says of messages that come while it closes, as at the end of every run, nor
+/// that nobody wants an answer any more.
+pub fn log_to_stderr() {
+    let usual = "warn,driml=info,zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off";
+    let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
+    let filter = wanted.map_or_else(
+        || EnvFilter::new(usual),
+        |wanted| {
+            EnvFilter::try_new(&wanted).unwrap_or_else(|e| {
+                line(&format!(
+                    "DRIML_LOG={wanted} is no filter ({e}), so it is left out; take for example debug"
+                ));
+                EnvFilter::new(usual)
+            })
+        },
+    );
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(stderr)
+        // It would say with `eprintln!`, which panics, that stderr cannot be written to.
+        .log_internal_errors(false)
+        .with_ansi(stderr().is_terminal())
+        .init();
+}
+
+/// Where lines for a person go: stderr, above a progress bar if stderr is a terminal. Clones share the bar.
+#[derive(Clone, Debug)]
+pub struct Screen {
+    bar: Option<ProgressBar>,
+}
+
+impl Screen {
+    /// With a progress bar of this `template` and length on a terminal, else without.
+    ///
+    /// # Panics
+    /// If the template is none: it is a constant, and tests make each.
+    pub fn new(length: u64, template: &str) -> Self {
+        let bar = stderr().is_terminal().then(|| {
+            let target = ProgressDrawTarget::term_like_with_hz(
+                Box::new(Terminal(Term::buffered_stderr())),
+                DRAWS_PER_SECOND,
+            );
+            let bar = ProgressBar::with_draw_target(Some(length), target);
+            let style = ProgressStyle::with_template(template);
+            bar.set_style(style.expect("the template is a constant, and a test makes one"));
+            bar
+        });
+        Self { bar }
+    }
+
+    /// Without a progress bar.
+    pub const fn plain() -> Self {
+        Self { bar: None }
+    }
+
+    /// The progress bar, if there is one.
+    pub const fn bar(&self) -> Option<&ProgressBar> {
+        self.bar.as_ref()
+    }
+
+    /// Writes one line.
+    pub fn line(&self, text: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| line(text)),
+            None => line(text),
+        }
+    }
+
+    /// Takes the progress bar away.
+    pub fn clear(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+/// A terminal on which drawing never fails: one that was closed in the middle of a run shows nothing.
+#[derive(Debug)]
+struct Terminal(Term);
+
+impl TermLike for Terminal {
+    fn width(&self) -> u16 {
+        TermLike::width(&self.0)
+    }
+
+    fn height(&self) -> u16 {
+        TermLike::height(&self.0)
+    }
+
+    fn move_cursor_up(&self, n: usize) -> io::Result<()> {
+        ignore(self.0.move_cursor_up(n))
+    }
+
+    fn move_cursor_down(&self, n: usize) -> io::Result<()> {
+        ignore(self.0.move_cursor_down(n))
+    }
+
+    fn move_cursor_right(&self, n: usize) -> io::Result<()> {
+        ignore(self.0.move_cursor_right(n))
+    }
+
+    fn move_cursor_left(&self, n: usize) -> io::Result<()> {
+        ignore(self.0.move_cursor_left(n))
+    }
+
+    fn write_line(&self, text: &str) -> io::Result<()> {
+        ignore(self.0.write_line(text))
+    }
+
+    fn write_str(&self, text: &str) -> io::Result<()> {
+        ignore(self.0.write_str(text))
+    }
+
+    fn clear_line(&self) -> io::Result<()> {
+        ignore(self.0.clear_line())
+    }
+
+    fn flush(&self) -> io::Result<()> {
+        ignore(self.0.flush())
+    }
+}
+
+/// Drops an error of drawing.
+fn ignore(drawn: io::Result<()>) -> io::Result<()> {
+    drop(drawn);
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cause_is_said_once() {
+        let full = || io::Error::from_raw_os_error(nix::libc::ENOSPC);
+        let inner = anyhow::Error::new(full());
+        let said = describe(&inner.context("writing x").context("saving"));
+        assert_eq!(said, format!("saving: writing x: {}", full()));
+
+        #[derive(Debug, thiserror::Error)]
+        #[error("cannot write x: {source}")]
+        struct NamesItsCause {
+            source: io::Error,
+        }
+        let named = anyhow::Error::new(NamesItsCause { source: full() });
+        let said = describe(&named.context("saving"));
+        assert_eq!(said, format!("saving: cannot write x: {}", full()));
+    }
+
+    #[test]
+    fn a_reader_that_is_gone_is_told_from_a_full_disk() {
+        let error = io::Error::from_raw_os_error;
+        assert!(is_gone(&error(nix::libc::EPIPE)) && is_gone(&error(nix::libc::EIO)));
+        assert!(!is_gone(&error(nix::libc::ENOSPC)));
+    }
+
+    #[test]
+    fn a_terminal_that_is_gone_can_still_be_drawn_on() {
+        let pty = nix::pty::openpty(None, None).unwrap();
+        let slave = std::fs::File::from(pty.slave);
+        let term = Term::read_write_pair(slave.try_clone().unwrap(), slave);
+        let target = ProgressDrawTarget::term_like(Box::new(Terminal(term)));
+        let bar = ProgressBar::with_draw_target(Some(10), target);
+        bar.tick();
+        drop(pty.master);
+        bar.set_message("one\ntwo");
+        bar.suspend(|| ());
+        bar.set_tab_width(4);
+        bar.finish_and_clear();
+    }
+}

@@ -1,0 +1,205 @@
+//! The live view of a run: one progress display on a terminal, a plain line now and then elsewhere.
+//! It asks nobody: the launcher and the lockstep mode tell it.
+
+use std::time::{Duration, Instant};
+
+use driml_machine::units::duration;
+use driml_protocol::{LearnerStatus, ReplayStatus, Waiting};
+
+use crate::{
+    console::Screen,
+    rates::Rates,
+    run_folder::{Behind, Episodes},
+};
+
+/// How often a line is written where there is no terminal.
+const PLAIN_PERIOD: Duration = Duration::from_secs(10);
+/// The progress display: how far, then two lines of numbers.
+pub const TEMPLATE: &str = "{bar:40} {percent:>3}%  {elapsed_precise}\n{msg}";
+
+/// An auxiliary loss for a person to read: `DIM 4t4` of `dim_4t4`.
+pub fn loss_title(name: &str) -> String {
+    match name.split_once('_') {
+        Some((kind, of_what)) => format!("{} {of_what}", kind.to_uppercase()),
+        None => name.to_uppercase(),
+    }
+}
+
+/// The live view.
+#[derive(Debug)]
+pub struct Display {
+    screen: Screen,
+    frames_max: u64,
+    updates_max: u64,
+    rates: Rates,
+    plain_next: Instant,
+}
+
+impl Display {
+    /// A view of a run of so many frames and updates, with so much `behind` it.
+    pub fn new(screen: Screen, frames_max: u64, updates_max: u64, behind: Behind) -> Self {
+        let mut rates = Rates::default();
+        rates.add(Instant::now(), behind.frames, behind.updates);
+        Self {
+            screen,
+            frames_max,
+            updates_max,
+            rates,
+            plain_next: Instant::now() + PLAIN_PERIOD,
+        }
+    }
+
+    /// Shows the state of the run.
+    pub fn show(&mut self, replay: &ReplayStatus, learner: &LearnerStatus, episodes: Episodes) {
+        let now = Instant::now();
+        self.rates
+            .add(now, replay.transitions_inserted, learner.updates);
+        let parts = self.text(replay, learner, episodes);
+        match self.screen.bar() {
+            Some(bar) => {
+                bar.set_position(replay.transitions_inserted.min(self.frames_max));
+                bar.set_message(parts.join("\n"));
+            }
+            None if now >= self.plain_next => {
+                self.plain_next = now + PLAIN_PERIOD;
+                self.screen.line(&parts.join("  "));
+            }
+            None => {}
+        }
+    }
+
+    fn text(
+        &self,
+        replay: &ReplayStatus,
+        learner: &LearnerStatus,
+        episodes: Episodes,
+    ) -> [String; 2] {
+        let (frames_rate, updates_rate) = self.rates.per_second();
+        let number = |value: Option<f64>, digits: usize| {
+            value.map_or("-".into(), |value| format!("{value:.digits$}"))
+        };
+        let losses = learner.losses.iter();
+        let losses = losses.map(|(name, loss)| format!("  {} {loss:.3}", loss_title(name)));
+        let k = replay
+            .mean_k()
+            .map_or(String::new(), |k| format!("  mean k {k:.2}"));
+        let left = time_left(
+            (
+                self.frames_max.saturating_sub(replay.transitions_inserted),
+                frames_rate,
+            ),
+            (
+                self.updates_max.saturating_sub(learner.updates),
+                updates_rate,
+            ),
+        );
+        [
+            format!(
+                "frames {}/{} ({frames_rate:.0}/s)  updates {}/{} ({updates_rate:.1}/s)  replay ratio {}",
+                replay.transitions_inserted,
+                self.frames_max,
+                learner.updates,
+                self.updates_max,
+                number(replay.replay_ratio(), 2),
+            ),
+            format!(
+                "return {} ({} episodes)  C51 {:.3}{}{k}  {}{}",
+                number(episodes.mean_return.map(|it| it.mean), 2),
+                episodes.count,
+                learner.c51_kl,
+                losses.collect::<String>(),
+                waiting(replay),
+                left.map_or(String::new(), |left| format!("  {} left", duration(left))),
+            ),
+        ]
+    }
+}
+
+/// Who waits for whom, and how many actors do.
+fn waiting(replay: &ReplayStatus) -> String {
+    match (replay.waiting, replay.actors_waiting) {
+        (Waiting::ActorsWaitForLearner, waiting @ 1..) => {
+            format!("{waiting} of {} actors wait for learner", replay.actors)
+        }
+        (waiting, _) => waiting.to_string(),
+    }
+}
+
+/// The longer of what frames and updates still take; none while something is left of which nothing happens.
+fn time_left(frames: (u64, f64), updates: (u64, f64)) -> Option<Duration> {
+    let seconds = |(left, rate): (u64, f64)| match left {
+        0 => Some(0.0),
+        _ if rate > 0.0 => Some(left as f64 / rate),
+        _ => None,
+    };
+    let longer = seconds(frames)?.max(seconds(updates)?);
+    Duration::try_from_secs_f64(longer).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use expect_test::expect;
+
+    use super::*;
+    use crate::run_folder::MeanReturn;
+
+    #[test]
+    fn the_view_says_what_a_person_wants_to_know() {
+        let mut display = Display::new(Screen::plain(), 200_000, 6_218, Behind::default());
+        let replay = ReplayStatus {
+            transitions_inserted: 33_000,
+            rows_sampled: 256_000,
+            warmup_transitions: 1_000,
+            k_histogram: vec![0, 1, 1, 2],
+            waiting: Waiting::ActorsWaitForLearner,
+            actors: 24,
+            actors_waiting: 23,
+            ..ReplayStatus::default()
+        };
+        let learner = LearnerStatus {
+            updates: 1000,
+            c51_kl: 0.1234,
+            losses: vec![("dim_4t4".into(), 4.0)],
+            ..LearnerStatus::default()
+        };
+        let episodes = Episodes {
+            count: 45,
+            mean_return: Some(MeanReturn {
+                mean: 1.234,
+                of: 45,
+            }),
+        };
+        let start = Instant::now();
+        display.rates = Rates::default();
+        display.rates.add(start, 31_400, 950);
+        display
+            .rates
+            .add(start + Duration::from_secs(10), 33_000, 1000);
+        expect![[r#"
+            frames 33000/200000 (160/s)  updates 1000/6218 (5.0/s)  replay ratio 8.00
+            return 1.23 (45 episodes)  C51 0.123  DIM 4t4 4.000  mean k 2.25  23 of 24 actors wait for learner  17 min 23 s left"#]]
+        .assert_eq(&display.text(&replay, &learner, episodes).join("\n"));
+        expect![[r#"
+            frames 0/200000 (160/s)  updates 0/6218 (5.0/s)  replay ratio -
+            return - (0 episodes)  C51 0.000  nobody waits  20 min 50 s left"#]]
+        .assert_eq(
+            &display
+                .text(
+                    &ReplayStatus::default(),
+                    &LearnerStatus::default(),
+                    Episodes::default(),
+                )
+                .join("\n"),
+        );
+    }
+
+    #[test]
+    fn no_time_is_left_to_guess_while_nothing_happens() {
+        assert_eq!(time_left((10, 0.0), (0, 0.0)), None);
+    }
+
+    #[test]
+    fn the_template_is_one() {
+        assert!(indicatif::ProgressStyle::with_template(TEMPLATE).is_ok());
+    }
+}

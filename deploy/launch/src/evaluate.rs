@@ -1,0 +1,210 @@
+//! Whole episodes with a run's newest checkpoint, and a random policy's beside them.
+//! It trains nothing and changes nothing in the run folder.
+
+use anyhow::Context;
+use clap::ValueEnum;
+use driml_actor::{NetworkPolicy, Policy, RandomPolicy, episode_returns};
+use driml_envs::WorldConfig;
+use driml_learner::{Compute, checkpoint};
+use driml_machine::error::{Usage, usage};
+use driml_settings::config::RunConfig;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::run_folder::RunFolder;
+
+/// Probability of a random action. Source: section 2 of the project's specification, after rlpyt.
+const EPSILON: f64 = 0.001;
+/// Copies of the world that are played at once.
+const COPIES_MAX: usize = 32;
+/// Steps of each copy after which an evaluation is given up; Procgen's longest episode has 6,000.
+const STEPS_A_ROUND_MAX: u64 = 20_000;
+/// The stream of the exploring policy's generator. A world seeded alike gives its copies streams that count from 0.
+const POLICY_STREAM: u64 = u64::MAX;
+
+/// Which levels to play.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Levels {
+    /// Those trained on, as in the training: where an episode went on through completed levels, it does
+    Train,
+    /// Those trained on, drawn at random, each an episode of its own (Procgen)
+    TrainSingle,
+    /// Others of the same game, each an episode of its own (Procgen)
+    Unseen,
+}
+
+/// Who chooses the actions.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Who {
+    /// The run's network.
+    Agent,
+    /// Every action equally likely.
+    Random,
+}
+
+/// A run's newest weights and its world, ready to play.
+pub struct Player {
+    /// Its settings.
+    pub config: RunConfig,
+    /// As safetensors.
+    weights: Vec<u8>,
+    /// Updates behind its weights.
+    pub updates: u64,
+}
+
+impl Player {
+    /// Reads the newest checkpoint of a run's folder.
+    ///
+    /// # Errors
+    /// A folder that is no run's or has no checkpoint, a damaged checkpoint.
+    pub fn load(folder: &RunFolder) -> anyhow::Result<Self> {
+        let path = folder.config();
+        let text = std::fs::read_to_string(&path).map_err(|e| {
+            usage!(
+                "{} is not the folder of a run: reading {}: {e}",
+                folder.display(),
+                path.display()
+            )
+        })?;
+        let config = RunConfig::parse(&path.display().to_string(), &text)?;
+        let restored = checkpoint::load_latest(
+            &folder.checkpoints(),
+            &config.model,
+            &config.learner.update,
+            &Compute::CPU,
+            config.run.hash(),
+        )?
+        .ok_or_else(|| {
+            usage!(
+                "{} has no checkpoint yet: let the run go on",
+                folder.display()
+            )
+        })?;
+        let weights = restored.agent.weights()?;
+        let updates = restored.agent.updates();
+        Ok(Self {
+            config,
+            weights,
+            updates,
+        })
+    }
+
+    /// Returns of whole episodes on the levels asked for; none if the world does not have them.
+    ///
+    /// # Errors
+    /// The policy or the world failed, or episodes do not end.
+    pub fn returns(
+        &self,
+        who: Who,
+        which: Levels,
+        episodes: u32,
+        seed: u64,
+    ) -> anyhow::Result<Option<Vec<f64>>> {
+        match levels(&self.config.world, which) {
+            Ok(world) => self.play(who, &world, episodes as usize, seed).map(Some),
+            Err(_) => Ok(None),
+        }
+    }
+
+    /// Returns of whole episodes in `world`, which is the run's with some levels of its own.
+    ///
+    /// # Errors
+    /// The policy or the world failed, or episodes do not end.
+    pub fn play(
+        &self,
+        who: Who,
+        world: &WorldConfig,
+        episodes: usize,
+        seed: u64,
+    ) -> anyhow::Result<Vec<f64>> {
+        let spec = &self.config.run;
+        let frame = (spec.frame_height as usize, spec.frame_width as usize);
+        let mut policy: Box<dyn Policy> = match who {
+            Who::Agent => Box::new(NetworkPolicy::new(
+                &self.config.model,
+                frame,
+                &self.weights,
+            )?),
+            Who::Random => Box::new(RandomPolicy::new(u8::try_from(spec.num_actions)?)),
+        };
+        let copies = episodes.min(COPIES_MAX);
+        let rounds = episodes.div_ceil(copies) as u64;
+        episode_returns(
+            world.build(copies, seed, 0)?,
+            spec.frame_stack as usize,
+            policy.as_mut(),
+            EPSILON,
+            episodes,
+            rounds * STEPS_A_ROUND_MAX,
+            policy_rng(seed),
+        )
+        .with_context(|| format!("playing {}", spec.world))
+    }
+}
+
+/// What the policy explores with: other numbers than those of any copy of the world, which has the same seed.
+fn policy_rng(seed: u64) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(POLICY_STREAM);
+    rng
+}
+
+/// The world with the levels asked for.
+///
+/// # Errors
+/// The world does not have them.
+pub fn levels(world: &WorldConfig, levels: Levels) -> Result<WorldConfig, Usage> {
+    let levels = match levels {
+        Levels::Train => driml_envs::Levels::Train,
+        Levels::TrainSingle => driml_envs::Levels::TrainSingle,
+        Levels::Unseen => driml_envs::Levels::Unseen,
+    };
+    world.with_levels(levels).map_err(|e| usage!("{e}"))
+}
+
+/// Mean and sample standard deviation; 0 for a single value.
+pub fn mean_and_deviation(values: &[f64]) -> (f64, f64) {
+    let count = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / count;
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    (
+        mean,
+        if values.len() > 1 {
+            (squares / (count - 1.0)).sqrt()
+        } else {
+            0.0
+        },
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::Rng;
+
+    use super::*;
+
+    #[test]
+    fn an_evaluation_hardly_explores() {
+        // Source: section 2 of the project's specification.
+        assert_eq!(EPSILON, 0.001);
+    }
+
+    #[test]
+    fn exploration_and_the_world_do_not_share_random_numbers() {
+        for seed in [0, 1, u64::MAX] {
+            let first = policy_rng(seed).random::<u64>();
+            // The streams of a world's copies: two for each.
+            for stream in 0..2 * COPIES_MAX as u64 {
+                let mut copy = ChaCha8Rng::seed_from_u64(seed);
+                copy.set_stream(stream);
+                assert_ne!(copy.random::<u64>(), first, "stream {stream}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_deviation_is_the_samples() {
+        assert_eq!(mean_and_deviation(&[1.0, 3.0]), (2.0, 2.0_f64.sqrt()));
+        assert_eq!(mean_and_deviation(&[4.0]), (4.0, 0.0));
+    }
+}

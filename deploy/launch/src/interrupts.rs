@@ -1,0 +1,117 @@
+//! Counts how often a person has asked this process to stop: by Ctrl-C, by SIGTERM, or by closing the terminal or pipe.
+//! The first is a wish to drain, the second to end at once; the caller decides.
+
+use std::{
+    ops::ControlFlow,
+    sync::{Arc, Condvar, Mutex},
+    time::{Duration, Instant},
+};
+
+use driml_protocol::end_signs::{self, EndSign};
+
+/// Signals closer together are one wish: tools such as `timeout` signal the process and its group.
+const ONE_WISH: Duration = Duration::from_millis(300);
+
+/// A shared count of interrupts.
+#[derive(Clone, Debug, Default)]
+pub struct Interrupts {
+    state: Arc<(Mutex<u32>, Condvar)>,
+}
+
+impl Interrupts {
+    /// Starts to listen for signs that this process should end, for the rest of its life; the death of the process `parent` is
+    /// one.
+    ///
+    /// # Errors
+    /// As [`end_signs::listen`].
+    pub fn listen(parent: Option<u32>) -> std::io::Result<Self> {
+        let this = Self::default();
+        let counted = this.clone();
+        let mut last = None;
+        end_signs::listen("interrupts", parent, move |sign| {
+            counted.hear(sign, &mut last, Instant::now());
+            ControlFlow::Continue(())
+        })?;
+        Ok(this)
+    }
+
+    /// Counts a sign that was heard at `now`. `last` is when the last wish began.
+    fn hear(&self, sign: EndSign, last: &mut Option<Instant>, now: Instant) {
+        let is_new = match sign {
+            // Counted from the wish's first signal: whoever keeps pressing is heard.
+            EndSign::Asked => last.is_none_or(|last| now - last > ONE_WISH),
+            // Nobody is there who could be in a hurry: a closed terminal sends SIGHUP, and the other signs follow.
+            EndSign::Abandoned => last.is_none(),
+        };
+        if is_new {
+            self.add();
+            *last = Some(now);
+        }
+    }
+
+    fn add(&self) {
+        *self
+            .state
+            .0
+            .lock()
+            .expect("no thread panics while holding the count") += 1;
+        self.state.1.notify_all();
+    }
+
+    /// How many there were.
+    pub fn count(&self) -> u32 {
+        *self
+            .state
+            .0
+            .lock()
+            .expect("no thread panics while holding the count")
+    }
+
+    /// Sleeps for `timeout`, or until there is one more; returns how many there were.
+    pub fn wait_timeout(&self, timeout: Duration) -> u32 {
+        let count = self
+            .state
+            .0
+            .lock()
+            .expect("no thread panics while holding the count");
+        let before = *count;
+        let waited = self
+            .state
+            .1
+            .wait_timeout_while(count, timeout, |count| *count == before);
+        *waited.expect("no thread panics while holding the count").0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_interrupt_counts_and_wakes() {
+        let interrupts = Interrupts::default();
+        assert_eq!(interrupts.wait_timeout(Duration::from_millis(1)), 0);
+        let other = interrupts.clone();
+        let waiter = std::thread::spawn(move || other.wait_timeout(Duration::from_secs(60)));
+        while !waiter.is_finished() {
+            interrupts.add();
+            std::thread::yield_now();
+        }
+        assert!(waiter.join().unwrap() >= 1);
+    }
+
+    #[test]
+    fn a_closed_terminal_is_the_first_wish_and_never_the_second() {
+        let interrupts = Interrupts::default();
+        let (start, mut last) = (Instant::now(), None);
+        let mut hear = |sign, seconds| {
+            interrupts.hear(sign, &mut last, start + Duration::from_secs(seconds));
+            interrupts.count()
+        };
+        assert_eq!(hear(EndSign::Abandoned, 0), 1);
+        assert_eq!(hear(EndSign::Abandoned, 5), 1);
+        assert_eq!(hear(EndSign::Asked, 10), 2, "a second wish by hand");
+        assert_eq!(hear(EndSign::Asked, 10), 2, "the same wish");
+        assert_eq!(hear(EndSign::Abandoned, 20), 2);
+    }
+}

@@ -1,0 +1,231 @@
+//! All parts in one process, one after the other in a fixed order: the same code as the processes run, without sockets.
+//! The same seed gives the same weights, bit for bit, on the same machine; it is for tests and debugging, not for speed.
+
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use driml_actor::{ActorSettings, Collector, Incarnation};
+use driml_learner::{Learner, LearnerPart};
+use driml_machine::error::Interrupted;
+use driml_protocol::{ActorJoin, Batch, BufferPool, Goodbye, InsertReply, LearnerStatus, Shutdown};
+use driml_replay_server::{Replay, Unready};
+use driml_settings::config::RunConfig;
+
+use crate::{
+    console::{self, Screen, print},
+    display::{Display, TEMPLATE},
+    run_folder::{Behind, Outcome, Recorder, RunFolder},
+};
+
+/// How often progress is shown and recorded.
+const POLL: Duration = Duration::from_secs(1);
+/// Every actor's incarnation: an actor of this mode has one life, and its number influences nothing.
+const INCARNATION: u64 = 1;
+/// The learner's number, which influences nothing either.
+const LEARNER: u64 = 1;
+
+/// Trains in this process, and leaves `run_dir`.
+///
+/// # Errors
+/// A part that failed, a file system that refuses; [`Interrupted`] if a person ended the run.
+pub fn run(
+    config: &RunConfig,
+    run_dir: &RunFolder,
+    exit_with_parent: Option<u32>,
+) -> anyhow::Result<()> {
+    let shutdown = Shutdown::on_signals(exit_with_parent).context("listening for signals")?;
+    let mut recorder = Recorder::create(
+        run_dir,
+        &config.to_toml(),
+        config.learner.update.objective.losses(),
+        &[],
+    )?;
+    let screen = Screen::new(config.frames(), TEMPLATE);
+    let mut parts = Parts::new(config)?;
+    let mut display = Display::new(
+        screen.clone(),
+        config.frames(),
+        config.updates(),
+        Behind::default(),
+    );
+    let mut shown = Instant::now();
+    let folder = run_dir.checkpoints();
+
+    let mut outcome = Outcome::Finished;
+    let mut saved = u64::MAX;
+    while parts.round()? {
+        if parts.learner.checkpoint_is_due() && parts.learner.updates() != saved {
+            saved = parts.learner.updates();
+            parts.learner.save(&folder)?;
+        }
+        if shown.elapsed() >= POLL {
+            shown = Instant::now();
+            let replay = parts.replay.status();
+            let said = recorder.record(std::slice::from_ref(&replay), &parts.status, &[]);
+            said.iter().for_each(|line| screen.line(line));
+            display.show(&replay, &parts.status, recorder.episodes(&replay));
+        }
+        if shutdown.is_set() {
+            outcome = Outcome::Interrupted;
+            break;
+        }
+    }
+    parts.end()?;
+    if parts.learner.updates() != saved {
+        parts.learner.save(&folder)?;
+    }
+    screen.clear();
+    let replay = parts.replay.status();
+    recorder.record(std::slice::from_ref(&replay), &parts.status, &[]);
+    let missing = recorder.missing();
+    missing.iter().for_each(|line| console::line(line));
+    let summary = recorder.summarise(outcome, &config.run, &replay, &parts.status);
+    print(&summary.describe(run_dir))?;
+    summary.write(run_dir)?;
+    if outcome == Outcome::Interrupted {
+        Err(Interrupted.into())
+    } else {
+        Ok(())
+    }
+}
+
+/// The parts, hand in hand.
+struct Parts {
+    actors: Vec<Collector>,
+    next_actor: usize,
+    replay: Replay,
+    learner: Learner,
+    status: LearnerStatus,
+    batch_rows: u32,
+    steps_per_chunk: u32,
+    unwanted: Vec<u64>,
+    published: u64,
+}
+
+impl Parts {
+    fn new(config: &RunConfig) -> anyhow::Result<Self> {
+        let text = config.to_toml();
+        let settings = ActorSettings::from_toml(&text)?;
+        let part = LearnerPart::from_toml(&text)?;
+        let batch_rows = part.learner.batch_rows;
+        let mut replay = Replay::new(&config.run, &config.replay, batch_rows)?;
+        for actor in 0..config.local.actors {
+            let join = ActorJoin {
+                actor,
+                incarnation: INCARNATION,
+            };
+            replay.join_actor(join).map_err(anyhow::Error::msg)?;
+        }
+        let mut learner = Learner::new(part, &config.local.learner_device.open()?)?;
+        let (header, weights) = learner.next_weights()?;
+        let status = LearnerStatus {
+            weights_version: header.version,
+            weights_sha256: header.sha256_hex(),
+            ..LearnerStatus::default()
+        };
+        let actor = |actor| {
+            let life = Incarnation {
+                actor,
+                id: INCARNATION,
+                after_updates: 0,
+                earlier_incarnations: 0,
+            };
+            Collector::new(
+                settings.clone(),
+                BufferPool::new(1),
+                life,
+                header.version,
+                &weights,
+            )
+        };
+        let actors = (0..config.local.actors)
+            .map(actor)
+            .collect::<Result<Vec<_>, _>>()?;
+        Ok(Self {
+            unwanted: vec![0; actors.len()],
+            actors,
+            next_actor: 0,
+            replay,
+            learner,
+            status,
+            batch_rows,
+            steps_per_chunk: settings.actor.steps_per_chunk,
+            published: 0,
+        })
+    }
+
+    /// One chunk of the next actor, then every update that it allows; `false` once all updates are done.
+    fn round(&mut self) -> anyhow::Result<bool> {
+        let id = self.next_actor;
+        self.next_actor = (id + 1) % self.actors.len();
+        let chunk = self.actors[id].collect(self.replay.inserted_total(), self.steps_per_chunk)?;
+        loop {
+            match self.replay.insert(&chunk) {
+                InsertReply::Stored { .. } => break,
+                InsertReply::Wait { .. } => match self.replay.sample(self.batch_rows) {
+                    Ok(batch) => self.learn(&batch)?,
+                    Err(unready) => bail!("actor and learner wait for each other: {unready:?}"),
+                },
+                InsertReply::Finished { .. } => {
+                    self.unwanted[id] += chunk.header.transitions() as u64;
+                    break;
+                }
+                InsertReply::OutOfOrder { expected } => {
+                    bail!(
+                        "actor {id} is at chunk {}, not {expected}",
+                        chunk.header.sequence
+                    )
+                }
+                InsertReply::Refused { why } => bail!("the replay refused a chunk: {why}"),
+            }
+        }
+        loop {
+            match self.replay.sample(self.batch_rows) {
+                Ok(batch) => self.learn(&batch)?,
+                Err(Unready::Wait(_)) => return Ok(true),
+                Err(Unready::Finished) => return Ok(false),
+                Err(Unready::Refused { why }) => bail!("the replay refuses to sample: {why}"),
+            }
+        }
+    }
+
+    fn learn(&mut self, batch: &Batch) -> anyhow::Result<()> {
+        let report = self.learner.update(batch)?;
+        self.learner.note(&report, &mut self.status);
+        if let Some(affinity) = self.learner.affinity_update(LEARNER) {
+            self.replay.set_affinity(&affinity)?;
+        }
+        if self.learner.publication_is_due() {
+            self.publish()?;
+        }
+        Ok(())
+    }
+
+    fn publish(&mut self) -> anyhow::Result<()> {
+        let (header, weights) = self.learner.next_weights()?;
+        for actor in &mut self.actors {
+            actor.set_weights(header.version, &weights)?;
+        }
+        self.published = self.learner.updates();
+        self.status.weights_version = header.version;
+        self.status.weights_sha256 = header.sha256_hex();
+        Ok(())
+    }
+
+    /// The last weights and everyone's last word.
+    fn end(&mut self) -> anyhow::Result<()> {
+        if self.published != self.learner.updates() {
+            self.publish()?;
+        }
+        for (id, (actor, unwanted)) in self.actors.iter().zip(&self.unwanted).enumerate() {
+            let produced = actor.produced() - unwanted;
+            self.replay.goodbye(&Goodbye {
+                actor: id as u32,
+                incarnation: INCARNATION,
+                produced,
+            });
+        }
+        self.status.finished = true;
+        Ok(())
+    }
+}

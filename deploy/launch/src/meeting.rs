@@ -1,0 +1,146 @@
+//! The folder in which the parts of a run meet at unix sockets: private, beside other temporary files, and removed with the last
+//! process that uses it. A socket's path must be short, so it is not in the run folder.
+//!
+//! The folder counts as used as long as anybody holds the lock of one file in it: the launcher, and each part, which has the
+//! file as its standard input. So those of a launcher that was killed are known, and swept by the next that starts or the last
+//! part that ends.
+
+use std::{
+    fs::{self, File, Permissions},
+    io,
+    os::unix::fs::{MetadataExt, PermissionsExt},
+    path::Path,
+};
+
+use anyhow::Context;
+use nix::unistd::{dup2_stdin, geteuid};
+
+const PREFIX: &str = "driml-run-";
+/// The file whose lock says that the folder is used.
+const IN_USE: &str = "in-use";
+
+/// A run's folder for sockets. Dropping it removes it.
+#[derive(Debug)]
+pub struct Meeting {
+    folder: tempfile::TempDir,
+    lock: File,
+}
+
+impl Meeting {
+    /// Makes one, and sweeps those that nobody uses any more.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(crate) fn create() -> anyhow::Result<Self> {
+        let place = std::env::temp_dir();
+        sweep(&place);
+        Self::create_in(&place).context("making a folder for the socket")
+    }
+
+    fn create_in(place: &Path) -> io::Result<Self> {
+        // Whoever can reach the socket can take part in the run.
+        let folder = tempfile::Builder::new()
+            .prefix(PREFIX)
+            .permissions(Permissions::from_mode(0o700))
+            .tempdir_in(place)?;
+        // Locked before it has the name by which it is known, or somebody who sweeps just now would find it without a holder.
+        let fresh = folder.path().join("new");
+        let lock = File::create(&fresh)?;
+        if let Err(e) = lock.try_lock() {
+            // Nobody sweeps what cannot be locked.
+            tracing::debug!("locking {}: {e}", fresh.display());
+        }
+        fs::rename(fresh, folder.path().join(IN_USE))?;
+        Ok(Self { folder, lock })
+    }
+
+    /// Where a part of this name listens.
+    pub(crate) fn endpoint(&self, name: &str) -> String {
+        let path = self.folder.path().join(format!("{name}.sock"));
+        format!("unixsock-stream/{}", path.display())
+    }
+
+    /// The lock, for a process that uses the folder: its standard input.
+    ///
+    /// # Errors
+    /// No more open files.
+    pub(crate) fn hold(&self) -> io::Result<File> {
+        self.lock.try_clone()
+    }
+}
+
+/// What a part does at its orderly end: uses no such folder any more, and sweeps, as its launcher may have been killed.
+pub fn leave() {
+    let nothing = File::open("/dev/null").map_err(|e| e.to_string());
+    match nothing.and_then(|nothing| dup2_stdin(nothing).map_err(|e| e.to_string())) {
+        Ok(()) => sweep(&std::env::temp_dir()),
+        Err(e) => tracing::debug!("leaving the folder of the socket: {e}"),
+    }
+}
+
+/// Removes folders of this user in `place` that nobody uses any more. What cannot be removed stays: it is in nobody's way.
+fn sweep(place: &Path) {
+    let entries = fs::read_dir(place).into_iter().flatten().flatten();
+    for entry in entries.filter(|it| it.file_name().to_string_lossy().starts_with(PREFIX)) {
+        let is_ours = entry
+            .metadata()
+            .is_ok_and(|it| it.is_dir() && it.uid() == geteuid().as_raw());
+        if is_ours && is_unused(&entry.path()) {
+            match fs::remove_dir_all(entry.path()) {
+                Ok(()) => tracing::debug!("removed {}", entry.path().display()),
+                Err(e) => tracing::debug!("removing {}: {e}", entry.path().display()),
+            }
+        }
+    }
+}
+
+fn is_unused(folder: &Path) -> bool {
+    File::open(folder.join(IN_USE)).is_ok_and(|lock| lock.try_lock().is_ok())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn folders(place: &Path) -> usize {
+        fs::read_dir(place).unwrap().count()
+    }
+
+    #[test]
+    fn what_nobody_uses_is_swept_and_nothing_else() {
+        let place = tempfile::tempdir().unwrap();
+        let meeting = Meeting::create_in(place.path()).unwrap();
+        let mode = fs::metadata(meeting.folder.path()).unwrap().mode();
+        assert_eq!(mode & 0o777, 0o700);
+        // Somebody else's, by its name or by what is in it.
+        fs::create_dir(place.path().join("driml-run-other")).unwrap();
+        fs::create_dir(place.path().join("else")).unwrap();
+        fs::write(place.path().join("else").join(IN_USE), "").unwrap();
+        sweep(place.path());
+        assert_eq!(folders(place.path()), 3);
+
+        // As after the launcher was killed: a part still uses it.
+        let part = meeting.hold().unwrap();
+        let Meeting { folder, lock } = meeting;
+        let path = folder.keep();
+        fs::write(path.join("learner.sock"), "").unwrap();
+        drop(lock);
+        sweep(place.path());
+        assert!(path.exists());
+        drop(part);
+        sweep(place.path());
+        assert!(!path.exists());
+        assert_eq!(folders(place.path()), 2);
+    }
+
+    #[test]
+    fn an_endpoint_is_in_the_folder() {
+        let place = tempfile::tempdir().unwrap();
+        let meeting = Meeting::create_in(place.path()).unwrap();
+        let path = meeting.folder.path().display().to_string();
+        assert_eq!(
+            meeting.endpoint("learner"),
+            format!("unixsock-stream/{path}/learner.sock")
+        );
+    }
+}

@@ -1,0 +1,489 @@
+//! The launcher: starts the parts as processes, watches them to the end of the run, and ends them in order.
+//! Each part is a `child`; what they say is for `statuses`, what is shown and kept for `display` and `record`.
+
+use std::{
+    path::Path,
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context, bail};
+use driml_machine::{
+    error::{Interrupted, Usage},
+    units::duration,
+};
+use driml_protocol::{
+    Keys, fault,
+    session::{self, Endpoints},
+};
+use driml_settings::config::RunConfig;
+
+use crate::{
+    child::{Part, Surroundings},
+    console::{self, Screen, print},
+    display::{Display, TEMPLATE},
+    endpoint::NAMESPACE,
+    interrupts::Interrupts,
+    meeting::Meeting,
+    resume,
+    run_folder::{Behind, Outcome, Recorder, RunFolder, Summary},
+    statuses::Statuses,
+};
+
+/// How often the parts are asked how they are.
+const POLL: Duration = Duration::from_secs(1);
+/// How long the replay server may take to listen.
+const LISTEN_MAX: Duration = Duration::from_secs(30);
+/// How long a part may leave questions unanswered, from its start too, before the run is given up.
+const SILENCE_MAX: Duration = Duration::from_secs(120);
+/// How long a run may make no progress before it is given up.
+const STALL_MAX: Duration = Duration::from_secs(600);
+/// How long actors may take to deliver what they have, once they are not needed or told to stop.
+const ACTORS_DRAIN_MAX: Duration = Duration::from_secs(60);
+/// How long actors may take to end once another part has failed.
+const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
+/// How long the learner may take to save, once it is told to stop.
+const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
+/// How long the replay server may take to end, once it is told to stop.
+const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
+/// How often a learner that saves is asked whether it is done.
+const DRAIN_POLL: Duration = Duration::from_millis(100);
+/// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
+const PART_THREADS: u32 = 1;
+
+/// Trains with one process for each part, and leaves `run_dir`; a run that is `resumed` has it already, and so much behind it.
+///
+/// # Errors
+/// A part that failed or went silent, a file system that refuses; [`Interrupted`] if a person ended the run.
+pub fn run(
+    config: &RunConfig,
+    run_dir: &RunFolder,
+    resumed: Option<Behind>,
+    listen: Option<String>,
+    exit_with_parent: Option<u32>,
+) -> anyhow::Result<()> {
+    let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
+    let servers = server_names(config.replay.shards);
+    let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
+    let names: Vec<_> = servers
+        .iter()
+        .cloned()
+        .chain(["learner".into()])
+        .chain(actors)
+        .collect();
+    let (text, losses) = (config.to_toml(), config.learner.update.objective.losses());
+    let mut recorder = match resumed {
+        Some(behind) => Recorder::go_on(run_dir, &text, losses, &names, behind, config.frames())?,
+        None => Recorder::create(run_dir, &text, losses, &names)?,
+    };
+    let behind = resumed.unwrap_or_default();
+    let meeting = Meeting::create()?;
+    let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
+    if let Some(listen) = listen {
+        endpoints[0] = listen;
+    }
+    let screen = Screen::new(config.frames(), TEMPLATE);
+    let display = Display::new(screen.clone(), config.frames(), config.updates(), behind);
+    let mut launch = Launch {
+        config,
+        run_dir,
+        behind,
+        servers,
+        endpoints,
+        meeting,
+        screen,
+        display,
+        interrupts,
+        parts: Vec::new(),
+        statuses: None,
+    };
+
+    session::sweep_shared_memory();
+    let ran = launch.start_and_watch(&mut recorder);
+    let ended = launch.end(&ran);
+    session::sweep_shared_memory();
+    launch.screen.clear();
+    let outcome = match (&ran, &ended) {
+        (Ok(Outcome::Finished), Ok(())) => Outcome::Finished,
+        (Ok(Outcome::Interrupted), Ok(())) => Outcome::Interrupted,
+        _ => Outcome::Failed,
+    };
+    let (summary, written) = launch.conclude(&mut recorder, outcome);
+    if let Err(failed) = ran.and(ended) {
+        // It is what the run is remembered by; that the disk is full too is said before.
+        if let Err(e) = written {
+            console::line(&console::describe(&e));
+        }
+        return Err(failed);
+    }
+    print(&summary.describe(run_dir))?;
+    written.with_context(|| {
+        format!(
+            "the run is over and its checkpoint saved, but there is no summary of it: make room on the disk, then `driml local --resume {}` \
+             writes it",
+            run_dir.display()
+        )
+    })?;
+    if outcome == Outcome::Interrupted {
+        if resume::can_go_on(&config.world, run_dir) {
+            console::line(&format!(
+                "`driml local --resume {}` goes on with it",
+                run_dir.display()
+            ));
+        }
+        Err(Interrupted.into())
+    } else {
+        Ok(())
+    }
+}
+
+/// A run's processes and what is known of them.
+struct Launch<'a> {
+    config: &'a RunConfig,
+    run_dir: &'a RunFolder,
+    behind: Behind,
+    /// Names of the replay servers, one a shard, and where each listens.
+    servers: Vec<String>,
+    endpoints: Vec<String>,
+    meeting: Meeting,
+    screen: Screen,
+    display: Display,
+    interrupts: Interrupts,
+    /// Replay servers, learner, actors, in this order, as far as they were started.
+    parts: Vec<Part>,
+    statuses: Option<Statuses>,
+}
+
+/// `replay-server`, or one for each of several shards.
+fn server_names(shards: u32) -> Vec<String> {
+    match shards {
+        1 => vec!["replay-server".into()],
+        _ => (0..shards).map(|i| format!("replay-server-{i}")).collect(),
+    }
+}
+
+impl Launch<'_> {
+    /// The learner's place in `parts`.
+    fn learner(&self) -> usize {
+        self.servers.len()
+    }
+
+    /// The first actor's place in `parts`.
+    fn first_actor(&self) -> usize {
+        self.servers.len() + 1
+    }
+
+    fn surroundings<'a>(&'a self, logs: &'a Path) -> Surroundings<'a> {
+        Surroundings {
+            logs,
+            screen: &self.screen,
+            meeting: Some(&self.meeting),
+        }
+    }
+
+    fn start_and_watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
+        let logs = self.run_dir.logs();
+        std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
+        let config = recorder.config_path().display().to_string();
+        let part = |words: &[&str]| {
+            words
+                .iter()
+                .map(|&word| word.to_owned())
+                .collect::<Vec<_>>()
+        };
+        for (shard, (name, endpoint)) in self.servers.iter().zip(&self.endpoints).enumerate() {
+            let (shard, after) = (shard.to_string(), self.behind.updates.to_string());
+            let mut args = part(&[
+                "replay-server",
+                "--listen",
+                endpoint,
+                "--shard",
+                &shard,
+                "--after-updates",
+                &after,
+                "--config",
+                &config,
+            ]);
+            if let Some(study) = self.config.replay.study {
+                args.extend(part(&["--study", study.name()]));
+            }
+            let server = Part::start(name, &args, PART_THREADS, self.surroundings(&logs))?;
+            self.parts.push(server);
+        }
+        let mut sessions = Vec::new();
+        for endpoint in self.endpoints.clone() {
+            match self.connect(&endpoint)? {
+                Some(session) => sessions.push(session),
+                None => return Ok(Outcome::Interrupted),
+            }
+        }
+        let keys = Keys::new(NAMESPACE).map_err(Usage)?;
+        self.statuses = Some(Statuses::new(sessions, keys, self.config.run.hash()));
+
+        let folder = self.run_dir.display().to_string();
+        let device = self.config.local.learner_device.to_string();
+        let mut args = part(&["learner", "--run-dir", &folder, "--device", &device]);
+        for endpoint in &self.endpoints {
+            args.extend(part(&["--connect", endpoint]));
+        }
+        self.parts.push(Part::start(
+            "learner",
+            &args,
+            self.config.local.learner_threads,
+            self.surroundings(&logs),
+        )?);
+        for id in 0..self.config.local.actors {
+            let args = part(&[
+                "actor",
+                "--connect",
+                &self.endpoints[id as usize % self.endpoints.len()],
+                "--id",
+                &id.to_string(),
+            ]);
+            self.parts.push(Part::start(
+                &format!("actor-{id}"),
+                &args,
+                PART_THREADS,
+                self.surroundings(&logs),
+            )?);
+        }
+        self.watch(recorder)
+    }
+
+    /// A session to the replay server as soon as it listens; none if a person was faster.
+    fn connect(&mut self, endpoint: &str) -> anyhow::Result<Option<zenoh::Session>> {
+        let endpoints = Endpoints {
+            listen: Vec::new(),
+            connect: vec![endpoint.to_owned()],
+        };
+        let deadline = Instant::now() + LISTEN_MAX;
+        loop {
+            // Opening may take seconds of its own, in which the replay server may end: so it is not waited for here.
+            let endpoints = endpoints.clone();
+            let (tell, told) = std::sync::mpsc::channel();
+            let open = move || {
+                fault::point("connect");
+                // Nobody listens any more if the run has ended meanwhile.
+                let _ = tell.send(session::open(&endpoints));
+            };
+            let thread = std::thread::Builder::new().name("connect".into());
+            thread.spawn(open).context("starting a thread")?;
+            let opened = loop {
+                self.check_alive()?;
+                if self.interrupts.count() > 0 {
+                    return Ok(None);
+                }
+                match told.recv_timeout(Duration::from_millis(50)) {
+                    Ok(opened) => break opened,
+                    Err(_) if Instant::now() > deadline => {
+                        bail!(
+                            "the replay server does not listen on {endpoint} after {}",
+                            duration(LISTEN_MAX)
+                        )
+                    }
+                    Err(_) => {}
+                }
+            };
+            match opened {
+                Ok(session) => return Ok(Some(session)),
+                Err(e) if Instant::now() > deadline => {
+                    return Err(e).context("reaching the replay server");
+                }
+                Err(e) => tracing::debug!("the replay server does not listen yet: {e}"),
+            }
+        }
+    }
+
+    /// Asks, shows and records once a second until the run is over.
+    fn watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
+        let mut heard = [Instant::now(); 2];
+        let mut progress = (Instant::now(), (0, 0));
+        loop {
+            if self.interrupts.wait_timeout(POLL) > 0 {
+                return Ok(Outcome::Interrupted);
+            }
+            self.check_alive()?;
+            let statuses = self
+                .statuses
+                .as_mut()
+                .expect("it was set before the run is watched");
+            for (heard, (name, answer)) in heard.iter_mut().zip([
+                ("replay server", statuses.ask_replay()),
+                ("learner", statuses.ask_learner()),
+            ]) {
+                match answer {
+                    Ok(()) => *heard = Instant::now(),
+                    Err(e) if heard.elapsed() > SILENCE_MAX => {
+                        return Err(e.context(format!(
+                            "the {name} has not answered for {}",
+                            duration(heard.elapsed())
+                        )));
+                    }
+                    Err(e) => tracing::debug!("the {name} did not answer: {e:#}"),
+                }
+            }
+            let (replay, mut learner) = (statuses.replay.clone(), statuses.learner.clone());
+            // Until the learner has answered, too.
+            learner.updates = learner.updates.max(self.behind.updates);
+            let rss: Vec<_> = self.parts.iter_mut().map(Part::rss_mib).collect();
+            for line in recorder.record(&statuses.shards, &learner, &rss) {
+                self.screen.line(&line);
+            }
+            self.display
+                .show(&replay, &learner, recorder.episodes(&replay));
+            if replay.finished && learner.finished {
+                return Ok(Outcome::Finished);
+            }
+            let counts = (replay.transitions_inserted, learner.updates);
+            if counts != progress.1 {
+                progress = (Instant::now(), counts);
+            } else if progress.0.elapsed() > STALL_MAX {
+                bail!(
+                    "no frame and no update for {}, at {} frames and {} updates ({}): see {}",
+                    duration(STALL_MAX),
+                    counts.0,
+                    counts.1,
+                    replay.waiting,
+                    self.run_dir.logs().display()
+                );
+            }
+        }
+    }
+
+    /// Whether all parts are as they should be: running, or actors that are not needed any more.
+    fn check_alive(&mut self) -> anyhow::Result<()> {
+        let first_actor = self.first_actor();
+        for (at, part) in self.parts.iter_mut().enumerate() {
+            if let Some(status) = part.end()
+                && !(at >= first_actor && status.success())
+            {
+                bail!("{}", part.obituary());
+            }
+        }
+        Ok(())
+    }
+
+    /// Ends all parts: actors first, so that what they have is stored; the learner saves; the replay server is last, so
+    /// that it can be asked for the final counts. A second interrupt ends everything at once.
+    fn end(&mut self, ran: &anyhow::Result<Outcome>) -> anyhow::Result<()> {
+        if matches!(ran, Ok(Outcome::Interrupted)) {
+            self.screen.line("stopping: actors deliver what they have, the learner saves (Ctrl-C again ends at once)");
+        }
+        // The interrupt that led here is the first.
+        let allowed = self.interrupts.count().min(1);
+        let interrupts = self.interrupts.clone();
+        let hurry = move || interrupts.count() > allowed;
+        let finished = matches!(ran, Ok(Outcome::Finished));
+        // Once a part has failed, what the actors still have will hardly be learned from.
+        let actors_max = if ran.is_ok() {
+            ACTORS_DRAIN_MAX
+        } else {
+            FAILED_DRAIN_MAX
+        };
+        let mut late = Vec::new();
+        let last = self.parts.len();
+        let (learner, first_actor) = (self.learner().min(last), self.first_actor().min(last));
+        // When the run is finished, actors hear it from the replay server and end by themselves.
+        let actors = self.stop(first_actor..last, !finished, actors_max, &hurry);
+        if finished {
+            late.extend(actors);
+        } else {
+            // What an actor could not deliver is in the count of lost transitions; all that was learned is still saved.
+            actors
+                .iter()
+                .for_each(|actor| self.screen.line(&format!("while stopping, {actor}")));
+        }
+        self.hear_the_learner_out(&hurry);
+        late.extend(self.stop(learner..first_actor, true, LEARNER_DRAIN_MAX, &hurry));
+        if let Some(statuses) = &mut self.statuses {
+            if let Err(e) = statuses.ask_replay() {
+                tracing::debug!("the replay server's last word: {e:#}");
+            }
+            // Before its router goes away, so that it does not try to reach it again.
+            statuses.close();
+        }
+        late.extend(self.stop(0..learner, true, REPLAY_DRAIN_MAX, &hurry));
+        if hurry() {
+            bail!("ended at once by an interrupt: what was not saved is lost");
+        }
+        if ran.is_ok() && !late.is_empty() {
+            bail!("at the end of the run, {}", late.join("; "));
+        }
+        Ok(())
+    }
+
+    /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
+    fn hear_the_learner_out(&mut self, hurry: &impl Fn() -> bool) {
+        let at = self.learner();
+        let Some(learner) = self.parts.get_mut(at) else {
+            return;
+        };
+        learner.ask_to_stop();
+        let deadline = Instant::now() + LEARNER_DRAIN_MAX;
+        let Some(statuses) = &mut self.statuses else {
+            return;
+        };
+        while Instant::now() < deadline && !hurry() {
+            if let Err(e) = statuses.ask_learner() {
+                tracing::debug!("a last question: {e:#}");
+                return;
+            }
+            if statuses.learner.finished {
+                return;
+            }
+            std::thread::sleep(DRAIN_POLL);
+        }
+    }
+
+    /// Waits for some parts to end, asking them first if `ask`; says which did not end well in time. None is left.
+    fn stop(
+        &mut self,
+        which: std::ops::Range<usize>,
+        ask: bool,
+        drain_max: Duration,
+        hurry: &impl Fn() -> bool,
+    ) -> Vec<String> {
+        let parts = &mut self.parts[which];
+        if ask {
+            parts.iter_mut().for_each(Part::ask_to_stop);
+        }
+        let deadline = Instant::now() + drain_max;
+        let mut late = Vec::new();
+        for part in parts {
+            match part.wait_until(deadline, hurry) {
+                Some(status) if status.success() => {}
+                Some(_) => late.push(part.obituary()),
+                None => {
+                    if !hurry() {
+                        late.push(format!(
+                            "{} did not end within {} and was killed",
+                            part.name,
+                            duration(drain_max)
+                        ));
+                    }
+                    part.kill();
+                    part.wait_until(Instant::now() + REPLAY_DRAIN_MAX, || false);
+                }
+            }
+        }
+        late
+    }
+
+    /// Writes the last row and the summary, says what could not be written before, and whether the summary could.
+    fn conclude(
+        &mut self,
+        recorder: &mut Recorder,
+        outcome: Outcome,
+    ) -> (Summary, anyhow::Result<()>) {
+        let (shards, replay, learner) = match &self.statuses {
+            Some(it) => (&it.shards[..], it.replay.clone(), it.learner.clone()),
+            None => Default::default(),
+        };
+        recorder.record(shards, &learner, &[]);
+        let logs = self.parts.iter().filter_map(Part::missing_log_lines);
+        let missing = recorder.missing().into_iter().chain(logs);
+        missing.for_each(|line| console::line(&line));
+        let summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);
+        let written = summary.write(self.run_dir);
+        (summary, written)
+    }
+}

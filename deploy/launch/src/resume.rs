@@ -1,0 +1,111 @@
+//! `driml local --resume`: the settings of an interrupted run, and what it has behind it.
+//! It changes nothing in the run's folder, and waits there for whoever still saves.
+
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use driml_envs::WorldConfig;
+use driml_learner::checkpoint::{self, CheckpointError};
+use driml_machine::{error::usage, resources::Machine};
+use driml_settings::config::{Flags, RunConfig, Source, resolve};
+
+use crate::{
+    console,
+    run_folder::{Behind, RunFolder, Summary},
+};
+
+/// How long the learner of a launcher that was killed may take to save.
+const SAVING_MAX: Duration = Duration::from_secs(120);
+
+/// Whether the run in `folder`, which is in this world, can be resumed: it has a checkpoint, which holds nothing of a world's own
+/// progress.
+pub fn can_go_on(world: &WorldConfig, folder: &RunFolder) -> bool {
+    let saved = checkpoint::list(&folder.checkpoints());
+    world.is_resumable() && saved.is_ok_and(|all| !all.is_empty())
+}
+
+/// Waits until the learner of the run in `folder` has saved, if the run was ended.
+///
+/// # Errors
+/// The run is still going on, or its learner takes too long.
+pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
+    folder.lock()?;
+    let checkpoints = folder.checkpoints();
+    let started = Instant::now();
+    let mut said = false;
+    while checkpoints.is_dir() {
+        match checkpoint::lock(&checkpoints) {
+            Err(CheckpointError::InUse(_)) if started.elapsed() < SAVING_MAX => {
+                if !std::mem::replace(&mut said, true) {
+                    console::line(&format!(
+                        "a learner still saves in {}: waiting",
+                        checkpoints.display()
+                    ));
+                }
+                std::thread::sleep(Duration::from_millis(250));
+            }
+            locked => {
+                locked?;
+                break;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The settings with which the run in `folder` goes on, and what it has behind it.
+///
+/// # Errors
+/// A folder that is no run's, settings that cannot work, no checkpoint, nothing left to do, somebody who is at it.
+pub fn find(
+    folder: &RunFolder,
+    flags: &Flags,
+    machine: &Machine,
+) -> anyhow::Result<(RunConfig, Behind)> {
+    let path = folder.config();
+    let name = path.display().to_string();
+    let text = std::fs::read_to_string(&path).map_err(|e| {
+        usage!(
+            "reading the settings {name}: {e}; --resume takes the folder of a run that was interrupted"
+        )
+    })?;
+    // First, as a run that is still ending holds memory.
+    wait_until_free(folder)?;
+    let flags = Flags {
+        study: RunConfig::parse(&name, &text)?.replay.study,
+        ..flags.clone()
+    };
+    let config = resolve(&Source::File(name, text), &flags, machine)?;
+    if !config.world.is_resumable() {
+        return Err(usage!(
+            "the ghosts of the run in {} change as episodes pass, and a checkpoint does not hold how far they are: start it anew",
+            folder.display()
+        )
+        .into());
+    }
+    let checkpoints = folder.checkpoints();
+    let all = checkpoint::list(&checkpoints).context("looking for checkpoints")?;
+    let Some(&(updates, _)) = all.last() else {
+        return Err(usage!(
+            "there is no checkpoint in {}: start the run anew, in another folder",
+            checkpoints.display()
+        )
+        .into());
+    };
+    // One that has all its updates and did not come to its end does so now.
+    if updates >= config.updates() && Summary::is_finished(folder) {
+        return Err(usage!(
+            "the run in {} is finished, {updates} updates for {} frames: to train on, add --frames with more than these",
+            folder.display(),
+            config.frames()
+        )
+        .into());
+    }
+    if updates == 0 {
+        return Ok((config, Behind::default()));
+    }
+    let rows = updates as f64 * f64::from(config.learner.batch_rows);
+    let frames =
+        config.replay.warmup_transitions + (rows / config.replay.replay_ratio).ceil() as u64;
+    Ok((config, Behind { updates, frames }))
+}

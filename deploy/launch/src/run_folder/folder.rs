@@ -1,0 +1,144 @@
+//! Where a run's files are. Nothing else in the program knows their names, but for the learner, which is told a folder and
+//! puts its checkpoints into `checkpoints/`.
+
+use std::{
+    fs::{self, File, TryLockError},
+    path::{Path, PathBuf},
+};
+
+use anyhow::Context;
+use driml_machine::error::{Usage, usage};
+use driml_protocol::whole_file;
+
+/// The folder of a run, which need not be there yet.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RunFolder {
+    path: PathBuf,
+}
+
+impl RunFolder {
+    /// The folder at `path`; nothing is looked at.
+    pub fn new(path: impl Into<PathBuf>) -> Self {
+        Self { path: path.into() }
+    }
+
+    /// The folder itself.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Its path for a message.
+    pub fn display(&self) -> std::path::Display<'_> {
+        self.path.display()
+    }
+
+    /// The resolved settings, TOML.
+    pub fn config(&self) -> PathBuf {
+        self.path.join("config.toml")
+    }
+
+    /// A row a second: frames, updates, losses, speed, memory.
+    pub fn metrics(&self) -> PathBuf {
+        self.path.join("metrics.csv")
+    }
+
+    /// The return of each training episode.
+    pub fn returns(&self) -> PathBuf {
+        self.path.join("returns.csv")
+    }
+
+    /// How the run ended and what it counted, JSON; it is there once the run has ended.
+    pub fn summary(&self) -> PathBuf {
+        self.path.join("summary.json")
+    }
+
+    /// A folder for each checkpoint.
+    pub fn checkpoints(&self) -> PathBuf {
+        self.path.join("checkpoints")
+    }
+
+    /// A file for each process.
+    pub fn logs(&self) -> PathBuf {
+        self.path.join("logs")
+    }
+
+    /// Refuses a folder in which something lies.
+    ///
+    /// # Errors
+    /// Says what to do.
+    pub fn check_free(&self) -> Result<(), Usage> {
+        let taken = match fs::read_dir(&self.path) {
+            Ok(mut entries) => entries.next().is_some(),
+            Err(_) => self.path.exists(),
+        };
+        if taken {
+            return Err(usage!(
+                "the run folder {} exists and is not empty: choose another --run-dir, or remove it",
+                self.display()
+            ));
+        }
+        Ok(())
+    }
+
+    /// Keeps other launchers out as long as the file is held.
+    ///
+    /// # Errors
+    /// Another launcher holds it, or a file system that refuses.
+    pub fn lock(&self) -> anyhow::Result<File> {
+        let path = self.path.join(".lock");
+        let doing = || format!("locking {}", path.display());
+        let file = File::create(&path).with_context(doing)?;
+        match file.try_lock() {
+            Ok(()) => Ok(file),
+            Err(TryLockError::WouldBlock) => Err(usage!(
+                "the run in {} is still going on: end it first, or wait",
+                self.display()
+            )
+            .into()),
+            Err(TryLockError::Error(e)) => {
+                // Not every file system of a cluster has locks, and runs were made without them before.
+                tracing::warn!(
+                    "{} cannot be locked: {e}; start no other run there",
+                    path.display()
+                );
+                Ok(file)
+            }
+        }
+    }
+
+    /// Writes the settings.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn write_config(&self, config_toml: &str) -> anyhow::Result<()> {
+        let head = "# The resolved settings of this run; `driml local --config` with this file repeats it.\n\n";
+        write_whole(&self.config(), format!("{head}{config_toml}").as_bytes())
+    }
+}
+
+/// Writes a file whole or not at all.
+///
+/// # Errors
+/// A file system that refuses.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    whole_file::write(path, bytes).with_context(|| format!("writing {}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_in_use_is_refused_and_an_empty_one_is_not() {
+        let folder = tempfile::tempdir().unwrap();
+        let check_free = |path: &Path| RunFolder::new(path).check_free();
+        assert!(check_free(folder.path()).is_ok());
+        fs::write(folder.path().join("x"), "").unwrap();
+        let said = check_free(folder.path()).unwrap_err().to_string();
+        assert!(
+            said.contains("exists and is not empty: choose another --run-dir"),
+            "{said}"
+        );
+        assert!(check_free(&folder.path().join("x")).is_err());
+    }
+}

@@ -1,0 +1,20 @@
+//! A run's folder: the names of its files, what is written there while a run goes on, and reading it again.
+
+mod columns;
+mod folder;
+mod metrics;
+mod recorder;
+mod resume_point;
+mod returns;
+mod summary;
+mod table;
+
+pub use self::{
+    columns::Columns,
+    folder::{RunFolder, write_whole},
+    metrics::{Progress, progress},
+    recorder::Recorder,
+    resume_point::Behind,
+    returns::{Episodes, MeanReturn},
+    summary::{Outcome, Summary},
+};

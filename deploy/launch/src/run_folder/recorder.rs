@@ -1,0 +1,271 @@
+//! What is written into the run folder while a run goes on: settings, metrics, returns, and the summary at its end.
+//! It reads no status from anywhere: whoever runs the parts hands them over.
+
+use std::{
+    fs::{self, File},
+    path::PathBuf,
+    time::Instant,
+};
+
+use anyhow::Context;
+use driml_protocol::{LearnerStatus, ReplayStatus, RunSpec};
+
+use super::{
+    columns::Columns,
+    folder::RunFolder,
+    metrics::{Moment, header, rows_up_to},
+    resume_point::Behind,
+    returns::{Episodes, TrainingReturns},
+    summary::{Outcome, Summary},
+    table::Table,
+};
+use crate::rates::Rates;
+
+const fn none(header: Vec<String>) -> Columns {
+    Columns {
+        header,
+        rows: Vec::new(),
+    }
+}
+
+/// Writes a run folder.
+#[derive(Debug)]
+pub struct Recorder {
+    /// Nobody else writes to the folder meanwhile.
+    _lock: File,
+    behind: Behind,
+    /// Seconds, frames and episodes in the last row before the run was resumed.
+    seconds_before: f64,
+    frames_before: u64,
+    episodes_before: u64,
+    /// Mean and standard deviation of k up to there.
+    k_before: Option<(f64, f64)>,
+    folder: RunFolder,
+    metrics: Table,
+    returns: TrainingReturns,
+    losses: &'static [&'static str],
+    processes: Vec<String>,
+    rss_max: Vec<Option<f64>>,
+    started: Instant,
+    rates: Rates,
+}
+
+impl Recorder {
+    /// Makes the folder and writes the settings; the clock starts. `losses` are the agent's auxiliary losses,
+    /// `processes` those whose memory is recorded.
+    ///
+    /// # Errors
+    /// A folder in which something lies, or a file system that refuses.
+    pub fn create(
+        folder: &RunFolder,
+        config_toml: &str,
+        losses: &'static [&'static str],
+        processes: &[String],
+    ) -> anyhow::Result<Self> {
+        folder.check_free()?;
+        fs::create_dir_all(folder.path())
+            .with_context(|| format!("making the run folder {}", folder.display()))?;
+        let lock = folder.lock()?;
+        folder.write_config(config_toml)?;
+        let rows = none(header(losses, processes));
+        let returns = TrainingReturns::create(folder)?;
+        Self::begin(
+            folder,
+            losses,
+            processes,
+            lock,
+            rows,
+            returns,
+            Behind::default(),
+        )
+    }
+
+    /// Goes on to `frames_max` frames in the folder of an interrupted run, which has so much `behind` it: the rows of metrics up
+    /// to there stay.
+    ///
+    /// # Errors
+    /// A run that is still going on, metrics of other columns, or a file system that refuses.
+    pub(crate) fn go_on(
+        folder: &RunFolder,
+        config_toml: &str,
+        losses: &'static [&'static str],
+        processes: &[String],
+        behind: Behind,
+        frames_max: u64,
+    ) -> anyhow::Result<Self> {
+        let lock = folder.lock()?;
+        let head = header(losses, processes);
+        let rows = match behind.updates {
+            0 => none(head),
+            _ => rows_up_to(&folder.metrics(), head, behind, frames_max)?,
+        };
+        let returns = TrainingReturns::go_on(folder, rows.last("frames").unwrap_or(0))?;
+        Summary::remove(folder)?;
+        folder.write_config(config_toml)?;
+        Self::begin(folder, losses, processes, lock, rows, returns, behind)
+    }
+
+    fn begin(
+        folder: &RunFolder,
+        losses: &'static [&'static str],
+        processes: &[String],
+        lock: File,
+        rows: Columns,
+        returns: TrainingReturns,
+        behind: Behind,
+    ) -> anyhow::Result<Self> {
+        let mut this = Self {
+            _lock: lock,
+            behind,
+            seconds_before: rows.last("seconds").unwrap_or(0.0),
+            frames_before: rows.last("frames").unwrap_or(0),
+            episodes_before: rows.last("episodes").unwrap_or(0),
+            k_before: rows.last("mean_k").zip(rows.last("sd_k")),
+            folder: folder.clone(),
+            metrics: Table::create(&folder.metrics(), &rows.header, &rows.rows)?,
+            returns,
+            losses,
+            processes: processes.to_vec(),
+            rss_max: vec![None; processes.len()],
+            started: Instant::now(),
+            rates: Rates::default(),
+        };
+        this.rates.add(this.started, behind.frames, behind.updates);
+        Ok(this)
+    }
+
+    /// The settings' file, for parts that read it.
+    pub(crate) fn config_path(&self) -> PathBuf {
+        self.folder.config()
+    }
+
+    /// Mean and standard deviation of k over all `updates` of the run, before it was resumed too.
+    fn k(&self, replay: &ReplayStatus, updates: u64) -> Option<(f64, f64)> {
+        let since = replay.mean_k().zip(replay.sd_k());
+        let (Some(before), Some(since)) = (self.k_before, since) else {
+            return since.or(self.k_before);
+        };
+        // All updates are of as many rows.
+        let share = self.behind.updates as f64 / updates.max(1) as f64;
+        let mixed = |before: f64, since: f64| share * before + (1.0 - share) * since;
+        let square = |(mean, sd): (f64, f64)| mean * mean + sd * sd;
+        let mean = mixed(before.0, since.0);
+        let variance = mixed(square(before), square(since)) - mean * mean;
+        Some((mean, variance.max(0.0).sqrt()))
+    }
+
+    fn seconds(&self) -> f64 {
+        self.seconds_before + self.started.elapsed().as_secs_f64()
+    }
+
+    /// Takes the state of the run: adds a row of metrics, in a resumed run once it is further than its last row, and the returns
+    /// of the episodes that ended. `shards` are the replay servers' own accounts; `rss_mib` is in the order of the processes given at
+    /// the start, none for one that ended.
+    ///
+    /// A disk that is full does not end the run: what a person should know is said the first time, and [`Self::missing`] says
+    /// at the end what was lost.
+    pub fn record(
+        &mut self,
+        shards: &[ReplayStatus],
+        learner: &LearnerStatus,
+        rss_mib: &[Option<f64>],
+    ) -> Vec<String> {
+        let replay = &ReplayStatus::merged(shards);
+        self.rates
+            .add(Instant::now(), replay.transitions_inserted, learner.updates);
+        for (max, now) in self.rss_max.iter_mut().zip(rss_mib) {
+            *max = now.map_or(*max, |now| Some(max.map_or(now, |max: f64| max.max(now))));
+        }
+        let said = self.returns.hear(shards);
+        let (frames, updates) = (replay.transitions_inserted, learner.updates);
+        let resumed = self.behind.updates > 0;
+        if resumed && (updates <= self.behind.updates || frames < self.frames_before) {
+            return said.into_iter().collect();
+        }
+        let processes = 0..self.processes.len();
+        let moment = Moment {
+            seconds: self.seconds(),
+            rates: self.rates.per_second(),
+            episodes: self.episodes(replay),
+            k: self.k(replay, updates),
+            replay,
+            learner,
+            losses: self.losses,
+            rss_mib: processes
+                .map(|i| rss_mib.get(i).copied().flatten())
+                .collect(),
+        };
+        let row = moment.row();
+        said.into_iter().chain(self.metrics.add(row)).collect()
+    }
+
+    /// Rows that could not be written up to now, for a person.
+    pub fn missing(&self) -> Vec<String> {
+        let missing = [self.metrics.missing(), self.returns.missing()];
+        missing.into_iter().flatten().collect()
+    }
+
+    /// The whole run's episodes.
+    pub fn episodes(&self, replay: &ReplayStatus) -> Episodes {
+        Episodes {
+            count: self.episodes_before + replay.episodes,
+            mean_return: self.returns.mean(),
+        }
+    }
+
+    /// What there is to say of the run, which ended so.
+    pub fn summarise(
+        &self,
+        outcome: Outcome,
+        run: &RunSpec,
+        replay: &ReplayStatus,
+        learner: &LearnerStatus,
+    ) -> Summary {
+        let wall_seconds = self.seconds();
+        // A resumed run that did not get anywhere still has behind it what it had.
+        let frames = replay.transitions_inserted.max(self.behind.frames);
+        let updates = learner.updates.max(self.behind.updates);
+        let rss = self.processes.iter().zip(&self.rss_max);
+        let episodes = self.episodes(replay);
+        Summary {
+            outcome,
+            world: run.world.clone(),
+            agent: run.agent.clone(),
+            seed: run.seed,
+            resumed_after_updates: self.behind.updates,
+            frames,
+            updates,
+            transitions_inserted: replay.transitions_inserted,
+            transitions_lost: replay.transitions_lost,
+            transitions_duplicated: replay.transitions_duplicated,
+            rows_sampled: replay.rows_sampled,
+            rows_unlearned: replay.rows_unlearned,
+            replay_ratio: replay.replay_ratio(),
+            episodes: episodes.count,
+            mean_return: episodes.mean_return.map(|it| it.mean),
+            mean_return_of: episodes.mean_return.map_or(0, |it| it.of as u64),
+            wall_seconds,
+            frames_per_second: frames as f64 / wall_seconds,
+            updates_per_second: updates as f64 / wall_seconds,
+            mean_k: self.k(replay, updates).map(|(mean, _)| mean),
+            k_histogram: replay.k_histogram.clone(),
+            action_histogram: replay.action_histogram.clone(),
+            weights_version: learner.weights_version,
+            weights_sha256: learner.weights_sha256.clone(),
+            chunks_retried: replay.chunks_retried,
+            batches_retried: replay.batches_retried,
+            replay_frame_mib: replay.frame_bytes_held.div_ceil(1 << 20),
+            messages_refused: replay.messages_refused,
+            insert_ms: replay.insert_ms,
+            weights_behind_s: replay.weights_behind_s,
+            weights_behind_updates: replay.weights_behind_updates,
+            rss_mib_max: rss
+                .map(|(name, mib)| (name.clone(), mib.map(f64::round).into()))
+                .collect(),
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "recorder_tests.rs"]
+mod tests;

@@ -1,0 +1,176 @@
+//! The run folder's files: what a run leaves, and what a resumed one goes on with.
+
+use driml_protocol::{Horizon, Returns, RunSpec, TimeoutRule, Waiting};
+use expect_test::expect;
+
+use super::*;
+
+fn spec() -> RunSpec {
+    RunSpec {
+        world: "chain".into(),
+        agent: "driml-ada".into(),
+        seed: 3,
+        frame_height: 12,
+        frame_width: 12,
+        frame_channels: 1,
+        frame_stack: 1,
+        num_actions: 3,
+        n_step: 7,
+        gamma: 0.99,
+        horizon: Horizon::Nhg { k_max: 5 },
+        timeout: TimeoutRule::Terminal,
+    }
+}
+
+/// What DIM reports.
+const LOSSES: [&str; 4] = ["dim_3t3", "dim_3t4", "dim_4t3", "dim_4t4"];
+
+fn statuses() -> (ReplayStatus, LearnerStatus) {
+    let replay = ReplayStatus {
+        transitions_inserted: 2_000,
+        warmup_transitions: 1_000,
+        rows_sampled: 8_000,
+        episodes: 7,
+        returns: Returns {
+            known: 7,
+            newest: vec![0.5; 7],
+        },
+        k_histogram: vec![2, 1, 1],
+        waiting: Waiting::Finished,
+        ..ReplayStatus::default()
+    };
+    let learner = LearnerStatus {
+        updates: 31,
+        losses: vec![("dim_4t4".into(), 2.0)],
+        weights_version: 4,
+        weights_sha256: "abcd".into(),
+        finished: true,
+        ..LearnerStatus::default()
+    };
+    (replay, learner)
+}
+
+#[test]
+fn a_run_leaves_settings_metrics_and_a_summary() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = RunFolder::new(folder.path().join("run"));
+    let mut recorder = Recorder::create(
+        &run,
+        "[run]\n",
+        &LOSSES,
+        &["replay-server".into(), "actor-0".into()],
+    )
+    .unwrap();
+    let (replay, learner) = statuses();
+    let nothing = ReplayStatus::default();
+    let mut record = |replay: &ReplayStatus, learner: &LearnerStatus, rss: &[Option<f64>]| {
+        let said = recorder.record(std::slice::from_ref(replay), learner, rss);
+        assert!(said.is_empty(), "{said:?}");
+    };
+    record(&nothing, &LearnerStatus::default(), &[]);
+    record(&replay, &learner, &[Some(12.34), None]);
+    assert!(recorder.missing().is_empty());
+    let summary = recorder.summarise(Outcome::Finished, &spec(), &replay, &learner);
+    summary.write(&run).unwrap();
+    assert!(Summary::is_finished(&run));
+    assert_eq!(
+        (summary.frames, summary.replay_ratio, summary.mean_k),
+        (2_000, Some(8.0), Some(1.5))
+    );
+
+    let csv = fs::read_to_string(run.metrics()).unwrap();
+    let columns: Vec<_> = csv.lines().map(|line| line.split(',').count()).collect();
+    assert_eq!(columns, [26, 26, 26], "{csv}");
+    expect!["seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,mean_return_of,c51_kl,dim_3t3,dim_3t4,dim_4t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,sd_k,mean_age,weights_version,affinity_version,actors,waiting,rss_mib_replay_server,rss_mib_actor_0"]
+        .assert_eq(csv.lines().next().unwrap());
+
+    let json: serde_json::Value =
+        serde_json::from_slice(&fs::read(run.summary()).unwrap()).unwrap();
+    for key in [
+        "frames",
+        "updates",
+        "transitions_inserted",
+        "transitions_lost",
+        "transitions_duplicated",
+        "rows_sampled",
+        "replay_ratio",
+        "episodes",
+        "mean_return",
+        "wall_seconds",
+        "frames_per_second",
+        "updates_per_second",
+        "mean_k",
+        "weights_version",
+        "weights_sha256",
+    ] {
+        assert!(!json[key].is_null(), "{key}");
+    }
+    assert_eq!(json["outcome"], "finished");
+    assert_eq!(json["rss_mib_max"]["replay-server"], 12.0);
+}
+
+#[test]
+fn a_resumed_run_goes_on_in_its_metrics() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = RunFolder::new(folder.path().join("run"));
+    let processes = ["replay-server".into()];
+    let mut recorder = Recorder::create(&run, "[run]\n", &LOSSES, &processes).unwrap();
+    let (mut replay, mut learner) = statuses();
+    // Mean k is 1.5 before the run is resumed, and 2 since.
+    for (frames, updates, episodes) in [(1_000, 0, 1), (2_000, 31, 7), (3_000, 62, 9)] {
+        (replay.transitions_inserted, replay.episodes) = (frames, episodes);
+        learner.updates = updates;
+        recorder.record(std::slice::from_ref(&replay), &learner, &[]);
+    }
+    let behind = Behind {
+        updates: 31,
+        frames: 2_000,
+    };
+    let said = Recorder::go_on(&run, "", &LOSSES, &processes, behind, 9_999).unwrap_err();
+    assert!(said.to_string().contains("is still going on"), "{said}");
+    let summary = recorder.summarise(Outcome::Interrupted, &spec(), &replay, &learner);
+    summary.write(&run).unwrap();
+    drop(recorder);
+    // A launcher that was killed while it wrote.
+    let path = run.metrics();
+    let text = fs::read_to_string(&path).unwrap();
+    fs::write(&path, format!("{text}9.0,40")).unwrap();
+
+    let other = ["replay-server".into(), "actor-0".into()];
+    let said = Recorder::go_on(&run, "", &LOSSES, &other, behind, 9_999).unwrap_err();
+    assert!(said.to_string().contains("has other columns"), "{said}");
+    let mut recorder =
+        Recorder::go_on(&run, "[new]\n", &LOSSES, &processes, behind, 9_999).unwrap();
+    assert!(!run.summary().exists());
+    // While the replay fills again nothing is new.
+    (replay.transitions_inserted, replay.episodes) = (1_500, 1);
+    learner.updates = 31;
+    recorder.record(std::slice::from_ref(&replay), &learner, &[]);
+    (replay.transitions_inserted, replay.episodes) = (2_100, 2);
+    replay.k_histogram = vec![0, 0, 5];
+    learner.updates = 62;
+    recorder.record(std::slice::from_ref(&replay), &learner, &[]);
+    let summary = recorder.summarise(Outcome::Finished, &spec(), &replay, &learner);
+    let counts = (summary.frames, summary.updates, summary.episodes);
+    assert_eq!(counts, (2_100, 62, 7 + 2));
+    assert_eq!(summary.mean_k, Some(1.75), "31 updates at 1.5, 31 at 2");
+    assert_eq!(summary.resumed_after_updates, 31);
+    let all = Behind {
+        updates: 99,
+        ..behind
+    };
+    let read =
+        |frames_max| rows_up_to(&path, header(&LOSSES, &processes), all, frames_max).unwrap();
+    assert_eq!(read(2_050).rows.len(), 2);
+    let rows = read(9_999);
+    let column = |name| -> Vec<f64> {
+        let values = rows.rows.iter().map(|row| rows.value(row, name).unwrap());
+        values.collect()
+    };
+    assert_eq!(column("frames"), [1_000.0, 2_000.0, 2_100.0]);
+    assert_eq!(column("episodes"), [1.0, 7.0, 9.0]);
+    assert_eq!(column("mean_k"), [1.5, 1.5, 1.75]);
+    // Squares: 2.5 and 4 are 3.25 in the mean, 1.75^2 is 3.0625.
+    assert_eq!(column("sd_k"), [0.5, 0.5, 0.433013]);
+    assert!(column("seconds").is_sorted());
+}

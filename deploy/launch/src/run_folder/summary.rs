@@ -1,0 +1,170 @@
+//! `summary.json`: how a run ended and what it counted, in one object.
+//! It computes nothing; the recorder fills it in.
+
+use std::{fs, time::Duration};
+
+use anyhow::Context;
+use driml_machine::units::duration;
+use driml_protocol::{Quantiles, whole_file};
+use serde::{Deserialize, Serialize};
+
+use super::folder::RunFolder;
+
+/// How a run ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Outcome {
+    /// All frames are in, their updates done and the last checkpoint written.
+    Finished,
+    /// A person ended it; what was done is saved.
+    Interrupted,
+    /// A part failed.
+    Failed,
+}
+
+/// `summary.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Summary {
+    /// How the run ended.
+    pub outcome: Outcome,
+    /// The world.
+    pub world: String,
+    /// The agent.
+    pub agent: String,
+    /// The seed.
+    pub seed: u64,
+    /// Updates that the run had behind it when it was resumed, the last time; 0 if it never was. Frames, updates,
+    /// rows, episodes, mean return, seconds and mean k are of the whole run, all else is of what came since.
+    #[serde(default)]
+    pub resumed_after_updates: u64,
+    /// Frames that trained: transitions stored.
+    pub frames: u64,
+    /// Updates done.
+    pub updates: u64,
+    /// Transitions stored.
+    pub transitions_inserted: u64,
+    /// Transitions that actors produced and that never arrived.
+    pub transitions_lost: u64,
+    /// Transitions stored twice.
+    pub transitions_duplicated: u64,
+    /// Rows served to the learner.
+    pub rows_sampled: u64,
+    /// Rows per transition, both counted from the end of the warm-up.
+    pub replay_ratio: Option<f64>,
+    /// Episodes that ended, in a resumed run those too in which the replay filled again.
+    pub episodes: u64,
+    /// Rows served to a learner that died before it saved what it learned from them; they do not count as served. Older runs do
+    /// not say.
+    #[serde(default)]
+    pub rows_unlearned: u64,
+    /// Mean undiscounted return of the last 100 training episodes, also over a resumption.
+    pub mean_return: Option<f64>,
+    /// Of how many episodes that is: of fewer than 100 only if there were fewer. Older runs do not say.
+    #[serde(default)]
+    pub mean_return_of: u64,
+    /// From the start of the first part to the end of the run.
+    pub wall_seconds: f64,
+    /// Frames over wall seconds.
+    pub frames_per_second: f64,
+    /// Updates over wall seconds.
+    pub updates_per_second: f64,
+    /// Mean k of the rows served with a positive; of several positives the furthest counts.
+    pub mean_k: Option<f64>,
+    /// How often each k was served; index 0 counts rows without a positive.
+    pub k_histogram: Vec<u64>,
+    /// How often each action was taken; older runs do not say.
+    #[serde(default)]
+    pub action_histogram: Vec<u64>,
+    /// Version of the last weights.
+    pub weights_version: u64,
+    /// SHA-256 of the last weights, hexadecimal.
+    pub weights_sha256: String,
+    /// Chunks recognised as a retry of a stored one.
+    pub chunks_retried: u64,
+    /// Batches that did not reach the learner and were asked for again; older runs do not say.
+    #[serde(default)]
+    pub batches_retried: u64,
+    /// Memory that the frames in the replay took at the end, MiB.
+    pub replay_frame_mib: u64,
+    /// Messages refused as malformed or foreign.
+    pub messages_refused: u64,
+    /// Milliseconds from a chunk's arrival at the replay server until it was stored, waiting at the rate limiter included. Older
+    /// runs do not say, nor does lockstep.
+    #[serde(default)]
+    pub insert_ms: Option<Quantiles>,
+    /// Seconds for which newer weights had been there when what older ones chose was stored; as above.
+    #[serde(default)]
+    pub weights_behind_s: Option<Quantiles>,
+    /// Updates by which the weights that acted were behind then; as above.
+    #[serde(default)]
+    pub weights_behind_updates: Option<Quantiles>,
+    /// Highest resident memory of each process, MiB.
+    pub rss_mib_max: serde_json::Map<String, serde_json::Value>,
+}
+
+impl Summary {
+    /// Writes it into the run folder, whole or not at all.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub fn write(&self, folder: &RunFolder) -> anyhow::Result<()> {
+        let path = folder.summary();
+        let doing = || format!("writing {}", path.display());
+        let mut text = serde_json::to_vec_pretty(self).with_context(doing)?;
+        text.push(b'\n');
+        whole_file::write(&path, &text).with_context(doing)
+    }
+
+    /// Reads that of the run in `folder`.
+    ///
+    /// # Errors
+    /// There is none, or it is not one.
+    pub fn read(folder: &RunFolder) -> anyhow::Result<Self> {
+        let path = folder.summary();
+        let doing = || format!("reading {}", path.display());
+        let text = fs::read(&path).with_context(doing)?;
+        serde_json::from_slice(&text).with_context(doing)
+    }
+
+    /// Removes the one of an earlier time from the run folder, if there is one.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn remove(folder: &RunFolder) -> anyhow::Result<()> {
+        let path = folder.summary();
+        match fs::remove_file(&path) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                Err(e).with_context(|| format!("removing {}", path.display()))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Whether the run in `folder` came to its end.
+    pub fn is_finished(folder: &RunFolder) -> bool {
+        Self::read(folder).is_ok_and(|it| it.outcome == Outcome::Finished)
+    }
+
+    /// What a person reads at the end.
+    pub fn describe(&self, run_dir: &RunFolder) -> String {
+        let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
+        let how = if self.outcome == Outcome::Finished {
+            "finished"
+        } else {
+            "interrupted"
+        };
+        format!(
+            "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, mean return {} over the last {} of {} episodes\n{}\n",
+            self.frames,
+            self.updates,
+            duration(Duration::from_secs_f64(self.wall_seconds)),
+            self.frames_per_second,
+            self.updates_per_second,
+            number(self.replay_ratio),
+            number(self.mean_return),
+            self.mean_return_of,
+            self.episodes,
+            run_dir.display()
+        )
+    }
+}

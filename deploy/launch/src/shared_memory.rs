@@ -1,0 +1,130 @@
+//! The shared memory that a process leaves behind in `/dev/shm`. zenoh's own bookkeeping keeps some of it open to the end of the
+//! process, so that it stays there until the next one sweeps; a part that ends in order removes it itself.
+//! What others use too, or could use, it leaves alone.
+
+use std::{fs, os::unix::fs::MetadataExt, path::Path};
+
+use nix::sys::stat::{major, minor};
+
+const FOLDER: &str = "/dev/shm";
+/// The extension of zenoh's segments. Whoever has one open holds a lock on it.
+const EXTENSION: &str = "zenoh";
+
+/// Removes the segments of shared memory that this process alone holds. It must not use them any more.
+pub fn remove_own() {
+    let Ok(locks) = fs::read_to_string("/proc/locks") else {
+        return;
+    };
+    for entry in fs::read_dir(FOLDER).into_iter().flatten().flatten() {
+        let path = entry.path();
+        let is_segment = path.extension().is_some_and(|it| it == EXTENSION);
+        let file = entry.metadata().ok().filter(|_| is_segment);
+        if file.is_some_and(|file| {
+            let file = FileId {
+                major: major(file.dev()),
+                minor: minor(file.dev()),
+                inode: file.ino(),
+            };
+            is_held_by_alone(&locks, &file, std::process::id())
+        }) && !is_mapped_elsewhere(&path)
+        {
+            remove(&path);
+        }
+    }
+}
+
+/// Whether another process has the file in its memory. The table of locks alone does not tell: it is read in pieces, and as others
+/// lock and unlock meanwhile, lines are skipped.
+fn is_mapped_elsewhere(path: &Path) -> bool {
+    let own = std::process::id().to_string();
+    let processes = fs::read_dir("/proc").into_iter().flatten().flatten();
+    let others = processes.filter(|it| {
+        let name = it.file_name();
+        let name = name.to_string_lossy();
+        name.bytes().all(|byte| byte.is_ascii_digit()) && name != own
+    });
+    let path = path.to_string_lossy();
+    let maps = |it: fs::DirEntry| fs::read_to_string(it.path().join("maps")).ok();
+    others
+        .filter_map(maps)
+        .any(|maps| maps.lines().any(|line| line.ends_with(&*path)))
+}
+
+fn remove(path: &Path) {
+    match fs::remove_file(path) {
+        Ok(()) => tracing::debug!("removed {}", path.display()),
+        Err(e) => tracing::debug!("removing {}: {e}", path.display()),
+    }
+}
+
+/// What tells a file from all others.
+struct FileId {
+    major: u64,
+    minor: u64,
+    inode: u64,
+}
+
+/// Whether the process `pid` and nobody else holds a lock on the file, by the kernel's table of locks.
+fn is_held_by_alone(locks: &str, file: &FileId, pid: u32) -> bool {
+    let FileId {
+        major,
+        minor,
+        inode,
+    } = file;
+    // `1: FLOCK  ADVISORY  READ  4711 00:1a:42 0 EOF`; device numbers are hexadecimal.
+    let id = format!("{major:02x}:{minor:02x}:{inode}");
+    let mut holders = locks.lines().filter_map(|line| {
+        let words: Vec<_> = line.split_whitespace().collect();
+        let at = words.iter().position(|word| *word == id)?;
+        words.get(at.checked_sub(1)?)?.parse::<u32>().ok()
+    });
+    let first = holders.next();
+    first == Some(pid) && holders.all(|holder| holder == pid)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_a_segment_of_this_process_alone_is_its_own() {
+        let locks = "1: FLOCK  ADVISORY  READ 7 00:1a:42 0 EOF\n\
+                     2: FLOCK  ADVISORY  READ 7 00:1a:43 0 EOF\n\
+                     3: FLOCK  ADVISORY  READ 8 00:1a:43 0 EOF\n\
+                     4: FLOCK  ADVISORY  READ 7 00:1a:42 0 EOF\n\
+                     5: -> FLOCK ADVISORY WRITE 9 fe:00:42 0 EOF\n";
+        let held = |minor, inode, pid| {
+            let file = FileId {
+                major: 0,
+                minor,
+                inode,
+            };
+            is_held_by_alone(locks, &file, pid)
+        };
+        assert!(held(0x1a, 42, 7));
+        assert!(!held(0x1a, 42, 8), "another's");
+        assert!(!held(0x1a, 43, 7), "shared");
+        assert!(!held(0x1a, 44, 7), "nobody's");
+        assert!(!held(0x1b, 42, 7), "on another device");
+    }
+
+    #[test]
+    fn the_kernel_s_table_is_as_this_reads_it() {
+        let file = tempfile::tempfile().unwrap();
+        file.lock().unwrap();
+        let data = file.metadata().unwrap();
+        let id = FileId {
+            major: major(data.dev()),
+            minor: minor(data.dev()),
+            inode: data.ino(),
+        };
+        let locks = fs::read_to_string("/proc/locks").unwrap();
+        assert!(
+            is_held_by_alone(&locks, &id, std::process::id()),
+            "{}:{}:{} in\n{locks}",
+            id.major,
+            id.minor,
+            id.inode
+        );
+    }
+}

@@ -1,0 +1,70 @@
+//! What the parts say of themselves, asked for over zenoh as any client would.
+//! It keeps the last answers and judges nothing.
+
+use std::time::Duration;
+
+use anyhow::Context;
+use driml_protocol::{Keys, LearnerStatus, ReplayStatus, RunClient};
+use zenoh::{Session, Wait};
+
+/// How long an answer may take; a part that is busy answers the next time.
+const ANSWER_MAX: Duration = Duration::from_secs(2);
+
+/// A client of a run that asks its parts how they are.
+pub struct Statuses {
+    /// One for each shard of the replay.
+    clients: Vec<RunClient>,
+    /// Each replay server's last answer.
+    pub shards: Vec<ReplayStatus>,
+    /// The same, as of one.
+    pub replay: ReplayStatus,
+    /// The learner's last answer.
+    pub learner: LearnerStatus,
+}
+
+impl Statuses {
+    /// A client over open sessions, one for each shard of the replay.
+    pub fn new(sessions: Vec<Session>, keys: Keys, spec_hash: u64) -> Self {
+        let client = |session| RunClient::new(session, keys.clone(), spec_hash);
+        Self {
+            clients: sessions.into_iter().map(client).collect(),
+            shards: Vec::new(),
+            replay: ReplayStatus::default(),
+            learner: LearnerStatus::default(),
+        }
+    }
+
+    /// Asks the replay servers.
+    ///
+    /// # Errors
+    /// No answer in time, or one that is not of this run.
+    pub fn ask_replay(&mut self) -> anyhow::Result<()> {
+        let answers = self.clients.iter().map(|client| client.fetch(ANSWER_MAX));
+        let shards = answers.collect::<Result<Vec<_>, _>>()?;
+        self.replay = ReplayStatus::merged(&shards);
+        self.shards = shards;
+        Ok(())
+    }
+
+    /// Asks the learner.
+    ///
+    /// # Errors
+    /// No answer in time, or one that is not of this run.
+    pub fn ask_learner(&mut self) -> anyhow::Result<()> {
+        let client = self
+            .clients
+            .first()
+            .context("a run has at least one replay server")?;
+        self.learner = client.fetch(ANSWER_MAX)?;
+        Ok(())
+    }
+
+    /// Leaves the run; the last answers stay.
+    pub fn close(&self) {
+        for client in &self.clients {
+            if let Err(e) = client.session().close().wait() {
+                tracing::debug!("closing the session: {e}");
+            }
+        }
+    }
+}

@@ -1,0 +1,130 @@
+//! `driml doctor`: what this machine can do and what it lacks, one line a fact, with what to do about it.
+//! It changes nothing, fetches nothing and measures no speed.
+
+pub mod cuda;
+mod engine;
+mod fact;
+mod host;
+
+use std::{fmt::Write as _, path::Path};
+
+use anyhow::bail;
+
+use self::fact::{Fact, State};
+
+/// What was found out, for the CPU and for CUDA.
+#[derive(Debug)]
+pub struct Report {
+    cpu: Vec<Fact>,
+    cuda: Vec<Fact>,
+}
+
+/// Looks at this machine; runs would go to `run_dir`.
+pub fn examine(run_dir: &Path) -> Report {
+    let mut cpu = host::facts(run_dir);
+    cpu.push(engine::fact());
+    let cuda = cuda::facts();
+    Report { cpu, cuda }
+}
+
+/// Only the CUDA devices, as JSON: so the usual program asks its CUDA flavour.
+///
+/// # Errors
+/// None that is known.
+pub fn devices_json() -> anyhow::Result<String> {
+    json(&cuda::devices())
+}
+
+impl Report {
+    /// A line a fact, and what can be trained on.
+    pub fn describe(&self) -> String {
+        describe(&self.all(), verdict(&self.cpu, &self.cuda))
+    }
+
+    /// The facts as JSON.
+    ///
+    /// # Errors
+    /// None that is known.
+    pub fn json(&self) -> anyhow::Result<String> {
+        json(&self.all())
+    }
+
+    fn all(&self) -> Vec<Fact> {
+        self.cpu.iter().chain(&self.cuda).cloned().collect()
+    }
+
+    /// Whether what training needs is there.
+    ///
+    /// # Errors
+    /// Something is missing that training on the CPU needs; with `cuda`, also what training on a GPU needs.
+    pub fn check(&self, cuda: bool) -> anyhow::Result<()> {
+        let missing = lacking(&self.cpu, |state| state == State::Missing);
+        if !missing.is_empty() {
+            bail!("training on the CPU needs what is missing here: {missing}");
+        }
+        if cuda && !cuda::is_ready(&self.cuda) {
+            let missing = lacking(&self.cuda, |state| state != State::Ok);
+            bail!("--device cuda needs what is missing here: {missing}");
+        }
+        Ok(())
+    }
+}
+
+/// The facts whose state is bad, by name.
+fn lacking(facts: &[Fact], bad: impl Fn(State) -> bool) -> String {
+    let bad = facts.iter().filter(|fact| bad(fact.state));
+    let names: Vec<_> = bad.map(|fact| fact.what.as_str()).collect();
+    names.join(", ")
+}
+
+fn json(facts: &[Fact]) -> anyhow::Result<String> {
+    Ok(serde_json::to_string_pretty(facts)? + "\n")
+}
+
+fn describe(facts: &[Fact], verdict: &str) -> String {
+    let mut text = String::new();
+    for fact in facts {
+        let _ = writeln!(text, "{fact}");
+    }
+    text + "\n" + verdict + "\n"
+}
+
+/// What can be trained on.
+fn verdict(cpu: &[Fact], cuda: &[Fact]) -> &'static str {
+    let cpu = cpu.iter().all(|fact| fact.state != State::Missing);
+    let cuda = cuda::is_ready(cuda);
+    match (cpu, cuda) {
+        (true, true) => "This machine can train on the CPU and with --device cuda.",
+        (true, false) => "This machine can train on the CPU, not with --device cuda.",
+        (false, _) => "This machine cannot train yet.",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_verdict_follows_what_is_missing() {
+        let cpu = |state| vec![Fact::ok("cores", ""), Fact::new(state, "disk", "")];
+        let cuda = |state| {
+            vec![
+                Fact::note("CUDA driver", "old"),
+                Fact::new(state, "cuda:0", ""),
+            ]
+        };
+        let says = |state, device| verdict(&cpu(state), &cuda(device));
+        assert!(says(State::Note, State::Ok).contains("CPU and with"));
+        assert!(says(State::Ok, State::Missing).contains("not with"));
+        assert!(verdict(&cpu(State::Ok), &[Fact::ok("CUDA driver", "")]).contains("not with"));
+        assert!(says(State::Missing, State::Ok).contains("cannot"));
+    }
+
+    #[test]
+    fn every_fact_is_a_line_and_the_verdict_stands_apart() {
+        let facts = [Fact::ok("cores", "2"), Fact::note("CUDA driver", "none")];
+        let text = describe(&facts, "Done.");
+        assert_eq!(text.lines().count(), 4, "{text}");
+        assert!(text.ends_with("\n\nDone.\n"), "{text}");
+    }
+}

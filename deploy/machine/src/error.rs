@@ -1,0 +1,55 @@
+//! The two kinds of failure of the program: a call that cannot work, and a run that went wrong.
+//! It prints nothing; the program does.
+
+/// A call or a configuration that cannot work; the message says what to do. Exit code 64.
+#[derive(Clone, Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct Usage(pub String);
+
+/// Makes a [`Usage`] from a format string.
+#[doc(hidden)]
+#[macro_export]
+macro_rules! __usage {
+    ($($arg:tt)*) => {
+        $crate::error::Usage(format!($($arg)*))
+    };
+}
+#[doc(inline)]
+pub use __usage as usage;
+
+/// Exit code of a call or configuration that cannot work (`EX_USAGE`).
+pub const EXIT_USAGE: u8 = 64;
+/// Exit code after Ctrl-C, as shells have it.
+pub const EXIT_INTERRUPTED: u8 = 130;
+
+/// The run was ended by a person, its state saved. Exit code 130, as shells have it for Ctrl-C.
+#[derive(Debug, thiserror::Error)]
+#[error("interrupted")]
+pub struct Interrupted;
+
+/// ` (did you mean "..."?)` with the candidate most like `name`, or nothing if none is near.
+pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> String {
+    let distance = |candidate: &str| strsim::levenshtein(name, candidate);
+    match candidates
+        .into_iter()
+        .min_by_key(|candidate| distance(candidate))
+    {
+        Some(best) if distance(best) <= 1 + name.len() / 4 => format!(" (did you mean {best:?}?)"),
+        _ => String::new(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn near_names_are_offered_and_far_ones_are_not() {
+        assert_eq!(
+            nearest("drimlada", ["c51", "driml-ada"]),
+            " (did you mean \"driml-ada\"?)"
+        );
+        assert_eq!(nearest("zzz", ["c51", "driml-ada"]), "");
+        assert_eq!(nearest("zzz", []), "");
+    }
+}

@@ -1,0 +1,128 @@
+//! What this machine offers, and the sizes of a run that follow from it.
+//! It measures no speed: how long a run takes is estimated in `plan`.
+
+use std::fs;
+
+/// Copies of the world in one actor: enough for batched inference, few enough for a quick round of chunks.
+const ENVS: u32 = 16;
+/// Share of the free memory that a replay sized by the machine may take; the learner and the system need the rest.
+const REPLAY_SHARE: f64 = 0.5;
+/// Share of the free memory that a replay sized by a person may take.
+const REPLAY_SHARE_MAX: f64 = 0.9;
+
+/// What a learner takes on Procgen (266 MiB measured), and some room.
+const LEARNER_BYTES: u64 = 512 << 20;
+/// What an actor of 16 copies takes on Procgen, whose engine holds its pictures (410 to 423 MiB measured), and elsewhere (97 MiB
+/// on Ms. PacMan).
+const ACTOR_BYTES: (u64, u64) = (430 << 20, 100 << 20);
+
+/// About the bytes that `actors` processes take in a world.
+pub fn actors_bytes(actors: u32, world: &str) -> u64 {
+    let (procgen, other) = ACTOR_BYTES;
+    let each = match world.starts_with("procgen") {
+        true => procgen,
+        false => other,
+    };
+    u64::from(actors) * each
+}
+
+/// What this machine offers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Machine {
+    /// Cores that this process may use.
+    pub cores: u32,
+    /// Memory that can be taken now, bytes.
+    pub memory_bytes: u64,
+}
+
+impl Machine {
+    /// This one. Where the memory cannot be read, 4 GiB are assumed.
+    pub fn this() -> Self {
+        let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get() as u32);
+        let memory_bytes = free_memory_bytes().unwrap_or(4 << 30);
+        Self {
+            cores,
+            memory_bytes,
+        }
+    }
+
+    /// Actor processes. Few: one actor feeds several learners' worth of cores, as an update takes 32 steps only.
+    pub const fn actors(&self) -> u32 {
+        match self.cores {
+            0..4 => 1,
+            4..16 => 2,
+            _ => 4,
+        }
+    }
+
+    /// Copies of the world in one actor.
+    pub const fn envs(&self) -> u32 {
+        ENVS
+    }
+
+    /// Threads of the learner: all cores, as it is what a run waits for.
+    pub const fn learner_threads(&self) -> u32 {
+        self.cores
+    }
+
+    /// Bytes that a replay sized by the machine may take, where the actors take `actors_bytes`.
+    pub fn replay_bytes(&self, actors_bytes: u64) -> u64 {
+        let share = (self.memory_bytes as f64 * REPLAY_SHARE) as u64;
+        share.min(self.beside_actors(actors_bytes))
+    }
+
+    /// Bytes that a replay sized by a person may take, where the actors take `actors_bytes`.
+    pub fn replay_bytes_max(&self, actors_bytes: u64) -> u64 {
+        let share = (self.memory_bytes as f64 * REPLAY_SHARE_MAX) as u64;
+        share.min(self.beside_actors(actors_bytes))
+    }
+
+    /// Bytes that actors and learner leave.
+    pub const fn beside_actors(&self, actors_bytes: u64) -> u64 {
+        let taken = actors_bytes.saturating_add(LEARNER_BYTES);
+        self.memory_bytes.saturating_sub(taken)
+    }
+}
+
+/// The kernel's estimate of available memory, or what the control group leaves, if that is less.
+fn free_memory_bytes() -> Option<u64> {
+    let system = meminfo_available(&fs::read_to_string("/proc/meminfo").ok()?)?;
+    let number = |path: &str| fs::read_to_string(path).ok()?.trim().parse::<u64>().ok();
+    let group = number("/sys/fs/cgroup/memory.max")
+        .zip(number("/sys/fs/cgroup/memory.current"))
+        .map(|(max, used)| max.saturating_sub(used));
+    Some(group.map_or(system, |group| group.min(system)))
+}
+
+fn meminfo_available(text: &str) -> Option<u64> {
+    let line = text
+        .lines()
+        .find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    let kib: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kib * 1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn available_memory_is_read_from_the_kernels_table() {
+        let text =
+            "MemTotal:       24600000 kB\nMemFree:        1000 kB\nMemAvailable:    2000 kB\n";
+        assert_eq!(meminfo_available(text), Some(2000 * 1024));
+        assert_eq!(meminfo_available("MemTotal: 1 kB"), None);
+    }
+
+    #[test]
+    fn every_machine_gets_at_least_one_of_each() {
+        for cores in [0, 1, 2, 8, 300] {
+            let machine = Machine {
+                cores,
+                memory_bytes: 1 << 30,
+            };
+            assert!(machine.actors() >= 1 && machine.actors() <= 4);
+        }
+        assert!(Machine::this().cores >= 1);
+    }
+}

@@ -1,0 +1,236 @@
+//! The settings that follow from others: filled in, checked when read back, refused when set by hand.
+//! It decides nothing of its own.
+
+use driml_envs::{WorldConfig, WorldName};
+use driml_learner::LearnerSettings;
+use driml_machine::error::{Usage, usage};
+use toml::{Table, Value};
+
+use crate::overrides::inline;
+
+/// What follows, and from what.
+const FOLLOWS: [(&str, &str); 14] = [
+    ("run.world", "is chosen by --env"),
+    ("run.agent", "is chosen by --agent"),
+    ("run.frame_height", "follows from the world"),
+    ("run.frame_width", "follows from the world"),
+    ("run.frame_channels", "follows from the world"),
+    ("run.num_actions", "follows from the world"),
+    ("world.kind", "is chosen by --env"),
+    ("world.game", "is chosen by --env"),
+    ("model.height", "follows from input.height"),
+    ("model.width", "follows from input.width"),
+    (
+        "model.channels",
+        "follows from the world and run.frame_stack",
+    ),
+    ("model.num_actions", "follows from the world"),
+    ("model.dim", "follows from learner.update"),
+    (
+        "replay.study",
+        "is a fault to be studied, and chosen by --study",
+    ),
+];
+
+/// Writes the names that everything else follows from.
+pub(crate) fn name(table: &mut Table, world: &str, agent: &str) {
+    put(table, "run.world", Value::String(world.into()));
+    put(table, "run.agent", Value::String(agent.into()));
+}
+
+/// Refuses a `--set` of something that follows from something else.
+///
+/// # Errors
+/// Says what to set instead.
+pub(crate) fn refuse(path: &str) -> Result<(), Usage> {
+    match followed(path) {
+        Some((known, how)) => Err(usage!("{known} cannot be set by hand: it {how}")),
+        None => Ok(()),
+    }
+}
+
+/// How a setting follows from others; none of one that does not.
+pub(crate) fn follows(path: &str) -> Option<&'static str> {
+    followed(path).map(|(_, how)| how)
+}
+
+/// The entry of [`FOLLOWS`] that is `path` or a table around it.
+fn followed(path: &str) -> Option<(&'static str, &'static str)> {
+    let inside = |known: &str| {
+        let rest = path.strip_prefix(known);
+        rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+    };
+    FOLLOWS.into_iter().find(|(known, _)| inside(known))
+}
+
+/// Fills in what follows.
+///
+/// # Errors
+/// A table from which something follows and that cannot be read.
+pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
+    let world: WorldName = text(table, "run.world")?
+        .parse()
+        .map_err(|e| usage!("run.world: {e}"))?;
+    put(table, "world.kind", Value::String(world.kind().into()));
+    if let Some((key, variant)) = world.variant() {
+        put(
+            table,
+            &format!("world.{key}"),
+            Value::String(variant.into()),
+        );
+    }
+    let config: WorldConfig = part(table, "world")?;
+    let update: LearnerSettings = part(table, "learner.update")?;
+    let shape = config.frame_shape();
+    let num_actions = config.num_actions();
+    let stack = whole(table, "run.frame_stack")?;
+    let dim = update.dim_parts(num_actions);
+    let size = |value: usize| Value::Integer(value as i64);
+    let dim = Value::try_from(dim).map_err(|e| usage!("the DIM heads as TOML: {e}"))?;
+    for (path, value) in [
+        ("run.frame_height", size(shape.height)),
+        ("run.frame_width", size(shape.width)),
+        ("run.frame_channels", size(shape.channels)),
+        ("run.num_actions", size(num_actions)),
+        (
+            "model.height",
+            Value::Integer(whole(table, "input.height")?),
+        ),
+        ("model.width", Value::Integer(whole(table, "input.width")?)),
+        (
+            "model.channels",
+            Value::Integer(stack.saturating_mul(shape.channels as i64)),
+        ),
+        ("model.num_actions", size(num_actions)),
+        ("model.dim", dim),
+    ] {
+        put(table, path, value);
+    }
+    visible_actions(table, &config);
+    ladder(table);
+    Ok(())
+}
+
+/// Fills in for how many actors the ladder of epsilons is, where there is one and nobody says it.
+fn ladder(table: &mut Table) {
+    let asked = find(table, "actor.epsilon_ladder").is_some_and(Value::is_table);
+    if asked
+        && find(table, "actor.epsilon_ladder.actors").is_none()
+        && let Some(actors) = find(table, "local.actors").cloned()
+    {
+        put(table, "actor.epsilon_ladder.actors", actors);
+    }
+}
+
+/// Fills in what each action amounts to in the world, where that is asked for and not given.
+fn visible_actions(table: &mut Table, world: &WorldConfig) {
+    let asked = find(table, "learner.affinity.alphabet").and_then(Value::as_str) == Some("visible");
+    if asked && find(table, "learner.affinity.visible").is_none() {
+        let map = world.visible_actions().into_iter();
+        let map = map.map(|action| Value::Integer(action.into())).collect();
+        put(table, "learner.affinity.visible", Value::Array(map));
+    }
+}
+
+/// Fills in what settings leave open that were written before there were several objectives: DIM, or none where all lambdas
+/// are 0, and the action as the network had it.
+pub(crate) fn complete(read: &mut Table) {
+    let number = |value: &Value| {
+        let whole = value.as_integer().map(|whole| whole as f64);
+        value.as_float().or(whole).unwrap_or(0.0)
+    };
+    if find(read, "local").is_some() && find(read, "local.learner_device").is_none() {
+        put(read, "local.learner_device", Value::String("cpu".into()));
+    }
+    let weighs = find(read, "learner.update.lambda")
+        .and_then(Value::as_table)
+        .is_some_and(|lambda| lambda.values().any(|value| number(value) > 0.0));
+    let action = find(read, "model.dim.action").and_then(Value::as_bool);
+    if find(read, "learner.update.lambda").is_some()
+        && find(read, "learner.update.objective").is_none()
+    {
+        let objective = if weighs { "dim" } else { "none" };
+        put(
+            read,
+            "learner.update.objective",
+            Value::String(objective.into()),
+        );
+        put(
+            read,
+            "learner.update.condition_on_action",
+            Value::Boolean(action.unwrap_or(false)),
+        );
+    }
+}
+
+/// Checks that what a file says of what follows is what follows.
+///
+/// # Errors
+/// The first value at odds, and what it follows from.
+pub(crate) fn check(read: &Table) -> Result<(), Usage> {
+    let mut right = read.clone();
+    derive(&mut right)?;
+    for (path, how) in FOLLOWS {
+        if let (Some(was), Some(is)) = (find(read, path), find(&right, path))
+            && was != is
+        {
+            return Err(usage!(
+                "{path} = {}, but it {how} and is {}; correct the one or the other",
+                inline(was),
+                inline(is)
+            ));
+        }
+    }
+    Ok(())
+}
+
+fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
+    let (first, rest) = path.split_once('.').unwrap_or((path, ""));
+    let value = table.get(first)?;
+    if rest.is_empty() {
+        Some(value)
+    } else {
+        find(value.as_table()?, rest)
+    }
+}
+
+/// Writes a value, making the tables on the way; what is no table on the way stays, for its reader to refuse.
+fn put(table: &mut Table, path: &str, value: Value) {
+    match path.split_once('.') {
+        None => {
+            table.insert(path.into(), value);
+        }
+        Some((first, rest)) => {
+            let inner = table
+                .entry(first)
+                .or_insert_with(|| Value::Table(Table::new()));
+            if let Some(inner) = inner.as_table_mut() {
+                put(inner, rest, value);
+            }
+        }
+    }
+}
+
+fn text(table: &Table, path: &str) -> Result<String, Usage> {
+    let value = find(table, path).and_then(Value::as_str);
+    value.map(str::to_owned).ok_or_else(|| {
+        usage!("the settings lack {path}, a word: use a config.toml that driml wrote")
+    })
+}
+
+fn whole(table: &Table, path: &str) -> Result<i64, Usage> {
+    let value = find(table, path).and_then(Value::as_integer);
+    value.ok_or_else(|| {
+        usage!("the settings lack {path}, a whole number: use a config.toml that driml wrote")
+    })
+}
+
+fn part<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
+    let value = find(table, path).ok_or_else(|| {
+        usage!("the settings have no [{path}] table: use a config.toml that driml wrote")
+    })?;
+    value
+        .clone()
+        .try_into()
+        .map_err(|e: toml::de::Error| usage!("in the settings' [{path}] table: {}", e.message()))
+}

@@ -1,0 +1,285 @@
+//! `driml presets`: what there is to start from, what the paper chose by game, and all settings of one game and agent, each
+//! with the source that its preset file gives. It resolves nothing itself.
+
+use std::collections::BTreeMap;
+
+use driml_envs::WorldName;
+use driml_machine::{
+    error::{Usage, usage},
+    resources::Machine,
+};
+use toml::{Table, Value};
+
+use crate::{
+    config::{self, Flags, Source},
+    derived,
+    presets::{AGENTS, Agent, Layer, Only, PRESETS, Preset, agent, layers, stack},
+};
+
+/// Where a setting's source begins, if the setting leaves room.
+const SOURCE_COLUMN: usize = 44;
+/// What the machine decides.
+const BY_MACHINE: [&str; 5] = [
+    "local.actors",
+    "local.learner_threads",
+    "local.learner_device",
+    "actor.envs",
+    "actor.world_threads",
+];
+
+/// Presets, agents, and what differs by game.
+pub fn menu() -> Result<String, Usage> {
+    let presets = PRESETS.iter().map(|preset| (preset.name, preset.about));
+    let agents = AGENTS.iter().map(|agent| (agent.name, agent.about));
+    let width = presets
+        .clone()
+        .chain(agents.clone())
+        .map(|(name, _)| name.len())
+        .max()
+        .unwrap_or(0);
+    let line = |(name, about)| format!("{name:width$}  {about}\n");
+    let presets: String = presets.map(line).collect();
+    let agents: String = agents.map(line).collect();
+    let mut text = format!("--preset\n{presets}\n--agent\n{agents}\n");
+    text += "what differs by world\n";
+    text += &format!(
+        "{:18}  {:9}  {:9}  {:11}  lambdas of DIM\n",
+        "--env", "driml-fix", "augments", "driml-noact"
+    );
+    for world in WorldName::all() {
+        let of = |name: &str| layers(&PRESETS[0], world, agent(name)?);
+        let (fix, noact) = (of("driml-fix")?, of("driml-noact")?);
+        text += &format!(
+            "{:18}  k = {:<5}  {:9}  k = {:<7}  {}\n",
+            world.to_string(),
+            k(&fix),
+            if find(&fix, "learner.augment").is_some() {
+                "yes"
+            } else {
+                "-"
+            },
+            k(&noact),
+            lambdas(&fix),
+        );
+    }
+    text += "\noff in every preset\n";
+    text += "--set 'actor.epsilon_ladder={base=0.4,alpha=7}'  fixed epsilons from actor to actor smaller, as Ape-X has them\n";
+    text += "\nEvery setting of one of them with its source: driml presets --game bigfish --agent driml-fix\n";
+    Ok(text)
+}
+
+fn k(table: &Table) -> String {
+    find(table, "run.horizon.k").map_or("-".into(), Value::to_string)
+}
+
+/// Those above 0.
+fn lambdas(table: &Table) -> String {
+    let all = find(table, "learner.update.lambda").and_then(Value::as_table);
+    let weighs = |value: &Value| value.as_float().is_some_and(|value| value > 0.0);
+    let some = all.into_iter().flatten().filter(|(_, value)| weighs(value));
+    let texts: Vec<String> = some
+        .map(|(pair, value)| format!("{pair} {value}"))
+        .collect();
+    texts.join(", ")
+}
+
+fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
+    let (first, rest) = path.split_once('.').unwrap_or((path, ""));
+    let value = table.get(first)?;
+    if rest.is_empty() {
+        Some(value)
+    } else {
+        find(value.as_table()?, rest)
+    }
+}
+
+/// The resolved settings, each with its source.
+pub fn sourced(preset: &'static Preset, world: WorldName, agent: &Agent) -> Result<String, Usage> {
+    let source = Source::Layers(preset, world, agent.name);
+    // What the preset asks for, on any machine; memory that is free at this moment is no setting.
+    let machine = Machine {
+        memory_bytes: u64::MAX,
+        ..Machine::this()
+    };
+    let config = config::resolve(&source, &Flags::default(), &machine)?;
+    let table: Table = config
+        .to_toml()
+        .parse()
+        .map_err(|e: toml::de::Error| usage!("the settings as TOML: {}", e.message()))?;
+    let mut sources = BTreeMap::new();
+    for layer in stack(preset, world, agent) {
+        note_sources(&layer, &world.to_string(), &mut sources);
+    }
+    let mut text = format!(
+        "# {} in {world}, preset {}: every setting and its source. `driml local --config` takes this file.\n",
+        agent.name, preset.name
+    );
+    write_table(&table, "", &sources, &mut text);
+    Ok(text)
+}
+
+/// Writes `table`, which lies at `path`: its values first, then the tables in it.
+fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, out: &mut String) {
+    let inner = |key: &str| match path {
+        "" => key.to_owned(),
+        _ => format!("{path}.{key}"),
+    };
+    // A table that a preset writes on one line stays one.
+    let is_line = |key: &str, value: &Value| {
+        !value.is_table() || sources.contains_key(&inner(key)) || inner(key) == "model.dim"
+    };
+    let (lines, tables): (Vec<_>, Vec<_>) =
+        table.iter().partition(|(key, value)| is_line(key, value));
+    if !lines.is_empty() {
+        out.push_str(&format!("\n[{path}]\n"));
+    }
+    for (key, value) in lines {
+        let setting = format!("{} = {value}", quoted(key));
+        let source = source_of(&inner(key), sources);
+        out.push_str(&format!("{setting:SOURCE_COLUMN$} # {source}\n"));
+    }
+    for (key, value) in tables {
+        if let Value::Table(table) = value {
+            write_table(table, &inner(key), sources, out);
+        }
+    }
+}
+
+/// A key as TOML has it.
+fn quoted(key: &str) -> String {
+    let bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    if key.chars().all(bare) {
+        key.to_owned()
+    } else {
+        Value::String(key.to_owned()).to_string()
+    }
+}
+
+fn source_of(path: &str, sources: &BTreeMap<String, String>) -> String {
+    if let Some(source) = sources.get(path) {
+        return source.clone();
+    }
+    if BY_MACHINE.contains(&path) {
+        return "this machine".into();
+    }
+    derived::follows(path).unwrap_or("not said").to_owned()
+}
+
+/// Adds what a file says about each of its settings; a later file's word replaces an earlier one's.
+fn note_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, String>) {
+    let mut parts = layer.text.split("[[only]]");
+    let everywhere = parts.next().unwrap_or_default();
+    let mut note = |text: &str, how: &str| {
+        for (path, comment) in comments(text) {
+            let path = path.strip_prefix("set.").unwrap_or(&path).to_owned();
+            let source = format!("{comment} [{}{how}]", layer.name);
+            sources.insert(path, source.trim_start().to_owned());
+        }
+    };
+    note(everywhere, "");
+    for block in parts {
+        let read = toml::from_str::<Only>(block);
+        let here = |only: &Only| only.worlds.iter().any(|name| name == world);
+        if read.is_ok_and(|only| here(&only)) {
+            note(block, ", by world");
+        }
+    }
+}
+
+/// The path of each setting in a preset file and the comment beside or above it.
+pub(crate) fn comments(text: &str) -> Vec<(String, String)> {
+    let mut found: Vec<(String, String)> = Vec::new();
+    let (mut table, mut above) = (String::new(), String::new());
+    for line in text.lines() {
+        let bare = line.trim();
+        if let Some(remark) = bare.strip_prefix('#') {
+            let goes_on = line.starts_with(' ');
+            match found.last_mut() {
+                Some((_, comment)) if goes_on => *comment += &format!(" {}", remark.trim()),
+                _ => above = remark.trim().to_owned(),
+            }
+        } else if let Some(name) = bare.strip_prefix('[').and_then(|it| it.strip_suffix(']')) {
+            table = format!("{name}.");
+            above.clear();
+        } else if let Some((key, rest)) = bare.split_once(" = ") {
+            let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '.';
+            if key.chars().all(plain) {
+                let beside = rest.split_once(" # ").map(|(_, comment)| comment.trim());
+                let comment = beside.map_or_else(|| above.clone(), str::to_owned);
+                found.push((format!("{table}{key}"), comment));
+                above.clear();
+            }
+        } else if bare.is_empty() {
+            above.clear();
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::RunConfig;
+
+    #[test]
+    fn every_setting_of_every_game_and_agent_has_a_source_and_reads_back() {
+        for world in WorldName::all() {
+            for agent in &AGENTS {
+                let text = sourced(&PRESETS[0], world, agent).unwrap();
+                assert!(!text.contains("not said"), "{text}");
+                RunConfig::parse("printed", &text).unwrap();
+            }
+        }
+    }
+
+    #[test]
+    fn a_game_s_own_choice_is_named_as_such() {
+        let world = "procgen:bigfish".parse().unwrap();
+        let text = sourced(&PRESETS[0], world, agent("driml-fix").unwrap()).unwrap();
+        let k = text
+            .lines()
+            .find(|line| line.starts_with("horizon"))
+            .unwrap();
+        assert!(
+            k.contains("k = 5") && k.ends_with("# paper [agent/driml-fix, by world]"),
+            "{k}"
+        );
+        assert!(text.contains("augment = "), "{text}");
+        let again: Table = text.parse().unwrap();
+        assert_eq!(k_of(&again), Some(5));
+    }
+
+    fn k_of(table: &Table) -> Option<i64> {
+        find(table, "run.horizon.k")?.as_integer()
+    }
+
+    #[test]
+    fn comments_are_found_beside_above_and_below() {
+        let text = "# of the file\n\n[a]\nx = 1   # one\ny = 2   # two,\n        # and more\n# above\nz = 3\n";
+        let found = comments(text);
+        let expected = [("a.x", "one"), ("a.y", "two, and more"), ("a.z", "above")];
+        assert_eq!(
+            found,
+            expected.map(|(path, comment)| (path.into(), comment.into()))
+        );
+    }
+
+    #[test]
+    fn the_menu_shows_what_differs_by_game() {
+        let text = menu().unwrap();
+        let line = |name: &str| {
+            text.lines()
+                .find(|line| line.starts_with(name))
+                .unwrap()
+                .to_owned()
+        };
+        assert_eq!(
+            line("procgen:bigfish"),
+            "procgen:bigfish     k = 5      yes        k = 1        4t4 1.0"
+        );
+        assert_eq!(
+            line("mspacman"),
+            "mspacman            k = 1      -          k = 1        3t3 1.0, 4t4 1.0"
+        );
+    }
+}

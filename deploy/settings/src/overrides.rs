@@ -1,0 +1,227 @@
+//! `--set key=value`: one value of the settings, by its dotted path.
+//! It knows keys and types by what is already in the settings, and no range: the parts' own checks follow.
+
+use driml_machine::error::{Usage, nearest, usage};
+use toml::{Table, Value};
+
+/// A parsed `--set`.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Override {
+    /// The dotted path.
+    pub path: String,
+    /// What it is to be.
+    value: Value,
+}
+
+impl Override {
+    /// Reads `key=value`; a value that is not TOML is taken as a word.
+    ///
+    /// # Errors
+    /// No `=`, or no path of at least a table and a key.
+    pub(crate) fn parse(text: &str) -> Result<Self, Usage> {
+        let form = "--set takes table.key=value, such as learner.update.adam.lr=1e-4";
+        let (path, value) = text
+            .split_once('=')
+            .ok_or_else(|| usage!("--set {text:?} has no '='; {form}"))?;
+        let (path, value) = (path.trim(), value.trim());
+        if path.split('.').any(|key| key.trim().is_empty()) {
+            return Err(usage!("--set {text:?} has no key before '='; {form}"));
+        }
+        let read = format!("value = {value}").parse::<Table>().ok();
+        // A line break could bring in a second key.
+        let value = match read
+            .and_then(|mut table| (table.len() == 1).then(|| table.remove("value")))
+            .flatten()
+        {
+            Some(value) => value,
+            None => Value::String(value.to_owned()),
+        };
+        Ok(Self {
+            path: path.to_owned(),
+            value,
+        })
+    }
+
+    /// Puts the value into `table`; returns whether the key was not there before.
+    ///
+    /// A new key is accepted in a table that exists: whether it means anything is for the reader of that table to say.
+    ///
+    /// # Errors
+    /// A path that leads nowhere, or a value of another type than the one it replaces.
+    pub(crate) fn apply(&self, table: &mut Table) -> Result<bool, Usage> {
+        let unknown = self.unknown(table);
+        let (tables, key) = self
+            .path
+            .rsplit_once('.')
+            .ok_or_else(|| self.unknown(table))?;
+        let mut inner = table;
+        for name in tables.split('.') {
+            inner = inner
+                .get_mut(name)
+                .and_then(Value::as_table_mut)
+                .ok_or(())
+                .map_err(|()| unknown.clone())?;
+        }
+        let value = match inner.get(key) {
+            Some(old) => self.as_type_of(old)?,
+            None => self.value.clone(),
+        };
+        Ok(inner.insert(key.to_owned(), value).is_none())
+    }
+
+    /// The value as the type of the one it replaces.
+    fn as_type_of(&self, old: &Value) -> Result<Value, Usage> {
+        match (old, &self.value) {
+            (Value::Float(_), Value::Integer(whole)) => Ok(Value::Float(*whole as f64)),
+            (old, new) if old.same_type(new) => Ok(new.clone()),
+            (old, new) => Err(usage!(
+                "--set {}={}: the value is {}, and {new} is {}",
+                self.path,
+                inline(new),
+                type_name(old),
+                type_name(new),
+                new = inline(new),
+            )),
+        }
+    }
+
+    /// The answer to a key that is not there: what is, and what comes near.
+    pub(crate) fn unknown(&self, table: &Table) -> Usage {
+        let mut known = table;
+        let mut at = Vec::new();
+        for name in self.path.split('.') {
+            match known.get(name).and_then(Value::as_table) {
+                Some(inner) => {
+                    known = inner;
+                    at.push(name);
+                }
+                None => break,
+            }
+        }
+        // The same key in another table is what is meant most often.
+        let paths = leaves(table);
+        let key = |path: &str| path.rsplit('.').next().map(str::to_owned);
+        let elsewhere = paths.iter().filter(|path| key(path) == key(&self.path));
+        let near = match elsewhere.min_by_key(|path| strsim::levenshtein(&self.path, path)) {
+            Some(path) => format!(" (did you mean {path:?}?)"),
+            None => nearest(&self.path, paths.iter().map(String::as_str)),
+        };
+        let keys: Vec<_> = known.keys().map(String::as_str).collect();
+        let place = if at.is_empty() {
+            "the settings have the tables".into()
+        } else {
+            format!("[{}] has", at.join("."))
+        };
+        usage!(
+            "there is no setting {:?}{near}; {place} {}",
+            self.path,
+            keys.join(", ")
+        )
+    }
+}
+
+/// The dotted paths of all values that are not tables.
+fn leaves(table: &Table) -> Vec<String> {
+    let mut paths = Vec::new();
+    for (key, value) in table {
+        match value {
+            Value::Table(inner) => paths.extend(
+                leaves(inner)
+                    .into_iter()
+                    .map(|path| format!("{key}.{path}")),
+            ),
+            _ => paths.push(key.clone()),
+        }
+    }
+    paths
+}
+
+fn type_name(value: &Value) -> &'static str {
+    match value {
+        Value::String(_) => "a word",
+        Value::Integer(_) => "a whole number",
+        Value::Float(_) => "a number",
+        Value::Boolean(_) => "true or false",
+        Value::Datetime(_) => "a date",
+        Value::Array(_) => "a list in [ ]",
+        Value::Table(_) => "a table in { }",
+    }
+}
+
+/// A value on one line, words without quotes.
+pub(crate) fn inline(value: &Value) -> String {
+    match value {
+        Value::String(word) => word.clone(),
+        other => other.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use expect_test::expect;
+
+    use super::*;
+
+    fn settings() -> Table {
+        "[run]\nseed = 1\ngamma = 0.99\ntimeout = \"terminal\"\nhorizon = { rule = \"fixed\", k = 5 }\n\
+         [learner]\nbatch_rows = 256\n[learner.update.adam]\nlr = 1e-3\nbeta1 = 0.9"
+            .parse()
+            .unwrap()
+    }
+
+    fn set(text: &str) -> Result<(Table, bool), String> {
+        let mut table = settings();
+        let new = Override::parse(text)
+            .and_then(|it| it.apply(&mut table))
+            .map_err(|e| e.to_string())?;
+        Ok((table, new))
+    }
+
+    #[test]
+    fn values_take_the_type_of_what_they_replace() {
+        assert_eq!(
+            set("learner.update.adam.lr=1e-4").unwrap().0["learner"]["update"]["adam"]["lr"],
+            Value::Float(1e-4)
+        );
+        assert_eq!(
+            set("run.gamma=1").unwrap().0["run"]["gamma"],
+            Value::Float(1.0)
+        );
+        assert_eq!(
+            set("run.timeout=bootstrap").unwrap().0["run"]["timeout"],
+            Value::String("bootstrap".into())
+        );
+        assert_eq!(
+            set("run.timeout = \"bootstrap\"").unwrap().0["run"]["timeout"].as_str(),
+            Some("bootstrap")
+        );
+        let (table, new) = set("run.horizon={rule=\"uniform\",k_max=3}").unwrap();
+        assert_eq!((table["run"]["horizon"].get("k"), new), (None, false));
+        assert!(set("run.other=3").unwrap().1);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_answered_with_what_does() {
+        let said = |text: &str| set(text).unwrap_err();
+        expect![[r#"--set "run.seed" has no '='; --set takes table.key=value, such as learner.update.adam.lr=1e-4"#]]
+            .assert_eq(&said("run.seed"));
+        expect![[r#"--set "=3" has no key before '='; --set takes table.key=value, such as learner.update.adam.lr=1e-4"#]]
+            .assert_eq(&said("=3"));
+        expect![[r#"--set run.seed=many: the value is a whole number, and many is a word"#]]
+            .assert_eq(&said("run.seed=many"));
+        expect![[r#"--set run.seed=1.5: the value is a whole number, and 1.5 is a number"#]]
+            .assert_eq(&said("run.seed=1.5"));
+        expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has batch_rows, update"#]]
+            .assert_eq(&said("learner.adam.lr=1"));
+        expect![[r#"there is no setting "seed" (did you mean "run.seed"?); the settings have the tables learner, run"#]]
+            .assert_eq(&said("seed=1"));
+        expect![[r#"there is no setting "ruin.seeds" (did you mean "run.seed"?); the settings have the tables learner, run"#]]
+            .assert_eq(&said("ruin.seeds=1"));
+    }
+
+    #[test]
+    fn one_set_cannot_bring_in_a_second_key() {
+        let smuggled = Override::parse("run.seed=1\nother = 2").unwrap();
+        assert!(smuggled.apply(&mut settings()).is_err());
+    }
+}

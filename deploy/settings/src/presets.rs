@@ -1,0 +1,384 @@
+//! The menu of presets: TOML layers that lie in `presets/`, built into the program and laid over one another.
+//! It checks no value: `config` does, once everything is in place.
+
+#[cfg(test)]
+mod pinned;
+
+use driml_envs::WorldName;
+use driml_machine::error::{Usage, nearest, usage};
+use serde::Deserialize;
+use toml::{Table, Value};
+
+/// One file of `presets/`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Layer {
+    pub(crate) name: &'static str,
+    pub(crate) text: &'static str,
+}
+
+macro_rules! layer {
+    ($path:literal) => {
+        Layer {
+            name: $path,
+            text: include_str!(concat!("../presets/", $path, ".toml")),
+        }
+    };
+}
+
+const BASE: Layer = layer!("base");
+
+/// A way to run any agent in a world.
+#[derive(Clone, Debug)]
+pub struct Preset {
+    /// As `--preset` takes it.
+    pub name: &'static str,
+    /// One line for `driml presets`.
+    pub about: &'static str,
+    /// Laid over base, world and agent.
+    layers: &'static [Layer],
+    /// The worlds it is made for; none means all.
+    families: &'static [&'static str],
+}
+
+/// Every preset, the default first.
+pub const PRESETS: [Preset; 4] = [
+    Preset {
+        name: "paper",
+        about: "as the paper's authors ran it, at the world's own frame size (the default)",
+        layers: &[],
+        families: &[],
+    },
+    Preset {
+        name: "paper-observation",
+        about: "`paper` with Procgen's frame enlarged to the paper's 104 x 80: 2.3 times the arithmetic",
+        layers: &[layer!("variant/paper-observation")],
+        families: &["procgen"],
+    },
+    Preset {
+        name: "split",
+        about: "`paper` with each of the 500 Procgen levels an episode of its own, and unseen ones to test on",
+        layers: &[layer!("variant/split")],
+        families: &["procgen"],
+    },
+    Preset {
+        name: "smoke",
+        about: "a tiny network, batch and replay: shows within a minute that all parts work together",
+        layers: &[layer!("variant/smoke")],
+        families: &[],
+    },
+];
+
+/// An agent.
+#[derive(Clone, Debug)]
+pub struct Agent {
+    /// As `--agent` takes it.
+    pub name: &'static str,
+    /// One line for `driml presets`.
+    pub(crate) about: &'static str,
+    layer: Layer,
+}
+
+/// Every agent.
+pub const AGENTS: [Agent; 7] = [
+    Agent {
+        name: "c51",
+        about: "the return alone",
+        layer: layer!("agent/c51"),
+    },
+    Agent {
+        name: "driml-fix",
+        about: "DIM at a fixed k, chosen by game; augments its states on seven of them",
+        layer: layer!("agent/driml-fix"),
+    },
+    Agent {
+        name: "driml-ada",
+        about: "DIM at a k that follows how predictable the stored actions are (the default)",
+        layer: layer!("agent/driml-ada"),
+    },
+    Agent {
+        name: "driml-randk",
+        about: "DIM at a k drawn uniformly",
+        layer: layer!("agent/driml-randk"),
+    },
+    Agent {
+        name: "driml-noact",
+        about: "DIM that is not told the action",
+        layer: layer!("agent/driml-noact"),
+    },
+    Agent {
+        name: "cpc",
+        about: "one InfoNCE for each of k = 1..5, not told the action",
+        layer: layer!("agent/cpc"),
+    },
+    Agent {
+        name: "curl",
+        about: "two augmentations of the same state, the second one seen by a moving average of the network",
+        layer: layer!("agent/curl"),
+    },
+];
+
+/// One for each kind of world in the registry of worlds.
+const WORLDS: [Layer; 4] = [
+    layer!("world/procgen"),
+    layer!("world/mspacman"),
+    layer!("world/chain"),
+    layer!("world/ising"),
+];
+
+fn world_layer(world: WorldName) -> Layer {
+    let name = format!("world/{}", world.kind());
+    let found = WORLDS.into_iter().find(|layer| layer.name == name);
+    found.expect("a test looks for a layer of each kind")
+}
+
+/// A world by its name, or by its game's.
+pub fn world(name: &str) -> Result<WorldName, Usage> {
+    let game = format!("procgen:{name}");
+    let known = name
+        .parse::<WorldName>()
+        .or_else(|e| game.parse().map_err(|_| e));
+    known.map_err(|e| Usage(e.to_string()))
+}
+
+/// Finds an agent by name.
+///
+/// # Errors
+/// Says which agents there are.
+pub fn agent(name: &str) -> Result<&'static Agent, Usage> {
+    AGENTS
+        .iter()
+        .find(|agent| agent.name == name)
+        .ok_or_else(|| {
+            let names = AGENTS.map(|agent| agent.name);
+            usage!(
+                "there is no agent {name:?}{}; --agent takes {}",
+                nearest(name, names),
+                names.join(", ")
+            )
+        })
+}
+
+/// Finds a preset by name.
+///
+/// # Errors
+/// Says which presets there are.
+pub fn preset(name: &str) -> Result<&'static Preset, Usage> {
+    PRESETS
+        .iter()
+        .find(|preset| preset.name == name)
+        .ok_or_else(|| {
+            let names = PRESETS.map(|preset| preset.name);
+            usage!(
+                "there is no preset {name:?}{}; --preset takes {} (`driml presets` describes them)",
+                nearest(name, names),
+                names.join(", ")
+            )
+        })
+}
+
+/// Lays base, world, agent and preset over one another, in this order: a later one wins.
+///
+/// # Errors
+/// A preset that is not made for the world.
+pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result<Table, Usage> {
+    if !preset.families.is_empty() && !preset.families.contains(&world.kind()) {
+        return Err(usage!(
+            "preset {:?} is for {} only, not for {world}; take --preset paper",
+            preset.name,
+            preset.families.join(", ")
+        ));
+    }
+    let mut table = Table::new();
+    for layer in stack(preset, world, agent) {
+        lay(&mut table, &layer, &world.to_string());
+    }
+    Ok(table)
+}
+
+/// The files that are laid over one another, the lowest first.
+pub(crate) fn stack(preset: &Preset, world: WorldName, agent: &Agent) -> Vec<Layer> {
+    let over = preset.layers.iter().copied();
+    [BASE, world_layer(world), agent.layer]
+        .into_iter()
+        .chain(over)
+        .collect()
+}
+
+/// Lays one file over `table`: first what holds everywhere, then each `[[only]]` block that names `world`.
+fn lay(table: &mut Table, layer: &Layer, world: &str) {
+    let (everywhere, blocks) = layer.read();
+    merge(table, everywhere);
+    for block in blocks
+        .into_iter()
+        .filter(|block| block.worlds.iter().any(|name| name == world))
+    {
+        merge(table, block.set);
+    }
+}
+
+/// What a person should know of an agent in a world before it starts.
+pub fn notes(name: &str, world: &str) -> Vec<String> {
+    let blocks = agent(name)
+        .map(|agent| agent.layer.read().1)
+        .unwrap_or_default();
+    let here = blocks
+        .into_iter()
+        .filter(|block| block.worlds.iter().any(|name| name == world));
+    here.filter_map(|block| block.note).collect()
+}
+
+/// An `[[only]]` block of a layer.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Only {
+    /// The worlds in which it holds.
+    pub(crate) worlds: Vec<String>,
+    /// What it sets.
+    #[serde(default)]
+    set: Table,
+    /// What a person should know before the run starts.
+    note: Option<String>,
+}
+
+impl Layer {
+    /// What holds in every world, and the blocks that hold in some.
+    fn read(&self) -> (Table, Vec<Only>) {
+        let bad = |e| -> ! {
+            panic!(
+                "presets/{}.toml is built in, and a test reads it: {e}",
+                self.name
+            )
+        };
+        let mut everywhere: Table = self.text.parse().unwrap_or_else(|e| bad(e));
+        let blocks = everywhere
+            .remove("only")
+            .map(|blocks| blocks.try_into().unwrap_or_else(|e| bad(e)));
+        (everywhere, blocks.unwrap_or_default())
+    }
+}
+
+/// Lays `upper` over `lower`, table by table; anything else is replaced.
+fn merge(lower: &mut Table, upper: Table) {
+    for (key, value) in upper {
+        match (lower.get_mut(&key), value) {
+            (Some(Value::Table(lower)), Value::Table(upper)) => merge(lower, upper),
+            (_, value) => {
+                lower.insert(key, value);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn later_layers_win_key_by_key() {
+        let mut lower: Table = "[a]\nx = 1\ny = 2\n[b]\nz = [1, 2]".parse().unwrap();
+        merge(&mut lower, "[a]\ny = 3\n[b]\nz = [4]".parse().unwrap());
+        assert_eq!(
+            lower,
+            "[a]\nx = 1\ny = 3\n[b]\nz = [4]".parse::<Table>().unwrap()
+        );
+    }
+
+    fn all_layers() -> Vec<Layer> {
+        let agents = AGENTS.into_iter().map(|agent| agent.layer);
+        let worlds = WorldName::all().map(world_layer);
+        let variants = PRESETS.into_iter().flat_map(|preset| preset.layers);
+        let variants = variants.map(|layer| Layer {
+            name: layer.name,
+            text: layer.text,
+        });
+        agents.chain(worlds).chain(variants).chain([BASE]).collect()
+    }
+
+    #[test]
+    fn every_kind_of_world_has_a_layer() {
+        for world in WorldName::all() {
+            assert!(world_layer(world).name.ends_with(world.kind()));
+        }
+    }
+
+    #[test]
+    fn every_only_block_names_worlds_that_exist() {
+        let worlds: BTreeSet<_> = WorldName::all().map(|world| world.to_string()).collect();
+        for layer in all_layers() {
+            for block in layer.read().1 {
+                for world in block.worlds {
+                    assert!(worlds.contains(&world), "{world} in {}", layer.name);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn every_layer_says_what_it_is_for() {
+        for layer in all_layers() {
+            assert!(layer.text.starts_with("# "), "{}", layer.name);
+        }
+    }
+
+    #[test]
+    fn worlds_go_by_their_games_name_too() {
+        assert_eq!(world("bigfish").unwrap(), world("procgen:bigfish").unwrap());
+        assert!(world("mspacman").is_ok());
+        let said = world("bigfihs").unwrap_err().to_string();
+        assert!(said.contains("did you mean"), "{said}");
+    }
+
+    /// The worlds in which an agent's settings pass `test`.
+    fn worlds(name: &str, test: impl Fn(&Table) -> bool) -> String {
+        let chosen: Vec<_> = WorldName::all()
+            .filter(|&world| test(&layers(&PRESETS[0], world, agent(name).unwrap()).unwrap()))
+            .map(|world| world.to_string())
+            .collect();
+        chosen.join(" ")
+    }
+
+    #[test]
+    fn states_are_augmented_where_the_paper_says() {
+        let augments = |table: &Table| table["learner"].get("augment").is_some();
+        expect_test::expect!["procgen:bigfish procgen:bossfight procgen:chaser procgen:coinrun procgen:jumper procgen:leaper procgen:ninja"]
+            .assert_eq(&worlds("driml-fix", augments));
+        assert_eq!(
+            worlds("curl", augments).split(' ').count(),
+            WorldName::all().count()
+        );
+        for name in ["c51", "driml-ada", "driml-randk", "driml-noact", "cpc"] {
+            assert_eq!(worlds(name, augments), "", "{name}");
+        }
+    }
+
+    #[test]
+    fn driml_noact_looks_as_far_ahead_as_table_1_says() {
+        let five = |table: &Table| table["run"]["horizon"]["k"].as_integer() == Some(5);
+        expect_test::expect!["procgen:bossfight procgen:chaser procgen:climber procgen:fruitbot procgen:jumper procgen:maze procgen:miner procgen:plunder"]
+            .assert_eq(&worlds("driml-noact", five));
+    }
+
+    #[test]
+    fn driml_fix_looks_as_far_ahead_as_the_paper_says() {
+        let k = |world: &str| {
+            let table = layers(
+                &PRESETS[0],
+                world.parse().unwrap(),
+                agent("driml-fix").unwrap(),
+            )
+            .unwrap();
+            table["run"]["horizon"]["k"].as_integer().unwrap()
+        };
+        let five: Vec<_> = WorldName::all()
+            .map(|world| world.to_string())
+            .filter(|world| k(world) == 5)
+            .collect();
+        expect_test::expect![[
+            r#"procgen:bigfish procgen:chaser procgen:climber procgen:fruitbot procgen:jumper procgen:maze procgen:miner procgen:plunder"#
+        ]]
+        .assert_eq(&five.join(" "));
+        assert_eq!(k("mspacman"), 1);
+    }
+}

@@ -1,0 +1,37 @@
+//! `driml actor`: one actor of a run.
+
+use clap::Args;
+use driml_launch::endpoint::check_endpoints;
+
+use super::join::{JoinFlags, clean_up_after, join};
+
+#[derive(Debug, Args)]
+pub(crate) struct ActorArgs {
+    /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; may be given several times
+    #[arg(long, value_name = "ENDPOINT", required = true)]
+    pub(crate) connect: Vec<String>,
+    /// Which actor this is; unique in the run
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) id: u32,
+    /// Copies of the world [default: as the run's settings say]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub(crate) envs: Option<u32>,
+    #[command(flatten)]
+    pub(crate) join: JoinFlags,
+}
+
+/// Plays until the run ends.
+///
+/// # Errors
+/// A call that cannot work, or what the actor met.
+pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
+    check_endpoints(&args.connect)?;
+    let shutdown = join(&args.join)?;
+    let run = driml_actor::RunArgs {
+        connect: args.connect,
+        namespace: args.join.namespace,
+        actor: args.id,
+        envs: args.envs,
+    };
+    clean_up_after(driml_actor::run(run, &shutdown))
+}

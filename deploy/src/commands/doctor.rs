@@ -1,0 +1,40 @@
+//! `driml doctor`: what this machine can do and what it lacks.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use driml_launch::console::print;
+use driml_machine::doctor;
+
+#[derive(Debug, Args)]
+pub(crate) struct DoctorArgs {
+    /// Where runs go: the disk that is looked at
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    pub(crate) run_dir: PathBuf,
+    /// Fail also where --device cuda would
+    #[arg(long)]
+    pub(crate) cuda: bool,
+    /// Print the facts as JSON
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Only the CUDA devices, as JSON: so the usual program asks its CUDA flavour
+    #[arg(long, hide = true)]
+    pub(crate) devices: bool,
+}
+
+/// Prints the facts.
+///
+/// # Errors
+/// Something is missing that training on the CPU needs; with `--cuda`, also what training on a GPU needs.
+pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<()> {
+    if args.devices {
+        return print(&doctor::devices_json()?);
+    }
+    let report = doctor::examine(&args.run_dir);
+    if args.json {
+        print(&report.json()?)?;
+    } else {
+        print(&report.describe())?;
+    }
+    report.check(args.cuda)
+}

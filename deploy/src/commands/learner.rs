@@ -1,0 +1,40 @@
+//! `driml learner`: the learner of a run.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use driml_launch::endpoint::check_endpoints;
+use driml_machine::device::{DeviceFlag, ready_for};
+
+use super::join::{JoinFlags, clean_up_after, join};
+
+#[derive(Debug, Args)]
+pub(crate) struct LearnerArgs {
+    /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; once for each of the run's replay shards
+    #[arg(long, value_name = "ENDPOINT", required = true)]
+    pub(crate) connect: Vec<String>,
+    /// Where checkpoints go: DIR/checkpoints
+    #[arg(long, value_name = "DIR")]
+    pub(crate) run_dir: PathBuf,
+    #[command(flatten)]
+    pub(crate) on: DeviceFlag,
+    #[command(flatten)]
+    pub(crate) join: JoinFlags,
+}
+
+/// Learns until the run ends.
+///
+/// # Errors
+/// A call that cannot work, or what the learner met.
+pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
+    check_endpoints(&args.connect)?;
+    ready_for(args.on.device)?;
+    let shutdown = join(&args.join)?;
+    let run = driml_learner::RunArgs {
+        connect: args.connect,
+        namespace: args.join.namespace,
+        run_dir: args.run_dir,
+        device: args.on.device,
+    };
+    clean_up_after(driml_learner::run(run, &shutdown))
+}

@@ -1,0 +1,13 @@
+//! One file a command: its flags and what it does with them.
+
+pub(crate) mod actor;
+pub(crate) mod doctor;
+pub(crate) mod evaluate;
+pub(crate) mod learner;
+pub(crate) mod parity;
+pub(crate) mod presets;
+pub(crate) mod procgen;
+pub(crate) mod replay_server;
+pub(crate) mod train;
+
+mod join;

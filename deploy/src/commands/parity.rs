@@ -1,0 +1,44 @@
+//! `driml parity`: the learner's arithmetic beside updates that were computed elsewhere in float64.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use driml_launch::console::print;
+use driml_learner::Operations;
+use driml_machine::device::{DeviceFlag, ready_for};
+
+#[derive(Debug, Args)]
+pub(crate) struct ParityArgs {
+    /// Case files (safetensors)
+    #[arg(value_name = "FILE", required = true)]
+    pub(crate) files: Vec<PathBuf>,
+    #[command(flatten)]
+    pub(crate) on: DeviceFlag,
+    /// With candle's own operations, as on a GPU, in place of this project's kernels
+    #[arg(long)]
+    pub(crate) stock: bool,
+}
+
+/// Checks each file and prints what differs.
+///
+/// # Errors
+/// A file that cannot be read, or that is out of tolerance.
+pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
+    ready_for(args.on.device)?;
+    let mut failed = 0;
+    let mut compute = args.on.device.open()?;
+    if args.stock {
+        compute.operations = Operations::Stock;
+    }
+    for file in &args.files {
+        let report = driml_learner::parity::check_file(file, &compute)?;
+        print(&report.to_string())?;
+        failed += usize::from(!report.passed());
+    }
+    anyhow::ensure!(
+        failed == 0,
+        "{failed} of {} files are out of tolerance",
+        args.files.len()
+    );
+    Ok(())
+}

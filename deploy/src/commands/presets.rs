@@ -1,0 +1,41 @@
+//! `driml presets`: what there is to start from, or all settings of one game and agent with their sources.
+
+use clap::Args;
+use driml_launch::console::print;
+use driml_machine::error::usage;
+use driml_settings::{
+    menu,
+    presets::{self, PRESETS},
+};
+
+/// World and agent of which nothing is said, as `driml local` has it.
+const GAME: &str = "bigfish";
+const AGENT: &str = "driml-ada";
+
+#[derive(Debug, Args)]
+pub(crate) struct PresetsArgs {
+    /// Print the settings for this game of Procgen, or another world
+    #[arg(long, value_name = "GAME")]
+    pub(crate) game: Option<String>,
+    /// Print the settings of this agent
+    #[arg(long, value_name = "AGENT")]
+    pub(crate) agent: Option<String>,
+    /// Print the settings of this preset
+    #[arg(long, value_name = "NAME")]
+    pub(crate) preset: Option<String>,
+}
+
+/// Prints the menu, or the settings of a game and an agent as TOML that `driml local --config` takes.
+///
+/// # Errors
+/// Names that nothing has.
+pub(crate) fn run(args: &PresetsArgs) -> anyhow::Result<()> {
+    if args.game.is_none() && args.agent.is_none() && args.preset.is_none() {
+        return print(&menu::menu()?);
+    }
+    let preset = presets::preset(args.preset.as_deref().unwrap_or(PRESETS[0].name))?;
+    let game = args.game.as_deref().unwrap_or(GAME);
+    let world = presets::world(game).map_err(|e| usage!("--game: {e}"))?;
+    let agent = presets::agent(args.agent.as_deref().unwrap_or(AGENT))?;
+    print(&menu::sourced(preset, world, agent)?)
+}

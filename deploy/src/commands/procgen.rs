@@ -1,0 +1,26 @@
+//! `driml procgen`: Procgen's engine.
+
+use clap::Subcommand;
+use driml_launch::console::{self, print};
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ProcgenCommand {
+    /// Fetch the engine into the cache folder (DRIML_CACHE, or the user's own)
+    Install,
+}
+
+/// Fetches the engine and says where it is.
+///
+/// # Errors
+/// It cannot be had.
+pub(crate) fn run(command: &ProcgenCommand) -> anyhow::Result<()> {
+    match command {
+        ProcgenCommand::Install => {
+            let engine = procgen_sys::Engine::install(&mut console::line)?;
+            print(&format!(
+                "procgen's engine is in {}\n",
+                engine.root().display()
+            ))
+        }
+    }
+}

@@ -1,0 +1,52 @@
+//! `driml replay-server`: the replay server of a run, which hands its settings to the others.
+
+use clap::Args;
+use driml_launch::endpoint::check_endpoints;
+use driml_machine::resources::Machine;
+use driml_settings::flags::{self, RunFlags};
+
+use super::join::{JoinFlags, clean_up_after, join};
+
+#[derive(Debug, Args)]
+pub(crate) struct ReplayServerArgs {
+    /// Endpoint to listen on, such as tcp/127.0.0.1:7447; may be given several times. Whoever reaches it can take part in the
+    /// run and change what is learned: an address that others reach, such as tcp/0.0.0.0:7447, belongs in a trusted network
+    #[arg(long, value_name = "ENDPOINT", required = true)]
+    pub(crate) listen: Vec<String>,
+    /// Router to connect to as well
+    #[arg(long, value_name = "ENDPOINT")]
+    pub(crate) connect: Vec<String>,
+    /// Which of the run's --replay-shards this is
+    #[arg(long, value_name = "I", default_value_t = 0)]
+    pub(crate) shard: u32,
+    /// Go on after so many updates: those of the newest checkpoint in the learner's run folder
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=u64::from(u32::MAX)))]
+    pub(crate) after_updates: u64,
+    #[command(flatten)]
+    pub(crate) run: RunFlags,
+    #[command(flatten)]
+    pub(crate) join: JoinFlags,
+}
+
+/// Serves until the run ends.
+///
+/// # Errors
+/// A call or settings that cannot work, or what the server met.
+pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
+    check_endpoints(&args.listen)?;
+    check_endpoints(&args.connect)?;
+    let (config, _) = flags::resolve(&args.run, &Machine::this())?;
+    let shutdown = join(&args.join)?;
+    for note in &config.notes {
+        tracing::warn!("{note}");
+    }
+    let run = driml_replay_server::RunArgs {
+        listen: args.listen,
+        connect: args.connect,
+        namespace: args.join.namespace,
+        shard: args.shard,
+        after_updates: args.after_updates,
+        config_toml: config.to_toml(),
+    };
+    clean_up_after(driml_replay_server::run(run, &shutdown))
+}

@@ -1,0 +1,172 @@
+//! `driml local`: settings, plan, engine, run folder, and then the processes, as processes or in lockstep.
+//! Starting and ending processes is for `processes`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use driml_launch::{
+    console::{self, print},
+    endpoint::check_endpoints,
+    lockstep, plan, processes, resume,
+    run_folder::RunFolder,
+};
+use driml_learner::DeviceName;
+use driml_machine::{
+    device::ready_for,
+    error::{Usage, usage},
+    resources::Machine,
+};
+use driml_protocol::RunSpec;
+use driml_settings::{
+    config::RunConfig,
+    flags::{RunFlags, flags, resolve},
+};
+
+/// What a resumed run has settled.
+const RESUMED: [&str; 11] = [
+    "env",
+    "agent",
+    "preset",
+    "config",
+    "actors",
+    "replay_shards",
+    "envs",
+    "seed",
+    "study",
+    "run_dir",
+    "lockstep",
+];
+
+#[derive(Debug, Args)]
+pub(crate) struct LocalArgs {
+    #[command(flatten)]
+    pub(crate) run: RunFlags,
+    /// Where settings, metrics, checkpoints, logs and summary go [default: runs/WORLD-AGENT-seedS-TIME]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) run_dir: Option<PathBuf>,
+    /// Go on with the interrupted run in this folder, from its newest checkpoint and with its own settings, but for --frames,
+    /// --device and --set
+    #[arg(long, value_name = "DIR", conflicts_with_all = RESUMED)]
+    pub(crate) resume: Option<PathBuf>,
+    /// What the learner computes on: cpu, cuda (the first GPU) or cuda:N [default: as the settings say, cpu]
+    #[arg(long, value_name = "DEVICE")]
+    pub(crate) device: Option<DeviceName>,
+    /// All parts in one process in a fixed order: the same seed gives the same weights
+    #[arg(long, conflicts_with = "listen")]
+    pub(crate) lockstep: bool,
+    /// Endpoint on which the parts meet [default: a unix socket in a fresh folder]
+    #[arg(long, value_name = "ENDPOINT")]
+    pub(crate) listen: Option<String>,
+    /// End as after Ctrl-C when the process that started this one, which has this number, ends
+    #[arg(long, value_name = "PID", hide = true)]
+    pub(crate) exit_with_parent: Option<u32>,
+}
+
+/// Trains on this machine.
+///
+/// # Errors
+/// Settings that cannot work, a run folder in use, an engine that cannot be had, a part that failed, an interrupt.
+pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
+    let machine = Machine::this();
+    if let Some(device) = args.device {
+        args.run.sets.push(format!("local.learner_device={device}"));
+    }
+    let (config, from, behind) = match &args.resume {
+        Some(folder) => {
+            let (config, behind) =
+                resume::find(&RunFolder::new(folder), &flags(&args.run), &machine)?;
+            let from = format!("its checkpoint after {} updates", behind.updates);
+            (config, from, Some(behind))
+        }
+        None => {
+            let (config, from) = resolve(&args.run, &machine)?;
+            (config, from, None)
+        }
+    };
+    check_endpoints(args.listen.as_slice())?;
+    ready_for(config.local.learner_device)?;
+    let (shards, actors) = (config.replay.shards, config.local.actors);
+    if shards > actors {
+        return Err(usage!(
+            "{shards} replay shards for {actors} actors: a shard without actors would stay empty; add --actors {shards} or use fewer shards"
+        )
+        .into());
+    }
+    check_ladder(&config)?;
+    let run_dir = match args.resume {
+        Some(folder) => RunFolder::new(folder),
+        None => {
+            let run_dir = args.run_dir.unwrap_or_else(|| default_run_dir(&config.run));
+            let run_dir = RunFolder::new(run_dir);
+            run_dir.check_free()?;
+            run_dir
+        }
+    };
+    print(&plan::describe(
+        &config,
+        &from,
+        &run_dir,
+        args.lockstep,
+        behind.unwrap_or_default(),
+        &machine,
+    ))?;
+    config.world.install(&mut console::line)?;
+    if args.lockstep {
+        if shards > 1 {
+            return Err(usage!(
+                "--lockstep runs everything in one process, with one replay: leave --replay-shards out"
+            )
+            .into());
+        }
+        lockstep::run(&config, &run_dir, args.exit_with_parent)
+    } else {
+        processes::run(
+            &config,
+            &run_dir,
+            behind,
+            args.listen,
+            args.exit_with_parent,
+        )
+    }
+}
+
+/// Where this program starts all actors, the ladder of epsilons is theirs, no rung empty.
+fn check_ladder(config: &RunConfig) -> Result<(), Usage> {
+    let actors = config.local.actors;
+    match &config.actor.epsilon_ladder {
+        Some(ladder) if ladder.actors != actors => Err(usage!(
+            "actor.epsilon_ladder is for {} actors, but {actors} are started: --set actor.epsilon_ladder.actors={actors}",
+            ladder.actors
+        )),
+        _ => Ok(()),
+    }
+}
+
+fn default_run_dir(run: &RunSpec) -> PathBuf {
+    let world = run.world.replace(':', "-");
+    PathBuf::from("runs").join(format!(
+        "{world}-{}-seed{}-{}",
+        run.agent,
+        run.seed,
+        timestamp(jiff::Timestamp::now())
+    ))
+}
+
+/// `20260131-235959`, in UTC.
+fn timestamp(time: jiff::Timestamp) -> String {
+    time.strftime("%Y%m%d-%H%M%S").to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn timestamps_are_the_calendars() {
+        let of = |seconds| timestamp(jiff::Timestamp::from_second(seconds).unwrap());
+        assert_eq!(of(0), "19700101-000000");
+        assert_eq!(of(951_782_399), "20000228-235959");
+        assert_eq!(of(951_782_400), "20000229-000000");
+        assert_eq!(of(1_767_225_599), "20251231-235959");
+    }
+}

@@ -1,0 +1,48 @@
+//! Arrays of numbers that both estimates have: checks of a saved one, and the softmax of each row of a matrix.
+
+use super::error::AffinityError;
+
+/// Checks the length of an array by name, and that its numbers are finite.
+pub(super) fn check_array<T: Copy + Into<f64>>(
+    name: &str,
+    array: &[T],
+    len: usize,
+) -> Result<(), AffinityError> {
+    if array.len() != len {
+        let found = array.len();
+        return Err(AffinityError(format!(
+            "{name} has {found} numbers, not {len}"
+        )));
+    }
+    match array.iter().position(|&value| !value.into().is_finite()) {
+        Some(at) => Err(AffinityError(format!("{name} is not finite at index {at}"))),
+        None => Ok(()),
+    }
+}
+
+/// [`check_array`] for probabilities.
+pub(super) fn check_probabilities<T: Copy + Into<f64>>(
+    name: &str,
+    array: &[T],
+    len: usize,
+) -> Result<(), AffinityError> {
+    check_array(name, array, len)?;
+    let probability = |&value: &T| (0.0..=1.0 + 1e-6).contains(&value.into());
+    match array.iter().position(|value| !probability(value)) {
+        Some(at) => Err(AffinityError(format!(
+            "{name} is no probability at index {at}"
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// Row-wise softmax of `q` [m, m].
+pub(super) fn row_softmax(q: &[f64], m: usize) -> Vec<f64> {
+    let mut matrix = Vec::with_capacity(q.len());
+    for row in q.chunks_exact(m) {
+        let max = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let sum: f64 = row.iter().map(|q| (q - max).exp()).sum();
+        matrix.extend(row.iter().map(|q| (q - max).exp() / sum));
+    }
+    matrix
+}

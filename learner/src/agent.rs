@@ -1,0 +1,405 @@
+//! One update: C51 plus the auxiliary objective, clipped, through Adam; then the target network's turn.
+//! It does not fetch batches, publish weights or keep checkpoints, and knows no process but its own.
+
+use std::collections::HashMap;
+
+use candle_core::Tensor;
+use driml_model::{Compute, DimParts, ModelConfig, Network, Parameters};
+use rand_chacha::ChaCha8Rng;
+
+use crate::{
+    auxiliary::{
+        key_encoder::KeyEncoder,
+        loss::{AuxiliaryLoss, LossInputs, WeightedLoss},
+    },
+    batch::Batch,
+    error::UpdateError,
+    losses::{
+        c51::{kl_loss, softmax},
+        projection::project,
+    },
+    optimiser::{
+        adam::Adam,
+        gradients::{Gradients, clip_factor},
+        target,
+    },
+    settings::LearnerSettings,
+    tensors::states,
+};
+
+/// What one update did, for a person to watch.
+#[derive(Clone, Debug, PartialEq)]
+pub struct UpdateReport {
+    /// Mean KL divergence of the prediction from the projected target, in nats.
+    pub c51_kl: f32,
+    /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
+    pub losses: Vec<(&'static str, f32)>,
+    /// `c51_kl + sum of weight * loss`.
+    pub total: f32,
+    /// Global 2-norm of the gradients before clipping.
+    pub grad_norm: f64,
+    /// Mean over rows of the taken action's value, in units of return.
+    pub q_mean: f32,
+}
+
+/// The losses of a batch and all that led to them, before any step is taken.
+#[derive(Debug)]
+pub struct Evaluation {
+    /// Mean KL divergence, in nats.
+    pub c51_kl: f32,
+    /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
+    pub losses: Vec<(&'static str, f32)>,
+    /// `c51_kl + sum of weight * loss`.
+    pub total: f32,
+    /// Online values of s_t [B, A].
+    pub q_values_t: Vec<f32>,
+    /// Greedy action in s_{t+n} [B].
+    pub next_greedy_action: Vec<u8>,
+    /// Projected target distributions [B, N].
+    pub target_projection: Vec<f32>,
+    /// Gradients of the total, before clipping.
+    pub gradients: Gradients,
+}
+
+/// The parameters of all networks that a learner has.
+#[derive(Debug)]
+pub struct NetworkParameters {
+    /// The network that learns.
+    pub online: Parameters,
+    /// C51's target network: torso and head.
+    pub target: Parameters,
+    /// CURL's key encoder: torso and Psi_4; there for that objective and for no other.
+    pub key: Option<Parameters>,
+}
+
+/// The learner: online and target network, CURL's key encoder, optimiser, count of updates.
+#[derive(Debug)]
+pub struct Agent {
+    model: ModelConfig,
+    settings: LearnerSettings,
+    compute: Compute,
+    auxiliary: Box<dyn AuxiliaryLoss>,
+    pub(crate) online: Parameters,
+    pub(crate) target: Parameters,
+    online_network: Network,
+    target_network: Network,
+    key: Option<KeyEncoder>,
+    pub(crate) adam: Adam,
+    pub(crate) updates: u64,
+}
+
+impl Agent {
+    /// A learner with initial weights drawn from `rng`, the same on every device; the slow networks are copies.
+    ///
+    /// # Errors
+    /// Settings out of their ranges, or a model whose heads are not those that the objective uses.
+    pub fn new(
+        model: ModelConfig,
+        settings: LearnerSettings,
+        compute: &Compute,
+        rng: &mut ChaCha8Rng,
+    ) -> Result<Self, UpdateError> {
+        let online = Parameters::init(&model, rng, &compute.device)?;
+        let key = settings.auxiliary()?.key_tau();
+        let key = key.map(|_| KeyEncoder::copy_of(&online));
+        let parameters = NetworkParameters {
+            target: online.without_dim()?,
+            key: key.transpose()?,
+            online,
+        };
+        Self::from_parameters(model, settings, compute, parameters)
+    }
+
+    /// A learner with given weights, on the device of `compute`, before its first update.
+    ///
+    /// # Errors
+    /// As [`Agent::new`], and parameters that do not fit the model.
+    pub fn from_parameters(
+        model: ModelConfig,
+        settings: LearnerSettings,
+        compute: &Compute,
+        parameters: NetworkParameters,
+    ) -> Result<Self, UpdateError> {
+        settings.validate()?;
+        let NetworkParameters {
+            online,
+            target,
+            key,
+        } = parameters;
+        let built = DimParts {
+            action: model.dim.embeds_action(),
+            ..model.dim
+        };
+        let needed = settings.dim_parts(model.num_actions);
+        if needed != built {
+            return Err(UpdateError::Settings(format!(
+                "the objective uses {needed:?}, the model builds {built:?}"
+            )));
+        }
+        let operations = compute.operations;
+        let auxiliary = settings.auxiliary()?;
+        let key = match (auxiliary.key_tau(), key) {
+            (None, None) => None,
+            (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, operations, key)?),
+            (wanted, _) => {
+                let there = if wanted.is_some() { "missing" } else { "there" };
+                let objective = settings.objective.name();
+                return Err(UpdateError::State(format!(
+                    "a key encoder is {there}, with objective = {objective}"
+                )));
+            }
+        };
+        Ok(Self {
+            online_network: Network::with_operations(&model, &online, operations)?,
+            target_network: Network::with_operations(&model.without_dim(), &target, operations)?,
+            key,
+            adam: Adam::new(settings.adam, &online, operations)?,
+            compute: compute.clone(),
+            auxiliary,
+            updates: 0,
+            model,
+            settings,
+            online,
+            target,
+        })
+    }
+
+    /// The network's sizes.
+    pub const fn model(&self) -> &ModelConfig {
+        &self.model
+    }
+
+    /// The settings.
+    pub const fn settings(&self) -> &LearnerSettings {
+        &self.settings
+    }
+
+    /// Updates taken since the run began, those before a restart included.
+    pub const fn updates(&self) -> u64 {
+        self.updates
+    }
+
+    /// The online network's parameters.
+    pub const fn online(&self) -> &Parameters {
+        &self.online
+    }
+
+    /// The target network's parameters.
+    pub const fn target(&self) -> &Parameters {
+        &self.target
+    }
+
+    /// The parameters of CURL's key encoder, if that is the objective.
+    pub fn key(&self) -> Option<&Parameters> {
+        self.key.as_ref().map(KeyEncoder::parameters)
+    }
+
+    /// What actors need, torso and head, as safetensors bytes.
+    ///
+    /// # Errors
+    /// A weight that is not finite; a failing serialisation.
+    pub fn weights(&self) -> Result<Vec<u8>, UpdateError> {
+        Ok(self
+            .online
+            .to_safetensors(|name| !name.starts_with(target::AUXILIARY_PREFIX))?)
+    }
+
+    /// Learns from one batch.
+    ///
+    /// # Errors
+    /// A batch that does not fit, or losses or gradients that are not finite: nothing has then changed. A step beyond the
+    /// finite numbers, [`UpdateError::Diverged`]: the learner is then good for nothing, and can be neither published nor saved.
+    pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
+        let evaluation = self.evaluate(batch)?;
+        let grad_norm = self.apply(&evaluation.gradients)?;
+        let num_actions = self.model.num_actions;
+        let taken = evaluation
+            .q_values_t
+            .chunks_exact(num_actions)
+            .zip(batch.action);
+        let q_sum: f32 = taken.map(|(q, &action)| q[usize::from(action)]).sum();
+        Ok(UpdateReport {
+            c51_kl: evaluation.c51_kl,
+            losses: evaluation.losses,
+            total: evaluation.total,
+            grad_norm,
+            q_mean: q_sum / batch.rows as f32,
+        })
+    }
+
+    /// Checks that `batch` is one of this network's and objective's.
+    ///
+    /// # Errors
+    /// [`UpdateError::Batch`] with what is wrong with it.
+    pub(crate) fn check(&self, batch: &Batch<'_>) -> Result<(), UpdateError> {
+        batch.validate(&self.model, self.settings.objective.positives())
+    }
+
+    /// Losses and gradients of one batch at the present parameters.
+    ///
+    /// # Errors
+    /// A batch that does not fit, or losses that are not finite.
+    pub fn evaluate(&self, batch: &Batch<'_>) -> Result<Evaluation, UpdateError> {
+        self.check(batch)?;
+        let (next_greedy_action, target_projection) = self.make_target(batch)?;
+
+        let features_t = self
+            .online_network
+            .features(&self.states(batch.states_t)?)?;
+        let logits = self.online_network.logits(&features_t.f4)?;
+        let q_values_t = self.online_network.q_values(&logits.detach())?;
+        let kl = kl_loss(
+            &logits,
+            batch.action,
+            target_projection.clone(),
+            self.compute.operations,
+        )?;
+        let auxiliary = self.auxiliary.losses(&LossInputs {
+            online: &self.online_network,
+            model: &self.model,
+            batch,
+            features_t: &features_t,
+            key: self.key.as_ref(),
+            device: &self.compute.device,
+        })?;
+        let mut total = kl.clone();
+        for WeightedLoss { loss, weight, .. } in &auxiliary {
+            total = (total + loss.affine(*weight, 0.0)?)?;
+        }
+        // Before any number is read: reading waits for a GPU, which should have all its work by then.
+        let gradients = Gradients::take(&self.online, total.backward()?)?;
+        let c51_kl = finite("the C51 loss", &kl)?;
+        let mut losses = Vec::with_capacity(auxiliary.len());
+        for WeightedLoss { name, loss, .. } in &auxiliary {
+            losses.push((*name, finite(name, loss)?));
+        }
+        Ok(Evaluation {
+            c51_kl,
+            losses,
+            total: finite("the total loss", &total)?,
+            q_values_t: flat(&q_values_t)?,
+            next_greedy_action,
+            target_projection,
+            gradients,
+        })
+    }
+
+    /// Clips `gradients` and takes one step with them; moves the slow networks whose turn it is.
+    /// Returns their global norm before clipping.
+    ///
+    /// # Errors
+    /// As [`Agent::update`].
+    pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
+        let norm = gradients.norm(self.compute.operations)?;
+        self.adam.step(
+            &self.online,
+            gradients,
+            clip_factor(norm, self.settings.max_grad_norm),
+        )?;
+        self.updates += 1;
+        if let Some(key) = &self.key {
+            key.follow(&self.online)?;
+        }
+        if self
+            .updates
+            .is_multiple_of(self.settings.target_period_updates)
+        {
+            let (tau, operations) = (self.settings.target_tau, self.compute.operations);
+            target::follow(&self.target, &self.online, tau, operations)?;
+        }
+        Ok(norm)
+    }
+
+    /// Greedy actions in s_{t+n} [B] and their distributions one Bellman step earlier [B, N], without a graph.
+    fn make_target(&self, batch: &Batch<'_>) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
+        let ModelConfig {
+            num_actions,
+            atoms,
+            v_min,
+            v_max,
+            ..
+        } = self.model;
+        let states_n = self.states(batch.states_n)?;
+        let target_logits = distribution(&self.target_network, &states_n)?;
+        let next_q_values = if self.settings.double_dqn {
+            self.online_network
+                .q_values(&distribution(&self.online_network, &states_n)?)?
+        } else {
+            self.target_network.q_values(&target_logits)?
+        };
+        let next_greedy: Vec<u8> = flat(&next_q_values)?
+            .chunks_exact(num_actions)
+            .map(greedy)
+            .collect();
+
+        let logits = flat(&target_logits)?;
+        let mut probs = vec![0f32; batch.rows * atoms];
+        for (row, (probs, &action)) in probs.chunks_exact_mut(atoms).zip(&next_greedy).enumerate() {
+            let at = (row * num_actions + usize::from(action)) * atoms;
+            softmax(&logits[at..at + atoms], probs);
+        }
+        if !probs.iter().all(|p| p.is_finite()) {
+            return Err(UpdateError::NonFinite {
+                what: "the target network's distribution".to_owned(),
+            });
+        }
+        let mut projected = vec![0f32; probs.len()];
+        project(
+            &probs,
+            batch.n_step_return,
+            batch.bootstrap_discount,
+            v_min,
+            v_max,
+            &mut projected,
+        );
+        Ok((next_greedy, projected))
+    }
+
+    fn states(&self, bytes: &[u8]) -> candle_core::Result<Tensor> {
+        states(&self.model, bytes, &self.compute.device)
+    }
+
+    /// Puts back a state that [`Agent::online`], [`Agent::target`] and [`Adam`] had after `updates` updates.
+    pub(crate) fn restore_progress(
+        &mut self,
+        updates: u64,
+        adam_step: u64,
+        moments: HashMap<String, Tensor>,
+    ) -> Result<(), UpdateError> {
+        self.adam
+            .restore(adam_step, moments, &self.compute.device)?;
+        self.updates = updates;
+        Ok(())
+    }
+}
+
+/// Logits [B, A, N] of `frames`, cut off from any graph.
+fn distribution(network: &Network, frames: &Tensor) -> Result<Tensor, UpdateError> {
+    Ok(network.logits(&network.features(frames)?.f4)?.detach())
+}
+
+fn flat(tensor: &Tensor) -> Result<Vec<f32>, UpdateError> {
+    Ok(tensor.flatten_all()?.to_vec1()?)
+}
+
+/// Index of the first largest value.
+fn greedy(values: &[f32]) -> u8 {
+    let mut best = 0;
+    for (i, value) in values.iter().enumerate() {
+        if *value > values[best] {
+            best = i;
+        }
+    }
+    u8::try_from(best).expect("a model has at most 255 actions")
+}
+
+fn finite(what: &str, loss: &Tensor) -> Result<f32, UpdateError> {
+    let value = loss.to_scalar::<f32>()?;
+    if value.is_finite() {
+        Ok(value)
+    } else {
+        Err(UpdateError::NonFinite {
+            what: what.to_owned(),
+        })
+    }
+}

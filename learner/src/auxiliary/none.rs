@@ -1,0 +1,45 @@
+//! No auxiliary loss: the agent learns the return alone, without a second pass and without heads.
+
+use driml_model::DimParts;
+
+use super::{
+    loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
+    positives::Positives,
+    settings::{AuxiliarySettings, PAIRS},
+};
+use crate::error::UpdateError;
+
+/// Its line of the menu.
+pub const NONE: MenuItem = MenuItem {
+    name: "none",
+    positives: Positives::None,
+    losses: &[],
+    make,
+};
+
+fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+    let wanted = settings.lambda.wanted();
+    match PAIRS.iter().zip(wanted).find(|(_, wanted)| *wanted) {
+        Some((pair, _)) => Err(UpdateError::Objective(format!(
+            "objective = none computes no auxiliary loss, but lambda.{pair} is above 0: set it to 0, or take another agent"
+        ))),
+        None => Ok(Box::new(ReturnAlone)),
+    }
+}
+
+#[derive(Debug)]
+struct ReturnAlone;
+
+impl AuxiliaryLoss for ReturnAlone {
+    fn heads(&self, _action: bool) -> DimParts {
+        DimParts::NONE
+    }
+
+    fn passes(&self, _positives: usize, _augmented: bool) -> Passes {
+        Passes::default()
+    }
+
+    fn losses(&self, _inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
+        Ok(Vec::new())
+    }
+}

@@ -1,0 +1,158 @@
+//! What auxiliary losses take from the settings: weights, the scores' clip, and a table of each loss's own numbers.
+//! Which loss there is stands in `super`.
+
+use driml_model::DimParts;
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+
+use crate::error::UpdateError;
+
+/// The pairs NtM in the order of every array of four here: features N of (s_t, a_t) against features M of s_{t+k}.
+pub const PAIRS: [&str; 4] = ["3t3", "3t4", "4t3", "4t4"];
+
+/// Weight of each pair's loss in the total, 0 or above; a pair at 0 is not computed.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Lambda {
+    /// Local against local.
+    #[serde(rename = "3t3")]
+    pub l3t3: f64,
+    /// Local against global.
+    #[serde(rename = "3t4")]
+    pub l3t4: f64,
+    /// Global against local.
+    #[serde(rename = "4t3")]
+    pub l4t3: f64,
+    /// Global against global.
+    #[serde(rename = "4t4")]
+    pub l4t4: f64,
+}
+
+impl Lambda {
+    /// Every pair with a weight of 1.
+    pub const EVERY: Self = Self {
+        l3t3: 1.0,
+        l3t4: 1.0,
+        l4t3: 1.0,
+        l4t4: 1.0,
+    };
+
+    /// No pair.
+    pub const NONE: Self = Self {
+        l3t3: 0.0,
+        l3t4: 0.0,
+        l4t3: 0.0,
+        l4t4: 0.0,
+    };
+
+    /// In the order of [`PAIRS`].
+    pub const fn values(&self) -> [f64; 4] {
+        [self.l3t3, self.l3t4, self.l4t3, self.l4t4]
+    }
+
+    /// The pairs with a weight above 0.
+    pub fn wanted(&self) -> [bool; 4] {
+        self.values().map(|lambda| lambda > 0.0)
+    }
+
+    /// The heads that the pairs with a weight above 0 need; `action` says whether psi is given a_t.
+    pub fn dim_parts(&self, action: bool) -> DimParts {
+        let [local_local, local_global, global_local, global_global] = self.wanted();
+        let psi3 = local_local || local_global;
+        let psi4 = global_local || global_global;
+        DimParts {
+            psi3,
+            phi3: local_local || global_local,
+            psi4,
+            phi4: local_global || global_global,
+            action: action && (psi3 || psi4),
+        }
+    }
+
+    /// Checks the ranges.
+    ///
+    /// # Errors
+    /// The first weight that is negative or not finite.
+    pub fn validate(&self) -> Result<(), UpdateError> {
+        for (name, value) in PAIRS.iter().zip(self.values()) {
+            if !(value >= 0.0 && value.is_finite()) {
+                return Err(UpdateError::Settings(format!("lambda.{name} = {value}")));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The settings from which a loss is made.
+#[derive(Clone, Copy, Debug)]
+pub struct AuxiliarySettings<'a> {
+    /// The loss's name in the menu.
+    pub objective: &'static str,
+    /// Weights of the losses between pairs of levels.
+    pub lambda: Lambda,
+    /// Whether Psi is given a_t.
+    pub condition_on_action: bool,
+    /// Bound c of the scores' soft clip `c * tanh(x / c)`.
+    pub tanh_clip: f64,
+    /// Tables of losses' own numbers, by the loss's name: `[learner.update.<name>]`.
+    pub own: &'a toml::Table,
+}
+
+impl AuxiliarySettings<'_> {
+    /// The loss's own table; `None` if it is not there.
+    ///
+    /// # Errors
+    /// A table that is not a `T`.
+    pub fn own<T: DeserializeOwned>(&self) -> Result<Option<T>, UpdateError> {
+        let Some(table) = self.own.get(self.objective) else {
+            return Ok(None);
+        };
+        let own = table.clone().try_into();
+        own.map(Some).map_err(|e| {
+            let why = e.to_string();
+            UpdateError::Objective(format!("{}: {}", self.objective, why.trim_end()))
+        })
+    }
+
+    /// Checks that a loss that is weighed by lambda has a weight.
+    ///
+    /// # Errors
+    /// All weights are 0.
+    pub fn check_weighted(&self) -> Result<(), UpdateError> {
+        if self.lambda.wanted().contains(&true) {
+            return Ok(());
+        }
+        let name = self.objective;
+        Err(UpdateError::Objective(format!(
+            "objective = {name}, but all lambdas are 0: set one above 0, or take the agent c51"
+        )))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_heads_of_weighted_pairs_are_needed() {
+        let lambda = |l3t3, l3t4, l4t3, l4t4| Lambda {
+            l3t3,
+            l3t4,
+            l4t3,
+            l4t4,
+        };
+        let parts = |lambda: Lambda| {
+            let p = lambda.dim_parts(true);
+            [p.psi3, p.phi3, p.psi4, p.phi4, p.action]
+        };
+        assert_eq!(parts(lambda(0.0, 0.0, 0.0, 0.0)), [false; 5]);
+        assert_eq!(
+            parts(lambda(0.0, 0.0, 0.0, 1.0)),
+            [false, false, true, true, true]
+        );
+        assert_eq!(
+            parts(lambda(0.0, 0.5, 0.0, 0.0)),
+            [true, false, false, true, true]
+        );
+        assert_eq!(parts(lambda(1.0, 0.0, 0.0, 1.0)), [true; 5]);
+    }
+}

@@ -1,0 +1,295 @@
+//! A learner's work without its network connections: batch in, report out, weights and affinity on demand.
+//! The processes and the lockstep mode run this same code; it neither asks for batches nor sends anything.
+
+use std::path::{Path, PathBuf};
+
+use driml_model::{Compute, Enlarge};
+use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, WeightsHeader};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+
+use crate::{
+    affinity::{AffinityError, AffinityEstimator},
+    agent::{Agent, UpdateReport},
+    augment::Augment,
+    auxiliary::positives::Positives,
+    batch::Batch,
+    checkpoint::{self, CheckpointError, RunState},
+    config::{ConfigError, LearnerPart},
+    error::UpdateError,
+};
+
+/// Weights as they travel: what they say of themselves, and a safetensors file.
+pub type Weights = (WeightsHeader, Vec<u8>);
+
+/// Why a learner could not be made, learn or be saved.
+#[derive(Debug, thiserror::Error)]
+pub enum LearnerError {
+    /// The update was not taken.
+    #[error(transparent)]
+    Update(#[from] UpdateError),
+    /// The pairs of actions do not fit the affinity's alphabet, or the estimate left the finite numbers.
+    #[error(transparent)]
+    Affinity(#[from] AffinityError),
+    /// Settings of the learner that cannot work.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// Sizes that no network can have.
+    #[error(transparent)]
+    Model(#[from] driml_model::ModelError),
+    /// A checkpoint was not written or not read.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// The checkpoint's affinity is estimated in another way than this run's.
+    #[error(
+        "the checkpoint in {} estimated the action affinity otherwise: resume with the settings it was made with, or choose another folder",
+        .0.display()
+    )]
+    OtherAffinity(PathBuf),
+}
+
+/// Everything that a learner changes while it learns.
+pub struct Learner {
+    part: LearnerPart,
+    spec_hash: u64,
+    agent: Agent,
+    affinity: Option<AffinityEstimator>,
+    rng: ChaCha8Rng,
+    enlarge: Option<Enlarge>,
+    /// States of the last batch at the network's input size, if that is another: memory to use again.
+    enlarged: [Vec<u8>; 3],
+    augment: Option<Augment>,
+    /// What the auxiliary objective sees of the last batch, if that is not the plain states: memory to use again.
+    seen: [Vec<u8>; 2],
+    weights_version: u64,
+}
+
+impl Learner {
+    /// A learner at its start, all generators derived from the run's seed.
+    ///
+    /// # Errors
+    /// Settings that cannot work.
+    pub fn new(part: LearnerPart, compute: &Compute) -> Result<Self, LearnerError> {
+        let spec = &part.spec;
+        let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
+        let mut rng = ChaCha8Rng::from_seed(spec.seed_for("learner", 0));
+        let agent = Agent::new(
+            part.model.clone(),
+            part.learner.update.clone(),
+            compute,
+            &mut init,
+        )?;
+        let affinity = part
+            .learner
+            .affinity
+            .estimator(part.model.num_actions, &mut rng)?;
+        let from = (spec.frame_height as usize, spec.frame_width as usize);
+        let to = (part.model.height, part.model.width);
+        let enlarge = (from != to)
+            .then(|| Enlarge::new(from, to, part.model.channels))
+            .transpose()?;
+        let augment = part.learner.augment.map(|settings| {
+            let size = (to.0, to.1, part.model.channels);
+            Augment::new(settings, size, spec.frame_channels as usize)
+        });
+        Ok(Self {
+            spec_hash: spec.hash(),
+            agent,
+            affinity,
+            rng,
+            enlarge,
+            enlarged: Default::default(),
+            augment,
+            seen: Default::default(),
+            weights_version: 0,
+            part,
+        })
+    }
+
+    /// A learner that goes on from the newest checkpoint in `folder`; one at its start if there is none.
+    ///
+    /// # Errors
+    /// Settings that cannot work, or a checkpoint that is damaged, of another run or of other settings.
+    pub fn resume(
+        part: LearnerPart,
+        compute: &Compute,
+        folder: &Path,
+    ) -> Result<Self, LearnerError> {
+        let mut this = Self::new(part, compute)?;
+        let restored = checkpoint::load_latest(
+            folder,
+            &this.part.model,
+            &this.part.learner.update,
+            compute,
+            this.spec_hash,
+        )?;
+        let Some(restored) = restored else {
+            return Ok(this);
+        };
+        let same_affinity = match (&this.affinity, &restored.affinity) {
+            (Some(fresh), Some(found)) => found.has_settings_of(fresh),
+            (None, None) => true,
+            _ => false,
+        };
+        if !same_affinity {
+            return Err(LearnerError::OtherAffinity(folder.to_owned()));
+        }
+        this.weights_version = restored.weights_version;
+        this.agent = restored.agent;
+        this.affinity = restored.affinity;
+        this.rng = restored.rng;
+        tracing::info!(
+            "resumed after {} updates from {}",
+            this.updates(),
+            folder.display()
+        );
+        Ok(this)
+    }
+
+    /// Hash of the run spec.
+    pub const fn spec_hash(&self) -> u64 {
+        self.spec_hash
+    }
+
+    /// Updates taken.
+    pub const fn updates(&self) -> u64 {
+        self.agent.updates()
+    }
+
+    /// Learns from one batch: the network and the affinity.
+    ///
+    /// # Errors
+    /// A batch that does not fit, or arithmetic that left the finite numbers; all is then as it was, except after
+    /// [`UpdateError::Diverged`](crate::UpdateError::Diverged), when neither weights nor a checkpoint can be had any more.
+    pub fn update(&mut self, batch: &WireBatch) -> Result<UpdateReport, LearnerError> {
+        let mut frames = [batch.states_t(), batch.states_k(), batch.states_n()];
+        if let Some(enlarge) = &self.enlarge {
+            for (states, larger) in frames.iter_mut().zip(&mut self.enlarged) {
+                enlarge_all(enlarge, states, larger);
+                *states = larger;
+            }
+        }
+        let [states_t, mut states_k, states_n] = frames;
+        let (mut positives, mut valid) = (batch.positives(), batch.positive_valid());
+        let mut anchors = None;
+        // Kept only if the update succeeds.
+        let mut rng = self.rng.clone();
+        let all_valid;
+        if let Some(augment) = &mut self.augment {
+            if self.part.learner.update.objective.positives() == Positives::OtherView {
+                // Two views of the same state; every row has them.
+                all_valid = vec![1; batch.rows()];
+                (states_k, positives, valid) = (states_t, 1, all_valid.as_slice());
+            }
+            let [seen_t, seen_k] = &mut self.seen;
+            augment.apply(states_t, seen_t, &mut rng);
+            augment.apply(states_k, seen_k, &mut rng);
+            (anchors, states_k) = (Some(seen_t.as_slice()), seen_k);
+        }
+        let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
+        let batch = Batch {
+            rows: batch.rows(),
+            states_t,
+            anchors,
+            positives,
+            states_k,
+            states_n,
+            action: batch.actions(),
+            next_action: batch.next_actions(),
+            n_step_return: &returns,
+            bootstrap_discount: &discounts,
+            positive_valid: valid,
+        };
+        self.agent.check(&batch)?;
+        let mut affinity = self.affinity.clone();
+        if let Some(affinity) = &mut affinity {
+            affinity.observe(&batch.action_pairs(), &mut rng)?;
+        }
+        let report = self.agent.update(&batch)?;
+        (self.rng, self.affinity) = (rng, affinity);
+        Ok(report)
+    }
+
+    /// Writes into `status` what the last update gave.
+    pub fn note(&self, report: &UpdateReport, status: &mut LearnerStatus) {
+        status.updates = self.updates();
+        status.c51_kl = report.c51_kl;
+        let losses = report.losses.iter();
+        status.losses = losses.map(|&(name, loss)| (name.into(), loss)).collect();
+        status.total = report.total;
+        status.grad_norm = report.grad_norm;
+        status.q_mean = report.q_mean;
+    }
+
+    /// The next weights get a version above `version`: actors take what is newer than theirs, which may be those of a learner
+    /// that died after its last checkpoint.
+    pub fn publish_above(&mut self, version: u64) {
+        self.weights_version = self.weights_version.max(version);
+    }
+
+    /// The affinity matrix after the last update, if this agent has one, as `learner` sends it.
+    pub fn affinity_update(&self, learner: u64) -> Option<AffinityUpdate> {
+        self.affinity.as_ref().map(|affinity| AffinityUpdate {
+            learner,
+            version: self.agent.updates(),
+            num_actions: affinity.num_actions() as u32,
+            matrix: affinity.matrix().to_vec(),
+        })
+    }
+
+    /// Whether the actors are due newer weights after this many updates.
+    pub const fn publication_is_due(&self) -> bool {
+        self.agent
+            .updates()
+            .is_multiple_of(self.part.learner.publish_period_updates)
+    }
+
+    /// Whether a checkpoint is due after this many updates.
+    pub const fn checkpoint_is_due(&self) -> bool {
+        self.updates() > 0
+            && self
+                .updates()
+                .is_multiple_of(self.part.learner.checkpoint_period_updates)
+    }
+
+    /// The present weights as a new version.
+    ///
+    /// # Errors
+    /// The tensor library failed.
+    pub fn next_weights(&mut self) -> Result<Weights, LearnerError> {
+        let safetensors = self.agent.weights()?;
+        self.weights_version += 1;
+        let header = WeightsHeader::new(self.weights_version, self.updates(), &safetensors);
+        Ok((header, safetensors))
+    }
+
+    /// Writes a checkpoint into `folder`.
+    ///
+    /// # Errors
+    /// The file system refused; older checkpoints are untouched.
+    pub fn save(&self, folder: &Path) -> Result<(), LearnerError> {
+        let state = RunState {
+            agent: &self.agent,
+            affinity: self.affinity.as_ref(),
+            rng: &self.rng,
+            weights_version: self.weights_version,
+            run_spec_hash: self.spec_hash,
+        };
+        let path = checkpoint::save(folder, &state, self.part.learner.checkpoints_kept as usize)?;
+        tracing::info!("saved {}", path.display());
+        Ok(())
+    }
+}
+
+/// Enlarges all `states` into `larger`, a share of them on each thread.
+fn enlarge_all(enlarge: &Enlarge, states: &[u8], larger: &mut Vec<u8>) {
+    let (from, to) = (enlarge.input_bytes(), enlarge.output_bytes());
+    let count = states.len() / from;
+    larger.resize(count * to, 0);
+    let share = count.div_ceil(rayon::current_num_threads()).max(1);
+    larger
+        .par_chunks_mut(share * to)
+        .zip(states.par_chunks(share * from))
+        .for_each(|(larger, states)| enlarge.apply(states, larger));
+}

@@ -1,0 +1,194 @@
+//! The C51 loss: KL divergence of the prediction for the taken action from a projected target.
+//! It does not make the target (`projection` does) and sends no gradient into it.
+
+use candle_core::{Result, Tensor, bail};
+use driml_model::Operations;
+
+use super::{scalar_op::scalar_op, stock};
+
+/// Mean over rows of `KL(target || softmax(logits of the taken action))`, and its gradient.
+///
+/// `logits` [B, A, N]; `action` [B], each below `num_actions`; `target` [B, N], rows sum to 1.
+/// Loss: `1/B * sum_b sum_i target * (ln target - ln softmax)`, with `0 ln 0 = 0`, in nats.
+/// `gradient` [B, A, N] is overwritten with the derivative by the logits: `(softmax - target) / B` for the taken
+/// action, 0 for the others. The arithmetic is f64 and shifts by the largest logit, so any finite logits are fine.
+/// Source: Bellemare et al. 2017, equation 7.
+///
+/// # Panics
+/// If the lengths disagree or an action is out of range: the caller has checked its batch by then.
+pub fn kl(
+    logits: &[f32],
+    action: &[u8],
+    num_actions: usize,
+    target: &[f32],
+    gradient: &mut [f32],
+) -> f64 {
+    let rows = action.len();
+    assert!(
+        rows > 0 && target.len().is_multiple_of(rows),
+        "whole rows of target"
+    );
+    let atoms = target.len() / rows;
+    assert_eq!(logits.len(), rows * num_actions * atoms, "logits [B, A, N]");
+    assert_eq!(
+        logits.len(),
+        gradient.len(),
+        "the gradient has the shape of the logits"
+    );
+    gradient.fill(0.0);
+    let mut total = 0.0;
+    for (row, (&action, target)) in action.iter().zip(target.chunks_exact(atoms)).enumerate() {
+        assert!(
+            usize::from(action) < num_actions,
+            "action {action} of {num_actions}"
+        );
+        let at = (row * num_actions + usize::from(action)) * atoms;
+        let logits = &logits[at..at + atoms];
+        let log_sum = log_sum_exp(logits);
+        let mass: f64 = target.iter().map(|&t| f64::from(t)).sum();
+        for ((&logit, &t), gradient) in logits.iter().zip(target).zip(&mut gradient[at..at + atoms])
+        {
+            let (log_p, t) = (f64::from(logit) - log_sum, f64::from(t));
+            if t > 0.0 {
+                total += t * (t.ln() - log_p);
+            }
+            *gradient = ((mass * log_p.exp() - t) / rows as f64) as f32;
+        }
+    }
+    total / rows as f64
+}
+
+/// `ln(sum_i exp(x_i))` of a row that is not empty, in f64.
+fn log_sum_exp(row: &[f32]) -> f64 {
+    let max = f64::from(row.iter().copied().fold(f32::NEG_INFINITY, f32::max));
+    max + row
+        .iter()
+        .map(|&x| (f64::from(x) - max).exp())
+        .sum::<f64>()
+        .ln()
+}
+
+/// Writes softmax of `row` to `out`, both of one length.
+pub fn softmax(row: &[f32], out: &mut [f32]) {
+    let log_sum = log_sum_exp(row);
+    for (out, &x) in out.iter_mut().zip(row) {
+        *out = (f64::from(x) - log_sum).exp() as f32;
+    }
+}
+
+/// [`kl`] as a candle operation: `logits` [B, A, N] to a scalar.
+///
+/// # Errors
+/// Logits that are not [B, A, N] f32 with the B and N of `action` and `target`.
+pub fn kl_loss(
+    logits: &Tensor,
+    action: &[u8],
+    target: Vec<f32>,
+    operations: Operations,
+) -> Result<Tensor> {
+    let (rows, num_actions, atoms) = logits.dims3()?;
+    if rows != action.len() || target.len() != rows * atoms {
+        bail!(
+            "logits of {rows} rows and {atoms} atoms meet {} actions and a target of {} values",
+            action.len(),
+            target.len()
+        );
+    }
+    if operations == Operations::Stock {
+        return stock::kl_loss(logits, action, target);
+    }
+    let action = action.to_vec();
+    scalar_op("c51-kl", logits, move |logits, gradient| {
+        kl(logits, &action, num_actions, &target, gradient)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::{Device, Var};
+
+    use super::*;
+
+    const ACTIONS: usize = 2;
+    const LOGITS: [f32; 12] = [
+        0.3, -1.0, 0.7, 2.0, 0.1, -0.4, 1.5, 1.4, -2.0, 0.0, 0.2, 0.9,
+    ];
+    const TARGET: [f32; 6] = [0.2, 0.5, 0.3, 0.0, 0.0, 1.0];
+
+    #[test]
+    fn the_gradient_is_the_slope_of_the_loss() {
+        let mut gradient = [0f32; 12];
+        let mut scratch = [0f32; 12];
+        kl(&LOGITS, &[1, 0], ACTIONS, &TARGET, &mut gradient);
+        for i in 0..LOGITS.len() {
+            let mut shifted = |by: f32| {
+                let mut logits = LOGITS;
+                logits[i] += by;
+                (
+                    kl(&logits, &[1, 0], ACTIONS, &TARGET, &mut scratch),
+                    f64::from(logits[i]),
+                )
+            };
+            let ((high, x_high), (low, x_low)) = (shifted(1e-3), shifted(-1e-3));
+            let slope = (high - low) / (x_high - x_low);
+            assert!(
+                (slope - f64::from(gradient[i])).abs() < 1e-6,
+                "logit {i}: {slope} and {}",
+                gradient[i]
+            );
+        }
+        assert_eq!(gradient[0..3], [0.0; 3], "the action that was not taken");
+    }
+
+    #[test]
+    fn a_perfect_prediction_costs_nothing() {
+        let logits: Vec<f32> = [0.2f32, 0.5, 0.3].iter().map(|p| p.ln()).collect();
+        let mut gradient = [0f32; 3];
+        let loss = kl(&logits, &[0], 1, &[0.2, 0.5, 0.3], &mut gradient);
+        assert!(loss.abs() < 1e-7 && gradient.iter().all(|g| g.abs() < 1e-7));
+    }
+
+    #[test]
+    fn extreme_logits_stay_finite() {
+        let mut gradient = [0f32; 3];
+        let loss = kl(&[1e4, -1e4, 0.0], &[0], 1, &[0.0, 1.0, 0.0], &mut gradient);
+        assert!((loss - 2e4).abs() < 1e-6);
+        assert_eq!(gradient, [1.0, -1.0, 0.0]);
+    }
+
+    #[test]
+    fn the_operation_gives_the_function() -> Result<()> {
+        let logits = Var::from_slice(&LOGITS, (2, ACTIONS, 3), &Device::Cpu)?;
+        let loss = kl_loss(&logits, &[1, 0], TARGET.to_vec(), Operations::Own)?;
+        let grads = loss.affine(3.0, 0.0)?.backward()?;
+        let mut gradient = [0f32; 12];
+        let expected = kl(&LOGITS, &[1, 0], ACTIONS, &TARGET, &mut gradient);
+        assert_eq!(loss.to_scalar::<f32>()?, expected as f32);
+        let got = grads
+            .get(&logits)
+            .expect("a gradient")
+            .flatten_all()?
+            .to_vec1::<f32>()?;
+        assert_eq!(got, gradient.map(|g| g * 3.0));
+        Ok(())
+    }
+
+    #[test]
+    fn candle_s_own_operations_give_it_too() -> Result<()> {
+        for scale in [1.0, 1e4] {
+            let logits = LOGITS.map(|logit| logit * scale);
+            let var = Var::from_slice(&logits, (2, ACTIONS, 3), &Device::Cpu)?;
+            let loss = kl_loss(&var, &[1, 0], TARGET.to_vec(), Operations::Stock)?;
+            let mut gradient = [0f32; 12];
+            let expected = kl(&logits, &[1, 0], ACTIONS, &TARGET, &mut gradient);
+            let error = f64::from(loss.to_scalar::<f32>()?) - expected;
+            assert!(error.abs() <= 1e-6 * expected, "{scale}: {error}");
+            let grads = loss.backward()?;
+            let got = grads.get(&var).expect("a gradient").flatten_all()?;
+            for (got, expected) in got.to_vec1::<f32>()?.iter().zip(gradient) {
+                assert!((got - expected).abs() < 1e-6, "{scale}: {got}, {expected}");
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,248 @@
+//! The InfoNCE loss over a matrix of scores, with the soft clip of the scores folded in.
+//! It does not compute the scores, and does not know which features they compare.
+
+use candle_core::{Result, Tensor, bail};
+use driml_model::Operations;
+use rayon::prelude::*;
+
+use super::{scalar_op::scalar_op, scores::Scores, stock};
+
+/// InfoNCE of every valid row against every valid row of its batch, at each location, and its gradient.
+///
+/// `dots` [L, B, B]: `dots[l, i, j]` is anchor i's dot product with candidate j at location l; the pair (i, i) is the
+/// positive. `valid` [B]: a row with 0 is neither anchor nor candidate. With `s = clip(dots)` the loss is the mean over
+/// l and valid i of `ln sum_{valid j} exp(s_lij) - s_lii`, in nats: 0 if fewer than two rows are valid.
+/// `gradient` [L, B, B] is overwritten with the derivative by `dots`, 0 in the rows and columns that are not valid.
+/// Every finite input gives a finite result.
+/// Source: van den Oord et al. 2018, equation 4; the clip is Bachman et al. 2019, section 3.
+///
+/// # Panics
+/// If the lengths disagree: the caller has checked its batch by then.
+pub fn info_nce(dots: &[f32], valid: &[u8], scores: Scores, gradient: &mut [f32]) -> f64 {
+    let rows = valid.len();
+    assert!(
+        rows > 0 && dots.len().is_multiple_of(rows * rows),
+        "dots [L, B, B]"
+    );
+    assert_eq!(
+        dots.len(),
+        gradient.len(),
+        "the gradient has the shape of the dots"
+    );
+    let locations = dots.len() / (rows * rows);
+    let candidates: Vec<usize> = (0..rows).filter(|&row| valid[row] != 0).collect();
+    if candidates.is_empty() || locations == 0 {
+        gradient.fill(0.0);
+        return 0.0;
+    }
+    let weight = 1.0 / (locations * candidates.len()) as f64;
+    let losses: Vec<f64> = dots
+        .par_chunks_exact(rows)
+        .zip(gradient.par_chunks_exact_mut(rows))
+        .enumerate()
+        .map_init(
+            || vec![(0f64, 0f64); candidates.len()],
+            |scratch, (at, (dots, gradient))| {
+                gradient.fill(0.0);
+                let anchor = at % rows;
+                if valid[anchor] == 0 {
+                    return 0.0;
+                }
+                anchor_loss(dots, anchor, &candidates, scores, weight, scratch, gradient)
+            },
+        )
+        .collect();
+    // Summed in order, so that two runs give the same bits whatever the threads did.
+    losses.iter().sum::<f64>() * weight
+}
+
+/// One anchor's `ln sum exp(s) - s_positive`; its `gradient` row, times `weight`.
+fn anchor_loss(
+    dots: &[f32],
+    anchor: usize,
+    candidates: &[usize],
+    scores: Scores,
+    weight: f64,
+    scratch: &mut [(f64, f64)],
+    gradient: &mut [f32],
+) -> f64 {
+    let mut max = f64::NEG_INFINITY;
+    let mut positive = 0.0;
+    for (entry, &j) in scratch.iter_mut().zip(candidates) {
+        *entry = scores.clip(dots[j]);
+        max = max.max(entry.0);
+        if j == anchor {
+            positive = entry.0;
+        }
+    }
+    let mut sum = 0.0;
+    for (score, _) in scratch.iter_mut() {
+        *score = (*score - max).exp();
+        sum += *score;
+    }
+    for (&(exp, slope), &j) in scratch.iter().zip(candidates) {
+        let target = if j == anchor { 1.0 } else { 0.0 };
+        gradient[j] = ((exp / sum - target) * slope * weight) as f32;
+    }
+    sum.ln() + max - positive
+}
+
+/// [`info_nce`] as a candle operation: `dots` [L, B, B] to a scalar.
+///
+/// # Errors
+/// Dots that are not [L, B, B] f32 with the B of `valid`.
+pub fn info_nce_loss(
+    dots: &Tensor,
+    valid: &[u8],
+    scores: Scores,
+    operations: Operations,
+) -> Result<Tensor> {
+    let (_, anchors, candidates) = dots.dims3()?;
+    if anchors != valid.len() || candidates != valid.len() {
+        bail!(
+            "scores of {anchors} anchors and {candidates} candidates meet {} rows",
+            valid.len()
+        );
+    }
+    if operations == Operations::Stock {
+        return stock::info_nce_loss(dots, valid, scores);
+    }
+    let valid = valid.to_vec();
+    scalar_op("info-nce", dots, move |dots, gradient| {
+        info_nce(dots, &valid, scores, gradient)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::{Device, Var};
+
+    use super::*;
+
+    const SCORES: Scores = Scores {
+        scale: 0.25,
+        tanh_clip: 20.0,
+    };
+    const LOCATIONS: usize = 2;
+    const ROWS: usize = 3;
+
+    fn dots() -> Vec<f32> {
+        (0..LOCATIONS * ROWS * ROWS)
+            .map(|i| ((i * 37 % 19) as f32 - 9.0) * 3.0)
+            .collect()
+    }
+
+    fn loss_of(dots: &[f32], valid: &[u8]) -> (f64, Vec<f32>) {
+        let mut gradient = vec![f32::NAN; dots.len()];
+        let loss = info_nce(dots, valid, SCORES, &mut gradient);
+        (loss, gradient)
+    }
+
+    /// The definition, written out with `tanh` and no shift.
+    fn plain(dots: &[f32], valid: &[u8]) -> f64 {
+        let score = |l: usize, i: usize, j: usize| {
+            20.0 * (f64::from(dots[(l * ROWS + i) * ROWS + j]) * 0.25 / 20.0).tanh()
+        };
+        let rows: Vec<usize> = (0..ROWS).filter(|&i| valid[i] != 0).collect();
+        let anchor =
+            |l, i| rows.iter().map(|&j| score(l, i, j).exp()).sum::<f64>().ln() - score(l, i, i);
+        let sum: f64 = (0..LOCATIONS)
+            .map(|l| rows.iter().map(|&i| anchor(l, i)).sum::<f64>())
+            .sum();
+        sum / (LOCATIONS * rows.len()) as f64
+    }
+
+    #[test]
+    fn it_is_the_definition_and_its_slope() {
+        for valid in [[1, 1, 1], [1, 0, 1], [0, 1, 1]] {
+            let (loss, gradient) = loss_of(&dots(), &valid);
+            assert!((loss - plain(&dots(), &valid)).abs() < 1e-12);
+            for i in 0..gradient.len() {
+                let shifted = |by: f32| {
+                    let mut dots = dots();
+                    dots[i] += by;
+                    loss_of(&dots, &valid).0
+                };
+                let slope = (shifted(0.01) - shifted(-0.01)) / 0.02;
+                assert!(
+                    (slope - f64::from(gradient[i])).abs() < 1e-5,
+                    "{i}: {slope} and {}",
+                    gradient[i]
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn rows_without_a_positive_change_nothing() {
+        let valid = [1, 0, 1];
+        let mut other = dots();
+        for l in 0..LOCATIONS {
+            for i in 0..ROWS {
+                other[(l * ROWS + 1) * ROWS + i] = 77.0;
+                other[(l * ROWS + i) * ROWS + 1] = -77.0;
+            }
+        }
+        assert_eq!(loss_of(&dots(), &valid), loss_of(&other, &valid));
+    }
+
+    #[test]
+    fn one_valid_row_or_none_gives_zero() {
+        for valid in [[0, 0, 0], [0, 1, 0]] {
+            let (loss, gradient) = loss_of(&dots(), &valid);
+            assert_eq!(loss, 0.0, "{valid:?}");
+            assert!(gradient.iter().all(|&g| g == 0.0));
+        }
+    }
+
+    #[test]
+    fn saturated_scores_stay_finite_and_keep_their_small_slope() {
+        let dots: Vec<f32> = dots().iter().map(|d| d * 1e36).collect();
+        let (loss, gradient) = loss_of(&dots, &[1; ROWS]);
+        assert!(loss.is_finite() && gradient.iter().all(|g| g.is_finite()));
+
+        let (score, slope) = SCORES.clip(400.0);
+        let sech = 1.0 / (5.0f64).cosh();
+        assert!((score - 20.0 * (5.0f64).tanh()).abs() < 1e-12);
+        assert!((slope / (0.25 * sech * sech) - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_operation_gives_the_function() -> Result<()> {
+        let var = Var::from_vec(dots(), (LOCATIONS, ROWS, ROWS), &Device::Cpu)?;
+        let loss = info_nce_loss(&var, &[1, 1, 1], SCORES, Operations::Own)?;
+        let grads = loss.affine(2.0, 0.0)?.backward()?;
+        let (expected, gradient) = loss_of(&dots(), &[1, 1, 1]);
+        assert_eq!(loss.to_scalar::<f32>()?, expected as f32);
+        let got = grads
+            .get(&var)
+            .expect("a gradient")
+            .flatten_all()?
+            .to_vec1::<f32>()?;
+        assert_eq!(got, gradient.iter().map(|g| g * 2.0).collect::<Vec<_>>());
+        Ok(())
+    }
+
+    #[test]
+    fn candle_s_own_operations_give_it_too() -> Result<()> {
+        for valid in [[1, 1, 1], [1, 0, 1], [0, 1, 0], [0, 0, 0]] {
+            let var = Var::from_vec(dots(), (LOCATIONS, ROWS, ROWS), &Device::Cpu)?;
+            let loss = info_nce_loss(&var, &valid, SCORES, Operations::Stock)?;
+            let (expected, gradient) = loss_of(&dots(), &valid);
+            let error = f64::from(loss.to_scalar::<f32>()?) - expected;
+            assert!(error.abs() < 1e-5, "{valid:?}: {error}");
+            let grads = loss.backward()?;
+            let got = match grads.get(&var) {
+                Some(got) => got.flatten_all()?.to_vec1::<f32>()?,
+                None => vec![0.0; gradient.len()],
+            };
+            for (got, expected) in got.iter().zip(gradient) {
+                assert!(
+                    (got - expected).abs() < 1e-6,
+                    "{valid:?}: {got}, {expected}"
+                );
+            }
+        }
+        Ok(())
+    }
+}

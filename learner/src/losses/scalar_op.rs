@@ -1,0 +1,65 @@
+//! A loss as a candle operation: the forward pass computes value and gradient at once, the backward pass hands the gradient out.
+//! It is for the CPU, and for one backward pass.
+
+use std::sync::{Mutex, PoisonError};
+
+use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+
+use crate::tensors::slice;
+
+/// The scalar `loss(input)`, differentiable in `input`.
+///
+/// `loss` gets the input's values, row-major, writes their gradient over its second argument, of the same length, and returns
+/// the value.
+///
+/// # Errors
+/// An input that is not f32 on the CPU.
+pub(super) fn scalar_op<F>(name: &'static str, input: &Tensor, loss: F) -> Result<Tensor>
+where
+    F: Fn(&[f32], &mut [f32]) -> f64 + Send + Sync + 'static,
+{
+    let op = ScalarOp {
+        name,
+        loss,
+        gradient: Mutex::new(None),
+    };
+    input.contiguous()?.apply_op1(op)
+}
+
+struct ScalarOp<F> {
+    name: &'static str,
+    loss: F,
+    /// Made with the value, taken by the backward pass.
+    gradient: Mutex<Option<Vec<f32>>>,
+}
+
+impl<F: Fn(&[f32], &mut [f32]) -> f64 + Send + Sync> CustomOp1 for ScalarOp<F> {
+    fn name(&self) -> &'static str {
+        self.name
+    }
+
+    fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
+        let input = slice(storage, layout)?;
+        let mut gradient = vec![0f32; input.len()];
+        let value = (self.loss)(input, &mut gradient);
+        *self.gradient.lock().unwrap_or_else(PoisonError::into_inner) = Some(gradient);
+        Ok((CpuStorage::F32(vec![value as f32]), Shape::from(())))
+    }
+
+    /// The stored gradient times the scalar `grad_res`.
+    fn bwd(&self, arg: &Tensor, _: &Tensor, grad_res: &Tensor) -> Result<Option<Tensor>> {
+        let stored = self
+            .gradient
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .take();
+        let Some(mut gradient) = stored else {
+            bail!("{} has one backward pass", self.name);
+        };
+        let factor = grad_res.to_scalar::<f32>()?;
+        if factor != 1.0 {
+            gradient.iter_mut().for_each(|g| *g *= factor);
+        }
+        Tensor::from_vec(gradient, arg.shape(), arg.device()).map(Some)
+    }
+}

@@ -1,0 +1,53 @@
+//! The two losses as compositions of candle's own operations, for devices that this project has no kernels for.
+//! Arguments and results are those of `c51::kl_loss` and `info_nce::info_nce_loss`, which check the shapes first.
+
+use candle_core::{D, DType, Result, Tensor};
+use candle_nn::ops::log_softmax;
+
+use super::scores::Scores;
+
+/// As [`super::c51::kl_loss`].
+pub(super) fn kl_loss(logits: &Tensor, action: &[u8], target: Vec<f32>) -> Result<Tensor> {
+    let (rows, _, atoms) = logits.dims3()?;
+    let device = logits.device();
+    let taken: Vec<u32> = action.iter().map(|&action| action.into()).collect();
+    let taken = Tensor::from_vec(taken, (rows, 1, 1), device)?;
+    let taken = taken.broadcast_as((rows, 1, atoms))?.contiguous()?;
+    let logits = logits.contiguous()?.gather(&taken, 1)?.squeeze(1)?;
+    let ln = |&p: &f32| if p > 0.0 { p.ln() } else { 0.0 };
+    let ln_target = Tensor::from_vec(target.iter().map(ln).collect(), (rows, atoms), device)?;
+    let target = Tensor::from_vec(target, (rows, atoms), device)?;
+    let surprise = (ln_target - log_softmax(&logits, D::Minus1)?)?;
+    (target * surprise)?
+        .sum_all()?
+        .affine(1.0 / rows as f64, 0.0)
+}
+
+/// As [`super::info_nce::info_nce_loss`]. Beyond about 8 times the clip the slope of a score is 0 here: `1 - tanh^2` in f32.
+pub(super) fn info_nce_loss(dots: &Tensor, valid: &[u8], scores: Scores) -> Result<Tensor> {
+    let device = dots.device();
+    let rows: Vec<u32> = (0..)
+        .zip(valid)
+        .filter_map(|(row, &valid)| (valid != 0).then_some(row))
+        .collect();
+    let count = rows.len();
+    let locations = dots.dim(0)?;
+    if count == 0 || locations == 0 {
+        return Tensor::zeros((), DType::F32, device);
+    }
+    let dots = if count == valid.len() {
+        dots.clone()
+    } else {
+        let rows = Tensor::from_vec(rows, count, device)?;
+        let anchors = dots.contiguous()?.index_select(&rows, 1)?;
+        anchors.index_select(&rows, 2)?
+    };
+    let clip = scores.tanh_clip;
+    let scores = dots.affine(scores.scale / clip, 0.0)?.tanh()?;
+    let log_p = log_softmax(&scores.affine(clip, 0.0)?, D::Minus1)?;
+    let positive = Tensor::eye(count, DType::F32, device)?;
+    log_p
+        .broadcast_mul(&positive)?
+        .sum_all()?
+        .affine(-1.0 / (locations * count) as f64, 0.0)
+}

@@ -1,0 +1,416 @@
+//! Adam: one fused pass over parameters, gradients and moments, in place; elsewhere than on the CPU, candle's operations.
+//! It has no weight decay, no schedule of the learning rate, and no default for any of its numbers.
+
+use std::{
+    collections::{BTreeMap, HashMap},
+    sync::{
+        Mutex,
+        atomic::{AtomicBool, Ordering},
+    },
+};
+
+use candle_core::{CpuStorage, DType, Device, InplaceOp2, Layout, Tensor, Var, bail};
+use driml_model::{Operations, Parameters};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::gradients::Gradients;
+use crate::{
+    error::UpdateError,
+    tensors::{slice, slice_mut},
+};
+
+/// Elements a thread takes at a time.
+const CHUNK: usize = 1 << 14;
+
+/// Adam's numbers. Source: Kingma and Ba 2015, algorithm 1.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AdamSettings {
+    /// Learning rate, change of a parameter an update, above 0.
+    pub lr: f64,
+    /// Decay of the first moment an update, in [0, 1).
+    pub beta1: f64,
+    /// Decay of the second moment an update, in [0, 1).
+    pub beta2: f64,
+    /// Added to the root of the second moment, outside the root, above 0.
+    pub eps: f64,
+}
+
+impl AdamSettings {
+    /// Checks the ranges.
+    ///
+    /// # Errors
+    /// The first setting out of its range, with its value.
+    pub fn validate(&self) -> Result<(), UpdateError> {
+        let above_0 = |x: f64| x > 0.0 && x.is_finite();
+        let decay = |x: f64| (0.0..1.0).contains(&x);
+        for (name, value, fine) in [
+            ("adam.lr", self.lr, above_0(self.lr)),
+            ("adam.beta1", self.beta1, decay(self.beta1)),
+            ("adam.beta2", self.beta2, decay(self.beta2)),
+            ("adam.eps", self.eps, above_0(self.eps)),
+        ] {
+            if !fine {
+                return Err(UpdateError::Settings(format!("{name} = {value}")));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Running moments of one parameter's gradient.
+#[derive(Clone, Debug)]
+enum Moments {
+    /// In the parameter's layout, for the fused step.
+    Fused { m: Vec<f32>, v: Vec<f32> },
+    /// In its shape, on its device.
+    Tensors { m: Tensor, v: Tensor },
+}
+
+impl Moments {
+    fn new(m: &Tensor, v: &Tensor, operations: Operations) -> candle_core::Result<Self> {
+        Ok(match operations {
+            Operations::Own => Self::Fused {
+                m: m.flatten_all()?.to_vec1()?,
+                v: v.flatten_all()?.to_vec1()?,
+            },
+            Operations::Stock => Self::Tensors {
+                m: m.clone(),
+                v: v.clone(),
+            },
+        })
+    }
+
+    /// m and v on the CPU, in this shape.
+    fn tensors(&self, shape: &[usize]) -> candle_core::Result<[Tensor; 2]> {
+        Ok(match self {
+            Self::Fused { m, v } => [
+                Tensor::from_slice(m, shape, &Device::Cpu)?,
+                Tensor::from_slice(v, shape, &Device::Cpu)?,
+            ],
+            Self::Tensors { m, v } => [m.to_device(&Device::Cpu)?, v.to_device(&Device::Cpu)?],
+        })
+    }
+}
+
+/// Adam's state: the step count and both moments of every parameter, by name.
+#[derive(Clone, Debug)]
+pub struct Adam {
+    settings: AdamSettings,
+    step: u64,
+    operations: Operations,
+    /// By name, with the parameter's shape.
+    moments: BTreeMap<String, (Vec<usize>, Moments)>,
+}
+
+impl Adam {
+    /// Moments of zero for each of `parameters`.
+    ///
+    /// # Errors
+    /// A failing allocation.
+    pub fn new(
+        settings: AdamSettings,
+        parameters: &Parameters,
+        operations: Operations,
+    ) -> Result<Self, UpdateError> {
+        let mut moments = BTreeMap::new();
+        for (name, var) in parameters.iter() {
+            let zeros = var.zeros_like()?;
+            let both = Moments::new(&zeros, &zeros, operations)?;
+            moments.insert(name.to_owned(), (var.dims().to_vec(), both));
+        }
+        Ok(Self {
+            settings,
+            step: 0,
+            operations,
+            moments,
+        })
+    }
+
+    /// Steps taken.
+    pub const fn step_count(&self) -> u64 {
+        self.step
+    }
+
+    /// Takes one step, in place, on gradients times `factor`.
+    ///
+    /// `m = beta1 m + (1 - beta1) g`, `v = beta2 v + (1 - beta2) g^2`,
+    /// `p -= lr / (1 - beta1^t) * m / (sqrt(v) / sqrt(1 - beta2^t) + eps)`.
+    /// A parameter without a gradient is left as it is, moments included.
+    /// Source: PyTorch's `Adam` without weight decay.
+    ///
+    /// # Errors
+    /// A gradient whose shape or type is not its parameter's; a step size beyond the finite numbers, before anything has
+    /// changed; [`UpdateError::Diverged`] for a parameter or moment that the step took beyond them. The last is found out on the
+    /// CPU alone, where it costs nothing; on other devices no such parameter passes [`Parameters::to_safetensors`].
+    pub fn step(
+        &mut self,
+        parameters: &Parameters,
+        gradients: &Gradients,
+        factor: f64,
+    ) -> Result<(), UpdateError> {
+        let step = self.step + 1;
+        let lr = self.settings.lr;
+        let rule = Rule::new(self.settings, step, factor);
+        if !rule.step_size.is_finite() {
+            return Err(UpdateError::NonFinite {
+                what: format!("a step of Adam with lr = {lr:e}"),
+            });
+        }
+        self.step = step;
+        for (name, (_, moments)) in &mut self.moments {
+            let (Some(var), Some(gradient)) = (parameters.get(name), gradients.get(name)) else {
+                continue;
+            };
+            match moments {
+                Moments::Fused { m, v } => {
+                    let moments = Mutex::new((m.as_mut_slice(), v.as_mut_slice()));
+                    let all_finite = AtomicBool::new(true);
+                    let step = Step {
+                        rule,
+                        moments,
+                        all_finite,
+                    };
+                    var.inplace_op2(gradient, &step)?;
+                    if !step.all_finite.into_inner() {
+                        let name = name.clone();
+                        return Err(UpdateError::Diverged { name, lr });
+                    }
+                }
+                Moments::Tensors { m, v } => rule.apply_to_tensors(var, gradient, m, v)?,
+            }
+        }
+        Ok(())
+    }
+
+    /// The moments as tensors: `m.<name>` and `v.<name>`, in the parameters' shapes.
+    ///
+    /// # Errors
+    /// A failing allocation, or a moment that is not finite.
+    pub fn to_tensors(&self) -> Result<HashMap<String, Tensor>, UpdateError> {
+        let mut tensors = HashMap::new();
+        for (name, (shape, moments)) in &self.moments {
+            for (which, tensor) in ["m", "v"].into_iter().zip(moments.tensors(shape)?) {
+                let values = tensor.flatten_all()?.to_vec1::<f32>()?;
+                if !values.iter().all(|value| value.is_finite()) {
+                    return Err(UpdateError::State(format!(
+                        "the moment {which}.{name} is not finite"
+                    )));
+                }
+                tensors.insert(format!("{which}.{name}"), tensor);
+            }
+        }
+        Ok(tensors)
+    }
+
+    /// Puts back what [`Adam::to_tensors`] gave after `step` steps, bit for bit, on `device`.
+    ///
+    /// # Errors
+    /// A moment that is missing, of another shape or type, not finite, or of no parameter of this optimiser.
+    pub fn restore(
+        &mut self,
+        step: u64,
+        mut tensors: HashMap<String, Tensor>,
+        device: &Device,
+    ) -> Result<(), UpdateError> {
+        let mut restored = self.moments.clone();
+        for (name, (shape, moments)) in &mut restored {
+            let mut take = |which: &str| {
+                let name = format!("{which}.{name}");
+                let Some(tensor) = tensors.remove(&name) else {
+                    return Err(UpdateError::State(format!("the moment {name} is missing")));
+                };
+                if tensor.dims() != shape.as_slice() {
+                    let found = tensor.dims();
+                    return Err(UpdateError::State(format!(
+                        "the moment {name} is {found:?}, not {shape:?}"
+                    )));
+                }
+                let values = match tensor.dtype() {
+                    DType::F32 => tensor.flatten_all()?.to_vec1::<f32>()?,
+                    other => {
+                        return Err(UpdateError::State(format!(
+                            "the moment {name} has type {other:?}, not F32"
+                        )));
+                    }
+                };
+                // Of squares there is no negative mean.
+                let least = if which == "v" { 0.0 } else { f32::MIN };
+                if let Some(at) = values.iter().position(|v| !(least..=f32::MAX).contains(v)) {
+                    let value = values[at];
+                    return Err(UpdateError::State(format!(
+                        "the moment {name} is {value} at index {at}"
+                    )));
+                }
+                Ok(tensor.to_device(device)?)
+            };
+            *moments = Moments::new(&take("m")?, &take("v")?, self.operations)?;
+        }
+        if let Some(name) = tensors.keys().min() {
+            return Err(UpdateError::State(format!(
+                "the moment {name} belongs to no parameter"
+            )));
+        }
+        self.moments = restored;
+        self.step = step;
+        Ok(())
+    }
+}
+
+/// One step's numbers, the same for every element.
+#[derive(Clone, Copy)]
+struct Rule {
+    factor: f32,
+    beta1: f32,
+    rest1: f32,
+    beta2: f32,
+    rest2: f32,
+    step_size: f32,
+    root_scale: f32,
+    eps: f32,
+}
+
+impl Rule {
+    /// The numbers of step number `step`, counted from 1, on gradients times `factor`.
+    fn new(settings: AdamSettings, step: u64, factor: f64) -> Self {
+        let AdamSettings {
+            lr,
+            beta1,
+            beta2,
+            eps,
+        } = settings;
+        let t = i32::try_from(step).unwrap_or(i32::MAX);
+        Self {
+            factor: factor as f32,
+            beta1: beta1 as f32,
+            rest1: (1.0 - beta1) as f32,
+            beta2: beta2 as f32,
+            rest2: (1.0 - beta2) as f32,
+            step_size: (lr / (1.0 - beta1.powi(t))) as f32,
+            root_scale: (1.0 / (1.0 - beta2.powi(t)).sqrt()) as f32,
+            eps: eps as f32,
+        }
+    }
+
+    /// Takes the step on one stretch; says whether its parameters and second moments are finite after it. (So are then the
+    /// first moments, as a mean is no larger than the root of the mean square.)
+    #[allow(clippy::eq_op, reason = "x - x tells finite numbers from others")]
+    fn apply(&self, p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32]) -> bool {
+        // x - x is 0 for a finite x, else NaN. Collecting bits, unlike a test in the loop, costs nothing measurable.
+        let mut not_finite = 0;
+        for (((p, &g), m), v) in p.iter_mut().zip(g).zip(m).zip(v) {
+            let g = g * self.factor;
+            *m = self.beta1 * *m + self.rest1 * g;
+            *v = self.beta2 * *v + self.rest2 * g * g;
+            *p -= self.step_size * *m / (v.sqrt() * self.root_scale + self.eps);
+            not_finite |= ((*p - *p) + (*v - *v)).to_bits();
+        }
+        not_finite == 0
+    }
+
+    /// The same on tensors.
+    fn apply_to_tensors(
+        &self,
+        p: &Var,
+        g: &Tensor,
+        m: &mut Tensor,
+        v: &mut Tensor,
+    ) -> candle_core::Result<()> {
+        let by = |tensor: &Tensor, factor: f32| tensor.affine(factor.into(), 0.0);
+        let g = by(g, self.factor)?;
+        *m = (by(m, self.beta1)? + by(&g, self.rest1)?)?;
+        *v = (by(v, self.beta2)? + by(&g.sqr()?, self.rest2)?)?;
+        let root = v.sqrt()?.affine(self.root_scale.into(), self.eps.into())?;
+        p.set(&(p.as_detached_tensor() - (by(m, self.step_size)? / root)?)?)
+    }
+}
+
+struct Step<'a> {
+    rule: Rule,
+    /// Uncontended: candle hands operations out by shared reference only.
+    moments: Mutex<(&'a mut [f32], &'a mut [f32])>,
+    /// Whether all parameters and moments are finite after the step.
+    all_finite: AtomicBool,
+}
+
+impl InplaceOp2 for Step<'_> {
+    fn name(&self) -> &'static str {
+        "adam"
+    }
+
+    fn cpu_fwd(
+        &self,
+        parameter: &mut CpuStorage,
+        l1: &Layout,
+        gradient: &CpuStorage,
+        l2: &Layout,
+    ) -> candle_core::Result<()> {
+        let parameter = slice_mut(parameter, l1)?;
+        let gradient = slice(gradient, l2)?;
+        let mut moments = self
+            .moments
+            .lock()
+            .expect("nothing panics while it holds this lock");
+        let (m, v) = &mut *moments;
+        if parameter.len() != m.len() || gradient.len() != m.len() {
+            bail!(
+                "{} parameters, {} gradients, {} moments",
+                parameter.len(),
+                gradient.len(),
+                m.len()
+            );
+        }
+        parameter
+            .par_chunks_mut(CHUNK)
+            .zip(gradient.par_chunks(CHUNK))
+            .zip(m.par_chunks_mut(CHUNK).zip(v.par_chunks_mut(CHUNK)))
+            .for_each(|((p, g), (m, v))| {
+                if !self.rule.apply(p, g, m, v) {
+                    self.all_finite.store(false, Ordering::Relaxed);
+                }
+            });
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SETTINGS: AdamSettings = AdamSettings {
+        lr: 1.0,
+        beta1: 0.9,
+        beta2: 0.999,
+        eps: 1e-8,
+    };
+
+    /// Whether a step is fine at this parameter and gradient, in the last of so many elements.
+    fn fine(settings: AdamSettings, elements: usize, parameter: f32, gradient: f32) -> bool {
+        let rule = Rule::new(settings, 1, 1.0);
+        let (mut p, mut g) = (vec![0.5; elements], vec![0.1; elements]);
+        (p[elements - 1], g[elements - 1]) = (parameter, gradient);
+        let (mut m, mut v) = (vec![0.0; elements], vec![0.0; elements]);
+        rule.apply(&mut p, &g, &mut m, &mut v)
+    }
+
+    #[test]
+    fn a_step_beyond_the_finite_numbers_is_noticed_wherever_it_is() {
+        for elements in [1, 2, 7, 16, 33] {
+            assert!(fine(SETTINGS, elements, 3e38, 1.0));
+            let far = AdamSettings {
+                lr: 1e37,
+                ..SETTINGS
+            };
+            assert!(fine(far, elements, 3e38, 1.0), "towards 0");
+            assert!(
+                !fine(far, elements, 3.4e38, -1.0),
+                "past the largest number"
+            );
+            assert!(!fine(SETTINGS, elements, f32::NAN, 1.0));
+            assert!(!fine(SETTINGS, elements, f32::NEG_INFINITY, 1.0));
+            // The square of the gradient is not finite: the parameter would stand still for good.
+            assert!(!fine(SETTINGS, elements, 0.0, 1e30));
+        }
+    }
+}

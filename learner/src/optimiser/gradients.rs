@@ -1,0 +1,105 @@
+//! The gradients of one loss: taken out of a backward pass, their global norm, and the clipping that follows from it.
+//! It changes no parameter; `optim` does.
+
+use std::collections::BTreeMap;
+
+use candle_core::{DType, Storage, Tensor, backprop::GradStore, bail};
+use driml_model::{Operations, Parameters};
+use rayon::prelude::*;
+
+use crate::{error::UpdateError, tensors::slice};
+
+/// Elements a thread sums at a time.
+const CHUNK: usize = 1 << 14;
+
+/// Gradients of one loss, by parameter name. A parameter that the loss does not touch has none.
+#[derive(Debug)]
+pub struct Gradients {
+    by_name: BTreeMap<String, Tensor>,
+}
+
+impl Gradients {
+    /// Takes the gradients of `parameters` out of what a backward pass gave.
+    ///
+    /// # Errors
+    /// A failing copy of a gradient that is not contiguous.
+    pub fn take(parameters: &Parameters, mut store: GradStore) -> Result<Self, UpdateError> {
+        let mut by_name = BTreeMap::new();
+        for (name, var) in parameters.iter() {
+            if let Some(gradient) = store.remove(var) {
+                // candle leaves some gradients tied to the pass they come from; moments made of them would keep every pass.
+                by_name.insert(name.to_owned(), gradient.contiguous()?.detach());
+            }
+        }
+        Ok(Self { by_name })
+    }
+
+    /// The gradient of a parameter, if the loss touches it.
+    pub fn get(&self, name: &str) -> Option<&Tensor> {
+        self.by_name.get(name)
+    }
+
+    /// Global 2-norm of all gradients together, accumulated in f64.
+    ///
+    /// # Errors
+    /// [`UpdateError::NonFinite`] with the first parameter whose gradient is infinite or NaN.
+    pub fn norm(&self, operations: Operations) -> Result<f64, UpdateError> {
+        let squares: Vec<f64> = match operations {
+            Operations::Own => {
+                let each = self.by_name.values().map(squares_on_cpu);
+                each.collect::<Result<_, _>>()?
+            }
+            Operations::Stock => {
+                let squares = |g: &Tensor| g.to_dtype(DType::F64)?.sqr()?.sum_all();
+                let each = self.by_name.values().map(squares);
+                let each = each.collect::<candle_core::Result<Vec<_>>>()?;
+                // One copy to the host, not one a parameter.
+                Tensor::stack(&each, 0)?.to_vec1()?
+            }
+        };
+        let bad = self.by_name.keys().zip(&squares);
+        if let Some((name, _)) = bad.into_iter().find(|(_, it)| !it.is_finite()) {
+            return Err(UpdateError::NonFinite {
+                what: format!("the gradient of {name}"),
+            });
+        }
+        Ok(squares.iter().sum::<f64>().sqrt())
+    }
+}
+
+/// Sum of the squares of a tensor on the CPU.
+fn squares_on_cpu(tensor: &Tensor) -> candle_core::Result<f64> {
+    let (storage, layout) = tensor.storage_and_layout();
+    let Storage::Cpu(storage) = &*storage else {
+        bail!("this sum is the CPU's");
+    };
+    let parts: Vec<f64> = slice(storage, layout)?
+        .par_chunks(CHUNK)
+        .map(sum_of_squares)
+        .collect();
+    Ok(parts.iter().sum())
+}
+
+/// Sum of squares in f64, in eight interleaved parts so that it runs at the speed of memory.
+fn sum_of_squares(values: &[f32]) -> f64 {
+    let mut parts = [0f64; 8];
+    let chunks = values.chunks_exact(8);
+    let rest: f64 = chunks
+        .remainder()
+        .iter()
+        .map(|&x| f64::from(x) * f64::from(x))
+        .sum();
+    for chunk in chunks {
+        for (part, &x) in parts.iter_mut().zip(chunk) {
+            *part += f64::from(x) * f64::from(x);
+        }
+    }
+    parts.iter().sum::<f64>() + rest
+}
+
+/// Factor on gradients of global norm `norm` so that their norm stays within `max_norm`.
+///
+/// `max_norm / (norm + 1e-6)` where that is below 1, else 1. Source: PyTorch's `clip_grad_norm_`.
+pub fn clip_factor(norm: f64, max_norm: f64) -> f64 {
+    (max_norm / (norm + 1e-6)).min(1.0)
+}

@@ -1,0 +1,368 @@
+//! Fetches batches ahead of the update that needs them, several requests in flight, each on a thread of its own.
+//! It does not reorder or keep batches: what arrives first is learned from first.
+
+use std::{
+    sync::{Arc, Mutex, PoisonError, mpsc},
+    thread::JoinHandle,
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context, bail};
+use driml_protocol::{
+    Batch, BatchHeader, BatchReply, BatchRequest, BufferPool, PendingReply, ReplayStatus,
+    RequestId, RunClient, Seldom, Shutdown, Tally, fault, join_within, session::SessionError,
+    shared_memory::Trust,
+};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::shards::{self, Count};
+
+/// One request; the replay server answers within a second, if only to say that there is nothing yet.
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
+/// Pause between two tries when the replay server is out of reach.
+const RETRY_PAUSE: Duration = Duration::from_millis(200);
+
+/// Pause before shards that hold nothing are asked again.
+const LOOK_AGAIN: Duration = Duration::from_millis(50);
+/// How long the threads may take to end.
+const THREADS_END_MAX: Duration = Duration::from_secs(2);
+
+/// What is asked for, by whom, and how.
+#[derive(Clone, Copy, Debug)]
+pub struct Requests {
+    /// The learner that has joined the run.
+    pub learner: u64,
+    /// Rows of a batch.
+    pub rows: u32,
+    /// Requests on their way at once, and threads that wait for them.
+    pub in_flight: u32,
+    /// Whether batches may come through shared memory.
+    pub shared_memory: bool,
+    /// How long the replay server may be out of reach before the learner gives up.
+    pub unreachable_max: Duration,
+}
+
+/// What a fetching thread says.
+enum Fetched {
+    Batch(Batch),
+    Finished,
+    Failed(anyhow::Error),
+}
+
+/// The queue of fetched batches.
+pub struct BatchSource {
+    fetched: mpsc::Receiver<Fetched>,
+    /// Threads that have not said that they are finished.
+    fetching: u32,
+    threads: Vec<JoinHandle<()>>,
+    shutdown: Shutdown,
+}
+
+/// What the learner gets when it asks for its next batch.
+pub enum Next {
+    /// One.
+    Batch(Batch),
+    /// None within the time given.
+    NotYet,
+    /// None ever again.
+    Finished,
+}
+
+impl BatchSource {
+    /// Starts asking.
+    ///
+    /// # Errors
+    /// The operating system gave no thread.
+    pub fn start(
+        clients: &[RunClient],
+        requests: Requests,
+        shutdown: &Shutdown,
+    ) -> std::io::Result<Self> {
+        let (sender, fetched) = mpsc::sync_channel(0);
+        // A batch a thread, and the one that is learned from.
+        let pool = BufferPool::new(requests.in_flight as usize + clients.len());
+        let making = Arc::new(Mutex::new(Making::new(clients.len())));
+        let mut threads = Vec::new();
+        for i in 0..requests.in_flight {
+            // Which rows come from which shard follows from the order of answers, so this need not be the run's.
+            let mut rng = ChaCha8Rng::from_os_rng();
+            let fetcher = Fetcher {
+                clients: clients.to_vec(),
+                making: making.clone(),
+                id: RequestId::first(rng.random()),
+                rng,
+                requests,
+                pool: pool.clone(),
+                trust: Trust::default(),
+                said: Seldom::default(),
+                shutdown: shutdown.clone(),
+            };
+            let sender = sender.clone();
+            let thread = std::thread::Builder::new()
+                .name(format!("batches-{i}"))
+                .spawn(move || fetcher.run(&sender))?;
+            threads.push(thread);
+        }
+        Ok(Self {
+            fetched,
+            fetching: requests.in_flight,
+            threads,
+            shutdown: shutdown.clone(),
+        })
+    }
+
+    /// Waits for the threads' end, which the end of the session brings about.
+    pub fn end(self) {
+        drop(self.fetched);
+        join_within(self.threads, THREADS_END_MAX);
+    }
+
+    /// The next batch; batches that are on their way when the first thread hears of the end still come.
+    ///
+    /// # Errors
+    /// The replay server was out of reach for too long, or refuses.
+    pub fn next(&mut self, timeout: Duration) -> anyhow::Result<Next> {
+        let deadline = Instant::now() + timeout;
+        while self.fetching > 0 {
+            let left = deadline.saturating_duration_since(Instant::now());
+            match self.fetched.recv_timeout(left) {
+                Ok(Fetched::Batch(batch)) => return Ok(Next::Batch(batch)),
+                Ok(Fetched::Finished) => self.fetching -= 1,
+                Ok(Fetched::Failed(e)) => return Err(e),
+                Err(mpsc::RecvTimeoutError::Timeout) => return Ok(Next::NotYet),
+                Err(mpsc::RecvTimeoutError::Disconnected) if self.shutdown.is_set() => break,
+                Err(mpsc::RecvTimeoutError::Disconnected) => {
+                    bail!("the threads that fetch batches have ended")
+                }
+            }
+        }
+        Ok(Next::Finished)
+    }
+}
+
+/// The one batch that is put together from the parts of several shards. It outlives a failed try, because a part that was
+/// given is counted as sampled.
+struct Making {
+    counts: Vec<Count>,
+    /// Rows that are still to come from each shard.
+    pending: Vec<u32>,
+    /// The request for a part that each shard gets next.
+    ids: Vec<RequestId>,
+    parts: Vec<Batch>,
+}
+
+impl Making {
+    fn new(shards: usize) -> Self {
+        Self {
+            counts: vec![Count::default(); shards],
+            pending: vec![0; shards],
+            ids: vec![RequestId::first(rand::random()); shards],
+            parts: Vec::new(),
+        }
+    }
+}
+
+struct Fetcher {
+    clients: Vec<RunClient>,
+    making: Arc<Mutex<Making>>,
+    /// The request for a whole batch that comes next.
+    id: RequestId,
+    rng: ChaCha8Rng,
+    requests: Requests,
+    pool: BufferPool,
+    /// Whether batches may come through shared memory.
+    trust: Trust,
+    said: Seldom,
+    shutdown: Shutdown,
+}
+
+impl Fetcher {
+    fn run(mut self, sender: &mpsc::SyncSender<Fetched>) {
+        let mut answered = Instant::now();
+        while !self.shutdown.is_set() {
+            fault::point("batches");
+            let fetched = match self.fetch() {
+                Ok(None) => {
+                    answered = Instant::now();
+                    continue;
+                }
+                Ok(Some(fetched)) => fetched,
+                Err(e) if answered.elapsed() > self.requests.unreachable_max => {
+                    let max = self.requests.unreachable_max;
+                    Fetched::Failed(e.context(format!("no batch and no answer for {max:?}")))
+                }
+                Err(e) => {
+                    if let Some(more) = self.said.due() {
+                        tracing::warn!("asking for a batch again: {e:#}{more}");
+                    }
+                    self.shutdown.wait_timeout(RETRY_PAUSE);
+                    continue;
+                }
+            };
+            let last = !matches!(fetched, Fetched::Batch(_));
+            if sender.send(fetched).is_err() || last {
+                return;
+            }
+            answered = Instant::now();
+        }
+    }
+
+    /// One batch; `None` where the replay has nothing yet.
+    fn fetch(&mut self) -> anyhow::Result<Option<Fetched>> {
+        if self.clients.len() > 1 {
+            return self.fetch_parts();
+        }
+        self.id = self.id.again();
+        let asked = self.ask(0, self.id, self.requests.rows, None)?;
+        let answer = self.answer(asked)?;
+        self.id = self.id.next();
+        Ok(match answer {
+            Answer::Batch(batch) => Some(Fetched::Batch(batch)),
+            Answer::Wait => None,
+            Answer::Finished => Some(Fetched::Finished),
+            Answer::Refused(why) => Some(refused(&why)),
+        })
+    }
+
+    /// One batch, put together from what the shards give. One is put together at a time: each shard is told what the others
+    /// give, so that their rate limiters decide as one.
+    fn fetch_parts(&mut self) -> anyhow::Result<Option<Fetched>> {
+        let making = self.making.clone();
+        let mut making = making.lock().unwrap_or_else(PoisonError::into_inner);
+        let Making {
+            counts,
+            pending,
+            ids,
+            parts,
+        } = &mut *making;
+        if parts.is_empty() && pending.iter().all(|&rows| rows == 0) {
+            match shards::split(self.requests.rows, counts, &mut self.rng) {
+                Some(split) => *pending = split,
+                None => {
+                    self.shutdown.wait_timeout(LOOK_AGAIN);
+                    return self.recount(counts).map(|()| None);
+                }
+            }
+        }
+        let mut asked = Vec::new();
+        for shard in (0..pending.len()).filter(|&shard| pending[shard] > 0) {
+            let other_shards = shards::other_shards(counts, pending, shard);
+            ids[shard] = ids[shard].again();
+            let part = self.ask(shard, ids[shard], pending[shard], Some(other_shards))?;
+            asked.push((shard, part));
+        }
+        let (mut finished, mut failed) = (false, None);
+        for (shard, asked) in asked {
+            // A part that did not arrive is asked for again, by itself.
+            let answer = match self.answer(asked) {
+                Ok(answer) => answer,
+                Err(e) => {
+                    failed.get_or_insert(e);
+                    continue;
+                }
+            };
+            ids[shard] = ids[shard].next();
+            match answer {
+                Answer::Batch(part) => {
+                    let BatchHeader { tally, held, .. } = part.header;
+                    counts[shard] = Count { tally, held };
+                    pending[shard] = 0;
+                    parts.push(part);
+                }
+                Answer::Wait => {}
+                Answer::Finished => finished = true,
+                Answer::Refused(why) => return Ok(Some(refused(&why))),
+            }
+        }
+        if let Some(e) = failed {
+            return Err(e);
+        }
+        if pending.iter().all(|&rows| rows == 0) {
+            let header =
+                Batch::merged_header(parts).context("the shards' parts do not fit together")?;
+            let memory = self.pool.take_own(header.payload_bytes());
+            let whole = Batch::merge(parts, memory);
+            parts.clear();
+            return Ok(Some(Fetched::Batch(whole)));
+        }
+        self.recount(counts)?;
+        // A shard that has given its part knows of the others' transitions what they had then: it may be wrong about the end.
+        Ok((finished && parts.is_empty()).then_some(Fetched::Finished))
+    }
+
+    /// Asks all shards what they have counted.
+    fn recount(&self, counts: &mut [Count]) -> anyhow::Result<()> {
+        for (client, count) in self.clients.iter().zip(counts) {
+            let status: ReplayStatus = client.fetch(REQUEST_TIMEOUT).context("a shard's status")?;
+            *count = Count {
+                tally: Tally {
+                    inserted: status.transitions_inserted,
+                    rows_sampled: status.rows_sampled,
+                },
+                held: status.transitions_held,
+            };
+        }
+        Ok(())
+    }
+
+    /// Asks a shard for `rows` rows.
+    fn ask(
+        &mut self,
+        shard: usize,
+        id: RequestId,
+        rows: u32,
+        other_shards: Option<Tally>,
+    ) -> anyhow::Result<(PendingReply<BatchReply>, bool)> {
+        let request = BatchRequest {
+            learner: self.requests.learner,
+            id,
+            rows,
+            shared_memory: self.requests.shared_memory && self.trust.ask(),
+            other_shards,
+        };
+        let client = &self.clients[shard];
+        let asked = client.send(client.seal(&request)?, REQUEST_TIMEOUT)?;
+        Ok((asked, request.shared_memory))
+    }
+
+    fn answer(
+        &mut self,
+        (asked, shared_memory): (PendingReply<BatchReply>, bool),
+    ) -> anyhow::Result<Answer> {
+        // Where this process may not map shared memory, the question seems to have been answered by nobody.
+        let (reply, payload) = asked.receive(&self.pool).inspect_err(|e| {
+            let unheard = matches!(
+                e,
+                SessionError::NoReply { .. } | SessionError::Nobody { .. }
+            );
+            if shared_memory && unheard {
+                self.trust.lost();
+            }
+        })?;
+        Ok(match reply {
+            BatchReply::Batch(header) => {
+                if shared_memory {
+                    self.trust.worked();
+                }
+                Answer::Batch(Batch::from_payload(header, payload)?)
+            }
+            BatchReply::Wait(_) => Answer::Wait,
+            BatchReply::Finished => Answer::Finished,
+            BatchReply::Refused { why } => Answer::Refused(why),
+        })
+    }
+}
+
+/// What a replay server answers.
+enum Answer {
+    Batch(Batch),
+    Wait,
+    Finished,
+    Refused(String),
+}
+
+/// The end of all fetching: what was refused once will be refused again.
+fn refused(why: &str) -> Fetched {
+    Fetched::Failed(anyhow::anyhow!("the replay server refuses: {why}"))
+}

@@ -1,0 +1,227 @@
+//! One learner process: join, learn from batch after batch, publish, save, until told to stop.
+//! The learning itself is `learner`, which knows no network.
+
+use std::{
+    path::{Path, PathBuf},
+    time::{Duration, Instant},
+};
+
+use anyhow::Context;
+use driml_model::DeviceName;
+use driml_protocol::{BatchHeader, Keys, Shutdown, shared_memory, whole_file};
+
+use super::{
+    batch_source::{BatchSource, Next, Requests},
+    publish::Outlets,
+    shards::Shards,
+};
+use crate::{
+    checkpoint,
+    config::LearnerPart,
+    learner::{Learner, LearnerError},
+};
+
+/// How long a learner that was told to stop stays to be asked for its last status.
+const LAST_WORD_MAX: Duration = Duration::from_secs(3);
+/// How often a waiting learner looks whether it should stop.
+const TICK: Duration = Duration::from_millis(200);
+
+/// What a learner is told at its start; everything else comes from the replay server.
+#[derive(Clone, Debug)]
+pub struct RunArgs {
+    /// Endpoints of the replay server; one for each shard.
+    pub connect: Vec<String>,
+    /// Prefix of the run's keys.
+    pub namespace: String,
+    /// Where checkpoints go: `RUN_DIR/checkpoints`.
+    pub run_dir: PathBuf,
+    /// What computes.
+    pub device: DeviceName,
+}
+
+/// Runs the learner until `shutdown`. When the run has no more batches it saves, and stays to answer questions. Whatever ends it
+/// before, it saves what it has learned.
+///
+/// # Errors
+/// A device that is not there, nobody to join, settings that cannot work, an update that failed, a disk that refuses.
+pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
+    let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
+    let compute = args.device.open()?;
+    let Some(shards) = Shards::join(&args.connect, &keys, shutdown)? else {
+        return Ok(());
+    };
+    let part = LearnerPart::from_toml(&shards.config_toml)
+        .context("the settings that the replay server sent")?;
+    let folder = args.run_dir.join("checkpoints");
+    let _lock = checkpoint::lock(&folder)?;
+    let rows = part.learner.batch_rows;
+    let mut requests = Requests {
+        learner: rand::random(),
+        rows,
+        in_flight: part.learner.batches_in_flight,
+        shared_memory: part.transport.shared_memory,
+        unreachable_max: Duration::from_millis(part.learner.unreachable_max_ms),
+    };
+    if requests.shared_memory
+        && let Err(why) =
+            shared_memory::check_lockable(BatchHeader::of(&part.spec, rows).pool_bytes())
+    {
+        tracing::warn!("batches come through sockets, which is slower: {why}");
+        requests.shared_memory = false;
+    }
+    let mut learner = Learner::resume(part, &compute, &folder)?;
+    let updates = learner.updates();
+    let after_updates = shards.after_updates;
+    anyhow::ensure!(
+        updates >= after_updates,
+        "the replay server goes on after {after_updates} updates, the newest checkpoint in {} has {updates}: start the replay \
+         server with --after-updates {updates}, or choose the folder of the run",
+        folder.display(),
+    );
+    let counted = shards.updates_counted(rows);
+    anyhow::ensure!(
+        updates <= counted,
+        "the replay server has served the batches of {counted} updates, the newest checkpoint in {} has {updates}: to go on with \
+         that run, start the replay server with --after-updates {updates}; to begin another, choose another folder",
+        folder.display(),
+    );
+    let spec_hash = learner.spec_hash();
+    let learned = updates.saturating_mul(rows.into());
+    let clients = shards.clients(&keys, spec_hash);
+    let part_in_run = shards.take_part(&clients, requests.learner, learned, shutdown)?;
+    let Some(membership) = part_in_run else {
+        return Ok(());
+    };
+    learner.publish_above(membership.weights_version);
+    keep_settings(&args.run_dir, &shards.config_toml)?;
+    let outlets = Outlets::open(&clients, spec_hash, requests.learner, shutdown)?;
+    outlets.publish(learner.next_weights()?);
+    if updates > 0 {
+        outlets.with_status(|status| status.updates = updates);
+        if let Some(affinity) = learner.affinity_update(outlets.learner()) {
+            outlets.send_affinity(affinity);
+        }
+    }
+    let mut batches = BatchSource::start(&clients, requests, shutdown)?;
+    tracing::info!(
+        "learning on {} from batches of {rows} rows, run {spec_hash:016x}",
+        args.device,
+    );
+
+    let mut saving = Saving::new(folder);
+    let learned = learn(&mut learner, &mut batches, &outlets, &mut saving, shutdown);
+    if let Err(e) = &learned {
+        tracing::error!("ends after {} updates: {e:#}", learner.updates());
+    }
+    let saved = saving.finish(&learner);
+    if learned.is_ok() && !learner.publication_is_due() {
+        outlets.publish(learner.next_weights()?);
+    }
+    learned.and(saved.map_err(Into::into))?;
+    outlets.with_status(|status| status.finished = true);
+    tracing::info!("finished after {} updates", learner.updates());
+    shutdown.wait();
+    outlets.wait_until_heard(LAST_WORD_MAX);
+    drop(membership);
+    let closed = shards.close();
+    batches.end();
+    closed
+}
+
+/// Learns from batch after batch, until there are no more or `shutdown`.
+///
+/// # Errors
+/// The replay server was out of reach for too long or refuses, or an update failed; the learner is then as after the last update.
+fn learn(
+    learner: &mut Learner,
+    batches: &mut BatchSource,
+    outlets: &Outlets,
+    saving: &mut Saving,
+    shutdown: &Shutdown,
+) -> anyhow::Result<()> {
+    let mut waiting_since = Instant::now();
+    while !shutdown.is_set() {
+        let batch = match batches.next(TICK)? {
+            Next::Batch(batch) => batch,
+            Next::NotYet => continue,
+            Next::Finished => break,
+        };
+        let started = Instant::now();
+        let report = learner.update(&batch)?;
+        if let Some(affinity) = learner.affinity_update(outlets.learner()) {
+            outlets.send_affinity(affinity);
+        }
+        if learner.publication_is_due() {
+            outlets.publish(learner.next_weights()?);
+        }
+        let ended = Instant::now();
+        outlets.with_status(|status| {
+            learner.note(&report, status);
+            status.waiting_s += (started - waiting_since).as_secs_f64();
+            status.computing_s += (ended - started).as_secs_f64();
+        });
+        waiting_since = ended;
+        if learner.checkpoint_is_due() {
+            saving.save(learner);
+        }
+    }
+    Ok(())
+}
+
+/// Keeps checkpoints of one learner. A disk that refuses does not end the training: the next period tries again, and only what
+/// cannot be saved in the end is an error.
+struct Saving {
+    folder: PathBuf,
+    /// Updates in the newest checkpoint that was saved here.
+    saved: Option<u64>,
+    /// The first failure since then.
+    failed: Option<LearnerError>,
+}
+
+impl Saving {
+    const fn new(folder: PathBuf) -> Self {
+        Self {
+            folder,
+            saved: None,
+            failed: None,
+        }
+    }
+
+    fn save(&mut self, learner: &Learner) {
+        match learner.save(&self.folder) {
+            Ok(()) => {
+                self.saved = Some(learner.updates());
+                self.failed = None;
+            }
+            Err(e) => {
+                tracing::warn!(
+                    "no checkpoint after {} updates, trying again at the next period: {e:#}",
+                    learner.updates()
+                );
+                self.failed.get_or_insert(e);
+            }
+        }
+    }
+
+    /// Saves what is not saved yet.
+    ///
+    /// # Errors
+    /// The first failure since the last checkpoint that was saved.
+    fn finish(mut self, learner: &Learner) -> Result<(), LearnerError> {
+        if self.saved != Some(learner.updates()) {
+            self.save(learner);
+        }
+        self.failed.map_or(Ok(()), Err)
+    }
+}
+
+/// Leaves the run's settings beside the checkpoints, for `driml evaluate`; a file that is there is the launcher's.
+fn keep_settings(run_dir: &Path, config_toml: &str) -> anyhow::Result<()> {
+    let path = run_dir.join("config.toml");
+    if path.exists() {
+        return Ok(());
+    }
+    std::fs::create_dir_all(run_dir)
+        .and_then(|()| whole_file::write(&path, config_toml.as_bytes()))
+        .with_context(|| format!("writing {}", path.display()))
+}

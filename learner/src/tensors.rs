@@ -1,0 +1,46 @@
+//! Between bytes, slices and candle's tensors: states as the network takes them, and the values behind a tensor on the CPU.
+
+use std::borrow::Cow;
+
+use candle_core::{CpuStorage, Device, Layout, Tensor, bail};
+use driml_model::ModelConfig;
+
+/// The bytes of states as a tensor [B, H, W, C] u8 on `device`: bytes travel there, they become numbers there.
+pub(crate) fn states<'a>(
+    model: &ModelConfig,
+    bytes: impl Into<Cow<'a, [u8]>>,
+    device: &Device,
+) -> candle_core::Result<Tensor> {
+    let bytes = bytes.into();
+    let rows = bytes.len() / model.frame_len();
+    let shape = (rows, model.height, model.width, model.channels);
+    match bytes {
+        Cow::Borrowed(bytes) => Tensor::from_slice(bytes, shape, device),
+        Cow::Owned(bytes) => Tensor::from_vec(bytes, shape, device),
+    }
+}
+
+/// The f32 values of a contiguous tensor on the CPU.
+pub(crate) fn slice<'a>(
+    storage: &'a CpuStorage,
+    layout: &Layout,
+) -> candle_core::Result<&'a [f32]> {
+    match layout.contiguous_offsets() {
+        Some((start, end)) => Ok(&storage.as_slice::<f32>()?[start..end]),
+        None => bail!("a tensor of shape {:?} is not contiguous", layout.shape()),
+    }
+}
+
+/// [`slice`], to be written.
+pub(crate) fn slice_mut<'a>(
+    storage: &'a mut CpuStorage,
+    layout: &Layout,
+) -> candle_core::Result<&'a mut [f32]> {
+    match (storage, layout.contiguous_offsets()) {
+        (CpuStorage::F32(values), Some((start, end))) => Ok(&mut values[start..end]),
+        _ => bail!(
+            "a tensor of shape {:?} is not contiguous f32",
+            layout.shape()
+        ),
+    }
+}
