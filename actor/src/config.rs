@@ -71,11 +71,11 @@ pub struct InputSize {
 pub struct ActorSettings {
     /// What all parts agree on.
     pub spec: RunSpec,
-    /// The world.
+    /// The world that its copies are of.
     pub world: driml_envs::WorldConfig,
     /// The size at which the network sees it.
     pub input: InputSize,
-    /// The network.
+    /// The network that chooses actions.
     pub model: driml_model::ModelConfig,
     /// The actor's own.
     pub actor: Config,

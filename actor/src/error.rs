@@ -17,9 +17,9 @@ pub enum ActError {
     /// The world cannot be made.
     #[error("making the world {world}")]
     NoWorld {
-        /// Which one.
+        /// The world's name, as settings have it.
         world: String,
-        /// Why.
+        /// What the world says.
         source: EnvError,
     },
     /// The world has another shape than the run's parts agreed on.
@@ -28,7 +28,7 @@ pub enum ActError {
          write the run's settings anew with `driml local`"
     )]
     OtherShape {
-        /// Which world.
+        /// The world's name, as settings have it.
         world: String,
         /// What it gives.
         given: (u32, u32, u32, u32),

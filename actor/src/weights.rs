@@ -13,7 +13,7 @@ use driml_protocol::{
     WeightsHeader, WeightsReply, WeightsRequest, WeightsVersion, fault,
 };
 
-/// One piece.
+/// How long one piece may take to come.
 const PIECE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Pieces on their way at once.
 const PIECES_IN_FLIGHT: usize = 4;

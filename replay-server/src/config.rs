@@ -75,7 +75,7 @@ pub enum ConfigError {
     Key {
         /// The key, with its table.
         key: &'static str,
-        /// Its value.
+        /// The value that it has.
         value: String,
         /// What is wrong and what to do.
         why: String,

@@ -77,7 +77,7 @@ pub enum DeliveryError {
     /// The replay server says no, for ever.
     #[error("the replay server refused a chunk: {why}")]
     Refused {
-        /// Its reason.
+        /// The replay server's reason, a sentence.
         why: String,
     },
     /// No answer for too long.
