@@ -4,7 +4,7 @@
 use driml_envs::{EnvError, Environment, FrameStack, StepEnd};
 use rand_chacha::ChaCha8Rng;
 
-use crate::policy::Policy;
+use crate::{error::ActError, policy::Policy};
 
 /// One step of every copy.
 #[derive(Debug)]
@@ -60,7 +60,7 @@ impl Acting {
     ///
     /// # Errors
     /// The policy or the world failed; the world must not be stepped again.
-    pub fn step(&mut self, policy: &mut dyn Policy, epsilon: f64) -> anyhow::Result<Step<'_>> {
+    pub fn step(&mut self, policy: &mut dyn Policy, epsilon: f64) -> Result<Step<'_>, ActError> {
         self.world.observe(&mut self.frames);
         self.stack.push(&self.frames, &self.first);
         self.stack.write(&mut self.states);

@@ -1,23 +1,22 @@
 //! One actor's work without its network connections: act with the newest weights, give chunk after chunk.
 //! The processes and the lockstep mode run this same code; it neither sends nor waits.
 
-use anyhow::Context;
 use driml_protocol::{BufferPool, Chunk, RunSpec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    acting::Acting, config::ActorSettings, policy::NetworkPolicy, recorder::Recorder,
-    schedule::Schedule,
+    acting::Acting, config::ActorSettings, error::ActError, policy::NetworkPolicy,
+    recorder::Recorder, schedule::Schedule,
 };
 
-/// Which actor this is, and which life of it.
+/// One life of an actor, from its start to its end; a restarted actor is another incarnation.
 #[derive(Clone, Copy, Debug)]
 pub struct Incarnation {
     /// Its number, unique in the run.
     pub actor: u32,
-    /// Tells this life of it from others; it does not influence what is computed.
-    pub incarnation: u64,
+    /// Tells it from the others of its actor; it does not influence what is computed.
+    pub id: u64,
     /// Updates after which the run goes on: a resumed run does not play the episodes of its start again.
     pub after_updates: u64,
     /// Lives of this actor before this one: one that follows a dead one does not play its episodes again.
@@ -56,7 +55,7 @@ impl Collector {
         life: Incarnation,
         weights_version: u64,
         safetensors: &[u8],
-    ) -> anyhow::Result<Self> {
+    ) -> Result<Self, ActError> {
         let spec = &settings.spec;
         let config = &settings.actor;
         let schedule = Schedule::new(config, life.actor)?;
@@ -68,7 +67,10 @@ impl Collector {
                 u64::from_le_bytes(world_seed[..8].try_into().expect("eight bytes")),
                 config.world_threads as usize,
             )
-            .with_context(|| format!("making the world {}", spec.world))?;
+            .map_err(|source| ActError::NoWorld {
+                world: spec.world.clone(),
+                source,
+            })?;
         let shape = world.frame_shape();
         let promised = (
             spec.frame_height,
@@ -82,12 +84,13 @@ impl Collector {
             shape.channels as u32,
             world.num_actions() as u32,
         );
-        anyhow::ensure!(
-            promised == given,
-            "the world {} gives (height, width, channels, actions) {given:?}, the run spec promises {promised:?}: \
-             write the run's settings anew with `driml local`",
-            spec.world
-        );
+        if promised != given {
+            return Err(ActError::OtherShape {
+                world: spec.world.clone(),
+                given,
+                promised,
+            });
+        }
         let rng = ChaCha8Rng::from_seed(life.seed(spec, "exploration"));
         let policy = NetworkPolicy::new(&settings.model, (shape.height, shape.width), safetensors)?;
         Ok(Self {
@@ -95,7 +98,7 @@ impl Collector {
             recorder: Recorder::new(
                 pool,
                 life.actor,
-                life.incarnation,
+                life.id,
                 config.envs,
                 spec.frame_bytes() as u32,
             ),
@@ -109,7 +112,7 @@ impl Collector {
     ///
     /// # Errors
     /// Weights that do not fit the model.
-    pub fn set_weights(&mut self, version: u64, safetensors: &[u8]) -> anyhow::Result<()> {
+    pub fn set_weights(&mut self, version: u64, safetensors: &[u8]) -> Result<(), ActError> {
         self.policy.load(safetensors)?;
         self.weights_version = version;
         Ok(())
@@ -124,7 +127,7 @@ impl Collector {
     ///
     /// # Errors
     /// The policy or the world failed.
-    pub fn collect(&mut self, frames: u64, steps: u32) -> anyhow::Result<Chunk> {
+    pub fn collect(&mut self, frames: u64, steps: u32) -> Result<Chunk, ActError> {
         self.recorder.begin(self.weights_version, steps);
         let epsilon = self.schedule.epsilon(frames);
         loop {
@@ -152,7 +155,7 @@ mod tests {
     const STEPS: u32 = 32;
     const FIRST: Incarnation = Incarnation {
         actor: 3,
-        incarnation: 1,
+        id: 1,
         after_updates: 0,
         earlier_incarnations: 0,
     };
@@ -223,7 +226,7 @@ mod tests {
         }
     }
 
-    fn collector(settings: ActorSettings, life: Incarnation) -> anyhow::Result<Collector> {
+    fn collector(settings: ActorSettings, life: Incarnation) -> Result<Collector, ActError> {
         let rng = &mut ChaCha8Rng::seed_from_u64(1);
         let weights = Parameters::init(&settings.model, rng, &Compute::CPU.device).unwrap();
         let weights = weights.to_safetensors(|_| true).unwrap();
@@ -244,13 +247,7 @@ mod tests {
     fn a_restarted_actor_does_not_repeat_its_own_random_numbers() {
         let random = |life| actions(settings(1.0), life);
         let first = random(FIRST);
-        assert_eq!(
-            random(Incarnation {
-                incarnation: 2,
-                ..FIRST
-            }),
-            first
-        );
+        assert_eq!(random(Incarnation { id: 2, ..FIRST }), first);
         let at = |earlier_incarnations| Incarnation {
             earlier_incarnations,
             ..FIRST

@@ -2,7 +2,7 @@
 //! It fills in no number: presets do, with their sources.
 
 use driml_protocol::{
-    BufferPool, RunSpec, TRANSITION_BYTES,
+    BufferPool, RunSpec, RunSpecError, TRANSITION_BYTES,
     codec::PAYLOAD_BYTES_MAX,
     config::{Settings, TransportConfig},
 };
@@ -71,11 +71,11 @@ pub struct InputSize {
 pub struct ActorSettings {
     /// What all parts agree on.
     pub spec: RunSpec,
-    /// The world.
+    /// The world that its copies are of.
     pub world: driml_envs::WorldConfig,
     /// The size at which the network sees it.
     pub input: InputSize,
-    /// The network.
+    /// The network that chooses actions.
     pub model: driml_model::ModelConfig,
     /// The actor's own.
     pub actor: Config,
@@ -96,7 +96,7 @@ impl ActorSettings {
     ///
     /// # Errors
     /// A table that is missing or does not fit, or values that cannot work.
-    pub fn from_toml(text: &str) -> anyhow::Result<Self> {
+    pub fn from_toml(text: &str) -> Result<Self, SettingsError> {
         let settings = Settings::parse(text)?;
         let this = Self {
             spec: settings.table("run")?,
@@ -154,6 +154,23 @@ impl ActorSettings {
             BufferPool::new(count)
         }
     }
+}
+
+/// Why a run's settings are of no use to an actor.
+#[derive(Debug, thiserror::Error)]
+pub enum SettingsError {
+    /// A table is missing or does not fit.
+    #[error(transparent)]
+    Table(#[from] driml_protocol::config::ConfigError),
+    /// The run spec cannot work.
+    #[error(transparent)]
+    RunSpec(#[from] RunSpecError),
+    /// The network cannot exist.
+    #[error(transparent)]
+    Model(#[from] driml_model::ModelError),
+    /// The actor's own settings cannot work.
+    #[error(transparent)]
+    Actor(#[from] ConfigError),
 }
 
 /// Why the actor's settings cannot work.

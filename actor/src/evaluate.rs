@@ -4,7 +4,7 @@
 use driml_envs::{Environment, StepEnd};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{acting::Acting, policy::Policy};
+use crate::{acting::Acting, error::ActError, policy::Policy};
 
 /// Returns of `episodes` whole episodes of `policy` in `world`, in the order in which they ended.
 ///
@@ -21,7 +21,7 @@ pub fn episode_returns(
     episodes: usize,
     steps_max: u64,
     rng: ChaCha8Rng,
-) -> anyhow::Result<Vec<f64>> {
+) -> Result<Vec<f64>, ActError> {
     let envs = world.num_envs();
     let quota = |copy: usize| episodes / envs + usize::from(copy < episodes % envs);
     let mut acting = Acting::new(world, frame_stack, rng)?;
@@ -44,11 +44,13 @@ pub fn episode_returns(
             }
         }
     }
-    anyhow::ensure!(
-        returns.len() == episodes,
-        "only {} of {episodes} episodes ended within {steps_max} steps of each copy: ask for fewer",
-        returns.len()
-    );
+    if returns.len() < episodes {
+        return Err(ActError::EndlessEpisodes {
+            ended: returns.len(),
+            wanted: episodes,
+            steps_max,
+        });
+    }
     Ok(returns)
 }
 
@@ -111,7 +113,7 @@ mod tests {
             epsilon: f64,
             _rng: &mut ChaCha8Rng,
             actions: &mut [u8],
-        ) -> anyhow::Result<()> {
+        ) -> Result<(), ActError> {
             self.0.push(epsilon);
             actions.fill(0);
             Ok(())
@@ -122,7 +124,7 @@ mod tests {
         scripts: &[&[(f32, StepEnd)]],
         episodes: usize,
         steps_max: u64,
-    ) -> anyhow::Result<Vec<f64>> {
+    ) -> Result<Vec<f64>, ActError> {
         let scripts = scripts.iter().map(|script| script.to_vec()).collect();
         let world = Box::new(Scripted { scripts, step: 0 });
         let (mut policy, rng) = (Tape::default(), ChaCha8Rng::seed_from_u64(1));

@@ -5,6 +5,8 @@ use driml_model::{Enlarge, ModelConfig, PolicyNetwork};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
+use crate::error::ActError;
+
 /// Chooses one action for each of N states.
 pub trait Policy: Send {
     /// Writes actions [N] for `states` [N, H, W, C * stack]; each is random with probability `epsilon`.
@@ -17,7 +19,7 @@ pub trait Policy: Send {
         epsilon: f64,
         rng: &mut ChaCha8Rng,
         actions: &mut [u8],
-    ) -> anyhow::Result<()>;
+    ) -> Result<(), ActError>;
 }
 
 /// Uniform over the actions, whatever the state.
@@ -40,7 +42,7 @@ impl Policy for RandomPolicy {
         _epsilon: f64,
         rng: &mut ChaCha8Rng,
         actions: &mut [u8],
-    ) -> anyhow::Result<()> {
+    ) -> Result<(), ActError> {
         actions.fill_with(|| rng.random_range(0..self.num_actions));
         Ok(())
     }
@@ -63,7 +65,7 @@ impl NetworkPolicy {
         model: &ModelConfig,
         frame: (usize, usize),
         safetensors: &[u8],
-    ) -> anyhow::Result<Self> {
+    ) -> Result<Self, ActError> {
         let input = (model.height, model.width);
         let enlarge = (frame != input)
             .then(|| Enlarge::new(frame, input, model.channels))
@@ -72,7 +74,9 @@ impl NetworkPolicy {
             network: PolicyNetwork::new(model, safetensors)?,
             enlarge,
             enlarged: Vec::new(),
-            num_actions: u8::try_from(model.num_actions)?,
+            num_actions: u8::try_from(model.num_actions).map_err(|_| ActError::TooManyActions {
+                actions: model.num_actions,
+            })?,
         })
     }
 
@@ -80,7 +84,7 @@ impl NetworkPolicy {
     ///
     /// # Errors
     /// Weights that do not fit the model.
-    pub fn load(&mut self, safetensors: &[u8]) -> anyhow::Result<()> {
+    pub fn load(&mut self, safetensors: &[u8]) -> Result<(), ActError> {
         Ok(self.network.load(safetensors)?)
     }
 }
@@ -92,7 +96,7 @@ impl Policy for NetworkPolicy {
         epsilon: f64,
         rng: &mut ChaCha8Rng,
         actions: &mut [u8],
-    ) -> anyhow::Result<()> {
+    ) -> Result<(), ActError> {
         let input = match &self.enlarge {
             None => states,
             Some(enlarge) => {

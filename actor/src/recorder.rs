@@ -5,7 +5,7 @@ use driml_envs::StepEnd;
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 
 /// What a world ended, in the words of the wire.
-pub const fn end_on_the_wire(end: StepEnd) -> End {
+const fn end_on_the_wire(end: StepEnd) -> End {
     match end {
         StepEnd::Running => End::Running,
         StepEnd::LevelChange => End::LevelChange,

@@ -88,7 +88,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         pool.clone(),
         Incarnation {
             actor: join.actor,
-            incarnation: join.incarnation,
+            id: join.incarnation,
             after_updates: hello.after_updates,
             earlier_incarnations: welcome.earlier_incarnations,
         },

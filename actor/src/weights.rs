@@ -13,7 +13,7 @@ use driml_protocol::{
     WeightsHeader, WeightsReply, WeightsRequest, WeightsVersion, fault,
 };
 
-/// One piece.
+/// How long one piece may take to come.
 const PIECE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Pieces on their way at once.
 const PIECES_IN_FLIGHT: usize = 4;
@@ -31,7 +31,7 @@ pub type Weights = (WeightsHeader, Vec<u8>);
 
 /// The newest weights, taken at most once. They are pulled at most once for each time that they are asked for.
 #[derive(Clone, Debug)]
-pub struct Newest {
+pub struct NewestWeights {
     shared: Arc<(Mutex<State>, Condvar)>,
 }
 
@@ -46,7 +46,7 @@ struct State {
     is_wanted: bool,
 }
 
-impl Newest {
+impl NewestWeights {
     /// Nothing yet, where weights of `version` are in use.
     fn after(version: u64) -> Self {
         let state = State {
@@ -163,8 +163,8 @@ impl WeightsSource {
     ///
     /// # Errors
     /// No subscription, or no thread.
-    pub fn watch(self, version: u64, shutdown: Shutdown) -> anyhow::Result<Newest> {
-        let newest = Newest::after(version);
+    pub fn watch(self, version: u64, shutdown: Shutdown) -> anyhow::Result<NewestWeights> {
+        let newest = NewestWeights::after(version);
         let slot = newest.clone();
         let hear = move |announced: Result<WeightsVersion, CodecError>| match announced {
             Ok(announced) => slot.announce(announced.version),
@@ -271,7 +271,7 @@ mod tests {
 
     #[test]
     fn weights_are_pulled_once_for_each_time_they_are_asked_for() {
-        let newest = Newest::after(1);
+        let newest = NewestWeights::after(1);
         let wanted = || newest.wait_until_wanted(Duration::ZERO);
         assert_eq!(wanted(), None, "nothing newer was heard of");
         newest.announce(2);
@@ -290,7 +290,7 @@ mod tests {
 
     #[test]
     fn weights_that_are_coming_are_waited_for() {
-        let newest = Newest::after(1);
+        let newest = NewestWeights::after(1);
         newest.announce(2);
         let watcher = newest.clone();
         let pull = std::thread::spawn(move || {

@@ -182,7 +182,7 @@ impl RunClient {
     /// Declares where `M` is announced.
     ///
     /// # Errors
-    /// zenoh refused.
+    /// zenoh refused to declare it.
     pub fn announce<M: Keyed>(&self) -> zenoh::Result<Announcer<M>> {
         let publisher = self
             .session
@@ -201,7 +201,7 @@ impl RunClient {
     /// so it must not wait.
     ///
     /// # Errors
-    /// zenoh refused.
+    /// zenoh refused to declare it.
     pub fn subscribe<M: Keyed>(
         &self,
         hear: impl Fn(Result<M, CodecError>) + Send + Sync + 'static,
@@ -219,7 +219,7 @@ impl RunClient {
     /// Lets others see that `who` is connected, until the result is dropped.
     ///
     /// # Errors
-    /// zenoh refused.
+    /// zenoh refused to declare it.
     pub fn declare_alive(&self, who: Alive) -> zenoh::Result<LivelinessToken> {
         let token = self.session.liveliness();
         token.declare_token(self.keys.alive_key(who)).wait()

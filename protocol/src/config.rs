@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize, de::DeserializeOwned};
 /// Why settings were refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
-    /// Not TOML.
+    /// The text is not TOML.
     #[error("the settings are not valid TOML: {0}")]
     Syntax(String),
     /// A table is missing.
@@ -15,7 +15,7 @@ pub enum ConfigError {
     /// A table does not fit.
     #[error("in the settings' [{table}] table: {why}")]
     Table {
-        /// Which.
+        /// The table's name.
         table: &'static str,
         /// What is wrong.
         why: String,
@@ -36,7 +36,7 @@ pub struct TransportConfig {
 pub struct Settings(toml::Table);
 
 impl Settings {
-    /// Parses TOML.
+    /// Parses the settings, which are TOML.
     ///
     /// # Errors
     /// Text that is not TOML.

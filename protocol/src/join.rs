@@ -25,7 +25,7 @@ use crate::{
 const SERVER_MAX: Duration = Duration::from_secs(60);
 /// How long it waits for its predecessor to be gone: a session that was cut off counts as connected for its lease of 30 s.
 const TAKEN_MAX: Duration = Duration::from_secs(45);
-/// One try.
+/// How long one try waits for its reply.
 const TRY_MAX: Duration = Duration::from_secs(2);
 /// Pause between two tries.
 const PAUSE: Duration = Duration::from_millis(200);
@@ -33,7 +33,7 @@ const PAUSE: Duration = Duration::from_millis(200);
 /// Why a part could not join a run.
 #[derive(Debug, thiserror::Error)]
 pub enum JoinError {
-    /// Nobody there.
+    /// No replay server answers.
     #[error("no replay server answered within {} s: is it running, and is the endpoint right? ({last})", SERVER_MAX.as_secs())]
     Nobody {
         /// The last try's error.
@@ -51,7 +51,7 @@ pub enum JoinError {
     /// The replay server says no.
     #[error("the replay server refuses: {why}")]
     Refused {
-        /// The reason.
+        /// The replay server's reason, a sentence.
         why: String,
     },
 }

@@ -1,5 +1,25 @@
 //! Everything that crosses a process boundary: the run spec, the messages, their bytes, and where they travel.
 //! It holds no algorithm and no state; `README.md` beside this crate is the table of what is sent where.
+//!
+//! Start at [`RunClient`], which asks, fetches, announces and hears, and at [`QueryWorkers`], which answers. A [`Message`] is a
+//! header and perhaps a payload; [`codec`] turns both into bytes and back, and refuses what is damaged, foreign or of another
+//! kind. [`RunSpec`] is what all parts of a run agree on, and its hash is in every message.
+//!
+//! ```
+//! use driml_protocol::{Goodbye, codec};
+//!
+//! let run = 0x0c6c_6069_564f_3984; // RunSpec::hash
+//! let goodbye = Goodbye { actor: 3, incarnation: 7, produced: 4096 };
+//! let bytes = codec::encode(run, &goodbye, &[])?;
+//!
+//! let (back, payload) = codec::decode::<Goodbye>(&bytes, Some(run))?;
+//! assert_eq!(back, goodbye);
+//! assert!(payload.is_empty());
+//!
+//! let another = codec::decode::<Goodbye>(&bytes, Some(run + 1)).unwrap_err();
+//! assert!(another.to_string().starts_with("the message belongs to run spec 0c6c6069564f3984"));
+//! # Ok::<(), driml_protocol::CodecError>(())
+//! ```
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 

@@ -187,7 +187,7 @@ impl<M: Keyed + 'static> QueryWorkers<M> {
     /// reply is complete.
     ///
     /// # Errors
-    /// zenoh refused.
+    /// zenoh refused to declare it.
     pub fn declare(&self, client: &RunClient) -> zenoh::Result<Queryable<()>> {
         let (queries, waiting_bytes) = (self.queries.clone(), self.waiting_bytes.clone());
         let take = move |query: Query| {

@@ -57,7 +57,7 @@ pub enum SessionError {
     NoReply {
         /// Where it was asked.
         key: String,
-        /// How long.
+        /// How long the reply was waited for.
         within_ms: u128,
     },
     /// A request that is larger than a message may be.
@@ -76,10 +76,10 @@ pub enum SessionError {
         /// What is wrong with it.
         why: CodecError,
     },
-    /// zenoh failed.
+    /// zenoh could not send, or the other side replied with an error.
     #[error("{key}: {why}")]
     Zenoh {
-        /// Where.
+        /// Where it was asked.
         key: String,
         /// What zenoh said.
         why: String,
@@ -277,7 +277,7 @@ impl PendingBytes {
 /// Asks one question and waits for its one answer: [`send`] and [`PendingBytes::wait`].
 ///
 /// # Errors
-/// As those.
+/// As [`send`] and [`PendingBytes::wait`].
 pub fn ask(
     session: &Session,
     key: &str,

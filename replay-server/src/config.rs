@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::storage::frame_store::log::OVERHEAD_BYTES_MAX;
 
 /// Most shards of one replay.
-pub const SHARDS_MAX: u32 = 256;
+pub(crate) const SHARDS_MAX: u32 = 256;
 
 /// A known fault of the paper's published code, reproduced to show what it does: for studies alone.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -75,7 +75,7 @@ pub enum ConfigError {
     Key {
         /// The key, with its table.
         key: &'static str,
-        /// Its value.
+        /// The value that it has.
         value: String,
         /// What is wrong and what to do.
         why: String,
@@ -86,7 +86,7 @@ pub enum ConfigError {
 }
 
 /// Environment steps that must follow an anchor in its stream, unless its episode ends before: max(n_step, k_max).
-pub const fn reach(spec: &RunSpec) -> u32 {
+pub(crate) const fn reach(spec: &RunSpec) -> u32 {
     let k_max = spec.horizon.k_max();
     if spec.n_step > k_max {
         spec.n_step
@@ -199,14 +199,14 @@ impl Config {
 }
 
 /// Bytes that `transitions` take if their frames do not compress at all, with what compression itself takes.
-pub const fn compressed_bytes_least(transitions: u64, frame_bytes: usize) -> u64 {
+pub(crate) const fn compressed_bytes_least(transitions: u64, frame_bytes: usize) -> u64 {
     transitions
         .saturating_mul(frame_bytes as u64)
         .saturating_add(OVERHEAD_BYTES_MAX)
 }
 
 /// Most rows of one batch of this run, so that it stays below the codec's limit; larger requests are refused.
-pub fn rows_max(spec: &RunSpec) -> u32 {
+pub(crate) fn rows_max(spec: &RunSpec) -> u32 {
     let row_bytes = BatchHeader::of(spec, 1).payload_bytes();
     u32::try_from(PAYLOAD_BYTES_MAX / row_bytes).unwrap_or(u32::MAX)
 }

@@ -1,20 +1,82 @@
 //! The replay server: keeps transitions exactly once, holds the replay ratio, and serves batches with k drawn as they are made.
 //! It knows bytes and integers, never tensors, and it does not know what a frame shows.
+//!
+//! Start at [`run`], a whole replay server process, or at [`Replay`], the same without network, clock and threads: chunks go in,
+//! batches come out. [`RateLimiter`] says which side has to wait, [`horizon`] how far ahead a positive lies.
+//!
+//! ```
+//! use driml_protocol::{
+//!     ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
+//! };
+//! use driml_replay_server::{Compression, Config, Replay};
+//!
+//! let spec = RunSpec {
+//!     world: "counter".into(),
+//!     agent: "c51".into(),
+//!     seed: 1,
+//!     frame_height: 1,
+//!     frame_width: 1,
+//!     frame_channels: 1,
+//!     frame_stack: 1,
+//!     num_actions: 2,
+//!     n_step: 1,
+//!     gamma: 0.99,
+//!     horizon: Horizon::Fixed { k: 2 },
+//!     timeout: TimeoutRule::Terminal,
+//! };
+//! let config = Config {
+//!     capacity_transitions: 1000,
+//!     shards: 1,
+//!     compression: Compression::None,
+//!     compressed_bytes_max: None,
+//!     replay_ratio: 8.0,
+//!     warmup_transitions: 10,
+//!     slack_transitions: 100,
+//!     transitions_max: None,
+//!     study: None,
+//! };
+//! let mut replay = Replay::new(&spec, &config, 4)?;
+//! replay.join_actor(ActorJoin { actor: 0, incarnation: 1 })?;
+//!
+//! let mut chunk = Chunk::zeroed(ChunkHeader {
+//!     actor: 0,
+//!     incarnation: 1,
+//!     sequence: 0,
+//!     first_transition: 0,
+//!     weights_version: 0,
+//!     leaving: false,
+//!     streams: 1,
+//!     steps: 20,
+//!     frame_bytes: 1,
+//! });
+//! for row in 0..20 {
+//!     chunk.frame_mut(row).fill(row as u8);
+//!     chunk.set(row, 1, 0.5, End::Running);
+//! }
+//! let stored = replay.insert(&chunk);
+//! assert!(matches!(stored, InsertReply::Stored { inserted_total: 20, .. }));
+//!
+//! let batch = replay.sample(4).expect("20 transitions are more than the warm-up and a batch");
+//! // The frames count the steps, so s_{t+k} is two after s_t.
+//! assert_eq!(batch.states_k()[0], batch.states_t()[0] + 2);
+//! assert_eq!(batch.n_step_returns(), [0.5; 4]);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
-pub mod config;
-pub mod rate_limiter;
-pub mod replay;
-
+mod config;
 mod ledger;
+mod rate_limiter;
+mod replay;
 mod sampling;
 mod service;
 mod storage;
 
 pub use config::{Compression, Config, ConfigError, Study};
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
+pub use rate_limiter::RateLimiter;
 pub use replay::{Replay, Unready};
-pub use sampling::{horizon, packed_batch::Draft};
+pub use sampling::{horizon, packed_batch::PackedBatch};
 pub use service::{RunArgs, run};
 pub use storage::frame_store::{PackedChunk, Packer};

@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use driml_actor::delivery::{Delivery, DeliveryLimits};
+use driml_actor::{Delivery, DeliveryLimits};
 use driml_protocol::{
     BufferPool, Chunk, ChunkHeader, Keys, RunClient, Shutdown,
     session::{self, Endpoints},

@@ -10,7 +10,7 @@ use std::{
     time::Duration,
 };
 
-use driml_actor::delivery::{Delivery, DeliveryLimits};
+use driml_actor::{Delivery, DeliveryLimits};
 use driml_protocol::{
     ActorJoin, BufferPool, Chunk, ChunkHeader, Claim, Done, End, Goodbye, Horizon, InsertReply,
     Keys, RequestId, RunClient, RunSpec, Shutdown, TimeoutRule, codec,

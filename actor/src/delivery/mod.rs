@@ -15,7 +15,7 @@ use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown};
 use state::DeliveryState;
 use worker::DeliveryWorker;
 
-pub use state::DeliveryLimits;
+pub use state::{DeliveryError, DeliveryLimits};
 
 /// How long an actor whose chunks wait may wait for newer weights.
 const FRESH_WEIGHTS_MAX: Duration = Duration::from_millis(200);
@@ -25,7 +25,7 @@ pub struct Delivery {
     queue: mpsc::Sender<Chunk>,
     limit: usize,
     state: Arc<DeliveryState>,
-    thread: JoinHandle<anyhow::Result<u64>>,
+    thread: JoinHandle<Result<u64, DeliveryError>>,
 }
 
 impl Delivery {
@@ -108,10 +108,8 @@ impl Delivery {
     ///
     /// # Errors
     /// A chunk that could not be delivered.
-    pub fn finish(self) -> anyhow::Result<u64> {
+    pub fn finish(self) -> Result<u64, DeliveryError> {
         drop(self.queue);
-        self.thread
-            .join()
-            .map_err(|_| anyhow::anyhow!("the delivery thread panicked"))?
+        self.thread.join().map_err(|_| DeliveryError::Panicked)?
     }
 }

@@ -9,6 +9,8 @@ use std::{
     time::Duration,
 };
 
+use driml_protocol::session::SessionError;
+
 use crate::config::Config;
 
 /// Limits of one delivery.
@@ -59,4 +61,34 @@ impl DeliveryState {
     pub(super) fn is_held(&self) -> bool {
         self.is_held.load(Ordering::Relaxed)
     }
+}
+
+/// Why chunks could not be delivered.
+#[derive(Debug, thiserror::Error)]
+pub enum DeliveryError {
+    /// The actor was told to stop, and the replay server did not store what it had left.
+    #[error("chunk {sequence} was not stored within {within:?} of the end")]
+    NotDrained {
+        /// The first chunk that was not stored.
+        sequence: u64,
+        /// How long it was tried.
+        within: Duration,
+    },
+    /// The replay server says no, for ever.
+    #[error("the replay server refused a chunk: {why}")]
+    Refused {
+        /// The replay server's reason, a sentence.
+        why: String,
+    },
+    /// No answer for too long.
+    #[error("the replay server was out of reach for {within:?}")]
+    OutOfReach {
+        /// How long it was tried.
+        within: Duration,
+        /// The last try's error.
+        source: SessionError,
+    },
+    /// A broken invariant of our own.
+    #[error("the delivery thread panicked")]
+    Panicked,
 }

@@ -8,14 +8,13 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, bail};
 use driml_protocol::{
     BufferPool, Chunk, ChunkHeader, Claim, Done, Goodbye, InsertReply, PendingReply, RunClient,
     Seldom, Shutdown, fault, session::SessionError,
 };
 use zenoh::bytes::ZBytes;
 
-use super::state::{DeliveryLimits, DeliveryState};
+use super::state::{DeliveryError, DeliveryLimits, DeliveryState};
 
 /// After `Shutdown`, how long the chunks at hand may take to be stored.
 const DRAIN_MAX: Duration = Duration::from_secs(20);
@@ -104,7 +103,7 @@ impl DeliveryWorker {
     }
 
     /// Delivers until the queue ends; gives the number of transitions that were not wanted.
-    pub(super) fn run(mut self, chunks: &mpsc::Receiver<Chunk>) -> anyhow::Result<u64> {
+    pub(super) fn run(mut self, chunks: &mpsc::Receiver<Chunk>) -> Result<u64, DeliveryError> {
         let mut last = None;
         let mut produced = 0;
         let mut unwanted = 0;
@@ -171,12 +170,15 @@ impl DeliveryWorker {
     }
 
     /// Sends what the window allows and waits for what becomes of the first.
-    fn settle_first(&mut self) -> anyhow::Result<Outcome> {
+    fn settle_first(&mut self) -> Result<Outcome, DeliveryError> {
         let sequence = self.outgoing[0].header.sequence;
         if self.shutdown.is_set() {
             let since = *self.draining_since.get_or_insert_with(Instant::now);
             if since.elapsed() > DRAIN_MAX {
-                bail!("chunk {sequence} was not stored within {DRAIN_MAX:?} of the end");
+                return Err(DeliveryError::NotDrained {
+                    sequence,
+                    within: DRAIN_MAX,
+                });
             }
         }
         let reply = match self.send_window().and_then(|()| self.wait_for_first()) {
@@ -222,12 +224,12 @@ impl DeliveryWorker {
             }
             // Judged while one before it waited; all of those are stored now.
             Ok(InsertReply::OutOfOrder { .. }) => Ok(self.again()),
-            Ok(InsertReply::Refused { why }) => bail!("the replay server refused a chunk: {why}"),
+            Ok(InsertReply::Refused { why }) => Err(DeliveryError::Refused { why }),
             Err(e) if self.answered.elapsed() > self.limits.unreachable_max => {
-                Err(e).context(format!(
-                    "the replay server was out of reach for {:?}",
-                    self.limits.unreachable_max
-                ))
+                Err(DeliveryError::OutOfReach {
+                    within: self.limits.unreachable_max,
+                    source: e,
+                })
             }
             Err(e) => {
                 if let Some(more) = self.retries_said.due() {

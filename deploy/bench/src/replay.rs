@@ -8,10 +8,7 @@ use std::{
 };
 
 use anyhow::{Context, bail, ensure};
-use driml_actor::{
-    ActorSettings,
-    delivery::{Delivery, DeliveryLimits},
-};
+use driml_actor::{ActorSettings, Delivery, DeliveryLimits};
 use driml_launch::{
     child::{Part, Surroundings},
     console::Screen,

@@ -3,10 +3,7 @@
 
 use anyhow::Context;
 use clap::ValueEnum;
-use driml_actor::{
-    evaluate::episode_returns,
-    policy::{NetworkPolicy, Policy, RandomPolicy},
-};
+use driml_actor::{NetworkPolicy, Policy, RandomPolicy, episode_returns};
 use driml_envs::WorldConfig;
 use driml_learner::{Compute, checkpoint};
 use driml_machine::error::{Usage, usage};

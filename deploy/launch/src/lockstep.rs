@@ -126,7 +126,7 @@ impl Parts {
         let actor = |actor| {
             let life = Incarnation {
                 actor,
-                incarnation: INCARNATION,
+                id: INCARNATION,
                 after_updates: 0,
                 earlier_incarnations: 0,
             };
@@ -140,7 +140,7 @@ impl Parts {
         };
         let actors = (0..config.local.actors)
             .map(actor)
-            .collect::<anyhow::Result<Vec<_>>>()?;
+            .collect::<Result<Vec<_>, _>>()?;
         Ok(Self {
             unwanted: vec![0; actors.len()],
             actors,

@@ -106,7 +106,7 @@ pub enum BatchReply {
     Finished,
     /// Never: the reason, for a person.
     Refused {
-        /// The reason.
+        /// The replay server's reason, a sentence.
         why: String,
     },
 }

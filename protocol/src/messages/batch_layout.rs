@@ -7,19 +7,19 @@ use std::ops::Range;
 /// positives have one for every row of the first positive, then of the second, and so on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Column {
-    /// s_t.
+    /// s_t, the state of the anchor.
     StatesT,
     /// s_{t+k}, of each positive.
     StatesK,
-    /// s_{t+n}.
+    /// s_{t+n}, from which the return bootstraps.
     StatesN,
     /// The n-step return, f32.
     NStepReturn,
     /// The discount of what is bootstrapped, f32.
     BootstrapDiscount,
-    /// a_t.
+    /// a_t, the action in it.
     Action,
-    /// a_{t+1}.
+    /// a_{t+1}, the action in the next state.
     NextAction,
     /// 1 where the row has this positive.
     PositiveValid,

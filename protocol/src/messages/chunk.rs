@@ -21,13 +21,13 @@ const _: () = assert!(TRANSITION_BYTES == 6);
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum End {
-    /// Nothing.
+    /// Nothing: the next step goes on from it.
     Running = 0,
     /// A level: a boundary for DIM, not for the return.
     LevelChange = 1,
     /// The episode, by its step limit.
     TimedOut = 2,
-    /// The episode.
+    /// The episode, by the rules of the world.
     Terminal = 3,
 }
 

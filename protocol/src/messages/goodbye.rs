@@ -9,7 +9,7 @@ use crate::wire::message::{Keyed, Kind, Message, Request};
 /// An actor's last word: its own count of what it produced, against which the replay server checks its count.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Goodbye {
-    /// Which actor.
+    /// The actor's number in the run.
     pub actor: u32,
     /// Which life of it.
     pub incarnation: u64,

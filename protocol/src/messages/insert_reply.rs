@@ -8,7 +8,7 @@ use crate::wire::message::{Keyed, Kind, Message, Request};
 /// Asks what became of a chunk that the replay server keeps until its limiter opens: the chunk's header without its payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Claim {
-    /// Which actor.
+    /// The actor's number in the run.
     pub actor: u32,
     /// Which life of that actor.
     pub incarnation: u64,
@@ -61,7 +61,7 @@ pub enum InsertReply {
     },
     /// Not stored, and never will be: the reason, for a person.
     Refused {
-        /// The reason.
+        /// The replay server's reason, a sentence.
         why: String,
     },
 }

@@ -66,7 +66,7 @@ pub enum JoinReply {
     },
     /// Never: the reason, for a person.
     Refused {
-        /// The reason.
+        /// The replay server's reason, a sentence.
         why: String,
     },
 }

@@ -9,12 +9,12 @@ use crate::wire::message::{Keyed, Kind, Message};
 /// Who waits for whom at the rate limiter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Waiting {
-    /// Nobody.
+    /// Neither side waits.
     #[default]
     Nobody,
     /// The learner, for the first transitions.
     WarmUp {
-        /// Transitions stored.
+        /// Transitions stored so far.
         have: u64,
         /// Transitions needed before the first batch.
         need: u64,
@@ -62,11 +62,11 @@ impl Returns {
 /// How a quantity was distributed since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Quantiles {
-    /// The median.
+    /// The median of all values since the start.
     pub p50: f64,
     /// What 99% do not exceed.
     pub p99: f64,
-    /// The largest.
+    /// The largest value since the start.
     pub max: f64,
 }
 
@@ -276,7 +276,7 @@ impl ReplayStatus {
 /// The learner's account of itself.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct LearnerStatus {
-    /// Updates done.
+    /// Updates done since the start of the run.
     pub updates: u64,
     /// C51 loss of the last update.
     pub c51_kl: f32,

@@ -5,9 +5,9 @@ use serde::{Deserialize, Serialize};
 /// What the rate limiter counts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Tally {
-    /// Transitions stored.
+    /// Transitions stored since the start of the run.
     pub inserted: u64,
-    /// Rows sampled.
+    /// Rows sampled since the start of the run.
     pub rows_sampled: u64,
 }
 

@@ -77,7 +77,7 @@ pub enum WeightsRequest {
     NewerThan(u64),
     /// The piece of these weights that starts at `offset`.
     Piece {
-        /// Which weights.
+        /// The version of the weights, as the first piece said it.
         version: u64,
         /// Byte of the safetensors file, a multiple of [`PIECE_BYTES`].
         offset: u64,

@@ -11,7 +11,7 @@ pub enum CodecError {
     Length {
         /// Bytes at hand.
         have: usize,
-        /// Bytes expected.
+        /// Bytes that the prefix promises.
         need: usize,
     },
     /// Not one of our messages.
@@ -24,30 +24,30 @@ pub enum CodecError {
         "the sender speaks protocol version {theirs}, this part version {ours}: run the same build of driml everywhere"
     )]
     Version {
-        /// The sender's.
+        /// What the message says.
         theirs: u16,
-        /// Ours.
+        /// What this part has, or expects here.
         ours: u16,
     },
     /// Another kind than this place takes.
     #[error("a message of kind {theirs} came where kind {ours} is expected")]
     Kind {
-        /// The sender's.
+        /// What the message says.
         theirs: u16,
-        /// Ours.
+        /// What this part has, or expects here.
         ours: u16,
     },
-    /// Another run.
+    /// A message of a run with other settings.
     #[error(
         "the message belongs to run spec {theirs:016x}, this part runs {ours:016x}: start every part with the same settings, or let actors and learner fetch them with --connect"
     )]
     RunSpec {
-        /// The sender's hash.
+        /// The hash in the message.
         theirs: u64,
-        /// Ours.
+        /// What this part has, or expects here.
         ours: u64,
     },
-    /// Damaged bytes.
+    /// Bytes that were changed on the way.
     #[error("the message's checksum is wrong: it was damaged on the way")]
     Checksum,
     /// A header that does not decode, or is inconsistent with its payload.
@@ -60,7 +60,7 @@ pub enum CodecError {
     TooLarge {
         /// Bytes at hand.
         have: usize,
-        /// The limit.
+        /// The most that both sides accept.
         max: usize,
     },
 }

@@ -72,12 +72,12 @@ impl Keys {
 pub enum Alive {
     /// One life of an actor.
     Actor {
-        /// Which actor.
+        /// The actor's number in the run.
         actor: u32,
         /// Which life of it.
         incarnation: u64,
     },
-    /// A learner.
+    /// A learner, by its random number.
     Learner(u64),
 }
 

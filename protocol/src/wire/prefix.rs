@@ -11,7 +11,7 @@ macro_rules! prefix {
         }
 
         impl Prefix {
-            /// Its length.
+            /// Its length: the widths of all fields.
             pub(super) const BYTES: usize = 0 $(+ size_of::<$type>())*;
 
             /// The bytes as they travel.

@@ -56,7 +56,7 @@ struct Actor {
 pub(crate) enum Verdict {
     /// The next of its actor: store it.
     Next,
-    /// Stored already.
+    /// A copy of one that is stored already.
     Retried,
     /// Chunks before this one are missing.
     OutOfOrder { expected: u64 },

@@ -34,7 +34,7 @@ pub enum Unready {
     Finished,
     /// Never: the reason, for a person.
     Refused {
-        /// The reason.
+        /// Why, and what to do about it.
         why: String,
     },
 }

@@ -9,7 +9,7 @@ use super::{Replay, Unready};
 use crate::{
     config,
     ledger::requests::{Dedup, Requests},
-    sampling::packed_batch::{Draft, PackedStates},
+    sampling::packed_batch::{PackedBatch, PackedStates},
 };
 
 impl Replay {
@@ -33,12 +33,12 @@ impl Replay {
         Ok(())
     }
 
-    /// Makes a batch: [`Replay::draw`] and [`Draft::unpack`] in one.
+    /// Makes a batch: [`Replay::draw`] and [`PackedBatch::unpack`] in one.
     ///
     /// # Errors
     /// As [`Replay::draw`].
     pub fn sample(&mut self, rows: u32) -> Result<Batch, Unready> {
-        self.draw(rows).map(Draft::unpack)
+        self.draw(rows).map(PackedBatch::unpack)
     }
 
     /// A batch of `rows` rows, anchors uniform over the valid ones and drawn with replacement, or why there is none. With
@@ -46,7 +46,7 @@ impl Replay {
     ///
     /// # Errors
     /// The limiter or the lack of any valid anchor asks to wait; the run is over; `rows` can never be served.
-    pub fn draw(&mut self, rows: u32) -> Result<Draft, Unready> {
+    pub fn draw(&mut self, rows: u32) -> Result<PackedBatch, Unready> {
         self.draw_in(rows, Buffer::zeroed)
     }
 
@@ -58,7 +58,7 @@ impl Replay {
         &mut self,
         rows: u32,
         memory: impl FnOnce(usize) -> Buffer,
-    ) -> Result<Draft, Unready> {
+    ) -> Result<PackedBatch, Unready> {
         let rows_max = config::rows_max(&self.spec).min(self.limiter.rows_max());
         if rows == 0 || rows > rows_max {
             self.statistics.messages_refused += 1;
@@ -107,7 +107,7 @@ impl Replay {
         header.tally = self.limiter.tally();
         batch.header = header;
         self.starving = false;
-        Ok(Draft { batch, packed, ks })
+        Ok(PackedBatch { batch, packed, ks })
     }
 
     /// [`Replay::draw_in`] for request `id`. What an earlier attempt at this request was given did not arrive: from now on it
@@ -120,7 +120,7 @@ impl Replay {
         id: RequestId,
         rows: u32,
         memory: impl FnOnce(usize) -> Buffer,
-    ) -> Result<Draft, Unready> {
+    ) -> Result<PackedBatch, Unready> {
         match self.requests.begin(id) {
             Dedup::Superseded => return Err(Unready::Wait(self.limiter.waiting(rows))),
             Dedup::Fresh(lost) => {

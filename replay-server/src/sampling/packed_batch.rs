@@ -20,7 +20,7 @@ use crate::storage::{
 
 /// A batch, complete but for frames that are still to be unpacked.
 #[must_use]
-pub struct Draft {
+pub struct PackedBatch {
     pub(crate) batch: Batch,
     /// No rows if the batch has its frames.
     pub(crate) packed: PackedStates,
@@ -28,7 +28,7 @@ pub struct Draft {
     pub(crate) ks: Vec<u32>,
 }
 
-impl Draft {
+impl PackedBatch {
     /// The batch; with compression this is where most of the work is.
     pub fn unpack(self) -> Batch {
         let Self {
@@ -64,7 +64,7 @@ struct PackedPart {
 }
 
 impl PackedStates {
-    /// Nothing yet.
+    /// No rows yet, of frames of this size.
     pub(crate) fn new(frame_bytes: usize, pixel_bytes: usize) -> Self {
         Self {
             frame_bytes,

@@ -11,7 +11,7 @@ use super::{
 };
 use crate::{
     replay::{Replay, Unready},
-    sampling::packed_batch::Draft,
+    sampling::packed_batch::PackedBatch,
 };
 
 /// How long a request waits before it is told to come back: far below every learner's time-out.
@@ -92,7 +92,7 @@ impl Service {
     }
 }
 
-fn give_batch(responder: Responder<BatchReply>, drawn: Result<Draft, Unready>) {
+fn give_batch(responder: Responder<BatchReply>, drawn: Result<PackedBatch, Unready>) {
     match drawn {
         Ok(draft) => {
             let (header, payload) = draft.unpack().into_payload();
@@ -108,7 +108,7 @@ impl State {
         &mut self,
         now: Instant,
         memory: impl Fn(usize, bool) -> Buffer,
-    ) -> Option<(Parked, Result<Draft, Unready>)> {
+    ) -> Option<(Parked, Result<PackedBatch, Unready>)> {
         let (mut waiting, mut found) = (Vec::new(), None);
         while let Some(parked) = self.requests.pop() {
             let BatchRequest {

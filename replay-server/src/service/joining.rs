@@ -66,7 +66,7 @@ impl Service {
 enum Rejection {
     /// Not yet: another process is connected that plays it.
     Taken(String),
-    /// Never.
+    /// Never: this part cannot be taken at all.
     Refused(String),
 }
 

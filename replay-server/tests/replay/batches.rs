@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use driml_protocol::{Batch, ChunkHeader, Goodbye, Horizon, InsertReply, TimeoutRule, Waiting};
-use driml_replay_server::{Compression, Draft, Replay, Study, Unready};
+use driml_replay_server::{Compression, PackedBatch, Replay, Study, Unready};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -202,7 +202,7 @@ proptest! {
                 }
                 _ if history.inserted == 0 => {}
                 // Memory that held something else: whatever is not written shows.
-                _ => match replay.draw_in(8, |bytes| vec![0xAB; bytes].into()).map(Draft::unpack) {
+                _ => match replay.draw_in(8, |bytes| vec![0xAB; bytes].into()).map(PackedBatch::unpack) {
                     Ok(batch) => {
                         check_batch(&batch, &history);
                         rows_sampled += 8;

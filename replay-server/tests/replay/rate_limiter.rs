@@ -2,7 +2,7 @@
 //! It does not test what is stored or sampled.
 
 use driml_protocol::Waiting;
-use driml_replay_server::rate_limiter::RateLimiter;
+use driml_replay_server::RateLimiter;
 use proptest::prelude::*;
 
 #[test]

@@ -7,11 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_actor::{
-    ActorSettings,
-    delivery::{Delivery, DeliveryLimits},
-    weights::WeightsSource,
-};
+use driml_actor::{ActorSettings, Delivery, DeliveryLimits, WeightsSource};
 use driml_learner::{
     LearnerPart,
     remote::batch_source::{BatchSource, Next, Requests},
