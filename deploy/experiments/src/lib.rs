@@ -20,6 +20,7 @@ mod queue;
 mod random_walk;
 mod session;
 mod statistics;
+mod template;
 
 use crate::flags::ExperimentCommand;
 

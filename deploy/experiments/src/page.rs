@@ -1,107 +1,74 @@
 //! The page that an experiment leaves: claim, command, time, expected, got, differences.
-//! It is made from results alone, so that no number in it can be stale.
+//! Its text is a template beside the experiment; its numbers come from results alone, so that none can be stale.
+
+use std::fmt;
 
 use driml_machine::units::rough_duration;
 
-/// Numbers in rows and columns.
+use crate::template::{self, Values};
+
+const SMOKE: &str =
+    "**This is the smoke length: it shows that everything works, and its numbers mean nothing.**";
+
+/// Numbers in rows and columns, as Markdown.
 #[derive(Debug, Default)]
 pub(super) struct Table {
-    /// What it shows, and what its numbers are.
-    pub(super) caption: String,
     pub(super) header: Vec<String>,
     pub(super) rows: Vec<Vec<String>>,
 }
 
-impl Table {
-    fn text(&self) -> String {
-        let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
+impl fmt::Display for Table {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let rule = vec!["---".to_owned(); self.header.len()];
-        let rows: String = self.rows.iter().map(|row| line(row)).collect();
-        format!(
-            "{}\n\n{}{}{rows}\n",
-            self.caption,
-            line(&self.header),
-            line(&rule)
-        )
+        let lines = [&self.header, &rule].into_iter().chain(&self.rows);
+        let lines: Vec<_> = lines
+            .map(|cells| format!("| {} |", cells.join(" | ")))
+            .collect();
+        f.write_str(&lines.join("\n"))
     }
 }
 
-/// What stands on the page.
-#[derive(Debug, Default)]
+/// A page, filled in but for the time that it took.
+#[derive(Debug)]
 pub(super) struct Page {
-    /// Its first line.
-    pub(super) title: String,
-    /// What the paper claims.
-    pub(super) claim: String,
-    /// What repeats it.
-    pub(super) command: String,
-    /// What should come out.
-    pub(super) expected: Vec<String>,
-    /// What came out, numbers first.
-    pub(super) got: Vec<String>,
-    /// More of what came out.
-    pub(super) tables: Vec<Table>,
-    /// Where it differs from the paper, and why.
-    pub(super) differences: Vec<String>,
-    /// How it was done: sizes, seeds.
-    pub(super) setup: Vec<String>,
-    /// Stem and caption of each figure.
-    pub(super) figures: Vec<(String, String)>,
-    /// Name and content of each data file.
-    pub(super) data: Vec<(String, String)>,
-    /// Whether this was the smoke length.
-    pub(super) smoke: bool,
+    template: &'static str,
+    values: Values,
 }
 
 impl Page {
+    /// The page of this template; `command` repeats the experiment, which was of the smoke length or not.
+    pub(super) fn new(
+        template: &'static str,
+        mut values: Values,
+        command: &str,
+        smoke: bool,
+    ) -> Self {
+        values.set("command", command);
+        values.set("smoke", if smoke { SMOKE } else { "" });
+        Self { template, values }
+    }
+
     /// As Markdown. `seconds` is the time that all pieces took together, of which so many are made `at_once`.
     pub(super) fn text(&self, seconds: f64, at_once: u32) -> String {
         let at_once = match at_once {
             1 => String::new(),
             jobs => format!(" of runs, {jobs} at once,"),
         };
-        let mut out = format!("# {}\n\n", self.title);
-        if self.smoke {
-            out += "**This is the smoke length: it shows that everything works, and its numbers mean nothing.**\n\n";
-        }
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
-        out += &format!("**Claim.** {}\n\n", self.claim);
-        out += &format!("**Command.** `{}`\n\n", self.command);
-        out += &format!(
-            "**Time.** {}{at_once} on a machine with {cores} cores.\n\n",
-            rough_duration(seconds)
+        let time = rough_duration(seconds);
+        let mut values = self.values.clone();
+        values.set(
+            "time",
+            format!("{time}{at_once} on a machine with {cores} cores."),
         );
-        for (head, items) in [("Expected", &self.expected), ("Got", &self.got)] {
-            out += &format!("**{head}.**\n\n{}\n", list(items));
-        }
-        self.tables.iter().for_each(|table| out += &table.text());
-        for (head, items) in [
-            ("Differences from the paper", &self.differences),
-            ("How", &self.setup),
-        ] {
-            out += &format!("**{head}.**\n\n{}\n", list(items));
-        }
-        for (stem, caption) in &self.figures {
-            out += &format!("![{caption}]({stem}.png)\n\n");
-            out += &format!("{caption} ([SVG]({stem}.svg))\n\n");
-        }
-        out += "**Data.**\n\n";
-        let files = self.data.iter();
-        let files: Vec<String> = files
-            .map(|(name, what)| format!("`{name}.csv`: {what}"))
-            .collect();
-        out += &list(&files);
-        out
-    }
-
-    /// What came out, for the terminal.
-    pub(super) fn summary(&self) -> String {
-        list(&self.got)
+        template::fill(self.template, &values)
     }
 }
 
-fn list(items: &[String]) -> String {
-    items.iter().map(|item| format!("* {item}\n")).collect()
+/// What came out, for the terminal: the list below "Got".
+pub(super) fn summary(page: &str) -> String {
+    let list = page.split("**Got.**\n\n").nth(1).unwrap_or_default();
+    list.split("\n\n").next().unwrap_or_default().to_owned() + "\n"
 }
 
 #[cfg(test)]
@@ -109,38 +76,32 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_page_has_all_its_parts_and_says_when_it_is_a_smoke_test() {
-        let mut page = Page {
-            title: "T".into(),
-            claim: "C.".into(),
-            command: "driml experiment t".into(),
-            got: vec!["0.5".into()],
-            tables: vec![Table {
-                caption: "Numbers:".into(),
-                header: vec!["a".into(), "b".into()],
-                rows: vec![vec!["1".into(), "2".into()]],
-            }],
-            figures: vec![("fig".into(), "A figure".into())],
-            smoke: true,
-            ..Page::default()
+    fn the_page_has_its_parts_and_says_when_it_is_a_smoke_test() {
+        let table = Table {
+            header: vec!["a".into(), "b".into()],
+            rows: vec![vec!["1".into(), "2".into()]],
         };
-        let text = page.text(130.0, 1);
+        let template = "# T\n\n{smoke}\n\n**Command.** `{command}`\n\n**Time.** {time}\n\n**Got.**\n\n* {got}\n\nNumbers:\n\n{table}\n";
+        let mut values = Values::default();
+        values.set("got", 0.5).set("table", table);
+        let page = |smoke| Page::new(template, values.clone(), "driml experiment t", smoke);
+        let text = page(true).text(130.0, 1);
         for part in [
             "# T\n",
             "smoke length",
-            "**Claim.** C.",
+            "**Command.** `driml experiment t`",
             "**Time.** 2 min on",
             "**Got.**\n\n* 0.5\n",
-            "Numbers:\n\n| a | b |\n| --- | --- |\n| 1 | 2 |\n\n",
-            "![A figure](fig.png)",
+            "Numbers:\n\n| a | b |\n| --- | --- |\n| 1 | 2 |\n",
         ] {
             assert!(text.contains(part), "{part}\n{text}");
         }
+        assert_eq!(summary(&text), "* 0.5\n");
         assert!(
-            page.text(130.0, 2)
+            page(true)
+                .text(130.0, 2)
                 .contains("**Time.** 2 min of runs, 2 at once, on")
         );
-        page.smoke = false;
-        assert!(!page.text(1.0, 1).contains("smoke length"));
+        assert!(!page(false).text(1.0, 1).contains("smoke length"));
     }
 }

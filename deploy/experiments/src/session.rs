@@ -17,7 +17,11 @@ use driml_launch::{
 use driml_machine::error::{Interrupted, usage};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
-use crate::{flags::ExperimentFlags, page::Page, progress::Progress};
+use crate::{
+    flags::ExperimentFlags,
+    page::{self, Page},
+    progress::Progress,
+};
 
 /// Finished pieces, one file each, and the settings they were made with. Git does not keep it.
 const PIECES: &str = "pieces";
@@ -209,7 +213,7 @@ impl Session {
         write_whole(&self.folder.join("README.md"), text.as_bytes())?;
         print(&format!(
             "{}{}\n",
-            page.summary(),
+            page::summary(&text),
             self.folder.join("README.md").display()
         ))
     }

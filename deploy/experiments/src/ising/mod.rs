@@ -21,6 +21,7 @@ use crate::{
     page::Page,
     session::Session,
     statistics::Spread,
+    template::Values,
 };
 
 const NAME: &str = "ising";
@@ -78,7 +79,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     session.figure("fig2", &fig2(&task, &trained[0])?)?;
     session.figure("learning", &learning(&task, &trained))?;
     let command = command_line(NAME, args, session.folder());
-    session.finish(&page(&task, &trained, command, args.smoke))
+    session.finish(&page(&task, &trained, &command, args.smoke))
 }
 
 fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
@@ -266,106 +267,39 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
     }
 }
 
-fn page(task: &Task, trained: &[Trained], command: String, smoke: bool) -> Page {
+fn page(task: &Task, trained: &[Trained], command: &str, smoke: bool) -> Page {
     let settings = &task.settings;
-    let view = View::of(&task.model);
-    let next_t = settings.from_t + 1;
-    let last = |value: &dyn Fn(&Measured) -> f64| {
-        Spread::of(trained.iter().map(|one| value(&one.last)))
-            .map_or("none".to_owned(), |spread| spread.to_string())
+    let over_seeds = |value: &dyn Fn(&Trained) -> f64| {
+        Spread::of(trained.iter().map(value)).map_or("none".to_owned(), |it| it.to_string())
     };
-    let untrained = Spread::of(trained.iter().map(|one| one.checks[0].1.auc));
-    let untrained = untrained.map_or("none".to_owned(), |spread| spread.to_string());
-    Page {
-        title: "An Ising patch in noise (Fig. 2)".into(),
-        claim: format!(
-            "Local DIM encodes regions of high temporal predictability: its scores from t = {} to t = {next_t} are higher \
-             in the part of the lattice that follows an Ising model than in the noise around it.",
-            settings.from_t
-        ),
-        command,
-        expected: vec![
-            "Heat maps that are bright inside the patch and dark outside; an area under the ROC curve well above 0.5, the \
-             value of an untrained or blind score."
-                .into(),
-            format!(
-                "Not 1: a location sees {0} x {0} pixels, so most see both patch and noise.",
-                view.side
-            ),
-        ],
-        got: vec![
-            format!(
-                "Score against membership in the patch, {} episodes that were not trained on: area under the ROC curve {}; \
-                 by the raw score {}.",
-                settings.episodes,
-                last(&|measured| measured.auc),
-                last(&|measured| measured.auc_raw),
-            ),
-            format!(
-                "Among locations that see nothing but patch or nothing of it: {}.",
-                last(&|measured| measured.auc_clear)
-            ),
-            format!("Before training: {untrained}."),
-            format!(
-                "Inside the patch, true pairs against pairs of two episodes whose patches both cover the location: {}. \
-                 (At 0.5 the score would be a mere detector of patches; at 1 it tells *this* future from any other \
-                 patch's.)",
-                last(&|measured| measured.auc_pairs)
-            ),
-            format!(
-                "Loss on the episodes of these measurements, at the end: {} nats, of ln {} = {:.2} for a blind score.",
-                last(&|measured| measured.loss),
-                settings.batch_rows,
-                (settings.batch_rows as f64).ln()
-            ),
-        ],
-        tables: Vec::new(),
-        differences: vec![
-            "The paper shows three heat maps and gives no number; the areas under the curve are ours.".into(),
-            "The paper's appendix draws the patch's place anew at every time step, its main text once an episode. Ours \
-             follows the main text: a patch that jumps has no future to predict."
-                .into(),
-            "One time step is one Metropolis sweep over the patch with periodic rim; the paper says neither. The sampler is \
-             checked against exact enumeration, Kaufman's finite lattices and Onsager's solution in `actor/envs`."
-                .into(),
-            format!(
-                "Batches of {} pairs, {} updates; the paper's length is \"10 epochs\" of a number of snapshots that it does \
-                 not give.",
-                settings.batch_rows, settings.updates
-            ),
-        ],
-        setup: vec![
-            format!(
-                "{0} x {0} spins, patch {1} x {1}, temperature {2}; the project's torso and local heads (width {3}), \
-                 lambda_3t3 = 1 alone, no action, Adam at {4}; {5} seeds. A row is another episode at its own t < {6}.",
-                task.world.lattice_size,
-                task.world.patch_size,
-                task.world.temperature,
-                task.model.rkhs,
-                task.learner.adam.lr,
-                trained.len(),
-                task.world.episode_steps,
-            ),
-            format!(
-                "Score: the positive's log-softmax among {} episodes, as in the paper's listing. A location belongs to the \
-                 patch if the centre of its receptive field does.",
-                settings.batch_rows
-            ),
-        ],
-        figures: vec![
-            (
-                "fig2".into(),
-                format!("Three episodes: the lattice at t = {next_t} and t = {}, and the scores", settings.late_t),
-            ),
-            ("learning".into(), "Loss and areas under the ROC curve".into()),
-        ],
-        data: vec![
-            ("auc".into(), "each measurement of each seed".into()),
-            ("loss".into(), format!("training loss, means of {LOSS_WINDOW} updates")),
-            ("maps".into(), "the heat maps, row by row".into()),
-        ],
-        smoke,
-    }
+    let batch_rows = settings.batch_rows;
+    let mut values = Values::default();
+    values
+        .set("from_t", settings.from_t)
+        .set("next_t", settings.from_t + 1)
+        .set("late_t", settings.late_t)
+        .set("view", View::of(&task.model).side)
+        .set("episodes", settings.episodes)
+        .set("updates", settings.updates)
+        .set("loss_window", LOSS_WINDOW);
+    values
+        .set("auc", over_seeds(&|one| one.last.auc))
+        .set("auc_raw", over_seeds(&|one| one.last.auc_raw))
+        .set("auc_clear", over_seeds(&|one| one.last.auc_clear))
+        .set("auc_pairs", over_seeds(&|one| one.last.auc_pairs))
+        .set("untrained", over_seeds(&|one| one.checks[0].1.auc))
+        .set("loss", over_seeds(&|one| one.last.loss))
+        .set("batch_rows", batch_rows)
+        .set("blind_loss", format!("{:.2}", (batch_rows as f64).ln()));
+    values
+        .set("lattice", task.world.lattice_size)
+        .set("patch", task.world.patch_size)
+        .set("temperature", task.world.temperature)
+        .set("episode_steps", task.world.episode_steps)
+        .set("rkhs", task.model.rkhs)
+        .set("lr", task.learner.adam.lr)
+        .set("seeds", trained.len());
+    Page::new(include_str!("page.md"), values, command, smoke)
 }
 
 #[cfg(test)]

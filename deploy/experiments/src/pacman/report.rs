@@ -11,6 +11,7 @@ use crate::{
     page::{Page, Table},
     session::Session,
     statistics::{Spread, rank_correlation},
+    template::Values,
 };
 
 /// Share of a run, at its end, whose mean is the final loss.
@@ -37,19 +38,11 @@ pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> 
     let (continual, with_noise) = (&results.settings.continual, &results.settings.noise);
     write_traces(&session, "ghosts", &ghosts)?;
     write_traces(&session, "noise", &noise)?;
-    let mut tables = vec![loss_table(results, &losses)];
-    tables.push(task_table(
-        "(b) One lethal ghost after another",
-        continual,
-        results,
-        &ghosts,
-    ));
-    tables.push(task_table(
-        "(c) The same with Ising noise in the walls",
-        with_noise,
-        results,
-        &noise,
-    ));
+    let mut tables = Values::default();
+    tables
+        .set("losses", loss_table(results, &losses))
+        .set("ghosts", task_table(continual, results, &ghosts))
+        .set("noise", task_table(with_noise, results, &noise));
     let mut got = got_losses(&losses);
     got.extend(got_tasks("(b)", continual, results, &ghosts));
     got.extend(got_tasks("(c)", with_noise, results, &noise));
@@ -165,7 +158,6 @@ fn loss_table(results: &Results, losses: &[Loss]) -> Table {
         "global, whole run",
     ];
     Table {
-        caption: "(a) DIM loss in nats, by the ghosts' share of random moves: mean ± standard deviation over seeds.".into(),
         header: header.map(String::from).to_vec(),
         rows: rows.collect(),
     }
@@ -179,7 +171,7 @@ fn plus_minus(values: impl Iterator<Item = f64>) -> String {
     }
 }
 
-fn task_table(title: &str, continual: &Continual, results: &Results, traces: &[Trace]) -> Table {
+fn task_table(continual: &Continual, results: &Results, traces: &[Trace]) -> Table {
     let mut header = vec!["task".to_owned(), "lethal ghost".into()];
     for agent in &results.settings.agents {
         header.extend([
@@ -202,11 +194,6 @@ fn task_table(title: &str, continual: &Continual, results: &Results, traces: &[T
         row
     });
     Table {
-        caption: format!(
-            "{title}: mean return of the last {RETURNS_OF} episodes, at the end of each task of {} episodes and averaged over it; mean ± \
-             standard deviation over seeds.",
-            continual.episodes_per_task
-        ),
         header,
         rows: rows.collect(),
     }
@@ -276,100 +263,48 @@ fn got_tasks(
     lines
 }
 
-fn page(results: &Results, losses: &[Loss], mut got: Vec<String>, tables: Vec<Table>) -> Page {
+fn page(results: &Results, losses: &[Loss], got: Vec<String>, mut values: Values) -> Page {
     let settings = &results.settings;
-    let (continual, noise) = (&settings.continual, &settings.noise);
-    if !results.missing.is_empty() {
-        got.push(format!(
-            "Missing, and in no number here: {}.",
-            results.missing.join(", ")
-        ));
-    }
-    if got.is_empty() {
-        got.push("Too short for a number.".into());
-    }
-    let short = continual.episodes_per_task.min(noise.episodes_per_task) < 2 * RETURNS_OF;
-    let mut differences = vec![
-        format!(
-            "Length: {} frames in (a), where the paper tells its four runs apart after 100,000; tasks of {} episodes in (b) and {} in (c), \
-             where the paper's have 5,000 (`--frames 100000 --episodes-per-task 5000` for its length).",
-            settings.predictability.frames, continual.episodes_per_task, noise.episodes_per_task
-        ),
-        "The paper's text enlarges the frames to 42 x 38, its table of parameters to 84 x 84; what was taken is under \"How\". At 42 x 38 \
-         the last convolution has a single location, so \"local\" DIM compares whole frames too, one layer earlier than global DIM."
-            .into(),
-        "The paper gives neither maze nor rewards nor the number of parallel worlds; ours are the preset's.".into(),
-        format!(
-            "Each of {} copies of the world changes its ghost after its own share of a task's episodes, so that a copy's frames do not \
-             depend on the others: copies of long episodes change later than those of short ones, and a change is spread around its line.",
-            continual.envs
-        ),
-        "The published code bootstraps its 7-step returns from s_{t+1}; ours, for C51 and DRIML alike, from s_{t+7}.".into(),
-    ];
-    if order_of_epsilon(losses).is_some_and(|rank| rank <= 0.0) {
-        differences.push(
-            "(a) is not in the paper's order. Likely causes, not tested: s_{t+1} shares all but one of its stacked frames with s_t, so a pair \
-             is told from others without predicting a ghost; and the better the ghosts hunt, the shorter the episodes (see the table), so \
-             that more rows of a batch show the same first states, which nothing can tell apart."
-                .into(),
-        );
-    }
+    let (ghosts, noise) = (&settings.continual, &settings.noise);
+    let missing = &results.missing;
+    values
+        .when("some_missing", !missing.is_empty())
+        .set("missing", missing.join(", "))
+        .when("nothing", got.is_empty() && missing.is_empty())
+        .items("got", got);
+    let short = ghosts.episodes_per_task.min(noise.episodes_per_task) < 2 * RETURNS_OF;
     let replay = "replay.capacity_transitions=";
-    if let Some(capacity) = continual
+    let mut capacities = ghosts
         .sets
         .iter()
-        .find_map(|set| set.strip_prefix(replay))
-    {
-        differences.push(format!(
-            "The replay of (b) and (c) holds {capacity} transitions, about a task, as the paper's 1,000,000 are of its longer tasks: \
-             else the old ghosts' transitions would stay to the end."
-        ));
-    }
-    if short {
-        differences.push(format!(
-            "The mean return is over {RETURNS_OF} episodes, half a task or more: the start of a task still shows the end of the one before."
-        ));
-    }
-    Page {
-        title: "Ms. PacMan (Fig. 3)".into(),
-        claim: "(a) The less predictable the ghosts, the slower the DIM loss falls. (b) With one lethal ghost that changes, C51 ends each \
-                task where it ended the one before, while DRIML rises from task to task. (c) So it does with Ising noise in the walls."
-            .into(),
-        command: results.command.clone(),
-        expected: vec![
-            "(a) Losses in the order of epsilon.".into(),
-            "(b, c) If the claim shows at this length: returns at the end of the tasks that rise for DRIML and not for C51. An agent that \
-             still learns its first task rises too, so a rise alone is no sign of transfer; the two agents must differ by more than their \
-             seeds."
-                .into(),
-        ],
-        got,
-        tables,
-        differences,
-        setup: vec![
-            format!(
-                "All parts as processes. (a) {} with world.epsilon in {:?}, all four ghosts lethal. (b, c) {} tasks and {} tasks, one actor \
-                 with {} copies; a run ends after its last task, or after {EPISODE_FRAMES_MAX} frames an episode. {} seed(s), preset {}{}.",
-                settings.predictability.agent,
-                settings.predictability.epsilons,
-                continual.tasks,
-                noise.tasks,
-                continual.envs,
-                settings.seeds,
-                settings.preset,
-                match &settings.sets[..] {
-                    [] => String::new(),
-                    sets => format!(" with {}", sets.join(", ")),
-                }
-            ),
-        ],
-        figures: vec![("fig3".into(), "DIM loss by epsilon; return under changing lethal ghosts".into())],
-        data: vec![
-            ("loss".into(), "DIM losses of each run of (a)".into()),
-            ("final_loss".into(), "their means over the last fifth and the whole run".into()),
-            ("ghosts".into(), "returns of each run of (b)".into()),
-            ("noise".into(), "returns of each run of (c)".into()),
-        ],
-        smoke: results.smoke,
-    }
+        .filter_map(|set| set.strip_prefix(replay));
+    let capacity = capacities.next();
+    values
+        .when(
+            "out_of_order",
+            order_of_epsilon(losses).is_some_and(|rank| rank <= 0.0),
+        )
+        .when("smaller_replay", capacity.is_some())
+        .set("capacity", capacity.unwrap_or_default())
+        .when("short_tasks", short)
+        .set("returns_of", RETURNS_OF)
+        .set("episode_frames_max", EPISODE_FRAMES_MAX);
+    values
+        .set("frames", settings.predictability.frames)
+        .set("agent", &settings.predictability.agent)
+        .set(
+            "epsilons",
+            format!("{:?}", settings.predictability.epsilons),
+        )
+        .set("ghosts_tasks", ghosts.tasks)
+        .set("ghosts_episodes", ghosts.episodes_per_task)
+        .set("noise_tasks", noise.tasks)
+        .set("noise_episodes", noise.episodes_per_task)
+        .set("envs", ghosts.envs)
+        .set("seeds", settings.seeds)
+        .set("preset", &settings.preset)
+        .when("has_sets", !settings.sets.is_empty())
+        .set("sets", settings.sets.join(", "));
+    let template = include_str!("page.md");
+    Page::new(template, values, &results.command, results.smoke)
 }

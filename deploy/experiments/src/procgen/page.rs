@@ -15,8 +15,10 @@ use crate::{
     aggregate,
     page::{Page, Table},
     statistics::Spread,
+    template::Values,
 };
 
+const TEMPLATE: &str = include_str!("page.md");
 /// Frames of the paper's runs.
 const PAPER_FRAMES: f64 = 50e6;
 /// Standard errors from which on a mean return counts as different from the random policy's.
@@ -27,114 +29,67 @@ const SEEDS_MIN: u32 = 5;
 /// The page.
 pub(super) fn page(results: &Results, aggregates: &[Aggregate], adaptive: bool) -> Page {
     let settings = &results.settings;
+    let norm_scores = norm_scores(results);
+    let mut values = Values::default();
+    values
+        .items("above_random", above_random(results))
+        .when("some_missing", !results.missing.is_empty())
+        .set("missing", results.missing.join(", "))
+        .when("has_scores", !aggregates.is_empty())
+        .set("baseline", baseline(results).unwrap_or_default())
+        .when("has_norm_score", norm_scores.is_some())
+        .when("adaptive", adaptive);
+    let scores = (!aggregates.is_empty()).then(|| scores(results, aggregates));
+    values
+        .set("scores", scores.unwrap_or_default())
+        .set("table_1", table_1(results, norm_scores))
+        .set("greedy", greedy(results))
+        .set(
+            "actions",
+            if adaptive {
+                actions(results).to_string()
+            } else {
+                String::new()
+            },
+        );
     let share = settings.frames as f64 / PAPER_FRAMES;
-    let mut figures = vec![
-        ("curves".into(), "Training return by game".into()),
-        ("aggregate".into(), "Scores over all games".into()),
-    ];
-    let mut data: Vec<(String, String)> = vec![
-        ("runs".into(), "every run".into()),
-        (
-            "table".into(),
-            "means and standard deviations over seeds, with the paper's".into(),
-        ),
-        ("curves".into(), "the lines of the first figure".into()),
-        ("aggregate".into(), "the scores over all games".into()),
-    ];
-    let mut tables = vec![table_1(results), greedy(results)];
-    if adaptive {
-        tables.push(actions(results));
-        figures.push(("k".into(), "k of DRIML-ada over the training".into()));
-        figures.push((
-            "affinity".into(),
-            "The action affinity at the end, first seed".into(),
-        ));
-        data.push(("k".into(), "the lines of the figure of k".into()));
-        data.push((
-            "k_histogram".into(),
-            "rows served with each k; 0 is none".into(),
-        ));
-        data.push(("actions".into(), "transitions with each action".into()));
-    }
-    Page {
-        title: "Procgen (Table 1)".into(),
-        claim: "After 50 million frames, C51 with a DIM objective earns more on most of the sixteen games: its norm. score is \
-                1.9 for DRIML-ada and 1.48 for DRIML-fix, where C51's is 1."
-            .into(),
-        command: results.command.clone(),
-        expected: vec![
-            format!(
-                "{} frames are {}% of the paper's. That is enough to see whether an agent has learned anything on a game at \
-                 all, and how fast its first steps are.",
-                settings.frames,
-                percent(share)
-            ),
-            "It is not enough to confirm or refute the order of table 1: what an auxiliary loss gains late in a training cannot \
-             be seen, and with few seeds only large differences are differences at all."
-                .into(),
-        ],
-        got: got(results, aggregates),
-        tables,
-        differences: differences(results, share),
-        setup: [
-            Some(format!(
-                "Preset {}{}; {} frames a run, {} seed(s); {} episodes played on each kind of levels with the newest weights, \
-                 epsilon 0.001.",
-                settings.preset,
-                match &settings.sets[..] {
-                    [] => String::new(),
-                    sets => format!(" with {}", sets.join(", ")),
-                },
-                settings.frames,
-                settings.seeds,
-                settings.episodes
-            )),
-            (settings.seeds < SEEDS_MIN).then(|| {
-                format!(
-                    "The intervals are of {} seed(s) a game, and too narrow: so few values cannot tell how far others would spread. Take \
-                     them for no less than the spread between these very seeds; `--seeds {SEEDS_MIN}` or more makes them intervals.",
-                    settings.seeds
-                )
-            }),
-            resumed(results),
-            Some("Interquartile mean, probability of improvement and their intervals: Agarwal et al. 2021; 2,000 resamples of seeds \
-             within each game. Normalisation: (return - min) / (max - min) with Cobbe et al. 2020, appendix C, mode easy. It \
-             is made for single levels, so only returns of an episode a level are normalised."
-                .into()),
-        ]
-        .into_iter()
-        .flatten()
-        .collect(),
-        figures,
-        data,
-        smoke: results.smoke,
-    }
-}
-
-/// That runs were interrupted and went on, if any were.
-fn resumed(results: &Results) -> Option<String> {
+    let worlds = results.worlds();
+    let games = worlds.iter().filter(|world| world.starts_with("procgen:"));
+    let games = games.count();
+    values
+        .set("percent", percent(share))
+        .when("sequential", settings.preset != "split")
+        .set("games", games)
+        .when("no_games", games == 0)
+        .when("some_games", (1..16).contains(&games))
+        .when("few_seeds", settings.seeds < SEEDS_MIN)
+        .set("seeds_min", SEEDS_MIN);
     let summaries = results.cells.iter().map(|cell| &cell.ran.summary);
-    said_of_resumed(&summaries.collect::<Vec<_>>())
+    resumed(&summaries.collect::<Vec<_>>(), &mut values);
+    values
+        .set("preset", &settings.preset)
+        .when("has_sets", !settings.sets.is_empty())
+        .set("sets", settings.sets.join(", "))
+        .set("frames", settings.frames)
+        .set("seeds", settings.seeds)
+        .set("episodes", settings.episodes);
+    Page::new(TEMPLATE, values, &results.command, results.smoke)
 }
 
-fn said_of_resumed(all: &[&Summary]) -> Option<String> {
+/// Which runs were interrupted and went on, and of which of these only the returns since then are known.
+fn resumed(all: &[&Summary], values: &mut Values) {
     let resumed = all.iter().filter(|it| it.resumed_after_updates > 0);
     let count = resumed.clone().count();
     // What an older version played before the interruption was not kept.
     let short = resumed.filter(|it| it.mean_return_of < it.episodes.min(RETURNS_OF as u64));
-    let short = match short.count() {
-        0 => String::new(),
-        short => format!(
-            " The training return of {short} of them is of fewer than the last {RETURNS_OF} episodes, those since."
-        ),
-    };
-    (count > 0).then(|| {
-        format!(
-            "{count} of {} runs were interrupted and went on from a checkpoint, with a replay that had to fill again; of these, the \
-             histogram of k and the shares of actions are of what came after.{short}",
-            all.len()
-        )
-    })
+    let short = short.count();
+    values
+        .when("some_resumed", count > 0)
+        .set("resumed", count)
+        .set("runs", all.len())
+        .when("some_short", short > 0)
+        .set("short", short)
+        .set("returns_of", RETURNS_OF);
 }
 
 fn percent(share: f64) -> String {
@@ -143,9 +98,9 @@ fn percent(share: f64) -> String {
     format!("{percent:.decimals$}")
 }
 
-fn got(results: &Results, aggregates: &[Aggregate]) -> Vec<String> {
-    let mut lines = Vec::new();
-    for agent in results.agents() {
+/// On how many games each agent plays better than at random.
+fn above_random(results: &Results) -> Vec<String> {
+    let line = |agent: &str| {
         let played = || {
             results
                 .worlds()
@@ -161,36 +116,41 @@ fn got(results: &Results, aggregates: &[Aggregate]) -> Vec<String> {
         } else {
             format!(": {}", above.join(", "))
         };
-        lines.push(format!(
+        format!(
             "`{agent}` plays better than at random, in every seed by {ERRORS} standard errors of its episodes as trained, on {} of {} \
              games{which}.",
             above.len(),
             played().count()
-        ));
-    }
+        )
+    };
+    results.agents().into_iter().map(line).collect()
+}
+
+/// Scores over all games: an agent a row, a measure a column.
+fn scores(results: &Results, aggregates: &[Aggregate]) -> Table {
+    let mut measures: Vec<(&str, Kind)> = Vec::new();
     for it in aggregates {
-        let what = match it.measure {
-            "interquartile mean" => format!(
-                "Interquartile mean of normalised returns, {}, `{}`",
-                it.kind.name(),
-                it.agent
-            ),
-            _ => format!(
-                "Probability that `{}` is better than `{}`, {}",
-                it.agent,
-                baseline(results).unwrap_or_default(),
-                it.kind.name()
-            ),
-        };
-        lines.push(format!("{what}: {} ({} games).", it.estimate, it.games));
+        if !measures.contains(&(it.measure, it.kind)) {
+            measures.push((it.measure, it.kind));
+        }
     }
-    if !results.missing.is_empty() {
-        lines.push(format!(
-            "Missing, and in no number here: {}.",
-            results.missing.join(", ")
-        ));
+    let head = measures
+        .iter()
+        .map(|(measure, kind)| format!("{measure}, {}", kind.name()));
+    let row = |agent: &str| {
+        let cells = measures.iter().map(|&(measure, kind)| {
+            let mut here = aggregates
+                .iter()
+                .filter(|it| it.measure == measure && it.kind == kind);
+            let found = here.find(|it| it.agent == agent);
+            found.map_or("-".into(), |it| format!("{} ({})", it.estimate, it.games))
+        });
+        [format!("`{agent}`")].into_iter().chain(cells).collect()
+    };
+    Table {
+        header: ["agent".to_owned()].into_iter().chain(head).collect(),
+        rows: results.agents().into_iter().map(row).collect(),
     }
-    lines
 }
 
 /// Whether the episodes of each of the agent's seeds are better than the random policy's.
@@ -208,34 +168,8 @@ fn is_above_random(results: &Results, world: &str, agent: &str) -> bool {
     })
 }
 
-fn differences(results: &Results, share: f64) -> Vec<String> {
-    let mut lines = vec![
-        format!("The length: {}% of the paper's, and {} seeds instead of 3.", percent(share), results.settings.seeds),
-        "The published code bootstraps its 7-step returns from s_{t+1}, lets positives cross episode ends and leaves the 500 \
-         levels; ours does not, so its numbers are a reference and not what ours should become."
-            .into(),
-    ];
-    if results.settings.preset != "split" {
-        lines.push(
-            "Levels are sequential, as in the paper: an episode goes on through the levels that are completed, so a return \
-             can exceed a single level's, and returns as trained do not compare with those of an episode a level."
-                .into(),
-        );
-    }
-    let worlds = results.worlds();
-    match worlds.iter().filter(|world| world.starts_with("procgen:")).count() {
-        0 => lines.push("None of Procgen's games, but worlds that need no engine.".into()),
-        games if games < 16 => lines.push(format!(
-            "{games} of the sixteen games. `driml experiment procgen --screen` orders them by how soon C51 learns them; such a \
-             choice favours C51, as the return alone teaches quickly there."
-        )),
-        _ => {}
-    }
-    lines
-}
-
 /// Ours beside the paper's.
-fn table_1(results: &Results) -> Table {
+fn table_1(results: &Results, norm_scores: Option<Vec<String>>) -> Table {
     let agents = results.agents();
     let mut rows: Vec<Vec<String>> = Vec::new();
     for world in results.worlds() {
@@ -256,18 +190,8 @@ fn table_1(results: &Results) -> Table {
                 .collect(),
         );
     }
-    let mut caption = "Training return, mean of the last 100 episodes (of all, in a run that had fewer): mean ± standard deviation over \
-                       seeds; in brackets the \
-                       paper's (table 1; for driml-noact-k1 and -k5 its ablation) after 50 million frames."
-        .to_owned();
-    if let Some(row) = norm_scores(results) {
-        rows.push(row);
-        caption += " Norm. score: mean over these games of (return - worst agent's) / (best agent's - worst agent's), divided \
-                    by c51's; the paper does not define it, and this formula gives its row from its table. The paper's in \
-                    brackets is over the games and agents of this table.";
-    }
+    rows.extend(norm_scores);
     Table {
-        caption,
         header: ["game", "random"]
             .iter()
             .chain(&agents)
@@ -331,10 +255,6 @@ fn greedy(results: &Results) -> Table {
         "unseen levels, one an episode",
     ];
     Table {
-        caption: format!(
-            "Newest weights, {} episodes each: mean ± standard deviation over seeds.",
-            results.settings.episodes
-        ),
         header: header.map(String::from).to_vec(),
         rows,
     }
@@ -365,9 +285,6 @@ fn actions(results: &Results) -> Table {
     }
     let header = ["game", "mean k", "movement", "no-op", "special"];
     Table {
-        caption: "DRIML-ada: mean k over the whole run, and shares of its actions by what they amount to in the game. The learned \
-                  affinity starts uniform, where the mean k of 15 actions is 1.07, and takes some 1,500 updates to what the exact one \
-                  (`learner.affinity.estimator=exact`) has at once: that k rises until then says nothing of the agent.".into(),
         header: header.map(String::from).to_vec(),
         rows,
     }
@@ -376,6 +293,7 @@ fn actions(results: &Results) -> Table {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::template;
 
     #[test]
     fn the_page_says_which_returns_are_of_fewer_episodes() {
@@ -385,12 +303,19 @@ mod tests {
             mean_return_of: of,
             ..crate::made_up::summary()
         };
-        let said = |all: &[Summary]| said_of_resumed(&all.iter().collect::<Vec<_>>());
-        assert_eq!(said(&[summary(0, 500, 0)]), None, "never interrupted");
-        let good = said(&[summary(9, 500, 100), summary(9, 30, 30)]).unwrap();
-        assert!(good.starts_with("2 of 2 runs were interrupted"), "{good}");
+        let item = TEMPLATE
+            .split("\n* ")
+            .find(|it| it.starts_with("{if some_resumed}"));
+        let said = |all: &[Summary]| {
+            let mut values = Values::default();
+            resumed(&all.iter().collect::<Vec<_>>(), &mut values);
+            template::fill(&format!("* {}", item.unwrap()), &values)
+        };
+        assert_eq!(said(&[summary(0, 500, 0)]).trim(), "", "never interrupted");
+        let good = said(&[summary(9, 500, 100), summary(9, 30, 30)]);
+        assert!(good.starts_with("* 2 of 2 runs were interrupted"), "{good}");
         assert!(!good.contains("fewer than"), "{good}");
-        let old = said(&[summary(9, 500, 3), summary(9, 500, 100)]).unwrap();
+        let old = said(&[summary(9, 500, 3), summary(9, 500, 100)]);
         assert!(
             old.contains("training return of 1 of them is of fewer than the last 100"),
             "{old}"

@@ -12,6 +12,7 @@ use crate::{
     plot::{Run, over_seeds},
     session::Session,
     statistics::Spread,
+    template::Values,
 };
 
 /// Standard errors by which a mean return must exceed the random policy's: with sixteen games, 2 would be passed by luck.
@@ -190,57 +191,32 @@ fn page(results: &Results, screened: &[Screened]) -> Page {
         "random return",
         "greedy - random [standard errors]",
     ];
-    Page {
-        title: "On which games C51 learns soonest".into(),
-        claim: "None of the paper's: games are chosen here on which a short run can show something.".into(),
-        command: results.command.clone(),
-        expected: vec![
-            "Some games are above chance within the first thousand updates, those with dense rewards; most are not.".into(),
-        ],
-        got: vec![
-            format!("{above} of {} games stayed above chance to the end of {} frames.", screened.len(), settings.frames),
-            match by_greedy {
-                0 => format!("The soonest: `--games {}`.", chosen.join(",")),
-                _ => format!(
-                    "The first {CHOSEN} of the order below, {by_greedy} of them only by how surely the greedy policy beats the random one: \
-                     `--games {}`.",
-                    chosen.join(",")
-                ),
-            },
-            match &guessed[..] {
-                [] => "Each of these beats the random policy, in training or greedily.".into(),
-                guessed => format!(
-                    "Less than {GUESSED} standard errors apart from the random policy, so no more than a guess: {}.",
-                    guessed.join(", ")
-                ),
-            },
-        ],
-        tables: vec![Table {
-            caption: format!(
-                "Above random: the mean return of the last 100 training episodes exceeds the random policy's mean by {ERRORS} \
-                 standard errors, from that frame to the end, with at least {EPISODES_MIN} episodes seen. Those that never do \
-                 are ordered by the last column: newest weights, {} episodes, on the levels as trained.",
-                settings.episodes
-            ),
-            header: header.map(String::from).to_vec(),
-            rows: rows.collect(),
-        }],
-        differences: vec![
-            "The choice favours games on which the return alone teaches quickly, where an auxiliary loss has least to add; \
-             the page of the experiment says so beside its numbers."
-                .into(),
-        ],
-        setup: vec![format!(
-            "Agent {}, preset {}, {} frames, {} seed(s) a game.",
-            settings.agents.join(", "),
-            settings.preset,
-            settings.frames,
-            settings.seeds
-        )],
-        figures: vec![("screen".into(), "Training return of each game".into())],
-        data: vec![("screen".into(), "the table".into())],
-        smoke: results.smoke,
-    }
+    let table = Table {
+        header: header.map(String::from).to_vec(),
+        rows: rows.collect(),
+    };
+    let mut values = Values::default();
+    values
+        .set("above", above)
+        .set("games", screened.len())
+        .when("by_greedy", by_greedy > 0)
+        .set("greedy_count", by_greedy)
+        .set("chosen_count", CHOSEN)
+        .set("chosen", chosen.join(","))
+        .when("some_guessed", !guessed.is_empty())
+        .set("guessed", guessed.join(", "))
+        .set("guess_errors", GUESSED)
+        .set("table", table);
+    values
+        .set("errors", ERRORS)
+        .set("episodes_min", EPISODES_MIN)
+        .set("episodes", settings.episodes)
+        .set("agents", settings.agents.join(", "))
+        .set("preset", &settings.preset)
+        .set("frames", settings.frames)
+        .set("seeds", settings.seeds);
+    let template = include_str!("screen.md");
+    Page::new(template, values, &results.command, results.smoke)
 }
 
 #[cfg(test)]

@@ -18,6 +18,7 @@ use crate::{
     page::Page,
     session::Session,
     statistics::Spread,
+    template::Values,
 };
 
 const NAME: &str = "random-walk";
@@ -64,7 +65,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     session.figure("fig1", &figures::fig1(&results))?;
     session.figure("convergence", &figures::convergence(&results))?;
     let command = command_line(NAME, args, session.folder());
-    session.finish(&page(&results, command, args.smoke))
+    session.finish(&page(&results, &command, args.smoke))
 }
 
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
@@ -158,13 +159,12 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     session.csv("curves", &header, curves)
 }
 
-fn page(results: &Results, command: String, smoke: bool) -> Page {
+fn page(results: &Results, command: &str, smoke: bool) -> Page {
     let settings = &results.settings;
     let alpha = settings.figure_alpha;
     let chain = results.chain(alpha);
     let (t, rho) = (chain.transitions(), chain.stationary());
     let k = settings.states;
-    let at_figure = || results.of(Sampling::Stationary, alpha);
     let error = |one: &Trained| {
         let each = one.learnt.ratio.iter().enumerate();
         let each = each.map(|(at, ratio)| (ratio - t[at] / rho[at % k]).abs());
@@ -175,20 +175,40 @@ fn page(results: &Results, command: String, smoke: bool) -> Page {
     };
     let largest = (0..k * k).map(|at| t[at] / rho[at % k]).fold(0.0, f64::max);
     let spread = |values: &dyn Fn(&Trained) -> f64| {
-        Spread::of(at_figure().map(values)).map_or("none".to_owned(), |spread| spread.to_string())
+        let at_figure = results.of(Sampling::Stationary, alpha);
+        Spread::of(at_figure.map(values)).map_or("none".to_owned(), |spread| spread.to_string())
     };
-    let mut got = vec![
-        format!(
-            "Learnt against true ratio at alpha = {alpha} (b against a): mean absolute error {}, largest {}; the true \
-             entries are 0 to {largest:.2}.",
-            spread(&|one| error(one).0),
-            spread(&|one| error(one).1),
-        ),
-        format!(
-            "The law of the next state that follows from it is off by {} in total variation.",
-            spread(&|one| one.final_tv())
-        ),
-    ];
+    let mut values = Values::default();
+    values
+        .set("alpha", alpha)
+        .set("mean_error", spread(&|one| error(one).0))
+        .set("largest_error", spread(&|one| error(one).1))
+        .set("largest_ratio", format!("{largest:.2}"))
+        .set("final_tv", spread(&|one| one.final_tv()))
+        .items("convergence", convergence(results));
+    let holds = |measure| {
+        let found = results.gap_correlations(Sampling::Stationary, measure);
+        found.is_some_and(|spread| spread.mean > 0.5)
+    };
+    let (absolute, relative) = (holds(Measure::Tv), holds(Measure::Share));
+    values
+        .when("holds", absolute && relative)
+        .when("holds_in_absolute_error_only", absolute && !relative)
+        .when("fails", !absolute);
+    closed_forms(k, &mut values);
+    values
+        .set("rkhs", settings.rkhs)
+        .set("batch_rows", settings.batch_rows)
+        .set("lr", settings.adam.lr)
+        .set("updates", settings.updates)
+        .set("seeds", settings.seeds);
+    Page::new(include_str!("page.md"), values, command, smoke)
+}
+
+/// How long each sampling takes, by either measure.
+fn convergence(results: &Results) -> Vec<String> {
+    let settings = &results.settings;
+    let alpha = settings.figure_alpha;
     let time_at = |alpha: f64, sampling: Sampling, measure: Measure| {
         let times = results.of(sampling, alpha);
         let times = times.filter_map(|one| results.time(one, measure));
@@ -197,6 +217,7 @@ fn page(results: &Results, command: String, smoke: bool) -> Page {
     };
     let ends = [settings.alphas.first(), settings.alphas.last()];
     let [first, last] = ends.map(|end| end.copied().unwrap_or(alpha));
+    let mut lines = Vec::new();
     for (measure, what) in [
         (
             Measure::Tv,
@@ -219,7 +240,7 @@ fn page(results: &Results, command: String, smoke: bool) -> Page {
                 0 => String::new(),
                 late => format!(" ({late} trainings never got there)"),
             };
-            got.push(format!(
+            lines.push(format!(
                 "Updates until {what}, `{}`: {} at alpha = {first}, {} at {alpha}, {} at {last}{late}. Rank correlation \
                  over alpha with the inverse spectral gap: {}.",
                 sampling.name(),
@@ -232,111 +253,24 @@ fn page(results: &Results, command: String, smoke: bool) -> Page {
             ));
         }
     }
-    got.push(verdict(results));
-    Page {
-        title: "The transition ratio of a biased random walk (Fig. 1)".into(),
-        claim: "InfoNCE on successive states of a biased random walk learns the matrix T / rho; and it converges the \
-                faster the larger the spectral gap of T is, which is smallest near alpha = 0.5, where the walk is \
-                least predictable."
-            .into(),
-        command,
-        expected: vec![
-            "The learnt matrix looks like the true one: a band of two diagonals.".into(),
-            "Closed form and linear algebra agree for the mutual information and the gap (a test holds them to 1e-9)."
-                .into(),
-            "If the claim holds: a rank correlation near 1 between the inverse gap and the updates needed, also where \
-             the error is taken in proportion to what there is to learn."
-                .into(),
-        ],
-        got,
-        tables: Vec::new(),
-        differences: differences(&chain),
-        setup: vec![
-            format!(
-                "{k} states; Psi_4 and Phi_4 of the project's network on one-hot states (residual blocks, width {}); \
-                 InfoNCE over {} pairs, Adam at {}, {} updates; {} seeds.",
-                settings.rkhs, settings.batch_rows, settings.adam.lr, settings.updates, settings.seeds
-            ),
-            "`stationary`: independent pairs, the first state from rho. `from-one-end`: as many walkers as rows, all \
-             started in state 1, update t on their t-th step, as in the paper's proposition. `one-walker`: a single \
-             walker fills a replay from which batches are drawn, as in a run."
-                .into(),
-            "Errors are measured from the scores of all pairs of states, so they have no sampling noise: the total \
-             variation between true and learnt law of the next state, and the loss above its minimum with ever so many \
-             negatives, both in the mean over rho."
-                .into(),
-        ],
-        figures: vec![
-            (
-                "fig1".into(),
-                "The paper's four panels: true and learnt ratio, mutual information and inverse spectral gap".into(),
-            ),
-            (
-                "convergence".into(),
-                "How fast the ratio is learnt, against the spectral gap".into(),
-            ),
-        ],
-        data: vec![
-            ("alpha".into(), "panels c and d".into()),
-            ("ratio".into(), "panels a and b".into()),
-            ("convergence".into(), "one row a training".into()),
-            ("curves".into(), "errors on the way, stationary".into()),
-        ],
-        smoke,
-    }
-}
-
-/// What the correlations say of the claim.
-fn verdict(results: &Results) -> String {
-    let of = |measure| {
-        let found = results.gap_correlations(Sampling::Stationary, measure);
-        found.map_or(0.0, |spread| spread.mean)
-    };
-    let (absolute, relative) = (of(Measure::Tv), of(Measure::Share));
-    match (absolute > 0.5, relative > 0.5) {
-        (true, true) => "So the claim holds here: the smaller the gap, the slower, by either measure.".into(),
-        (true, false) => "So the claim holds in absolute error only, and for another reason than mixing: with a small gap \
-                          there is more to learn, and pairs drawn independently, which have nothing to mix, show the same. \
-                          In proportion to what there is to learn, a small gap does not make it slower."
-            .into(),
-        (false, _) => "So the claim does not hold here: a smaller gap does not make it slower.".into(),
-    }
+    lines
 }
 
 /// What follows from the closed forms alone, at any length of the experiment.
-fn differences(chain: &Chain) -> Vec<String> {
-    let at = |alpha: f64| Chain {
-        states: chain.states,
-        alpha,
-    };
+fn closed_forms(states: usize, values: &mut Values) {
+    let at = |alpha: f64| Chain { states, alpha };
     let (even, biased) = (at(0.5), at(0.9));
-    vec![
-        format!(
-            "The paper's Fig. 1c has the mutual information lowest near alpha = 0.5. For the chain it describes it is \
-             *highest* there: I = H(rho) - h(alpha) is {:.3} nats at 0.5 and {:.3} at 0.9, as a strong bias keeps the \
-             walk in a corner, where there is little left to tell. Lowest at 0.5 is the same walk without ends (a ring: ln K - \
-             h(alpha), {:.3} and {:.3} nats). The appendix's double sum, taken as printed, dips at 0.5 as well ({:.1}, {:.1} \
-             at 0.3), but is far above the {:.2} nats that {} states can hold, so it is no mutual information.",
-            even.mutual_information(),
-            biased.mutual_information(),
-            even.mutual_information_of_a_ring(),
-            biased.mutual_information_of_a_ring(),
-            even.mutual_information_as_printed(),
-            at(0.3).mutual_information_as_printed(),
-            (chain.states as f64).ln(),
-            chain.states,
-        ),
-        "So near alpha = 0.5 the gap is smallest *and* there is most to learn. Slower learning there is no evidence for \
-         mixing as its cause: `stationary` has nothing to mix and is the control."
-            .into(),
-        "The paper takes alpha = 0.499 as T were not invertible at 0.5. T's eigenvalues are 1 and 2 sqrt(alpha (1 - \
-         alpha)) cos(pi j / K): with an even number of states T is singular for every alpha, with an odd number for \
-         none. What fails at 0.5 is the formula for rho, 0 / 0. InfoNCE needs neither."
-            .into(),
-        "The heads are the project's own, residual blocks whose dot product is the score; the paper's have a hidden \
-         layer for the score as well. The number of states is not in the paper."
-            .into(),
-    ]
+    let nats = |value: f64| format!("{value:.3}");
+    let printed = |alpha: f64| format!("{:.1}", at(alpha).mutual_information_as_printed());
+    values
+        .set("mi_even", nats(even.mutual_information()))
+        .set("mi_biased", nats(biased.mutual_information()))
+        .set("ring_even", nats(even.mutual_information_of_a_ring()))
+        .set("ring_biased", nats(biased.mutual_information_of_a_ring()))
+        .set("printed_even", printed(0.5))
+        .set("printed_at_03", printed(0.3))
+        .set("most", format!("{:.2}", (states as f64).ln()))
+        .set("states", states);
 }
 
 #[cfg(test)]
