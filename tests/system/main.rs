@@ -19,6 +19,7 @@ mod local;
 mod lockstep;
 mod lost_batches;
 mod lost_chunks;
+mod pages;
 mod panics;
 mod parity;
 mod procgen;

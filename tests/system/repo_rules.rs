@@ -251,7 +251,7 @@ fn each_part_is_free_of_what_is_none_of_its_business() {
 }
 
 /// Every file of the repository that is not built, fetched or left by a run, with its path from the root.
-fn files() -> Vec<(String, PathBuf)> {
+pub(crate) fn files() -> Vec<(String, PathBuf)> {
     let mut files = Vec::new();
     let mut folders = vec![root()];
     while let Some(folder) = folders.pop() {
