@@ -5,19 +5,19 @@
 
 mod alone;
 mod assemble;
+mod candle_baseline;
 mod effort;
 mod env;
-mod figures;
 pub mod flags;
 mod launched;
 mod learner;
+mod measurements;
 mod peers;
 mod policy;
 mod recording;
 mod replay;
 mod scale;
 mod settings;
-mod stock;
 mod system;
 mod table;
 mod taking_part;
@@ -27,8 +27,8 @@ use driml_machine::device::ready_for;
 
 use crate::{
     effort::Effort,
-    figures::{Figure, MachineNote},
     flags::{BenchCommand, BenchFlags, BenchPart},
+    measurements::{MachineNote, Measurement},
 };
 
 /// Runs one bench and reports its figures.
@@ -44,7 +44,7 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
         } else {
             alone::figures(part, flags, device)?
         };
-        figures::report(part.name(), &figures, machine.computing_on(device), flags)
+        measurements::report(part.name(), &figures, machine.computing_on(device), flags)
     };
     match command {
         BenchCommand::Learner(args) => part(BenchPart::Learner, &args.flags, args.on.device),
@@ -52,14 +52,18 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
         BenchCommand::Replay(flags) => part(BenchPart::Replay, flags, DeviceName::Cpu),
         BenchCommand::Env(flags) => part(BenchPart::Env, flags, DeviceName::Cpu),
         BenchCommand::System(args) => {
-            figures::report("system", &system::measure(args)?, machine, &args.flags)
+            measurements::report("system", &system::measure(args)?, machine, &args.flags)
         }
         BenchCommand::Scale(args) => scale::run(args, machine),
         BenchCommand::Peers(args) => peers::run(args),
     }
 }
 
-fn measure(part: BenchPart, effort: &Effort, device: DeviceName) -> anyhow::Result<Vec<Figure>> {
+fn measure(
+    part: BenchPart,
+    effort: &Effort,
+    device: DeviceName,
+) -> anyhow::Result<Vec<Measurement>> {
     match part {
         BenchPart::Learner => learner::measure(effort, device),
         BenchPart::Policy => policy::measure(effort),

@@ -3,20 +3,20 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
-pub mod child;
 pub mod console;
-pub mod display;
 pub mod endpoint;
 pub mod evaluate;
 pub mod interrupts;
+pub mod launcher;
+pub mod live_view;
 pub mod lockstep;
+pub mod managed_process;
 pub mod meeting;
 pub mod panics;
-pub mod part_log;
 pub mod plan;
-pub mod processes;
+pub mod process_log;
 mod rates;
 pub mod resume;
 pub mod run_folder;
 pub mod shared_memory;
-pub mod statuses;
+pub mod status_client;

@@ -11,7 +11,7 @@ use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{LearnerStatus, ReplayStatus};
 
-use super::{columns::Columns, folder::RunFolder, resume_point::Behind, returns::Episodes};
+use super::{columns::Columns, folder::RunFolder, resume_point::ResumePoint, returns::Episodes};
 
 /// The pairs of the DIM losses, in the order of the status.
 pub const PAIRS: [&str; 4] = ["3t3", "3t4", "4t3", "4t4"];
@@ -115,7 +115,7 @@ impl Moment<'_> {
 pub(super) fn rows_up_to(
     path: &Path,
     header: Vec<String>,
-    behind: Behind,
+    behind: ResumePoint,
     frames_max: u64,
 ) -> anyhow::Result<Columns> {
     let reading = || format!("reading {}", path.display());

@@ -13,11 +13,11 @@ use driml_protocol::{LearnerStatus, ReplayStatus, RunSpec};
 use super::{
     columns::Columns,
     folder::RunFolder,
+    growing_csv::GrowingCsv,
     metrics::{Moment, header, rows_up_to},
-    resume_point::Behind,
+    resume_point::ResumePoint,
     returns::{Episodes, TrainingReturns},
     summary::{Outcome, Summary},
-    table::Table,
 };
 use crate::rates::Rates;
 
@@ -33,7 +33,7 @@ const fn none(header: Vec<String>) -> Columns {
 pub struct Recorder {
     /// Nobody else writes to the folder meanwhile.
     _lock: File,
-    behind: Behind,
+    behind: ResumePoint,
     /// Seconds, frames and episodes in the last row before the run was resumed.
     seconds_before: f64,
     frames_before: u64,
@@ -41,7 +41,7 @@ pub struct Recorder {
     /// Mean and standard deviation of k up to there.
     k_before: Option<(f64, f64)>,
     folder: RunFolder,
-    metrics: Table,
+    metrics: GrowingCsv,
     returns: TrainingReturns,
     processes: Vec<String>,
     rss_max: Vec<Option<f64>>,
@@ -66,7 +66,14 @@ impl Recorder {
         folder.write_config(config_toml)?;
         let rows = none(header(processes));
         let returns = TrainingReturns::create(folder)?;
-        Self::begin(folder, processes, lock, rows, returns, Behind::default())
+        Self::begin(
+            folder,
+            processes,
+            lock,
+            rows,
+            returns,
+            ResumePoint::default(),
+        )
     }
 
     /// Goes on to `frames_max` frames in the folder of an interrupted run, which has so much `behind` it: the rows of metrics up
@@ -78,7 +85,7 @@ impl Recorder {
         folder: &RunFolder,
         config_toml: &str,
         processes: &[String],
-        behind: Behind,
+        behind: ResumePoint,
         frames_max: u64,
     ) -> anyhow::Result<Self> {
         let lock = folder.lock()?;
@@ -99,7 +106,7 @@ impl Recorder {
         lock: File,
         rows: Columns,
         returns: TrainingReturns,
-        behind: Behind,
+        behind: ResumePoint,
     ) -> anyhow::Result<Self> {
         let mut this = Self {
             _lock: lock,
@@ -109,7 +116,7 @@ impl Recorder {
             episodes_before: rows.last("episodes").unwrap_or(0),
             k_before: rows.last("mean_k").zip(rows.last("sd_k")),
             folder: folder.clone(),
-            metrics: Table::create(&folder.metrics(), &rows.header, &rows.rows)?,
+            metrics: GrowingCsv::create(&folder.metrics(), &rows.header, &rows.rows)?,
             returns,
             processes: processes.to_vec(),
             rss_max: vec![None; processes.len()],
