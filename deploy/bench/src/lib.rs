@@ -1,5 +1,7 @@
 //! `driml bench`: how fast the parts are, alone and beside what others use for the same work.
-//! Nothing here passes or fails by its speed; a folder's file is one bench, and each figure says what it is of.
+//!
+//! A file is one bench, and gives `Measurement`s, each of which says what it is of; [`flags::BenchCommand`]
+//! lists them. `deploy/bench/peers/` has the same work in Python. Nothing here passes or fails by its speed.
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 

@@ -1,5 +1,22 @@
 //! Starting, watching and ending a run on this machine, and what it leaves in its folder.
-//! It draws nothing and compares no runs.
+//!
+//! Start with [`launcher::run`], which trains with one process for each part, or [`lockstep::run`], which does it in this
+//! process and in a fixed order. [`run_folder::RunFolder`] knows the names of a run's files:
+//!
+//! ```
+//! use driml_launch::run_folder::{RunFolder, Summary, progress};
+//!
+//! let folder = RunFolder::new("runs/chain-c51-seed1");
+//! assert!(folder.metrics().ends_with("chain-c51-seed1/metrics.csv"));
+//! if Summary::is_finished(&folder) {
+//!     println!("{}", Summary::read(&folder)?.describe(&folder));
+//! } else if let Some(so_far) = progress(&folder) {
+//!     println!("{} frames, {} episodes", so_far.frames, so_far.episodes);
+//! }
+//! # Ok::<(), anyhow::Error>(())
+//! ```
+//!
+//! It draws nothing and compares no runs: that is for `driml-experiments`.
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
