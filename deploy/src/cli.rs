@@ -16,7 +16,7 @@ use crate::commands::{
     presets::{self, PresetsArgs},
     procgen::{self, ProcgenCommand},
     replay_server::{self, ReplayServerArgs},
-    train::{self, LocalArgs},
+    train::{self, TrainArgs},
 };
 
 /// Deep Reinforcement and InfoMax Learning: actors, a replay server and a learner.
@@ -29,8 +29,9 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
+    #[command(visible_alias = "local")]
     /// Train on this machine: start all parts, show how it goes, leave a run folder
-    Local(LocalArgs),
+    Train(TrainArgs),
     /// One actor of a run whose replay server is reached at ENDPOINT
     Actor(ActorArgs),
     /// The replay server of a run; the other parts connect to it and take its settings
@@ -62,7 +63,7 @@ impl Command {
     /// Runs it.
     pub(crate) fn run(self) -> anyhow::Result<()> {
         match self {
-            Self::Local(args) => train::run(args),
+            Self::Train(args) => train::run(args),
             Self::Actor(args) => actor::run(args),
             Self::ReplayServer(args) => replay_server::run(args),
             Self::Learner(args) => learner::run(args),

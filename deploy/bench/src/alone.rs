@@ -4,12 +4,12 @@
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, ensure};
-use driml_launch::child;
+use driml_launch::managed_process;
 use driml_learner::DeviceName;
 
 use crate::{
-    figures::{Figure, Report},
     flags::{BenchFlags, BenchPart},
+    measurements::{Measurement, Report},
 };
 
 /// Runs this program again for one part's figures. Its progress goes to stderr.
@@ -20,7 +20,7 @@ pub(super) fn figures(
     part: BenchPart,
     flags: &BenchFlags,
     device: DeviceName,
-) -> anyhow::Result<Vec<Figure>> {
+) -> anyhow::Result<Vec<Measurement>> {
     let program = std::env::current_exe().context("finding this program's own file")?;
     let mut command = Command::new(program);
     command
@@ -33,7 +33,7 @@ pub(super) fn figures(
         })
         .stdin(Stdio::null())
         .stderr(Stdio::inherit());
-    child::suit_candle(&mut command, flags.threads);
+    managed_process::set_thread_env(&mut command, flags.threads);
     let doing = || format!("measuring the {}", part.name());
     let output = command.output().with_context(doing)?;
     ensure!(

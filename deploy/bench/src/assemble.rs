@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     effort::Effort,
-    figures::Figure,
+    measurements::Measurement,
     recording::Recording,
     settings::{self, AGENT, CAPACITY},
     taking_part::INCARNATION,
@@ -21,7 +21,7 @@ use crate::{
 ///
 /// # Errors
 /// A replay that does not store or sample.
-pub(super) fn measure(recording: &Recording, effort: &Effort) -> anyhow::Result<[Figure; 2]> {
+pub(super) fn measure(recording: &Recording, effort: &Effort) -> anyhow::Result<[Measurement; 2]> {
     let config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
     let (rows, frame_bytes) = (config.learner.batch_rows, recording.frame_bytes());
     let mut replay = Replay::new(&config.run, &config.replay, rows)?;
@@ -57,7 +57,7 @@ pub(super) fn measure(recording: &Recording, effort: &Effort) -> anyhow::Result<
         Ok::<_, anyhow::Error>(())
     })?;
     Ok([
-        Figure::found("batch of 3 states, without a wire", sampling, "batches/s"),
-        Figure::found("plain copy of a batch's bytes", copying, "batches/s"),
+        Measurement::found("batch of 3 states, without a wire", sampling, "batches/s"),
+        Measurement::found("plain copy of a batch's bytes", copying, "batches/s"),
     ])
 }

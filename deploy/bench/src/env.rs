@@ -6,7 +6,7 @@ use driml_launch::console;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{effort::Effort, figures::Figure, settings};
+use crate::{effort::Effort, measurements::Measurement, settings};
 
 const GAMES: [&str; 4] = ["bigfish", "coinrun", "maze", "starpilot"];
 /// Copies of the game.
@@ -20,7 +20,7 @@ const STEPS: usize = 64;
 ///
 /// # Errors
 /// An engine that cannot be had or fails.
-pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
+pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
     procgen_sys::Engine::install(&mut console::line)?;
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut figures = Vec::new();
@@ -42,7 +42,11 @@ pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
                 })
             })?;
             let name = format!("{game}, {ENVS} copies, {threads} engine threads");
-            figures.push(Figure::found(name, rate * (STEPS * ENVS) as f64, "steps/s"));
+            figures.push(Measurement::found(
+                name,
+                rate * (STEPS * ENVS) as f64,
+                "steps/s",
+            ));
         }
     }
     Ok(figures)

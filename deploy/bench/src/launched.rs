@@ -10,7 +10,7 @@ use anyhow::{Context, bail, ensure};
 use driml_launch::{
     endpoint::NAMESPACE,
     run_folder::{RunFolder, Summary},
-    statuses::Statuses,
+    status_client::Statuses,
 };
 use driml_protocol::{
     Keys, LearnerStatus, ReplayStatus,

@@ -6,7 +6,7 @@ use driml_settings::config::RunConfig;
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{effort::Effort, figures::Figure, settings, stock::StockLearner};
+use crate::{candle_baseline::CandleBaseline, effort::Effort, measurements::Measurement, settings};
 
 /// What is measured: its name, agent, preset and further settings.
 const CASES: [(&str, &str, &str, &[&str]); 4] = [
@@ -32,30 +32,30 @@ const GLOBAL_DIM: &str = "C51 + global-global DIM, 64x64x3";
 ///
 /// # Errors
 /// An update that failed.
-pub(super) fn measure(effort: &Effort, device: DeviceName) -> anyhow::Result<Vec<Figure>> {
+pub(super) fn measure(effort: &Effort, device: DeviceName) -> anyhow::Result<Vec<Measurement>> {
     let compute = device.open()?;
     let mut figures = Vec::new();
     for (name, agent, preset, sets) in CASES {
         let config = settings::of_run(settings::WORLD, agent, preset, sets)?;
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let rows = MadeUp::draw(&config, &mut rng);
+        let rows = SyntheticBatch::draw(&config, &mut rng);
         let batch = rows.batch();
         let (model, update) = (config.model.clone(), config.learner.update.clone());
         let mut learner = Agent::new(model, update, &compute, &mut rng)?;
         let rate = effort.rate_by_median(|| learner.update(&batch).map(drop))?;
-        figures.push(Figure::found(name, rate, "updates/s"));
+        figures.push(Measurement::found(name, rate, "updates/s"));
         if name == GLOBAL_DIM && device == DeviceName::Cpu {
-            let mut stock = StockLearner::new(&learner)?;
+            let mut stock = CandleBaseline::new(&learner)?;
             let rate = effort.rate_by_median(|| stock.update(&batch).map(drop))?;
             let name = format!("{name}, candle's stock operations");
-            figures.push(Figure::found(name, rate, "updates/s"));
+            figures.push(Measurement::found(name, rate, "updates/s"));
         }
     }
     Ok(figures)
 }
 
 /// A batch that no world gave.
-pub(super) struct MadeUp {
+pub(super) struct SyntheticBatch {
     frames: [Vec<u8>; 3],
     action: Vec<u8>,
     next_action: Vec<u8>,
@@ -64,7 +64,7 @@ pub(super) struct MadeUp {
     positive_valid: Vec<u8>,
 }
 
-impl MadeUp {
+impl SyntheticBatch {
     /// Random bytes, actions and returns, of the sizes that `config` has.
     pub(super) fn draw(config: &RunConfig, rng: &mut ChaCha8Rng) -> Self {
         let rows = config.learner.batch_rows as usize;

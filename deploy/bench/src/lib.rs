@@ -1,23 +1,25 @@
 //! `driml bench`: how fast the parts are, alone and beside what others use for the same work.
-//! Nothing here passes or fails by its speed; a folder's file is one bench, and each figure says what it is of.
+//!
+//! A file is one bench, and gives `Measurement`s, each of which says what it is of; [`flags::BenchCommand`]
+//! lists them. `deploy/bench/peers/` has the same work in Python. Nothing here passes or fails by its speed.
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 mod alone;
 mod assemble;
+mod candle_baseline;
 mod effort;
 mod env;
-mod figures;
 pub mod flags;
 mod launched;
 mod learner;
+mod measurements;
 mod peers;
 mod policy;
 mod recording;
 mod replay;
 mod scale;
 mod settings;
-mod stock;
 mod system;
 mod table;
 mod taking_part;
@@ -27,8 +29,8 @@ use driml_machine::device::ready_for;
 
 use crate::{
     effort::Effort,
-    figures::{Figure, MachineNote},
     flags::{BenchCommand, BenchFlags, BenchPart},
+    measurements::{MachineNote, Measurement},
 };
 
 /// Runs one bench and reports its figures.
@@ -44,7 +46,7 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
         } else {
             alone::figures(part, flags, device)?
         };
-        figures::report(part.name(), &figures, machine.computing_on(device), flags)
+        measurements::report(part.name(), &figures, machine.computing_on(device), flags)
     };
     match command {
         BenchCommand::Learner(args) => part(BenchPart::Learner, &args.flags, args.on.device),
@@ -52,14 +54,18 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
         BenchCommand::Replay(flags) => part(BenchPart::Replay, flags, DeviceName::Cpu),
         BenchCommand::Env(flags) => part(BenchPart::Env, flags, DeviceName::Cpu),
         BenchCommand::System(args) => {
-            figures::report("system", &system::measure(args)?, machine, &args.flags)
+            measurements::report("system", &system::measure(args)?, machine, &args.flags)
         }
         BenchCommand::Scale(args) => scale::run(args, machine),
         BenchCommand::Peers(args) => peers::run(args),
     }
 }
 
-fn measure(part: BenchPart, effort: &Effort, device: DeviceName) -> anyhow::Result<Vec<Figure>> {
+fn measure(
+    part: BenchPart,
+    effort: &Effort,
+    device: DeviceName,
+) -> anyhow::Result<Vec<Measurement>> {
     match part {
         BenchPart::Learner => learner::measure(effort, device),
         BenchPart::Policy => policy::measure(effort),

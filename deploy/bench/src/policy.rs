@@ -5,7 +5,7 @@ use driml_model::{Parameters, PolicyNetwork};
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{effort::Effort, figures::Figure, settings};
+use crate::{effort::Effort, measurements::Measurement, settings};
 
 /// Frames that are given to the policy at once.
 const BATCHES: [usize; 2] = [32, 256];
@@ -16,7 +16,7 @@ const PRESETS: [&str; 2] = ["paper", "paper-observation"];
 ///
 /// # Errors
 /// A network that failed.
-pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
+pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
     let mut figures = Vec::new();
     for preset in PRESETS {
         let model = settings::of_run(settings::WORLD, "c51", preset, &[])?.model;
@@ -29,7 +29,7 @@ pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
             let mut actions = vec![0; batch];
             let rate = effort.rate_by_median(|| policy.greedy_actions(&frames, &mut actions))?;
             let name = format!("{batch} frames of {}x{}x3", model.height, model.width);
-            figures.push(Figure::found(name, rate * batch as f64, "frames/s"));
+            figures.push(Measurement::found(name, rate * batch as f64, "frames/s"));
         }
     }
     Ok(figures)

@@ -10,9 +10,9 @@ use std::{
 use anyhow::{Context, bail, ensure};
 use driml_actor::{ActorSettings, Delivery, DeliveryLimits};
 use driml_launch::{
-    child::{Part, Surroundings},
     console::Screen,
     endpoint::NAMESPACE,
+    managed_process::{ManagedProcess, Surroundings},
 };
 use driml_learner::{
     LearnerPart,
@@ -25,7 +25,8 @@ use driml_protocol::{
 use zenoh::{Session, Wait};
 
 use crate::{
-    assemble, effort::Effort, figures::Figure, recording::Recording, settings, taking_part,
+    assemble, effort::Effort, measurements::Measurement, recording::Recording, settings,
+    taking_part,
 };
 
 /// Transitions of a chunk: streams and steps of each. An actor of 16 copies sends the last size.
@@ -37,7 +38,7 @@ const ANSWER_MAX: Duration = Duration::from_secs(30);
 ///
 /// # Errors
 /// An engine that cannot be had, a server that does not answer.
-pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
+pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
     let recording = Recording::play()?;
     let mut figures = Vec::new();
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
@@ -54,10 +55,10 @@ pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Figure>> {
             let transitions = chunk.0 * chunk.1;
             let rate = run.deliver(&recording, chunk, |_, started| effort.is_spent(started))?;
             let name = format!("insert, {transitions} transitions a chunk, {wire}");
-            figures.push(Figure::found(name, rate, "transitions/s"));
+            figures.push(Measurement::found(name, rate, "transitions/s"));
         }
         let (rate, name) = (run.fetch(effort)?, format!("batch of 3 states, {wire}"));
-        figures.push(Figure::found(name, rate, "batches/s"));
+        figures.push(Measurement::found(name, rate, "batches/s"));
         run.end();
     }
     figures.extend(assemble::measure(&recording, effort)?);
@@ -71,7 +72,7 @@ fn free_port() -> std::io::Result<std::net::SocketAddr> {
 
 /// A replay server and a client of its run.
 struct Run {
-    server: Part,
+    server: ManagedProcess,
     session: Session,
     keys: Keys,
     actor: ActorSettings,
@@ -96,7 +97,7 @@ impl Run {
             screen: &Screen::plain(),
             meeting: None,
         };
-        let mut server = Part::start("replay-server", &args, 1, surroundings)?;
+        let mut server = ManagedProcess::start("replay-server", &args, 1, surroundings)?;
         let session = reach(endpoint, &mut server)?;
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
         let hello = join::hello(&session, &keys, &Shutdown::default())?
@@ -198,7 +199,7 @@ impl Run {
 }
 
 /// A session to the server as soon as it listens.
-pub(super) fn reach(endpoint: &str, server: &mut Part) -> anyhow::Result<Session> {
+pub(super) fn reach(endpoint: &str, server: &mut ManagedProcess) -> anyhow::Result<Session> {
     let endpoints = Endpoints {
         listen: Vec::new(),
         connect: vec![endpoint.to_owned()],
@@ -208,7 +209,7 @@ pub(super) fn reach(endpoint: &str, server: &mut Part) -> anyhow::Result<Session
         match session::open(&endpoints) {
             Ok(session) => return Ok(session),
             Err(e) if Instant::now() > deadline => return Err(e.into()),
-            Err(_) if server.end().is_some() => bail!("{}", server.obituary()),
+            Err(_) if server.end().is_some() => bail!("{}", server.exit_report()),
             Err(e) => tracing::debug!("the replay server does not listen yet: {e}"),
         }
     }

@@ -7,9 +7,9 @@ use anyhow::bail;
 use driml_launch::console;
 
 use crate::{
-    figures::Figure,
     flags::BenchSystemArgs,
     launched::{Launched, Moment},
+    measurements::Measurement,
     settings,
 };
 
@@ -25,7 +25,7 @@ const AGENT: &str = "driml-ada";
 ///
 /// # Errors
 /// A run that failed, or was over before it could be looked at.
-pub(super) fn measure(args: &BenchSystemArgs) -> anyhow::Result<Vec<Figure>> {
+pub(super) fn measure(args: &BenchSystemArgs) -> anyhow::Result<Vec<Measurement>> {
     procgen_sys::Engine::install(&mut console::line)?;
     let config = settings::of_run(settings::WORLD, AGENT, "paper", &[])?;
     let frames = args.frames.unwrap_or(match args.flags.quick {
@@ -57,9 +57,9 @@ pub(super) fn measure(args: &BenchSystemArgs) -> anyhow::Result<Vec<Figure>> {
     let updates = rate(first.learner.updates, last.learner.updates);
     let stored = |moment: &Moment| moment.replay.transitions_inserted;
     let mut figures = vec![
-        Figure::found("updates", updates, "updates/s"),
-        Figure::found("frames", rate(stored(&first), stored(&last)), "frames/s"),
-        Figure::found(
+        Measurement::found("updates", updates, "updates/s"),
+        Measurement::found("frames", rate(stored(&first), stored(&last)), "frames/s"),
+        Measurement::found(
             "share of its time in which the learner computes",
             100.0 * computing / (computing + waiting),
             "%",
@@ -67,7 +67,7 @@ pub(super) fn measure(args: &BenchSystemArgs) -> anyhow::Result<Vec<Figure>> {
     ];
     figures.extend(summary.rss_mib_max.iter().filter_map(|(process, mib)| {
         let what = format!("memory of {process}");
-        Some(Figure::found(what, mib.as_f64()?, "MiB"))
+        Some(Measurement::found(what, mib.as_f64()?, "MiB"))
     }));
     Ok(figures)
 }

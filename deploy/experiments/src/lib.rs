@@ -1,8 +1,11 @@
-//! `driml experiment`: the paper's experiments, each a folder here, each leaving figures, data and a page.
-//! A new one is a folder with `run(flags)`, a command in `cli`, and settings beside its code.
+//! `driml experiment` and `driml plot`: the paper's experiments, each a folder here, each leaving figures, data and a page.
 //!
-//! An experiment is a grid of pieces (a setting and a seed, say). [`session::Session`] keeps each finished piece, so one that was
-//! stopped goes on where it was; [`page::Page`] is the README that it leaves.
+//! An experiment is a grid of pieces (a setting and a seed, say). `session::Session` keeps each finished piece, so that one
+//! that was stopped goes on where it was; pieces that are whole runs are made by `queue`. What it leaves is written by
+//! `page::Page` from the template `page.md` beside its settings.
+//!
+//! A new one is a folder with `run(args)`, a variant of [`flags::ExperimentCommand`], and beside its code `config.toml`,
+//! `smoke.toml` (the same in seconds) and `page.md`. Results that are kept are in `deploy/experiments/results/`.
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 

@@ -88,7 +88,7 @@ impl Progress {
     }
 
     /// How often a person has asked to stop.
-    pub(super) fn wishes(&self) -> u32 {
+    pub(super) fn interrupts(&self) -> u32 {
         self.interrupts.count()
     }
 

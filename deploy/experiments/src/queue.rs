@@ -14,10 +14,10 @@ use std::{
 
 use anyhow::Context;
 use driml_launch::{
-    child::exit_with_this_process,
+    managed_process::exit_with_this_process,
     resume,
     run_folder::{
-        Outcome, Progress as HowFar, RunFolder, Summary, progress as how_far, write_whole,
+        Outcome, Progress as RunProgress, RunFolder, Summary, progress as how_far, write_whole,
     },
 };
 use driml_machine::{
@@ -45,7 +45,7 @@ const LAST_WORDS_BYTES: u64 = 1200;
 
 /// A run to be made.
 #[derive(Clone, Debug)]
-pub(super) struct Plan {
+pub(super) struct PlannedRun {
     /// Its folder's name.
     pub(super) name: String,
     /// What follows `driml local`.
@@ -60,7 +60,7 @@ pub(super) struct Plan {
 
 /// A finished run.
 #[derive(Clone, Debug)]
-pub(super) struct Ran {
+pub(super) struct FinishedRun {
     pub(super) folder: RunFolder,
     pub(super) summary: Summary,
 }
@@ -72,10 +72,10 @@ pub(super) struct Ran {
 /// An interrupt, after the running ones were stopped; settings that cannot work; a file system that refuses.
 pub(super) fn run_all(
     session: &mut Session,
-    plans: &[Plan],
+    plans: &[PlannedRun],
     jobs: u32,
     report: bool,
-) -> anyhow::Result<Vec<Option<Ran>>> {
+) -> anyhow::Result<Vec<Option<FinishedRun>>> {
     let (folder, progress) = session.work();
     let root = folder.join(RUNS);
     fs::create_dir_all(&root).with_context(|| format!("making {}", root.display()))?;
@@ -121,13 +121,13 @@ struct Queue {
     /// Runs at once.
     jobs: u32,
     /// How often each was tried, and its plan.
-    waiting: VecDeque<(u32, Plan)>,
+    waiting: VecDeque<(u32, PlannedRun)>,
     running: Vec<Running>,
 }
 
 /// A child and how far it is.
 struct Running {
-    plan: Plan,
+    plan: PlannedRun,
     /// Which try this is, from 1.
     tried: u32,
     resumed: bool,
@@ -140,7 +140,7 @@ struct Running {
 
 impl Queue {
     /// The plan's run, if it is there, was made by this plan, and is whole and long enough.
-    fn finished(&self, plan: &Plan) -> Option<Ran> {
+    fn finished(&self, plan: &PlannedRun) -> Option<FinishedRun> {
         if !self.is_made_by(plan) {
             return None;
         }
@@ -153,11 +153,11 @@ impl Queue {
             Outcome::Interrupted => enough,
             Outcome::Failed => false,
         };
-        good.then_some(Ran { folder, summary })
+        good.then_some(FinishedRun { folder, summary })
     }
 
     /// Whether what lies in the plan's folder was begun by this very plan.
-    fn is_made_by(&self, plan: &Plan) -> bool {
+    fn is_made_by(&self, plan: &PlannedRun) -> bool {
         let call = fs::read(self.call(plan)).ok();
         let call = call.and_then(|text| serde_json::from_slice::<Vec<String>>(&text).ok());
         call.is_some_and(|args| args == plan.args)
@@ -194,7 +194,7 @@ impl Queue {
             let running = &mut self.running[at];
             let plan = &running.plan;
             let folder = RunFolder::new(self.root.join(&plan.name));
-            let HowFar { frames, episodes } = how_far(&folder).unwrap_or_default();
+            let RunProgress { frames, episodes } = how_far(&folder).unwrap_or_default();
             let share = |part: u64, all: u64| part as f64 / all.max(1) as f64;
             let share = plan
                 .episodes
@@ -247,21 +247,26 @@ impl Queue {
         Ok(())
     }
 
-    fn folder(&self, plan: &Plan) -> RunFolder {
+    fn folder(&self, plan: &PlannedRun) -> RunFolder {
         RunFolder::new(self.root.join(&plan.name))
     }
 
     /// Where the arguments are that a run was made with.
-    fn call(&self, plan: &Plan) -> PathBuf {
+    fn call(&self, plan: &PlannedRun) -> PathBuf {
         self.root.join(format!("{}.call.json", plan.name))
     }
 
-    fn log(&self, plan: &Plan) -> PathBuf {
+    fn log(&self, plan: &PlannedRun) -> PathBuf {
         self.root.join(format!("{}.log", plan.name))
     }
 
     /// Starts a run in a process group of its own, so that Ctrl-C reaches it through us alone.
-    fn start(&self, plan: Plan, tried: u32, progress: &mut Progress) -> anyhow::Result<Running> {
+    fn start(
+        &self,
+        plan: PlannedRun,
+        tried: u32,
+        progress: &mut Progress,
+    ) -> anyhow::Result<Running> {
         let path = self.log(&plan);
         let doing = || format!("making {}", path.display());
         let log = File::options()
@@ -272,7 +277,7 @@ impl Queue {
         self.wait_for_the_last(&log, &plan, progress)?;
         log.set_len(0).with_context(doing)?;
         let folder = self.folder(&plan).path().to_owned();
-        let resumed = folder.exists() && self.can_go_on(&plan, tried, progress)?;
+        let resumed = folder.exists() && self.is_resumable(&plan, tried, progress)?;
         if !resumed && let Some(aside) = move_aside(&folder)? {
             progress.line(&format!(
                 "{} was not finished, or is of another call: it is now {}, and the run starts anew",
@@ -309,7 +314,12 @@ impl Queue {
     }
 
     /// Whether what lies in the plan's folder goes on: at the first try alone, as its checkpoint may be what fails.
-    fn can_go_on(&self, plan: &Plan, tried: u32, progress: &mut Progress) -> anyhow::Result<bool> {
+    fn is_resumable(
+        &self,
+        plan: &PlannedRun,
+        tried: u32,
+        progress: &mut Progress,
+    ) -> anyhow::Result<bool> {
         let folder = self.folder(plan);
         resume::wait_until_free(&folder)?;
         if tried > 1 || !self.is_made_by(plan) {
@@ -341,7 +351,7 @@ impl Queue {
     fn wait_for_the_last(
         &self,
         log: &File,
-        plan: &Plan,
+        plan: &PlannedRun,
         progress: &mut Progress,
     ) -> anyhow::Result<()> {
         let mut said = false;
@@ -375,10 +385,10 @@ impl Queue {
         for running in &self.running {
             signal(&running.child, Signal::SIGTERM);
         }
-        let wishes = progress.wishes().max(1);
+        let interrupts = progress.interrupts().max(1);
         let deadline = Instant::now() + DRAIN_MAX;
         while !self.running.is_empty() {
-            if progress.wishes() > wishes || Instant::now() > deadline {
+            if progress.interrupts() > interrupts || Instant::now() > deadline {
                 for running in &mut self.running {
                     // It may have ended by itself in this moment.
                     let _ = running.child.kill();
@@ -448,7 +458,7 @@ mod tests {
             waiting: VecDeque::new(),
             running: Vec::new(),
         };
-        let plan = |frames: u64| Plan {
+        let plan = |frames: u64| PlannedRun {
             name: "run".into(),
             args: vec!["--frames".into(), frames.to_string()],
             frames,

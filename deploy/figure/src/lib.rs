@@ -1,5 +1,31 @@
 //! Figures: charts, heat maps and lattices on a light card, written as SVG or PNG from one description.
-//! It knows no run and no experiment, and needs no font, browser or library of the machine.
+//!
+//! Start with [`Figure`]: a title, notes, and panels in a grid, each a [`Chart`], a [`Heat`] map or a [`Lattice`]. The same
+//! figure gives the same bytes on every machine, as the font comes along. It knows no run and no experiment.
+//!
+//! ```
+//! use driml_figure::{Axis, Chart, Figure, Panel, Series};
+//!
+//! let curve = Series::line("driml-ada", 0, vec![(0.0, 1.0), (50_000.0, 4.5), (100_000.0, 9.0)]);
+//! let chart = Chart::new(
+//!     "coinrun",
+//!     Axis::linear("frames"),
+//!     Axis::linear("mean return"),
+//!     vec![curve],
+//! );
+//! let figure = Figure {
+//!     title: "Training return".into(),
+//!     notes: vec!["Mean of the last 100 episodes.".into()],
+//!     columns: 1,
+//!     panel_size: (430.0, 330.0),
+//!     panels: vec![Panel::Chart(chart)],
+//! };
+//! let folder = tempfile::tempdir()?;
+//! let path = folder.path().join("returns.svg");
+//! figure.save(&path)?;
+//! assert!(std::fs::read_to_string(&path)?.starts_with("<svg "));
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 

@@ -1,22 +1,39 @@
 //! Starting, watching and ending a run on this machine, and what it leaves in its folder.
-//! It draws nothing and compares no runs.
+//!
+//! Start with [`launcher::run`], which trains with one process for each part, or [`lockstep::run`], which does it in this
+//! process and in a fixed order. [`run_folder::RunFolder`] knows the names of a run's files:
+//!
+//! ```
+//! use driml_launch::run_folder::{RunFolder, Summary, progress};
+//!
+//! let folder = RunFolder::new("runs/chain-c51-seed1");
+//! assert!(folder.metrics().ends_with("chain-c51-seed1/metrics.csv"));
+//! if Summary::is_finished(&folder) {
+//!     println!("{}", Summary::read(&folder)?.describe(&folder));
+//! } else if let Some(so_far) = progress(&folder) {
+//!     println!("{} frames, {} episodes", so_far.frames, so_far.episodes);
+//! }
+//! # Ok::<(), anyhow::Error>(())
+//! ```
+//!
+//! It draws nothing and compares no runs: that is for `driml-experiments`.
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
-pub mod child;
 pub mod console;
-pub mod display;
 pub mod endpoint;
 pub mod evaluate;
 pub mod interrupts;
+pub mod launcher;
+pub mod live_view;
 pub mod lockstep;
+pub mod managed_process;
 pub mod meeting;
 pub mod panics;
-pub mod part_log;
 pub mod plan;
-pub mod processes;
+pub mod process_log;
 mod rates;
 pub mod resume;
 pub mod run_folder;
 pub mod shared_memory;
-pub mod statuses;
+pub mod status_client;

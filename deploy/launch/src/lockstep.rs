@@ -13,8 +13,8 @@ use driml_settings::config::RunConfig;
 
 use crate::{
     console::{self, Screen, print},
-    display::{Display, TEMPLATE},
-    run_folder::{Behind, Outcome, Recorder, RunFolder},
+    live_view::{Display, TEMPLATE},
+    run_folder::{Outcome, Recorder, ResumePoint, RunFolder},
 };
 
 /// How often progress is shown and recorded.
@@ -41,12 +41,12 @@ pub fn run(
         &[],
     )?;
     let screen = Screen::new(config.frames(), TEMPLATE);
-    let mut parts = Parts::new(config)?;
+    let mut parts = Lockstep::new(config)?;
     let mut display = Display::new(
         screen.clone(),
         config.frames(),
         config.updates(),
-        Behind::default(),
+        ResumePoint::default(),
     );
     let mut shown = Instant::now();
     let folder = run_dir.checkpoints();
@@ -90,7 +90,7 @@ pub fn run(
 }
 
 /// The parts, hand in hand.
-struct Parts {
+struct Lockstep {
     actors: Vec<Collector>,
     next_actor: usize,
     replay: Replay,
@@ -102,7 +102,7 @@ struct Parts {
     published: u64,
 }
 
-impl Parts {
+impl Lockstep {
     fn new(config: &RunConfig) -> anyhow::Result<Self> {
         let text = config.to_toml();
         let settings = ActorSettings::from_toml(&text)?;

@@ -8,7 +8,7 @@ use driml_machine::{resources::Machine, units::duration};
 use driml_model::ModelConfig;
 use driml_settings::config::{COMPRESSED_FIELDS_BYTES, RunConfig, replay_bytes_each};
 
-use crate::run_folder::{Behind, RunFolder};
+use crate::run_folder::{ResumePoint, RunFolder};
 
 /// Arithmetic that a core sustains over a whole run, learner and actors together, in GFLOP/s.
 ///
@@ -97,7 +97,7 @@ pub fn describe(
     from: &str,
     run_dir: &RunFolder,
     lockstep: bool,
-    behind: Behind,
+    behind: ResumePoint,
     machine: &Machine,
 ) -> String {
     let RunConfig {
@@ -223,7 +223,7 @@ mod tests {
             "preset paper",
             &RunFolder::new("runs/x"),
             false,
-            Behind::default(),
+            ResumePoint::default(),
             &MACHINE,
         );
         // The time depends on a measured constant.

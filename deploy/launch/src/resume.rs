@@ -11,7 +11,7 @@ use driml_settings::config::{Flags, RunConfig, Source, resolve};
 
 use crate::{
     console,
-    run_folder::{Behind, RunFolder, Summary},
+    run_folder::{ResumePoint, RunFolder, Summary},
 };
 
 /// How long the learner of a launcher that was killed may take to save.
@@ -19,7 +19,7 @@ const SAVING_MAX: Duration = Duration::from_secs(120);
 
 /// Whether the run in `folder`, which is in this world, can be resumed: it has a checkpoint, which holds nothing of a world's own
 /// progress.
-pub fn can_go_on(world: &WorldConfig, folder: &RunFolder) -> bool {
+pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
     let saved = checkpoint::list(&folder.checkpoints());
     world.is_resumable() && saved.is_ok_and(|all| !all.is_empty())
 }
@@ -61,7 +61,7 @@ pub fn find(
     folder: &RunFolder,
     flags: &Flags,
     machine: &Machine,
-) -> anyhow::Result<(RunConfig, Behind)> {
+) -> anyhow::Result<(RunConfig, ResumePoint)> {
     let path = folder.config();
     let name = path.display().to_string();
     let text = std::fs::read_to_string(&path).map_err(|e| {
@@ -102,10 +102,10 @@ pub fn find(
         .into());
     }
     if updates == 0 {
-        return Ok((config, Behind::default()));
+        return Ok((config, ResumePoint::default()));
     }
     let rows = updates as f64 * f64::from(config.learner.batch_rows);
     let frames =
         config.replay.warmup_transitions + (rows / config.replay.replay_ratio).ceil() as u64;
-    Ok((config, Behind { updates, frames }))
+    Ok((config, ResumePoint { updates, frames }))
 }

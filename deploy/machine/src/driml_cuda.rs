@@ -60,7 +60,7 @@ pub(crate) fn hand_over() -> anyhow::Error {
 ///
 /// # Errors
 /// The system does not say where this program's own file is.
-pub fn program() -> anyhow::Result<PathBuf> {
+pub(crate) fn program() -> anyhow::Result<PathBuf> {
     match env::var_os(PROGRAM).filter(|it| !it.is_empty()) {
         // Absolute: a bare name would be looked for on the PATH.
         Some(program) => path::absolute(PathBuf::from(program)).context(PROGRAM),
@@ -90,7 +90,7 @@ fn ready(program: &Path, args: impl IntoIterator<Item = OsString>) -> anyhow::Re
 }
 
 /// `program`, with the folders that may hold CUDA's libraries before all others that the loader searches.
-pub fn command(program: &Path) -> Command {
+pub(crate) fn command(program: &Path) -> Command {
     let mut command = Command::new(program);
     let known = env::var_os("LD_LIBRARY_PATH").unwrap_or_default();
     if let Some(path) = library_path(&library_folders(), &known) {
@@ -124,7 +124,7 @@ pub(crate) fn missing_libraries(program: &Path) -> anyhow::Result<Vec<String>> {
 ///
 /// # Errors
 /// It cannot be started, or has not ended after [`ANSWER_MAX`]; then it is killed.
-pub fn answer(mut command: Command) -> anyhow::Result<Output> {
+pub(crate) fn answer(mut command: Command) -> anyhow::Result<Output> {
     // Files and not pipes: nobody has to read while it runs.
     let (stdout, stderr) = (tempfile::tempfile()?, tempfile::tempfile()?);
     let mut child = command
@@ -187,7 +187,7 @@ fn lacking(program: &Path, missing: &[String]) -> Usage {
 }
 
 /// Where a library comes from, and what to do to have it.
-pub fn origin(library: &str) -> &'static str {
+pub(crate) fn origin(library: &str) -> &'static str {
     let starts = |names: &[&str]| names.iter().any(|name| library.starts_with(name));
     if starts(&["libcuda.so", "libnvidia-"]) {
         "comes with NVIDIA's driver: install it, or give the container its GPU (docker run --gpus all)"

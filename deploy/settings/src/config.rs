@@ -231,10 +231,10 @@ fn fit_memory(
     }
     Override::parse(&format!("replay.capacity_transitions={capacity}"))?.apply(table)?;
     // A replay that holds the whole run anyway is as good as a larger one.
-    let matters = replay
+    let is_smaller_than_the_run = replay
         .transitions_max
         .is_none_or(|frames| frames > capacity);
-    Ok(matters.then(|| {
+    Ok(is_smaller_than_the_run.then(|| {
         format!(
             "the replay holds the newest {capacity} transitions instead of {asked}: {free} of memory are free, and it takes half, or what actors and learner leave"
         )
@@ -272,8 +272,9 @@ fn fit_compressed(
         None => {
             Override::parse(&format!("replay.compressed_bytes_max={bytes}"))?.apply(table)?;
             let run_frames = replay.transitions_max.unwrap_or(u64::MAX);
-            let matters = run_frames.saturating_mul(run.frame_bytes() as u64) > bytes;
-            Ok(matters.then(|| {
+            let is_smaller_than_the_run =
+                run_frames.saturating_mul(run.frame_bytes() as u64) > bytes;
+            Ok(is_smaller_than_the_run.then(|| {
                 format!(
                     "compressed frames may take {}, as {free} of memory are free; if they compress badly, the replay holds fewer than {asked} transitions",
                     gib(bytes)

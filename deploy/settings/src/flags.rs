@@ -51,7 +51,7 @@ pub struct RunFlags {
     pub seed: Option<u64>,
     /// For studies alone: train with a known fault of the paper's published code
     #[arg(long, value_name = "FAULT", value_enum)]
-    pub study: Option<Fault>,
+    pub study: Option<ReproducedBug>,
     /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
@@ -59,7 +59,7 @@ pub struct RunFlags {
 
 /// A known fault of the paper's published code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum Fault {
+pub enum ReproducedBug {
     /// n-step returns that bootstrap from s_{t+1}, with the end of an episode seen at step t alone
     BootstrapFromNextState,
 }
@@ -104,7 +104,7 @@ pub fn flags(args: &RunFlags) -> Flags {
         replay_shards: args.replay_shards,
         seed: args.seed,
         study: args.study.map(|fault| match fault {
-            Fault::BootstrapFromNextState => Study::BootstrapFromNextState,
+            ReproducedBug::BootstrapFromNextState => Study::BootstrapFromNextState,
         }),
         sets: args.sets.clone(),
     }

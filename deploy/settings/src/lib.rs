@@ -1,5 +1,27 @@
-//! The settings of a run: presets in layers, flags over them, what the machine decides, what follows from the rest.
-//! It starts nothing and writes no file.
+//! The settings of a run: presets in layers, flags over them, what the machine decides, and what follows from the rest.
+//!
+//! Start with [`config::resolve`], which makes a [`config::RunConfig`] of a [`config::Source`] and [`config::Flags`]; the
+//! commands that start a run do so through [`flags::resolve`]. `presets/*.toml` has every number, each with its source.
+//!
+//! ```
+//! use driml_machine::resources::Machine;
+//! use driml_settings::{
+//!     config::{Flags, Source, resolve},
+//!     presets,
+//! };
+//!
+//! let world = presets::world("bigfish")?;
+//! let source = Source::Layers(presets::preset("paper")?, world, "driml-ada");
+//! let flags = Flags {
+//!     frames: Some(200_000),
+//!     sets: vec!["learner.update.adam.lr=1e-4".into()],
+//!     ..Flags::default()
+//! };
+//! let config = resolve(&source, &flags, &Machine::this())?;
+//! assert_eq!(config.run.world, "procgen:bigfish");
+//! assert_eq!(config.frames(), 200_000);
+//! # Ok::<(), driml_machine::error::Usage>(())
+//! ```
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 

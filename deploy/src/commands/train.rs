@@ -1,5 +1,5 @@
 //! `driml local`: settings, plan, engine, run folder, and then the processes, as processes or in lockstep.
-//! Starting and ending processes is for `processes`.
+//! Starting and ending them is for `driml_launch::launcher`.
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use clap::Args;
 use driml_launch::{
     console::{self, print},
     endpoint::check_endpoints,
-    lockstep, plan, processes, resume,
+    launcher, lockstep, plan, resume,
     run_folder::RunFolder,
 };
 use driml_learner::DeviceName;
@@ -38,7 +38,7 @@ const RESUMED: [&str; 11] = [
 ];
 
 #[derive(Debug, Args)]
-pub(crate) struct LocalArgs {
+pub(crate) struct TrainArgs {
     #[command(flatten)]
     pub(crate) run: RunFlags,
     /// Where settings, metrics, checkpoints, logs and summary go [default: runs/WORLD-AGENT-seedS-TIME]
@@ -66,7 +66,7 @@ pub(crate) struct LocalArgs {
 ///
 /// # Errors
 /// Settings that cannot work, a run folder in use, an engine that cannot be had, a part that failed, an interrupt.
-pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
+pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let machine = Machine::this();
     if let Some(device) = args.device {
         args.run.sets.push(format!("local.learner_device={device}"));
@@ -120,7 +120,7 @@ pub(crate) fn run(mut args: LocalArgs) -> anyhow::Result<()> {
         }
         lockstep::run(&config, &run_dir, args.exit_with_parent)
     } else {
-        processes::run(
+        launcher::run(
             &config,
             &run_dir,
             behind,

@@ -14,8 +14,8 @@ use serde::{Deserialize, Serialize};
 use crate::{
     alone,
     effort::median,
-    figures::{self, Figure, MachineNote},
     flags::{BenchPart, BenchPeersArgs},
+    measurements::{self, MachineNote, Measurement},
     peers::{
         pairs::{PAIRS, Pair, Theirs},
         script::{Absent, Script},
@@ -135,7 +135,7 @@ pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
         machine,
         rows: rows.collect::<anyhow::Result<_>>()?,
     };
-    figures::publish(
+    measurements::publish(
         &comparison,
         &describe(&comparison),
         args.flags.json.as_deref(),
@@ -143,8 +143,8 @@ pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
 }
 
 impl Sides {
-    fn add_ours(&mut self, figures: Vec<Figure>) {
-        for Figure { what, value, unit } in figures {
+    fn add_ours(&mut self, figures: Vec<Measurement>) {
+        for Measurement { what, value, unit } in figures {
             self.units.insert(what.clone(), unit);
             self.ours.entry(what).or_default().push(value);
         }

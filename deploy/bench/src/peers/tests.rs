@@ -4,8 +4,8 @@ use expect_test::expect;
 
 use super::*;
 
-fn figure(what: &str, value: f64) -> Figure {
-    Figure::found(what, value, "updates/s")
+fn figure(what: &str, value: f64) -> Measurement {
+    Measurement::found(what, value, "updates/s")
 }
 
 fn samples(of: &[(&str, &[f64])]) -> Samples {

@@ -2,7 +2,7 @@
 
 use driml_launch::console;
 
-use crate::{figures::Figure, flags::BenchScaleArgs, table};
+use crate::{flags::BenchScaleArgs, measurements::Measurement, table};
 
 /// One case's table, and its figures as JSON has them.
 pub(super) struct Table {
@@ -10,7 +10,7 @@ pub(super) struct Table {
     pub(super) rows: Vec<Vec<String>>,
     /// What is to be said below it.
     pub(super) notes: String,
-    pub(super) figures: Vec<Figure>,
+    pub(super) figures: Vec<Measurement>,
 }
 
 impl Table {
@@ -37,7 +37,7 @@ impl Table {
         let heads = &self.heads[known_by.len()..];
         for (head, value) in heads.iter().zip(values) {
             let Some(value) = *value else { continue };
-            self.figures.push(Figure {
+            self.figures.push(Measurement {
                 what: format!("{case}, {}: {head}", known_by.join(", ")),
                 value,
                 unit: head.clone(),

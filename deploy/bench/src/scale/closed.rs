@@ -3,7 +3,7 @@
 
 use std::{sync::atomic::AtomicU64, thread, time::Duration};
 
-use driml_launch::statuses::Statuses;
+use driml_launch::status_client::Statuses;
 use driml_protocol::{Quantiles, Shutdown};
 
 use super::{

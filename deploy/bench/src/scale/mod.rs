@@ -10,8 +10,8 @@ mod servers;
 mod synthetic;
 
 use crate::{
-    figures::{self, MachineNote},
     flags::{BenchScaleArgs, ScaleCase},
+    measurements::{self, MachineNote},
 };
 
 /// Measures the cases that are asked for, all if none is, and reports.
@@ -33,5 +33,5 @@ pub(super) fn run(args: &BenchScaleArgs, machine: MachineNote) -> anyhow::Result
         text.push_str(&format!("{title}\n{}\n", table.text()));
         figures.extend(table.figures);
     }
-    figures::report_as("scale", &figures, &text, machine, &args.flags)
+    measurements::report_as("scale", &figures, &text, machine, &args.flags)
 }

@@ -10,10 +10,10 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_launch::{
-    child::{Part, Surroundings},
     console::Screen,
     endpoint::NAMESPACE,
-    statuses::Statuses,
+    managed_process::{ManagedProcess, Surroundings},
+    status_client::Statuses,
 };
 use driml_protocol::{
     Keys, ReplayStatus,
@@ -48,7 +48,7 @@ pub(super) struct Watched {
 
 /// The replay servers that are measured.
 pub(super) struct Servers {
-    parts: Vec<Part>,
+    parts: Vec<ManagedProcess>,
     endpoints: Vec<String>,
     pub(super) keys: Keys,
 }
@@ -82,7 +82,7 @@ impl Servers {
                 screen: &Screen::plain(),
                 meeting: None,
             };
-            let mut part = Part::start(&name, &args, 1, surroundings)?;
+            let mut part = ManagedProcess::start(&name, &args, 1, surroundings)?;
             let session = reach(&endpoint, &mut part)?;
             if let Err(e) = session.close().wait() {
                 tracing::debug!("closing a session: {e}");
@@ -129,7 +129,7 @@ impl Servers {
         thread::sleep(Duration::from_secs_f64(seconds));
         let (ended, stored_after, served_after, busy_after) = moment(self)?;
         let elapsed = (ended - started).as_secs_f64();
-        let memory = self.parts.iter_mut().map(Part::rss_mib);
+        let memory = self.parts.iter_mut().map(ManagedProcess::rss_mib);
         Ok(Watched {
             stored: (stored_after - stored) as f64 / elapsed,
             batches: (served_after - served) as f64 / elapsed,
@@ -145,7 +145,7 @@ impl Servers {
         let mut ticks = 0;
         for part in &mut self.parts {
             if part.end().is_some() {
-                bail!("{}", part.obituary());
+                bail!("{}", part.exit_report());
             }
             let path = format!("/proc/{}/stat", part.pid());
             let stat = std::fs::read_to_string(&path).with_context(|| format!("reading {path}"))?;

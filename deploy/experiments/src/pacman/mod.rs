@@ -15,7 +15,7 @@ use self::{
 };
 use crate::{
     flags::{PacmanArgs, command_line},
-    queue::{self, Plan},
+    queue::{self, PlannedRun},
     session::Session,
 };
 
@@ -29,7 +29,7 @@ pub(super) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let units = plans.iter().map(|(_, _, plan)| plan.units).sum();
     let report_only = args.queue.report;
     let mut session = Session::open_queue(NAME, &args.flags, &settings, units, report_only)?;
-    let runs: Vec<Plan> = plans.iter().map(|(_, _, plan)| plan.clone()).collect();
+    let runs: Vec<PlannedRun> = plans.iter().map(|(_, _, plan)| plan.clone()).collect();
     let ran = queue::run_all(&mut session, &runs, settings.jobs, report_only)?;
     let mut results = Results {
         command: command(args, &session),

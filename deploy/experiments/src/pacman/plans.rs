@@ -1,7 +1,7 @@
 //! The runs of Fig. 3: what each is for, and its command line.
 
 use super::settings::{Continual, Predictability, Settings};
-use crate::queue::Plan;
+use crate::queue::PlannedRun;
 
 /// Frames of an episode, about; only the estimate of the time left depends on it.
 const EPISODE_FRAMES: u64 = 190;
@@ -10,7 +10,7 @@ pub(super) const EPISODE_FRAMES_MAX: u64 = 500;
 
 /// What a run is for.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) enum Part {
+pub(super) enum RunKind {
     /// (a)
     Epsilon(f64),
     /// (b), of this agent.
@@ -21,29 +21,29 @@ pub(super) enum Part {
 
 impl Settings {
     /// The runs, seed by seed.
-    pub(super) fn plans(&self) -> Vec<(Part, u32, Plan)> {
+    pub(super) fn plans(&self) -> Vec<(RunKind, u32, PlannedRun)> {
         let mut plans = Vec::new();
         for seed in 1..=self.seeds {
             for &epsilon in &self.predictability.epsilons {
-                let part = Part::Epsilon(epsilon);
+                let part = RunKind::Epsilon(epsilon);
                 plans.push((part, seed, self.predictability_plan(epsilon, seed)));
             }
             for agent in &self.agents {
                 let plan = self.continual_plan("ghosts", &self.continual, agent, seed);
-                plans.push((Part::Ghosts(agent.clone()), seed, plan));
+                plans.push((RunKind::Ghosts(agent.clone()), seed, plan));
             }
             for agent in &self.agents {
                 let plan = self.continual_plan("noise", &self.noise, agent, seed);
-                plans.push((Part::Noise(agent.clone()), seed, plan));
+                plans.push((RunKind::Noise(agent.clone()), seed, plan));
             }
         }
         plans
     }
 
-    fn predictability_plan(&self, epsilon: f64, seed: u32) -> Plan {
+    fn predictability_plan(&self, epsilon: f64, seed: u32) -> PlannedRun {
         let Predictability { agent, frames, .. } = &self.predictability;
         let sets = [format!("world.epsilon={epsilon}")];
-        Plan {
+        PlannedRun {
             name: format!("epsilon{epsilon}-seed{seed}"),
             args: self.args(agent, seed, *frames, &sets),
             frames: *frames,
@@ -52,7 +52,13 @@ impl Settings {
         }
     }
 
-    fn continual_plan(&self, name: &str, continual: &Continual, agent: &str, seed: u32) -> Plan {
+    fn continual_plan(
+        &self,
+        name: &str,
+        continual: &Continual,
+        agent: &str,
+        seed: u32,
+    ) -> PlannedRun {
         let order: Vec<String> = continual.order.iter().map(u8::to_string).collect();
         let mut sets = continual.sets.clone();
         sets.push(format!(
@@ -64,7 +70,7 @@ impl Settings {
         sets.push(format!("actor.envs={}", continual.envs));
         let episodes = continual.episodes();
         let frames = episodes * EPISODE_FRAMES_MAX;
-        Plan {
+        PlannedRun {
             name: format!("{name}-{agent}-seed{seed}"),
             args: self.args(agent, seed, frames, &sets),
             frames,

@@ -3,7 +3,7 @@
 
 use super::{
     figure::figure,
-    plans::{EPISODE_FRAMES_MAX, Part},
+    plans::{EPISODE_FRAMES_MAX, RunKind},
     results::{LOSSES, Points, RETURNS_OF, Results, Trace, loss_of, traces},
     settings::Continual,
 };
@@ -130,7 +130,7 @@ fn loss_table(results: &Results, losses: &[Loss]) -> Table {
         .epsilons
         .iter()
         .map(|&epsilon| {
-            let part = Part::Epsilon(epsilon);
+            let part = RunKind::Epsilon(epsilon);
             let here = results.runs.iter().filter(|(of, ..)| *of == part);
             let episodes = here.map(|(.., ran)| ran.summary.episodes as f64);
             let mut row = vec![

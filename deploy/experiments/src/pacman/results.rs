@@ -1,10 +1,10 @@
 //! What the runs of Fig. 3 left: their losses over frames, and their returns over episodes.
 
 use super::{
-    plans::Part,
+    plans::RunKind,
     settings::{Continual, Settings},
 };
-use crate::{plot::Run, queue::Ran, statistics::Spread};
+use crate::{plot::Run, queue::FinishedRun, statistics::Spread};
 
 /// The DIM losses of the preset: column of the metrics, and what it compares.
 pub(super) const LOSSES: [(&str, &str); 2] = [("dim_3t3", "local"), ("dim_4t4", "global")];
@@ -18,7 +18,7 @@ pub(super) type Points = Vec<(f64, f64)>;
 pub(super) struct Results {
     pub(super) settings: Settings,
     /// Part and seed of each finished run.
-    pub(super) runs: Vec<(Part, u32, Ran)>,
+    pub(super) runs: Vec<(RunKind, u32, FinishedRun)>,
     /// Runs that are missing.
     pub(super) missing: Vec<String>,
     pub(super) command: String,
@@ -52,7 +52,7 @@ pub(super) fn loss_of(
     let runs = results
         .runs
         .iter()
-        .filter(|(part, ..)| *part == Part::Epsilon(epsilon));
+        .filter(|(part, ..)| *part == RunKind::Epsilon(epsilon));
     runs.map(|(_, seed, ran)| Ok((*seed, Run::read(&ran.folder)?.values(column)?)))
         .collect()
 }
@@ -68,8 +68,8 @@ pub(super) fn traces(results: &Results, noise: bool) -> anyhow::Result<Vec<Trace
     let mut traces = Vec::new();
     for (part, seed, ran) in &results.runs {
         let agent = match part {
-            Part::Ghosts(agent) if !noise => agent,
-            Part::Noise(agent) if noise => agent,
+            RunKind::Ghosts(agent) if !noise => agent,
+            RunKind::Noise(agent) if noise => agent,
             _ => continue,
         };
         let run = Run::read(&ran.folder)?;

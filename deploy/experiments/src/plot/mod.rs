@@ -9,7 +9,7 @@ mod runs;
 use std::collections::BTreeSet;
 
 use driml_figure::{Axis, Chart, Figure, Format, Panel, Series};
-use driml_launch::{console::print, display::loss_title, run_folder::RunFolder};
+use driml_launch::{console::print, live_view::loss_title, run_folder::RunFolder};
 use driml_machine::error::usage;
 
 pub(crate) use self::{

@@ -6,7 +6,7 @@ use driml_settings::presets;
 use serde::Deserialize;
 
 use super::published;
-use crate::{flags::ProcgenArgs, queue::Plan};
+use crate::{flags::ProcgenArgs, queue::PlannedRun};
 
 const FULL: &str = include_str!("config.toml");
 const SMOKE: &str = include_str!("smoke.toml");
@@ -42,7 +42,7 @@ pub(super) struct Settings {
 }
 
 /// Where in the grid a run is.
-pub(super) struct Spot {
+pub(super) struct GridPoint {
     pub(super) world: String,
     pub(super) agent: String,
     pub(super) seed: u32,
@@ -50,12 +50,12 @@ pub(super) struct Spot {
 
 impl Settings {
     /// The runs, seed by seed, so that a grid that was stopped has a seed of everything before it has two of anything.
-    pub(super) fn plans(&self) -> Vec<(Spot, Plan)> {
+    pub(super) fn plans(&self) -> Vec<(GridPoint, PlannedRun)> {
         let mut plans = Vec::new();
         for seed in 1..=self.seeds {
             for world in &self.worlds {
                 for agent in &self.agents {
-                    let spot = Spot {
+                    let spot = GridPoint {
                         world: world.clone(),
                         agent: agent.clone(),
                         seed,
@@ -68,7 +68,7 @@ impl Settings {
         plans
     }
 
-    pub(super) fn plan(&self, spot: &Spot) -> Plan {
+    pub(super) fn plan(&self, spot: &GridPoint) -> PlannedRun {
         let (seed, frames) = (spot.seed.to_string(), self.frames.to_string());
         let (agent, k) = with_k(&spot.agent);
         let mut args: Vec<String> = [
@@ -86,7 +86,7 @@ impl Settings {
         for set in self.sets.iter().chain(&k) {
             args.extend(["--set".into(), set.clone()]);
         }
-        Plan {
+        PlannedRun {
             name: format!("{}-{}-seed{}", short(&spot.world), spot.agent, spot.seed),
             args,
             frames: self.frames,
@@ -219,7 +219,7 @@ mod tests {
         assert_eq!(names(&both).unwrap(), both);
         assert!(names(&["driml-ada-k5"]).is_err() && names(&["driml-noact-kx"]).is_err());
         let file: File = toml::from_str(SMOKE).unwrap();
-        let spot = Spot {
+        let spot = GridPoint {
             world: "procgen:heist".into(),
             agent: "driml-noact-k5".into(),
             seed: 2,

@@ -22,12 +22,12 @@ use serde::Serialize;
 
 use self::{
     grid::{settings, short},
-    results::{Cell, Played, Results},
+    results::{Evaluation, Results, RunResult},
 };
 use crate::{
     flags::{ProcgenArgs, command_line},
     plot,
-    queue::{self, Plan, Ran},
+    queue::{self, FinishedRun, PlannedRun},
     session::Session,
 };
 
@@ -74,7 +74,7 @@ pub(super) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     if !report_only && settings.worlds.iter().any(is_procgen) {
         procgen_sys::Engine::install(&mut console::line)?;
     }
-    let runs: Vec<Plan> = plans.iter().map(|(_, plan)| plan.clone()).collect();
+    let runs: Vec<PlannedRun> = plans.iter().map(|(_, plan)| plan.clone()).collect();
     let ran = queue::run_all(&mut session, &runs, settings.jobs, report_only)?;
     let mut results = Results {
         command: command(args, name, &session),
@@ -104,7 +104,7 @@ pub(super) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
             let random = play("", &format!("{}-random", short(&spot.world)), Who::Random)?;
             results.random.insert(spot.world.clone(), random);
         }
-        results.cells.push(Cell {
+        results.cells.push(RunResult {
             world: spot.world,
             agent: spot.agent,
             seed: spot.seed,
@@ -141,7 +141,7 @@ fn report(session: Session, results: &Results) -> anyhow::Result<()> {
     let header = ["measure", "of", "agent", "games", "value", "low", "high"];
     session.csv("aggregate", &header, rows)?;
     session.figure("aggregate", &scores::figure(results, &aggregates))?;
-    let adaptive: Vec<&Cell> = results.adaptive().collect();
+    let adaptive: Vec<&RunResult> = results.adaptive().collect();
     if !adaptive.is_empty() {
         session.figure("k", &curves::k_figure(&session, results)?)?;
         curves::write_actions(&session, results)?;
@@ -152,7 +152,7 @@ fn report(session: Session, results: &Results) -> anyhow::Result<()> {
     session.finish(&page::page(results, &aggregates, !adaptive.is_empty()))
 }
 
-fn played(ran: &Ran, who: Who, episodes: u32) -> anyhow::Result<Played> {
+fn played(ran: &FinishedRun, who: Who, episodes: u32) -> anyhow::Result<Evaluation> {
     let player = Player::load(&ran.folder)?;
     let on = |levels| player.returns(who, levels, episodes, PLAY_SEED);
     // A world steps on one thread.
@@ -162,7 +162,7 @@ fn played(ran: &Ran, who: Who, episodes: u32) -> anyhow::Result<Played> {
         let trained = on(Levels::Train)?.unwrap_or_default();
         let join =
             |thread: ScopedJoinHandle<'_, _>| thread.join().expect("a panic has ended the process");
-        Ok(Played {
+        Ok(Evaluation {
             trained,
             single: join(single)?,
             unseen: join(unseen)?,

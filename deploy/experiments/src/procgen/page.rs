@@ -8,7 +8,7 @@ use driml_protocol::RETURNS_OF;
 use super::{
     grid::short,
     k, published,
-    results::{Cell, Kind, Results},
+    results::{Kind, Results, RunResult},
     scores::{Aggregate, baseline},
 };
 use crate::{
@@ -264,7 +264,7 @@ fn greedy(results: &Results) -> Table {
 fn actions(results: &Results) -> Table {
     let mut rows = Vec::new();
     for name in results.worlds() {
-        let cells: Vec<&Cell> = results
+        let cells: Vec<&RunResult> = results
             .adaptive()
             .filter(|cell| cell.world == name)
             .collect();
@@ -274,7 +274,7 @@ fn actions(results: &Results) -> Table {
         if cells.is_empty() {
             continue;
         }
-        let mean = |of: &dyn Fn(&Cell) -> f64| {
+        let mean = |of: &dyn Fn(&RunResult) -> f64| {
             let spread = Spread::of(cells.iter().map(|cell| of(cell)));
             spread.map_or("-".into(), |it| plus_minus(it.mean, it.sd, it.count))
         };

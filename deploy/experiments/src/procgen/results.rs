@@ -5,20 +5,20 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::grid::Settings;
-use crate::queue::Ran;
+use crate::queue::FinishedRun;
 
 /// A finished run and how its agent plays.
-pub(super) struct Cell {
+pub(super) struct RunResult {
     pub(super) world: String,
     pub(super) agent: String,
     pub(super) seed: u32,
-    pub(super) ran: Ran,
-    pub(super) played: Played,
+    pub(super) ran: FinishedRun,
+    pub(super) played: Evaluation,
 }
 
 /// Returns of whole episodes.
 #[derive(Debug, Serialize, Deserialize)]
-pub(super) struct Played {
+pub(super) struct Evaluation {
     /// In the world as it was trained in.
     pub(super) trained: Vec<f64>,
     /// On the levels trained on, one an episode; none for a world without levels.
@@ -30,9 +30,9 @@ pub(super) struct Played {
 /// All there is to report.
 pub(super) struct Results {
     pub(super) settings: Settings,
-    pub(super) cells: Vec<Cell>,
+    pub(super) cells: Vec<RunResult>,
     /// The random policy, by world.
-    pub(super) random: BTreeMap<String, Played>,
+    pub(super) random: BTreeMap<String, Evaluation>,
     /// Runs that are missing.
     pub(super) missing: Vec<String>,
     pub(super) command: String,
@@ -41,7 +41,7 @@ pub(super) struct Results {
 
 impl Results {
     /// Runs whose k follows the affinity.
-    pub(super) fn adaptive(&self) -> impl Iterator<Item = &Cell> {
+    pub(super) fn adaptive(&self) -> impl Iterator<Item = &RunResult> {
         self.cells.iter().filter(|cell| cell.agent == "driml-ada")
     }
 
@@ -50,8 +50,8 @@ impl Results {
         &'a self,
         world: &'a str,
         agent: &'a str,
-    ) -> impl Iterator<Item = &'a Cell> {
-        let here = move |cell: &&Cell| cell.world == world && cell.agent == agent;
+    ) -> impl Iterator<Item = &'a RunResult> {
+        let here = move |cell: &&RunResult| cell.world == world && cell.agent == agent;
         self.cells.iter().filter(here)
     }
 
@@ -102,7 +102,7 @@ impl Kind {
     }
 }
 
-impl Cell {
+impl RunResult {
     pub(super) fn score(&self, kind: Kind) -> Option<f64> {
         match kind {
             Kind::Training => self.ran.summary.mean_return,
@@ -111,7 +111,7 @@ impl Cell {
     }
 }
 
-impl Played {
+impl Evaluation {
     pub(super) fn mean(&self, kind: Kind) -> Option<f64> {
         let returns = match kind {
             Kind::Training => None,

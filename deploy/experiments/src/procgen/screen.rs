@@ -5,7 +5,7 @@ use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 
 use super::{
     grid::short,
-    results::{Cell, Kind, Results},
+    results::{Kind, Results, RunResult},
 };
 use crate::{
     page::{Page, Table},
@@ -82,7 +82,7 @@ pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> 
     session.finish(&page(results, &screened))
 }
 
-fn screen(results: &Results, cell: &Cell) -> anyhow::Result<Option<Screened>> {
+fn screen(results: &Results, cell: &RunResult) -> anyhow::Result<Option<Screened>> {
     let random = Spread::of(results.random[&cell.world].trained.iter().copied());
     let greedy = Spread::of(cell.played.trained.iter().copied());
     let (Some(random), Some(greedy)) = (random, greedy) else {

@@ -11,7 +11,7 @@ use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{LearnerStatus, ReplayStatus};
 
-use super::{columns::Columns, folder::RunFolder, resume_point::Behind, returns::Episodes};
+use super::{columns::Columns, folder::RunFolder, resume_point::ResumePoint, returns::Episodes};
 
 /// Bytes at the end of the file in which its last row lies.
 const LAST_ROW_BYTES: u64 = 4096;
@@ -115,7 +115,7 @@ impl Moment<'_> {
 pub(super) fn rows_up_to(
     path: &Path,
     header: Vec<String>,
-    behind: Behind,
+    behind: ResumePoint,
     frames_max: u64,
 ) -> anyhow::Result<Columns> {
     let reading = || format!("reading {}", path.display());

@@ -2,19 +2,19 @@
 
 mod columns;
 mod folder;
+mod growing_csv;
 mod metrics;
 mod recorder;
 mod resume_point;
 mod returns;
 mod summary;
-mod table;
 
 pub use self::{
     columns::Columns,
     folder::{RunFolder, write_whole},
     metrics::{Progress, progress},
     recorder::Recorder,
-    resume_point::Behind,
+    resume_point::ResumePoint,
     returns::{Episodes, MeanReturn},
     summary::{Outcome, Summary},
 };

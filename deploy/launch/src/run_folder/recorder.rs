@@ -13,11 +13,11 @@ use driml_protocol::{LearnerStatus, ReplayStatus, RunSpec};
 use super::{
     columns::Columns,
     folder::RunFolder,
+    growing_csv::GrowingCsv,
     metrics::{Moment, header, rows_up_to},
-    resume_point::Behind,
+    resume_point::ResumePoint,
     returns::{Episodes, TrainingReturns},
     summary::{Outcome, Summary},
-    table::Table,
 };
 use crate::rates::Rates;
 
@@ -33,7 +33,7 @@ const fn none(header: Vec<String>) -> Columns {
 pub struct Recorder {
     /// Nobody else writes to the folder meanwhile.
     _lock: File,
-    behind: Behind,
+    behind: ResumePoint,
     /// Seconds, frames and episodes in the last row before the run was resumed.
     seconds_before: f64,
     frames_before: u64,
@@ -41,7 +41,7 @@ pub struct Recorder {
     /// Mean and standard deviation of k up to there.
     k_before: Option<(f64, f64)>,
     folder: RunFolder,
-    metrics: Table,
+    metrics: GrowingCsv,
     returns: TrainingReturns,
     losses: &'static [&'static str],
     processes: Vec<String>,
@@ -76,7 +76,7 @@ impl Recorder {
             lock,
             rows,
             returns,
-            Behind::default(),
+            ResumePoint::default(),
         )
     }
 
@@ -90,7 +90,7 @@ impl Recorder {
         config_toml: &str,
         losses: &'static [&'static str],
         processes: &[String],
-        behind: Behind,
+        behind: ResumePoint,
         frames_max: u64,
     ) -> anyhow::Result<Self> {
         let lock = folder.lock()?;
@@ -112,7 +112,7 @@ impl Recorder {
         lock: File,
         rows: Columns,
         returns: TrainingReturns,
-        behind: Behind,
+        behind: ResumePoint,
     ) -> anyhow::Result<Self> {
         let mut this = Self {
             _lock: lock,
@@ -122,7 +122,7 @@ impl Recorder {
             episodes_before: rows.last("episodes").unwrap_or(0),
             k_before: rows.last("mean_k").zip(rows.last("sd_k")),
             folder: folder.clone(),
-            metrics: Table::create(&folder.metrics(), &rows.header, &rows.rows)?,
+            metrics: GrowingCsv::create(&folder.metrics(), &rows.header, &rows.rows)?,
             returns,
             losses,
             processes: processes.to_vec(),

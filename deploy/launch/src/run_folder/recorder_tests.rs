@@ -122,7 +122,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
         learner.updates = updates;
         recorder.record(std::slice::from_ref(&replay), &learner, &[]);
     }
-    let behind = Behind {
+    let behind = ResumePoint {
         updates: 31,
         frames: 2_000,
     };
@@ -155,7 +155,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     assert_eq!(counts, (2_100, 62, 7 + 2));
     assert_eq!(summary.mean_k, Some(1.75), "31 updates at 1.5, 31 at 2");
     assert_eq!(summary.resumed_after_updates, 31);
-    let all = Behind {
+    let all = ResumePoint {
         updates: 99,
         ..behind
     };

@@ -2,7 +2,7 @@
 
 /// What a run has behind it when it starts: nothing, or what its newest checkpoint has learned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Behind {
+pub struct ResumePoint {
     /// Updates done.
     pub updates: u64,
     /// Frames that these updates needed, the warm-up included.

@@ -11,7 +11,7 @@ use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{RETURNS_OF, ReplayStatus, Returns};
 
-use super::{columns::Columns, folder::RunFolder, table::Table};
+use super::{columns::Columns, folder::RunFolder, growing_csv::GrowingCsv};
 
 const HEADER: [&str; 3] = ["frames", "episode", "return"];
 
@@ -36,7 +36,7 @@ pub struct Episodes {
 /// The returns of a run.
 #[derive(Debug)]
 pub(super) struct TrainingReturns {
-    table: Table,
+    table: GrowingCsv,
     /// The newest, the oldest first.
     newest: VecDeque<f64>,
     /// The number of the newest.
@@ -80,7 +80,7 @@ impl TrainingReturns {
     }
 
     fn begin(folder: &RunFolder, rows: &[csv::StringRecord]) -> anyhow::Result<Self> {
-        let table = Table::create(&folder.returns(), &HEADER.map(String::from), rows)?;
+        let table = GrowingCsv::create(&folder.returns(), &HEADER.map(String::from), rows)?;
         let known: Vec<_> = rows.iter().filter_map(read).collect();
         let newest = known.iter().rev().take(RETURNS_OF).rev();
         let (frames, episode, _) = known.last().copied().unwrap_or_default();
@@ -138,7 +138,7 @@ impl TrainingReturns {
         })
     }
 
-    /// What is missing in the file, as [`Table::missing`] says it.
+    /// What is missing in the file, as [`GrowingCsv::missing`] says it.
     pub(super) fn missing(&self) -> Option<String> {
         self.table.missing()
     }

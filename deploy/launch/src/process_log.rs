@@ -20,7 +20,7 @@ const TAIL_LINES_MAX: usize = 8;
 
 /// A part's log, and the threads that write it.
 #[derive(Debug)]
-pub(crate) struct PartLog {
+pub(crate) struct ProcessLog {
     name: String,
     path: PathBuf,
     kept: Arc<Mutex<Kept>>,
@@ -38,7 +38,7 @@ struct Kept {
     failed: Option<io::Error>,
 }
 
-impl PartLog {
+impl ProcessLog {
     /// Opens the log of the part `name` in the folder `logs`, to go on at its end.
     ///
     /// # Errors
@@ -77,7 +77,7 @@ impl PartLog {
                 fault::point(&point);
                 let Ok(line) = line else { return };
                 let line = String::from_utf8_lossy(&line).into_owned();
-                let shown = matters(&line).then(|| format!("{name}: {line}"));
+                let shown = is_warning(&line).then(|| format!("{name}: {line}"));
                 let said = lock(&kept).add(line);
                 let said = said
                     .map(|e| format!("the log of {name} cannot be written: {e}; the run goes on"));
@@ -141,7 +141,7 @@ impl Kept {
 }
 
 /// Whether a log line is a warning or worse: the level is the second word, after the time.
-fn matters(line: &str) -> bool {
+fn is_warning(line: &str) -> bool {
     let level = line.split_whitespace().nth(1);
     matches!(level, Some("WARN" | "ERROR")) || line.starts_with("error:")
 }
@@ -152,21 +152,21 @@ mod tests {
 
     #[test]
     fn warnings_and_worse_reach_the_screen() {
-        assert!(matters(
+        assert!(is_warning(
             "2026-01-01T00:00:00.1Z  WARN driml_actor: weights were refused"
         ));
-        assert!(matters("2026-01-01T00:00:00.1Z ERROR driml_actor: gone"));
-        assert!(matters("error: nobody answers"));
-        assert!(!matters(
+        assert!(is_warning("2026-01-01T00:00:00.1Z ERROR driml_actor: gone"));
+        assert!(is_warning("error: nobody answers"));
+        assert!(!is_warning(
             "2026-01-01T00:00:00.1Z  INFO driml_actor: ERROR is a word here"
         ));
-        assert!(!matters(""));
+        assert!(!is_warning(""));
     }
 
     #[test]
     fn a_log_keeps_its_last_lines_and_counts_those_that_it_lost() {
         let folder = tempfile::tempdir().unwrap();
-        let mut log = PartLog::open("actor-0", folder.path()).unwrap();
+        let mut log = ProcessLog::open("actor-0", folder.path()).unwrap();
         let lines: String = (0..10).map(|n| format!("line {n}\n")).collect();
         let screen = Screen::plain();
         log.follow(io::Cursor::new(lines.clone()), &screen).unwrap();

@@ -1,5 +1,5 @@
 //! The launcher: starts the parts as processes, watches them to the end of the run, and ends them in order.
-//! Each part is a `child`; what they say is for `statuses`, what is shown and kept for `display` and `record`.
+//! Each is a `managed_process`; `status_client` asks how they are, `live_view` shows it and `run_folder` keeps it.
 
 use std::{
     path::Path,
@@ -18,15 +18,15 @@ use driml_protocol::{
 use driml_settings::config::RunConfig;
 
 use crate::{
-    child::{Part, Surroundings},
     console::{self, Screen, print},
-    display::{Display, TEMPLATE},
     endpoint::NAMESPACE,
     interrupts::Interrupts,
+    live_view::{Display, TEMPLATE},
+    managed_process::{ManagedProcess, Surroundings},
     meeting::Meeting,
     resume,
-    run_folder::{Behind, Outcome, Recorder, RunFolder, Summary},
-    statuses::Statuses,
+    run_folder::{Outcome, Recorder, ResumePoint, RunFolder, Summary},
+    status_client::Statuses,
 };
 
 /// How often the parts are asked how they are.
@@ -57,7 +57,7 @@ const PART_THREADS: u32 = 1;
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
-    resumed: Option<Behind>,
+    resumed: Option<ResumePoint>,
     listen: Option<String>,
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
@@ -124,7 +124,7 @@ pub fn run(
         )
     })?;
     if outcome == Outcome::Interrupted {
-        if resume::can_go_on(&config.world, run_dir) {
+        if resume::is_resumable(&config.world, run_dir) {
             console::line(&format!(
                 "`driml local --resume {}` goes on with it",
                 run_dir.display()
@@ -140,7 +140,7 @@ pub fn run(
 struct Launch<'a> {
     config: &'a RunConfig,
     run_dir: &'a RunFolder,
-    behind: Behind,
+    behind: ResumePoint,
     /// Names of the replay servers, one a shard, and where each listens.
     servers: Vec<String>,
     endpoints: Vec<String>,
@@ -149,7 +149,7 @@ struct Launch<'a> {
     display: Display,
     interrupts: Interrupts,
     /// Replay servers, learner, actors, in this order, as far as they were started.
-    parts: Vec<Part>,
+    parts: Vec<ManagedProcess>,
     statuses: Option<Statuses>,
 }
 
@@ -206,7 +206,8 @@ impl Launch<'_> {
             if let Some(study) = self.config.replay.study {
                 args.extend(part(&["--study", study.name()]));
             }
-            let server = Part::start(name, &args, PART_THREADS, self.surroundings(&logs))?;
+            let server =
+                ManagedProcess::start(name, &args, PART_THREADS, self.surroundings(&logs))?;
             self.parts.push(server);
         }
         let mut sessions = Vec::new();
@@ -225,7 +226,7 @@ impl Launch<'_> {
         for endpoint in &self.endpoints {
             args.extend(part(&["--connect", endpoint]));
         }
-        self.parts.push(Part::start(
+        self.parts.push(ManagedProcess::start(
             "learner",
             &args,
             self.config.local.learner_threads,
@@ -239,7 +240,7 @@ impl Launch<'_> {
                 "--id",
                 &id.to_string(),
             ]);
-            self.parts.push(Part::start(
+            self.parts.push(ManagedProcess::start(
                 &format!("actor-{id}"),
                 &args,
                 PART_THREADS,
@@ -324,7 +325,7 @@ impl Launch<'_> {
             let (replay, mut learner) = (statuses.replay.clone(), statuses.learner.clone());
             // Until the learner has answered, too.
             learner.updates = learner.updates.max(self.behind.updates);
-            let rss: Vec<_> = self.parts.iter_mut().map(Part::rss_mib).collect();
+            let rss: Vec<_> = self.parts.iter_mut().map(ManagedProcess::rss_mib).collect();
             for line in recorder.record(&statuses.shards, &learner, &rss) {
                 self.screen.line(&line);
             }
@@ -356,7 +357,7 @@ impl Launch<'_> {
             if let Some(status) = part.end()
                 && !(at >= first_actor && status.success())
             {
-                bail!("{}", part.obituary());
+                bail!("{}", part.exit_report());
             }
         }
         Ok(())
@@ -371,7 +372,7 @@ impl Launch<'_> {
         // The interrupt that led here is the first.
         let allowed = self.interrupts.count().min(1);
         let interrupts = self.interrupts.clone();
-        let hurry = move || interrupts.count() > allowed;
+        let abort = move || interrupts.count() > allowed;
         let finished = matches!(ran, Ok(Outcome::Finished));
         // Once a part has failed, what the actors still have will hardly be learned from.
         let actors_max = if ran.is_ok() {
@@ -383,7 +384,7 @@ impl Launch<'_> {
         let last = self.parts.len();
         let (learner, first_actor) = (self.learner().min(last), self.first_actor().min(last));
         // When the run is finished, actors hear it from the replay server and end by themselves.
-        let actors = self.stop(first_actor..last, !finished, actors_max, &hurry);
+        let actors = self.stop(first_actor..last, !finished, actors_max, &abort);
         if finished {
             late.extend(actors);
         } else {
@@ -392,8 +393,8 @@ impl Launch<'_> {
                 .iter()
                 .for_each(|actor| self.screen.line(&format!("while stopping, {actor}")));
         }
-        self.hear_the_learner_out(&hurry);
-        late.extend(self.stop(learner..first_actor, true, LEARNER_DRAIN_MAX, &hurry));
+        self.wait_for_final_checkpoint(&abort);
+        late.extend(self.stop(learner..first_actor, true, LEARNER_DRAIN_MAX, &abort));
         if let Some(statuses) = &mut self.statuses {
             if let Err(e) = statuses.ask_replay() {
                 tracing::debug!("the replay server's last word: {e:#}");
@@ -401,8 +402,8 @@ impl Launch<'_> {
             // Before its router goes away, so that it does not try to reach it again.
             statuses.close();
         }
-        late.extend(self.stop(0..learner, true, REPLAY_DRAIN_MAX, &hurry));
-        if hurry() {
+        late.extend(self.stop(0..learner, true, REPLAY_DRAIN_MAX, &abort));
+        if abort() {
             bail!("ended at once by an interrupt: what was not saved is lost");
         }
         if ran.is_ok() && !late.is_empty() {
@@ -412,7 +413,7 @@ impl Launch<'_> {
     }
 
     /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
-    fn hear_the_learner_out(&mut self, hurry: &impl Fn() -> bool) {
+    fn wait_for_final_checkpoint(&mut self, abort: &impl Fn() -> bool) {
         let at = self.learner();
         let Some(learner) = self.parts.get_mut(at) else {
             return;
@@ -422,7 +423,7 @@ impl Launch<'_> {
         let Some(statuses) = &mut self.statuses else {
             return;
         };
-        while Instant::now() < deadline && !hurry() {
+        while Instant::now() < deadline && !abort() {
             if let Err(e) = statuses.ask_learner() {
                 tracing::debug!("a last question: {e:#}");
                 return;
@@ -440,20 +441,20 @@ impl Launch<'_> {
         which: std::ops::Range<usize>,
         ask: bool,
         drain_max: Duration,
-        hurry: &impl Fn() -> bool,
+        abort: &impl Fn() -> bool,
     ) -> Vec<String> {
         let parts = &mut self.parts[which];
         if ask {
-            parts.iter_mut().for_each(Part::ask_to_stop);
+            parts.iter_mut().for_each(ManagedProcess::ask_to_stop);
         }
         let deadline = Instant::now() + drain_max;
         let mut late = Vec::new();
         for part in parts {
-            match part.wait_until(deadline, hurry) {
+            match part.wait_until(deadline, abort) {
                 Some(status) if status.success() => {}
-                Some(_) => late.push(part.obituary()),
+                Some(_) => late.push(part.exit_report()),
                 None => {
-                    if !hurry() {
+                    if !abort() {
                         late.push(format!(
                             "{} did not end within {} and was killed",
                             part.name,
@@ -479,7 +480,10 @@ impl Launch<'_> {
             None => Default::default(),
         };
         recorder.record(shards, &learner, &[]);
-        let logs = self.parts.iter().filter_map(Part::missing_log_lines);
+        let logs = self
+            .parts
+            .iter()
+            .filter_map(ManagedProcess::missing_log_lines);
         let missing = recorder.missing().into_iter().chain(logs);
         missing.for_each(|line| console::line(&line));
         let summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);

@@ -9,7 +9,7 @@ use driml_protocol::{LearnerStatus, ReplayStatus, Waiting};
 use crate::{
     console::Screen,
     rates::Rates,
-    run_folder::{Behind, Episodes},
+    run_folder::{Episodes, ResumePoint},
 };
 
 /// How often a line is written where there is no terminal.
@@ -37,7 +37,7 @@ pub struct Display {
 
 impl Display {
     /// A view of a run of so many frames and updates, with so much `behind` it.
-    pub fn new(screen: Screen, frames_max: u64, updates_max: u64, behind: Behind) -> Self {
+    pub fn new(screen: Screen, frames_max: u64, updates_max: u64, behind: ResumePoint) -> Self {
         let mut rates = Rates::default();
         rates.add(Instant::now(), behind.frames, behind.updates);
         Self {
@@ -145,7 +145,7 @@ mod tests {
 
     #[test]
     fn the_view_says_what_a_person_wants_to_know() {
-        let mut display = Display::new(Screen::plain(), 200_000, 6_218, Behind::default());
+        let mut display = Display::new(Screen::plain(), 200_000, 6_218, ResumePoint::default());
         let replay = ReplayStatus {
             transitions_inserted: 33_000,
             rows_sampled: 256_000,

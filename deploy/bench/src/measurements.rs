@@ -12,7 +12,7 @@ use crate::{flags::BenchFlags, table};
 
 /// One thing that was measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Figure {
+pub(super) struct Measurement {
     /// What, unique in its bench.
     pub(super) what: String,
     /// How much of the unit.
@@ -21,7 +21,7 @@ pub(super) struct Figure {
     pub(super) unit: String,
 }
 
-impl Figure {
+impl Measurement {
     /// A figure, which is told to whoever watches stderr.
     pub(super) fn found(what: impl Into<String>, value: f64, unit: &str) -> Self {
         let (what, unit) = (what.into(), unit.to_owned());
@@ -98,7 +98,7 @@ pub(super) struct Report {
     /// Where, as it was before the first measurement.
     pub(super) machine: MachineNote,
     /// What was found.
-    pub(super) figures: Vec<Figure>,
+    pub(super) figures: Vec<Measurement>,
 }
 
 /// Prints the figures as a table, or writes them as the flags ask for.
@@ -107,7 +107,7 @@ pub(super) struct Report {
 /// A file that cannot be written.
 pub(super) fn report(
     bench: &str,
-    figures: &[Figure],
+    figures: &[Measurement],
     machine: MachineNote,
     flags: &BenchFlags,
 ) -> anyhow::Result<()> {
@@ -124,7 +124,7 @@ pub(super) fn report(
 /// As there.
 pub(super) fn report_as(
     bench: &str,
-    figures: &[Figure],
+    figures: &[Measurement],
     table: &str,
     machine: MachineNote,
     flags: &BenchFlags,
@@ -179,7 +179,7 @@ mod tests {
             quick: true,
             threads: 2,
             machine: MachineNote::this(),
-            figures: vec![Figure::found("an update", 5.25, "updates/s")],
+            figures: vec![Measurement::found("an update", 5.25, "updates/s")],
         };
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("figures.json");

@@ -14,19 +14,19 @@ use nix::{
     unistd::Pid,
 };
 
-use crate::{console::Screen, meeting::Meeting, part_log::PartLog};
+use crate::{console::Screen, meeting::Meeting, process_log::ProcessLog};
 
 /// How often a part that should end is looked at.
 const POLL: Duration = Duration::from_millis(20);
 
 /// A started part.
 #[derive(Debug)]
-pub struct Part {
+pub struct ManagedProcess {
     /// Its name: `replay-server`, `learner`, `actor-0`.
     pub name: String,
     child: Child,
     end: Option<ExitStatus>,
-    log: PartLog,
+    log: ProcessLog,
 }
 
 /// What all parts of a run have in common when they start.
@@ -49,7 +49,7 @@ const FOR_CANDLE: [(&str, &str); 3] = [
 ];
 
 /// Gives a process the environment of every part, with so many threads for arithmetic.
-pub fn suit_candle(command: &mut Command, threads: u32) {
+pub fn set_thread_env(command: &mut Command, threads: u32) {
     command
         .env("RAYON_NUM_THREADS", threads.to_string())
         .envs(FOR_CANDLE);
@@ -61,7 +61,7 @@ pub fn exit_with_this_process() -> [String; 2] {
     ["--exit-with-parent".into(), std::process::id().to_string()]
 }
 
-impl Part {
+impl ManagedProcess {
     /// Starts this program with other arguments, in a process group of its own so that Ctrl-C does not reach it. It ends when
     /// this process does.
     ///
@@ -78,7 +78,7 @@ impl Part {
             screen,
             meeting,
         } = surroundings;
-        let mut log = PartLog::open(name, logs)?;
+        let mut log = ProcessLog::open(name, logs)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
         let starting = || format!("starting {name}");
         let stdin = match meeting {
@@ -86,7 +86,7 @@ impl Part {
             None => Stdio::null(),
         };
         let mut command = Command::new(program);
-        suit_candle(&mut command, threads);
+        set_thread_env(&mut command, threads);
         let mut child = command
             .args(args)
             .args(exit_with_this_process())
@@ -149,9 +149,9 @@ impl Part {
     pub fn wait_until(
         &mut self,
         deadline: Instant,
-        hurry: impl Fn() -> bool,
+        abort: impl Fn() -> bool,
     ) -> Option<ExitStatus> {
-        while self.end().is_none() && Instant::now() < deadline && !hurry() {
+        while self.end().is_none() && Instant::now() < deadline && !abort() {
             std::thread::sleep(POLL);
         }
         if self.end.is_some() {
@@ -174,7 +174,7 @@ impl Part {
     }
 
     /// How and with which last words it ended, for a person.
-    pub fn obituary(&mut self) -> String {
+    pub fn exit_report(&mut self) -> String {
         self.wait_until(Instant::now(), || false);
         let how = match self.end {
             None => "is still running".into(),
@@ -202,7 +202,7 @@ impl Part {
     }
 }
 
-impl Drop for Part {
+impl Drop for ManagedProcess {
     fn drop(&mut self) {
         self.kill();
         let _ = self.child.wait();

@@ -13,7 +13,7 @@ use driml_learner::{Agent, Batch, LearnerSettings, losses::projection::project};
 use driml_model::{ModelConfig, Parameters};
 
 /// Online and target network and the optimiser.
-pub(super) struct StockLearner {
+pub(super) struct CandleBaseline {
     model: ModelConfig,
     settings: LearnerSettings,
     online: HashMap<String, Tensor>,
@@ -25,7 +25,7 @@ pub(super) struct StockLearner {
     support: Tensor,
 }
 
-impl StockLearner {
+impl CandleBaseline {
     /// A copy of a learner before its first update.
     ///
     /// # Errors
@@ -225,7 +225,7 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
-    use crate::{learner::MadeUp, settings};
+    use crate::{learner::SyntheticBatch, settings};
 
     #[test]
     fn it_learns_what_the_learner_learns() {
@@ -237,10 +237,10 @@ mod tests {
         ];
         let config = settings::of_run(settings::WORLD, "driml-ada", "paper", &small).unwrap();
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let made_up = MadeUp::draw(&config, &mut rng);
+        let made_up = SyntheticBatch::draw(&config, &mut rng);
         let update = config.learner.update.clone();
         let mut learner = Agent::new(config.model, update, &Compute::CPU, &mut rng).unwrap();
-        let mut stock = StockLearner::new(&learner).unwrap();
+        let mut stock = CandleBaseline::new(&learner).unwrap();
         for _ in 0..3 {
             let ours = learner.update(&made_up.batch()).unwrap().total;
             let stock = stock.update(&made_up.batch()).unwrap();

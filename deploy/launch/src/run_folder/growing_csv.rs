@@ -16,7 +16,7 @@ const WAITING_MAX: usize = 10_000;
 
 /// The file and what is not in it yet.
 #[derive(Debug)]
-pub(super) struct Table {
+pub(super) struct GrowingCsv {
     /// Its name, for messages.
     name: String,
     file: File,
@@ -28,7 +28,7 @@ pub(super) struct Table {
     failed: Option<io::Error>,
 }
 
-impl Table {
+impl GrowingCsv {
     /// Makes the file anew, with a header and the rows that it begins with.
     ///
     /// # Errors
@@ -114,8 +114,8 @@ mod tests {
     use super::*;
 
     /// A table on a full disk.
-    fn full(path: &Path) -> Table {
-        let mut table = Table::create(path, &["a".into()], &[]).unwrap();
+    fn full(path: &Path) -> GrowingCsv {
+        let mut table = GrowingCsv::create(path, &["a".into()], &[]).unwrap();
         table.file = File::options().append(true).open("/dev/full").unwrap();
         table
     }
@@ -160,7 +160,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x.csv");
         let rows = [csv::StringRecord::from(vec!["1", "2"])];
-        let mut table = Table::create(&path, &["a".into(), "b".into()], &rows).unwrap();
+        let mut table = GrowingCsv::create(&path, &["a".into(), "b".into()], &rows).unwrap();
         table.add(["3".into(), "4".into()]);
         assert_eq!(fs::read_to_string(&path).unwrap(), "a,b\n1,2\n3,4\n");
     }
