@@ -81,16 +81,21 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
     let groups = groups::of(&runs, !args.separate);
     let mut panels = Vec::new();
     for column in &columns {
+        let reports = |run: &Run| run.auxiliary_losses().contains(column);
+        let is_loss = runs.iter().any(reports);
         let drawn = groups
             .iter()
-            .map(|group| group.curve(column, args.smooth, args.band))
+            .map(|group| {
+                // Agents differ in their losses: what another one reports is not drawn for this one.
+                if is_loss && !group.runs.iter().any(|run| reports(run)) {
+                    return Ok(Curve::default());
+                }
+                group.curve(column, args.smooth, args.band)
+            })
             .collect::<anyhow::Result<Vec<_>>>()?;
         if !args.column.is_empty() && drawn.iter().all(|curve| curve.points.is_empty()) {
             return Err(usage!("none of these runs has a value of {column:?} yet").into());
         }
-        let is_loss = runs
-            .iter()
-            .any(|run| run.auxiliary_losses().contains(column));
         panels.push(Panel::Chart(chart(column, is_loss, &groups, drawn)));
     }
     if panels.is_empty() {
@@ -247,6 +252,25 @@ mod tests {
         let svg = std::fs::read_to_string(root.path().join("all.svg")).unwrap();
         assert!(svg.contains("the band is their smallest and largest value"));
         assert!(svg.contains("Not smoothed."));
+    }
+
+    #[test]
+    fn agents_with_different_losses_are_drawn_beside_each_other() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = |agent: &str, losses: &str, values: &str| {
+            let metrics = format!("frames,c51_kl,{losses}total_loss\n10,0.5,{values}0.5\n");
+            run_folder(root.path(), agent, agent, 1, &metrics)
+        };
+        let a = folder("driml-fix", "dim_3t3,dim_4t4,", ",1.5,");
+        let b = folder("curl", "curl,", "2.5,");
+        let c = folder("c51", "", "");
+        for columns in [&[][..], &["dim_4t4", "curl"]] {
+            let out = root.path().join("losses.svg");
+            run(&args(&[&a, &b, &c], columns, out.clone())).unwrap();
+            let svg = std::fs::read_to_string(out).unwrap();
+            assert!(svg.contains("DIM 4t4 loss") && svg.contains("CURL loss"));
+            assert!(!svg.contains("DIM 3t3"), "it has no values");
+        }
     }
 
     #[test]
