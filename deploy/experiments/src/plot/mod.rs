@@ -206,7 +206,7 @@ mod tests {
         std::fs::create_dir(&folder).unwrap();
         std::fs::write(folder.join("metrics.csv"), metrics).unwrap();
         let config = format!(
-            "[run]\nworld = \"chain\"\nagent = \"{agent}\"\nseed = {seed}\n[local]\nactors = {seed}\n"
+            "[run]\nworld = \"chain\"\nagent = \"{agent}\"\nseed = {seed}\n[local]\nactors = 1\nlearner_threads = {seed}\n"
         );
         std::fs::write(folder.join("config.toml"), config).unwrap();
         folder
