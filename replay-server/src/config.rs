@@ -18,6 +18,9 @@ pub enum Study {
 }
 
 impl Study {
+    /// Every fault there is.
+    pub const ALL: [Self; 1] = [Self::BootstrapFromNextState];
+
     /// As settings and `--study` have it.
     pub const fn name(self) -> &'static str {
         match self {

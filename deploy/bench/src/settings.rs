@@ -3,7 +3,7 @@
 
 use driml_machine::{error::Usage, resources::Machine};
 use driml_settings::{
-    config::RunConfig,
+    config::{Flags, RunConfig},
     flags::{self, RunFlags},
 };
 
@@ -39,13 +39,10 @@ pub(super) fn of_run(
         agent: Some(agent.into()),
         preset: Some(preset.into()),
         config: None,
-        actors: None,
-        envs: None,
-        replay_shards: None,
-        frames: None,
-        seed: None,
-        study: None,
-        sets: sets.iter().map(|&set| set.to_owned()).collect(),
+        over: Flags {
+            sets: sets.iter().map(|&set| set.to_owned()).collect(),
+            ..Flags::default()
+        },
     };
     Ok(flags::resolve(&flags, &Machine::this())?.0)
 }

@@ -1,6 +1,10 @@
 //! The resolved settings of a run: one TOML with a table for each part, checked as a whole.
 //! It fills in no number but those that follow from others and those that the machine decides.
 
+use clap::{
+    Args,
+    builder::{PossibleValue, PossibleValuesParser, TypedValueParser},
+};
 use driml_envs::{WorldConfig, WorldName};
 use driml_learner::{DeviceName, EstimatorKind};
 use driml_machine::{
@@ -65,23 +69,46 @@ pub enum Source {
     File(String, String),
 }
 
-/// Flags over the source, in the order in which they apply.
-#[derive(Clone, Debug, Default)]
+/// Flags over the source; `--set` applies after the others.
+#[derive(Clone, Debug, Default, Args)]
 pub struct Flags {
-    /// Actor processes.
+    /// Actor processes [default: by cores]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
     pub actors: Option<u32>,
-    /// Copies of the world in each actor.
-    pub envs: Option<u32>,
-    /// Frames of the whole run.
-    pub frames: Option<u64>,
-    /// Replay servers.
+    /// Replay servers among which the actors and the memory are spread [default: 1]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
     pub replay_shards: Option<u32>,
-    /// Seed of every generator of the run.
+    /// Copies of the world in each actor [default: 16]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub envs: Option<u32>,
+    /// Frames of the whole run; it ends when they are in and their updates done
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=i64::MAX as u64))]
+    pub frames: Option<u64>,
+    /// Seed of every generator of the run
+    #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=i64::MAX as u64))]
     pub seed: Option<u64>,
-    /// A known fault of the paper's published code, to be studied.
+    /// For studies alone: train with a known fault of the paper's published code
+    #[arg(long, value_name = "FAULT", value_parser = studies())]
     pub study: Option<Study>,
-    /// Single settings as `--set` takes them.
+    /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
+    #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
+}
+
+/// The faults by their names, with what they are for `--help`.
+fn studies() -> impl TypedValueParser<Value = Study> {
+    let named = |study: Study| {
+        let about = match study {
+            Study::BootstrapFromNextState => {
+                "n-step returns that bootstrap from s_{t+1}, with the end of an episode seen at step t alone"
+            }
+        };
+        PossibleValue::new(study.name()).help(about)
+    };
+    PossibleValuesParser::new(Study::ALL.map(named)).map(|name| {
+        let known = Study::ALL.into_iter().find(|study| study.name() == name);
+        known.expect("clap lets no other name pass")
+    })
 }
 
 /// Resolves the settings of a run: source, flags, `--set`, what the machine decides, what follows from the rest.

@@ -3,13 +3,12 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 use driml_envs::WorldName;
 use driml_machine::{
     error::{Usage, usage},
     resources::Machine,
 };
-use driml_replay_server::Study;
 
 use crate::{
     config::{self, Flags, RunConfig, Source},
@@ -34,34 +33,9 @@ pub struct RunFlags {
     /// Resolved settings of another run, its config.toml, instead of world, agent and preset
     #[arg(long, value_name = "FILE", conflicts_with_all = ["preset", "env", "agent"])]
     pub config: Option<PathBuf>,
-    /// Actor processes [default: by cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
-    pub actors: Option<u32>,
-    /// Replay servers among which the actors and the memory are spread [default: 1]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
-    pub replay_shards: Option<u32>,
-    /// Copies of the world in each actor [default: 16]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
-    pub envs: Option<u32>,
-    /// Frames of the whole run; it ends when they are in and their updates done
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=i64::MAX as u64))]
-    pub frames: Option<u64>,
-    /// Seed of every generator of the run
-    #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=i64::MAX as u64))]
-    pub seed: Option<u64>,
-    /// For studies alone: train with a known fault of the paper's published code
-    #[arg(long, value_name = "FAULT", value_enum)]
-    pub study: Option<ReproducedBug>,
-    /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    pub sets: Vec<String>,
-}
-
-/// A known fault of the paper's published code.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum ReproducedBug {
-    /// n-step returns that bootstrap from s_{t+1}, with the end of an episode seen at step t alone
-    BootstrapFromNextState,
+    /// What applies over them.
+    #[command(flatten)]
+    pub over: Flags,
 }
 
 /// The settings that the flags ask for, and where they come from.
@@ -92,20 +66,5 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
             )
         }
     };
-    Ok((config::resolve(&source, &flags(args), machine)?, from))
-}
-
-/// The flags in the order in which they apply over presets or a file.
-pub fn flags(args: &RunFlags) -> Flags {
-    Flags {
-        actors: args.actors,
-        envs: args.envs,
-        frames: args.frames,
-        replay_shards: args.replay_shards,
-        seed: args.seed,
-        study: args.study.map(|fault| match fault {
-            ReproducedBug::BootstrapFromNextState => Study::BootstrapFromNextState,
-        }),
-        sets: args.sets.clone(),
-    }
+    Ok((config::resolve(&source, &args.over, machine)?, from))
 }

@@ -19,7 +19,7 @@ use driml_machine::{
 use driml_protocol::RunSpec;
 use driml_settings::{
     config::RunConfig,
-    flags::{RunFlags, flags, resolve},
+    flags::{RunFlags, resolve},
 };
 
 /// What a resumed run has settled.
@@ -69,12 +69,14 @@ pub(crate) struct TrainArgs {
 pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let machine = Machine::this();
     if let Some(device) = args.device {
-        args.run.sets.push(format!("local.learner_device={device}"));
+        args.run
+            .over
+            .sets
+            .push(format!("local.learner_device={device}"));
     }
     let (config, from, behind) = match &args.resume {
         Some(folder) => {
-            let (config, behind) =
-                resume::find(&RunFolder::new(folder), &flags(&args.run), &machine)?;
+            let (config, behind) = resume::find(&RunFolder::new(folder), &args.run.over, &machine)?;
             let from = format!("its checkpoint after {} updates", behind.updates);
             (config, from, Some(behind))
         }
