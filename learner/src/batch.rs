@@ -2,11 +2,9 @@
 //! It does not travel (the protocol's batch does) and is not sampled here.
 
 use driml_model::ModelConfig;
+use driml_protocol::NO_ACTION;
 
 use crate::{auxiliary::positives::Positives, error::UpdateError};
-
-/// Stands in `next_action` where a row has none: its transition ended the episode or the level.
-pub const NO_ACTION: u8 = 255;
 
 /// Rows (s_t, a_t, a_{t+1}, n-step return, discount, s_{t+k}, s_{t+n}), plane by plane; B rows each.
 ///

@@ -21,6 +21,8 @@ use crate::{
     settings::LearnerSettings,
 };
 
+/// The folder in a run's folder in which its checkpoints lie.
+pub const FOLDER: &str = "checkpoints";
 /// 2: CURL's key encoder has a file of its own. All else is as in 1.
 const FORMAT: u32 = 2;
 const PREFIX: &str = "checkpoint-";

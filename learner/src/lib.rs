@@ -68,7 +68,7 @@ pub use affinity::{
 pub use agent::{Agent, Evaluation, NetworkParameters, UpdateReport};
 pub use augment::{Augment, AugmentSettings};
 pub use auxiliary::{Objective, positives::Positives, settings::Lambda};
-pub use batch::{Batch, NO_ACTION};
+pub use batch::Batch;
 pub use config::{
     AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart, LearnerPartError,
 };

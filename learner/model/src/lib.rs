@@ -2,7 +2,29 @@
 //! It has never heard of processes, replay or worlds, and it computes no loss.
 //!
 //! The learner differentiates through [`Network`]; an actor uses [`PolicyNetwork`], which runs the same kernels without
-//! a graph. [`Parameters`] hold the weights under PyTorch's names and shapes.
+//! a graph. [`Parameters`] hold the weights under PyTorch's names and shapes. Start at [`ModelConfig`], which fixes every
+//! shape, and at [`Network::features`]:
+//!
+//! ```
+//! use candle_core::{Device, Tensor};
+//! use driml_model::{ConvLayer, DimHeads, ModelConfig, Network, Parameters};
+//! use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
+//!
+//! let no_heads = DimHeads { psi3: false, phi3: false, psi4: false, phi4: false, action: false };
+//! let config = ModelConfig {
+//!     height: 8, width: 8, channels: 1, num_actions: 3, atoms: 5, v_min: -1.0, v_max: 1.0,
+//!     conv: vec![ConvLayer { out: 4, kernel: 4, stride: 2 }],
+//!     hidden: 8, rkhs: 8, action_embed: 2, dim: no_heads,
+//! };
+//! let rng = &mut ChaCha8Rng::seed_from_u64(1);
+//! let parameters = Parameters::init(&config, rng, &Device::Cpu)?;
+//! let network = Network::new(&config, &parameters)?;
+//! // Two states of 8 x 8 x 1 bytes, channels last.
+//! let states = Tensor::zeros((2, 8, 8, 1), candle_core::DType::U8, &Device::Cpu)?;
+//! let logits = network.logits(&network.features(&states)?.f4)?;
+//! assert_eq!(network.q_values(&logits)?.dims(), [2, 3]);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 mod compute;

@@ -10,12 +10,13 @@ use std::{
 
 use candle_core::{DType, Device, Tensor};
 use driml_model::{ConvLayer, DimHeads, ModelConfig};
+use driml_protocol::NO_ACTION;
 use safetensors::SafeTensors;
 use serde::Deserialize;
 
 use crate::{
     auxiliary::{Objective, dim::DIM, positives::Positives, settings::Lambda},
-    batch::{Batch, NO_ACTION},
+    batch::Batch,
     error::UpdateError,
     optimiser::adam::AdamSettings,
     settings::LearnerSettings,

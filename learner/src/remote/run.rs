@@ -52,7 +52,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     };
     let part = LearnerPart::from_toml(&shards.config_toml)
         .context("the settings that the replay server sent")?;
-    let folder = args.run_dir.join("checkpoints");
+    let folder = args.run_dir.join(checkpoint::FOLDER);
     let _lock = checkpoint::lock(&folder)?;
     let rows = part.learner.batch_rows;
     let mut requests = Requests {

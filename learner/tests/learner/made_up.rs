@@ -2,10 +2,11 @@
 //! Nothing here is measured or asserted.
 
 use driml_learner::{
-    AdamSettings, Agent, Batch, Lambda, LearnerSettings, NO_ACTION, Objective,
+    AdamSettings, Agent, Batch, Lambda, LearnerSettings, Objective,
     auxiliary::{cpc, curl, dim},
 };
 use driml_model::{Compute, ConvLayer, Kernels, ModelConfig};
+use driml_protocol::NO_ACTION;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

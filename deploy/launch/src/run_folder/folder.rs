@@ -54,7 +54,7 @@ impl RunFolder {
 
     /// A folder for each checkpoint.
     pub fn checkpoints(&self) -> PathBuf {
-        self.path.join("checkpoints")
+        self.path.join(driml_learner::checkpoint::FOLDER)
     }
 
     /// A file for each process.
