@@ -5,6 +5,7 @@ use clap::{
     Args,
     builder::{PossibleValue, PossibleValuesParser, TypedValueParser},
 };
+use driml_actor::InputSize;
 use driml_envs::{WorldConfig, WorldName};
 use driml_learner::{DeviceName, EstimatorKind};
 use driml_machine::{
@@ -38,14 +39,15 @@ pub struct LocalConfig {
     pub learner_device: DeviceName,
 }
 
-/// The resolved settings of a run.
-#[derive(Clone, Debug)]
+/// The resolved settings of a run. TOML is what they come from and travel as; between, there is this form alone.
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RunConfig {
-    table: Table,
     /// What every part agrees on.
     pub run: RunSpec,
     /// The world.
     pub world: WorldConfig,
+    /// The size to which frames are enlarged.
+    pub input: InputSize,
     /// The actors' own.
     pub actor: driml_actor::Config,
     /// The replay server's own.
@@ -54,9 +56,12 @@ pub struct RunConfig {
     pub learner: driml_learner::Config,
     /// The network.
     pub model: ModelConfig,
+    /// How messages travel.
+    pub transport: TransportConfig,
     /// The launcher's own.
     pub local: LocalConfig,
     /// What a person should know before the run starts.
+    #[serde(skip)]
     pub notes: Vec<String>,
 }
 
@@ -160,7 +165,7 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
     let capacity_set = set(&mut table, &flags.sets)? || !sized_by_machine;
     let note = fit_memory(&mut table, capacity_set, machine)?;
     derive(&mut table)?;
-    let mut config = RunConfig::from_table(table).map_err(|e| match source {
+    let mut config = RunConfig::from_table(&table).map_err(|e| match source {
         Source::File(name, _) if flags.sets.is_empty() => usage!("{name}: {e}"),
         _ => e,
     })?;
@@ -349,24 +354,23 @@ fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
             tables.join(", ")
         ));
     }
-    let _: driml_actor::InputSize = read(table, "input")?;
-    let _: TransportConfig = read(table, "transport")?;
     Ok(RunConfig {
         run: read(table, "run")?,
         world: read(table, "world")?,
+        input: read(table, "input")?,
         actor: read(table, "actor")?,
         replay: read(table, "replay")?,
         learner: read(table, "learner")?,
         model: read(table, "model")?,
+        transport: read(table, "transport")?,
         local: read(table, "local")?,
-        table: table.clone(),
         notes: Vec::new(),
     })
 }
 
 impl RunConfig {
-    fn from_table(table: Table) -> Result<Self, Usage> {
-        let mut config = parts_read(&table)?;
+    fn from_table(table: &Table) -> Result<Self, Usage> {
+        let mut config = parts_read(table)?;
         config.validate()?;
         config.notes = presets::notes(&config.run.agent, &config.run.world);
         if config.replay.study.is_some() {
@@ -387,13 +391,16 @@ impl RunConfig {
             .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
         derived::complete(&mut table);
         derived::check(&table)
-            .and_then(|()| Self::from_table(table))
+            .and_then(|()| Self::from_table(&table))
             .map_err(|e| usage!("{name}: {e}"))
     }
 
-    /// The settings as every part reads them.
+    /// The settings as every part reads them, sorted by name.
     pub fn to_toml(&self) -> String {
-        toml::to_string(&self.table).expect("a table of plain values is TOML")
+        let text = toml::to_string(self).expect("a struct of plain values is TOML");
+        // As text, a number of 32 bits has the digits that a person wrote; as a value of 64 it would have more.
+        let sorted: Table = text.parse().expect("it was just written");
+        toml::to_string(&sorted).expect("a table of plain values is TOML")
     }
 
     /// Transitions of the whole run.
