@@ -1,6 +1,6 @@
 //! The menu of auxiliary losses: what an agent learns beside the return.
 //!
-//! Each loss is a file of this folder that implements [`AuxiliaryLoss`](loss::AuxiliaryLoss), and a line of [`MENU`]. Nothing
+//! Each loss is a file of this folder that implements [`AuxiliaryLoss`], and a line of [`MENU`]. Nothing
 //! outside this folder asks which loss it is: what the rest must know (heads, positives, names of what is reported) the
 //! loss says itself.
 
