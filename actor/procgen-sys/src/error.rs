@@ -137,7 +137,7 @@ pub enum InstallError {
          delete it and check which package index pip uses {WITHOUT_ENGINE}"
     )]
     WrongHash {
-        /// The wheel.
+        /// Where the wheel's file lies.
         path: PathBuf,
         /// The pinned hash.
         expected: String,
@@ -147,7 +147,7 @@ pub enum InstallError {
     /// The wheel cannot be unpacked.
     #[error("unpacking {path}: {reason}; delete it and fetch it again {WITHOUT_ENGINE}")]
     BadWheel {
-        /// The wheel.
+        /// Where the wheel's file lies.
         path: PathBuf,
         /// What is wrong with it.
         reason: String,

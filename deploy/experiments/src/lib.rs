@@ -27,7 +27,7 @@ mod template;
 
 use crate::flags::ExperimentCommand;
 
-/// Runs one.
+/// Runs the experiment that the command names.
 ///
 /// # Errors
 /// A folder of other settings, a file system that refuses, an interrupt.

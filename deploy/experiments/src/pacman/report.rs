@@ -28,7 +28,7 @@ struct Loss {
     whole: f64,
 }
 
-/// Writes everything.
+/// Writes the tables, figure 3 and the page of what was run.
 pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> {
     let losses = losses(results)?;
     let ghosts = traces(results, false)?;

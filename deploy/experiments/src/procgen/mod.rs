@@ -123,7 +123,7 @@ pub(super) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     queue::check_made(&results.missing, report_only)
 }
 
-/// Writes everything.
+/// Writes the tables, the figures and the page of what was run.
 fn report(session: Session, results: &Results) -> anyhow::Result<()> {
     curves::write_runs(&session, results)?;
     curves::write_table(&session, results)?;

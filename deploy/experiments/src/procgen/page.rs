@@ -26,7 +26,7 @@ const ERRORS: f64 = 2.0;
 /// Seeds a game from which on a bootstrap over them says something.
 const SEEDS_MIN: u32 = 5;
 
-/// The page.
+/// The page of table 1: what the runs gave beside the paper's numbers.
 pub(super) fn page(results: &Results, aggregates: &[Aggregate], adaptive: bool) -> Page {
     let settings = &results.settings;
     let norm_scores = norm_scores(results);
