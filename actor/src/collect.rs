@@ -212,6 +212,7 @@ mod tests {
                 dim: DimHeads::NONE,
             },
             actor: Config {
+                precision: driml_model::Precision::F32,
                 envs: ENVS,
                 steps_per_chunk: STEPS,
                 round_transitions_max: None,

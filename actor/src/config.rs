@@ -290,6 +290,7 @@ mod tests {
     #[test]
     fn chunks_get_shorter_as_actors_get_many() {
         let config = |envs, steps_per_chunk, round_transitions_max| Config {
+            precision: driml_model::Precision::F32,
             envs,
             steps_per_chunk,
             round_transitions_max,

@@ -229,25 +229,7 @@ impl<E: Element> Panels<E> {
 fn pack_panel<E: Element>(b: Matrix<'_>, first: usize, width: usize, panel: &mut [E]) {
     let cols = width.min(b.cols - first);
     if b.transposed {
-        if cols < width || !b.rows.is_multiple_of(E::DEPTH) {
-            panel.fill(E::default());
-        }
-        // Column j of `b` is a run of k in memory; blocks of k keep the panel's part in the first cache.
-        const BLOCK: usize = 64;
-        for block in (0..b.rows).step_by(BLOCK) {
-            let end = b.rows.min(block + BLOCK);
-            for col in 0..cols {
-                let run = &b.data[(first + col) * b.rows..][block..end];
-                let steps = &mut panel[block / E::DEPTH * width * E::DEPTH..];
-                let steps = steps.chunks_mut(width * E::DEPTH);
-                for (step, pair) in steps.zip(run.chunks(E::DEPTH)) {
-                    for (to, &from) in step[col * E::DEPTH..].iter_mut().zip(pair) {
-                        *to = E::of(from);
-                    }
-                }
-            }
-        }
-        return;
+        return pack_transposed(b, first, cols, width, panel);
     }
     let steps = panel.chunks_exact_mut(width * E::DEPTH);
     for (step, rows) in steps.zip(b.data.chunks(b.cols * E::DEPTH)) {
@@ -256,6 +238,48 @@ fn pack_panel<E: Element>(b: Matrix<'_>, first: usize, width: usize, panel: &mut
             row.get(first..first + cols).unwrap_or_default()
         };
         E::join(part(0), part(1), step);
+    }
+}
+
+/// [`pack_panel`] of a matrix whose columns are its runs in memory: square blocks are turned in registers and the first cache.
+#[inline(always)]
+fn pack_transposed<E: Element>(
+    b: Matrix<'_>,
+    first: usize,
+    cols: usize,
+    width: usize,
+    panel: &mut [E],
+) {
+    let (k, depth) = (b.rows, E::DEPTH);
+    let steps = k.div_ceil(depth);
+    if cols < width {
+        panel.fill(E::default());
+    }
+    let mut block = [[E::default(); 2 * LANES]; LANES];
+    for step in (0..steps).step_by(LANES) {
+        for col in (0..cols).step_by(LANES) {
+            let (block_steps, block_cols) = (LANES.min(steps - step), LANES.min(cols - col));
+            for (row, block) in block.iter_mut().take(block_cols).enumerate() {
+                let run = &b.data[(first + col + row) * k..][step * depth..];
+                let run = &run[..(block_steps * depth).min(k - step * depth)];
+                if run.len() == LANES * depth {
+                    for (to, &from) in block.iter_mut().zip(run) {
+                        *to = E::of(from);
+                    }
+                } else {
+                    block.fill(E::default());
+                    for (to, &from) in block.iter_mut().zip(run) {
+                        *to = E::of(from);
+                    }
+                }
+            }
+            for at in 0..block_steps {
+                let to = &mut panel[((step + at) * width + col) * depth..];
+                for (to, block) in to.chunks_exact_mut(depth).zip(&block[..block_cols]) {
+                    to.copy_from_slice(&block[at * depth..(at + 1) * depth]);
+                }
+            }
+        }
     }
 }
 
