@@ -265,7 +265,7 @@ impl Agent {
             total = (total + loss.affine(*weight, 0.0)?)?;
         }
         // Before any number is read: reading waits for a GPU, which should have all its work by then.
-        let gradients = Gradients::take(&self.online, total.backward()?)?;
+        let gradients = Gradients::of(&self.online, &total)?;
         let c51_kl = finite("the C51 loss", &kl)?;
         let mut losses = Vec::with_capacity(auxiliary.len());
         for WeightedLoss { name, loss, .. } in &auxiliary {

@@ -1,10 +1,10 @@
-//! The gradients of one loss: taken out of a backward pass, their global norm, and the clipping that follows from it.
+//! The gradients of one loss: of a backward pass, their global norm, and the clipping that follows from it.
 //! It changes no parameter; `optim` does.
 
 use std::collections::BTreeMap;
 
-use candle_core::{DType, Storage, Tensor, backprop::GradStore, bail};
-use driml_model::{Kernels, Parameters};
+use candle_core::{DType, Storage, Tensor, bail};
+use driml_model::{Backward, Kernels, Parameters};
 use rayon::prelude::*;
 
 use crate::{error::UpdateError, tensors::slice};
@@ -19,16 +19,16 @@ pub struct Gradients {
 }
 
 impl Gradients {
-    /// Takes the gradients of `parameters` out of what a backward pass gave.
+    /// The gradients of `loss`, a scalar, by `parameters`.
     ///
     /// # Errors
-    /// A failing copy of a gradient that is not contiguous.
-    pub fn take(parameters: &Parameters, mut store: GradStore) -> Result<Self, UpdateError> {
+    /// A backward pass that failed.
+    pub fn of(parameters: &Parameters, loss: &Tensor) -> Result<Self, UpdateError> {
+        let mut backward = Backward::of(loss)?;
         let mut by_name = BTreeMap::new();
         for (name, var) in parameters.iter() {
-            if let Some(gradient) = store.remove(var) {
-                // candle leaves some gradients tied to the pass they come from; moments made of them would keep every pass.
-                by_name.insert(name.to_owned(), gradient.contiguous()?.detach());
+            if let Some(gradient) = backward.remove(var)? {
+                by_name.insert(name.to_owned(), gradient);
             }
         }
         Ok(Self { by_name })

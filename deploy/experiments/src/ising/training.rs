@@ -86,7 +86,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
         let (now, next) = pairs.batch(&mut rng)?;
         let value = scorer.loss(&now, &next)?;
         loss.push(value.to_scalar::<f32>()?);
-        let gradients = Gradients::take(&parameters, value.backward()?)?;
+        let gradients = Gradients::of(&parameters, &value)?;
         let factor = clip_factor(gradients.norm(Kernels::FUSED)?, task.learner.max_grad_norm);
         adam.step(&parameters, &gradients, factor)?;
         progress.advance(1)?;

@@ -213,7 +213,7 @@ impl Heads {
             .dim
             .pair_losses(&self.network, &now, &next, &action, &valid)?;
         for loss in losses.iter().flatten() {
-            let gradients = Gradients::take(&self.parameters, loss.backward()?)?;
+            let gradients = Gradients::of(&self.parameters, loss)?;
             let factor = clip_factor(gradients.norm(Kernels::FUSED)?, self.max_grad_norm);
             self.adam.step(&self.parameters, &gradients, factor)?;
         }

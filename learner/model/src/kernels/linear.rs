@@ -7,6 +7,7 @@
 use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
 use rayon::prelude::*;
 
+use crate::gradients;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::{Matrix, Threads, multiply};
 use crate::kernels::units::Mode;
@@ -102,17 +103,13 @@ impl CustomOp3 for Linear {
         let x = Matrix::new(floats(x, x_layout)?, self.rows, self.inputs);
         let w = Matrix::new(floats(w, w_layout)?, self.outputs, self.inputs);
         let b = floats(b, b_layout)?;
-        let group_len = self.rows / self.groups * self.outputs;
-        let mut y = vec![0.0; self.rows * self.outputs];
-        y.par_chunks_mut(self.task_len())
-            .enumerate()
-            .for_each(|(task, y)| {
-                let first = task * self.task_len();
-                for (row, y) in y.chunks_exact_mut(self.outputs).enumerate() {
-                    let group = (first + row * self.outputs) / group_len;
-                    y.copy_from_slice(&b[group * self.outputs..][..self.outputs]);
-                }
-            });
+        // Biases first, to which the products are added: written once, without zeros before them.
+        let mut y = Vec::with_capacity(self.rows * self.outputs);
+        for bias in b.chunks_exact(self.outputs) {
+            for _ in 0..self.rows / self.groups {
+                y.extend_from_slice(bias);
+            }
+        }
         multiply(
             self.precision,
             &mut y,
@@ -168,39 +165,46 @@ impl CustomOp3 for Linear {
             );
             Tensor::from_vec(grad_x, x.shape(), device)
         });
-        let grad_w = w.track_op().then(|| -> Result<Tensor> {
-            let x = Matrix::new(floats(cpu(&x_storage)?, x_layout)?, self.rows, self.inputs);
-            let mut grad_w = vec![0.0; self.outputs * self.inputs];
+        let x_values = floats(cpu(&x_storage)?, x_layout)?;
+        let add_to_w = |sum: &mut [f32], there: bool| {
+            let mode = if there { Mode::Add } else { Mode::Replace };
+            let x = Matrix::new(x_values, self.rows, self.inputs);
             multiply(
                 self.precision,
-                &mut grad_w,
-                Mode::Replace,
+                sum,
+                mode,
                 grad.transposed(),
                 x,
                 Threads::Pool,
             );
-            Tensor::from_vec(grad_w, w.shape(), device)
-        });
-        let grad_b = b.track_op().then(|| -> Result<Tensor> {
-            if self.groups == self.rows {
-                return grad_y.reshape(b.shape());
+        };
+        let grad_w = if !w.track_op() || gradients::add_in_place(w, add_to_w) {
+            None
+        } else {
+            let mut grad_w = vec![0.0; self.outputs * self.inputs];
+            add_to_w(&mut grad_w, false);
+            Some(Tensor::from_vec(grad_w, w.shape(), device)?)
+        };
+        let add_to_b = |sum: &mut [f32], _: bool| {
+            for (sum, value) in sum.iter_mut().zip(self.group_sums(grad_values)) {
+                *sum += value;
             }
-            Tensor::from_vec(self.group_sums(grad_values), b.shape(), device)
-        });
-        Ok((
-            grad_x.transpose()?,
-            grad_w.transpose()?,
-            grad_b.transpose()?,
-        ))
+        };
+        let grad_b = if !b.track_op() {
+            None
+        } else if self.groups == self.rows {
+            Some(grad_y.reshape(b.shape())?)
+        } else if gradients::add_in_place(b, add_to_b) {
+            None
+        } else {
+            let sums = self.group_sums(grad_values);
+            Some(Tensor::from_vec(sums, b.shape(), device)?)
+        };
+        Ok((grad_x.transpose()?, grad_w, grad_b))
     }
 }
 
 impl Linear {
-    /// Scalars of a task's whole rows.
-    fn task_len(&self) -> usize {
-        (TASK_LEN / self.outputs).max(1) * self.outputs
-    }
-
     /// Sums of each group's rows: [rows, outputs] to [groups, outputs].
     fn group_sums(&self, grad: &[f32]) -> Vec<f32> {
         let outputs = self.outputs;

@@ -155,7 +155,7 @@ impl<E: Element> Panels<E> {
         let panel_len = steps * width * E::DEPTH;
         let mut values = Buffer::new(panel_len * b.cols.div_ceil(width));
         let pack = |panel: usize, values: &mut [E]| {
-            unit.vectorize(|| pack_panel(b, panel * width, width, values));
+            unit.vectorize(|| pack_panel(unit, b, panel * width, width, values));
         };
         match threads {
             Threads::Caller => {
@@ -226,57 +226,61 @@ impl<E: Element> Panels<E> {
 
 /// Packs columns `first..` of `b` as one panel of this width.
 #[inline(always)]
-fn pack_panel<E: Element>(b: Matrix<'_>, first: usize, width: usize, panel: &mut [E]) {
+fn pack_panel<U: Unit>(
+    unit: U,
+    b: Matrix<'_>,
+    first: usize,
+    width: usize,
+    panel: &mut [U::Element],
+) {
     let cols = width.min(b.cols - first);
     if b.transposed {
-        return pack_transposed(b, first, cols, width, panel);
+        return pack_transposed(unit, b, first, width, panel);
     }
-    let steps = panel.chunks_exact_mut(width * E::DEPTH);
-    for (step, rows) in steps.zip(b.data.chunks(b.cols * E::DEPTH)) {
+    let steps = panel.chunks_exact_mut(width * U::Element::DEPTH);
+    for (step, rows) in steps.zip(b.data.chunks(b.cols * U::Element::DEPTH)) {
         let part = |row: usize| {
             let row = rows.get(row * b.cols..).unwrap_or_default();
             row.get(first..first + cols).unwrap_or_default()
         };
-        E::join(part(0), part(1), step);
+        U::Element::join(part(0), part(1), step);
     }
 }
 
-/// [`pack_panel`] of a matrix whose columns are its runs in memory: square blocks are turned in registers and the first cache.
+/// [`pack_panel`] of a matrix whose columns are its runs in memory: square blocks of steps are transposed in registers.
 #[inline(always)]
-fn pack_transposed<E: Element>(
+fn pack_transposed<U: Unit>(
+    unit: U,
     b: Matrix<'_>,
     first: usize,
-    cols: usize,
     width: usize,
-    panel: &mut [E],
+    panel: &mut [U::Element],
 ) {
-    let (k, depth) = (b.rows, E::DEPTH);
-    let steps = k.div_ceil(depth);
-    if cols < width {
-        panel.fill(E::default());
-    }
-    let mut block = [[E::default(); 2 * LANES]; LANES];
+    let (k, depth) = (b.rows, U::Element::DEPTH);
+    let (steps, cols) = (k.div_ceil(depth), width.min(b.cols - first));
+    let columns = &b.data[first * k..(first + cols) * k];
     for step in (0..steps).step_by(LANES) {
-        for col in (0..cols).step_by(LANES) {
-            let (block_steps, block_cols) = (LANES.min(steps - step), LANES.min(cols - col));
-            for (row, block) in block.iter_mut().take(block_cols).enumerate() {
-                let run = &b.data[(first + col + row) * k..][step * depth..];
-                let run = &run[..(block_steps * depth).min(k - step * depth)];
+        let run = step * depth..k.min((step + LANES) * depth);
+        for col in (0..width).step_by(LANES) {
+            let mut block = [[0; LANES]; LANES];
+            let block_columns = columns.chunks_exact(k).skip(col).take(LANES);
+            for (block, column) in block.iter_mut().zip(block_columns) {
+                let run = &column[run.clone()];
                 if run.len() == LANES * depth {
-                    for (to, &from) in block.iter_mut().zip(run) {
-                        *to = E::of(from);
+                    for (bits, values) in block.iter_mut().zip(run.chunks_exact(depth)) {
+                        *bits = U::Element::step(values);
                     }
                 } else {
-                    block.fill(E::default());
-                    for (to, &from) in block.iter_mut().zip(run) {
-                        *to = E::of(from);
+                    for (bits, values) in block.iter_mut().zip(run.chunks(depth)) {
+                        *bits = U::Element::step(values);
                     }
                 }
             }
-            for at in 0..block_steps {
-                let to = &mut panel[((step + at) * width + col) * depth..];
-                for (to, block) in to.chunks_exact_mut(depth).zip(&block[..block_cols]) {
-                    to.copy_from_slice(&block[at * depth..(at + 1) * depth]);
+            unit.transpose(&mut block);
+            for (at, block) in block.iter().enumerate().take(steps - step) {
+                let to = &mut panel[((step + at) * width + col) * depth..][..LANES * depth];
+                for (to, &bits) in to.chunks_exact_mut(depth).zip(block) {
+                    U::Element::unpack(bits, to);
                 }
             }
         }
@@ -380,7 +384,7 @@ fn pack_steps<U: Unit>(unit: U, b: Matrix<'_>, values: &mut [U::Element], thread
     let steps = (TASK_LEN / (cols * depth)).max(1);
     let pack = |values: &mut [U::Element], data: &[f32]| {
         let part = Matrix::new(data, data.len() / cols, cols);
-        unit.vectorize(|| pack_panel(part, 0, cols, values));
+        unit.vectorize(|| pack_panel(unit, part, 0, cols, values));
     };
     match threads {
         Threads::Caller => pack(values, b.data),

@@ -143,3 +143,108 @@ pub(crate) fn stack_backward<U: Unit>(
     }
     sums
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::ConvLayer;
+    use crate::kernels::precision::Precision;
+    use crate::kernels::units::{ForUnit, with_every_unit};
+
+    /// Sizes that fill no register: odd runs, odd numbers of windows, channels beyond a panel.
+    fn shapes() -> Vec<ConvShape> {
+        let layers = [(5, 3, 2), (70, 4, 1), (9, 2, 1)];
+        let mut input = (17, 23, 3);
+        let shape = |(out, kernel, stride)| {
+            let layer = ConvLayer {
+                out,
+                kernel,
+                stride,
+            };
+            let shape = ConvShape::new(input, layer).unwrap();
+            input = shape.output();
+            shape
+        };
+        layers.map(shape).to_vec()
+    }
+
+    fn values(len: usize, by: usize, scale: f32) -> Vec<f32> {
+        (0..len)
+            .map(|at| ((at * by % 101) as f32 / 50.0 - 1.0) * scale)
+            .collect()
+    }
+
+    #[derive(Clone, Copy)]
+    struct Run<'a> {
+        shapes: &'a [ConvShape],
+        parameters: &'a [f32],
+        images: Pixels<'a>,
+        grad_maps: &'a [f32],
+    }
+
+    impl ForUnit for Run<'_> {
+        /// Maps, gradients of parameters and of images.
+        type Output = [Vec<f32>; 3];
+
+        fn run<U: Unit>(self, unit: U) -> [Vec<f32>; 3] {
+            let layers = layers(unit, self.shapes, self.parameters, true, true);
+            let mut maps = vec![0.0; self.grad_maps.len()];
+            let saved = stack_forward(unit, &layers, self.images, &mut maps);
+            let mut grad_images = vec![0.0; self.images.len()];
+            let grads = stack_backward(
+                unit,
+                &layers,
+                self.images,
+                &saved,
+                &maps,
+                self.grad_maps,
+                Some(&mut grad_images),
+            );
+            [maps, grads, grad_images]
+        }
+    }
+
+    #[test]
+    fn every_unit_gives_the_same_up_to_the_order_of_sums() {
+        let shapes = shapes();
+        let (first, last) = (&shapes[0], &shapes[2]);
+        let count = 3;
+        let floats = values(count * first.image_len(), 37, 1.0);
+        let bytes: Vec<u8> = (0..floats.len()).map(|at| (at * 31 % 256) as u8).collect();
+        let parameters = values(parameters_len(&shapes), 53, 0.2);
+        let grad_maps = values(count * last.map_len(), 17, 1.0);
+        for images in [Pixels::Floats(&floats), Pixels::Bytes(&bytes)] {
+            for precision in Precision::ALL {
+                let run = Run {
+                    shapes: &shapes,
+                    parameters: &parameters,
+                    images,
+                    grad_maps: &grad_maps,
+                };
+                let results = with_every_unit(precision, run);
+                let (wanted, others) = results.split_first().unwrap();
+                // A sum that lands on the other side of a bf16 moves what is computed from it by its 256th part.
+                let tolerance = match precision {
+                    Precision::F32 => 1e-5,
+                    Precision::Bf16 => 1e-2,
+                };
+                for result in others {
+                    for (got, wanted) in result.iter().zip(wanted) {
+                        let norm = |values: &mut dyn Iterator<Item = f32>| {
+                            values
+                                .map(|x| f64::from(x) * f64::from(x))
+                                .sum::<f64>()
+                                .sqrt()
+                        };
+                        let error = norm(&mut got.iter().zip(wanted).map(|(a, b)| a - b));
+                        let size = norm(&mut wanted.iter().copied());
+                        assert!(
+                            size > 0.0 && error <= tolerance * size,
+                            "{precision}: {error} of {size}"
+                        );
+                    }
+                }
+            }
+        }
+    }
+}

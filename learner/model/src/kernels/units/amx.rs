@@ -260,6 +260,11 @@ impl Unit for Amx {
     }
 
     #[inline(always)]
+    fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
+        super::avx512::Single::here().transpose(block);
+    }
+
+    #[inline(always)]
     fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
         super::avx512::Single::here().vectorize(work)
     }

@@ -5,7 +5,8 @@
 use std::arch::x86_64::{
     __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_dpbf16_ps, _mm512_fmadd_ps, _mm512_loadu_ps,
     _mm512_loadu_si512, _mm512_mask_storeu_ps, _mm512_maskz_loadu_ps, _mm512_set1_epi32,
-    _mm512_set1_ps, _mm512_setzero_ps,
+    _mm512_set1_ps, _mm512_setzero_ps, _mm512_shuffle_i32x4, _mm512_storeu_si512,
+    _mm512_unpackhi_epi32, _mm512_unpackhi_epi64, _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
 };
 use std::mem::transmute;
 
@@ -85,6 +86,12 @@ impl Unit for Single {
     }
 
     #[inline(always)]
+    fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
+        // SAFETY: `here` found the instructions.
+        unsafe { transposed(block) }
+    }
+
+    #[inline(always)]
     fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
         // SAFETY: `here` found the instructions.
         unsafe { vectorized(work) }
@@ -112,6 +119,12 @@ impl Unit for Brain {
     }
 
     #[inline(always)]
+    fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
+        // SAFETY: `here` found the instructions.
+        unsafe { transposed(block) }
+    }
+
+    #[inline(always)]
     fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
         // SAFETY: `here` found the instructions.
         unsafe { vectorized(work) }
@@ -122,6 +135,55 @@ impl Brain {
     #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
     unsafe fn compute_sized(tile: &RawTile<bf16>, rows: usize, vecs: usize) {
         sizes!(tile, rows, vecs);
+    }
+}
+
+/// Transposes 16 registers of 16: pairs of 32 bits, of 64 bits, then quarters of registers twice.
+#[target_feature(enable = "avx512f")]
+unsafe fn transposed(block: &mut [[u32; LANES]; LANES]) {
+    // SAFETY: every row of the block is the 64 bytes of a register, read and written where it is.
+    let rows: [__m512i; LANES] =
+        std::array::from_fn(|row| unsafe { _mm512_loadu_si512(block[row].as_ptr().cast()) });
+    let pairs: [__m512i; LANES] = std::array::from_fn(|at| {
+        let (a, b) = (rows[at & !1], rows[at | 1]);
+        if at & 1 == 0 {
+            _mm512_unpacklo_epi32(a, b)
+        } else {
+            _mm512_unpackhi_epi32(a, b)
+        }
+    });
+    // Of four rows, columns 4 q + at % 4 in quarter q.
+    let fours: [__m512i; LANES] = std::array::from_fn(|at| {
+        let first = (at & !3) + (at & 2) / 2;
+        let (a, b) = (pairs[first], pairs[first + 2]);
+        if at & 1 == 0 {
+            _mm512_unpacklo_epi64(a, b)
+        } else {
+            _mm512_unpackhi_epi64(a, b)
+        }
+    });
+    let column = |at: usize| at & 3;
+    let eights: [__m512i; LANES] = std::array::from_fn(|at| {
+        // Rows 0..8 for at < 8, else 8..16; of quarters 0 and 2, or 1 and 3.
+        let first = at / 8 * 8 + column(at);
+        let (a, b) = (fours[first], fours[first + 4]);
+        if at & 4 == 0 {
+            _mm512_shuffle_i32x4::<0b10_00_10_00>(a, b)
+        } else {
+            _mm512_shuffle_i32x4::<0b11_01_11_01>(a, b)
+        }
+    });
+    for (step, row) in block.iter_mut().enumerate() {
+        let (quarter, at) = (step / 4, step & 3);
+        let from = at + (quarter & 1) * 4;
+        let (a, b) = (eights[from], eights[from + 8]);
+        let done = if quarter < 2 {
+            _mm512_shuffle_i32x4::<0b10_00_10_00>(a, b)
+        } else {
+            _mm512_shuffle_i32x4::<0b11_01_11_01>(a, b)
+        };
+        // SAFETY: as above.
+        unsafe { _mm512_storeu_si512(row.as_mut_ptr().cast(), done) };
     }
 }
 

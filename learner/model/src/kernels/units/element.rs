@@ -26,6 +26,12 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     /// `second` is for a depth of 2.
     fn join(first: &[f32], second: &[f32], step: &mut [Self]);
 
+    /// The step that `values` begin with, as 32 bits; 0 for what they do not have.
+    fn step(values: &[f32]) -> u32;
+
+    /// The scalars of a step, into `step` [DEPTH].
+    fn unpack(bits: u32, step: &mut [Self]);
+
     /// Scalars that need no rounding, as they are.
     fn in_place(values: &[f32]) -> Option<&[Self]>;
 }
@@ -54,6 +60,16 @@ impl Element for f32 {
         let (begin, end) = step.split_at_mut(first.len());
         begin.copy_from_slice(first);
         end.fill(0.0);
+    }
+
+    #[inline(always)]
+    fn step(values: &[f32]) -> u32 {
+        values.first().map_or(0, |value| value.to_bits())
+    }
+
+    #[inline(always)]
+    fn unpack(bits: u32, step: &mut [Self]) {
+        step[0] = Self::from_bits(bits);
     }
 
     fn in_place(values: &[f32]) -> Option<&[Self]> {
@@ -99,6 +115,23 @@ impl Element for bf16 {
             }
         }
         end.fill(Self::default());
+    }
+
+    #[inline(always)]
+    fn step(values: &[f32]) -> u32 {
+        let bits = |at: usize| {
+            let value = values
+                .get(at)
+                .map_or(Self::default(), |&value| Self::of(value));
+            u32::from(value.to_bits())
+        };
+        bits(0) | bits(1) << 16
+    }
+
+    #[inline(always)]
+    fn unpack(bits: u32, step: &mut [Self]) {
+        step[0] = Self::from_bits(bits as u16);
+        step[1] = Self::from_bits((bits >> 16) as u16);
     }
 
     fn in_place(_: &[f32]) -> Option<&[Self]> {

@@ -37,6 +37,14 @@ pub(crate) trait Unit: Copy + Send + Sync + 'static {
     #[allow(unsafe_code, reason = "implemented with the unit's instructions")]
     unsafe fn compute(self, tile: &RawTile<Self::Element>, rows: usize, vecs: usize);
 
+    /// Transposes a block of steps, [column, step] to [step, column].
+    #[inline(always)]
+    fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
+        let turned: [[u32; LANES]; LANES] =
+            std::array::from_fn(|step| std::array::from_fn(|column| block[column][step]));
+        *block = turned;
+    }
+
     /// Runs `work` compiled for the unit's instructions, so that its loops use its registers.
     fn vectorize<R>(self, work: impl FnOnce() -> R) -> R;
 }
@@ -127,10 +135,33 @@ pub fn kernels_in_words(precision: Precision) -> &'static str {
     }
 }
 
+/// Does `work` on every unit that can be had here, the emulated one included, and collects what it gives.
+#[cfg(test)]
+pub(crate) fn with_every_unit<F: ForUnit + Copy>(precision: Precision, work: F) -> Vec<F::Output> {
+    let all = [
+        Instructions::Plain,
+        Instructions::Avx2,
+        Instructions::Avx512,
+        Instructions::Avx512Bf16,
+        Instructions::Amx,
+    ];
+    let there = all.into_iter().filter(|&best| best <= instructions());
+    #[allow(unused_mut, reason = "there is no emulated unit elsewhere")]
+    let mut results: Vec<_> = there
+        .map(|best| with_unit_of(best, precision, work))
+        .collect();
+    #[cfg(target_arch = "x86_64")]
+    if precision == Precision::Bf16 {
+        results.push(work.run(amx::emulated::EmulatedAmx));
+    }
+    results
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    #[derive(Clone, Copy)]
     struct Product<'a> {
         rows: usize,
         vecs: usize,
@@ -219,13 +250,6 @@ mod tests {
     fn every_unit_computes_every_size_of_tile() {
         let left: Vec<f32> = (0..97).map(|i| (i * 37 % 41) as f32 / 8.0 - 2.5).collect();
         let right: Vec<f32> = (0..89).map(|i| (i * 29 % 31) as f32 / 8.0 - 1.9).collect();
-        let all = [
-            Instructions::Plain,
-            Instructions::Avx2,
-            Instructions::Avx512,
-            Instructions::Avx512Bf16,
-            Instructions::Amx,
-        ];
         let mut tried = 0;
         let sizes = [1, 2, 4].into_iter().flat_map(|vecs| {
             (1..=8)
@@ -239,7 +263,7 @@ mod tests {
                 ((vecs - 1) * LANES + 1, Mode::Add, 16),
                 (vecs * LANES, Mode::Replace, 35),
             ] {
-                let product = || Product {
+                let product = Product {
                     rows,
                     vecs,
                     cols,
@@ -249,16 +273,38 @@ mod tests {
                     steps,
                     rows_inside,
                 };
-                for best in all.into_iter().filter(|&best| best <= instructions()) {
-                    for precision in Precision::ALL {
-                        tried += usize::from(with_unit_of(best, precision, product()).is_some());
-                    }
+                for precision in Precision::ALL {
+                    tried += with_every_unit(precision, product)
+                        .into_iter()
+                        .flatten()
+                        .count();
                 }
-                #[cfg(target_arch = "x86_64")]
-                assert!(product().run(amx::emulated::EmulatedAmx).is_some());
             }
         }
         assert!(tried >= 2 * 3 * 4, "{tried} tiles");
+    }
+
+    #[test]
+    fn every_unit_transposes_a_block() {
+        #[derive(Clone, Copy)]
+        struct Transpose;
+        impl ForUnit for Transpose {
+            type Output = ();
+            fn run<U: Unit>(self, unit: U) {
+                let number = |row: usize, col: usize| (row * 100 + col) as u32;
+                let mut block: [[u32; LANES]; LANES] =
+                    std::array::from_fn(|row| std::array::from_fn(|col| number(row, col)));
+                unit.transpose(&mut block);
+                for (row, block) in block.iter().enumerate() {
+                    for (col, &got) in block.iter().enumerate() {
+                        assert_eq!(got, number(col, row));
+                    }
+                }
+            }
+        }
+        for precision in Precision::ALL {
+            assert!(!with_every_unit(precision, Transpose).is_empty());
+        }
     }
 
     #[test]
