@@ -25,7 +25,7 @@ use crate::{
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// Rows of one update, B.
-    pub batch_rows: u32,
+    pub batch_size: u32,
     /// Batches asked for ahead of the one being learned from.
     pub batches_in_flight: u32,
     /// Updates from one version of the weights to the next.
@@ -159,7 +159,7 @@ impl Config {
     /// The first field that cannot work, and why.
     pub fn validate(&self) -> Result<(), ConfigError> {
         for (key, value, max) in [
-            ("batch_rows", u64::from(self.batch_rows), 65_536),
+            ("batch_size", u64::from(self.batch_size), 65_536),
             ("batches_in_flight", u64::from(self.batches_in_flight), 64),
             (
                 "publish_period_updates",

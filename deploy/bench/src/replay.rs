@@ -166,7 +166,7 @@ impl Run {
             std::slice::from_ref(&client),
             Requests {
                 learner: taking_part::LEARNER,
-                rows: learner.batch_rows,
+                rows: learner.batch_size,
                 in_flight: learner.batches_in_flight,
                 shared_memory: transport.shared_memory,
                 unreachable_max: ANSWER_MAX,

@@ -24,7 +24,7 @@ use driml_machine::{
     error::{EXIT_USAGE, usage},
     resources::Machine,
 };
-use driml_settings::config::Flags;
+use driml_settings::{config::Flags, renamed};
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
@@ -158,8 +158,9 @@ impl Queue {
 
     /// Whether what lies in the plan's folder was begun by this very plan.
     fn is_made_by(&self, plan: &PlannedRun) -> bool {
-        let call = fs::read(self.call(plan)).ok();
-        let call = call.and_then(|text| serde_json::from_slice::<Vec<String>>(&text).ok());
+        let call = fs::read_to_string(self.call(plan)).ok();
+        let call = call.map(|text| renamed::update_json(&text));
+        let call = call.and_then(|text| serde_json::from_str::<Vec<String>>(&text).ok());
         call.is_some_and(|args| args == plan.args)
     }
 
@@ -476,6 +477,20 @@ mod tests {
         fs::write(queue.call(&plan(10)), call).unwrap();
         assert!(queue.finished(&plan(10)).is_some());
         assert!(queue.finished(&plan(20)).is_none());
+        let sized = PlannedRun {
+            args: vec!["--set".into(), "learner.batch_size=64".into()],
+            ..plan(10)
+        };
+        fs::write(queue.call(&sized), r#"["--set","learner.batch_rows=64"]"#).unwrap();
+        assert!(
+            queue.finished(&sized).is_some(),
+            "the old name of a setting"
+        );
+        fs::write(
+            queue.call(&sized),
+            serde_json::to_vec(&plan(10).args).unwrap(),
+        )
+        .unwrap();
         fs::write(folder.metrics(), "seconds,frames\n").unwrap();
         assert!(queue.finished(&plan(10)).is_none(), "its metrics are gone");
     }

@@ -96,7 +96,7 @@ struct Lockstep {
     replay: Replay,
     learner: Learner,
     status: LearnerStatus,
-    batch_rows: u32,
+    batch_size: u32,
     steps_per_chunk: u32,
     unwanted: Vec<u64>,
     published: u64,
@@ -107,8 +107,8 @@ impl Lockstep {
         let text = config.to_toml();
         let settings = ActorSettings::from_toml(&text)?;
         let part = LearnerPart::from_toml(&text)?;
-        let batch_rows = part.learner.batch_rows;
-        let mut replay = Replay::new(&config.run, &config.replay, batch_rows)?;
+        let batch_size = part.learner.batch_size;
+        let mut replay = Replay::new(&config.run, &config.replay, batch_size)?;
         for actor in 0..config.local.actors {
             let join = ActorJoin {
                 actor,
@@ -148,7 +148,7 @@ impl Lockstep {
             replay,
             learner,
             status,
-            batch_rows,
+            batch_size,
             steps_per_chunk: settings.actor.steps_per_chunk,
             published: 0,
         })
@@ -162,7 +162,7 @@ impl Lockstep {
         loop {
             match self.replay.insert(&chunk) {
                 InsertReply::Stored { .. } => break,
-                InsertReply::Wait { .. } => match self.replay.sample(self.batch_rows) {
+                InsertReply::Wait { .. } => match self.replay.sample(self.batch_size) {
                     Ok(batch) => self.learn(&batch)?,
                     Err(unready) => bail!("actor and learner wait for each other: {unready:?}"),
                 },
@@ -180,7 +180,7 @@ impl Lockstep {
             }
         }
         loop {
-            match self.replay.sample(self.batch_rows) {
+            match self.replay.sample(self.batch_size) {
                 Ok(batch) => self.learn(&batch)?,
                 Err(Unready::Wait(_)) => return Ok(true),
                 Err(Unready::Finished) => return Ok(false),

@@ -63,7 +63,7 @@ fn row_flops(model: &ModelConfig) -> RowFlops {
 /// forward and backward; an augmented s_t once more; CURL's query both ways and its key forward. The InfoNCE scores come on
 /// top: locations * rows^2 * rkhs for each positive. A frame is one forward pass.
 pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
-    let (model, rows) = (&config.model, f64::from(config.learner.batch_rows));
+    let (model, rows) = (&config.model, f64::from(config.learner.batch_size));
     let RowFlops {
         local,
         global,
@@ -145,7 +145,7 @@ pub fn describe(
                 "{} in all, with {} updates of {} rows (replay ratio {})",
                 config.frames(),
                 config.updates(),
-                learner.batch_rows,
+                learner.batch_size,
                 replay.replay_ratio
             ),
         ),

@@ -104,7 +104,7 @@ pub fn find(
     if updates == 0 {
         return Ok((config, ResumePoint::default()));
     }
-    let rows = updates as f64 * f64::from(config.learner.batch_rows);
+    let rows = updates as f64 * f64::from(config.learner.batch_size);
     let frames =
         config.replay.warmup_transitions + (rows / config.replay.replay_ratio).ceil() as u64;
     Ok((config, ResumePoint { updates, frames }))

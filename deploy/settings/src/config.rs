@@ -25,6 +25,7 @@ use crate::{
     derived::{self, derive},
     overrides::Override,
     presets::{self, Preset},
+    renamed,
 };
 
 /// What `driml local` does with the parts.
@@ -131,6 +132,7 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
             let mut read: Table = text
                 .parse()
                 .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
+            renamed::update(&mut read);
             derived::complete(&mut read);
             derived::check(&read).map_err(|e| usage!("{name}: {e}"))?;
             read
@@ -196,6 +198,7 @@ fn set(table: &mut Table, sets: &[String]) -> Result<bool, Usage> {
     let mut capacity_set = false;
     for text in sets {
         let one = Override::parse(text)?;
+        renamed::refuse(&one.path)?;
         derived::refuse(&one.path)?;
         capacity_set |= one.path == "replay.capacity_transitions";
         let mut tried = table.clone();
@@ -389,6 +392,7 @@ impl RunConfig {
         let mut table: Table = text
             .parse()
             .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
+        renamed::update(&mut table);
         derived::complete(&mut table);
         derived::check(&table)
             .and_then(|()| Self::from_table(&table))
@@ -411,7 +415,7 @@ impl RunConfig {
     /// Updates that belong to all transitions, at the replay ratio.
     pub fn updates(&self) -> u64 {
         let after = self.frames().saturating_sub(self.replay.warmup_transitions);
-        (after as f64 * self.replay.replay_ratio / f64::from(self.learner.batch_rows)).floor()
+        (after as f64 * self.replay.replay_ratio / f64::from(self.learner.batch_size)).floor()
             as u64
     }
 
@@ -435,7 +439,7 @@ impl RunConfig {
             ));
         }
         self.replay
-            .validate(&self.run, self.learner.batch_rows)
+            .validate(&self.run, self.learner.batch_size)
             .map_err(|e| said(&e))?;
         self.learner.validate().map_err(|e| said(&e))?;
         self.learner

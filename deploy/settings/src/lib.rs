@@ -31,3 +31,4 @@ pub mod flags;
 pub mod menu;
 mod overrides;
 pub mod presets;
+pub mod renamed;

@@ -54,7 +54,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         .context("the settings that the replay server sent")?;
     let folder = args.run_dir.join(checkpoint::FOLDER);
     let _lock = checkpoint::lock(&folder)?;
-    let rows = part.learner.batch_rows;
+    let rows = part.learner.batch_size;
     let mut requests = Requests {
         learner: rand::random(),
         rows,

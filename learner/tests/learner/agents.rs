@@ -415,7 +415,7 @@ fn part(objective: Objective, augment: Option<AugmentSettings>) -> LearnerPart {
         },
         model,
         learner: Config {
-            batch_rows: 6,
+            batch_size: 6,
             batches_in_flight: 1,
             publish_period_updates: 2,
             checkpoint_period_updates: 2,

@@ -141,7 +141,7 @@ impl Learner<'_> {
         }
         let requests = Requests {
             learner: taking_part::LEARNER,
-            rows: learner.batch_rows,
+            rows: learner.batch_size,
             in_flight: learner.batches_in_flight,
             shared_memory: transport.shared_memory,
             unreachable_max: ANSWER_MAX,

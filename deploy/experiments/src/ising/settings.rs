@@ -14,7 +14,7 @@ pub(super) struct Settings {
     /// Updates of a training.
     pub(super) updates: u64,
     /// Pairs in a batch, each with all others as negatives.
-    pub(super) batch_rows: usize,
+    pub(super) batch_size: usize,
     /// Measurements before the end.
     pub(super) checks: u64,
     /// Episodes of each.

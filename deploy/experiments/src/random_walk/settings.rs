@@ -19,7 +19,7 @@ pub(super) struct Settings {
     /// Updates of a training.
     pub(super) updates: u64,
     /// Pairs in a batch, each with all others as negatives.
-    pub(super) batch_rows: usize,
+    pub(super) batch_size: usize,
     /// Width of the heads.
     pub(super) rkhs: usize,
     /// Rows sampled per transition of a single walker.

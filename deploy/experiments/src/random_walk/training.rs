@@ -245,7 +245,7 @@ struct Source {
 
 impl Source {
     fn new(chain: &Chain, settings: &Settings, sampling: Sampling, rng: &mut ChaCha8Rng) -> Self {
-        let rows = settings.batch_rows;
+        let rows = settings.batch_size;
         let mut this = Self {
             sampling,
             rows,

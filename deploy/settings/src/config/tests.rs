@@ -118,7 +118,7 @@ fn what_nobody_uses_is_not_there() {
 fn settings_that_cannot_work_are_answered_with_what_to_do() {
     let said = |agent: &str, set: &str| with("procgen:bigfish", agent, &[set]).unwrap_err();
     expect![[r#"there is no setting "learner.update.adam.learning_rate"; [learner.update.adam] has beta1, beta2, eps, lr"#]].assert_eq(&said("driml-ada", "learner.update.adam.learning_rate=1"));
-    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_rows, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
+    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
     expect![[r#"there is no setting "world.num_level" (did you mean "world.num_levels"?); [world] has center_agent, distribution_mode, num_levels, paint_vel_info, restrict_themes, start_level, use_backgrounds, use_sequential_levels"#]].assert_eq(&said("driml-ada", "world.num_level=5"));
     expect!["model.height cannot be set by hand: it follows from input.height"]
         .assert_eq(&said("driml-ada", "model.height=84"));
@@ -256,6 +256,26 @@ fn settings_from_before_there_were_objectives_are_read() {
         );
         assert_eq!(read.run.hash(), new.run.hash());
     }
+}
+
+#[test]
+fn settings_with_names_of_before_are_read_and_set_by_the_names_of_today() {
+    let new = with("chain", "c51", &[]).unwrap();
+    let old = new.to_toml().replace("batch_size", "batch_rows");
+    assert_ne!(old, new.to_toml());
+    let read = RunConfig::parse("old.toml", &old).unwrap();
+    assert_eq!(read.to_toml(), new.to_toml());
+    let source = Source::File("old.toml".into(), old.clone());
+    let resolved = resolve(&source, &Flags::default(), &MACHINE).unwrap();
+    assert_eq!(resolved.to_toml(), new.to_toml());
+
+    expect!["learner.batch_rows is called learner.batch_size now"]
+        .assert_eq(&with("chain", "c51", &["learner.batch_rows=64"]).unwrap_err());
+    let both = old.replace("batch_rows = 64", "batch_rows = 64\nbatch_size = 64");
+    let said = RunConfig::parse("both.toml", &both)
+        .unwrap_err()
+        .to_string();
+    assert!(said.contains("unknown field `batch_rows`"), "{said}");
 }
 
 #[test]

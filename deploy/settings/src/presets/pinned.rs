@@ -40,7 +40,7 @@ const PINNED: [(&str, &[Pinned]); 13] = [
         ("replay.slack_transitions", "256", "ours"),
         ("replay.transitions_max", "200000", "ours"),
         ("transport.shared_memory", "true", "ours"),
-        ("learner.batch_rows", "256", "code"),
+        ("learner.batch_size", "256", "code"),
         ("learner.batches_in_flight", "2", "ours"),
         ("learner.publish_period_updates", "8", "ours"),
         ("learner.checkpoint_period_updates", "1000", "ours"),
