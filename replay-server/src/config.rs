@@ -9,19 +9,19 @@ use crate::storage::frame_store::log::OVERHEAD_BYTES_MAX;
 /// Most shards of one replay.
 pub(crate) const SHARDS_MAX: u32 = 256;
 
-/// A known fault of the paper's published code, reproduced to show what it does: for studies alone.
+/// A known bug of the paper's published code, reproduced to show what it does. No other run has one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Study {
+pub enum ReproducedBug {
     /// The n-step return bootstraps from s_{t+1} instead of s_{t+n}, at gamma^n, unless step t itself ended the episode.
     BootstrapFromNextState,
 }
 
-impl Study {
-    /// Every fault there is.
+impl ReproducedBug {
+    /// Every bug there is.
     pub const ALL: [Self; 1] = [Self::BootstrapFromNextState];
 
-    /// As settings and `--study` have it.
+    /// As settings and `--reproduce-bug` have it.
     pub const fn name(self) -> &'static str {
         match self {
             Self::BootstrapFromNextState => "bootstrap-from-next-state",
@@ -65,9 +65,9 @@ pub struct Config {
     pub slack_transitions: u64,
     /// Transitions of the whole run, warm-up included: once that many are stored, no more are taken. None runs on.
     pub transitions_max: Option<u64>,
-    /// A known fault to reproduce; none in every run that is not a study of it.
+    /// A known bug to train with, chosen by `--reproduce-bug`; none in every other run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub study: Option<Study>,
+    pub reproduced_bug: Option<ReproducedBug>,
 }
 
 /// Why settings were refused.

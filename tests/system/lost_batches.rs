@@ -55,7 +55,7 @@ fn config(shards: u32) -> Config {
         warmup_transitions: 0,
         slack_transitions: 1_000,
         transitions_max: Some(TRANSITIONS),
-        study: None,
+        reproduced_bug: None,
     }
 }
 

@@ -78,7 +78,7 @@ impl Server {
             warmup_transitions: 0,
             slack_transitions: 2 * TRANSITIONS,
             transitions_max: None,
-            study: None,
+            reproduced_bug: None,
         };
         let mut replay = Replay::new(&spec(), &config, ROWS).unwrap();
         for actor in 0..ACTORS {

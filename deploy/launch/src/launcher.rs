@@ -203,8 +203,8 @@ impl Launch<'_> {
                 "--config",
                 &config,
             ]);
-            if let Some(study) = self.config.replay.study {
-                args.extend(part(&["--study", study.name()]));
+            if let Some(bug) = self.config.replay.reproduced_bug {
+                args.extend(part(&["--reproduce-bug", bug.name()]));
             }
             let server =
                 ManagedProcess::start(name, &args, PART_THREADS, self.surroundings(&logs))?;

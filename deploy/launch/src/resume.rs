@@ -72,7 +72,7 @@ pub fn find(
     // First, as a run that is still ending holds memory.
     wait_until_free(folder)?;
     let flags = Flags {
-        study: RunConfig::parse(&name, &text)?.replay.study,
+        reproduce_bug: RunConfig::parse(&name, &text)?.replay.reproduced_bug,
         ..flags.clone()
     };
     let config = resolve(&Source::File(name, text), &flags, machine)?;

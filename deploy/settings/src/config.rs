@@ -15,7 +15,7 @@ use driml_machine::{
 };
 use driml_model::ModelConfig;
 use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
-use driml_replay_server::{Compression, Study};
+use driml_replay_server::{Compression, ReproducedBug};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -93,26 +93,28 @@ pub struct Flags {
     /// Seed of every generator of the run
     #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=i64::MAX as u64))]
     pub seed: Option<u64>,
-    /// For studies alone: train with a known fault of the paper's published code
-    #[arg(long, value_name = "FAULT", value_parser = studies())]
-    pub study: Option<Study>,
+    /// Train with a known bug of the paper's published code, to see what it does
+    #[arg(long, value_name = "BUG", value_parser = reproduced_bugs())]
+    pub reproduce_bug: Option<ReproducedBug>,
     /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
 }
 
-/// The faults by their names, with what they are for `--help`.
-fn studies() -> impl TypedValueParser<Value = Study> {
-    let named = |study: Study| {
-        let about = match study {
-            Study::BootstrapFromNextState => {
+/// The bugs by their names, with what they are for `--help`.
+fn reproduced_bugs() -> impl TypedValueParser<Value = ReproducedBug> {
+    let named = |bug: ReproducedBug| {
+        let about = match bug {
+            ReproducedBug::BootstrapFromNextState => {
                 "n-step returns that bootstrap from s_{t+1}, with the end of an episode seen at step t alone"
             }
         };
-        PossibleValue::new(study.name()).help(about)
+        PossibleValue::new(bug.name()).help(about)
     };
-    PossibleValuesParser::new(Study::ALL.map(named)).map(|name| {
-        let known = Study::ALL.into_iter().find(|study| study.name() == name);
+    PossibleValuesParser::new(ReproducedBug::ALL.map(named)).map(|name| {
+        let known = ReproducedBug::ALL
+            .into_iter()
+            .find(|bug| bug.name() == name);
         known.expect("clap lets no other name pass")
     })
 }
@@ -163,7 +165,7 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
             Override::parse(&format!("{path}={value}"))?.apply(&mut table)?;
         }
     }
-    study(&mut table, flags.study)?;
+    set_reproduced_bug(&mut table, flags.reproduce_bug)?;
     let capacity_set = set(&mut table, &flags.sets)? || !sized_by_machine;
     let note = fit_memory(&mut table, capacity_set, machine)?;
     derive(&mut table)?;
@@ -175,20 +177,20 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
     Ok(config)
 }
 
-/// Sets the fault to be studied; refuses settings that have one which nobody asked for.
-fn study(table: &mut Table, asked: Option<Study>) -> Result<(), Usage> {
+/// Sets the bug to train with; refuses settings that have one without the flag.
+fn set_reproduced_bug(table: &mut Table, asked: Option<ReproducedBug>) -> Result<(), Usage> {
     let Some(replay) = table.get_mut("replay").and_then(Value::as_table_mut) else {
         return Ok(());
     };
-    if let (Some(found), None) = (replay.get("study"), asked) {
+    if let (Some(found), None) = (replay.get("reproduced_bug"), asked) {
         return Err(usage!(
-            "replay.study = {found}: these settings train with a known fault, for studies alone; add --study {} if that is meant",
-            found.as_str().unwrap_or("FAULT")
+            "replay.reproduced_bug = {found}: these settings train with a known bug; add --reproduce-bug {} if that is meant",
+            found.as_str().unwrap_or("BUG")
         ));
     }
-    if let Some(study) = asked {
-        let name = Value::try_from(study).map_err(|e| usage!("--study as TOML: {e}"))?;
-        replay.insert("study".into(), name);
+    if let Some(bug) = asked {
+        let name = Value::try_from(bug).map_err(|e| usage!("--reproduce-bug as TOML: {e}"))?;
+        replay.insert("reproduced_bug".into(), name);
     }
     Ok(())
 }
@@ -376,9 +378,9 @@ impl RunConfig {
         let mut config = parts_read(table)?;
         config.validate()?;
         config.notes = presets::notes(&config.run.agent, &config.run.world);
-        if config.replay.study.is_some() {
+        if config.replay.reproduced_bug.is_some() {
             let note =
-                "a study: the targets have a known fault of the paper's published code (--study)";
+                "the targets have a known bug of the paper's published code (--reproduce-bug)";
             config.notes.push(note.into());
         }
         Ok(config)

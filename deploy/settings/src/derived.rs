@@ -27,8 +27,8 @@ const FOLLOWS: [(&str, &str); 14] = [
     ("model.num_actions", "follows from the world"),
     ("model.dim", "follows from learner.update"),
     (
-        "replay.study",
-        "is a fault to be studied, and chosen by --study",
+        "replay.reproduced_bug",
+        "is a known bug to train with, and chosen by --reproduce-bug",
     ),
 ];
 

@@ -32,7 +32,7 @@ const RESUMED: [&str; 11] = [
     "replay_shards",
     "envs",
     "seed",
-    "study",
+    "reproduce_bug",
     "run_dir",
     "lockstep",
 ];

@@ -133,7 +133,7 @@ impl Replay {
             episodes: Episodes::new(spec),
             anchors: Anchors::default(),
             window: Window::default(),
-            assembler: Assembler::new(spec, config.study),
+            assembler: Assembler::new(spec, config.reproduced_bug),
             affinity: Affinity::uniform(spec.num_actions),
             rng,
             statistics: Statistics::new(spec.horizon.k_max(), spec.num_actions),

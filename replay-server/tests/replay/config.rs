@@ -12,7 +12,7 @@ fn good() -> Config {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
-        study: None,
+        reproduced_bug: None,
         replay_ratio: 8.0,
         warmup_transitions: 1000,
         slack_transitions: 32,
