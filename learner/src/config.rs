@@ -232,7 +232,7 @@ struct InputSize {
 
 /// Why a run's settings are none that a learner can work with.
 #[derive(Debug, thiserror::Error)]
-pub enum LearnerPartError {
+pub enum LearnerConfigError {
     /// Not TOML, or a table that is missing or does not fit.
     #[error(transparent)]
     Tables(#[from] driml_protocol::config::ConfigError),
@@ -257,7 +257,7 @@ pub enum LearnerPartError {
 
 /// Everything a learner needs to know of a run.
 #[derive(Clone, Debug)]
-pub struct LearnerPart {
+pub struct LearnerConfig {
     /// What all parts agree on.
     pub spec: RunSpec,
     /// The network's sizes: the `[model]` table.
@@ -268,12 +268,12 @@ pub struct LearnerPart {
     pub transport: TransportConfig,
 }
 
-impl LearnerPart {
+impl LearnerConfig {
     /// Reads the tables from a run's resolved settings.
     ///
     /// # Errors
     /// A table that is missing or does not fit, or values that cannot work.
-    pub fn from_toml(text: &str) -> Result<Self, LearnerPartError> {
+    pub fn from_toml(text: &str) -> Result<Self, LearnerConfigError> {
         let settings = Settings::parse(text)?;
         let this = Self {
             spec: settings.table("run")?,
@@ -291,7 +291,7 @@ impl LearnerPart {
         let follows = sizes == (input.height, input.width, states)
             && this.model.num_actions == this.spec.num_actions as usize;
         if !follows {
-            return Err(LearnerPartError::Sizes);
+            return Err(LearnerConfigError::Sizes);
         }
         Ok(this)
     }

@@ -70,7 +70,8 @@ pub use augment::{Augment, AugmentSettings};
 pub use auxiliary::{Objective, positives::Positives, settings::Lambda};
 pub use batch::Batch;
 pub use config::{
-    AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart, LearnerPartError,
+    AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerConfig,
+    LearnerConfigError,
 };
 pub use driml_model::{Compute, DeviceName, Kernels};
 pub use error::UpdateError;

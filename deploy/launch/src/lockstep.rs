@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use driml_actor::{ActorSettings, Collector, Incarnation};
-use driml_learner::{Learner, LearnerPart};
+use driml_learner::{Learner, LearnerConfig};
 use driml_machine::error::Interrupted;
 use driml_protocol::{ActorJoin, Batch, BufferPool, Goodbye, InsertReply, LearnerStatus, Shutdown};
 use driml_replay_server::{Replay, Unready};
@@ -106,8 +106,8 @@ impl Lockstep {
     fn new(config: &RunConfig) -> anyhow::Result<Self> {
         let text = config.to_toml();
         let settings = ActorSettings::from_toml(&text)?;
-        let part = LearnerPart::from_toml(&text)?;
-        let batch_size = part.learner.batch_size;
+        let learner_config = LearnerConfig::from_toml(&text)?;
+        let batch_size = learner_config.learner.batch_size;
         let mut replay = Replay::new(&config.run, &config.replay, batch_size)?;
         for actor in 0..config.local.actors {
             let join = ActorJoin {
@@ -116,7 +116,7 @@ impl Lockstep {
             };
             replay.join_actor(join).map_err(anyhow::Error::msg)?;
         }
-        let mut learner = Learner::new(part, &config.local.learner_device.open()?)?;
+        let mut learner = Learner::new(learner_config, &config.local.learner_device.open()?)?;
         let (header, weights) = learner.next_weights()?;
         let status = LearnerStatus {
             weights_version: header.version,

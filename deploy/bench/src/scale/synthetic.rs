@@ -9,7 +9,7 @@ use std::{
 
 use driml_actor::{ActorSettings, Delivery, DeliveryLimits, WeightsSource};
 use driml_learner::{
-    LearnerPart,
+    LearnerConfig,
     remote::batch_source::{BatchSource, Next, Requests},
 };
 use driml_protocol::{Keys, RunClient, Shutdown};
@@ -126,12 +126,12 @@ impl Learner<'_> {
         stop: &Shutdown,
         count: &AtomicU64,
     ) -> anyhow::Result<()> {
-        let LearnerPart {
+        let LearnerConfig {
             spec,
             learner,
             transport,
             ..
-        } = LearnerPart::from_toml(&self.config.to_toml())?;
+        } = LearnerConfig::from_toml(&self.config.to_toml())?;
         let spec_hash = spec.hash();
         let mut alive = Vec::new();
         let client = |session: &Session| RunClient::new(session.clone(), keys.clone(), spec_hash);
