@@ -37,7 +37,7 @@ pub struct BenchFlags {
     /// Threads for arithmetic
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub(crate) threads: u32,
-    /// Measure in this very process, whose environment is already that of a part
+    /// Measure in this very process, whose environment is already that of a run's process
     #[arg(long, hide = true)]
     pub(crate) here: bool,
 }
@@ -105,9 +105,9 @@ fn rate(text: &str) -> Result<f64, String> {
 /// What `driml bench peers` takes.
 #[derive(Debug, Args)]
 pub struct BenchPeersArgs {
-    /// Only these parts
-    #[arg(long, value_enum, value_delimiter = ',', value_name = "PARTS")]
-    pub(crate) only: Vec<BenchPart>,
+    /// Only these components
+    #[arg(long, value_enum, value_delimiter = ',', value_name = "COMPONENTS")]
+    pub(crate) only: Vec<Component>,
     /// Rounds of ours, theirs [default: 5, or 1 with --quick]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) rounds: Option<u32>,
@@ -127,9 +127,9 @@ pub struct BenchPeersArgs {
     pub(crate) flags: BenchFlags,
 }
 
-/// A part that is measured by itself, and beside a peer.
+/// A component that is measured by itself, and beside a peer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
-pub enum BenchPart {
+pub enum Component {
     /// Beside PyTorch
     Learner,
     /// Beside PyTorch
@@ -140,7 +140,7 @@ pub enum BenchPart {
     Env,
 }
 
-impl BenchPart {
+impl Component {
     /// As the command line has it.
     pub(crate) const fn name(self) -> &'static str {
         match self {
