@@ -448,7 +448,7 @@ mod tests {
 
     use super::*;
     use crate::made_up;
-    use driml_launch::run_folder::Recorder;
+    use driml_launch::run_folder::RunRecorder;
 
     #[test]
     fn a_run_counts_for_the_plan_that_made_it_alone() {
@@ -468,7 +468,7 @@ mod tests {
         };
         let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
         let folder = RunFolder::new(queue.root.join("run"));
-        let mut recorder = Recorder::create(&folder, "", &[], &[]).unwrap();
+        let mut recorder = RunRecorder::create(&folder, "", &[], &[]).unwrap();
         recorder.record(std::slice::from_ref(&replay), &learner, &[]);
         let summary = recorder.summarise(Outcome::Finished, &made_up::spec(), &replay, &learner);
         summary.write(&folder).unwrap();

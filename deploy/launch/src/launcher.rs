@@ -25,7 +25,7 @@ use crate::{
     managed_process::{ManagedProcess, Surroundings},
     meeting::Meeting,
     resume,
-    run_folder::{Outcome, Recorder, ResumePoint, RunFolder, Summary},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary},
     status_client::Statuses,
 };
 
@@ -50,7 +50,8 @@ const DRAIN_POLL: Duration = Duration::from_millis(100);
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
 const PART_THREADS: u32 = 1;
 
-/// Trains with one process for each part, and leaves `run_dir`; a run that is `resumed` has it already, and so much behind it.
+/// Trains with one process for each part, and leaves `run_dir`; a run that is `resumed` has that folder already and goes on
+/// from the point given.
 ///
 /// # Errors
 /// A part that failed or went silent, a file system that refuses; [`Interrupted`] if a person ended the run.
@@ -72,21 +73,33 @@ pub fn run(
         .collect();
     let (text, losses) = (config.to_toml(), config.learner.update.objective.losses());
     let mut recorder = match resumed {
-        Some(behind) => Recorder::go_on(run_dir, &text, losses, &names, behind, config.frames())?,
-        None => Recorder::create(run_dir, &text, losses, &names)?,
+        Some(resume_point) => RunRecorder::go_on(
+            run_dir,
+            &text,
+            losses,
+            &names,
+            resume_point,
+            config.frames(),
+        )?,
+        None => RunRecorder::create(run_dir, &text, losses, &names)?,
     };
-    let behind = resumed.unwrap_or_default();
+    let resume_point = resumed.unwrap_or_default();
     let meeting = Meeting::create()?;
     let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
     if let Some(listen) = listen {
         endpoints[0] = listen;
     }
     let screen = Screen::new(config.frames(), TEMPLATE);
-    let display = Display::new(screen.clone(), config.frames(), config.updates(), behind);
+    let display = Display::new(
+        screen.clone(),
+        config.frames(),
+        config.updates(),
+        resume_point,
+    );
     let mut launch = Launch {
         config,
         run_dir,
-        behind,
+        resume_point,
         servers,
         endpoints,
         meeting,
@@ -140,7 +153,7 @@ pub fn run(
 struct Launch<'a> {
     config: &'a RunConfig,
     run_dir: &'a RunFolder,
-    behind: ResumePoint,
+    resume_point: ResumePoint,
     /// Names of the replay servers, one a shard, and where each listens.
     servers: Vec<String>,
     endpoints: Vec<String>,
@@ -180,7 +193,7 @@ impl Launch<'_> {
         }
     }
 
-    fn start_and_watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
+    fn start_and_watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
         let logs = self.run_dir.logs();
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
         let config = recorder.config_path().display().to_string();
@@ -191,7 +204,7 @@ impl Launch<'_> {
                 .collect::<Vec<_>>()
         };
         for (shard, (name, endpoint)) in self.servers.iter().zip(&self.endpoints).enumerate() {
-            let (shard, after) = (shard.to_string(), self.behind.updates.to_string());
+            let (shard, after) = (shard.to_string(), self.resume_point.updates.to_string());
             let mut args = part(&[
                 "replay-server",
                 "--listen",
@@ -295,7 +308,7 @@ impl Launch<'_> {
     }
 
     /// Asks, shows and records once a second until the run is over.
-    fn watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
+    fn watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
         let mut heard = [Instant::now(); 2];
         let mut progress = (Instant::now(), (0, 0));
         loop {
@@ -324,7 +337,7 @@ impl Launch<'_> {
             }
             let (replay, mut learner) = (statuses.replay.clone(), statuses.learner.clone());
             // Until the learner has answered, too.
-            learner.updates = learner.updates.max(self.behind.updates);
+            learner.updates = learner.updates.max(self.resume_point.updates);
             let rss: Vec<_> = self.parts.iter_mut().map(ManagedProcess::rss_mib).collect();
             for line in recorder.record(&statuses.shards, &learner, &rss) {
                 self.screen.line(&line);
@@ -472,7 +485,7 @@ impl Launch<'_> {
     /// Writes the last row and the summary, says what could not be written before, and whether the summary could.
     fn conclude(
         &mut self,
-        recorder: &mut Recorder,
+        recorder: &mut RunRecorder,
         outcome: Outcome,
     ) -> (Summary, anyhow::Result<()>) {
         let (shards, replay, learner) = match &self.statuses {

@@ -36,10 +36,15 @@ pub struct Display {
 }
 
 impl Display {
-    /// A view of a run of so many frames and updates, with so much `behind` it.
-    pub fn new(screen: Screen, frames_max: u64, updates_max: u64, behind: ResumePoint) -> Self {
+    /// A view of a run of `frames_max` frames and `updates_max` updates that starts at `resume_point`.
+    pub fn new(
+        screen: Screen,
+        frames_max: u64,
+        updates_max: u64,
+        resume_point: ResumePoint,
+    ) -> Self {
         let mut rates = Rates::default();
-        rates.add(Instant::now(), behind.frames, behind.updates);
+        rates.add(Instant::now(), resume_point.frames, resume_point.updates);
         Self {
             screen,
             frames_max,

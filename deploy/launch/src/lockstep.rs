@@ -14,7 +14,7 @@ use driml_settings::config::RunConfig;
 use crate::{
     console::{self, Screen, print},
     live_view::{Display, TEMPLATE},
-    run_folder::{Outcome, Recorder, ResumePoint, RunFolder},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder},
 };
 
 /// How often progress is shown and recorded.
@@ -34,7 +34,7 @@ pub fn run(
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(exit_with_parent).context("listening for signals")?;
-    let mut recorder = Recorder::create(
+    let mut recorder = RunRecorder::create(
         run_dir,
         &config.to_toml(),
         config.learner.update.objective.losses(),

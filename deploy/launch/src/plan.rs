@@ -91,13 +91,13 @@ pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
     Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX)
 }
 
-/// The plan of a run that has so much `behind` it, one fact a line.
+/// The plan of a run that starts at `resume_point`, one fact a line.
 pub fn describe(
     config: &RunConfig,
     from: &str,
     run_dir: &RunFolder,
     lockstep: bool,
-    behind: ResumePoint,
+    resume_point: ResumePoint,
     machine: &Machine,
 ) -> String {
     let RunConfig {
@@ -113,7 +113,7 @@ pub fn describe(
         max.saturating_add(held * COMPRESSED_FIELDS_BYTES)
     });
     let bytes = compressed.min(held * replay_bytes_each(run));
-    let left = 1.0 - behind.updates as f64 / config.updates().max(1) as f64;
+    let left = 1.0 - resume_point.updates as f64 / config.updates().max(1) as f64;
     let processes = if lockstep {
         "one, all parts in lockstep".into()
     } else {

@@ -1,4 +1,4 @@
-//! `driml local --resume`: the settings of an interrupted run, and what it has behind it.
+//! `driml local --resume`: the settings of an interrupted run, and the point from which it goes on.
 //! It changes nothing in the run's folder, and waits there for whoever still saves.
 
 use std::time::{Duration, Instant};
@@ -53,7 +53,7 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The settings with which the run in `folder` goes on, and what it has behind it.
+/// The settings with which the run in `folder` goes on, and from which point.
 ///
 /// # Errors
 /// A folder that is no run's, settings that cannot work, no checkpoint, nothing left to do, somebody who is at it.

@@ -33,7 +33,7 @@ pub struct Summary {
     pub agent: String,
     /// The seed.
     pub seed: u64,
-    /// Updates that the run had behind it when it was resumed, the last time; 0 if it never was. Frames, updates,
+    /// Updates that were done when the run was resumed, the last time; 0 if it never was. Frames, updates,
     /// rows, episodes, mean return, seconds and mean k are of the whole run, all else is of what came since.
     #[serde(default)]
     pub resumed_after_updates: u64,
