@@ -1,4 +1,5 @@
-//! The launcher: starts the parts as processes, watches them to the end of the run, and ends them in order.
+//! The launcher: starts replay servers, learner and actors as processes, watches them to the end of the run, and ends them in
+//! order.
 //! Each is a `managed_process`; `status_client` asks how they are, `live_view` shows it and `run_folder` keeps it.
 
 use std::{
@@ -29,17 +30,17 @@ use crate::{
     status_client::Statuses,
 };
 
-/// How often the parts are asked how they are.
+/// How often the processes are asked how they are.
 const POLL: Duration = Duration::from_secs(1);
 /// How long the replay server may take to listen.
 const LISTEN_MAX: Duration = Duration::from_secs(30);
-/// How long a part may leave questions unanswered, from its start too, before the run is given up.
+/// How long a process may leave questions unanswered, from its start too, before the run is given up.
 const SILENCE_MAX: Duration = Duration::from_secs(120);
 /// How long a run may make no progress before it is given up.
 const STALL_MAX: Duration = Duration::from_secs(600);
 /// How long actors may take to deliver what they have, once they are not needed or told to stop.
 const ACTORS_DRAIN_MAX: Duration = Duration::from_secs(60);
-/// How long actors may take to end once another part has failed.
+/// How long actors may take to end once another process has failed.
 const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
 /// How long the learner may take to save, once it is told to stop.
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
@@ -48,13 +49,13 @@ const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
 /// How often a learner that saves is asked whether it is done.
 const DRAIN_POLL: Duration = Duration::from_millis(100);
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
-const PART_THREADS: u32 = 1;
+const PROCESS_THREADS: u32 = 1;
 
-/// Trains with one process for each part, and leaves `run_dir`; a run that is `resumed` has that folder already and goes on
-/// from the point given.
+/// Trains with a process for each replay server, the learner and each actor, and leaves `run_dir`; a run that is `resumed` has
+/// that folder already and goes on from the point given.
 ///
 /// # Errors
-/// A part that failed or went silent, a file system that refuses; [`Interrupted`] if a person ended the run.
+/// A process that failed or went silent, a file system that refuses; [`Interrupted`] if a person ended the run.
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
@@ -106,7 +107,7 @@ pub fn run(
         screen,
         display,
         interrupts,
-        parts: Vec::new(),
+        processes: Vec::new(),
         statuses: None,
     };
 
@@ -162,7 +163,7 @@ struct Launch<'a> {
     display: Display,
     interrupts: Interrupts,
     /// Replay servers, learner, actors, in this order, as far as they were started.
-    parts: Vec<ManagedProcess>,
+    processes: Vec<ManagedProcess>,
     statuses: Option<Statuses>,
 }
 
@@ -175,12 +176,12 @@ fn server_names(shards: u32) -> Vec<String> {
 }
 
 impl Launch<'_> {
-    /// The learner's place in `parts`.
+    /// The learner's place in `processes`.
     fn learner(&self) -> usize {
         self.servers.len()
     }
 
-    /// The first actor's place in `parts`.
+    /// The first actor's place in `processes`.
     fn first_actor(&self) -> usize {
         self.servers.len() + 1
     }
@@ -197,15 +198,11 @@ impl Launch<'_> {
         let logs = self.run_dir.logs();
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
         let config = recorder.config_path().display().to_string();
-        let part = |words: &[&str]| {
-            words
-                .iter()
-                .map(|&word| word.to_owned())
-                .collect::<Vec<_>>()
-        };
+        let words =
+            |args: &[&str]| -> Vec<String> { args.iter().map(|&arg| arg.to_owned()).collect() };
         for (shard, (name, endpoint)) in self.servers.iter().zip(&self.endpoints).enumerate() {
             let (shard, after) = (shard.to_string(), self.resume_point.updates.to_string());
-            let mut args = part(&[
+            let mut args = words(&[
                 "replay-server",
                 "--listen",
                 endpoint,
@@ -217,11 +214,11 @@ impl Launch<'_> {
                 &config,
             ]);
             if let Some(bug) = self.config.replay.reproduced_bug {
-                args.extend(part(&["--reproduce-bug", bug.name()]));
+                args.extend(words(&["--reproduce-bug", bug.name()]));
             }
             let server =
-                ManagedProcess::start(name, &args, PART_THREADS, self.surroundings(&logs))?;
-            self.parts.push(server);
+                ManagedProcess::start(name, &args, PROCESS_THREADS, self.surroundings(&logs))?;
+            self.processes.push(server);
         }
         let mut sessions = Vec::new();
         for endpoint in self.endpoints.clone() {
@@ -235,28 +232,28 @@ impl Launch<'_> {
 
         let folder = self.run_dir.display().to_string();
         let device = self.config.local.learner_device.to_string();
-        let mut args = part(&["learner", "--run-dir", &folder, "--device", &device]);
+        let mut args = words(&["learner", "--run-dir", &folder, "--device", &device]);
         for endpoint in &self.endpoints {
-            args.extend(part(&["--connect", endpoint]));
+            args.extend(words(&["--connect", endpoint]));
         }
-        self.parts.push(ManagedProcess::start(
+        self.processes.push(ManagedProcess::start(
             "learner",
             &args,
             self.config.local.learner_threads,
             self.surroundings(&logs),
         )?);
         for id in 0..self.config.local.actors {
-            let args = part(&[
+            let args = words(&[
                 "actor",
                 "--connect",
                 &self.endpoints[id as usize % self.endpoints.len()],
                 "--id",
                 &id.to_string(),
             ]);
-            self.parts.push(ManagedProcess::start(
+            self.processes.push(ManagedProcess::start(
                 &format!("actor-{id}"),
                 &args,
-                PART_THREADS,
+                PROCESS_THREADS,
                 self.surroundings(&logs),
             )?);
         }
@@ -338,7 +335,11 @@ impl Launch<'_> {
             let (replay, mut learner) = (statuses.replay.clone(), statuses.learner.clone());
             // Until the learner has answered, too.
             learner.updates = learner.updates.max(self.resume_point.updates);
-            let rss: Vec<_> = self.parts.iter_mut().map(ManagedProcess::rss_mib).collect();
+            let rss: Vec<_> = self
+                .processes
+                .iter_mut()
+                .map(ManagedProcess::rss_mib)
+                .collect();
             for line in recorder.record(&statuses.shards, &learner, &rss) {
                 self.screen.line(&line);
             }
@@ -363,20 +364,20 @@ impl Launch<'_> {
         }
     }
 
-    /// Whether all parts are as they should be: running, or actors that are not needed any more.
+    /// Whether all processes are as they should be: running, or actors that are not needed any more.
     fn check_alive(&mut self) -> anyhow::Result<()> {
         let first_actor = self.first_actor();
-        for (at, part) in self.parts.iter_mut().enumerate() {
-            if let Some(status) = part.end()
+        for (at, process) in self.processes.iter_mut().enumerate() {
+            if let Some(status) = process.end()
                 && !(at >= first_actor && status.success())
             {
-                bail!("{}", part.exit_report());
+                bail!("{}", process.exit_report());
             }
         }
         Ok(())
     }
 
-    /// Ends all parts: actors first, so that what they have is stored; the learner saves; the replay server is last, so
+    /// Ends all processes: actors first, so that what they have is stored; the learner saves; the replay server is last, so
     /// that it can be asked for the final counts. A second interrupt ends everything at once.
     fn end(&mut self, ran: &anyhow::Result<Outcome>) -> anyhow::Result<()> {
         if matches!(ran, Ok(Outcome::Interrupted)) {
@@ -387,14 +388,14 @@ impl Launch<'_> {
         let interrupts = self.interrupts.clone();
         let abort = move || interrupts.count() > allowed;
         let finished = matches!(ran, Ok(Outcome::Finished));
-        // Once a part has failed, what the actors still have will hardly be learned from.
+        // Once a process has failed, what the actors still have will hardly be learned from.
         let actors_max = if ran.is_ok() {
             ACTORS_DRAIN_MAX
         } else {
             FAILED_DRAIN_MAX
         };
         let mut late = Vec::new();
-        let last = self.parts.len();
+        let last = self.processes.len();
         let (learner, first_actor) = (self.learner().min(last), self.first_actor().min(last));
         // When the run is finished, actors hear it from the replay server and end by themselves.
         let actors = self.stop(first_actor..last, !finished, actors_max, &abort);
@@ -428,7 +429,7 @@ impl Launch<'_> {
     /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
     fn wait_for_final_checkpoint(&mut self, abort: &impl Fn() -> bool) {
         let at = self.learner();
-        let Some(learner) = self.parts.get_mut(at) else {
+        let Some(learner) = self.processes.get_mut(at) else {
             return;
         };
         learner.ask_to_stop();
@@ -448,7 +449,7 @@ impl Launch<'_> {
         }
     }
 
-    /// Waits for some parts to end, asking them first if `ask`; says which did not end well in time. None is left.
+    /// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left.
     fn stop(
         &mut self,
         which: std::ops::Range<usize>,
@@ -456,26 +457,26 @@ impl Launch<'_> {
         drain_max: Duration,
         abort: &impl Fn() -> bool,
     ) -> Vec<String> {
-        let parts = &mut self.parts[which];
+        let processes = &mut self.processes[which];
         if ask {
-            parts.iter_mut().for_each(ManagedProcess::ask_to_stop);
+            processes.iter_mut().for_each(ManagedProcess::ask_to_stop);
         }
         let deadline = Instant::now() + drain_max;
         let mut late = Vec::new();
-        for part in parts {
-            match part.wait_until(deadline, abort) {
+        for process in processes {
+            match process.wait_until(deadline, abort) {
                 Some(status) if status.success() => {}
-                Some(_) => late.push(part.exit_report()),
+                Some(_) => late.push(process.exit_report()),
                 None => {
                     if !abort() {
                         late.push(format!(
                             "{} did not end within {} and was killed",
-                            part.name,
+                            process.name,
                             duration(drain_max)
                         ));
                     }
-                    part.kill();
-                    part.wait_until(Instant::now() + REPLAY_DRAIN_MAX, || false);
+                    process.kill();
+                    process.wait_until(Instant::now() + REPLAY_DRAIN_MAX, || false);
                 }
             }
         }
@@ -494,7 +495,7 @@ impl Launch<'_> {
         };
         recorder.record(shards, &learner, &[]);
         let logs = self
-            .parts
+            .processes
             .iter()
             .filter_map(ManagedProcess::missing_log_lines);
         let missing = recorder.missing().into_iter().chain(logs);

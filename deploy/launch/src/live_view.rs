@@ -59,15 +59,15 @@ impl Display {
         let now = Instant::now();
         self.rates
             .add(now, replay.transitions_inserted, learner.updates);
-        let parts = self.text(replay, learner, episodes);
+        let texts = self.text(replay, learner, episodes);
         match self.screen.bar() {
             Some(bar) => {
                 bar.set_position(replay.transitions_inserted.min(self.frames_max));
-                bar.set_message(parts.join("\n"));
+                bar.set_message(texts.join("\n"));
             }
             None if now >= self.plain_next => {
                 self.plain_next = now + PLAIN_PERIOD;
-                self.screen.line(&parts.join("  "));
+                self.screen.line(&texts.join("  "));
             }
             None => {}
         }

@@ -27,7 +27,7 @@ const LEARNER: u64 = 1;
 /// Trains in this process, and leaves `run_dir`.
 ///
 /// # Errors
-/// A part that failed, a file system that refuses; [`Interrupted`] if a person ended the run.
+/// A component that failed, a file system that refuses; [`Interrupted`] if a person ended the run.
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
@@ -41,7 +41,7 @@ pub fn run(
         &[],
     )?;
     let screen = Screen::new(config.frames(), TEMPLATE);
-    let mut parts = Lockstep::new(config)?;
+    let mut lockstep = Lockstep::new(config)?;
     let mut display = Display::new(
         screen.clone(),
         config.frames(),
@@ -53,33 +53,33 @@ pub fn run(
 
     let mut outcome = Outcome::Finished;
     let mut saved = u64::MAX;
-    while parts.round()? {
-        if parts.learner.checkpoint_is_due() && parts.learner.updates() != saved {
-            saved = parts.learner.updates();
-            parts.learner.save(&folder)?;
+    while lockstep.round()? {
+        if lockstep.learner.checkpoint_is_due() && lockstep.learner.updates() != saved {
+            saved = lockstep.learner.updates();
+            lockstep.learner.save(&folder)?;
         }
         if shown.elapsed() >= POLL {
             shown = Instant::now();
-            let replay = parts.replay.status();
-            let said = recorder.record(std::slice::from_ref(&replay), &parts.status, &[]);
+            let replay = lockstep.replay.status();
+            let said = recorder.record(std::slice::from_ref(&replay), &lockstep.status, &[]);
             said.iter().for_each(|line| screen.line(line));
-            display.show(&replay, &parts.status, recorder.episodes(&replay));
+            display.show(&replay, &lockstep.status, recorder.episodes(&replay));
         }
         if shutdown.is_set() {
             outcome = Outcome::Interrupted;
             break;
         }
     }
-    parts.end()?;
-    if parts.learner.updates() != saved {
-        parts.learner.save(&folder)?;
+    lockstep.end()?;
+    if lockstep.learner.updates() != saved {
+        lockstep.learner.save(&folder)?;
     }
     screen.clear();
-    let replay = parts.replay.status();
-    recorder.record(std::slice::from_ref(&replay), &parts.status, &[]);
+    let replay = lockstep.replay.status();
+    recorder.record(std::slice::from_ref(&replay), &lockstep.status, &[]);
     let missing = recorder.missing();
     missing.iter().for_each(|line| console::line(line));
-    let summary = recorder.summarise(outcome, &config.run, &replay, &parts.status);
+    let summary = recorder.summarise(outcome, &config.run, &replay, &lockstep.status);
     print(&summary.describe(run_dir))?;
     summary.write(run_dir)?;
     if outcome == Outcome::Interrupted {
@@ -89,7 +89,7 @@ pub fn run(
     }
 }
 
-/// The parts, hand in hand.
+/// The components of a run, which take turns.
 struct Lockstep {
     actors: Vec<Collector>,
     next_actor: usize,

@@ -79,8 +79,8 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
             Value::String(variant.into()),
         );
     }
-    let config: WorldConfig = part(table, "world")?;
-    let update: LearnerSettings = part(table, "learner.update")?;
+    let config: WorldConfig = table_at(table, "world")?;
+    let update: LearnerSettings = table_at(table, "learner.update")?;
     let shape = config.frame_shape();
     let num_actions = config.num_actions();
     let stack = whole(table, "run.frame_stack")?;
@@ -225,7 +225,7 @@ fn whole(table: &Table, path: &str) -> Result<i64, Usage> {
     })
 }
 
-fn part<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
+fn table_at<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
     let value = find(table, path).ok_or_else(|| {
         usage!("the settings have no [{path}] table: use a config.toml that driml wrote")
     })?;

@@ -38,9 +38,9 @@ pub(super) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
         runs: Vec::new(),
         missing: Vec::new(),
     };
-    for ((part, seed, plan), ran) in plans.into_iter().zip(ran) {
+    for ((kind, seed, plan), ran) in plans.into_iter().zip(ran) {
         match ran {
-            Some(ran) => results.runs.push((part, seed, ran)),
+            Some(ran) => results.runs.push((kind, seed, ran)),
             None => results.missing.push(plan.name),
         }
     }

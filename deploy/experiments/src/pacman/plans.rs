@@ -25,8 +25,8 @@ impl Settings {
         let mut plans = Vec::new();
         for seed in 1..=self.seeds {
             for &epsilon in &self.predictability.epsilons {
-                let part = RunKind::Epsilon(epsilon);
-                plans.push((part, seed, self.predictability_plan(epsilon, seed)));
+                let kind = RunKind::Epsilon(epsilon);
+                plans.push((kind, seed, self.predictability_plan(epsilon, seed)));
             }
             for agent in &self.agents {
                 let plan = self.continual_plan("ghosts", &self.continual, agent, seed);

@@ -130,8 +130,8 @@ fn loss_table(results: &Results, losses: &[Loss]) -> Table {
         .epsilons
         .iter()
         .map(|&epsilon| {
-            let part = RunKind::Epsilon(epsilon);
-            let here = results.runs.iter().filter(|(of, ..)| *of == part);
+            let kind = RunKind::Epsilon(epsilon);
+            let here = results.runs.iter().filter(|(of, ..)| *of == kind);
             let episodes = here.map(|(.., ran)| ran.summary.episodes as f64);
             let mut row = vec![
                 epsilon.to_string(),
@@ -223,7 +223,7 @@ fn got_losses(losses: &[Loss]) -> Vec<String> {
 }
 
 fn got_tasks(
-    part: &str,
+    panel: &str,
     continual: &Continual,
     results: &Results,
     traces: &[Trace],
@@ -236,7 +236,7 @@ fn got_tasks(
             .filter_map(|trace| Some(trace.task(continual, last)?.0 - trace.task(continual, 0)?.0));
         if let Some(gain) = Spread::of(gains) {
             lines.push(format!(
-                "{part} `{agent}`: return at the end of the last task minus that of the first: {gain}."
+                "{panel} `{agent}`: return at the end of the last task minus that of the first: {gain}."
             ));
         }
     }
@@ -255,7 +255,7 @@ fn got_tasks(
             });
             if let Some(apart) = Spread::of(apart) {
                 lines.push(format!(
-                    "{part} `{agent}` minus `{first}`, return over all tasks, seed by seed: {apart}."
+                    "{panel} `{agent}` minus `{first}`, return over all tasks, seed by seed: {apart}."
                 ));
             }
         }

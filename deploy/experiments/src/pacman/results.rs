@@ -52,7 +52,7 @@ pub(super) fn loss_of(
     let runs = results
         .runs
         .iter()
-        .filter(|(part, ..)| *part == RunKind::Epsilon(epsilon));
+        .filter(|(kind, ..)| *kind == RunKind::Epsilon(epsilon));
     runs.map(|(_, seed, ran)| Ok((*seed, Run::read(&ran.folder)?.values(column)?)))
         .collect()
 }
@@ -66,8 +66,8 @@ pub(super) fn traces(results: &Results, noise: bool) -> anyhow::Result<Vec<Trace
         &settings.continual
     };
     let mut traces = Vec::new();
-    for (part, seed, ran) in &results.runs {
-        let agent = match part {
+    for (kind, seed, ran) in &results.runs {
+        let agent = match kind {
             RunKind::Ghosts(agent) if !noise => agent,
             RunKind::Noise(agent) if noise => agent,
             _ => continue,
