@@ -3,13 +3,14 @@
 
 use std::{
     collections::BTreeMap,
-    fs::{self, File, TryLockError},
+    fs::{self, File},
     io::{self, Write},
     path::{Path, PathBuf},
 };
 
 use candle_core::Device;
 use driml_model::{Compute, Encoder, ModelConfig, Parameters};
+use driml_protocol::lock_file;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -278,19 +279,9 @@ fn tensor_files(agent: &Agent) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateErr
 pub fn lock(folder: &Path) -> Result<File, CheckpointError> {
     fs::create_dir_all(folder).map_err(io_error("create", folder))?;
     let path = folder.join(LOCK);
-    let file = File::create(&path).map_err(io_error("create", &path))?;
-    match file.try_lock() {
-        Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => Err(CheckpointError::InUse(folder.to_owned())),
-        Err(TryLockError::Error(why)) => {
-            // Not every file system of a cluster has locks.
-            tracing::warn!(
-                "{} cannot be locked: {why}; let no other learner save there",
-                path.display()
-            );
-            Ok(file)
-        }
-    }
+    let lock = lock_file::create(&path, "let no other learner save there");
+    let lock = lock.map_err(io_error("create", &path))?;
+    lock.ok_or_else(|| CheckpointError::InUse(folder.to_owned()))
 }
 
 /// The checkpoints in `folder`, oldest first, as (updates, path). A folder that does not exist has none.

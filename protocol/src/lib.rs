@@ -53,7 +53,7 @@ pub use messages::{
     },
 };
 pub use process::{
-    end_signs, fault,
+    end_signs, fault, lock_file,
     seldom::Seldom,
     shutdown::{Shutdown, join_within},
     whole_file,

@@ -4,7 +4,7 @@
 
 use std::{
     collections::VecDeque,
-    fs::{self, File, TryLockError},
+    fs::{self, File},
     io::{Read, Seek, SeekFrom},
     os::unix::process::CommandExt,
     path::{Path, PathBuf},
@@ -24,6 +24,7 @@ use driml_machine::{
     error::{EXIT_USAGE, usage},
     resources::Machine,
 };
+use driml_protocol::lock_file;
 use driml_settings::{config::Flags, renamed};
 use nix::{
     sys::signal::{Signal, kill},
@@ -357,12 +358,8 @@ impl Queue {
     ) -> anyhow::Result<()> {
         let mut said = false;
         loop {
-            match log.try_lock() {
-                Ok(()) => return Ok(()),
-                Err(TryLockError::Error(e)) => {
-                    return Err(e).context("locking a run's log");
-                }
-                Err(TryLockError::WouldBlock) => {}
+            if lock_file::try_lock(log).context("locking a run's log")? {
+                return Ok(());
             }
             if !said {
                 said = true;

@@ -13,6 +13,7 @@ use std::{
 };
 
 use anyhow::Context;
+use driml_protocol::lock_file;
 use nix::unistd::{dup2_stdin, geteuid};
 
 const PREFIX: &str = "driml-run-";
@@ -46,7 +47,7 @@ impl Meeting {
         // Locked before it has the name by which it is known, or somebody who sweeps just now would find it without a holder.
         let fresh = folder.path().join("new");
         let lock = File::create(&fresh)?;
-        if let Err(e) = lock.try_lock() {
+        if let Err(e) = lock_file::try_lock(&lock) {
             // Nobody sweeps what cannot be locked.
             tracing::debug!("locking {}: {e}", fresh.display());
         }
@@ -95,7 +96,8 @@ fn sweep(place: &Path) {
 }
 
 fn is_unused(folder: &Path) -> bool {
-    File::open(folder.join(IN_USE)).is_ok_and(|lock| lock.try_lock().is_ok())
+    let lock = File::open(folder.join(IN_USE));
+    lock.is_ok_and(|lock| matches!(lock_file::try_lock(&lock), Ok(true)))
 }
 
 #[cfg(test)]
