@@ -10,7 +10,7 @@ use std::{
 use anyhow::{Context, bail};
 use driml_protocol::{
     Assembly, BufferPool, CodecError, PIECE_BYTES, PendingReply, RunClient, Seldom, Shutdown,
-    WeightsHeader, WeightsReply, WeightsRequest, WeightsVersion, fault,
+    Weights, WeightsReply, WeightsRequest, WeightsVersion, fault,
 };
 
 /// How long one piece may take to come.
@@ -25,9 +25,6 @@ const TICK: Duration = Duration::from_millis(200);
 const PAUSE: Duration = Duration::from_millis(200);
 /// How long the first weights may take before a person hears that they are waited for.
 const SILENT_MAX: Duration = Duration::from_secs(5);
-
-/// Weights as they came: what they say of themselves, and a safetensors file.
-pub type Weights = (WeightsHeader, Vec<u8>);
 
 /// The newest weights, taken at most once. They are pulled at most once for each time that they are asked for.
 #[derive(Clone, Debug)]
@@ -105,7 +102,7 @@ impl NewestWeights {
         let mut state = self.state();
         match weights {
             Some(weights) => {
-                state.pulled = weights.0.version;
+                state.pulled = weights.header.version;
                 state.slot = Some(weights);
             }
             // Whoever announced them did not have them.
@@ -263,10 +260,15 @@ impl WeightsSource {
 
 #[cfg(test)]
 mod tests {
+    use driml_protocol::WeightsHeader;
+
     use super::*;
 
     fn weights(version: u64) -> Option<Weights> {
-        Some((WeightsHeader::new(version, 0, &[]), Vec::new()))
+        Some(Weights {
+            header: WeightsHeader::new(version, 0, &[]),
+            safetensors: Vec::new(),
+        })
     }
 
     #[test]
@@ -279,7 +281,10 @@ mod tests {
         newest.put(weights(2));
         newest.announce(3);
         assert_eq!(wanted(), None, "the last ones were not taken yet");
-        assert_eq!(newest.take_within(Duration::ZERO).unwrap().0.version, 2);
+        assert_eq!(
+            newest.take_within(Duration::ZERO).unwrap().header.version,
+            2
+        );
         assert_eq!(wanted(), Some(2));
         // A stranger's announcement: nothing newer is there, and nobody waits for it.
         newest.announce(1 << 60);
@@ -298,7 +303,7 @@ mod tests {
             watcher.put(weights(2));
         });
         let taken = newest.take_within(Duration::from_secs(3600));
-        assert_eq!(taken.unwrap().0.version, 2);
+        assert_eq!(taken.unwrap().header.version, 2);
         pull.join().unwrap();
     }
 }

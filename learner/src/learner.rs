@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use driml_model::{Compute, Enlarge};
-use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, WeightsHeader};
+use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, Weights, WeightsHeader};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -19,9 +19,6 @@ use crate::{
     config::{ConfigError, LearnerConfig},
     error::UpdateError,
 };
-
-/// Weights as they travel: what they say of themselves, and a safetensors file.
-pub type Weights = (WeightsHeader, Vec<u8>);
 
 /// Why a learner could not be made, learn or be saved.
 #[derive(Debug, thiserror::Error)]
@@ -261,7 +258,10 @@ impl Learner {
         let safetensors = self.agent.weights()?;
         self.weights_version += 1;
         let header = WeightsHeader::new(self.weights_version, self.updates(), &safetensors);
-        Ok((header, safetensors))
+        Ok(Weights {
+            header,
+            safetensors,
+        })
     }
 
     /// Writes a checkpoint into `folder`.

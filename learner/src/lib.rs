@@ -75,7 +75,7 @@ pub use config::{
 };
 pub use driml_model::{Compute, DeviceName, Kernels};
 pub use error::UpdateError;
-pub use learner::{Learner, LearnerError, Weights};
+pub use learner::{Learner, LearnerError};
 pub use optimiser::adam::AdamSettings;
 pub use remote::run::{RunArgs, run};
 pub use settings::LearnerSettings;

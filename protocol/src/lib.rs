@@ -48,7 +48,7 @@ pub use messages::{
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
     tally::Tally,
     weights::{
-        Assembly, PIECE_BYTES, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
+        Assembly, PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
         WeightsVersion,
     },
 };

@@ -64,10 +64,11 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     let client = system.connect();
     let hash = client.spec.hash();
     let config = LearnerConfig::from_toml(&client.config_toml).unwrap();
-    let (_, good) = Learner::new(config, &Compute::CPU)
+    let good = Learner::new(config, &Compute::CPU)
         .unwrap()
         .next_weights()
-        .unwrap();
+        .unwrap()
+        .safetensors;
     let learner = FakeLearner { client: &client };
     let upload = FakeLearner::upload;
 

@@ -7,7 +7,9 @@ use anyhow::{Context, bail};
 use driml_actor::{ActorSettings, Collector, Incarnation};
 use driml_learner::{Learner, LearnerConfig};
 use driml_machine::error::Interrupted;
-use driml_protocol::{ActorJoin, Batch, BufferPool, Goodbye, InsertReply, LearnerStatus, Shutdown};
+use driml_protocol::{
+    ActorJoin, Batch, BufferPool, Goodbye, InsertReply, LearnerStatus, Shutdown, Weights,
+};
 use driml_replay_server::{Replay, Unready};
 use driml_settings::config::RunConfig;
 
@@ -117,10 +119,10 @@ impl Lockstep {
             replay.join_actor(join).map_err(anyhow::Error::msg)?;
         }
         let mut learner = Learner::new(learner_config, &config.local.learner_device.open()?)?;
-        let (header, weights) = learner.next_weights()?;
+        let first = learner.next_weights()?;
         let status = LearnerStatus {
-            weights_version: header.version,
-            weights_sha256: header.sha256_hex(),
+            weights_version: first.header.version,
+            weights_sha256: first.header.sha256_hex(),
             ..LearnerStatus::default()
         };
         let actor = |actor| {
@@ -134,8 +136,8 @@ impl Lockstep {
                 settings.clone(),
                 BufferPool::new(1),
                 life,
-                header.version,
-                &weights,
+                first.header.version,
+                &first.safetensors,
             )
         };
         let actors = (0..config.local.actors)
@@ -202,9 +204,12 @@ impl Lockstep {
     }
 
     fn publish(&mut self) -> anyhow::Result<()> {
-        let (header, weights) = self.learner.next_weights()?;
+        let Weights {
+            header,
+            safetensors,
+        } = self.learner.next_weights()?;
         for actor in &mut self.actors {
-            actor.set_weights(header.version, &weights)?;
+            actor.set_weights(header.version, &safetensors)?;
         }
         self.published = self.learner.updates();
         self.status.weights_version = header.version;

@@ -84,8 +84,8 @@ impl Actor<'_> {
                     steps
                 }
                 Pace::Unpaced => {
-                    if let Some((weights, _)) = newest.take_within(delivery.fresh_weights_max()) {
-                        chunks.act_with(weights.version);
+                    if let Some(weights) = newest.take_within(delivery.fresh_weights_max()) {
+                        chunks.act_with(weights.header.version);
                     }
                     settings
                         .actor
