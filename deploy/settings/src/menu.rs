@@ -224,7 +224,7 @@ mod tests {
     #[test]
     fn every_setting_of_every_game_and_agent_has_a_source_and_reads_back() {
         for world in WorldName::all() {
-            for agent in &AGENTS {
+            for agent in AGENTS {
                 let text = sourced(&PRESETS[0], world, agent).unwrap();
                 assert!(!text.contains("not said"), "{text}");
                 RunConfig::parse("printed", &text).unwrap();

@@ -34,9 +34,9 @@ fn with(world: &str, agent: &str, set: &[&str]) -> Result<RunConfig, String> {
 #[test]
 fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
     let mut resolved = 0;
-    for preset in &PRESETS {
+    for preset in PRESETS {
         for world in WorldName::all() {
-            for agent in &AGENTS {
+            for agent in AGENTS {
                 let source = Source::Layers(preset, world, agent.name);
                 let config = match resolve(&source, &Flags::default(), &MACHINE) {
                     Err(e) if e.0.contains("take --preset paper") => continue,
