@@ -4,9 +4,9 @@
 
 use std::{fs, os::unix::fs::MetadataExt, path::Path};
 
+use driml_protocol::shared_memory::FOLDER;
 use nix::sys::stat::{major, minor};
 
-const FOLDER: &str = "/dev/shm";
 /// The extension of zenoh's segments. Whoever has one open holds a lock on it.
 const EXTENSION: &str = "zenoh";
 

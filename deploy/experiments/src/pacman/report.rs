@@ -1,10 +1,12 @@
 //! Data and page of Fig. 3, from the runs' metrics.
 //! It draws nothing beyond the episodes and frames that the settings ask for.
 
+use driml_protocol::RETURNS_OF;
+
 use super::{
     figure::figure,
     plans::{EPISODE_FRAMES_MAX, RunKind},
-    results::{LOSSES, Points, RETURNS_OF, Results, Trace, loss_of, traces},
+    results::{LOSSES, Points, Results, Trace, loss_of, traces},
     settings::Continual,
 };
 use crate::{
@@ -272,7 +274,7 @@ fn page(results: &Results, losses: &[Loss], got: Vec<String>, mut values: Values
         .set("missing", missing.join(", "))
         .when("nothing", got.is_empty() && missing.is_empty())
         .items("got", got);
-    let short = ghosts.episodes_per_task.min(noise.episodes_per_task) < 2 * RETURNS_OF;
+    let short = ghosts.episodes_per_task.min(noise.episodes_per_task) < 2 * RETURNS_OF as u64;
     let replay = "replay.capacity_transitions=";
     let mut capacities = ghosts
         .sets

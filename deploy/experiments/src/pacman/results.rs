@@ -8,8 +8,6 @@ use crate::{plot::Run, queue::FinishedRun, statistics::Spread};
 
 /// The DIM losses of the preset: column of the metrics, and what it compares.
 pub(super) const LOSSES: [(&str, &str); 2] = [("dim_3t3", "local"), ("dim_4t4", "global")];
-/// Episodes in the recorded mean return.
-pub(super) const RETURNS_OF: u64 = 100;
 
 /// (x, y) in the order of x.
 pub(super) type Points = Vec<(f64, f64)>;

@@ -2,6 +2,7 @@
 //! It chooses nothing by itself; the page has the order and says how it was made.
 
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
+use driml_protocol::RETURNS_OF;
 
 use super::{
     grid::short,
@@ -19,8 +20,6 @@ use crate::{
 const ERRORS: f64 = 3.0;
 /// Training episodes before their mean counts.
 const EPISODES_MIN: f64 = 20.0;
-/// Episodes in the recorded mean return.
-const RETURNS_OF: f64 = 100.0;
 /// Standard errors below which a proposed game is called a guess.
 const GUESSED: f64 = 2.0;
 /// Games that the page proposes.
@@ -115,7 +114,7 @@ fn soonest(run: &Run, random: &Spread) -> anyhow::Result<Option<f64>> {
     let mut since = None;
     // Once known, the return is in every row: the last rows of both belong together.
     for (row, episodes) in returns.iter().rev().zip(episodes.iter().rev()) {
-        let error = random.sd / episodes.1.clamp(1.0, RETURNS_OF).sqrt();
+        let error = random.sd / episodes.1.clamp(1.0, RETURNS_OF as f64).sqrt();
         if episodes.1 < EPISODES_MIN || row.1 <= random.mean + ERRORS * error {
             break;
         }
