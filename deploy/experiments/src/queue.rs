@@ -25,7 +25,7 @@ use driml_machine::{
     resources::Machine,
 };
 use driml_protocol::lock_file;
-use driml_settings::{config::Flags, renamed};
+use driml_settings::{renamed, resolve::Flags};
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,

@@ -6,7 +6,10 @@ use std::time::Duration;
 use driml_learner::{DeviceName, auxiliary::loss::Passes};
 use driml_machine::{resources::Machine, units::duration};
 use driml_model::ModelConfig;
-use driml_settings::config::{COMPRESSED_FIELDS_BYTES, RunConfig, replay_bytes_each};
+use driml_settings::{
+    config::RunConfig,
+    memory::{COMPRESSED_FIELDS_BYTES, replay_bytes_each},
+};
 
 use crate::run_folder::{ResumePoint, RunFolder};
 
@@ -201,8 +204,8 @@ mod tests {
 
     use super::*;
     use driml_settings::{
-        config::{Flags, Source, resolve},
         presets::PRESETS,
+        resolve::{Flags, Source, resolve},
     };
 
     const MACHINE: Machine = Machine {

@@ -7,7 +7,10 @@ use anyhow::Context;
 use driml_envs::WorldConfig;
 use driml_learner::checkpoint::{self, CheckpointError};
 use driml_machine::{error::usage, resources::Machine};
-use driml_settings::config::{Flags, RunConfig, Source, resolve};
+use driml_settings::{
+    config::RunConfig,
+    resolve::{Flags, Source, resolve},
+};
 
 use crate::{
     console,

@@ -11,9 +11,9 @@ use driml_machine::{
 use toml::{Table, Value};
 
 use crate::{
-    config::{self, Flags, Source},
     derived,
     presets::{AGENTS, Agent, Layer, Only, PRESETS, Preset, agent, layers, stack},
+    resolve::{Flags, Source, resolve},
 };
 
 /// Where a setting's source begins, if the setting leaves room.
@@ -101,7 +101,7 @@ pub fn sourced(preset: &'static Preset, world: WorldName, agent: &Agent) -> Resu
         memory_bytes: u64::MAX,
         ..Machine::this()
     };
-    let config = config::resolve(&source, &Flags::default(), &machine)?;
+    let config = resolve(&source, &Flags::default(), &machine)?;
     let table: Table = config
         .to_toml()
         .parse()

@@ -8,8 +8,8 @@ use driml_envs::{WorldConfig, WorldName};
 use driml_figure::{Axis, Chart, Field, Figure, GREY, Heat, Lattice, Mark, Outline, Panel, Series};
 use driml_machine::{error::usage, resources::Machine};
 use driml_settings::{
-    config::{self, Flags, Source},
     presets,
+    resolve::{Flags, Source, resolve},
 };
 
 use self::{
@@ -41,7 +41,7 @@ fn task(settings: &Settings) -> anyhow::Result<Task> {
         sets: settings.sets.clone(),
         ..Flags::default()
     };
-    let config = config::resolve(&source, &flags, &Machine::this())?;
+    let config = resolve(&source, &flags, &Machine::this())?;
     let WorldConfig::Ising(world) = config.world else {
         return Err(usage!("the Ising world's settings are those of another world").into());
     };

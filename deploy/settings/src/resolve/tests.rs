@@ -1,6 +1,8 @@
 //! Presets, flags, `--set` and files: what they resolve to, and what is said of those that cannot work.
 //! The texts of single `--set`s are tested beside `overrides`.
 
+use driml_envs::WorldConfig;
+use driml_protocol::Horizon;
 use expect_test::expect;
 
 use super::*;
