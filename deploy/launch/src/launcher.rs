@@ -12,19 +12,18 @@ use driml_machine::{
     error::{Interrupted, Usage},
     units::duration,
 };
-use driml_protocol::{
-    Keys, fault,
-    session::{self, Endpoints},
-};
+use driml_protocol::{Keys, session};
 use driml_settings::config::RunConfig;
 
 use crate::{
+    connect::connect,
     console::{self, Screen, print},
     endpoint::NAMESPACE,
     interrupts::Interrupts,
     live_view::{Display, TEMPLATE},
     managed_process::{ManagedProcess, Surroundings},
     meeting::Meeting,
+    processes::{Processes, stop},
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary},
     status_client::Statuses,
@@ -32,8 +31,6 @@ use crate::{
 
 /// How often the processes are asked how they are.
 const POLL: Duration = Duration::from_secs(1);
-/// How long the replay server may take to listen.
-const LISTEN_MAX: Duration = Duration::from_secs(30);
 /// How long a process may leave questions unanswered, from its start too, before the run is given up.
 const SILENCE_MAX: Duration = Duration::from_secs(120);
 /// How long a run may make no progress before it is given up.
@@ -107,7 +104,7 @@ pub fn run(
         screen,
         display,
         interrupts,
-        processes: Vec::new(),
+        processes: Processes::default(),
         statuses: None,
     };
 
@@ -162,8 +159,7 @@ struct Launch<'a> {
     screen: Screen,
     display: Display,
     interrupts: Interrupts,
-    /// Replay servers, learner, actors, in this order, as far as they were started.
-    processes: Vec<ManagedProcess>,
+    processes: Processes,
     statuses: Option<Statuses>,
 }
 
@@ -176,16 +172,6 @@ fn server_names(shards: u32) -> Vec<String> {
 }
 
 impl Launch<'_> {
-    /// The learner's place in `processes`.
-    fn learner(&self) -> usize {
-        self.servers.len()
-    }
-
-    /// The first actor's place in `processes`.
-    fn first_actor(&self) -> usize {
-        self.servers.len() + 1
-    }
-
     fn surroundings<'a>(&'a self, logs: &'a Path) -> Surroundings<'a> {
         Surroundings {
             logs,
@@ -218,11 +204,11 @@ impl Launch<'_> {
             }
             let server =
                 ManagedProcess::start(name, &args, PROCESS_THREADS, self.surroundings(&logs))?;
-            self.processes.push(server);
+            self.processes.replay_servers.push(server);
         }
         let mut sessions = Vec::new();
         for endpoint in self.endpoints.clone() {
-            match self.connect(&endpoint)? {
+            match connect(&endpoint, &self.interrupts, || self.processes.check_alive())? {
                 Some(session) => sessions.push(session),
                 None => return Ok(Outcome::Interrupted),
             }
@@ -236,7 +222,7 @@ impl Launch<'_> {
         for endpoint in &self.endpoints {
             args.extend(words(&["--connect", endpoint]));
         }
-        self.processes.push(ManagedProcess::start(
+        self.processes.learner = Some(ManagedProcess::start(
             "learner",
             &args,
             self.config.local.learner_threads,
@@ -250,7 +236,7 @@ impl Launch<'_> {
                 "--id",
                 &id.to_string(),
             ]);
-            self.processes.push(ManagedProcess::start(
+            self.processes.actors.push(ManagedProcess::start(
                 &format!("actor-{id}"),
                 &args,
                 PROCESS_THREADS,
@@ -258,50 +244,6 @@ impl Launch<'_> {
             )?);
         }
         self.watch(recorder)
-    }
-
-    /// A session to the replay server as soon as it listens; none if a person was faster.
-    fn connect(&mut self, endpoint: &str) -> anyhow::Result<Option<zenoh::Session>> {
-        let endpoints = Endpoints {
-            listen: Vec::new(),
-            connect: vec![endpoint.to_owned()],
-        };
-        let deadline = Instant::now() + LISTEN_MAX;
-        loop {
-            // Opening may take seconds of its own, in which the replay server may end: so it is not waited for here.
-            let endpoints = endpoints.clone();
-            let (tell, told) = std::sync::mpsc::channel();
-            let open = move || {
-                fault::point("connect");
-                // Nobody listens any more if the run has ended meanwhile.
-                let _ = tell.send(session::open(&endpoints));
-            };
-            let thread = std::thread::Builder::new().name("connect".into());
-            thread.spawn(open).context("starting a thread")?;
-            let opened = loop {
-                self.check_alive()?;
-                if self.interrupts.count() > 0 {
-                    return Ok(None);
-                }
-                match told.recv_timeout(Duration::from_millis(50)) {
-                    Ok(opened) => break opened,
-                    Err(_) if Instant::now() > deadline => {
-                        bail!(
-                            "the replay server does not listen on {endpoint} after {}",
-                            duration(LISTEN_MAX)
-                        )
-                    }
-                    Err(_) => {}
-                }
-            };
-            match opened {
-                Ok(session) => return Ok(Some(session)),
-                Err(e) if Instant::now() > deadline => {
-                    return Err(e).context("reaching the replay server");
-                }
-                Err(e) => tracing::debug!("the replay server does not listen yet: {e}"),
-            }
-        }
     }
 
     /// Asks, shows and records once a second until the run is over.
@@ -312,7 +254,7 @@ impl Launch<'_> {
             if self.interrupts.wait_timeout(POLL) > 0 {
                 return Ok(Outcome::Interrupted);
             }
-            self.check_alive()?;
+            self.processes.check_alive()?;
             let statuses = self
                 .statuses
                 .as_mut()
@@ -335,11 +277,7 @@ impl Launch<'_> {
             let (replay, mut learner) = (statuses.replay.clone(), statuses.learner.clone());
             // Until the learner has answered, too.
             learner.updates = learner.updates.max(self.resume_point.updates);
-            let rss: Vec<_> = self
-                .processes
-                .iter_mut()
-                .map(ManagedProcess::rss_mib)
-                .collect();
+            let rss = self.processes.rss_mib();
             for line in recorder.record(&statuses.shards, &learner, &rss) {
                 self.screen.line(&line);
             }
@@ -364,19 +302,6 @@ impl Launch<'_> {
         }
     }
 
-    /// Whether all processes are as they should be: running, or actors that are not needed any more.
-    fn check_alive(&mut self) -> anyhow::Result<()> {
-        let first_actor = self.first_actor();
-        for (at, process) in self.processes.iter_mut().enumerate() {
-            if let Some(status) = process.end()
-                && !(at >= first_actor && status.success())
-            {
-                bail!("{}", process.exit_report());
-            }
-        }
-        Ok(())
-    }
-
     /// Ends all processes: actors first, so that what they have is stored; the learner saves; the replay server is last, so
     /// that it can be asked for the final counts. A second interrupt ends everything at once.
     fn end(&mut self, ran: &anyhow::Result<Outcome>) -> anyhow::Result<()> {
@@ -395,10 +320,8 @@ impl Launch<'_> {
             FAILED_DRAIN_MAX
         };
         let mut late = Vec::new();
-        let last = self.processes.len();
-        let (learner, first_actor) = (self.learner().min(last), self.first_actor().min(last));
         // When the run is finished, actors hear it from the replay server and end by themselves.
-        let actors = self.stop(first_actor..last, !finished, actors_max, &abort);
+        let actors = stop(&mut self.processes.actors, !finished, actors_max, &abort);
         if finished {
             late.extend(actors);
         } else {
@@ -408,7 +331,12 @@ impl Launch<'_> {
                 .for_each(|actor| self.screen.line(&format!("while stopping, {actor}")));
         }
         self.wait_for_final_checkpoint(&abort);
-        late.extend(self.stop(learner..first_actor, true, LEARNER_DRAIN_MAX, &abort));
+        late.extend(stop(
+            self.processes.learner.as_mut_slice(),
+            true,
+            LEARNER_DRAIN_MAX,
+            &abort,
+        ));
         if let Some(statuses) = &mut self.statuses {
             if let Err(e) = statuses.ask_replay() {
                 tracing::debug!("the replay server's last word: {e:#}");
@@ -416,7 +344,12 @@ impl Launch<'_> {
             // Before its router goes away, so that it does not try to reach it again.
             statuses.close();
         }
-        late.extend(self.stop(0..learner, true, REPLAY_DRAIN_MAX, &abort));
+        late.extend(stop(
+            &mut self.processes.replay_servers,
+            true,
+            REPLAY_DRAIN_MAX,
+            &abort,
+        ));
         if abort() {
             bail!("ended at once by an interrupt: what was not saved is lost");
         }
@@ -428,8 +361,7 @@ impl Launch<'_> {
 
     /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
     fn wait_for_final_checkpoint(&mut self, abort: &impl Fn() -> bool) {
-        let at = self.learner();
-        let Some(learner) = self.processes.get_mut(at) else {
+        let Some(learner) = &mut self.processes.learner else {
             return;
         };
         learner.ask_to_stop();
@@ -449,40 +381,6 @@ impl Launch<'_> {
         }
     }
 
-    /// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left.
-    fn stop(
-        &mut self,
-        which: std::ops::Range<usize>,
-        ask: bool,
-        drain_max: Duration,
-        abort: &impl Fn() -> bool,
-    ) -> Vec<String> {
-        let processes = &mut self.processes[which];
-        if ask {
-            processes.iter_mut().for_each(ManagedProcess::ask_to_stop);
-        }
-        let deadline = Instant::now() + drain_max;
-        let mut late = Vec::new();
-        for process in processes {
-            match process.wait_until(deadline, abort) {
-                Some(status) if status.success() => {}
-                Some(_) => late.push(process.exit_report()),
-                None => {
-                    if !abort() {
-                        late.push(format!(
-                            "{} did not end within {} and was killed",
-                            process.name,
-                            duration(drain_max)
-                        ));
-                    }
-                    process.kill();
-                    process.wait_until(Instant::now() + REPLAY_DRAIN_MAX, || false);
-                }
-            }
-        }
-        late
-    }
-
     /// Writes the last row and the summary, says what could not be written before, and whether the summary could.
     fn conclude(
         &mut self,
@@ -494,10 +392,7 @@ impl Launch<'_> {
             None => Default::default(),
         };
         recorder.record(shards, &learner, &[]);
-        let logs = self
-            .processes
-            .iter()
-            .filter_map(ManagedProcess::missing_log_lines);
+        let logs = self.processes.missing_log_lines();
         let missing = recorder.missing().into_iter().chain(logs);
         missing.for_each(|line| console::line(&line));
         let summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);

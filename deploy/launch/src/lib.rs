@@ -20,6 +20,7 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
+mod connect;
 pub mod console;
 pub mod endpoint;
 pub mod evaluate;
@@ -32,6 +33,7 @@ pub mod meeting;
 pub mod panics;
 pub mod plan;
 pub mod process_log;
+mod processes;
 mod rates;
 pub mod resume;
 pub mod run_folder;
