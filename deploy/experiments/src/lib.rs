@@ -21,6 +21,7 @@ mod procgen;
 mod progress;
 mod queue;
 mod random_walk;
+mod runs;
 mod session;
 mod statistics;
 mod template;

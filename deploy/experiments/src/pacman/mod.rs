@@ -15,7 +15,8 @@ use self::{
 };
 use crate::{
     flags::{PacmanArgs, command_line},
-    queue::{self, PlannedRun},
+    queue,
+    runs::PlannedRun,
     session::Session,
 };
 

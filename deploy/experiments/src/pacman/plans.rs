@@ -1,7 +1,7 @@
 //! The runs of Fig. 3: what each is for, and its command line.
 
 use super::settings::{Continual, Predictability, Settings};
-use crate::queue::PlannedRun;
+use crate::runs::PlannedRun;
 
 /// Frames of an episode, about; only the estimate of the time left depends on it.
 const EPISODE_FRAMES: u64 = 190;

@@ -4,7 +4,7 @@ use super::{
     plans::RunKind,
     settings::{Continual, Settings},
 };
-use crate::{plot::Run, queue::FinishedRun, statistics::Spread};
+use crate::{plot::Run, runs::FinishedRun, statistics::Spread};
 
 /// The DIM losses of the preset: column of the metrics, and what it compares.
 pub(super) const LOSSES: [(&str, &str); 2] = [("dim_3t3", "local"), ("dim_4t4", "global")];

@@ -6,7 +6,7 @@ use driml_settings::presets;
 use serde::Deserialize;
 
 use super::published;
-use crate::{flags::ProcgenArgs, queue::PlannedRun};
+use crate::{flags::ProcgenArgs, runs::PlannedRun};
 
 const FULL: &str = include_str!("config.toml");
 const SMOKE: &str = include_str!("smoke.toml");
