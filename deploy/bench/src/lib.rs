@@ -2,6 +2,23 @@
 //!
 //! A file is one bench, and gives `Measurement`s, each of which says what it is of; [`flags::BenchCommand`]
 //! lists them. `deploy/bench/peers/` has the same work in Python. Nothing here passes or fails by its speed.
+//!
+//! Start with [`run`]; what it takes comes from a command line:
+//!
+//! ```no_run
+//! use clap::Parser;
+//! use driml_bench::flags::BenchCommand;
+//!
+//! #[derive(Parser)]
+//! struct CommandLine {
+//!     #[command(subcommand)]
+//!     bench: BenchCommand,
+//! }
+//!
+//! let line = CommandLine::parse_from(["driml", "policy", "--quick", "--json", "policy.json"]);
+//! driml_bench::run(&line.bench)?; // Prints a table, and writes the same figures as JSON.
+//! # Ok::<(), anyhow::Error>(())
+//! ```
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 

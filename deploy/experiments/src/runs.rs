@@ -173,11 +173,7 @@ mod tests {
         };
         fs::write(runs.call(&sized), r#"["--set","learner.batch_rows=64"]"#).unwrap();
         assert!(runs.finished(&sized).is_some(), "the old name of a setting");
-        fs::write(
-            runs.call(&sized),
-            serde_json::to_vec(&plan(10).args).unwrap(),
-        )
-        .unwrap();
+        runs.write_call(&plan(10)).unwrap();
         fs::write(folder.metrics(), "seconds,frames\n").unwrap();
         assert!(runs.finished(&plan(10)).is_none(), "its metrics are gone");
     }
