@@ -130,18 +130,18 @@ pub struct BenchPeersArgs {
 /// A component that is measured by itself, and beside a peer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
 pub enum Component {
-    /// Beside PyTorch
+    /// Updates, beside PyTorch's
     Learner,
-    /// Beside PyTorch
+    /// Frames through the policy, beside PyTorch's
     Policy,
-    /// Beside Reverb
+    /// Inserts and batches, beside Reverb's
     Replay,
-    /// Beside gym3
+    /// Steps of Procgen, beside gym3's
     Env,
 }
 
 impl Component {
-    /// As the command line has it.
+    /// Its name on the command line.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Learner => "learner",

@@ -23,7 +23,7 @@ pub(super) struct PlannedRun {
     pub(super) name: String,
     /// What follows `driml local`.
     pub(super) args: Vec<String>,
-    /// Its length.
+    /// Its length in frames.
     pub(super) frames: u64,
     /// Episodes after which it is long enough, if that comes first.
     pub(super) episodes: Option<u64>,

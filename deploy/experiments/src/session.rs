@@ -117,7 +117,7 @@ impl Session {
         (&self.folder, &mut self.progress)
     }
 
-    /// Counts the time that such work took, added up over runs of which so many are made at once.
+    /// Counts the time that such work took, added up over runs that are made `at_once` at a time.
     pub(super) fn spend(&mut self, seconds: f64, at_once: u32) {
         self.seconds += seconds;
         self.at_once = at_once;

@@ -35,7 +35,7 @@ pub(crate) fn connect(
         let (tell, told) = std::sync::mpsc::channel();
         let open = move || {
             fault::point("connect");
-            // Nobody listens any more if the run has ended meanwhile.
+            // The receiver is gone if the run has ended meanwhile.
             let _ = tell.send(session::open(&endpoints));
         };
         let thread = std::thread::Builder::new().name("connect".into());

@@ -52,7 +52,7 @@ const PROCESS_THREADS: u32 = 1;
 /// that folder already and goes on from the point given.
 ///
 /// # Errors
-/// A process that failed or went silent, a file system that refuses; [`Interrupted`] if a person ended the run.
+/// A process that failed or went silent, a file system that refuses; [`Interrupted`] if the run was asked to stop.
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,

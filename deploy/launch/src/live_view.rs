@@ -1,5 +1,5 @@
 //! The live view of a run: one progress display on a terminal, a plain line now and then elsewhere.
-//! It asks nobody: the launcher and the lockstep mode tell it.
+//! It asks no process: the launcher and the lockstep mode hand it the numbers.
 
 use std::time::{Duration, Instant};
 
@@ -17,7 +17,7 @@ const PLAIN_PERIOD: Duration = Duration::from_secs(10);
 /// The progress display: how far, then two lines of numbers.
 pub const TEMPLATE: &str = "{bar:40} {percent:>3}%  {elapsed_precise}\n{msg}";
 
-/// An auxiliary loss for a person to read: `DIM 4t4` of `dim_4t4`.
+/// The display name of an auxiliary loss: `DIM 4t4` of `dim_4t4`.
 pub fn loss_title(name: &str) -> String {
     match name.split_once('_') {
         Some((kind, of_what)) => format!("{} {of_what}", kind.to_uppercase()),

@@ -29,7 +29,7 @@ const LEARNER: u64 = 1;
 /// Trains in this process, and leaves `run_dir`.
 ///
 /// # Errors
-/// A component that failed, a file system that refuses; [`Interrupted`] if a person ended the run.
+/// A component that failed, a file system that refuses; [`Interrupted`] if the run was asked to stop.
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,

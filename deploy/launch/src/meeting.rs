@@ -28,7 +28,7 @@ pub struct Meeting {
 }
 
 impl Meeting {
-    /// Makes one, and sweeps those that nobody uses any more.
+    /// Makes one, and removes those that are no longer in use.
     ///
     /// # Errors
     /// A file system that refuses.
@@ -39,16 +39,16 @@ impl Meeting {
     }
 
     fn create_in(place: &Path) -> io::Result<Self> {
-        // Whoever can reach the socket can take part in the run.
+        // Any process that can reach the socket can take part in the run.
         let folder = tempfile::Builder::new()
             .prefix(PREFIX)
             .permissions(Permissions::from_mode(0o700))
             .tempdir_in(place)?;
-        // Locked before it has the name by which it is known, or somebody who sweeps just now would find it without a holder.
+        // Locked before it has the name by which it is known, or a process that sweeps just now would find it without a holder.
         let fresh = folder.path().join("new");
         let lock = File::create(&fresh)?;
         if let Err(e) = lock_file::try_lock(&lock) {
-            // Nobody sweeps what cannot be locked.
+            // What cannot be locked is not swept.
             tracing::debug!("locking {}: {e}", fresh.display());
         }
         fs::rename(fresh, folder.path().join(IN_USE))?;
@@ -79,7 +79,7 @@ pub fn leave() {
     }
 }
 
-/// Removes folders of this user in `place` that nobody uses any more. What cannot be removed stays: it is in nobody's way.
+/// Removes folders of this user in `place` that are no longer in use. What cannot be removed stays and does no harm.
 fn sweep(place: &Path) {
     let entries = fs::read_dir(place).into_iter().flatten().flatten();
     for entry in entries.filter(|it| it.file_name().to_string_lossy().starts_with(PREFIX)) {

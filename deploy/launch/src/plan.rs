@@ -1,4 +1,4 @@
-//! What a run will do and about how long it takes, for a person to read before it starts.
+//! What a run will do and about how long it takes, printed before it starts.
 //! It decides nothing, and its time is an estimate from the network's arithmetic, not a promise.
 
 use std::time::Duration;
@@ -26,7 +26,7 @@ struct RowFlops {
     local: f64,
     /// From f3 to f4.
     global: f64,
-    /// C51 head.
+    /// The head that gives C51's distributions.
     head: f64,
     /// DIM heads that exist, at every location where they are applied.
     dim: f64,
@@ -179,7 +179,7 @@ pub fn describe(
     text
 }
 
-/// Bytes for a person.
+/// Bytes in a unit that fits them.
 fn size(bytes: u64) -> String {
     match bytes >> 20 {
         mib @ 0..1024 => format!("{} MiB", mib + 1),

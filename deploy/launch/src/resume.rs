@@ -1,5 +1,5 @@
 //! `driml local --resume`: the settings of an interrupted run, and the point from which it goes on.
-//! It changes nothing in the run's folder, and waits there for whoever still saves.
+//! It changes nothing in the run's folder, and waits until an earlier learner has saved there.
 
 use std::time::{Duration, Instant};
 
@@ -59,7 +59,7 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
 /// The settings with which the run in `folder` goes on, and from which point.
 ///
 /// # Errors
-/// A folder that is no run's, settings that cannot work, no checkpoint, nothing left to do, somebody who is at it.
+/// A folder that is no run's, settings that cannot work, no checkpoint, nothing left to do, a run that is still going on.
 pub fn find(
     folder: &RunFolder,
     flags: &Flags,

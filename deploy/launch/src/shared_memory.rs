@@ -7,7 +7,7 @@ use std::{fs, os::unix::fs::MetadataExt, path::Path};
 use driml_protocol::shared_memory::FOLDER;
 use nix::sys::stat::{major, minor};
 
-/// The extension of zenoh's segments. Whoever has one open holds a lock on it.
+/// The extension of zenoh's segments. A process that has one open holds a lock on it.
 const EXTENSION: &str = "zenoh";
 
 /// Removes the segments of shared memory that this process alone holds. It must not use them any more.
@@ -64,7 +64,7 @@ struct FileId {
     inode: u64,
 }
 
-/// Whether the process `pid` and nobody else holds a lock on the file, by the kernel's table of locks.
+/// Whether the process `pid` alone holds a lock on the file, by the kernel's table of locks.
 fn is_held_by_alone(locks: &str, file: &FileId, pid: u32) -> bool {
     let FileId {
         major,

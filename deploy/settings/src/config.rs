@@ -14,11 +14,11 @@ use toml::Table;
 
 use crate::{derived, presets, renamed};
 
-/// What `driml local` does with the parts.
+/// How many processes the launcher starts, and with what.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LocalConfig {
-    /// Actor processes.
+    /// Number of actor processes.
     pub actors: u32,
     /// Threads of the learner.
     pub learner_threads: u32,
@@ -29,25 +29,25 @@ pub struct LocalConfig {
 /// The resolved settings of a run. TOML is what they come from and travel as; between, there is this form alone.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RunConfig {
-    /// What every part agrees on.
+    /// What all processes of the run agree on.
     pub run: RunSpec,
-    /// The world.
+    /// The world and its own settings.
     pub world: WorldConfig,
     /// The size to which frames are enlarged.
     pub input: InputSize,
-    /// The actors' own.
+    /// The `[actor]` table.
     pub actor: driml_actor::Config,
-    /// The replay server's own.
+    /// The `[replay]` table.
     pub replay: driml_replay_server::Config,
-    /// The learner's own.
+    /// The `[learner]` table.
     pub learner: driml_learner::Config,
-    /// The network.
+    /// Sizes of the network.
     pub model: ModelConfig,
     /// How messages travel.
     pub transport: TransportConfig,
-    /// The launcher's own.
+    /// The `[local]` table, which the launcher reads.
     pub local: LocalConfig,
-    /// What a person should know before the run starts.
+    /// Notes that are printed before the run starts.
     #[serde(skip)]
     pub notes: Vec<String>,
 }
@@ -130,7 +130,7 @@ impl RunConfig {
     /// The settings as every part reads them, sorted by name.
     pub fn to_toml(&self) -> String {
         let text = toml::to_string(self).expect("a struct of plain values is TOML");
-        // As text, a number of 32 bits has the digits that a person wrote; as a value of 64 it would have more.
+        // As text, a number of 32 bits has the digits that were set; as a value of 64 it would have more.
         let sorted: Table = text.parse().expect("it was just written");
         toml::to_string(&sorted).expect("a table of plain values is TOML")
     }

@@ -111,7 +111,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     Ok(())
 }
 
-/// Fills in for how many actors the ladder of epsilons is, where there is one and nobody says it.
+/// Fills in for how many actors the ladder of epsilons is, where there is one and it is not set.
 fn ladder(table: &mut Table) {
     let asked = find(table, "actor.epsilon_ladder").is_some_and(Value::is_table);
     if asked

@@ -145,7 +145,7 @@ fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, ou
     }
 }
 
-/// A key as TOML has it.
+/// A key in TOML's form.
 fn quoted(key: &str) -> String {
     let bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
     if key.chars().all(bare) {

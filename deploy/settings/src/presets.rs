@@ -68,7 +68,7 @@ pub const PRESETS: &[Preset] = &[
     },
 ];
 
-/// An agent.
+/// An agent: its name and its layer of settings.
 #[derive(Clone, Debug)]
 pub struct Agent {
     /// As `--agent` takes it.
@@ -81,7 +81,7 @@ pub struct Agent {
 /// Makes [`AGENTS`]: a line has an agent's name, which is that of its file in `presets/agent/`, and what it is.
 macro_rules! agents {
     ($($name:literal: $about:literal;)+) => {
-        /// Every agent.
+        /// Every agent that `--agent` takes.
         pub const AGENTS: &[Agent] = &[$(Agent {
             name: $name,
             about: $about,
@@ -199,7 +199,7 @@ fn lay(table: &mut Table, layer: &Layer, world: &str) {
     }
 }
 
-/// What a person should know of an agent in a world before it starts.
+/// Notes on an agent in a world, to be printed before the run starts.
 pub fn notes(name: &str, world: &str) -> Vec<String> {
     let blocks = agent(name)
         .map(|agent| agent.layer.read().1)
@@ -219,7 +219,7 @@ pub struct Only {
     /// What it sets.
     #[serde(default)]
     set: Table,
-    /// What a person should know before the run starts.
+    /// A note that is printed before the run starts.
     note: Option<String>,
 }
 

@@ -161,7 +161,7 @@ fn set(table: &mut Table, sets: &[String]) -> Result<bool, Usage> {
         capacity_set |= one.path == "replay.capacity_transitions";
         let mut tried = table.clone();
         let new = one.apply(&mut tried)?;
-        // A key that was not there may be an optional one. Its table's own type knows; if it does not, nobody does.
+        // A key that was not there may be an optional one. The type of its table decides.
         if new {
             let mut derived = tried.clone();
             let read = derive(&mut derived).and_then(|()| parts_read(&derived));

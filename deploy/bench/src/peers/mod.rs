@@ -65,7 +65,7 @@ struct Row {
     skipped: Option<String>,
 }
 
-/// The comparison as JSON has it.
+/// The comparison, as it is written to JSON.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Comparison {
     rounds: u32,

@@ -3,12 +3,12 @@
 
 use crate::flags::Component;
 
-/// One comparison.
+/// A figure of ours and the figure of a peer that it is compared with.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pair {
     /// The component whose bench has our figure.
     pub(super) component: Component,
-    /// Our figure.
+    /// The name of our figure.
     pub(super) ours: &'static str,
     /// What it is compared with.
     pub(super) theirs: Theirs,

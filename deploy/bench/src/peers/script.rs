@@ -60,7 +60,7 @@ pub(super) enum Peer {
 }
 
 impl Peer {
-    /// Its name for a person.
+    /// Its name in tables and messages.
     pub(super) const fn name(self) -> &'static str {
         match self {
             Self::Torch => "PyTorch",
@@ -79,7 +79,7 @@ impl Peer {
     }
 }
 
-/// Why a peer has no figures, for a person.
+/// Why a peer has no figures, as the table says it.
 #[derive(Debug)]
 pub(super) struct Absent(pub(super) String);
 

@@ -26,7 +26,7 @@ const PUBLISH_PERIOD: u64 = 8;
 /// When an actor sends.
 #[derive(Clone, Copy)]
 pub(super) enum Pace {
-    /// A chunk of so many steps in each period; the first one later.
+    /// A chunk of `steps` steps in each period; the first one is sent later.
     Every {
         steps: u32,
         period: Duration,

@@ -5,13 +5,13 @@ use crate::runs::PlannedRun;
 
 /// Frames of an episode, about; only the estimate of the time left depends on it.
 const EPISODE_FRAMES: u64 = 190;
-/// Most frames of an episode: the world's step limit. A run of so many frames has all its episodes.
+/// Most frames of an episode: the world's step limit. A run of that many frames has all its episodes.
 pub(super) const EPISODE_FRAMES_MAX: u64 = 500;
 
 /// What a run is for.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum RunKind {
-    /// (a)
+    /// (a): ghosts that move at random with this probability.
     Epsilon(f64),
     /// (b), of this agent.
     Ghosts(String),

@@ -16,7 +16,7 @@ const TOTAL_LOSS: &str = "total_loss";
 /// Columns of `metrics.csv` that hold words.
 const WORDS: [&str; 1] = ["waiting"];
 
-/// A run.
+/// The metrics of one run, and its settings.
 #[derive(Debug)]
 pub(crate) struct Run {
     folder: RunFolder,

@@ -104,7 +104,7 @@ fn screen(results: &Results, cell: &RunResult) -> anyhow::Result<Option<Screened
 }
 
 /// The frames after which the mean return of the last 100 training episodes stayed above the random policy's mean by
-/// `ERRORS` standard errors of a mean of so many of its episodes, to the end of the run.
+/// `ERRORS` standard errors of a mean of as many of its episodes, to the end of the run.
 fn soonest(run: &Run, random: &Spread) -> anyhow::Result<Option<f64>> {
     let returns = run.values("mean_return")?;
     // Of how many episodes it is; runs of older versions, which cannot be resumed by this one, only have the count of all.

@@ -3,7 +3,7 @@
 use driml_learner::AdamSettings;
 use serde::{Deserialize, Serialize};
 
-/// `deploy/experiments/src/random_walk/*.toml`.
+/// The contents of `config.toml` or `smoke.toml` beside this file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {

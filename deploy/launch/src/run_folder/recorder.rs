@@ -1,5 +1,5 @@
 //! What is written into the run folder while a run goes on: settings, metrics, returns, and the summary at its end.
-//! It reads no status from anywhere: whoever runs the parts hands them over.
+//! It reads no status from anywhere: its caller hands them over.
 
 use std::{
     fs::{self, File},
@@ -31,7 +31,7 @@ const fn none(header: Vec<String>) -> Columns {
 /// Writes a run folder.
 #[derive(Debug)]
 pub struct RunRecorder {
-    /// Nobody else writes to the folder meanwhile.
+    /// No other launcher writes to the folder while this is held.
     _lock: File,
     resume_point: ResumePoint,
     /// Seconds, frames and episodes in the last row before the run was resumed.
@@ -135,7 +135,7 @@ impl RunRecorder {
         Ok(this)
     }
 
-    /// The settings' file, for parts that read it.
+    /// The settings' file, for processes that read it.
     pub(crate) fn config_path(&self) -> PathBuf {
         self.folder.config()
     }
@@ -163,7 +163,7 @@ impl RunRecorder {
     /// of the episodes that ended. `shards` are the replay servers' own accounts; `rss_mib` is in the order of the processes given at
     /// the start, none for one that ended.
     ///
-    /// A disk that is full does not end the run: what a person should know is said the first time, and [`Self::missing`] says
+    /// A disk that is full does not end the run: a warning is returned the first time, and [`Self::missing`] says
     /// at the end what was lost.
     pub fn record(
         &mut self,
@@ -200,7 +200,7 @@ impl RunRecorder {
         said.into_iter().chain(self.metrics.add(row)).collect()
     }
 
-    /// Rows that could not be written up to now, for a person.
+    /// What to say about rows that could not be written up to now.
     pub fn missing(&self) -> Vec<String> {
         let missing = [self.metrics.missing(), self.returns.missing()];
         missing.into_iter().flatten().collect()
