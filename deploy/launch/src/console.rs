@@ -50,7 +50,7 @@ pub fn describe(error: &anyhow::Error) -> String {
 
 /// Sends the log to stderr. `DRIML_LOG` says what is logged, in the form of `RUST_LOG`.
 ///
-/// zenoh warns of each try to reach a part that is not there yet or any more, which is ours to judge: so only its errors are
+/// zenoh warns of each try to reach a process that is not there yet or any more, which is ours to judge: so only its errors are
 /// logged, and of those neither what its session says of messages that come while it closes, as at the end of every run, nor
 /// that no answer is wanted any more.
 pub fn log_to_stderr() {

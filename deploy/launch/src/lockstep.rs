@@ -1,5 +1,5 @@
-//! All parts in one process, one after the other in a fixed order: the same code as the processes run, without sockets.
-//! The same seed gives the same weights, bit for bit, on the same machine; it is for tests and debugging, not for speed.
+//! Actors, replay server and learner in one process, one after the other in a fixed order: the same code as the processes run,
+//! without sockets. The same seed gives the same weights, bit for bit, on the same machine; it is for tests and debugging, not for speed.
 
 use std::time::{Duration, Instant};
 

@@ -40,8 +40,8 @@ pub struct Surroundings<'a> {
     pub meeting: Option<&'a Meeting>,
 }
 
-/// What suits candle in every part: its second pool spins while it waits, which costs more than it gives on busy cores, and
-/// glibc returns each large tensor to the system and faults it in again unless told to keep it.
+/// The environment that suits candle in every process: its second pool spins while it waits, which costs more than it gives on
+/// busy cores, and glibc returns each large tensor to the system and faults it in again unless told to keep it.
 const FOR_CANDLE: [(&str, &str); 3] = [
     ("CANDLE_NUM_THREADS", "1"),
     ("MALLOC_MMAP_THRESHOLD_", "1000000000"),

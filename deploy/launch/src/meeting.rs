@@ -1,9 +1,9 @@
-//! The folder in which the parts of a run meet at unix sockets: private, beside other temporary files, and removed with the last
-//! process that uses it. A socket's path must be short, so it is not in the run folder.
+//! The folder in which the processes of a run meet at unix sockets: private, beside other temporary files, and removed with the
+//! last process that uses it. A socket's path must be short, so it is not in the run folder.
 //!
-//! The folder counts as used as long as anybody holds the lock of one file in it: the launcher, and each part, which has the
-//! file as its standard input. So those of a launcher that was killed are known, and swept by the next that starts or the last
-//! part that ends.
+//! The folder is in use as long as a process holds the lock of one file in it: the launcher, and each process that it started,
+//! which has the file as its standard input. A folder whose launcher was killed is recognised by this, and removed by the next
+//! launcher that starts or the last process that ends.
 
 use std::{
     fs::{self, File, Permissions},
@@ -55,7 +55,7 @@ impl Meeting {
         Ok(Self { folder, lock })
     }
 
-    /// Where a part of this name listens.
+    /// Where a process of this name listens.
     pub(crate) fn endpoint(&self, name: &str) -> String {
         let path = self.folder.path().join(format!("{name}.sock"));
         format!("unixsock-stream/{}", path.display())
@@ -70,7 +70,7 @@ impl Meeting {
     }
 }
 
-/// What a part does at its orderly end: uses no such folder any more, and sweeps, as its launcher may have been killed.
+/// What a process does at its orderly end: uses no such folder any more, and sweeps, as its launcher may have been killed.
 pub fn leave() {
     let nothing = File::open("/dev/null").map_err(|e| e.to_string());
     match nothing.and_then(|nothing| dup2_stdin(nothing).map_err(|e| e.to_string())) {
@@ -121,7 +121,7 @@ mod tests {
         sweep(place.path());
         assert_eq!(folders(place.path()), 3);
 
-        // As after the launcher was killed: a part still uses it.
+        // As after the launcher was killed: a process still uses it.
         let part = meeting.hold().unwrap();
         let Meeting { folder, lock } = meeting;
         let path = folder.keep();

@@ -1,5 +1,5 @@
 //! The shared memory that a process leaves behind in `/dev/shm`. zenoh's own bookkeeping keeps some of it open to the end of the
-//! process, so that it stays there until the next one sweeps; a part that ends in order removes it itself.
+//! process, so that it stays there until the next one sweeps; a process that ends in order removes it itself.
 //! What others use too, or could use, it leaves alone.
 
 use std::{fs, os::unix::fs::MetadataExt, path::Path};

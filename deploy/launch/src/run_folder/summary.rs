@@ -18,7 +18,7 @@ pub enum Outcome {
     Finished,
     /// A person ended it; what was done is saved.
     Interrupted,
-    /// A part failed.
+    /// A process failed.
     Failed,
 }
 
@@ -62,7 +62,7 @@ pub struct Summary {
     /// Of how many episodes that is: of fewer than 100 only if there were fewer. Older runs do not say.
     #[serde(default)]
     pub mean_return_of: u64,
-    /// From the start of the first part to the end of the run.
+    /// From the start of the first process to the end of the run.
     pub wall_seconds: f64,
     /// Frames over wall seconds.
     pub frames_per_second: f64,
