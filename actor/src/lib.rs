@@ -84,4 +84,4 @@ pub use policy::{NetworkPolicy, Policy, RandomPolicy};
 pub use recorder::ChunkRecorder;
 pub use run::{RunArgs, run};
 pub use schedule::{BeyondLadder, Schedule};
-pub use weights::{NewestWeights, WeightsSource};
+pub use weights::{NewestWeights, WeightsError, WeightsSource};
