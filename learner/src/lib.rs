@@ -73,7 +73,7 @@ pub use config::{
     AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerConfig,
     LearnerConfigError,
 };
-pub use driml_model::{Compute, DeviceName, Kernels};
+pub use driml_model::{Compute, DeviceName, Kernels, Precision};
 pub use error::UpdateError;
 pub use learner::{Learner, LearnerError};
 pub use optimiser::adam::AdamSettings;

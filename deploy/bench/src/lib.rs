@@ -41,7 +41,7 @@ mod system;
 mod table;
 mod taking_part;
 
-use driml_learner::DeviceName;
+use driml_learner::{DeviceName, Precision};
 use driml_machine::device::ready_for;
 
 use crate::{
@@ -59,7 +59,7 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
     let alone = |component, flags: &BenchFlags, device: DeviceName| {
         ready_for(device)?;
         let figures = if flags.here {
-            measure(component, &Effort::new(flags), device)?
+            measure(component, flags, device)?
         } else {
             alone::figures(component, flags, device)?
         };
@@ -85,12 +85,22 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
 
 fn measure(
     component: Component,
-    effort: &Effort,
+    flags: &BenchFlags,
     device: DeviceName,
 ) -> anyhow::Result<Vec<Measurement>> {
+    let effort = &Effort::new(flags);
+    let by_precision = |measure: &dyn Fn(Precision) -> anyhow::Result<Vec<Measurement>>| {
+        let mut figures = Vec::new();
+        for precision in flags.precisions(device) {
+            figures.extend(measure(precision)?);
+        }
+        Ok(figures)
+    };
     match component {
-        Component::Learner => learner::measure(effort, device),
-        Component::Policy => policy::measure(effort),
+        Component::Learner => {
+            by_precision(&|precision| learner::measure(effort, device, precision))
+        }
+        Component::Policy => by_precision(&|precision| policy::measure(effort, precision)),
         Component::Replay => replay::measure(effort),
         Component::Env => env::measure(effort),
     }

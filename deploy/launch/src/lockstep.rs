@@ -118,7 +118,11 @@ impl Lockstep {
             };
             replay.join_actor(join).map_err(anyhow::Error::msg)?;
         }
-        let mut learner = Learner::new(learner_config, &config.local.learner_device.open()?)?;
+        let compute = config
+            .local
+            .learner_device
+            .open(learner_config.learner.precision)?;
+        let mut learner = Learner::new(learner_config, &compute)?;
         let first = learner.next_weights()?;
         let status = LearnerStatus {
             weights_version: first.header.version,

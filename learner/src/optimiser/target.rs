@@ -31,7 +31,7 @@ pub fn follow(
             )));
         };
         match kernels {
-            Kernels::Fused => var.inplace_op2(source, &Follow { tau: tau as f32 })?,
+            Kernels::Fused(_) => var.inplace_op2(source, &Follow { tau: tau as f32 })?,
             Kernels::Candle => {
                 let (kept, taken) = (var.affine(1.0 - tau, 0.0)?, source.affine(tau, 0.0)?);
                 var.set(&(kept + taken)?)?;

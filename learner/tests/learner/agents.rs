@@ -415,6 +415,7 @@ fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConf
         },
         model,
         learner: Config {
+            precision: Default::default(),
             batch_size: 6,
             batches_in_flight: 1,
             publish_period_updates: 2,

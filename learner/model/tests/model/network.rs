@@ -82,7 +82,7 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
     };
     for config in [odd, even] {
         let parameters = with_biases(&config);
-        let (ours, our_gradients) = outputs_and_gradients(&config, &parameters, Kernels::Fused)?;
+        let (ours, our_gradients) = outputs_and_gradients(&config, &parameters, Kernels::FUSED)?;
         let (theirs, their_gradients) =
             outputs_and_gradients(&config, &parameters, Kernels::Candle)?;
         for (index, (ours, theirs)) in ours.iter().zip(&theirs).enumerate() {
