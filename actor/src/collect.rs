@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     acting::Acting, config::ActorSettings, error::ActError, policy::NetworkPolicy,
-    recorder::Recorder, schedule::Schedule,
+    recorder::ChunkRecorder, schedule::Schedule,
 };
 
 /// One life of an actor, from its start to its end; a restarted actor is another incarnation.
@@ -38,7 +38,7 @@ impl Incarnation {
 pub struct Collector {
     schedule: Schedule,
     acting: Acting,
-    recorder: Recorder,
+    recorder: ChunkRecorder,
     policy: NetworkPolicy,
     weights_version: u64,
 }
@@ -100,7 +100,7 @@ impl Collector {
         )?;
         Ok(Self {
             acting: Acting::new(world, spec.frame_stack as usize, rng)?,
-            recorder: Recorder::new(
+            recorder: ChunkRecorder::new(
                 pool,
                 life.actor,
                 life.id,

@@ -16,7 +16,7 @@ const fn end_on_the_wire(end: StepEnd) -> End {
 
 /// Fills chunk after chunk.
 #[derive(Debug)]
-pub struct Recorder {
+pub struct ChunkRecorder {
     pool: BufferPool,
     /// Of the chunk being filled, or of the next one.
     header: ChunkHeader,
@@ -25,8 +25,8 @@ pub struct Recorder {
     filled_steps: u32,
 }
 
-impl Recorder {
-    /// A recorder for `streams` copies; how long its chunks are is for [`Recorder::begin`].
+impl ChunkRecorder {
+    /// A recorder for `streams` copies; how long its chunks are is for [`ChunkRecorder::begin`].
     pub fn new(
         pool: BufferPool,
         actor: u32,
@@ -118,7 +118,7 @@ mod tests {
 
     #[test]
     fn chunks_are_numbered_and_stream_major() {
-        let mut recorder = Recorder::new(BufferPool::new(1), 7, 9, 2, 1);
+        let mut recorder = ChunkRecorder::new(BufferPool::new(1), 7, 9, 2, 1);
         let ends = [StepEnd::Running, StepEnd::Terminal];
         let mut chunks = Vec::new();
         for step in 0..7_u8 {

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use driml_protocol::{
-    ActorJoin, Alive, Keys, RunClient, Shutdown, join,
+    ActorJoin, Alive, Keys, RunClient, Shutdown, Weights, join,
     session::{self, Endpoints},
 };
 use zenoh::Wait;
@@ -76,7 +76,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let source = WeightsSource {
         client: client.clone(),
     };
-    let Some((header, weights)) = source.first(WEIGHTS_WAIT_MAX, shutdown)? else {
+    let Some(first) = source.first(WEIGHTS_WAIT_MAX, shutdown)? else {
         return Ok(());
     };
     let limits = DeliveryLimits::of(&settings.actor);
@@ -92,10 +92,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             after_updates: hello.after_updates,
             earlier_incarnations: welcome.earlier_incarnations,
         },
-        header.version,
-        &weights,
+        first.header.version,
+        &first.safetensors,
     )?;
-    let newest = source.watch(header.version, shutdown.clone())?;
+    let newest = source.watch(first.header.version, shutdown.clone())?;
     let delivery = Delivery::start(
         client.clone(),
         welcome.inserted_total,
@@ -110,8 +110,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     );
     while !shutdown.is_set() && !delivery.is_finished() {
         let newer = newest.take_within(delivery.fresh_weights_max());
-        if let Some((header, weights)) = newer
-            && let Err(e) = collector.set_weights(header.version, &weights)
+        if let Some(Weights {
+            header,
+            safetensors,
+        }) = newer
+            && let Err(e) = collector.set_weights(header.version, &safetensors)
         {
             tracing::warn!(
                 "weights {} were refused, the old ones stay: {e:#}",

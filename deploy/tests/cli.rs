@@ -58,7 +58,7 @@ fn names_that_nothing_has() {
     "#]]
     .assert_eq(&usage(&["local", "--preset", "split", "--env", "mspacman"]));
     expect![[r#"
-        error: there is no setting "learner.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_rows, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, unreachable_max_ms, update
+        error: there is no setting "learner.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, unreachable_max_ms, update
     "#]].assert_eq(&usage(&["local", "--set", "learner.lr=1"]));
 }
 
@@ -69,9 +69,9 @@ fn values_that_cannot_work() {
     "#]]
     .assert_eq(&usage(&["local", "--set", "run.gamma=2"]));
     expect![[r#"
-        error: --set learner.batch_rows=many: the value is a whole number, and many is a word
+        error: --set learner.batch_size=many: the value is a whole number, and many is a word
     "#]]
-    .assert_eq(&usage(&["local", "--set", "learner.batch_rows=many"]));
+    .assert_eq(&usage(&["local", "--set", "learner.batch_size=many"]));
     expect![[r#"
         error: 10 frames are no more than the warm-up of 500: ask for more --frames, or --set replay.warmup_transitions=1
     "#]].assert_eq(&usage(&["local", "--env", "chain", "--frames", "10"]));

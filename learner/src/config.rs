@@ -25,7 +25,7 @@ use crate::{
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// Rows of one update, B.
-    pub batch_rows: u32,
+    pub batch_size: u32,
     /// In which numbers an update's products are computed; weights, moments, losses and sums are f32 in either. Settings of
     /// earlier versions do not have it: f32.
     #[serde(default)]
@@ -163,7 +163,7 @@ impl Config {
     /// The first field that cannot work, and why.
     pub fn validate(&self) -> Result<(), ConfigError> {
         for (key, value, max) in [
-            ("batch_rows", u64::from(self.batch_rows), 65_536),
+            ("batch_size", u64::from(self.batch_size), 65_536),
             ("batches_in_flight", u64::from(self.batches_in_flight), 64),
             (
                 "publish_period_updates",
@@ -236,7 +236,7 @@ struct InputSize {
 
 /// Why a run's settings are none that a learner can work with.
 #[derive(Debug, thiserror::Error)]
-pub enum LearnerPartError {
+pub enum LearnerConfigError {
     /// Not TOML, or a table that is missing or does not fit.
     #[error(transparent)]
     Tables(#[from] driml_protocol::config::ConfigError),
@@ -261,7 +261,7 @@ pub enum LearnerPartError {
 
 /// Everything a learner needs to know of a run.
 #[derive(Clone, Debug)]
-pub struct LearnerPart {
+pub struct LearnerConfig {
     /// What all parts agree on.
     pub spec: RunSpec,
     /// The network's sizes: the `[model]` table.
@@ -272,12 +272,12 @@ pub struct LearnerPart {
     pub transport: TransportConfig,
 }
 
-impl LearnerPart {
+impl LearnerConfig {
     /// Reads the tables from a run's resolved settings.
     ///
     /// # Errors
     /// A table that is missing or does not fit, or values that cannot work.
-    pub fn from_toml(text: &str) -> Result<Self, LearnerPartError> {
+    pub fn from_toml(text: &str) -> Result<Self, LearnerConfigError> {
         let settings = Settings::parse(text)?;
         let this = Self {
             spec: settings.table("run")?,
@@ -295,7 +295,7 @@ impl LearnerPart {
         let follows = sizes == (input.height, input.width, states)
             && this.model.num_actions == this.spec.num_actions as usize;
         if !follows {
-            return Err(LearnerPartError::Sizes);
+            return Err(LearnerConfigError::Sizes);
         }
         Ok(this)
     }

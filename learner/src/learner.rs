@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use driml_model::{Compute, Enlarge};
-use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, WeightsHeader};
+use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, Weights, WeightsHeader};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -16,12 +16,9 @@ use crate::{
     auxiliary::positives::Positives,
     batch::Batch,
     checkpoint::{self, CheckpointError, RunState},
-    config::{ConfigError, LearnerPart},
+    config::{ConfigError, LearnerConfig},
     error::UpdateError,
 };
-
-/// Weights as they travel: what they say of themselves, and a safetensors file.
-pub type Weights = (WeightsHeader, Vec<u8>);
 
 /// Why a learner could not be made, learn or be saved.
 #[derive(Debug, thiserror::Error)]
@@ -51,7 +48,7 @@ pub enum LearnerError {
 
 /// Everything that a learner changes while it learns.
 pub struct Learner {
-    part: LearnerPart,
+    config: LearnerConfig,
     spec_hash: u64,
     agent: Agent,
     affinity: Option<AffinityEstimator>,
@@ -70,27 +67,27 @@ impl Learner {
     ///
     /// # Errors
     /// Settings that cannot work.
-    pub fn new(part: LearnerPart, compute: &Compute) -> Result<Self, LearnerError> {
-        let spec = &part.spec;
+    pub fn new(config: LearnerConfig, compute: &Compute) -> Result<Self, LearnerError> {
+        let spec = &config.spec;
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
         let mut rng = ChaCha8Rng::from_seed(spec.seed_for("learner", 0));
         let agent = Agent::new(
-            part.model.clone(),
-            part.learner.update.clone(),
+            config.model.clone(),
+            config.learner.update.clone(),
             compute,
             &mut init,
         )?;
-        let affinity = part
+        let affinity = config
             .learner
             .affinity
-            .estimator(part.model.num_actions, &mut rng)?;
+            .estimator(config.model.num_actions, &mut rng)?;
         let from = (spec.frame_height as usize, spec.frame_width as usize);
-        let to = (part.model.height, part.model.width);
+        let to = (config.model.height, config.model.width);
         let enlarge = (from != to)
-            .then(|| Enlarge::new(from, to, part.model.channels))
+            .then(|| Enlarge::new(from, to, config.model.channels))
             .transpose()?;
-        let augment = part.learner.augment.map(|settings| {
-            let size = (to.0, to.1, part.model.channels);
+        let augment = config.learner.augment.map(|settings| {
+            let size = (to.0, to.1, config.model.channels);
             Augment::new(settings, size, spec.frame_channels as usize)
         });
         Ok(Self {
@@ -103,7 +100,7 @@ impl Learner {
             augment,
             seen: Default::default(),
             weights_version: 0,
-            part,
+            config,
         })
     }
 
@@ -112,15 +109,15 @@ impl Learner {
     /// # Errors
     /// Settings that cannot work, or a checkpoint that is damaged, of another run or of other settings.
     pub fn resume(
-        part: LearnerPart,
+        config: LearnerConfig,
         compute: &Compute,
         folder: &Path,
     ) -> Result<Self, LearnerError> {
-        let mut this = Self::new(part, compute)?;
+        let mut this = Self::new(config, compute)?;
         let restored = checkpoint::load_latest(
             folder,
-            &this.part.model,
-            &this.part.learner.update,
+            &this.config.model,
+            &this.config.learner.update,
             compute,
             this.spec_hash,
         )?;
@@ -177,7 +174,7 @@ impl Learner {
         let mut rng = self.rng.clone();
         let all_valid;
         if let Some(augment) = &mut self.augment {
-            if self.part.learner.update.objective.positives() == Positives::OtherView {
+            if self.config.learner.update.objective.positives() == Positives::OtherView {
                 // Two views of the same state; every row has them.
                 all_valid = vec![1; batch.rows()];
                 (states_k, positives, valid) = (states_t, 1, all_valid.as_slice());
@@ -242,7 +239,7 @@ impl Learner {
     pub const fn publication_is_due(&self) -> bool {
         self.agent
             .updates()
-            .is_multiple_of(self.part.learner.publish_period_updates)
+            .is_multiple_of(self.config.learner.publish_period_updates)
     }
 
     /// Whether a checkpoint is due after this many updates.
@@ -250,7 +247,7 @@ impl Learner {
         self.updates() > 0
             && self
                 .updates()
-                .is_multiple_of(self.part.learner.checkpoint_period_updates)
+                .is_multiple_of(self.config.learner.checkpoint_period_updates)
     }
 
     /// The present weights as a new version.
@@ -261,7 +258,10 @@ impl Learner {
         let safetensors = self.agent.weights()?;
         self.weights_version += 1;
         let header = WeightsHeader::new(self.weights_version, self.updates(), &safetensors);
-        Ok((header, safetensors))
+        Ok(Weights {
+            header,
+            safetensors,
+        })
     }
 
     /// Writes a checkpoint into `folder`.
@@ -276,7 +276,11 @@ impl Learner {
             weights_version: self.weights_version,
             run_spec_hash: self.spec_hash,
         };
-        let path = checkpoint::save(folder, &state, self.part.learner.checkpoints_kept as usize)?;
+        let path = checkpoint::save(
+            folder,
+            &state,
+            self.config.learner.checkpoints_kept as usize,
+        )?;
         tracing::info!("saved {}", path.display());
         Ok(())
     }

@@ -70,11 +70,12 @@ pub use augment::{Augment, AugmentSettings};
 pub use auxiliary::{Objective, positives::Positives, settings::Lambda};
 pub use batch::Batch;
 pub use config::{
-    AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart, LearnerPartError,
+    AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerConfig,
+    LearnerConfigError,
 };
 pub use driml_model::{Compute, DeviceName, Kernels, Precision};
 pub use error::UpdateError;
-pub use learner::{Learner, LearnerError, Weights};
+pub use learner::{Learner, LearnerError};
 pub use optimiser::adam::AdamSettings;
 pub use remote::run::{RunArgs, run};
 pub use settings::LearnerSettings;

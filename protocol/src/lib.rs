@@ -48,12 +48,12 @@ pub use messages::{
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
     tally::Tally,
     weights::{
-        Assembly, PIECE_BYTES, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
+        Assembly, PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
         WeightsVersion,
     },
 };
 pub use process::{
-    end_signs, fault,
+    end_signs, fault, lock_file,
     seldom::Seldom,
     shutdown::{Shutdown, join_within},
     whole_file,

@@ -66,7 +66,7 @@ fn filled(frame_stack: u32) -> (Replay, Chunk) {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
-        study: None,
+        reproduced_bug: None,
         replay_ratio: 1e9,
         warmup_transitions: 0,
         slack_transitions: 1 << 50,

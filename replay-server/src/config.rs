@@ -9,19 +9,19 @@ use crate::storage::frame_store::log::OVERHEAD_BYTES_MAX;
 /// Most shards of one replay.
 pub(crate) const SHARDS_MAX: u32 = 256;
 
-/// A known fault of the paper's published code, reproduced to show what it does: for studies alone.
+/// A known bug of the paper's published code, reproduced to show what it does. No other run has one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Study {
+pub enum ReproducedBug {
     /// The n-step return bootstraps from s_{t+1} instead of s_{t+n}, at gamma^n, unless step t itself ended the episode.
     BootstrapFromNextState,
 }
 
-impl Study {
-    /// Every fault there is.
+impl ReproducedBug {
+    /// Every bug there is.
     pub const ALL: [Self; 1] = [Self::BootstrapFromNextState];
 
-    /// As settings and `--study` have it.
+    /// As settings and `--reproduce-bug` have it.
     pub const fn name(self) -> &'static str {
         match self {
             Self::BootstrapFromNextState => "bootstrap-from-next-state",
@@ -65,9 +65,9 @@ pub struct Config {
     pub slack_transitions: u64,
     /// Transitions of the whole run, warm-up included: once that many are stored, no more are taken. None runs on.
     pub transitions_max: Option<u64>,
-    /// A known fault to reproduce; none in every run that is not a study of it.
+    /// A known bug to train with, chosen by `--reproduce-bug`; none in every other run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub study: Option<Study>,
+    pub reproduced_bug: Option<ReproducedBug>,
 }
 
 /// Why settings were refused.
@@ -99,14 +99,14 @@ pub(crate) const fn reach(spec: &RunSpec) -> u32 {
 }
 
 impl Config {
-    /// Checks every value, alone and against `batch_rows`, the rows of the learner's batches.
+    /// Checks every value, alone and against `batch_size`, the rows of the learner's batches.
     ///
-    /// The run cannot stall if slack_transitions * replay_ratio >= batch_rows: inserts then wait only while a whole batch
+    /// The run cannot stall if slack_transitions * replay_ratio >= batch_size: inserts then wait only while a whole batch
     /// may be sampled.
     ///
     /// # Errors
     /// The first key that cannot work, its value and what to do.
-    pub fn validate(&self, spec: &RunSpec, batch_rows: u32) -> Result<(), ConfigError> {
+    pub fn validate(&self, spec: &RunSpec, batch_size: u32) -> Result<(), ConfigError> {
         spec.validate()?;
         let bad = |key, value: String, why: String| Err(ConfigError::Key { key, value, why });
         let ratio = self.replay_ratio;
@@ -118,9 +118,9 @@ impl Config {
             );
         }
         let rows_max = rows_max(spec);
-        if batch_rows == 0 || batch_rows > rows_max {
+        if batch_size == 0 || batch_size > rows_max {
             let why = format!("a batch of this run has 1 to {rows_max} rows");
-            return bad("learner.batch_rows", batch_rows.to_string(), why);
+            return bad("learner.batch_size", batch_size.to_string(), why);
         }
         if !(1..=SHARDS_MAX).contains(&self.shards) {
             let why = format!("a replay has 1 to {SHARDS_MAX} shards");
@@ -176,10 +176,10 @@ impl Config {
                 why,
             );
         }
-        if (self.slack_transitions as f64) * ratio < f64::from(batch_rows) {
-            let least = (f64::from(batch_rows) / ratio).ceil();
+        if (self.slack_transitions as f64) * ratio < f64::from(batch_size) {
+            let least = (f64::from(batch_size) / ratio).ceil();
             let why = format!(
-                "actors and learner would wait for each other; use at least batch rows / replay_ratio = {batch_rows} / {ratio} = {least}"
+                "actors and learner would wait for each other; use at least learner.batch_size / replay_ratio = {batch_size} / {ratio} = {least}"
             );
             return bad(
                 "replay.slack_transitions",
@@ -188,11 +188,11 @@ impl Config {
             );
         }
         if let Some(max) = self.transitions_max {
-            let batch = (f64::from(batch_rows) / ratio).ceil();
+            let batch = (f64::from(batch_size) / ratio).ceil();
             let least = self.warmup_transitions as f64 + batch;
             if (max as f64) < least {
                 let why = format!(
-                    "the run would end before its first batch; use at least warmup_transitions + batch rows / replay_ratio = {least}"
+                    "the run would end before its first batch; use at least warmup_transitions + learner.batch_size / replay_ratio = {least}"
                 );
                 return bad("replay.transitions_max", max.to_string(), why);
             }

@@ -33,7 +33,7 @@
 //!     warmup_transitions: 10,
 //!     slack_transitions: 100,
 //!     transitions_max: None,
-//!     study: None,
+//!     reproduced_bug: None,
 //! };
 //! let mut replay = Replay::new(&spec, &config, 4)?;
 //! replay.join_actor(ActorJoin { actor: 0, incarnation: 1 })?;
@@ -73,7 +73,7 @@ mod sampling;
 mod service;
 mod storage;
 
-pub use config::{Compression, Config, ConfigError, Study};
+pub use config::{Compression, Config, ConfigError, ReproducedBug};
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use rate_limiter::RateLimiter;
 pub use replay::{Replay, Unready};

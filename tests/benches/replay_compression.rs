@@ -55,7 +55,7 @@ fn replay(compression: Compression, frame_stack: u32) -> Replay {
         shards: 1,
         compression,
         compressed_bytes_max: None,
-        study: None,
+        reproduced_bug: None,
         replay_ratio: 1e9,
         warmup_transitions: 0,
         slack_transitions: 1 << 50,

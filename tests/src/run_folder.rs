@@ -186,7 +186,7 @@ impl RunFolder {
         );
         assert_eq!(summary.messages_refused, 0, "{said}");
         assert_eq!(summary.frames, summary.transitions_inserted, "{said}");
-        let rows_before = summary.resumed_after_updates * self.setting("learner.batch_rows") as u64;
+        let rows_before = summary.resumed_after_updates * self.setting("learner.batch_size") as u64;
         assert_eq!(
             rows_before + summary.k_histogram.iter().sum::<u64>(),
             summary.rows_sampled,
@@ -235,7 +235,7 @@ impl RunFolder {
     pub fn check_finished(&self) -> Summary {
         let summary = self.check("finished");
         let said = format!("{summary:#?}");
-        let rows = self.setting("learner.batch_rows") as u64;
+        let rows = self.setting("learner.batch_size") as u64;
         let (warmup, ratio) = (
             self.setting("replay.warmup_transitions") as u64,
             self.setting("replay.replay_ratio"),

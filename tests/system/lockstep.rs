@@ -2,19 +2,10 @@
 //! It starts one process only.
 
 use driml_envs::{CorridorConfig, optimal_return};
+use driml_settings::presets::AGENTS;
 use driml_tests::{Summary, TestSystem};
 
 use crate::{SHORT, system};
-
-const AGENTS: [&str; 7] = [
-    "c51",
-    "driml-fix",
-    "driml-ada",
-    "driml-randk",
-    "driml-noact",
-    "cpc",
-    "curl",
-];
 
 fn run(system: &TestSystem, flags: &str, name: &str) -> Summary {
     system
@@ -69,7 +60,7 @@ fn a_compressed_replay_leads_to_the_same_weights() {
 fn every_agent_runs_in_every_world_that_needs_nothing() {
     let system = system();
     for world in ["chain", "mspacman", "ising"] {
-        for agent in AGENTS {
+        for agent in AGENTS.iter().map(|agent| agent.name) {
             let flags = format!("--env {world} --agent {agent} --preset smoke --frames 256");
             let summary = run(&system, &flags, &format!("{world}-{agent}"));
             let looks_ahead = !["c51", "curl"].contains(&agent);

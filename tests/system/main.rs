@@ -26,6 +26,7 @@ mod procgen;
 mod repo_rules;
 mod resume;
 mod successors;
+mod tiny_replay;
 
 use driml_tests::{Process, TestSystem};
 

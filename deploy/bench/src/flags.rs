@@ -41,7 +41,7 @@ pub struct BenchFlags {
     /// Precision of products, for the learner and the policy; may be given several times [default: both]
     #[arg(long, value_name = "PRECISION")]
     pub(crate) precision: Vec<Precision>,
-    /// Measure in this very process, whose environment is already that of a part
+    /// Measure in this very process, whose environment is already that of a run's process
     #[arg(long, hide = true)]
     pub(crate) here: bool,
 }
@@ -124,9 +124,9 @@ fn rate(text: &str) -> Result<f64, String> {
 /// What `driml bench peers` takes.
 #[derive(Debug, Args)]
 pub struct BenchPeersArgs {
-    /// Only these parts
-    #[arg(long, value_enum, value_delimiter = ',', value_name = "PARTS")]
-    pub(crate) only: Vec<BenchPart>,
+    /// Only these components
+    #[arg(long, value_enum, value_delimiter = ',', value_name = "COMPONENTS")]
+    pub(crate) only: Vec<Component>,
     /// Rounds of ours, theirs [default: 5, or 1 with --quick]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) rounds: Option<u32>,
@@ -146,21 +146,21 @@ pub struct BenchPeersArgs {
     pub(crate) flags: BenchFlags,
 }
 
-/// A part that is measured by itself, and beside a peer.
+/// A component that is measured by itself, and beside a peer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
-pub enum BenchPart {
-    /// Beside PyTorch
+pub enum Component {
+    /// Updates, beside PyTorch's
     Learner,
-    /// Beside PyTorch
+    /// Frames through the policy, beside PyTorch's
     Policy,
-    /// Beside Reverb
+    /// Inserts and batches, beside Reverb's
     Replay,
-    /// Beside gym3
+    /// Steps of Procgen, beside gym3's
     Env,
 }
 
-impl BenchPart {
-    /// As the command line has it.
+impl Component {
+    /// Its name on the command line.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Learner => "learner",

@@ -80,7 +80,7 @@ pub(super) struct SyntheticBatch {
 impl SyntheticBatch {
     /// Random bytes, actions and returns, of the sizes that `config` has.
     pub(super) fn draw(config: &RunConfig, rng: &mut ChaCha8Rng) -> Self {
-        let rows = config.learner.batch_rows as usize;
+        let rows = config.learner.batch_size as usize;
         let mut frames = || {
             let mut frames = vec![0; rows * config.model.frame_len()];
             rng.fill_bytes(&mut frames);

@@ -1,7 +1,24 @@
-//! `driml bench`: how fast the parts are, alone and beside what others use for the same work.
+//! `driml bench`: how fast the components are, alone and beside what others use for the same work.
 //!
 //! A file is one bench, and gives `Measurement`s, each of which says what it is of; [`flags::BenchCommand`]
 //! lists them. `deploy/bench/peers/` has the same work in Python. Nothing here passes or fails by its speed.
+//!
+//! Start with [`run`]; what it takes comes from a command line:
+//!
+//! ```no_run
+//! use clap::Parser;
+//! use driml_bench::flags::BenchCommand;
+//!
+//! #[derive(Parser)]
+//! struct CommandLine {
+//!     #[command(subcommand)]
+//!     bench: BenchCommand,
+//! }
+//!
+//! let line = CommandLine::parse_from(["driml", "policy", "--quick", "--json", "policy.json"]);
+//! driml_bench::run(&line.bench)?; // Prints a table, and writes the same figures as JSON.
+//! # Ok::<(), anyhow::Error>(())
+//! ```
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
@@ -29,30 +46,35 @@ use driml_machine::device::ready_for;
 
 use crate::{
     effort::Effort,
-    flags::{BenchCommand, BenchFlags, BenchPart},
+    flags::{BenchCommand, BenchFlags, Component},
     measurements::{MachineNote, Measurement},
 };
 
 /// Runs one bench and reports its figures.
 ///
 /// # Errors
-/// A part that failed, an engine that cannot be had, a file that cannot be written.
+/// A component that failed, an engine that cannot be had, a file that cannot be written.
 pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
     let machine = MachineNote::this();
-    let part = |part, flags: &BenchFlags, device: DeviceName| {
+    let alone = |component, flags: &BenchFlags, device: DeviceName| {
         ready_for(device)?;
         let figures = if flags.here {
-            measure(part, flags, device)?
+            measure(component, flags, device)?
         } else {
-            alone::figures(part, flags, device)?
+            alone::figures(component, flags, device)?
         };
-        measurements::report(part.name(), &figures, machine.computing_on(device), flags)
+        measurements::report(
+            component.name(),
+            &figures,
+            machine.computing_on(device),
+            flags,
+        )
     };
     match command {
-        BenchCommand::Learner(args) => part(BenchPart::Learner, &args.flags, args.on.device),
-        BenchCommand::Policy(flags) => part(BenchPart::Policy, flags, DeviceName::Cpu),
-        BenchCommand::Replay(flags) => part(BenchPart::Replay, flags, DeviceName::Cpu),
-        BenchCommand::Env(flags) => part(BenchPart::Env, flags, DeviceName::Cpu),
+        BenchCommand::Learner(args) => alone(Component::Learner, &args.flags, args.on.device),
+        BenchCommand::Policy(flags) => alone(Component::Policy, flags, DeviceName::Cpu),
+        BenchCommand::Replay(flags) => alone(Component::Replay, flags, DeviceName::Cpu),
+        BenchCommand::Env(flags) => alone(Component::Env, flags, DeviceName::Cpu),
         BenchCommand::System(args) => {
             measurements::report("system", &system::measure(args)?, machine, &args.flags)
         }
@@ -62,7 +84,7 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
 }
 
 fn measure(
-    part: BenchPart,
+    component: Component,
     flags: &BenchFlags,
     device: DeviceName,
 ) -> anyhow::Result<Vec<Measurement>> {
@@ -74,12 +96,12 @@ fn measure(
         }
         Ok(figures)
     };
-    match part {
-        BenchPart::Learner => {
+    match component {
+        Component::Learner => {
             by_precision(&|precision| learner::measure(effort, device, precision))
         }
-        BenchPart::Policy => by_precision(&|precision| policy::measure(effort, precision)),
-        BenchPart::Replay => replay::measure(effort),
-        BenchPart::Env => env::measure(effort),
+        Component::Policy => by_precision(&|precision| policy::measure(effort, precision)),
+        Component::Replay => replay::measure(effort),
+        Component::Env => env::measure(effort),
     }
 }

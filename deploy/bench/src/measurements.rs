@@ -1,4 +1,4 @@
-//! What a bench found, for a person and as JSON.
+//! What a bench found, as a table and as JSON.
 //! It measures nothing and compares nothing.
 
 use std::{fs, path::Path};
@@ -22,7 +22,7 @@ pub(super) struct Measurement {
 }
 
 impl Measurement {
-    /// A figure, which is told to whoever watches stderr.
+    /// A figure, which is printed to stderr at once.
     pub(super) fn found(what: impl Into<String>, value: f64, unit: &str) -> Self {
         let (what, unit) = (what.into(), unit.to_owned());
         console::line(&format!("  {what}: {} {unit}", table::number(value)));
@@ -45,7 +45,7 @@ pub(super) struct MachineNote {
 }
 
 impl MachineNote {
-    /// This one.
+    /// What this machine is, and how busy it is now.
     pub(super) fn this() -> Self {
         let cpuinfo = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
         Self {
@@ -98,7 +98,7 @@ fn processor(cpuinfo: &str) -> Option<&str> {
 /// A bench's figures as JSON has them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Report {
-    /// Which bench.
+    /// The name of the bench that measured.
     pub(super) bench: String,
     /// Whether it took a few iterations only.
     pub(super) quick: bool,

@@ -22,7 +22,7 @@ pub(super) struct Recording {
     frame_bytes: usize,
     /// [STEPS, STREAMS, frame bytes].
     frames: Vec<u8>,
-    /// [STEPS, STREAMS].
+    /// Action, reward and end of each step [STEPS, STREAMS].
     steps: Vec<(u8, f32, End)>,
 }
 
@@ -70,7 +70,7 @@ impl Recording {
         self.frame_bytes
     }
 
-    /// Chunk after chunk of one actor, so many steps of the first so many streams each, in memory of `pool`; the recording
+    /// Chunk after chunk of one actor, `steps` steps of the first `streams` streams each, in memory of `pool`; the recording
     /// plays round and round.
     pub(super) fn chunks(
         &self,
@@ -118,7 +118,7 @@ impl Chunks<'_> {
         self.next.weights_version = version;
     }
 
-    /// The next chunk, of so many steps.
+    /// The next chunk, of `steps` steps.
     pub(super) fn next_of(&mut self, steps: u32) -> Chunk {
         self.next.steps = steps;
         let Recording {

@@ -15,7 +15,7 @@ use driml_launch::{
     managed_process::{ManagedProcess, Surroundings},
 };
 use driml_learner::{
-    LearnerPart,
+    LearnerConfig,
     remote::batch_source::{BatchSource, Next, Requests},
 };
 use driml_protocol::{
@@ -76,7 +76,7 @@ struct Run {
     session: Session,
     keys: Keys,
     actor: ActorSettings,
-    learner: LearnerPart,
+    learner: LearnerConfig,
     /// Deliveries so far; each is another actor.
     deliveries: u32,
 }
@@ -107,7 +107,7 @@ impl Run {
             session,
             keys,
             actor: ActorSettings::from_toml(&hello.config_toml)?,
-            learner: LearnerPart::from_toml(&hello.config_toml)?,
+            learner: LearnerConfig::from_toml(&hello.config_toml)?,
             deliveries: 0,
         })
     }
@@ -154,7 +154,7 @@ impl Run {
     /// Batches a second, each read as a learner would.
     fn fetch(&self, effort: &Effort) -> anyhow::Result<f64> {
         let shutdown = Shutdown::default();
-        let LearnerPart {
+        let LearnerConfig {
             spec,
             learner,
             transport,
@@ -166,7 +166,7 @@ impl Run {
             std::slice::from_ref(&client),
             Requests {
                 learner: taking_part::LEARNER,
-                rows: learner.batch_rows,
+                rows: learner.batch_size,
                 in_flight: learner.batches_in_flight,
                 shared_memory: transport.shared_memory,
                 unreachable_max: ANSWER_MAX,

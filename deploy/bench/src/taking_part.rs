@@ -57,7 +57,7 @@ fn alive(client: &RunClient, who: Alive) -> anyhow::Result<LivelinessToken> {
     token.map_err(|e| anyhow::anyhow!("declaring a client alive: {e}"))
 }
 
-/// Hands over weights, as the learner does after so many `updates`.
+/// Hands over weights, as the learner does after `updates` updates.
 ///
 /// # Errors
 /// The replay server does not answer or refuses.

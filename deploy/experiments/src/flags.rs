@@ -108,7 +108,7 @@ pub(crate) fn settings<T: DeserializeOwned>(
     })
 }
 
-/// The command that repeats an experiment, as its page has it.
+/// The command that repeats an experiment, for its page.
 pub(crate) fn command_line(name: &str, flags: &ExperimentFlags, out: &Path) -> String {
     let mut words = format!("driml experiment {name}");
     if flags.smoke {

@@ -6,6 +6,23 @@
 //!
 //! A new one is a folder with `run(args)`, a variant of [`flags::ExperimentCommand`], and beside its code `config.toml`,
 //! `smoke.toml` (the same in seconds) and `page.md`. Results that are kept are in `deploy/experiments/results/`.
+//!
+//! Start with [`run`]; what it takes comes from a command line, here the one of Fig. 1 in its short form:
+//!
+//! ```no_run
+//! use clap::Parser;
+//! use driml_experiments::flags::ExperimentCommand;
+//!
+//! #[derive(Parser)]
+//! struct CommandLine {
+//!     #[command(subcommand)]
+//!     experiment: ExperimentCommand,
+//! }
+//!
+//! let line = CommandLine::parse_from(["driml", "random-walk", "--smoke", "--out", "walk"]);
+//! driml_experiments::run(&line.experiment)?; // Leaves walk/README.md with its figures and data.
+//! # Ok::<(), anyhow::Error>(())
+//! ```
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
@@ -21,6 +38,7 @@ mod procgen;
 mod progress;
 mod queue;
 mod random_walk;
+mod runs;
 mod session;
 mod statistics;
 mod template;

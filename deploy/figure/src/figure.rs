@@ -55,7 +55,7 @@ pub enum FigureError {
     /// The picture has no area, or is too large for memory.
     #[error("drawing {}: {why}", .path.display())]
     Draw {
-        /// The file.
+        /// The file that was to be written.
         path: PathBuf,
         /// What is wrong with it.
         why: String,
@@ -63,9 +63,9 @@ pub enum FigureError {
     /// The file system refused.
     #[error("writing {}", .path.display())]
     Write {
-        /// The file.
+        /// The file that was to be written.
         path: PathBuf,
-        /// Its reason.
+        /// What the file system said.
         source: std::io::Error,
     },
 }
@@ -75,7 +75,7 @@ pub enum FigureError {
 pub enum Format {
     /// Scalable, with text as text.
     Svg,
-    /// Pixels.
+    /// Pixels, with the font that comes along.
     Png,
 }
 

@@ -1,4 +1,4 @@
-//! Everything that this program writes to stdout and stderr: lines for a person, the log, progress bars, results.
+//! Everything that this program writes to stdout and stderr: messages, the log, progress bars, results.
 //! A terminal or pipe that is gone takes nothing and is no error here; `driml_protocol::end_signs` notices it.
 
 use std::io::{self, ErrorKind, IsTerminal, Write, stderr};
@@ -11,7 +11,7 @@ use tracing_subscriber::EnvFilter;
 /// How often a progress bar is drawn at most, times a second.
 const DRAWS_PER_SECOND: u8 = 20;
 
-/// Writes a line to stderr. What cannot be written is dropped: nobody reads it, or the disk is full, and a run goes on.
+/// Writes a line to stderr. What cannot be written is dropped: the pipe is closed or the disk is full, and a run goes on.
 pub fn line(text: &str) {
     // In one write, so that lines of several threads do not mix.
     let _ = stderr().write_all(format!("{text}\n").as_bytes());
@@ -50,9 +50,9 @@ pub fn describe(error: &anyhow::Error) -> String {
 
 /// Sends the log to stderr. `DRIML_LOG` says what is logged, in the form of `RUST_LOG`.
 ///
-/// zenoh warns of each try to reach a part that is not there yet or any more, which is ours to judge: so only its errors are
+/// zenoh warns of each try to reach a process that is not there yet or any more, which is ours to judge: so only its errors are
 /// logged, and of those neither what its session says of messages that come while it closes, as at the end of every run, nor
-/// that nobody wants an answer any more.
+/// that no answer is wanted any more.
 pub fn log_to_stderr() {
     let usual = "warn,driml=info,zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off";
     let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
@@ -76,7 +76,7 @@ pub fn log_to_stderr() {
         .init();
 }
 
-/// Where lines for a person go: stderr, above a progress bar if stderr is a terminal. Clones share the bar.
+/// Where messages go: stderr, above a progress bar if stderr is a terminal. Clones share the bar.
 #[derive(Clone, Debug)]
 pub struct Screen {
     bar: Option<ProgressBar>,

@@ -44,9 +44,9 @@ pub enum Who {
 
 /// A run's newest weights and its world, ready to play.
 pub struct Player {
-    /// Its settings.
+    /// The settings of the run that trained them.
     pub config: RunConfig,
-    /// As safetensors.
+    /// The network's parameters, a safetensors file.
     weights: Vec<u8>,
     /// Updates behind its weights.
     pub updates: u64,

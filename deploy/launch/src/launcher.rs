@@ -1,4 +1,5 @@
-//! The launcher: starts the parts as processes, watches them to the end of the run, and ends them in order.
+//! The launcher: starts replay servers, learner and actors as processes, watches them to the end of the run, and ends them in
+//! order.
 //! Each is a `managed_process`; `status_client` asks how they are, `live_view` shows it and `run_folder` keeps it.
 
 use std::{
@@ -11,35 +12,32 @@ use driml_machine::{
     error::{Interrupted, Usage},
     units::duration,
 };
-use driml_protocol::{
-    Keys, fault,
-    session::{self, Endpoints},
-};
+use driml_protocol::{Keys, session};
 use driml_settings::config::RunConfig;
 
 use crate::{
+    connect::connect,
     console::{self, Screen, print},
     endpoint::NAMESPACE,
     interrupts::Interrupts,
     live_view::{Display, TEMPLATE},
     managed_process::{ManagedProcess, Surroundings},
     meeting::Meeting,
+    processes::{Processes, stop},
     resume,
-    run_folder::{Outcome, Recorder, ResumePoint, RunFolder, Summary},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary},
     status_client::Statuses,
 };
 
-/// How often the parts are asked how they are.
+/// How often the processes are asked how they are.
 const POLL: Duration = Duration::from_secs(1);
-/// How long the replay server may take to listen.
-const LISTEN_MAX: Duration = Duration::from_secs(30);
-/// How long a part may leave questions unanswered, from its start too, before the run is given up.
+/// How long a process may leave questions unanswered, from its start too, before the run is given up.
 const SILENCE_MAX: Duration = Duration::from_secs(120);
 /// How long a run may make no progress before it is given up.
 const STALL_MAX: Duration = Duration::from_secs(600);
 /// How long actors may take to deliver what they have, once they are not needed or told to stop.
 const ACTORS_DRAIN_MAX: Duration = Duration::from_secs(60);
-/// How long actors may take to end once another part has failed.
+/// How long actors may take to end once another process has failed.
 const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
 /// How long the learner may take to save, once it is told to stop.
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
@@ -48,12 +46,13 @@ const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
 /// How often a learner that saves is asked whether it is done.
 const DRAIN_POLL: Duration = Duration::from_millis(100);
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
-const PART_THREADS: u32 = 1;
+const PROCESS_THREADS: u32 = 1;
 
-/// Trains with one process for each part, and leaves `run_dir`; a run that is `resumed` has it already, and so much behind it.
+/// Trains with a process for each replay server, the learner and each actor, and leaves `run_dir`; a run that is `resumed` has
+/// that folder already and goes on from the point given.
 ///
 /// # Errors
-/// A part that failed or went silent, a file system that refuses; [`Interrupted`] if a person ended the run.
+/// A process that failed or went silent, a file system that refuses; [`Interrupted`] if the run was asked to stop.
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
@@ -72,28 +71,40 @@ pub fn run(
         .collect();
     let (text, losses) = (config.to_toml(), config.learner.update.objective.losses());
     let mut recorder = match resumed {
-        Some(behind) => Recorder::go_on(run_dir, &text, losses, &names, behind, config.frames())?,
-        None => Recorder::create(run_dir, &text, losses, &names)?,
+        Some(resume_point) => RunRecorder::go_on(
+            run_dir,
+            &text,
+            losses,
+            &names,
+            resume_point,
+            config.frames(),
+        )?,
+        None => RunRecorder::create(run_dir, &text, losses, &names)?,
     };
-    let behind = resumed.unwrap_or_default();
+    let resume_point = resumed.unwrap_or_default();
     let meeting = Meeting::create()?;
     let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
     if let Some(listen) = listen {
         endpoints[0] = listen;
     }
     let screen = Screen::new(config.frames(), TEMPLATE);
-    let display = Display::new(screen.clone(), config.frames(), config.updates(), behind);
+    let display = Display::new(
+        screen.clone(),
+        config.frames(),
+        config.updates(),
+        resume_point,
+    );
     let mut launch = Launch {
         config,
         run_dir,
-        behind,
+        resume_point,
         servers,
         endpoints,
         meeting,
         screen,
         display,
         interrupts,
-        parts: Vec::new(),
+        processes: Processes::default(),
         statuses: None,
     };
 
@@ -140,7 +151,7 @@ pub fn run(
 struct Launch<'a> {
     config: &'a RunConfig,
     run_dir: &'a RunFolder,
-    behind: ResumePoint,
+    resume_point: ResumePoint,
     /// Names of the replay servers, one a shard, and where each listens.
     servers: Vec<String>,
     endpoints: Vec<String>,
@@ -148,8 +159,7 @@ struct Launch<'a> {
     screen: Screen,
     display: Display,
     interrupts: Interrupts,
-    /// Replay servers, learner, actors, in this order, as far as they were started.
-    parts: Vec<ManagedProcess>,
+    processes: Processes,
     statuses: Option<Statuses>,
 }
 
@@ -162,16 +172,6 @@ fn server_names(shards: u32) -> Vec<String> {
 }
 
 impl Launch<'_> {
-    /// The learner's place in `parts`.
-    fn learner(&self) -> usize {
-        self.servers.len()
-    }
-
-    /// The first actor's place in `parts`.
-    fn first_actor(&self) -> usize {
-        self.servers.len() + 1
-    }
-
     fn surroundings<'a>(&'a self, logs: &'a Path) -> Surroundings<'a> {
         Surroundings {
             logs,
@@ -180,19 +180,15 @@ impl Launch<'_> {
         }
     }
 
-    fn start_and_watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
+    fn start_and_watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
         let logs = self.run_dir.logs();
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
         let config = recorder.config_path().display().to_string();
-        let part = |words: &[&str]| {
-            words
-                .iter()
-                .map(|&word| word.to_owned())
-                .collect::<Vec<_>>()
-        };
+        let words =
+            |args: &[&str]| -> Vec<String> { args.iter().map(|&arg| arg.to_owned()).collect() };
         for (shard, (name, endpoint)) in self.servers.iter().zip(&self.endpoints).enumerate() {
-            let (shard, after) = (shard.to_string(), self.behind.updates.to_string());
-            let mut args = part(&[
+            let (shard, after) = (shard.to_string(), self.resume_point.updates.to_string());
+            let mut args = words(&[
                 "replay-server",
                 "--listen",
                 endpoint,
@@ -203,16 +199,16 @@ impl Launch<'_> {
                 "--config",
                 &config,
             ]);
-            if let Some(study) = self.config.replay.study {
-                args.extend(part(&["--study", study.name()]));
+            if let Some(bug) = self.config.replay.reproduced_bug {
+                args.extend(words(&["--reproduce-bug", bug.name()]));
             }
             let server =
-                ManagedProcess::start(name, &args, PART_THREADS, self.surroundings(&logs))?;
-            self.parts.push(server);
+                ManagedProcess::start(name, &args, PROCESS_THREADS, self.surroundings(&logs))?;
+            self.processes.replay_servers.push(server);
         }
         let mut sessions = Vec::new();
         for endpoint in self.endpoints.clone() {
-            match self.connect(&endpoint)? {
+            match connect(&endpoint, &self.interrupts, || self.processes.check_alive())? {
                 Some(session) => sessions.push(session),
                 None => return Ok(Outcome::Interrupted),
             }
@@ -222,87 +218,43 @@ impl Launch<'_> {
 
         let folder = self.run_dir.display().to_string();
         let device = self.config.local.learner_device.to_string();
-        let mut args = part(&["learner", "--run-dir", &folder, "--device", &device]);
+        let mut args = words(&["learner", "--run-dir", &folder, "--device", &device]);
         for endpoint in &self.endpoints {
-            args.extend(part(&["--connect", endpoint]));
+            args.extend(words(&["--connect", endpoint]));
         }
-        self.parts.push(ManagedProcess::start(
+        self.processes.learner = Some(ManagedProcess::start(
             "learner",
             &args,
             self.config.local.learner_threads,
             self.surroundings(&logs),
         )?);
         for id in 0..self.config.local.actors {
-            let args = part(&[
+            let args = words(&[
                 "actor",
                 "--connect",
                 &self.endpoints[id as usize % self.endpoints.len()],
                 "--id",
                 &id.to_string(),
             ]);
-            self.parts.push(ManagedProcess::start(
+            self.processes.actors.push(ManagedProcess::start(
                 &format!("actor-{id}"),
                 &args,
-                PART_THREADS,
+                PROCESS_THREADS,
                 self.surroundings(&logs),
             )?);
         }
         self.watch(recorder)
     }
 
-    /// A session to the replay server as soon as it listens; none if a person was faster.
-    fn connect(&mut self, endpoint: &str) -> anyhow::Result<Option<zenoh::Session>> {
-        let endpoints = Endpoints {
-            listen: Vec::new(),
-            connect: vec![endpoint.to_owned()],
-        };
-        let deadline = Instant::now() + LISTEN_MAX;
-        loop {
-            // Opening may take seconds of its own, in which the replay server may end: so it is not waited for here.
-            let endpoints = endpoints.clone();
-            let (tell, told) = std::sync::mpsc::channel();
-            let open = move || {
-                fault::point("connect");
-                // Nobody listens any more if the run has ended meanwhile.
-                let _ = tell.send(session::open(&endpoints));
-            };
-            let thread = std::thread::Builder::new().name("connect".into());
-            thread.spawn(open).context("starting a thread")?;
-            let opened = loop {
-                self.check_alive()?;
-                if self.interrupts.count() > 0 {
-                    return Ok(None);
-                }
-                match told.recv_timeout(Duration::from_millis(50)) {
-                    Ok(opened) => break opened,
-                    Err(_) if Instant::now() > deadline => {
-                        bail!(
-                            "the replay server does not listen on {endpoint} after {}",
-                            duration(LISTEN_MAX)
-                        )
-                    }
-                    Err(_) => {}
-                }
-            };
-            match opened {
-                Ok(session) => return Ok(Some(session)),
-                Err(e) if Instant::now() > deadline => {
-                    return Err(e).context("reaching the replay server");
-                }
-                Err(e) => tracing::debug!("the replay server does not listen yet: {e}"),
-            }
-        }
-    }
-
     /// Asks, shows and records once a second until the run is over.
-    fn watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
+    fn watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
         let mut heard = [Instant::now(); 2];
         let mut progress = (Instant::now(), (0, 0));
         loop {
             if self.interrupts.wait_timeout(POLL) > 0 {
                 return Ok(Outcome::Interrupted);
             }
-            self.check_alive()?;
+            self.processes.check_alive()?;
             let statuses = self
                 .statuses
                 .as_mut()
@@ -324,8 +276,8 @@ impl Launch<'_> {
             }
             let (replay, mut learner) = (statuses.replay.clone(), statuses.learner.clone());
             // Until the learner has answered, too.
-            learner.updates = learner.updates.max(self.behind.updates);
-            let rss: Vec<_> = self.parts.iter_mut().map(ManagedProcess::rss_mib).collect();
+            learner.updates = learner.updates.max(self.resume_point.updates);
+            let rss = self.processes.rss_mib();
             for line in recorder.record(&statuses.shards, &learner, &rss) {
                 self.screen.line(&line);
             }
@@ -350,20 +302,7 @@ impl Launch<'_> {
         }
     }
 
-    /// Whether all parts are as they should be: running, or actors that are not needed any more.
-    fn check_alive(&mut self) -> anyhow::Result<()> {
-        let first_actor = self.first_actor();
-        for (at, part) in self.parts.iter_mut().enumerate() {
-            if let Some(status) = part.end()
-                && !(at >= first_actor && status.success())
-            {
-                bail!("{}", part.exit_report());
-            }
-        }
-        Ok(())
-    }
-
-    /// Ends all parts: actors first, so that what they have is stored; the learner saves; the replay server is last, so
+    /// Ends all processes: actors first, so that what they have is stored; the learner saves; the replay server is last, so
     /// that it can be asked for the final counts. A second interrupt ends everything at once.
     fn end(&mut self, ran: &anyhow::Result<Outcome>) -> anyhow::Result<()> {
         if matches!(ran, Ok(Outcome::Interrupted)) {
@@ -374,17 +313,15 @@ impl Launch<'_> {
         let interrupts = self.interrupts.clone();
         let abort = move || interrupts.count() > allowed;
         let finished = matches!(ran, Ok(Outcome::Finished));
-        // Once a part has failed, what the actors still have will hardly be learned from.
+        // Once a process has failed, what the actors still have will hardly be learned from.
         let actors_max = if ran.is_ok() {
             ACTORS_DRAIN_MAX
         } else {
             FAILED_DRAIN_MAX
         };
         let mut late = Vec::new();
-        let last = self.parts.len();
-        let (learner, first_actor) = (self.learner().min(last), self.first_actor().min(last));
         // When the run is finished, actors hear it from the replay server and end by themselves.
-        let actors = self.stop(first_actor..last, !finished, actors_max, &abort);
+        let actors = stop(&mut self.processes.actors, !finished, actors_max, &abort);
         if finished {
             late.extend(actors);
         } else {
@@ -394,7 +331,12 @@ impl Launch<'_> {
                 .for_each(|actor| self.screen.line(&format!("while stopping, {actor}")));
         }
         self.wait_for_final_checkpoint(&abort);
-        late.extend(self.stop(learner..first_actor, true, LEARNER_DRAIN_MAX, &abort));
+        late.extend(stop(
+            self.processes.learner.as_mut_slice(),
+            true,
+            LEARNER_DRAIN_MAX,
+            &abort,
+        ));
         if let Some(statuses) = &mut self.statuses {
             if let Err(e) = statuses.ask_replay() {
                 tracing::debug!("the replay server's last word: {e:#}");
@@ -402,7 +344,12 @@ impl Launch<'_> {
             // Before its router goes away, so that it does not try to reach it again.
             statuses.close();
         }
-        late.extend(self.stop(0..learner, true, REPLAY_DRAIN_MAX, &abort));
+        late.extend(stop(
+            &mut self.processes.replay_servers,
+            true,
+            REPLAY_DRAIN_MAX,
+            &abort,
+        ));
         if abort() {
             bail!("ended at once by an interrupt: what was not saved is lost");
         }
@@ -414,8 +361,7 @@ impl Launch<'_> {
 
     /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
     fn wait_for_final_checkpoint(&mut self, abort: &impl Fn() -> bool) {
-        let at = self.learner();
-        let Some(learner) = self.parts.get_mut(at) else {
+        let Some(learner) = &mut self.processes.learner else {
             return;
         };
         learner.ask_to_stop();
@@ -435,44 +381,10 @@ impl Launch<'_> {
         }
     }
 
-    /// Waits for some parts to end, asking them first if `ask`; says which did not end well in time. None is left.
-    fn stop(
-        &mut self,
-        which: std::ops::Range<usize>,
-        ask: bool,
-        drain_max: Duration,
-        abort: &impl Fn() -> bool,
-    ) -> Vec<String> {
-        let parts = &mut self.parts[which];
-        if ask {
-            parts.iter_mut().for_each(ManagedProcess::ask_to_stop);
-        }
-        let deadline = Instant::now() + drain_max;
-        let mut late = Vec::new();
-        for part in parts {
-            match part.wait_until(deadline, abort) {
-                Some(status) if status.success() => {}
-                Some(_) => late.push(part.exit_report()),
-                None => {
-                    if !abort() {
-                        late.push(format!(
-                            "{} did not end within {} and was killed",
-                            part.name,
-                            duration(drain_max)
-                        ));
-                    }
-                    part.kill();
-                    part.wait_until(Instant::now() + REPLAY_DRAIN_MAX, || false);
-                }
-            }
-        }
-        late
-    }
-
     /// Writes the last row and the summary, says what could not be written before, and whether the summary could.
     fn conclude(
         &mut self,
-        recorder: &mut Recorder,
+        recorder: &mut RunRecorder,
         outcome: Outcome,
     ) -> (Summary, anyhow::Result<()>) {
         let (shards, replay, learner) = match &self.statuses {
@@ -480,10 +392,7 @@ impl Launch<'_> {
             None => Default::default(),
         };
         recorder.record(shards, &learner, &[]);
-        let logs = self
-            .parts
-            .iter()
-            .filter_map(ManagedProcess::missing_log_lines);
+        let logs = self.processes.missing_log_lines();
         let missing = recorder.missing().into_iter().chain(logs);
         missing.for_each(|line| console::line(&line));
         let summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);

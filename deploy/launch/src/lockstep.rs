@@ -1,20 +1,22 @@
-//! All parts in one process, one after the other in a fixed order: the same code as the processes run, without sockets.
-//! The same seed gives the same weights, bit for bit, on the same machine; it is for tests and debugging, not for speed.
+//! Actors, replay server and learner in one process, one after the other in a fixed order: the same code as the processes run,
+//! without sockets. The same seed gives the same weights, bit for bit, on the same machine; it is for tests and debugging, not for speed.
 
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use driml_actor::{ActorSettings, Collector, Incarnation};
-use driml_learner::{Learner, LearnerPart};
+use driml_learner::{Learner, LearnerConfig};
 use driml_machine::error::Interrupted;
-use driml_protocol::{ActorJoin, Batch, BufferPool, Goodbye, InsertReply, LearnerStatus, Shutdown};
+use driml_protocol::{
+    ActorJoin, Batch, BufferPool, Goodbye, InsertReply, LearnerStatus, Shutdown, Weights,
+};
 use driml_replay_server::{Replay, Unready};
 use driml_settings::config::RunConfig;
 
 use crate::{
     console::{self, Screen, print},
     live_view::{Display, TEMPLATE},
-    run_folder::{Outcome, Recorder, ResumePoint, RunFolder},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder},
 };
 
 /// How often progress is shown and recorded.
@@ -27,21 +29,21 @@ const LEARNER: u64 = 1;
 /// Trains in this process, and leaves `run_dir`.
 ///
 /// # Errors
-/// A part that failed, a file system that refuses; [`Interrupted`] if a person ended the run.
+/// A component that failed, a file system that refuses; [`Interrupted`] if the run was asked to stop.
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(exit_with_parent).context("listening for signals")?;
-    let mut recorder = Recorder::create(
+    let mut recorder = RunRecorder::create(
         run_dir,
         &config.to_toml(),
         config.learner.update.objective.losses(),
         &[],
     )?;
     let screen = Screen::new(config.frames(), TEMPLATE);
-    let mut parts = Lockstep::new(config)?;
+    let mut lockstep = Lockstep::new(config)?;
     let mut display = Display::new(
         screen.clone(),
         config.frames(),
@@ -53,33 +55,33 @@ pub fn run(
 
     let mut outcome = Outcome::Finished;
     let mut saved = u64::MAX;
-    while parts.round()? {
-        if parts.learner.checkpoint_is_due() && parts.learner.updates() != saved {
-            saved = parts.learner.updates();
-            parts.learner.save(&folder)?;
+    while lockstep.round()? {
+        if lockstep.learner.checkpoint_is_due() && lockstep.learner.updates() != saved {
+            saved = lockstep.learner.updates();
+            lockstep.learner.save(&folder)?;
         }
         if shown.elapsed() >= POLL {
             shown = Instant::now();
-            let replay = parts.replay.status();
-            let said = recorder.record(std::slice::from_ref(&replay), &parts.status, &[]);
+            let replay = lockstep.replay.status();
+            let said = recorder.record(std::slice::from_ref(&replay), &lockstep.status, &[]);
             said.iter().for_each(|line| screen.line(line));
-            display.show(&replay, &parts.status, recorder.episodes(&replay));
+            display.show(&replay, &lockstep.status, recorder.episodes(&replay));
         }
         if shutdown.is_set() {
             outcome = Outcome::Interrupted;
             break;
         }
     }
-    parts.end()?;
-    if parts.learner.updates() != saved {
-        parts.learner.save(&folder)?;
+    lockstep.end()?;
+    if lockstep.learner.updates() != saved {
+        lockstep.learner.save(&folder)?;
     }
     screen.clear();
-    let replay = parts.replay.status();
-    recorder.record(std::slice::from_ref(&replay), &parts.status, &[]);
+    let replay = lockstep.replay.status();
+    recorder.record(std::slice::from_ref(&replay), &lockstep.status, &[]);
     let missing = recorder.missing();
     missing.iter().for_each(|line| console::line(line));
-    let summary = recorder.summarise(outcome, &config.run, &replay, &parts.status);
+    let summary = recorder.summarise(outcome, &config.run, &replay, &lockstep.status);
     print(&summary.describe(run_dir))?;
     summary.write(run_dir)?;
     if outcome == Outcome::Interrupted {
@@ -89,14 +91,14 @@ pub fn run(
     }
 }
 
-/// The parts, hand in hand.
+/// The components of a run, which take turns.
 struct Lockstep {
     actors: Vec<Collector>,
     next_actor: usize,
     replay: Replay,
     learner: Learner,
     status: LearnerStatus,
-    batch_rows: u32,
+    batch_size: u32,
     steps_per_chunk: u32,
     unwanted: Vec<u64>,
     published: u64,
@@ -106,9 +108,9 @@ impl Lockstep {
     fn new(config: &RunConfig) -> anyhow::Result<Self> {
         let text = config.to_toml();
         let settings = ActorSettings::from_toml(&text)?;
-        let part = LearnerPart::from_toml(&text)?;
-        let batch_rows = part.learner.batch_rows;
-        let mut replay = Replay::new(&config.run, &config.replay, batch_rows)?;
+        let learner_config = LearnerConfig::from_toml(&text)?;
+        let batch_size = learner_config.learner.batch_size;
+        let mut replay = Replay::new(&config.run, &config.replay, batch_size)?;
         for actor in 0..config.local.actors {
             let join = ActorJoin {
                 actor,
@@ -116,12 +118,15 @@ impl Lockstep {
             };
             replay.join_actor(join).map_err(anyhow::Error::msg)?;
         }
-        let compute = config.local.learner_device.open(part.learner.precision)?;
-        let mut learner = Learner::new(part, &compute)?;
-        let (header, weights) = learner.next_weights()?;
+        let compute = config
+            .local
+            .learner_device
+            .open(learner_config.learner.precision)?;
+        let mut learner = Learner::new(learner_config, &compute)?;
+        let first = learner.next_weights()?;
         let status = LearnerStatus {
-            weights_version: header.version,
-            weights_sha256: header.sha256_hex(),
+            weights_version: first.header.version,
+            weights_sha256: first.header.sha256_hex(),
             ..LearnerStatus::default()
         };
         let actor = |actor| {
@@ -135,8 +140,8 @@ impl Lockstep {
                 settings.clone(),
                 BufferPool::new(1),
                 life,
-                header.version,
-                &weights,
+                first.header.version,
+                &first.safetensors,
             )
         };
         let actors = (0..config.local.actors)
@@ -149,7 +154,7 @@ impl Lockstep {
             replay,
             learner,
             status,
-            batch_rows,
+            batch_size,
             steps_per_chunk: settings.actor.steps_per_chunk,
             published: 0,
         })
@@ -163,7 +168,7 @@ impl Lockstep {
         loop {
             match self.replay.insert(&chunk) {
                 InsertReply::Stored { .. } => break,
-                InsertReply::Wait { .. } => match self.replay.sample(self.batch_rows) {
+                InsertReply::Wait { .. } => match self.replay.sample(self.batch_size) {
                     Ok(batch) => self.learn(&batch)?,
                     Err(unready) => bail!("actor and learner wait for each other: {unready:?}"),
                 },
@@ -181,7 +186,7 @@ impl Lockstep {
             }
         }
         loop {
-            match self.replay.sample(self.batch_rows) {
+            match self.replay.sample(self.batch_size) {
                 Ok(batch) => self.learn(&batch)?,
                 Err(Unready::Wait(_)) => return Ok(true),
                 Err(Unready::Finished) => return Ok(false),
@@ -203,9 +208,12 @@ impl Lockstep {
     }
 
     fn publish(&mut self) -> anyhow::Result<()> {
-        let (header, weights) = self.learner.next_weights()?;
+        let Weights {
+            header,
+            safetensors,
+        } = self.learner.next_weights()?;
         for actor in &mut self.actors {
-            actor.set_weights(header.version, &weights)?;
+            actor.set_weights(header.version, &safetensors)?;
         }
         self.published = self.learner.updates();
         self.status.weights_version = header.version;

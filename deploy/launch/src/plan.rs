@@ -1,4 +1,4 @@
-//! What a run will do and about how long it takes, for a person to read before it starts.
+//! What a run will do and about how long it takes, printed before it starts.
 //! It decides nothing, and its time is an estimate from the network's arithmetic, not a promise.
 
 use std::time::Duration;
@@ -6,7 +6,10 @@ use std::time::Duration;
 use driml_learner::{DeviceName, auxiliary::loss::Passes};
 use driml_machine::{resources::Machine, units::duration};
 use driml_model::ModelConfig;
-use driml_settings::config::{COMPRESSED_FIELDS_BYTES, RunConfig, replay_bytes_each};
+use driml_settings::{
+    config::RunConfig,
+    memory::{COMPRESSED_FIELDS_BYTES, replay_bytes_each},
+};
 
 use crate::run_folder::{ResumePoint, RunFolder};
 
@@ -23,7 +26,7 @@ struct RowFlops {
     local: f64,
     /// From f3 to f4.
     global: f64,
-    /// C51 head.
+    /// The head that gives C51's distributions.
     head: f64,
     /// DIM heads that exist, at every location where they are applied.
     dim: f64,
@@ -63,7 +66,7 @@ fn row_flops(model: &ModelConfig) -> RowFlops {
 /// forward and backward; an augmented s_t once more; CURL's query both ways and its key forward. The InfoNCE scores come on
 /// top: locations * rows^2 * rkhs for each positive. A frame is one forward pass.
 pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
-    let (model, rows) = (&config.model, f64::from(config.learner.batch_rows));
+    let (model, rows) = (&config.model, f64::from(config.learner.batch_size));
     let RowFlops {
         local,
         global,
@@ -91,13 +94,13 @@ pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
     Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX)
 }
 
-/// The plan of a run that has so much `behind` it, one fact a line.
+/// The plan of a run that starts at `resume_point`, one fact a line.
 pub fn describe(
     config: &RunConfig,
     from: &str,
     run_dir: &RunFolder,
     lockstep: bool,
-    behind: ResumePoint,
+    resume_point: ResumePoint,
     machine: &Machine,
 ) -> String {
     let RunConfig {
@@ -113,7 +116,7 @@ pub fn describe(
         max.saturating_add(held * COMPRESSED_FIELDS_BYTES)
     });
     let bytes = compressed.min(held * replay_bytes_each(run));
-    let left = 1.0 - behind.updates as f64 / config.updates().max(1) as f64;
+    let left = 1.0 - resume_point.updates as f64 / config.updates().max(1) as f64;
     let processes = if lockstep {
         "one, all parts in lockstep".into()
     } else {
@@ -145,7 +148,7 @@ pub fn describe(
                 "{} in all, with {} updates of {} rows (replay ratio {})",
                 config.frames(),
                 config.updates(),
-                learner.batch_rows,
+                learner.batch_size,
                 replay.replay_ratio
             ),
         ),
@@ -176,7 +179,7 @@ pub fn describe(
     text
 }
 
-/// Bytes for a person.
+/// Bytes in a unit that fits them.
 fn size(bytes: u64) -> String {
     match bytes >> 20 {
         mib @ 0..1024 => format!("{} MiB", mib + 1),
@@ -201,8 +204,8 @@ mod tests {
 
     use super::*;
     use driml_settings::{
-        config::{Flags, Source, resolve},
         presets::PRESETS,
+        resolve::{Flags, Source, resolve},
     };
 
     const MACHINE: Machine = Machine {

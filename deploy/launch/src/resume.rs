@@ -1,5 +1,5 @@
-//! `driml local --resume`: the settings of an interrupted run, and what it has behind it.
-//! It changes nothing in the run's folder, and waits there for whoever still saves.
+//! `driml local --resume`: the settings of an interrupted run, and the point from which it goes on.
+//! It changes nothing in the run's folder, and waits until an earlier learner has saved there.
 
 use std::time::{Duration, Instant};
 
@@ -7,7 +7,10 @@ use anyhow::Context;
 use driml_envs::WorldConfig;
 use driml_learner::checkpoint::{self, CheckpointError};
 use driml_machine::{error::usage, resources::Machine};
-use driml_settings::config::{Flags, RunConfig, Source, resolve};
+use driml_settings::{
+    config::RunConfig,
+    resolve::{Flags, Source, resolve},
+};
 
 use crate::{
     console,
@@ -53,10 +56,10 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The settings with which the run in `folder` goes on, and what it has behind it.
+/// The settings with which the run in `folder` goes on, and from which point.
 ///
 /// # Errors
-/// A folder that is no run's, settings that cannot work, no checkpoint, nothing left to do, somebody who is at it.
+/// A folder that is no run's, settings that cannot work, no checkpoint, nothing left to do, a run that is still going on.
 pub fn find(
     folder: &RunFolder,
     flags: &Flags,
@@ -72,7 +75,7 @@ pub fn find(
     // First, as a run that is still ending holds memory.
     wait_until_free(folder)?;
     let flags = Flags {
-        study: RunConfig::parse(&name, &text)?.replay.study,
+        reproduce_bug: RunConfig::parse(&name, &text)?.replay.reproduced_bug,
         ..flags.clone()
     };
     let config = resolve(&Source::File(name, text), &flags, machine)?;
@@ -104,7 +107,7 @@ pub fn find(
     if updates == 0 {
         return Ok((config, ResumePoint::default()));
     }
-    let rows = updates as f64 * f64::from(config.learner.batch_rows);
+    let rows = updates as f64 * f64::from(config.learner.batch_size);
     let frames =
         config.replay.warmup_transitions + (rows / config.replay.replay_ratio).ceil() as u64;
     Ok((config, ResumePoint { updates, frames }))

@@ -7,7 +7,7 @@ use std::fs;
 const ENVS: u32 = 16;
 /// Share of the free memory that a replay sized by the machine may take; the learner and the system need the rest.
 const REPLAY_SHARE: f64 = 0.5;
-/// Share of the free memory that a replay sized by a person may take.
+/// Share of the free memory that a replay may take whose size was asked for.
 const REPLAY_SHARE_MAX: f64 = 0.9;
 
 /// What a learner takes on Procgen (266 MiB measured), and some room.
@@ -71,7 +71,7 @@ impl Machine {
         share.min(self.beside_actors(actors_bytes))
     }
 
-    /// Bytes that a replay sized by a person may take, where the actors take `actors_bytes`.
+    /// Bytes that a replay may take whose size was asked for, where the actors take `actors_bytes`.
     pub fn replay_bytes_max(&self, actors_bytes: u64) -> u64 {
         let share = (self.memory_bytes as f64 * REPLAY_SHARE_MAX) as u64;
         share.min(self.beside_actors(actors_bytes))

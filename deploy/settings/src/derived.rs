@@ -27,8 +27,8 @@ const FOLLOWS: [(&str, &str); 14] = [
     ("model.num_actions", "follows from the world"),
     ("model.dim", "follows from learner.update"),
     (
-        "replay.study",
-        "is a fault to be studied, and chosen by --study",
+        "replay.reproduced_bug",
+        "is a known bug to train with, and chosen by --reproduce-bug",
     ),
 ];
 
@@ -79,8 +79,8 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
             Value::String(variant.into()),
         );
     }
-    let config: WorldConfig = part(table, "world")?;
-    let update: LearnerSettings = part(table, "learner.update")?;
+    let config: WorldConfig = table_at(table, "world")?;
+    let update: LearnerSettings = table_at(table, "learner.update")?;
     let shape = config.frame_shape();
     let num_actions = config.num_actions();
     let stack = whole(table, "run.frame_stack")?;
@@ -111,7 +111,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     Ok(())
 }
 
-/// Fills in for how many actors the ladder of epsilons is, where there is one and nobody says it.
+/// Fills in for how many actors the ladder of epsilons is, where there is one and it is not set.
 fn ladder(table: &mut Table) {
     let asked = find(table, "actor.epsilon_ladder").is_some_and(Value::is_table);
     if asked
@@ -225,7 +225,7 @@ fn whole(table: &Table, path: &str) -> Result<i64, Usage> {
     })
 }
 
-fn part<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
+fn table_at<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
     let value = find(table, path).ok_or_else(|| {
         usage!("the settings have no [{path}] table: use a config.toml that driml wrote")
     })?;

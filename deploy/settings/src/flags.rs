@@ -11,8 +11,9 @@ use driml_machine::{
 };
 
 use crate::{
-    config::{self, Flags, RunConfig, Source},
+    config::RunConfig,
     presets,
+    resolve::{self, Flags, Source},
 };
 
 const ENV: &str = "procgen:bigfish";
@@ -66,5 +67,5 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
             )
         }
     };
-    Ok((config::resolve(&source, &args.over, machine)?, from))
+    Ok((resolve::resolve(&source, &args.over, machine)?, from))
 }

@@ -11,9 +11,9 @@ use driml_machine::{
 use toml::{Table, Value};
 
 use crate::{
-    config::{self, Flags, Source},
     derived,
     presets::{AGENTS, Agent, Layer, Only, PRESETS, Preset, agent, layers, stack},
+    resolve::{Flags, Source, resolve},
 };
 
 /// Where a setting's source begins, if the setting leaves room.
@@ -101,7 +101,7 @@ pub fn sourced(preset: &'static Preset, world: WorldName, agent: &Agent) -> Resu
         memory_bytes: u64::MAX,
         ..Machine::this()
     };
-    let config = config::resolve(&source, &Flags::default(), &machine)?;
+    let config = resolve(&source, &Flags::default(), &machine)?;
     let table: Table = config
         .to_toml()
         .parse()
@@ -145,7 +145,7 @@ fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, ou
     }
 }
 
-/// A key as TOML has it.
+/// A key in TOML's form.
 fn quoted(key: &str) -> String {
     let bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
     if key.chars().all(bare) {
@@ -224,7 +224,7 @@ mod tests {
     #[test]
     fn every_setting_of_every_game_and_agent_has_a_source_and_reads_back() {
         for world in WorldName::all() {
-            for agent in &AGENTS {
+            for agent in AGENTS {
                 let text = sourced(&PRESETS[0], world, agent).unwrap();
                 assert!(!text.contains("not said"), "{text}");
                 RunConfig::parse("printed", &text).unwrap();

@@ -164,7 +164,7 @@ mod tests {
 
     fn settings() -> Table {
         "[run]\nseed = 1\ngamma = 0.99\ntimeout = \"terminal\"\nhorizon = { rule = \"fixed\", k = 5 }\n\
-         [learner]\nbatch_rows = 256\n[learner.update.adam]\nlr = 1e-3\nbeta1 = 0.9"
+         [learner]\nbatch_size = 256\n[learner.update.adam]\nlr = 1e-3\nbeta1 = 0.9"
             .parse()
             .unwrap()
     }
@@ -211,7 +211,7 @@ mod tests {
             .assert_eq(&said("run.seed=many"));
         expect![[r#"--set run.seed=1.5: the value is a whole number, and 1.5 is a number"#]]
             .assert_eq(&said("run.seed=1.5"));
-        expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has batch_rows, update"#]]
+        expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has batch_size, update"#]]
             .assert_eq(&said("learner.adam.lr=1"));
         expect![[r#"there is no setting "seed" (did you mean "run.seed"?); the settings have the tables learner, run"#]]
             .assert_eq(&said("seed=1"));

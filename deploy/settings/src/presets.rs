@@ -17,10 +17,10 @@ pub(crate) struct Layer {
 }
 
 macro_rules! layer {
-    ($path:literal) => {
+    ($($path:literal)+) => {
         Layer {
-            name: $path,
-            text: include_str!(concat!("../presets/", $path, ".toml")),
+            name: concat!($($path),+),
+            text: include_str!(concat!("../presets/", $($path,)+ ".toml")),
         }
     };
 }
@@ -41,7 +41,7 @@ pub struct Preset {
 }
 
 /// Every preset, the default first.
-pub const PRESETS: [Preset; 4] = [
+pub const PRESETS: &[Preset] = &[
     Preset {
         name: "paper",
         about: "as the paper's authors ran it, at the world's own frame size (the default)",
@@ -68,7 +68,7 @@ pub const PRESETS: [Preset; 4] = [
     },
 ];
 
-/// An agent.
+/// An agent: its name and its layer of settings.
 #[derive(Clone, Debug)]
 pub struct Agent {
     /// As `--agent` takes it.
@@ -78,47 +78,30 @@ pub struct Agent {
     layer: Layer,
 }
 
-/// Every agent.
-pub const AGENTS: [Agent; 7] = [
-    Agent {
-        name: "c51",
-        about: "the return alone",
-        layer: layer!("agent/c51"),
-    },
-    Agent {
-        name: "driml-fix",
-        about: "DIM at a fixed k, chosen by game; augments its states on seven of them",
-        layer: layer!("agent/driml-fix"),
-    },
-    Agent {
-        name: "driml-ada",
-        about: "DIM at a k that follows how predictable the stored actions are (the default)",
-        layer: layer!("agent/driml-ada"),
-    },
-    Agent {
-        name: "driml-randk",
-        about: "DIM at a k drawn uniformly",
-        layer: layer!("agent/driml-randk"),
-    },
-    Agent {
-        name: "driml-noact",
-        about: "DIM that is not told the action",
-        layer: layer!("agent/driml-noact"),
-    },
-    Agent {
-        name: "cpc",
-        about: "one InfoNCE for each of k = 1..5, not told the action",
-        layer: layer!("agent/cpc"),
-    },
-    Agent {
-        name: "curl",
-        about: "two augmentations of the same state, the second one seen by a moving average of the network",
-        layer: layer!("agent/curl"),
-    },
-];
+/// Makes [`AGENTS`]: a line has an agent's name, which is that of its file in `presets/agent/`, and what it is.
+macro_rules! agents {
+    ($($name:literal: $about:literal;)+) => {
+        /// Every agent that `--agent` takes.
+        pub const AGENTS: &[Agent] = &[$(Agent {
+            name: $name,
+            about: $about,
+            layer: layer!("agent/" $name),
+        }),+];
+    };
+}
+
+agents! {
+    "c51": "the return alone";
+    "driml-fix": "DIM at a fixed k, chosen by game; augments its states on seven of them";
+    "driml-ada": "DIM at a k that follows how predictable the stored actions are (the default)";
+    "driml-randk": "DIM at a k drawn uniformly";
+    "driml-noact": "DIM that is not told the action";
+    "cpc": "one InfoNCE for each of k = 1..5, not told the action";
+    "curl": "two augmentations of the same state, the second one seen by a moving average of the network";
+}
 
 /// One for each kind of world in the registry of worlds.
-const WORLDS: [Layer; 4] = [
+const WORLDS: &[Layer] = &[
     layer!("world/procgen"),
     layer!("world/mspacman"),
     layer!("world/chain"),
@@ -127,8 +110,8 @@ const WORLDS: [Layer; 4] = [
 
 fn world_layer(world: WorldName) -> Layer {
     let name = format!("world/{}", world.kind());
-    let found = WORLDS.into_iter().find(|layer| layer.name == name);
-    found.expect("a test looks for a layer of each kind")
+    let found = WORLDS.iter().find(|layer| layer.name == name);
+    *found.expect("a test looks for a layer of each kind")
 }
 
 /// A world by its name, or by its game's.
@@ -149,10 +132,10 @@ pub fn agent(name: &str) -> Result<&'static Agent, Usage> {
         .iter()
         .find(|agent| agent.name == name)
         .ok_or_else(|| {
-            let names = AGENTS.map(|agent| agent.name);
+            let names: Vec<_> = AGENTS.iter().map(|agent| agent.name).collect();
             usage!(
                 "there is no agent {name:?}{}; --agent takes {}",
-                nearest(name, names),
+                nearest(name, names.iter().copied()),
                 names.join(", ")
             )
         })
@@ -167,10 +150,10 @@ pub fn preset(name: &str) -> Result<&'static Preset, Usage> {
         .iter()
         .find(|preset| preset.name == name)
         .ok_or_else(|| {
-            let names = PRESETS.map(|preset| preset.name);
+            let names: Vec<_> = PRESETS.iter().map(|preset| preset.name).collect();
             usage!(
                 "there is no preset {name:?}{}; --preset takes {} (`driml presets` describes them)",
-                nearest(name, names),
+                nearest(name, names.iter().copied()),
                 names.join(", ")
             )
         })
@@ -216,7 +199,7 @@ fn lay(table: &mut Table, layer: &Layer, world: &str) {
     }
 }
 
-/// What a person should know of an agent in a world before it starts.
+/// Notes on an agent in a world, to be printed before the run starts.
 pub fn notes(name: &str, world: &str) -> Vec<String> {
     let blocks = agent(name)
         .map(|agent| agent.layer.read().1)
@@ -236,7 +219,7 @@ pub struct Only {
     /// What it sets.
     #[serde(default)]
     set: Table,
-    /// What a person should know before the run starts.
+    /// A note that is printed before the run starts.
     note: Option<String>,
 }
 
@@ -286,9 +269,9 @@ mod tests {
     }
 
     fn all_layers() -> Vec<Layer> {
-        let agents = AGENTS.into_iter().map(|agent| agent.layer);
+        let agents = AGENTS.iter().map(|agent| agent.layer);
         let worlds = WorldName::all().map(world_layer);
-        let variants = PRESETS.into_iter().flat_map(|preset| preset.layers);
+        let variants = PRESETS.iter().flat_map(|preset| preset.layers);
         let variants = variants.map(|layer| Layer {
             name: layer.name,
             text: layer.text,

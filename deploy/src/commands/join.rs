@@ -6,7 +6,7 @@ use driml_launch::{endpoint::NAMESPACE, meeting, shared_memory};
 use driml_machine::error::Usage;
 use driml_protocol::{Keys, Shutdown, session};
 
-/// How a part reaches the run.
+/// How a process reaches the run.
 #[derive(Debug, Args)]
 pub(crate) struct JoinFlags {
     /// Prefix of the run's keys
@@ -17,7 +17,7 @@ pub(crate) struct JoinFlags {
     pub(crate) exit_with_parent: Option<u32>,
 }
 
-/// Checks how a part reaches the run, and starts to listen for signals.
+/// Checks how a process reaches the run, and starts to listen for signals.
 ///
 /// # Errors
 /// A namespace that is none.
@@ -29,7 +29,7 @@ pub(super) fn join(flags: &JoinFlags) -> anyhow::Result<Shutdown> {
     Shutdown::on_signals(flags.exit_with_parent).context("listening for signals")
 }
 
-/// What a part does when it has ended, well or not: nothing of it is left outside the run folder.
+/// What a process does when it has ended, well or not: nothing of it is left outside the run folder.
 pub(super) fn clean_up_after(ran: anyhow::Result<()>) -> anyhow::Result<()> {
     meeting::leave();
     shared_memory::remove_own();

@@ -32,7 +32,7 @@ const RESUMED: [&str; 11] = [
     "replay_shards",
     "envs",
     "seed",
-    "study",
+    "reproduce_bug",
     "run_dir",
     "lockstep",
 ];
@@ -74,11 +74,12 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             .sets
             .push(format!("local.learner_device={device}"));
     }
-    let (config, from, behind) = match &args.resume {
+    let (config, from, resume_point) = match &args.resume {
         Some(folder) => {
-            let (config, behind) = resume::find(&RunFolder::new(folder), &args.run.over, &machine)?;
-            let from = format!("its checkpoint after {} updates", behind.updates);
-            (config, from, Some(behind))
+            let (config, resume_point) =
+                resume::find(&RunFolder::new(folder), &args.run.over, &machine)?;
+            let from = format!("its checkpoint after {} updates", resume_point.updates);
+            (config, from, Some(resume_point))
         }
         None => {
             let (config, from) = resolve(&args.run, &machine)?;
@@ -109,7 +110,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
         &from,
         &run_dir,
         args.lockstep,
-        behind.unwrap_or_default(),
+        resume_point.unwrap_or_default(),
         &machine,
     ))?;
     config.world.install(&mut console::line)?;
@@ -125,7 +126,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
         launcher::run(
             &config,
             &run_dir,
-            behind,
+            resume_point,
             args.listen,
             args.exit_with_parent,
         )

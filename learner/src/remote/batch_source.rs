@@ -7,7 +7,6 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, bail};
 use driml_protocol::{
     Batch, BatchHeader, BatchReply, BatchRequest, BufferPool, PendingReply, ReplayStatus,
     RequestId, RunClient, Seldom, Shutdown, Tally, fault, join_within, session::SessionError,
@@ -16,7 +15,10 @@ use driml_protocol::{
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::shards::{self, Count};
+use super::{
+    error::BatchError,
+    shards::{self, Count},
+};
 
 /// One request; the replay server answers within a second, if only to say that there is nothing yet.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
@@ -47,7 +49,7 @@ pub struct Requests {
 enum Fetched {
     Batch(Batch),
     Finished,
-    Failed(anyhow::Error),
+    Failed(BatchError),
 }
 
 /// The queue of fetched batches.
@@ -122,7 +124,7 @@ impl BatchSource {
     ///
     /// # Errors
     /// The replay server was out of reach for too long, or refuses.
-    pub fn next(&mut self, timeout: Duration) -> anyhow::Result<Next> {
+    pub fn next(&mut self, timeout: Duration) -> Result<Next, BatchError> {
         let deadline = Instant::now() + timeout;
         while self.fetching > 0 {
             let left = deadline.saturating_duration_since(Instant::now());
@@ -133,7 +135,7 @@ impl BatchSource {
                 Err(mpsc::RecvTimeoutError::Timeout) => return Ok(Next::NotYet),
                 Err(mpsc::RecvTimeoutError::Disconnected) if self.shutdown.is_set() => break,
                 Err(mpsc::RecvTimeoutError::Disconnected) => {
-                    bail!("the threads that fetch batches have ended")
+                    return Err(BatchError::ThreadsEnded);
                 }
             }
         }
@@ -189,12 +191,14 @@ impl Fetcher {
                 }
                 Ok(Some(fetched)) => fetched,
                 Err(e) if answered.elapsed() > self.requests.unreachable_max => {
-                    let max = self.requests.unreachable_max;
-                    Fetched::Failed(e.context(format!("no batch and no answer for {max:?}")))
+                    Fetched::Failed(BatchError::Unreachable {
+                        unreachable_max: self.requests.unreachable_max,
+                        source: Box::new(e),
+                    })
                 }
                 Err(e) => {
                     if let Some(more) = self.said.due() {
-                        tracing::warn!("asking for a batch again: {e:#}{more}");
+                        tracing::warn!("asking for a batch again: {e}{more}");
                     }
                     self.shutdown.wait_timeout(RETRY_PAUSE);
                     continue;
@@ -209,7 +213,7 @@ impl Fetcher {
     }
 
     /// One batch; `None` where the replay has nothing yet.
-    fn fetch(&mut self) -> anyhow::Result<Option<Fetched>> {
+    fn fetch(&mut self) -> Result<Option<Fetched>, BatchError> {
         if self.clients.len() > 1 {
             return self.fetch_from_shards();
         }
@@ -221,13 +225,13 @@ impl Fetcher {
             Answer::Batch(batch) => Some(Fetched::Batch(batch)),
             Answer::Wait => None,
             Answer::Finished => Some(Fetched::Finished),
-            Answer::Refused(why) => Some(refused(&why)),
+            Answer::Refused(why) => Some(Fetched::Failed(BatchError::Refused(why))),
         })
     }
 
     /// One batch, put together from what the shards give. One is put together at a time: each shard is told what the others
     /// give, so that their rate limiters decide as one.
-    fn fetch_from_shards(&mut self) -> anyhow::Result<Option<Fetched>> {
+    fn fetch_from_shards(&mut self) -> Result<Option<Fetched>, BatchError> {
         let partial = self.partial.clone();
         let mut partial = partial.lock().unwrap_or_else(PoisonError::into_inner);
         let PartialBatch {
@@ -272,15 +276,16 @@ impl Fetcher {
                 }
                 Answer::Wait => {}
                 Answer::Finished => finished = true,
-                Answer::Refused(why) => return Ok(Some(refused(&why))),
+                Answer::Refused(why) => {
+                    return Ok(Some(Fetched::Failed(BatchError::Refused(why))));
+                }
             }
         }
         if let Some(e) = failed {
             return Err(e);
         }
         if pending.iter().all(|&rows| rows == 0) {
-            let header =
-                Batch::merged_header(parts).context("the shards' parts do not fit together")?;
+            let header = Batch::merged_header(parts).ok_or(BatchError::DifferentShards)?;
             let memory = self.pool.take_own(header.payload_bytes());
             let whole = Batch::merge(parts, memory);
             parts.clear();
@@ -292,9 +297,9 @@ impl Fetcher {
     }
 
     /// Asks all shards what they have counted.
-    fn recount(&self, counts: &mut [Count]) -> anyhow::Result<()> {
+    fn recount(&self, counts: &mut [Count]) -> Result<(), BatchError> {
         for (client, count) in self.clients.iter().zip(counts) {
-            let status: ReplayStatus = client.fetch(REQUEST_TIMEOUT).context("a shard's status")?;
+            let status: ReplayStatus = client.fetch(REQUEST_TIMEOUT).map_err(BatchError::Status)?;
             *count = Count {
                 tally: Tally {
                     inserted: status.transitions_inserted,
@@ -313,7 +318,7 @@ impl Fetcher {
         id: RequestId,
         rows: u32,
         other_shards: Option<Tally>,
-    ) -> anyhow::Result<(PendingReply<BatchReply>, bool)> {
+    ) -> Result<(PendingReply<BatchReply>, bool), BatchError> {
         let request = BatchRequest {
             learner: self.requests.learner,
             id,
@@ -329,7 +334,7 @@ impl Fetcher {
     fn answer(
         &mut self,
         (asked, shared_memory): (PendingReply<BatchReply>, bool),
-    ) -> anyhow::Result<Answer> {
+    ) -> Result<Answer, BatchError> {
         // A process that may not map shared memory never sees the reply: to it the request looks unanswered.
         let (reply, payload) = asked.receive(&self.pool).inspect_err(|e| {
             let unheard = matches!(
@@ -360,9 +365,4 @@ enum Answer {
     Wait,
     Finished,
     Refused(String),
-}
-
-/// The end of all fetching: what was refused once will be refused again.
-fn refused(why: &str) -> Fetched {
-    Fetched::Failed(anyhow::anyhow!("the replay server refuses: {why}"))
 }

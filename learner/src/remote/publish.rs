@@ -11,11 +11,9 @@ use std::{
 
 use driml_protocol::{
     AffinityUpdate, CodecError, Done, LearnerStatus, QueryWorkers, Request, Responder, RunClient,
-    Sealed, Seldom, Shutdown, WeightsUpload, fault,
+    Sealed, Seldom, Shutdown, Weights, WeightsUpload, fault,
 };
 use zenoh::query::Queryable;
-
-use crate::learner::Weights;
 
 /// One delivery of the affinity matrix.
 const AFFINITY_TIMEOUT: Duration = Duration::from_secs(5);
@@ -116,12 +114,12 @@ impl Outlets {
             said: Seldom::default(),
         };
         let weights = to_all("weights", WEIGHTS_TIMEOUT);
-        weights.start(this.weights.clone(), move |(header, safetensors)| {
+        weights.start(this.weights.clone(), move |weights| {
             let upload = WeightsUpload {
                 learner,
-                weights: *header,
+                weights: weights.header,
             };
-            Sealed::with_payload(&upload, safetensors.clone().into(), spec_hash)
+            Sealed::with_payload(&upload, weights.safetensors.clone().into(), spec_hash)
         })?;
         let affinity = to_all("affinity", AFFINITY_TIMEOUT);
         affinity.start(this.affinity.clone(), move |update| {
@@ -139,8 +137,8 @@ impl Outlets {
     /// are replaced.
     pub(crate) fn publish(&self, weights: Weights) {
         let mut status = lock(&self.status);
-        status.weights_version = weights.0.version;
-        status.weights_sha256 = weights.0.sha256_hex();
+        status.weights_version = weights.header.version;
+        status.weights_sha256 = weights.header.sha256_hex();
         drop(status);
         self.weights.put(weights);
     }

@@ -17,7 +17,7 @@ use super::{
 };
 use crate::{
     checkpoint,
-    config::LearnerPart,
+    config::LearnerConfig,
     learner::{Learner, LearnerError},
 };
 
@@ -49,27 +49,27 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let Some(shards) = Shards::join(&args.connect, &keys, shutdown)? else {
         return Ok(());
     };
-    let part = LearnerPart::from_toml(&shards.config_toml)
+    let config = LearnerConfig::from_toml(&shards.config_toml)
         .context("the settings that the replay server sent")?;
-    let compute = args.device.open(part.learner.precision)?;
+    let compute = args.device.open(config.learner.precision)?;
     let folder = args.run_dir.join(checkpoint::FOLDER);
     let _lock = checkpoint::lock(&folder)?;
-    let rows = part.learner.batch_rows;
+    let rows = config.learner.batch_size;
     let mut requests = Requests {
         learner: rand::random(),
         rows,
-        in_flight: part.learner.batches_in_flight,
-        shared_memory: part.transport.shared_memory,
-        unreachable_max: Duration::from_millis(part.learner.unreachable_max_ms),
+        in_flight: config.learner.batches_in_flight,
+        shared_memory: config.transport.shared_memory,
+        unreachable_max: Duration::from_millis(config.learner.unreachable_max_ms),
     };
     if requests.shared_memory
         && let Err(why) =
-            shared_memory::check_lockable(BatchHeader::of(&part.spec, rows).pool_bytes())
+            shared_memory::check_lockable(BatchHeader::of(&config.spec, rows).pool_bytes())
     {
         tracing::warn!("batches come through sockets, which is slower: {why}");
         requests.shared_memory = false;
     }
-    let mut learner = Learner::resume(part, &compute, &folder)?;
+    let mut learner = Learner::resume(config, &compute, &folder)?;
     let updates = learner.updates();
     let after_updates = shards.after_updates;
     anyhow::ensure!(

@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, fs};
 
 use driml_learner::{
     AffinityConfig, Agent, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner,
-    LearnerPart, LearnerSettings, NetworkParameters, Objective, UpdateError,
+    LearnerConfig, LearnerSettings, NetworkParameters, Objective, UpdateError,
 };
 use driml_model::{Compute, DimHeads, ModelConfig, Parameters};
 use driml_protocol::{
@@ -391,14 +391,14 @@ fn a_psi_that_is_not_given_the_action_does_not_see_it() {
 
 const STATE: usize = 20 * 24 * 2;
 
-fn part(objective: Objective, augment: Option<AugmentSettings>) -> LearnerPart {
+fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConfig {
     let (model, update) = of(objective, GLOBAL);
     let horizon = match objective.name() {
         "cpc" => Horizon::All { k_max: 3 },
         "dim" => Horizon::Fixed { k: 1 },
         _ => Horizon::None,
     };
-    LearnerPart {
+    LearnerConfig {
         spec: RunSpec {
             world: "test".into(),
             agent: objective.name().into(),
@@ -416,7 +416,7 @@ fn part(objective: Objective, augment: Option<AugmentSettings>) -> LearnerPart {
         model,
         learner: Config {
             precision: Default::default(),
-            batch_rows: 6,
+            batch_size: 6,
             batches_in_flight: 1,
             publish_period_updates: 2,
             checkpoint_period_updates: 2,
@@ -439,8 +439,8 @@ fn part(objective: Objective, augment: Option<AugmentSettings>) -> LearnerPart {
 }
 
 /// A batch as the replay server of this run would send it.
-fn served(part: &LearnerPart, seed: u64) -> WireBatch {
-    let positives = part.spec.horizon.positives();
+fn served(config: &LearnerConfig, seed: u64) -> WireBatch {
+    let positives = config.spec.horizon.positives();
     let mut batch = WireBatch::zeroed(BatchHeader {
         rows: 6,
         positives: positives as u32,
@@ -486,9 +486,9 @@ const NOTHING: AugmentSettings = AugmentSettings {
 fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
     for objective in [DIM, CPC] {
         let report = |augment| {
-            let part = part(objective, augment);
-            let batch = served(&part, 1);
-            Learner::new(part, &Compute::CPU)
+            let config = config(objective, augment);
+            let batch = served(&config, 1);
+            Learner::new(config, &Compute::CPU)
                 .unwrap()
                 .update(&batch)
                 .unwrap()
@@ -515,18 +515,18 @@ fn an_augmenting_run_resumes_bit_for_bit() {
             std::process::id()
         ));
         let _ = fs::remove_dir_all(&folder);
-        let part = part(objective, Some(STRONG));
+        let config = config(objective, Some(STRONG));
         let learn = |learner: &mut Learner, updates: std::ops::Range<u64>| {
             for seed in updates {
-                learner.update(&served(&part, seed)).unwrap();
+                learner.update(&served(&config, seed)).unwrap();
             }
         };
-        let mut straight = Learner::new(part.clone(), &Compute::CPU).unwrap();
+        let mut straight = Learner::new(config.clone(), &Compute::CPU).unwrap();
         learn(&mut straight, 0..8);
-        let mut half = Learner::new(part.clone(), &Compute::CPU).unwrap();
+        let mut half = Learner::new(config.clone(), &Compute::CPU).unwrap();
         learn(&mut half, 0..4);
         half.save(&folder).unwrap();
-        let mut resumed = Learner::resume(part.clone(), &Compute::CPU, &folder).unwrap();
+        let mut resumed = Learner::resume(config.clone(), &Compute::CPU, &folder).unwrap();
         assert_eq!(resumed.updates(), 4);
         learn(&mut resumed, 4..8);
         let (mut a, mut b) = (folder.join("a"), folder.join("b"));
@@ -554,12 +554,12 @@ fn an_augmenting_run_resumes_bit_for_bit() {
 #[test]
 fn a_curl_checkpoint_without_a_key_encoder_is_refused() {
     let folder = Folder::new("old-curl");
-    let part = part(CURL, Some(STRONG));
-    let learner = Learner::new(part.clone(), &Compute::CPU).unwrap();
+    let config = config(CURL, Some(STRONG));
+    let learner = Learner::new(config.clone(), &Compute::CPU).unwrap();
     learner.save(&folder.0).unwrap();
     let path = folder.0.join("checkpoint-000000000000");
     change_state(&path, |state| state["format"] = 1.into());
-    let resume = || Learner::resume(part.clone(), &Compute::CPU, &folder.0).map(|_| ());
+    let resume = || Learner::resume(config.clone(), &Compute::CPU, &folder.0).map(|_| ());
     let said = resume().unwrap_err().to_string();
     assert!(
         said.contains("keys came from the target network") && said.contains("begin anew"),
@@ -579,16 +579,16 @@ fn a_curl_checkpoint_without_a_key_encoder_is_refused() {
 /// A refused batch leaves the generator where it was.
 #[test]
 fn a_refused_batch_draws_nothing() {
-    let part = part(CURL, Some(STRONG));
-    let good = served(&part, 1);
-    let mut bad = served(&part, 2);
+    let config = config(CURL, Some(STRONG));
+    let good = served(&config, 1);
+    let mut bad = served(&config, 2);
     bad.rows_mut().set(0, 77, 0, 0.0, 0.9);
-    let mut learner = Learner::new(part.clone(), &Compute::CPU).unwrap();
+    let mut learner = Learner::new(config.clone(), &Compute::CPU).unwrap();
     assert!(learner.update(&bad).is_err());
     let after = learner.update(&good).unwrap();
     assert_eq!(
         after,
-        Learner::new(part, &Compute::CPU)
+        Learner::new(config, &Compute::CPU)
             .unwrap()
             .update(&good)
             .unwrap()
@@ -598,14 +598,14 @@ fn a_refused_batch_draws_nothing() {
 #[test]
 fn augmentation_and_objective_belong_together() {
     let said = |objective, augment| {
-        part(objective, augment)
+        config(objective, augment)
             .learner
             .validate()
             .unwrap_err()
             .to_string()
     };
     assert!(said(CURL, None).contains("take the agent curl"));
-    let mut c51 = part(DIM, Some(STRONG)).learner;
+    let mut c51 = config(DIM, Some(STRONG)).learner;
     c51.update.objective = Objective::NONE;
     assert!(
         c51.validate()
@@ -619,7 +619,7 @@ fn augmentation_and_objective_belong_together() {
         "learner.augment.hue = 0.7 cannot work: it must lie between 0 and 0.5, half a turn either way"
     );
     assert_eq!(
-        part(CURL, Some(NOTHING)).model.dim,
+        config(CURL, Some(NOTHING)).model.dim,
         DimHeads {
             psi4: true,
             ..DimHeads::NONE

@@ -53,7 +53,7 @@ impl From<Unready> for BatchReply {
 pub struct Replay {
     spec: RunSpec,
     config: Config,
-    batch_rows: u32,
+    batch_size: u32,
     ring: Ring,
     actors: Actors,
     requests: Requests,
@@ -72,13 +72,13 @@ pub struct Replay {
 }
 
 impl Replay {
-    /// An empty replay for batches of `batch_rows` rows; its draws follow from `spec.seed` and the order of calls. Of several
+    /// An empty replay for batches of `batch_size` rows; its draws follow from `spec.seed` and the order of calls. Of several
     /// shards it is the first: [`Replay::shard`].
     ///
     /// # Errors
     /// Settings that cannot work, or more memory than the system grants.
-    pub fn new(spec: &RunSpec, config: &Config, batch_rows: u32) -> Result<Self, ConfigError> {
-        Self::shard(spec, config, batch_rows, 0)
+    pub fn new(spec: &RunSpec, config: &Config, batch_size: u32) -> Result<Self, ConfigError> {
+        Self::shard(spec, config, batch_size, 0)
     }
 
     /// Shard `shard` of `config.shards`, which holds its share of the capacity and draws its own numbers.
@@ -88,10 +88,10 @@ impl Replay {
     pub fn shard(
         spec: &RunSpec,
         config: &Config,
-        batch_rows: u32,
+        batch_size: u32,
         shard: u32,
     ) -> Result<Self, ConfigError> {
-        config.validate(spec, batch_rows)?;
+        config.validate(spec, batch_size)?;
         if shard >= config.shards {
             return Err(ConfigError::Key {
                 key: "replay.shards",
@@ -119,7 +119,7 @@ impl Replay {
         Ok(Self {
             spec: spec.clone(),
             config: config.clone(),
-            batch_rows,
+            batch_size,
             ring,
             actors: Actors::default(),
             requests: Requests::default(),
@@ -133,7 +133,7 @@ impl Replay {
             episodes: Episodes::new(spec),
             anchors: Anchors::default(),
             window: Window::default(),
-            assembler: Assembler::new(spec, config.study),
+            assembler: Assembler::new(spec, config.reproduced_bug),
             affinity: Affinity::uniform(spec.num_actions),
             rng,
             statistics: Statistics::new(spec.horizon.k_max(), spec.num_actions),
@@ -147,7 +147,7 @@ impl Replay {
     /// next row is sampled, as at the start of the run; so the run steps its worlds that many times more than it counts.
     #[must_use]
     pub fn resumed_at(mut self, updates: u64, shard: u32) -> Self {
-        let rows = updates.saturating_mul(u64::from(self.batch_rows));
+        let rows = updates.saturating_mul(u64::from(self.batch_size));
         let inserted = (rows as f64 / self.config.replay_ratio) as u64;
         let (shards, shard) = (u64::from(self.config.shards), u64::from(shard));
         let share = |total: u64| total / shards + u64::from(shard < total % shards);

@@ -38,7 +38,7 @@ impl Replay {
 
     /// Who waits for whom now, for batches of the size that the replay was made for.
     pub fn waiting(&self) -> Waiting {
-        match self.limiter.waiting(self.batch_rows) {
+        match self.limiter.waiting(self.batch_size) {
             Waiting::ActorsWaitForLearner | Waiting::Nobody if self.starving => {
                 Waiting::LearnerWaitsForActors
             }

@@ -8,7 +8,7 @@ use super::{
     episodes::Window,
     horizon::{self, Affinity},
 };
-use crate::config::Study;
+use crate::config::ReproducedBug;
 
 /// The states of a row, as indices in the ring.
 #[derive(Clone, Copy)]
@@ -67,19 +67,19 @@ impl RowStates {
 pub(crate) struct Assembler {
     horizon: Horizon,
     timeout: TimeoutRule,
-    study: Option<Study>,
+    reproduced_bug: Option<ReproducedBug>,
     /// gamma^0 ..= gamma^n.
     discounts: Vec<f64>,
     actions: Vec<u8>,
 }
 
 impl Assembler {
-    pub(crate) fn new(spec: &RunSpec, study: Option<Study>) -> Self {
+    pub(crate) fn new(spec: &RunSpec, reproduced_bug: Option<ReproducedBug>) -> Self {
         let powers = std::iter::successors(Some(1.0), |power| Some(power * spec.gamma));
         Self {
             horizon: spec.horizon,
             timeout: spec.timeout,
-            study,
+            reproduced_bug,
             discounts: powers.take(spec.n_step as usize + 1).collect(),
             actions: Vec::with_capacity(spec.horizon.k_max() as usize),
         }
@@ -100,9 +100,9 @@ impl Assembler {
             NO_ACTION
         };
         let (n_step_return, follows) = self.n_step_return(window);
-        let bootstrap = match self.study {
+        let bootstrap = match self.reproduced_bug {
             None => follows.map(|i| (i, self.discounts[i])),
-            Some(Study::BootstrapFromNextState) => self.next_state(window),
+            Some(ReproducedBug::BootstrapFromNextState) => self.next_state(window),
         };
         let discount = bootstrap.map_or(0.0, |(_, discount)| discount);
         rows.set(
@@ -151,7 +151,7 @@ impl Assembler {
         (sum, Some(n))
     }
 
-    /// s_{t+1} at gamma^n, unless step t ended its episode: the fault of [`Study::BootstrapFromNextState`].
+    /// s_{t+1} at gamma^n, unless step t ended its episode: the bug of [`ReproducedBug::BootstrapFromNextState`].
     fn next_state(&self, window: &Window) -> Option<(usize, f64)> {
         let n = self.discounts.len() - 1;
         (!window.step(0).end.is_episode_end()).then(|| (1, self.discounts[n]))

@@ -13,7 +13,7 @@ use super::{
 use crate::storage::{
     frame_store::{
         Frames,
-        compressed::{CompressedFrames, Part},
+        compressed::{BlockPart, CompressedFrames},
     },
     ring::Ring,
 };
@@ -134,7 +134,7 @@ impl PackedStates {
         taken.any(|part| part.transitions.contains(&index))
     }
 
-    fn take(&mut self, frames: &CompressedFrames, part: &Part, key: Option<u64>) {
+    fn take(&mut self, frames: &CompressedFrames, part: &BlockPart, key: Option<u64>) {
         let start = self.bytes.len();
         frames.copy(part, &mut self.bytes);
         self.parts.push(PackedPart {

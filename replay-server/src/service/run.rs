@@ -66,14 +66,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let spec: RunSpec = settings.table("run")?;
     spec.validate()?;
     let config: Config = settings.table("replay")?;
-    let batch_rows = number(&settings, "learner", "batch_rows")?;
+    let batch_size = number(&settings, "learner", "batch_size")?;
     let ack_timeout = Duration::from_millis(number(&settings, "actor", "ack_timeout_ms")?.into());
-    let mut replay = Replay::shard(&spec, &config, batch_rows, args.shard)?;
+    let mut replay = Replay::shard(&spec, &config, batch_size, args.shard)?;
     if args.after_updates > 0 {
         replay = replay.resumed_at(args.after_updates, args.shard);
     }
     let transport: TransportConfig = settings.table("transport")?;
-    let batch = BatchHeader::of(&spec, batch_rows);
+    let batch = BatchHeader::of(&spec, batch_size);
     let pool = if transport.shared_memory {
         BufferPool::shared(SPARE_MAX, POOL_BATCHES, batch.payload_bytes())
     } else {

@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{PIECE_BYTES, WeightsHeader, WeightsReply, WeightsRequest};
+use driml_protocol::{PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest};
 
 /// Versions that are kept while actors pull them. When so many are being pulled, whoever begins gets the newest of these: many
 /// actors that pull slowly are served to the end, with weights that are a little older.
@@ -15,12 +15,6 @@ const KEPT_MAX: usize = 8;
 const KEPT_FOR: Duration = Duration::from_secs(5);
 /// Most versions that one upload may be ahead of the one before: more is no count of a learner's.
 const VERSION_STEP_MAX: u64 = 1 << 20;
-
-/// Weights as they came.
-pub(super) struct Weights {
-    pub(super) header: WeightsHeader,
-    pub(super) safetensors: Vec<u8>,
-}
 
 /// The newest weights, and older ones that are being pulled.
 #[derive(Default)]

@@ -110,7 +110,7 @@ fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
-        study: None,
+        reproduced_bug: None,
         replay_ratio: 64.0,
         warmup_transitions: 0,
         slack_transitions: 1,

@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use driml_protocol::{Batch, ChunkHeader, Goodbye, Horizon, InsertReply, TimeoutRule, Waiting};
-use driml_replay_server::{Compression, PackedBatch, Replay, Study, Unready};
+use driml_replay_server::{Compression, PackedBatch, Replay, ReproducedBug, Unready};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -113,7 +113,7 @@ proptest! {
         horizon in horizons(),
         bootstrap in any::<bool>(),
         lz4 in any::<bool>(),
-        study in any::<bool>(),
+        has_bug in any::<bool>(),
         capacity in 24u64..160,
         (actors, streams) in (1u32..4, 1u32..4),
     ) {
@@ -126,10 +126,10 @@ proptest! {
         if lz4 {
             config.compression = Compression::Lz4;
         }
-        config.study = study.then_some(Study::BootstrapFromNextState);
+        config.reproduced_bug = has_bug.then_some(ReproducedBug::BootstrapFromNextState);
         let mut replay = Replay::new(&spec, &config, 8).unwrap();
         let mut history = History::new(&spec, capacity);
-        history.study = config.study;
+        history.reproduced_bug = config.reproduced_bug;
         let mut known: HashMap<u32, Actor> = HashMap::new();
         let (mut lost, mut retried, mut refused, mut rows_sampled) = (0, 0, 0, 0);
         for _ in 0..150 {

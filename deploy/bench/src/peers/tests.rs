@@ -16,7 +16,7 @@ fn samples(of: &[(&str, &[f64])]) -> Samples {
 
 fn pair(theirs: Theirs, goal: Option<f64>) -> Pair {
     Pair {
-        part: BenchPart::Learner,
+        component: Component::Learner,
         ours: "C51",
         theirs,
         goal,
@@ -83,12 +83,15 @@ fn a_peer_that_is_missing_is_shown_as_skipped() {
 
 #[test]
 fn every_peer_s_figure_is_named_in_its_script() {
-    for Pair { part, theirs, .. } in PAIRS {
+    for Pair {
+        component, theirs, ..
+    } in PAIRS
+    {
         let Theirs::Peers(name) = theirs else {
             continue;
         };
         // Names that a script puts together are checked by running it.
-        if matches!(part, BenchPart::Learner | BenchPart::Replay) {
+        if matches!(component, Component::Learner | Component::Replay) {
             let quoted = format!("\"{name}\"");
             let scripts = script::texts();
             assert!(scripts.iter().any(|text| text.contains(&quoted)), "{name}");

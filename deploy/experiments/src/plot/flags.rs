@@ -13,7 +13,7 @@ pub struct PlotArgs {
     /// Column of metrics.csv, one chart each; may be given several times [default: return, losses, k, speed]
     #[arg(long, value_name = "COLUMN")]
     pub(crate) column: Vec<String>,
-    /// Draw the mean over so many frames before each point
+    /// Draw the mean over this many frames before each point
     #[arg(long, value_name = "FRAMES", value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) smooth: Option<u64>,
     /// What the band over several seeds shows

@@ -6,6 +6,7 @@ use std::path::Path;
 use anyhow::Context;
 use driml_launch::run_folder::{Columns, RunFolder};
 use driml_machine::error::{Usage, nearest, usage};
+use driml_settings::renamed;
 
 /// The column with the standard deviation of k; runs recorded by older programs lack it.
 pub(super) const SPREAD_OF_K: &str = "sd_k";
@@ -15,7 +16,7 @@ const TOTAL_LOSS: &str = "total_loss";
 /// Columns of `metrics.csv` that hold words.
 const WORDS: [&str; 1] = ["waiting"];
 
-/// A run.
+/// The metrics of one run, and its settings.
 #[derive(Debug)]
 pub(crate) struct Run {
     folder: RunFolder,
@@ -126,6 +127,7 @@ pub(super) fn folder_name(folder: &Path) -> String {
 /// Settings without the seed and without what differs between machines alone. A run without settings stands for itself.
 fn settings(path: &Path) -> Option<toml::Table> {
     let mut table: toml::Table = std::fs::read_to_string(path).ok()?.parse().ok()?;
+    renamed::update(&mut table);
     // The machine decides most of how a run is launched, but what is learned depends on how many actors there are.
     let actors = table
         .remove("local")

@@ -5,7 +5,7 @@
 
 use rand::Rng;
 
-/// The walk.
+/// A biased random walk on a line of states, whose transition ratio is known in closed form.
 #[derive(Clone, Debug)]
 pub(super) struct Chain {
     /// States K, at least 2.

@@ -198,7 +198,7 @@ fn page(results: &Results, command: &str, smoke: bool) -> Page {
     closed_forms(k, &mut values);
     values
         .set("rkhs", settings.rkhs)
-        .set("batch_rows", settings.batch_rows)
+        .set("batch_size", settings.batch_size)
         .set("lr", settings.adam.lr)
         .set("updates", settings.updates)
         .set("seeds", settings.seeds);

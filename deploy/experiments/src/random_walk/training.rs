@@ -53,7 +53,7 @@ impl Sampling {
 pub(super) struct Learnt {
     /// When it was measured.
     pub(super) updates: Vec<u64>,
-    /// How far InfoNCE's loss with ever so many negatives is above its minimum, in nats: E_rho KL(T_i || learnt T_i).
+    /// How far InfoNCE's loss with infinitely many negatives is above its minimum, in nats: E_rho KL(T_i || learnt T_i).
     pub(super) excess: Vec<f64>,
     /// Error of the law of the next state, a probability: E_rho of the total variation between T_i and learnt T_i.
     pub(super) tv: Vec<f64>,
@@ -245,7 +245,7 @@ struct Source {
 
 impl Source {
     fn new(chain: &Chain, settings: &Settings, sampling: Sampling, rng: &mut ChaCha8Rng) -> Self {
-        let rows = settings.batch_rows;
+        let rows = settings.batch_size;
         let mut this = Self {
             sampling,
             rows,

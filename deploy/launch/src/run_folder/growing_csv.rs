@@ -61,7 +61,7 @@ impl GrowingCsv {
         })
     }
 
-    /// Adds a row, after those that wait. What a person should know is said the first time that a row has to wait.
+    /// Adds a row, after those that wait. A warning is returned the first time that a row has to wait.
     ///
     /// # Panics
     /// If a row cannot be made into text, which takes no file.

@@ -110,12 +110,12 @@ impl Moment<'_> {
     }
 }
 
-/// The rows of an interrupted run up to what it has `behind` it, of no more than `frames_max` frames; none where there is no
+/// The rows of an interrupted run up to `resume_point`, of no more than `frames_max` frames; none where there is no
 /// such file.
 pub(super) fn rows_up_to(
     path: &Path,
     header: Vec<String>,
-    behind: ResumePoint,
+    resume_point: ResumePoint,
     frames_max: u64,
 ) -> anyhow::Result<Columns> {
     let reading = || format!("reading {}", path.display());
@@ -143,7 +143,7 @@ pub(super) fn rows_up_to(
             return Err(usage!("{}: {row:?} is no row of metrics", path.display()).into());
         };
         // Actors run ahead: without the second condition a run that now ends sooner would end before its rows.
-        if updates <= behind.updates && frames <= frames_max {
+        if updates <= resume_point.updates && frames <= frames_max {
             kept.rows.push(row);
         }
     }

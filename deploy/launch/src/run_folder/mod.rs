@@ -13,7 +13,7 @@ pub use self::{
     columns::Columns,
     folder::{RunFolder, write_whole},
     metrics::{Progress, progress},
-    recorder::Recorder,
+    recorder::RunRecorder,
     resume_point::ResumePoint,
     returns::{Episodes, MeanReturn},
     summary::{Outcome, Summary},

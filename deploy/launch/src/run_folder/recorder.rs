@@ -1,5 +1,5 @@
 //! What is written into the run folder while a run goes on: settings, metrics, returns, and the summary at its end.
-//! It reads no status from anywhere: whoever runs the parts hands them over.
+//! It reads no status from anywhere: its caller hands them over.
 
 use std::{
     fs::{self, File},
@@ -30,10 +30,10 @@ const fn none(header: Vec<String>) -> Columns {
 
 /// Writes a run folder.
 #[derive(Debug)]
-pub struct Recorder {
-    /// Nobody else writes to the folder meanwhile.
+pub struct RunRecorder {
+    /// No other launcher writes to the folder while this is held.
     _lock: File,
-    behind: ResumePoint,
+    resume_point: ResumePoint,
     /// Seconds, frames and episodes in the last row before the run was resumed.
     seconds_before: f64,
     frames_before: u64,
@@ -50,7 +50,7 @@ pub struct Recorder {
     rates: Rates,
 }
 
-impl Recorder {
+impl RunRecorder {
     /// Makes the folder and writes the settings; the clock starts. `losses` are the agent's auxiliary losses,
     /// `processes` those whose memory is recorded.
     ///
@@ -80,7 +80,7 @@ impl Recorder {
         )
     }
 
-    /// Goes on to `frames_max` frames in the folder of an interrupted run, which has so much `behind` it: the rows of metrics up
+    /// Goes on from `resume_point` to `frames_max` frames in the folder of an interrupted run: the rows of metrics up
     /// to there stay.
     ///
     /// # Errors
@@ -90,19 +90,19 @@ impl Recorder {
         config_toml: &str,
         losses: &'static [&'static str],
         processes: &[String],
-        behind: ResumePoint,
+        resume_point: ResumePoint,
         frames_max: u64,
     ) -> anyhow::Result<Self> {
         let lock = folder.lock()?;
         let head = header(losses, processes);
-        let rows = match behind.updates {
+        let rows = match resume_point.updates {
             0 => none(head),
-            _ => rows_up_to(&folder.metrics(), head, behind, frames_max)?,
+            _ => rows_up_to(&folder.metrics(), head, resume_point, frames_max)?,
         };
         let returns = TrainingReturns::go_on(folder, rows.last("frames").unwrap_or(0))?;
         Summary::remove(folder)?;
         folder.write_config(config_toml)?;
-        Self::begin(folder, losses, processes, lock, rows, returns, behind)
+        Self::begin(folder, losses, processes, lock, rows, returns, resume_point)
     }
 
     fn begin(
@@ -112,11 +112,11 @@ impl Recorder {
         lock: File,
         rows: Columns,
         returns: TrainingReturns,
-        behind: ResumePoint,
+        resume_point: ResumePoint,
     ) -> anyhow::Result<Self> {
         let mut this = Self {
             _lock: lock,
-            behind,
+            resume_point,
             seconds_before: rows.last("seconds").unwrap_or(0.0),
             frames_before: rows.last("frames").unwrap_or(0),
             episodes_before: rows.last("episodes").unwrap_or(0),
@@ -130,11 +130,12 @@ impl Recorder {
             started: Instant::now(),
             rates: Rates::default(),
         };
-        this.rates.add(this.started, behind.frames, behind.updates);
+        this.rates
+            .add(this.started, resume_point.frames, resume_point.updates);
         Ok(this)
     }
 
-    /// The settings' file, for parts that read it.
+    /// The settings' file, for processes that read it.
     pub(crate) fn config_path(&self) -> PathBuf {
         self.folder.config()
     }
@@ -146,7 +147,7 @@ impl Recorder {
             return since.or(self.k_before);
         };
         // All updates are of as many rows.
-        let share = self.behind.updates as f64 / updates.max(1) as f64;
+        let share = self.resume_point.updates as f64 / updates.max(1) as f64;
         let mixed = |before: f64, since: f64| share * before + (1.0 - share) * since;
         let square = |(mean, sd): (f64, f64)| mean * mean + sd * sd;
         let mean = mixed(before.0, since.0);
@@ -162,7 +163,7 @@ impl Recorder {
     /// of the episodes that ended. `shards` are the replay servers' own accounts; `rss_mib` is in the order of the processes given at
     /// the start, none for one that ended.
     ///
-    /// A disk that is full does not end the run: what a person should know is said the first time, and [`Self::missing`] says
+    /// A disk that is full does not end the run: a warning is returned the first time, and [`Self::missing`] says
     /// at the end what was lost.
     pub fn record(
         &mut self,
@@ -178,8 +179,8 @@ impl Recorder {
         }
         let said = self.returns.hear(shards);
         let (frames, updates) = (replay.transitions_inserted, learner.updates);
-        let resumed = self.behind.updates > 0;
-        if resumed && (updates <= self.behind.updates || frames < self.frames_before) {
+        let resumed = self.resume_point.updates > 0;
+        if resumed && (updates <= self.resume_point.updates || frames < self.frames_before) {
             return said.into_iter().collect();
         }
         let processes = 0..self.processes.len();
@@ -199,7 +200,7 @@ impl Recorder {
         said.into_iter().chain(self.metrics.add(row)).collect()
     }
 
-    /// Rows that could not be written up to now, for a person.
+    /// What to say about rows that could not be written up to now.
     pub fn missing(&self) -> Vec<String> {
         let missing = [self.metrics.missing(), self.returns.missing()];
         missing.into_iter().flatten().collect()
@@ -222,9 +223,9 @@ impl Recorder {
         learner: &LearnerStatus,
     ) -> Summary {
         let wall_seconds = self.seconds();
-        // A resumed run that did not get anywhere still has behind it what it had.
-        let frames = replay.transitions_inserted.max(self.behind.frames);
-        let updates = learner.updates.max(self.behind.updates);
+        // A resumed run that did not get anywhere still has what was done before.
+        let frames = replay.transitions_inserted.max(self.resume_point.frames);
+        let updates = learner.updates.max(self.resume_point.updates);
         let rss = self.processes.iter().zip(&self.rss_max);
         let episodes = self.episodes(replay);
         Summary {
@@ -232,7 +233,7 @@ impl Recorder {
             world: run.world.clone(),
             agent: run.agent.clone(),
             seed: run.seed,
-            resumed_after_updates: self.behind.updates,
+            resumed_after_updates: self.resume_point.updates,
             frames,
             updates,
             transitions_inserted: replay.transitions_inserted,

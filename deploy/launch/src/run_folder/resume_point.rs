@@ -1,9 +1,9 @@
 //! Where a run begins: at nothing, or where its newest checkpoint stands.
 
-/// What a run has behind it when it starts: nothing, or what its newest checkpoint has learned.
+/// What was done before a run starts: nothing, or what its newest checkpoint has learned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ResumePoint {
-    /// Updates done.
+    /// Updates that the checkpoint has learned.
     pub updates: u64,
     /// Frames that these updates needed, the warm-up included.
     pub frames: u64,

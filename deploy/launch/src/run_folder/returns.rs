@@ -18,7 +18,7 @@ const HEADER: [&str; 3] = ["frames", "episode", "return"];
 /// A mean, and of how many returns it is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MeanReturn {
-    /// The mean.
+    /// The mean return of the newest episodes.
     pub mean: f64,
     /// Episodes: 100, or as many as there were.
     pub of: usize,
@@ -93,7 +93,7 @@ impl TrainingReturns {
         })
     }
 
-    /// Takes what each shard knows now. Says what a person should know about the file.
+    /// Takes what each shard knows now. Returns warnings about the file.
     pub(super) fn hear(&mut self, shards: &[ReplayStatus]) -> Option<String> {
         let frames = shards.iter().map(|it| it.transitions_inserted).sum();
         // While a resumed run's replay fills again it counts frames that it had before.

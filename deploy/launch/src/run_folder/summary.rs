@@ -18,30 +18,30 @@ pub enum Outcome {
     Finished,
     /// A person ended it; what was done is saved.
     Interrupted,
-    /// A part failed.
+    /// A process failed.
     Failed,
 }
 
-/// `summary.json`.
+/// The contents of `summary.json`: how a run ended and what it counted.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
     /// How the run ended.
     pub outcome: Outcome,
-    /// The world.
+    /// The world's name, such as `procgen:bigfish`.
     pub world: String,
-    /// The agent.
+    /// The agent's name, such as `driml-ada`.
     pub agent: String,
-    /// The seed.
+    /// The seed of every generator of the run.
     pub seed: u64,
-    /// Updates that the run had behind it when it was resumed, the last time; 0 if it never was. Frames, updates,
+    /// Updates that were done when the run was resumed, the last time; 0 if it never was. Frames, updates,
     /// rows, episodes, mean return, seconds and mean k are of the whole run, all else is of what came since.
     #[serde(default)]
     pub resumed_after_updates: u64,
     /// Frames that trained: transitions stored.
     pub frames: u64,
-    /// Updates done.
+    /// Updates that the learner has done.
     pub updates: u64,
-    /// Transitions stored.
+    /// Transitions that the replay has stored.
     pub transitions_inserted: u64,
     /// Transitions that actors produced and that never arrived.
     pub transitions_lost: u64,
@@ -62,7 +62,7 @@ pub struct Summary {
     /// Of how many episodes that is: of fewer than 100 only if there were fewer. Older runs do not say.
     #[serde(default)]
     pub mean_return_of: u64,
-    /// From the start of the first part to the end of the run.
+    /// From the start of the first process to the end of the run.
     pub wall_seconds: f64,
     /// Frames over wall seconds.
     pub frames_per_second: f64,
@@ -145,7 +145,7 @@ impl Summary {
         Self::read(folder).is_ok_and(|it| it.outcome == Outcome::Finished)
     }
 
-    /// What a person reads at the end.
+    /// What is printed at the end.
     pub fn describe(&self, run_dir: &RunFolder) -> String {
         let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
         let how = if self.outcome == Outcome::Finished {

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use driml_protocol::shared_memory::lockable_bytes;
+use driml_protocol::shared_memory::{self, lockable_bytes};
 use nix::sys::statvfs::statvfs;
 
 use super::fact::{Fact, State};
@@ -13,8 +13,6 @@ use crate::{resources::Machine, units::gib};
 const MEMORY_MIN: u64 = 1 << 30;
 /// Below this the replay sized by the machine holds less than a short run's frames, bytes.
 const MEMORY_ENOUGH: u64 = 4 << 30;
-/// Where memory is shared between the processes of a host.
-const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
 /// What the batches and one actor's chunks take of it, rounded up, bytes.
 const SHARED_MEMORY_ENOUGH: u64 = 256 << 20;
 /// Below this not even one checkpoint is sure to fit, bytes.
@@ -39,7 +37,7 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
         cores(machine.cores),
         vectors(Vectors::this()),
         memory(&machine),
-        shared_memory(free(Path::new(SHARED_MEMORY_FOLDER))),
+        shared_memory(free(Path::new(shared_memory::FOLDER))),
         locked_memory(lockable_bytes()),
         disk(runs),
     ]
@@ -123,7 +121,7 @@ fn memory(machine: &Machine) -> Fact {
 }
 
 fn shared_memory(free: Result<u64, String>) -> Fact {
-    let (what, folder) = ("shared memory", SHARED_MEMORY_FOLDER);
+    let (what, folder) = ("shared memory", shared_memory::FOLDER);
     match free {
         Ok(free) if free >= SHARED_MEMORY_ENOUGH => {
             Fact::ok(what, format!("{} free in {folder}", gib(free)))

@@ -18,7 +18,7 @@ type Pinned = (&'static str, &'static str, &'static str);
 
 /// By layer; `only N:` stands before the settings of a layer's block that holds in some worlds.
 #[rustfmt::skip]
-const PINNED: [(&str, &[Pinned]); 13] = [
+const PINNED: &[(&str, &[Pinned])] = &[
     ("base", &[
         ("run.seed", "1", "ours"),
         ("run.n_step", "7", "paper"),
@@ -40,7 +40,7 @@ const PINNED: [(&str, &[Pinned]); 13] = [
         ("replay.slack_transitions", "256", "ours"),
         ("replay.transitions_max", "200000", "ours"),
         ("transport.shared_memory", "true", "ours"),
-        ("learner.batch_rows", "256", "code"),
+        ("learner.batch_size", "256", "code"),
         ("learner.batches_in_flight", "2", "ours"),
         ("learner.publish_period_updates", "8", "ours"),
         ("learner.checkpoint_period_updates", "1000", "ours"),
@@ -210,7 +210,7 @@ const PINNED: [(&str, &[Pinned]); 13] = [
 const OWN: [&str; 2] = ["world/chain", "variant/smoke"];
 
 fn all_layers() -> BTreeMap<&'static str, Layer> {
-    let agents = AGENTS.into_iter().map(|agent| agent.layer);
+    let agents = AGENTS.iter().map(|agent| agent.layer);
     let worlds = WorldName::all().map(world_layer);
     let variants = PRESETS
         .iter()
@@ -266,7 +266,7 @@ fn every_number_has_its_source_beside_it() {
     let layers = all_layers();
     for (name, pinned) in PINNED {
         let parts: Vec<_> = layers[name].text.split("[[only]]").map(comments).collect();
-        for (key, _, source) in pinned {
+        for (key, _, source) in *pinned {
             let (part, path) = match key.strip_prefix("only ") {
                 None => (0, (*key).to_owned()),
                 Some(rest) => {

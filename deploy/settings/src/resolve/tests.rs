@@ -1,6 +1,8 @@
 //! Presets, flags, `--set` and files: what they resolve to, and what is said of those that cannot work.
 //! The texts of single `--set`s are tested beside `overrides`.
 
+use driml_envs::WorldConfig;
+use driml_protocol::Horizon;
 use expect_test::expect;
 
 use super::*;
@@ -34,9 +36,9 @@ fn with(world: &str, agent: &str, set: &[&str]) -> Result<RunConfig, String> {
 #[test]
 fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
     let mut resolved = 0;
-    for preset in &PRESETS {
+    for preset in PRESETS {
         for world in WorldName::all() {
-            for agent in &AGENTS {
+            for agent in AGENTS {
                 let source = Source::Layers(preset, world, agent.name);
                 let config = match resolve(&source, &Flags::default(), &MACHINE) {
                     Err(e) if e.0.contains("take --preset paper") => continue,
@@ -118,7 +120,7 @@ fn what_nobody_uses_is_not_there() {
 fn settings_that_cannot_work_are_answered_with_what_to_do() {
     let said = |agent: &str, set: &str| with("procgen:bigfish", agent, &[set]).unwrap_err();
     expect![[r#"there is no setting "learner.update.adam.learning_rate"; [learner.update.adam] has beta1, beta2, eps, lr"#]].assert_eq(&said("driml-ada", "learner.update.adam.learning_rate=1"));
-    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_rows, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
+    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
     expect![[r#"there is no setting "world.num_level" (did you mean "world.num_levels"?); [world] has center_agent, distribution_mode, num_levels, paint_vel_info, restrict_themes, start_level, use_backgrounds, use_sequential_levels"#]].assert_eq(&said("driml-ada", "world.num_level=5"));
     expect!["model.height cannot be set by hand: it follows from input.height"]
         .assert_eq(&said("driml-ada", "model.height=84"));
@@ -259,12 +261,32 @@ fn settings_from_before_there_were_objectives_are_read() {
 }
 
 #[test]
+fn settings_with_names_of_before_are_read_and_set_by_the_names_of_today() {
+    let new = with("chain", "c51", &[]).unwrap();
+    let old = new.to_toml().replace("batch_size", "batch_rows");
+    assert_ne!(old, new.to_toml());
+    let read = RunConfig::parse("old.toml", &old).unwrap();
+    assert_eq!(read.to_toml(), new.to_toml());
+    let source = Source::File("old.toml".into(), old.clone());
+    let resolved = resolve(&source, &Flags::default(), &MACHINE).unwrap();
+    assert_eq!(resolved.to_toml(), new.to_toml());
+
+    expect!["learner.batch_rows is called learner.batch_size now"]
+        .assert_eq(&with("chain", "c51", &["learner.batch_rows=64"]).unwrap_err());
+    let both = old.replace("batch_rows = 64", "batch_rows = 64\nbatch_size = 64");
+    let said = RunConfig::parse("both.toml", &both)
+        .unwrap_err()
+        .to_string();
+    assert!(said.contains("unknown field `batch_rows`"), "{said}");
+}
+
+#[test]
 fn flags_come_before_set_and_both_before_the_machine() {
     let flags = Flags {
         replay_shards: None,
         frames: Some(7_000),
         seed: Some(5),
-        study: None,
+        reproduce_bug: None,
         actors: Some(3),
         envs: Some(2),
         sets: vec!["run.seed=6".into()],
@@ -340,20 +362,20 @@ fn a_compressed_replay_is_bounded_in_bytes_instead() {
 }
 
 #[test]
-fn a_fault_is_trained_with_only_where_it_is_asked_for() {
+fn a_known_bug_is_trained_with_only_where_it_is_asked_for() {
     let plain = with("chain", "c51", &[]).unwrap();
-    assert_eq!(plain.replay.study, None);
+    assert_eq!(plain.replay.reproduced_bug, None);
     expect![
-        "replay.study cannot be set by hand: it is a fault to be studied, and chosen by --study"
+        "replay.reproduced_bug cannot be set by hand: it is a known bug to train with, and chosen by --reproduce-bug"
     ]
-    .assert_eq(&with("chain", "c51", &["replay.study=bootstrap-from-next-state"]).unwrap_err());
+    .assert_eq(&with("chain", "c51", &["replay.reproduced_bug=bootstrap-from-next-state"]).unwrap_err());
     let asked = Flags {
-        study: Some(Study::BootstrapFromNextState),
+        reproduce_bug: Some(ReproducedBug::BootstrapFromNextState),
         ..Flags::default()
     };
     let faulty = resolve(&source("paper", "chain", "c51"), &asked, &MACHINE).unwrap();
-    assert_eq!(faulty.replay.study, asked.study);
-    assert!(faulty.notes.iter().any(|note| note.contains("known fault")));
+    assert_eq!(faulty.replay.reproduced_bug, asked.reproduce_bug);
+    assert!(faulty.notes.iter().any(|note| note.contains("known bug")));
 
     // Nor does a file bring it in by itself.
     let file = Source::File("faulty.toml".into(), faulty.to_toml());
@@ -361,10 +383,13 @@ fn a_fault_is_trained_with_only_where_it_is_asked_for() {
         .unwrap_err()
         .to_string();
     assert!(
-        said.contains("add --study bootstrap-from-next-state if that is meant"),
+        said.contains("add --reproduce-bug bootstrap-from-next-state if that is meant"),
         "{said}"
     );
     assert!(resolve(&file, &asked, &MACHINE).is_ok());
+    let old = faulty.to_toml().replace("reproduced_bug", "study");
+    let old = RunConfig::parse("old.toml", &old).unwrap();
+    assert_eq!(old.replay, faulty.replay);
     // What was trained with it can still be looked at.
     assert!(RunConfig::parse("faulty.toml", &faulty.to_toml()).is_ok());
 }
