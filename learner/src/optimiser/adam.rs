@@ -23,6 +23,9 @@ use crate::{
 /// Elements a thread takes at a time.
 const CHUNK: usize = 1 << 14;
 
+/// Steps from one flushing of subnormal moments to the next: in every step it would cost a quarter of the step's time.
+const FLUSH_PERIOD: u64 = 32;
+
 /// Adam's numbers. Source: Kingma and Ba 2015, algorithm 1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -269,6 +272,8 @@ struct Rule {
     step_size: f32,
     root_scale: f32,
     eps: f32,
+    /// Whether this step begins with flushing the moments.
+    flushes: bool,
 }
 
 impl Rule {
@@ -290,13 +295,21 @@ impl Rule {
             step_size: (lr / (1.0 - beta1.powi(t))) as f32,
             root_scale: (1.0 / (1.0 - beta2.powi(t)).sqrt()) as f32,
             eps: eps as f32,
+            flushes: step.is_multiple_of(FLUSH_PERIOD),
         }
     }
 
     /// Takes the step on one stretch; says whether its parameters and second moments are finite after it. (So are then the
     /// first moments, as a mean is no larger than the root of the mean square.)
+    ///
+    /// Once in [`FLUSH_PERIOD`] steps, moments below the normal numbers become 0. Those of a gradient that is gone would else stay
+    /// there for good, as 0.9 times the smallest numbers rounds back to them, and make each later step several times as slow.
     #[allow(clippy::eq_op, reason = "x - x tells finite numbers from others")]
     fn apply(&self, p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32]) -> bool {
+        if self.flushes {
+            flush(m);
+            flush(v);
+        }
         // x - x is 0 for a finite x, else NaN. Collecting bits, unlike a test in the loop, costs nothing measurable.
         let mut not_finite = 0;
         for (((p, &g), m), v) in p.iter_mut().zip(g).zip(m).zip(v) {
@@ -323,6 +336,17 @@ impl Rule {
         *v = (by(v, self.beta2)? + by(&g.sqr()?, self.rest2)?)?;
         let root = v.sqrt()?.affine(self.root_scale.into(), self.eps.into())?;
         p.set(&(p.as_detached_tensor() - (by(m, self.step_size)? / root)?)?)
+    }
+}
+
+/// Puts 0 in place of subnormal numbers; all others, NaN included, stay as they are.
+fn flush(values: &mut [f32]) {
+    for value in values {
+        *value = if value.abs() < f32::MIN_POSITIVE {
+            0.0
+        } else {
+            *value
+        };
     }
 }
 
@@ -384,6 +408,30 @@ mod tests {
         beta2: 0.999,
         eps: 1e-8,
     };
+
+    #[test]
+    fn moments_of_a_gradient_that_is_gone_end_at_zero() {
+        let (mut p, mut m, mut v) = (vec![1.0f32; 9], vec![0.0; 9], vec![0.0; 9]);
+        // The last element's gradient stays.
+        let mut g = vec![1e-3f32; 9];
+        let mut updates = 0;
+        let mut run = |g: &[f32], count: u64| {
+            for _ in 0..count {
+                updates += 1;
+                let rule = Rule::new(SETTINGS, updates, 1.0);
+                assert!(rule.apply(&mut p, g, &mut m, &mut v));
+            }
+            (m.clone(), v.clone())
+        };
+        run(&g, 10);
+        g[..8].fill(0.0);
+        let (m, v) = run(&g, 2_000);
+        assert_eq!(m[..8], [0.0; 8], "0.9^2000 of what it was");
+        assert!((m[8] / 1e-3 - 1.0).abs() < 1e-5 && v[0] > f32::MIN_POSITIVE);
+        let (_, v) = run(&g, 75_000);
+        assert_eq!(v[..8], [0.0; 8], "0.999^77000 of what it was");
+        assert!((v[8] / 1e-6 - 1.0).abs() < 1e-3);
+    }
 
     /// Whether a step is fine at this parameter and gradient, in the last of that many `elements`.
     fn fine(settings: AdamSettings, elements: usize, parameter: f32, gradient: f32) -> bool {
