@@ -58,6 +58,7 @@ mod learner;
 pub mod losses;
 pub mod optimiser;
 pub mod parity;
+mod ranges;
 pub mod remote;
 mod settings;
 mod tensors;
