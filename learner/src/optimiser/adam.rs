@@ -183,7 +183,8 @@ impl Adam {
                     var.inplace_op2(gradient, &step)?;
                     if !step.all_finite.into_inner() {
                         let name = name.clone();
-                        return Err(UpdateError::Diverged { name, lr });
+                        let update = self.step;
+                        return Err(UpdateError::Diverged { name, update, lr });
                     }
                 }
                 Moments::Tensors { m, v } => rule.apply_to_tensors(var, gradient, m, v)?,

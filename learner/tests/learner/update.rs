@@ -387,7 +387,8 @@ fn parameters_that_a_step_took_beyond_the_finite_numbers_are_not_published() {
         assert!(matches!(said, UpdateError::Diverged { .. }), "{said}");
         let said = said.to_string();
         assert!(
-            said.contains(name) && said.contains("newest checkpoint"),
+            said.contains(&format!("update 1 took {name} beyond"))
+                && said.contains("newest checkpoint"),
             "{said}"
         );
         let said = agent.weights().unwrap_err().to_string();
