@@ -109,7 +109,7 @@ impl Assembler {
             row,
             anchor.action,
             next_action,
-            n_step_return as f32,
+            return_f32(n_step_return),
             discount as f32,
         );
         let furthest = self.draw_k(affinity, window, rng).unwrap_or(0);
@@ -172,5 +172,35 @@ impl Assembler {
             return None;
         }
         horizon::draw_k(self.horizon, affinity, &self.actions, rng)
+    }
+}
+
+/// A return as it travels. One beyond the finite f32, as rewards at their limit may round to, is the largest there is: the
+/// projection takes both for the end of the support, and a learner refuses what is not finite.
+fn return_f32(sum: f64) -> f32 {
+    sum.clamp(f32::MIN.into(), f32::MAX.into()) as f32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Rewards at the limit that the replay server sets, whose sum rounds to more than a float can be for some n.
+    #[test]
+    fn a_return_is_a_number_whatever_the_rewards() {
+        for n in 1..=1000u16 {
+            let reward = f32::MAX / f32::from(n);
+            let sum = f64::from(n) * f64::from(reward);
+            let found = [return_f32(sum), -return_f32(-sum)];
+            let whole = found
+                .iter()
+                .all(|r| (f32::MAX * 0.999_999..=f32::MAX).contains(r));
+            assert!(whole, "{n} steps of {reward:e}: {found:?}");
+        }
+        assert_eq!(
+            (return_f32(1e300), return_f32(-1e300)),
+            (f32::MAX, f32::MIN)
+        );
+        assert_eq!((return_f32(0.1), return_f32(1e-300)), (0.1, 0.0));
     }
 }
