@@ -192,12 +192,15 @@ impl ModelConfig {
         self.height * self.width * self.channels
     }
 
-    /// The atoms z_i = v_min + i (v_max - v_min) / (atoms - 1).
+    /// The atoms z_i = v_min + i (v_max - v_min) / (atoms - 1); the last is `v_max` itself.
     pub fn atoms_support(&self) -> Vec<f32> {
         let (v_min, v_max) = (f64::from(self.v_min), f64::from(self.v_max));
-        let step = (v_max - v_min) / (self.atoms - 1) as f64;
-        (0..self.atoms)
+        let last = self.atoms - 1;
+        let step = (v_max - v_min) / last as f64;
+        // Far from 0 not even an f64 has v_min + (v_max - v_min) = v_max.
+        (0..last)
             .map(|i| (v_min + i as f64 * step) as f32)
+            .chain([self.v_max])
             .collect()
     }
 

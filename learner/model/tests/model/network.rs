@@ -375,6 +375,25 @@ fn inputs_that_do_not_fit_are_errors() {
 }
 
 #[test]
+fn a_support_begins_and_ends_where_it_says() {
+    for (v_min, v_max) in [
+        (-10.0, 10.0),
+        (0.1, 0.7),
+        (-9.174_887e29, -7.596_588_6),
+        (1e6, 1_000_001.0),
+    ] {
+        let config = ModelConfig {
+            v_min,
+            v_max,
+            ..small()
+        };
+        let support = config.atoms_support();
+        assert_eq!((support[0], support[10]), (v_min, v_max));
+        assert!(support.is_sorted(), "{support:?}");
+    }
+}
+
+#[test]
 fn configurations_that_cannot_work_are_errors() {
     let fails = |change: fn(&mut ModelConfig)| {
         let mut config = small();
