@@ -53,6 +53,8 @@ pub mod auxiliary;
 mod batch;
 pub mod checkpoint;
 mod config;
+#[cfg(test)]
+mod edges;
 mod error;
 mod learner;
 pub mod losses;

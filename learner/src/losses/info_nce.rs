@@ -13,7 +13,8 @@ use super::{candle, scalar_op::scalar_op, scores::Scores};
 /// positive. `valid` [B]: a row with 0 is neither anchor nor candidate. With `s = clip(dots)` the loss is the mean over
 /// l and valid i of `ln sum_{valid j} exp(s_lij) - s_lii`, in nats: 0 if fewer than two rows are valid.
 /// `gradient` [L, B, B] is overwritten with the derivative by `dots`, 0 in the rows and columns that are not valid.
-/// Every finite input gives a finite result.
+/// Every finite input gives a finite result. It is computed in f64: the loss is right to 1e-12 beside the largest score's last
+/// place, the gradient to that of an f32.
 /// Source: van den Oord et al. 2018, equation 4; the clip is Bachman et al. 2019, section 3.
 ///
 /// # Panics
