@@ -92,7 +92,12 @@ impl Collector {
             });
         }
         let rng = ChaCha8Rng::from_seed(life.seed(spec, "exploration"));
-        let policy = NetworkPolicy::new(&settings.model, (shape.height, shape.width), safetensors)?;
+        let policy = NetworkPolicy::new(
+            &settings.model,
+            (shape.height, shape.width),
+            safetensors,
+            settings.actor.precision,
+        )?;
         Ok(Self {
             acting: Acting::new(world, spec.frame_stack as usize, rng)?,
             recorder: Recorder::new(
@@ -207,6 +212,7 @@ mod tests {
                 dim: DimHeads::NONE,
             },
             actor: Config {
+                precision: driml_model::Precision::F32,
                 envs: ENVS,
                 steps_per_chunk: STEPS,
                 round_transitions_max: None,

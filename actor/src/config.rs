@@ -26,6 +26,9 @@ pub struct Config {
     pub round_transitions_max: Option<u64>,
     /// Chunks waiting to be acknowledged; at this many the actor stops stepping until one is.
     pub chunks_in_flight_max: u32,
+    /// In which numbers the network's products are computed. Settings of earlier versions do not have it: f32.
+    #[serde(default)]
+    pub precision: driml_model::Precision,
     /// Threads that step the copies; 0 steps them in the acting thread.
     pub world_threads: u32,
     /// Probability of a random action at the run's first frame.
@@ -287,6 +290,7 @@ mod tests {
     #[test]
     fn chunks_get_shorter_as_actors_get_many() {
         let config = |envs, steps_per_chunk, round_transitions_max| Config {
+            precision: driml_model::Precision::F32,
             envs,
             steps_per_chunk,
             round_transitions_max,

@@ -1,7 +1,7 @@
 //! Who chooses actions: the network with epsilon-greedy exploration, or chance alone.
 //! It does not know the schedule of epsilon nor where weights come from.
 
-use driml_model::{Enlarge, ModelConfig, PolicyNetwork};
+use driml_model::{Enlarge, ModelConfig, PolicyNetwork, Precision};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -57,7 +57,8 @@ pub struct NetworkPolicy {
 }
 
 impl NetworkPolicy {
-    /// A policy with the weights of a safetensors file; `frame` is (height, width) of a state as it comes.
+    /// A policy with the weights of a safetensors file; `frame` is (height, width) of a state as it comes. Its products are
+    /// computed in `precision`.
     ///
     /// # Errors
     /// Weights that do not fit the model.
@@ -65,13 +66,14 @@ impl NetworkPolicy {
         model: &ModelConfig,
         frame: (usize, usize),
         safetensors: &[u8],
+        precision: Precision,
     ) -> Result<Self, ActError> {
         let input = (model.height, model.width);
         let enlarge = (frame != input)
             .then(|| Enlarge::new(frame, input, model.channels))
             .transpose()?;
         Ok(Self {
-            network: PolicyNetwork::new(model, safetensors)?,
+            network: PolicyNetwork::new(model, safetensors, precision)?,
             enlarge,
             enlarged: Vec::new(),
             num_actions: u8::try_from(model.num_actions).map_err(|_| ActError::TooManyActions {
@@ -148,7 +150,7 @@ mod tests {
         let rng = &mut ChaCha8Rng::seed_from_u64(1);
         let weights = Parameters::init(&model, rng, &Compute::CPU.device).unwrap();
         let weights = weights.to_safetensors(|_| true).unwrap();
-        NetworkPolicy::new(&model, (4, 4), &weights).unwrap()
+        NetworkPolicy::new(&model, (4, 4), &weights, Precision::F32).unwrap()
     }
 
     /// How often each action is chosen in `STATES` equal states.

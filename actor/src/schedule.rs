@@ -81,6 +81,7 @@ mod tests {
     use super::*;
 
     const CONFIG: Config = Config {
+        precision: driml_model::Precision::F32,
         envs: 1,
         steps_per_chunk: 1,
         round_transitions_max: None,

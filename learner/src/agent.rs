@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     auxiliary::{
         key_encoder::KeyEncoder,
-        loss::{AuxiliaryLoss, LossInputs, WeightedLoss},
+        loss::{AuxiliaryLoss, LossInputs, OnlineFeatures, WeightedLoss},
     },
     batch::Batch,
     error::UpdateError,
@@ -51,8 +51,8 @@ pub struct Evaluation {
     pub losses: Vec<(&'static str, f32)>,
     /// `c51_kl + sum of weight * loss`.
     pub total: f32,
-    /// Online values of s_t [B, A].
-    pub q_values_t: Vec<f32>,
+    /// Online logits of s_t [B, A, N], without a graph.
+    pub logits_t: Tensor,
     /// Greedy action in s_{t+n} [B].
     pub next_greedy_action: Vec<u8>,
     /// Projected target distributions [B, N].
@@ -212,12 +212,7 @@ impl Agent {
     pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
         let evaluation = self.evaluate(batch)?;
         let grad_norm = self.apply(&evaluation.gradients)?;
-        let num_actions = self.model.num_actions;
-        let taken = evaluation
-            .q_values_t
-            .chunks_exact(num_actions)
-            .zip(batch.action);
-        let q_sum: f32 = taken.map(|(q, &action)| q[usize::from(action)]).sum();
+        let q_sum: f32 = self.taken_values(&evaluation, batch.action)?.iter().sum();
         Ok(UpdateReport {
             c51_kl: evaluation.c51_kl,
             losses: evaluation.losses,
@@ -243,11 +238,14 @@ impl Agent {
         self.check(batch)?;
         let (next_greedy_action, target_projection) = self.make_target(batch)?;
 
-        let features_t = self
-            .online_network
-            .features(&self.states(batch.states_t)?)?;
-        let logits = self.online_network.logits(&features_t.f4)?;
-        let q_values_t = self.online_network.q_values(&logits.detach())?;
+        let features = OnlineFeatures::new(
+            &self.online_network,
+            &self.model,
+            &*self.auxiliary,
+            batch,
+            &self.compute.device,
+        )?;
+        let logits = self.online_network.logits(&features.now.f4)?;
         let kl = kl_loss(
             &logits,
             batch.action,
@@ -258,7 +256,7 @@ impl Agent {
             online: &self.online_network,
             model: &self.model,
             batch,
-            features_t: &features_t,
+            features: &features,
             key: self.key.as_ref(),
             device: &self.compute.device,
         })?;
@@ -277,11 +275,34 @@ impl Agent {
             c51_kl,
             losses,
             total: finite("the total loss", &total)?,
-            q_values_t: flat(&q_values_t)?,
+            logits_t: logits.detach(),
             next_greedy_action,
             target_projection,
             gradients,
         })
+    }
+
+    /// Online values of s_t [B, A], of an evaluation by this agent.
+    ///
+    /// # Errors
+    /// A failing allocation.
+    pub fn q_values_t(&self, evaluation: &Evaluation) -> Result<Vec<f32>, UpdateError> {
+        flat(&self.online_network.q_values(&evaluation.logits_t)?)
+    }
+
+    /// Online values [B] of the actions taken in s_t.
+    fn taken_values(
+        &self,
+        evaluation: &Evaluation,
+        action: &[u8],
+    ) -> Result<Vec<f32>, UpdateError> {
+        let (rows, _, atoms) = evaluation.logits_t.dims3()?;
+        let indices: Vec<u32> = action.iter().map(|&action| action.into()).collect();
+        let indices = Tensor::from_vec(indices, (rows, 1, 1), evaluation.logits_t.device())?
+            .broadcast_as((rows, 1, atoms))?
+            .contiguous()?;
+        let taken = evaluation.logits_t.gather(&indices, 1)?;
+        flat(&self.online_network.q_values(&taken)?)
     }
 
     /// Clips `gradients` and takes one step with them; moves the slow networks whose turn it is.

@@ -1,7 +1,7 @@
 //! The learner's settings, and what it takes from the run's other tables.
 //! It fills in no number: presets do, with their sources.
 
-use driml_model::ModelConfig;
+use driml_model::{ModelConfig, Precision};
 use driml_protocol::{
     RunSpec, RunSpecError,
     config::{Settings, TransportConfig},
@@ -26,6 +26,10 @@ use crate::{
 pub struct Config {
     /// Rows of one update, B.
     pub batch_rows: u32,
+    /// In which numbers an update's products are computed; weights, moments, losses and sums are f32 in either. Settings of
+    /// earlier versions do not have it: f32.
+    #[serde(default)]
+    pub precision: Precision,
     /// Batches asked for ahead of the one being learned from.
     pub batches_in_flight: u32,
     /// Updates from one version of the weights to the next.

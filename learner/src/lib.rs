@@ -75,7 +75,7 @@ pub use batch::Batch;
 pub use config::{
     AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart, LearnerPartError,
 };
-pub use driml_model::{Compute, DeviceName, Kernels};
+pub use driml_model::{Compute, DeviceName, Kernels, Precision};
 pub use error::UpdateError;
 pub use learner::{Learner, LearnerError, Weights};
 pub use optimiser::adam::AdamSettings;

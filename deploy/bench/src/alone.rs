@@ -27,6 +27,12 @@ pub(super) fn figures(
         .args(["bench", part.name(), "--here", "--json", "-"])
         .args(["--threads", &flags.threads.to_string()])
         .args(flags.quick.then_some("--quick"))
+        .args(
+            flags
+                .precision
+                .iter()
+                .flat_map(|precision| ["--precision", precision.name()]),
+        )
         .args(match device {
             DeviceName::Cpu => Vec::new(),
             gpu => vec!["--device".to_owned(), gpu.to_string()],

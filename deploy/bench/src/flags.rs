@@ -4,6 +4,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
+use driml_learner::{DeviceName, Precision};
 use driml_machine::device::DeviceFlag;
 
 /// What to measure.
@@ -37,9 +38,27 @@ pub struct BenchFlags {
     /// Threads for arithmetic
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub(crate) threads: u32,
+    /// Precision of products, for the learner and the policy; may be given several times [default: both]
+    #[arg(long, value_name = "PRECISION")]
+    pub(crate) precision: Vec<Precision>,
     /// Measure in this very process, whose environment is already that of a part
     #[arg(long, hide = true)]
     pub(crate) here: bool,
+}
+
+impl BenchFlags {
+    /// The precisions to measure, those that a GPU does not have left out.
+    pub(crate) fn precisions(&self, device: DeviceName) -> Vec<Precision> {
+        let asked = if self.precision.is_empty() {
+            &Precision::ALL[..]
+        } else {
+            &self.precision
+        };
+        let there = |precision: &&Precision| {
+            device == DeviceName::Cpu || !self.precision.is_empty() || **precision == Precision::F32
+        };
+        asked.iter().filter(there).copied().collect()
+    }
 }
 
 /// What `driml bench learner` takes.

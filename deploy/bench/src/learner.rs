@@ -1,12 +1,17 @@
 //! Updates of the learner at the paper's sizes, and one of them by candle's stock operations.
 //! Batches are made up: nothing but the arithmetic is measured.
 
-use driml_learner::{Agent, Batch, DeviceName};
+use driml_learner::{Agent, Batch, DeviceName, Precision};
 use driml_settings::config::RunConfig;
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{candle_baseline::CandleBaseline, effort::Effort, measurements::Measurement, settings};
+use crate::{
+    candle_baseline::CandleBaseline,
+    effort::Effort,
+    measurements::{Measurement, named},
+    settings,
+};
 
 /// What is measured: its name, agent, preset and further settings.
 const CASES: [(&str, &str, &str, &[&str]); 4] = [
@@ -32,8 +37,12 @@ const GLOBAL_DIM: &str = "C51 + global-global DIM, 64x64x3";
 ///
 /// # Errors
 /// An update that failed.
-pub(super) fn measure(effort: &Effort, device: DeviceName) -> anyhow::Result<Vec<Measurement>> {
-    let compute = device.open()?;
+pub(super) fn measure(
+    effort: &Effort,
+    device: DeviceName,
+    precision: Precision,
+) -> anyhow::Result<Vec<Measurement>> {
+    let compute = device.open(precision)?;
     let mut figures = Vec::new();
     for (name, agent, preset, sets) in CASES {
         let config = settings::of_run(settings::WORLD, agent, preset, sets)?;
@@ -43,8 +52,12 @@ pub(super) fn measure(effort: &Effort, device: DeviceName) -> anyhow::Result<Vec
         let (model, update) = (config.model.clone(), config.learner.update.clone());
         let mut learner = Agent::new(model, update, &compute, &mut rng)?;
         let rate = effort.rate_by_median(|| learner.update(&batch).map(drop))?;
-        figures.push(Measurement::found(name, rate, "updates/s"));
-        if name == GLOBAL_DIM && device == DeviceName::Cpu {
+        figures.push(Measurement::found(
+            named(name, precision),
+            rate,
+            "updates/s",
+        ));
+        if name == GLOBAL_DIM && device == DeviceName::Cpu && precision == Precision::F32 {
             let mut stock = CandleBaseline::new(&learner)?;
             let rate = effort.rate_by_median(|| stock.update(&batch).map(drop))?;
             let name = format!("{name}, candle's stock operations");

@@ -24,7 +24,7 @@ mod system;
 mod table;
 mod taking_part;
 
-use driml_learner::DeviceName;
+use driml_learner::{DeviceName, Precision};
 use driml_machine::device::ready_for;
 
 use crate::{
@@ -42,7 +42,7 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
     let part = |part, flags: &BenchFlags, device: DeviceName| {
         ready_for(device)?;
         let figures = if flags.here {
-            measure(part, &Effort::new(flags), device)?
+            measure(part, flags, device)?
         } else {
             alone::figures(part, flags, device)?
         };
@@ -63,12 +63,22 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
 
 fn measure(
     part: BenchPart,
-    effort: &Effort,
+    flags: &BenchFlags,
     device: DeviceName,
 ) -> anyhow::Result<Vec<Measurement>> {
+    let effort = &Effort::new(flags);
+    let by_precision = |measure: &dyn Fn(Precision) -> anyhow::Result<Vec<Measurement>>| {
+        let mut figures = Vec::new();
+        for precision in flags.precisions(device) {
+            figures.extend(measure(precision)?);
+        }
+        Ok(figures)
+    };
     match part {
-        BenchPart::Learner => learner::measure(effort, device),
-        BenchPart::Policy => policy::measure(effort),
+        BenchPart::Learner => {
+            by_precision(&|precision| learner::measure(effort, device, precision))
+        }
+        BenchPart::Policy => by_precision(&|precision| policy::measure(effort, precision)),
         BenchPart::Replay => replay::measure(effort),
         BenchPart::Env => env::measure(effort),
     }

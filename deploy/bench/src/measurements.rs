@@ -5,7 +5,7 @@ use std::{fs, path::Path};
 
 use anyhow::Context;
 use driml_launch::console::{self, print};
-use driml_learner::DeviceName;
+use driml_learner::{DeviceName, Precision};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::{flags::BenchFlags, table};
@@ -69,6 +69,15 @@ impl MachineNote {
             gpu,
             ..self.clone()
         }
+    }
+}
+
+/// What is computed, and in which precision if it is not f32.
+pub(super) fn named(what: impl Into<String>, precision: Precision) -> String {
+    let what = what.into();
+    match precision {
+        Precision::F32 => what,
+        other => format!("{what}, {other}"),
     }
 }
 

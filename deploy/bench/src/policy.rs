@@ -1,11 +1,15 @@
 //! Frames through an actor's policy, forward only.
 //! It takes no action in a world.
 
-use driml_model::{Parameters, PolicyNetwork};
+use driml_model::{Parameters, PolicyNetwork, Precision};
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{effort::Effort, measurements::Measurement, settings};
+use crate::{
+    effort::Effort,
+    measurements::{Measurement, named},
+    settings,
+};
 
 /// Frames that are given to the policy at once.
 const BATCHES: [usize; 2] = [32, 256];
@@ -16,19 +20,21 @@ const PRESETS: [&str; 2] = ["paper", "paper-observation"];
 ///
 /// # Errors
 /// A network that failed.
-pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
+pub(super) fn measure(effort: &Effort, precision: Precision) -> anyhow::Result<Vec<Measurement>> {
     let mut figures = Vec::new();
     for preset in PRESETS {
         let model = settings::of_run(settings::WORLD, "c51", preset, &[])?.model;
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let parameters = Parameters::init(&model, &mut rng, &candle_core::Device::Cpu)?;
-        let mut policy = PolicyNetwork::new(&model, &parameters.to_safetensors(|_| true)?)?;
+        let mut policy =
+            PolicyNetwork::new(&model, &parameters.to_safetensors(|_| true)?, precision)?;
         for batch in BATCHES {
             let mut frames = vec![0; batch * model.frame_len()];
             rng.fill_bytes(&mut frames);
             let mut actions = vec![0; batch];
             let rate = effort.rate_by_median(|| policy.greedy_actions(&frames, &mut actions))?;
-            let name = format!("{batch} frames of {}x{}x3", model.height, model.width);
+            let size = format!("{}x{}x3", model.height, model.width);
+            let name = named(format!("{batch} frames of {size}"), precision);
             figures.push(Measurement::found(name, rate * batch as f64, "frames/s"));
         }
     }

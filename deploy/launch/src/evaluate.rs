@@ -124,6 +124,7 @@ impl Player {
                 &self.config.model,
                 frame,
                 &self.weights,
+                self.config.actor.precision,
             )?),
             Who::Random => Box::new(RandomPolicy::new(u8::try_from(spec.num_actions)?)),
         };

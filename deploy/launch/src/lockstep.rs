@@ -116,7 +116,8 @@ impl Lockstep {
             };
             replay.join_actor(join).map_err(anyhow::Error::msg)?;
         }
-        let mut learner = Learner::new(part, &config.local.learner_device.open()?)?;
+        let compute = config.local.learner_device.open(part.learner.precision)?;
+        let mut learner = Learner::new(part, &compute)?;
         let (header, weights) = learner.next_weights()?;
         let status = LearnerStatus {
             weights_version: header.version,

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use driml_launch::console::print;
-use driml_learner::Kernels;
+use driml_learner::{Kernels, Precision};
 use driml_machine::device::{DeviceFlag, ready_for};
 
 #[derive(Debug, Args)]
@@ -14,6 +14,9 @@ pub(crate) struct ParityArgs {
     pub(crate) files: Vec<PathBuf>,
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
+    /// In which numbers products are computed
+    #[arg(long, value_name = "PRECISION", default_value_t = Precision::F32, conflicts_with = "stock")]
+    pub(crate) precision: Precision,
     /// With candle's own operations, as on a GPU, in place of this project's kernels
     #[arg(long)]
     pub(crate) stock: bool,
@@ -26,7 +29,7 @@ pub(crate) struct ParityArgs {
 pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
     ready_for(args.on.device)?;
     let mut failed = 0;
-    let mut compute = args.on.device.open()?;
+    let mut compute = args.on.device.open(args.precision)?;
     if args.stock {
         compute.kernels = Kernels::Candle;
     }

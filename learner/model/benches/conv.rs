@@ -4,7 +4,7 @@
 
 use candle_core::{DType, Device, Result, Tensor, Var};
 use criterion::{Criterion, criterion_group, criterion_main};
-use driml_model::conv2d_relu;
+use driml_model::{Precision, conv2d_relu};
 
 const BATCH: usize = 256;
 
@@ -20,6 +20,14 @@ fn values(len: usize, scale: f32) -> Vec<f32> {
     (0..len)
         .map(|index| ((index * 7919 % 1009) as f32 / 1009.0 - 0.5) * scale)
         .collect()
+}
+
+fn f32(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
+    conv2d_relu(images, weight, bias, stride, Precision::F32)
+}
+
+fn bf16(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
+    conv2d_relu(images, weight, bias, stride, Precision::Bf16)
 }
 
 fn stock(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
@@ -67,7 +75,11 @@ fn layers(criterion: &mut Criterion) {
         let mut group = criterion.benchmark_group(name);
         group.sample_size(10);
         type Layer = fn(&Tensor, &Tensor, &Tensor, usize) -> Result<Tensor>;
-        for (which, layer) in [("ours", conv2d_relu as Layer), ("candle", stock as Layer)] {
+        for (which, layer) in [
+            ("f32", f32 as Layer),
+            ("bf16", bf16 as Layer),
+            ("candle", stock as Layer),
+        ] {
             group.bench_function(format!("{which} forward"), |bencher| {
                 bencher.iter(|| layer(&images, &weight, &bias, stride).unwrap());
             });

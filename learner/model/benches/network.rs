@@ -4,7 +4,9 @@
 
 use candle_core::{Device, Tensor};
 use criterion::{Criterion, criterion_group, criterion_main};
-use driml_model::{ConvLayer, DimHeads, ModelConfig, Network, Parameters, PolicyNetwork};
+use driml_model::{
+    ConvLayer, DimHeads, ModelConfig, Network, Parameters, PolicyNetwork, Precision,
+};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
@@ -118,6 +120,7 @@ fn actor(criterion: &mut Criterion) {
         let mut policy = PolicyNetwork::new(
             &config,
             &parameters(&config).to_safetensors(|_| true).unwrap(),
+            Precision::F32,
         )
         .unwrap();
         for batch in [1, 32, 256] {

@@ -9,22 +9,26 @@ use serde::{Deserialize, Serialize};
 use crate::kernels::{
     candle::{self, ConvLayerTensors},
     conv, linear,
+    precision::Precision,
 };
 
-/// What the network and the losses are computed with. Both give the same up to rounding, gradients included.
+/// What the network and the losses are computed with. All give the same up to rounding, gradients included.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kernels {
-    /// This project's kernels, fused and blocked for the CPU, and there alone.
-    Fused,
+    /// This project's kernels, fused and blocked for the CPU, and there alone; products in this precision.
+    Fused(Precision),
     /// Compositions of candle's own operations: any device, several times slower on the CPU.
     Candle,
 }
 
 impl Kernels {
+    /// This project's kernels in f32.
+    pub const FUSED: Self = Self::Fused(Precision::F32);
+
     /// The faster ones of those that a device has.
     pub fn of(device: &Device) -> Self {
         if device.is_cpu() {
-            Self::Fused
+            Self::FUSED
         } else {
             Self::Candle
         }
@@ -36,14 +40,14 @@ impl Kernels {
         layers: &[ConvLayerTensors<'_>],
     ) -> candle_core::Result<Tensor> {
         match self {
-            Self::Fused => conv::conv_stack(images, layers),
+            Self::Fused(precision) => conv::conv_stack(images, layers, precision),
             Self::Candle => candle::conv_stack(images, layers),
         }
     }
 
     pub(crate) fn linear(self, x: &Tensor, w: &Tensor, b: &Tensor) -> candle_core::Result<Tensor> {
         match self {
-            Self::Fused => linear::linear(x, w, b),
+            Self::Fused(precision) => linear::linear(x, w, b, precision),
             Self::Candle => candle::linear(x, w, b),
         }
     }
@@ -55,14 +59,14 @@ impl Kernels {
         b: &Tensor,
     ) -> candle_core::Result<Tensor> {
         match self {
-            Self::Fused => linear::linear_relu(x, w, b),
+            Self::Fused(precision) => linear::linear_relu(x, w, b, precision),
             Self::Candle => candle::relu(&candle::linear(x, w, b)?),
         }
     }
 
     pub(crate) fn relu(self, x: &Tensor) -> candle_core::Result<Tensor> {
         match self {
-            Self::Fused => linear::relu(x),
+            Self::Fused(_) => linear::relu(x),
             Self::Candle => candle::relu(x),
         }
     }
@@ -81,8 +85,16 @@ impl Compute {
     /// The CPU with this project's kernels.
     pub const CPU: Self = Self {
         device: Device::Cpu,
-        kernels: Kernels::Fused,
+        kernels: Kernels::FUSED,
     };
+
+    /// The CPU with this project's kernels, products in `precision`.
+    pub const fn cpu(precision: Precision) -> Self {
+        Self {
+            device: Device::Cpu,
+            kernels: Kernels::Fused(precision),
+        }
+    }
 
     /// A device with the faster kernels that it has.
     pub fn on(device: &Device) -> Self {
@@ -109,6 +121,16 @@ pub enum DeviceError {
     /// Not the name of a device.
     #[error("{0:?} is no device: take cpu, cuda or cuda:N")]
     Name(String),
+    /// Only this project's kernels, which are the CPU's, have another precision than f32.
+    #[error(
+        "{device} computes in f32 alone: set learner.precision = \"f32\", or compute {precision} on the CPU"
+    )]
+    Precision {
+        /// The device that was asked for.
+        device: DeviceName,
+        /// The precision that was asked for.
+        precision: Precision,
+    },
     /// The driver refused, or the program has no CUDA in it.
     #[error("{device} cannot be used: {why}; `driml doctor` says what is missing")]
     Open {
@@ -120,13 +142,17 @@ pub enum DeviceError {
 }
 
 impl DeviceName {
-    /// The device with the faster kernels that it has.
+    /// The device with the faster kernels that it has, products in `precision`.
     ///
     /// # Errors
-    /// A GPU that is not there, or a program that was built without the feature `cuda`.
-    pub fn open(self) -> Result<Compute, DeviceError> {
+    /// A GPU that is not there, or a program that was built without the feature `cuda`; bf16 on a GPU.
+    pub fn open(self, precision: Precision) -> Result<Compute, DeviceError> {
         match self {
-            Self::Cpu => Ok(Compute::CPU),
+            Self::Cpu => Ok(Compute::cpu(precision)),
+            Self::Cuda(_) if precision != Precision::F32 => Err(DeviceError::Precision {
+                device: self,
+                precision,
+            }),
             Self::Cuda(ordinal) => {
                 let device = Device::new_cuda(ordinal)
                     .map_err(|why| DeviceError::Open { device: self, why })?;
@@ -189,10 +215,23 @@ mod tests {
         }
     }
 
+    #[test]
+    fn a_gpu_has_no_bf16_of_ours() {
+        let error = DeviceName::Cuda(1).open(Precision::Bf16).unwrap_err();
+        assert!(
+            error.to_string().contains("set learner.precision"),
+            "{error}"
+        );
+        assert!(DeviceName::Cpu.open(Precision::Bf16).is_ok());
+    }
+
     #[cfg(not(feature = "cuda"))]
     #[test]
     fn a_program_without_cuda_says_so() {
-        let error = DeviceName::Cuda(0).open().unwrap_err().to_string();
+        let error = DeviceName::Cuda(0)
+            .open(Precision::F32)
+            .unwrap_err()
+            .to_string();
         assert!(
             error.contains("cuda:0 cannot be used") && error.contains("driml doctor"),
             "{error}"

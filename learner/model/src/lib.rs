@@ -49,6 +49,8 @@ pub use geometry::{ConvLayer, ConvShape};
 pub use input::Enlarge;
 pub use kernels::conv::{conv_stack, conv2d_relu};
 pub use kernels::linear::{linear, linear_relu, relu};
+pub use kernels::precision::{Precision, UnknownPrecision};
+pub use kernels::units::kernels_in_words;
 pub use network::{Features, Network};
 pub use parameters::Parameters;
 pub use policy::PolicyNetwork;

@@ -20,6 +20,19 @@ pub struct Features {
     pub f4: Tensor,
 }
 
+impl Features {
+    /// Those of `rows` rows from `first` on.
+    ///
+    /// # Errors
+    /// Fewer rows.
+    pub fn narrow(&self, first: usize, rows: usize) -> candle_core::Result<Self> {
+        Ok(Self {
+            f3: self.f3.narrow(0, first, rows)?,
+            f4: self.f4.narrow(0, first, rows)?,
+        })
+    }
+}
+
 /// Torso, C51 head and the DIM heads that the configuration has.
 ///
 /// It shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes this network.

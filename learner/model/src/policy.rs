@@ -10,11 +10,13 @@ use rayon::prelude::*;
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::geometry::ConvShape;
 use crate::heads::c51::expected_returns;
-use crate::kernels::gemm::Matrix;
-use crate::kernels::im2col::{ConvScratch, Images, forward, grown};
-use crate::kernels::linear::{self, relu_in_place};
+use crate::kernels::buffer::Buffer;
+use crate::kernels::convolution::{Convolution, Images, PADDING, Pixels, forward};
+use crate::kernels::linear::relu_of;
+use crate::kernels::precision::Precision;
+use crate::kernels::product::{Matrix, Panels, Threads};
+use crate::kernels::units::{Element, ForUnit, Left, Mode, Unit, row_tiles, with_unit};
 use crate::parameters::{decode, is_dim};
 
 /// Frames that go through the network together on one thread.
@@ -24,26 +26,26 @@ const TILE_FRAMES: usize = 32;
 pub struct PolicyNetwork {
     config: ModelConfig,
     support: Vec<f32>,
-    weights: PolicyWeights,
-    /// One a task.
-    scratch: Vec<Scratch>,
+    precision: Precision,
+    weights: Box<dyn Weights>,
     values: Vec<f32>,
 }
 
 impl PolicyNetwork {
-    /// The network of `config` with the weights of a safetensors file; DIM parameters in it are ignored.
+    /// The network of `config` with the weights of a safetensors file; DIM parameters in it are ignored. Its products are
+    /// computed in `precision`.
     ///
     /// # Errors
     /// An invalid configuration, bytes that are not safetensors, or a parameter that is missing, unknown, of another type
     /// or shape, or not finite.
-    pub fn new(config: &ModelConfig, safetensors: &[u8]) -> Result<Self> {
+    pub fn new(config: &ModelConfig, safetensors: &[u8], precision: Precision) -> Result<Self> {
         let config = config.without_dim();
-        let weights = PolicyWeights::decode(&config, safetensors)?;
+        let weights = weights(&config, safetensors, precision)?;
         Ok(Self {
             support: config.atoms_support(),
             config,
+            precision,
             weights,
-            scratch: Vec::new(),
             values: Vec::new(),
         })
     }
@@ -53,7 +55,7 @@ impl PolicyNetwork {
     /// # Errors
     /// As for [`PolicyNetwork::new`].
     pub fn load(&mut self, safetensors: &[u8]) -> Result<()> {
-        self.weights = PolicyWeights::decode(&self.config, safetensors)?;
+        self.weights = weights(&self.config, safetensors, self.precision)?;
         Ok(())
     }
 
@@ -71,24 +73,16 @@ impl PolicyNetwork {
             )));
         }
         let tasks = rayon::current_num_threads().min(batch);
-        if self.scratch.len() < tasks {
-            self.scratch.resize_with(tasks, Scratch::default);
-        }
-        let (weights, support) = (&self.weights, &self.support);
+        let (weights, support) = (&*self.weights, &self.support);
         if tasks <= 1 {
-            if let Some(scratch) = self.scratch.first_mut() {
-                weights.q_values(support, frames, values, scratch);
-            }
+            weights.q_values(support, frames, values);
         } else {
             let share = batch.div_ceil(tasks);
             let values = values.par_chunks_mut(share * actions);
             let frames = frames.par_chunks(share * frame_len);
             values
                 .zip(frames)
-                .zip(&mut self.scratch)
-                .for_each(|((values, frames), scratch)| {
-                    weights.q_values(support, frames, values, scratch);
-                });
+                .for_each(|(values, frames)| weights.q_values(support, frames, values));
         }
         match values.iter().position(|value| !value.is_finite()) {
             Some(index) => Err(ModelError::NotFinite {
@@ -135,37 +129,45 @@ impl fmt::Debug for PolicyNetwork {
     }
 }
 
-/// Weights as the kernels want them.
-struct PolicyWeights {
-    convolutions: Vec<Convolution>,
-    fc: Dense,
-    head: Dense,
+/// Weights as one unit's kernels want them.
+trait Weights: Send + Sync {
+    /// Expected returns of any number of frames, on the calling thread.
+    fn q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]);
 }
 
-struct Convolution {
-    shape: ConvShape,
-    packed: Vec<f32>,
+/// The weights in a safetensors file, for the fastest unit of this processor.
+fn weights(
+    config: &ModelConfig,
+    safetensors: &[u8],
+    precision: Precision,
+) -> Result<Box<dyn Weights>> {
+    struct Decode<'a>(&'a ModelConfig, &'a [u8]);
+    impl ForUnit for Decode<'_> {
+        type Output = Result<Box<dyn Weights>>;
+        fn run<U: Unit>(self, unit: U) -> Self::Output {
+            Ok(Box::new(UnitWeights::decode(unit, self.0, self.1)?))
+        }
+    }
+    with_unit(precision, Decode(config, safetensors))
+}
+
+struct UnitWeights<U: Unit> {
+    unit: U,
+    convolutions: Vec<Convolution<U::Element>>,
+    fc: Dense<U>,
+    head: Dense<U>,
+}
+
+/// A fully connected layer.
+struct Dense<U: Unit> {
+    /// Of [in, out].
+    weight: Panels<U::Element>,
     bias: Vec<f32>,
+    inputs: usize,
 }
 
-/// A fully connected layer with its weight as [in, out].
-struct Dense {
-    weight: Vec<f32>,
-    bias: Vec<f32>,
-}
-
-/// Buffers that one task keeps between calls.
-#[derive(Default)]
-struct Scratch {
-    conv: ConvScratch,
-    maps: Vec<f32>,
-    next_maps: Vec<f32>,
-    hidden: Vec<f32>,
-    logits: Vec<f32>,
-}
-
-impl PolicyWeights {
-    fn decode(config: &ModelConfig, safetensors: &[u8]) -> Result<Self> {
+impl<U: Unit> UnitWeights<U> {
+    fn decode(unit: U, config: &ModelConfig, safetensors: &[u8]) -> Result<Self> {
         let mut parameters = decode(config, |_| true, safetensors, is_dim)?;
         let mut take = |name: &str| {
             let (_, values) = parameters
@@ -175,37 +177,66 @@ impl PolicyWeights {
         };
         let convolutions = (1..)
             .zip(config.conv_shapes())
-            .map(|(number, shape)| Convolution {
-                shape,
-                packed: shape.pack_weight(&take(&format!("torso.conv{number}.weight"))),
-                bias: take(&format!("torso.conv{number}.bias")),
-            });
-        let convolutions = convolutions.collect();
+            .map(|(number, shape)| {
+                let weight = take(&format!("torso.conv{number}.weight"));
+                let bias = take(&format!("torso.conv{number}.bias"));
+                Convolution::new(unit, shape, &weight, &bias, false)
+            })
+            .collect();
         let (height, width, channels) = config.local_shape();
         // The inputs in our maps' order, row, column, channel, instead of PyTorch's channel, row, column.
         let column = |input: usize| input % channels * height * width + input / channels;
         let fc_weight = transposed(&take("torso.fc.weight"), config.hidden, column);
-        let fc = Dense {
-            weight: fc_weight,
-            bias: take("torso.fc.bias"),
-        };
-        let head_weight = transposed(
-            &take("head.weight"),
-            config.num_actions * config.atoms,
-            |input| input,
-        );
-        let head = Dense {
-            weight: head_weight,
-            bias: take("head.bias"),
-        };
+        let fc = Dense::new(unit, &fc_weight, take("torso.fc.bias"));
+        let outputs = config.num_actions * config.atoms;
+        let head_weight = transposed(&take("head.weight"), outputs, |input| input);
+        let head = Dense::new(unit, &head_weight, take("head.bias"));
         Ok(Self {
+            unit,
             convolutions,
             fc,
             head,
         })
     }
 
-    fn q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32], scratch: &mut Scratch) {
+    fn tile_q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]) {
+        let unit = self.unit;
+        let count = values.len() * support.len() / self.head.bias.len();
+        let (mut maps, mut scale) = Pixels::Bytes(frames).operands(unit);
+        for layer in &self.convolutions {
+            let len = count * layer.shape.map_len();
+            let mut output = Buffer::<U::Element>::new(len + PADDING);
+            output[len..].fill(U::Element::default());
+            let images = Images {
+                values: &maps,
+                scale,
+            };
+            forward(unit, layer, images, count, |first, row| {
+                for (value, &map) in output[first..].iter_mut().zip(row) {
+                    *value = U::Element::of(map);
+                }
+            });
+            (maps, scale) = (output, 1.0);
+        }
+        let hidden = self.fc.forward(unit, &maps, count);
+        let stride = self.fc.bias.len().next_multiple_of(U::Element::DEPTH);
+        let mut active = Buffer::<U::Element>::new(count * stride);
+        unit.vectorize(|| {
+            let rows = active.chunks_exact_mut(stride);
+            for (row, hidden) in rows.zip(hidden.chunks_exact(self.fc.bias.len())) {
+                row.fill(U::Element::default());
+                for (value, &hidden) in row.iter_mut().zip(hidden) {
+                    *value = U::Element::of(relu_of(hidden));
+                }
+            }
+        });
+        let logits = self.head.forward(unit, &active, count);
+        expected_returns(&logits, support, values);
+    }
+}
+
+impl<U: Unit> Weights for UnitWeights<U> {
+    fn q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]) {
         let frame_len = self
             .convolutions
             .first()
@@ -215,67 +246,45 @@ impl PolicyWeights {
             .chunks(TILE_FRAMES * frame_len)
             .zip(values.chunks_mut(TILE_FRAMES * actions));
         for (frames, values) in tiles {
-            self.tile_q_values(support, frames, values, scratch);
+            self.tile_q_values(support, frames, values);
         }
-    }
-
-    fn tile_q_values(
-        &self,
-        support: &[f32],
-        frames: &[u8],
-        values: &mut [f32],
-        scratch: &mut Scratch,
-    ) {
-        let Scratch {
-            conv,
-            maps,
-            next_maps,
-            hidden,
-            logits,
-        } = scratch;
-        let batch = values.len() * support.len() / self.head.bias.len();
-        for (
-            index,
-            Convolution {
-                shape,
-                packed,
-                bias,
-            },
-        ) in self.convolutions.iter().enumerate()
-        {
-            let images = match index {
-                0 => Images::Bytes(frames),
-                _ => Images::Floats(&maps[..batch * shape.image_len()]),
-            };
-            forward(
-                shape,
-                images,
-                packed,
-                bias,
-                grown(next_maps, batch * shape.map_len()),
-                conv,
-            );
-            std::mem::swap(maps, next_maps);
-        }
-        let flat = self.fc.weight.len() / self.fc.bias.len();
-        let hidden = self.fc.forward(&maps[..batch * flat], batch, hidden);
-        relu_in_place(hidden);
-        let logits = self.head.forward(hidden, batch, logits);
-        expected_returns(logits, support, values);
     }
 }
 
-impl Dense {
-    fn forward<'a>(&self, x: &[f32], batch: usize, y: &'a mut Vec<f32>) -> &'a mut [f32] {
+impl<U: Unit> Dense<U> {
+    /// `weight` [in, out], `bias` [out].
+    fn new(unit: U, weight: &[f32], bias: Vec<f32>) -> Self {
+        let inputs = weight.len() / bias.len();
+        let weight = Matrix::new(weight, inputs, bias.len());
+        Self {
+            weight: Panels::pack(unit, weight, Threads::Caller),
+            bias,
+            inputs,
+        }
+    }
+
+    /// [count, out] of `x` [count, in], whose rows begin at whole steps.
+    fn forward(&self, unit: U, x: &[U::Element], count: usize) -> Buffer<f32> {
         let outputs = self.bias.len();
-        let inputs = self.weight.len() / outputs;
-        let y = grown(y, batch * outputs);
-        linear::forward(
-            Matrix::new(x, batch, inputs),
-            Matrix::new(&self.weight, inputs, outputs),
-            &self.bias,
-            y,
-        );
+        let mut y = Buffer::new(count * outputs);
+        for row in y.chunks_exact_mut(outputs) {
+            row.copy_from_slice(&self.bias);
+        }
+        let depth = U::Element::DEPTH;
+        let row_stride = self.inputs.next_multiple_of(depth);
+        for (row, rows) in row_tiles::<U>(count, self.weight.vecs()) {
+            let left = Left {
+                values: x,
+                start: row * row_stride,
+                row_stride,
+                step: depth,
+                steps: row_stride / depth,
+                run_stride: 0,
+                runs: 1,
+            };
+            self.weight
+                .multiply(unit, rows, left, Mode::Add, &mut y[row * outputs..]);
+        }
         y
     }
 }

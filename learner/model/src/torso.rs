@@ -59,7 +59,7 @@ impl Torso {
             .collect();
         let maps = self.kernels.conv_stack(frames, &layers)?;
         let flat = match self.kernels {
-            Kernels::Fused => maps.apply_op1(ChannelsFirst)?,
+            Kernels::Fused(_) => maps.apply_op1(ChannelsFirst)?,
             Kernels::Candle => maps.permute((0, 3, 1, 2))?.flatten_from(1)?,
         };
         let f4 = self.kernels.linear(&flat, &self.fc_weight, &self.fc_bias)?;

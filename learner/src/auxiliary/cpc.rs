@@ -12,6 +12,7 @@ use super::{
     positives::Positives,
 };
 use crate::{
+    batch::Batch,
     error::UpdateError,
     losses::{info_nce::info_nce_loss, scores::Dots},
 };
@@ -56,6 +57,10 @@ impl AuxiliaryLoss for Cpc {
         Passes::of_pairs(self.pairs.lambda, positives, augmented)
     }
 
+    fn later_states<'a>(&self, batch: &Batch<'a>) -> Cow<'a, [u8]> {
+        present(batch.states_k, batch.positive_valid)
+    }
+
     /// For each pair with a weight above 0 the mean over the P offsets of the InfoNCE of the rows that have a positive there, 0
     /// where fewer than two have. A mean, so that lambda weighs as much as DIM's.
     ///
@@ -63,14 +68,9 @@ impl AuxiliaryLoss for Cpc {
     /// for measuring similarity").
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
         let (online, valid) = (inputs.online, inputs.batch.positive_valid);
-        let anchors = inputs.anchors()?;
-        let later = if valid.iter().any(|&valid| valid != 0) {
-            Some(inputs.features(present(inputs.batch.states_k, valid))?)
-        } else {
-            None
-        };
+        let (anchors, later) = (&inputs.features.anchors, inputs.features.later.as_ref());
         let action = inputs.action()?;
-        let offsets = self.offsets(online, &anchors, later.as_ref(), &action, valid)?;
+        let offsets = self.offsets(online, anchors, later, &action, valid)?;
         let mut sums = [const { None::<Tensor> }; 4];
         let mut all_dots = [const { Vec::new() }; 4];
         for Offset { rows, dots } in offsets {

@@ -7,6 +7,8 @@
 //! "exactly the same networks for measuring similarity (i.e. one residual block for CURL and CPC)", hence no bilinear
 //! product and no second head.
 
+use std::borrow::Cow;
+
 use driml_model::DimHeads;
 use serde::{Deserialize, Serialize};
 
@@ -17,6 +19,7 @@ use super::{
     settings::AuxiliarySettings,
 };
 use crate::{
+    batch::Batch,
     error::UpdateError,
     losses::{info_nce::info_nce_loss, scores::Scores},
     ranges::{TAU, check_range},
@@ -93,11 +96,16 @@ impl AuxiliaryLoss for Curl {
         }
     }
 
+    /// None: the other view is the key encoder's.
+    fn later_states<'a>(&self, _batch: &Batch<'a>) -> Cow<'a, [u8]> {
+        Cow::Borrowed(&[])
+    }
+
     /// InfoNCE of the online network's vectors of one view with the key encoder's of the other. All rows take part: a state
     /// needs no successor here.
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
         let keys = inputs.keys()?;
-        let anchors = inputs.anchors()?;
+        let anchors = &inputs.features.anchors;
         let query = inputs.online.psi4(&anchors.f4, &inputs.action()?)?;
         let dots = dim::global_dots(&query, &keys)?;
         let all = vec![1; inputs.batch.rows];

@@ -1,6 +1,8 @@
 //! Deep InfoMax: InfoNCE between features of (s_t, a_t) and of s_{t+k}, for up to four pairs of levels.
 //! It holds no parameters (the model does) and does not mask beyond `positive_valid`.
 
+use std::borrow::Cow;
+
 use candle_core::Tensor;
 use driml_model::{DimHeads, Features, Network};
 
@@ -10,6 +12,7 @@ use super::{
     settings::{AuxiliarySettings, Lambda},
 };
 use crate::{
+    batch::Batch,
     error::UpdateError,
     losses::{
         info_nce::info_nce_loss,
@@ -99,12 +102,17 @@ impl AuxiliaryLoss for Dim {
         Passes::of_pairs(self.lambda, positives, augmented)
     }
 
+    fn later_states<'a>(&self, batch: &Batch<'a>) -> Cow<'a, [u8]> {
+        Cow::Borrowed(batch.states_k)
+    }
+
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
         let (online, batch) = (inputs.online, inputs.batch);
-        let anchors = inputs.anchors()?;
-        let later = inputs.features(batch.states_k)?;
-        let wanted = self.lambda.wanted();
-        let dots = dots(online, &anchors, &later, &inputs.action()?, wanted)?;
+        let Some(later) = &inputs.features.later else {
+            return Ok(Vec::new());
+        };
+        let (anchors, wanted) = (&inputs.features.anchors, self.lambda.wanted());
+        let dots = dots(online, anchors, later, &inputs.action()?, wanted)?;
         let mut losses = Vec::new();
         for ((name, weight), dots) in NAMES.into_iter().zip(self.lambda.values()).zip(dots) {
             if let Some(dots) = dots {

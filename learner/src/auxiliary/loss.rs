@@ -40,6 +40,10 @@ pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
     /// What an update costs beyond C51's, where a row has `positives` later states; for an estimate of a run's time.
     fn passes(&self, positives: usize, augmented: bool) -> Passes;
 
+    /// The later states [.., H, W, C] that the loss needs the online network's features of, if any. They pass through it together
+    /// with s_t.
+    fn later_states<'a>(&self, batch: &Batch<'a>) -> Cow<'a, [u8]>;
+
     /// The losses of one batch, with their graphs.
     ///
     /// # Errors
@@ -88,7 +92,57 @@ pub struct WeightedLoss {
     pub dots: Vec<Dots>,
 }
 
-/// What a loss may look at. Nothing passes through a network before the loss asks for it.
+/// The online network's features of all states that an update needs with a graph, of one pass through it.
+///
+/// One pass, as every pass packs the weights again and has a gradient of its own for each of them.
+#[derive(Debug)]
+pub struct OnlineFeatures {
+    /// Of s_t as it is.
+    pub now: Features,
+    /// Of s_t as the loss sees it: augmented, if the batch is.
+    pub anchors: Features,
+    /// Of the loss's [`AuxiliaryLoss::later_states`]; none if there are none.
+    pub later: Option<Features>,
+}
+
+impl OnlineFeatures {
+    /// Passes what `loss` needs of `batch` through `network`.
+    ///
+    /// # Errors
+    /// States that do not fit the network.
+    pub fn new(
+        network: &Network,
+        model: &ModelConfig,
+        loss: &dyn AuxiliaryLoss,
+        batch: &Batch<'_>,
+        device: &Device,
+    ) -> Result<Self, UpdateError> {
+        let later = loss.later_states(batch);
+        let parts = [batch.states_t, batch.anchors.unwrap_or_default(), &later];
+        let all = if parts[1..].iter().all(|part| part.is_empty()) {
+            Cow::Borrowed(batch.states_t)
+        } else {
+            Cow::Owned(parts.concat())
+        };
+        let features = network.features(&states(model, all, device)?)?;
+        let mut first = 0;
+        let mut cut = |part: &[u8]| -> candle_core::Result<Option<Features>> {
+            let rows = part.len() / model.frame_len();
+            let start = first;
+            first += rows;
+            (rows > 0).then(|| features.narrow(start, rows)).transpose()
+        };
+        let [now, anchors, later] = [cut(parts[0])?, cut(parts[1])?, cut(parts[2])?];
+        let now = now.unwrap_or(features.clone());
+        Ok(Self {
+            anchors: anchors.unwrap_or_else(|| now.clone()),
+            now,
+            later,
+        })
+    }
+}
+
+/// What a loss may look at.
 pub struct LossInputs<'a> {
     /// The network that learns.
     pub online: &'a Network,
@@ -96,8 +150,8 @@ pub struct LossInputs<'a> {
     pub model: &'a ModelConfig,
     /// The rows that are learned from, checked.
     pub batch: &'a Batch<'a>,
-    /// The online network's features of s_t, not augmented.
-    pub features_t: &'a Features,
+    /// The online network's features of the batch's states.
+    pub features: &'a OnlineFeatures,
     /// The key encoder of a loss with a [`AuxiliaryLoss::key_tau`].
     pub key: Option<&'a KeyEncoder>,
     /// Where the states go.
@@ -105,25 +159,6 @@ pub struct LossInputs<'a> {
 }
 
 impl LossInputs<'_> {
-    /// The online network's features of s_t as the loss sees it: augmented, if the batch is.
-    ///
-    /// # Errors
-    /// The tensor library refused.
-    pub fn anchors(&self) -> Result<Features, UpdateError> {
-        match self.batch.anchors {
-            Some(anchors) => self.features(anchors),
-            None => Ok(self.features_t.clone()),
-        }
-    }
-
-    /// The online network's features of `states` [.., H, W, C], as many as there are.
-    ///
-    /// # Errors
-    /// The tensor library refused.
-    pub fn features<'s>(&self, states: impl Into<Cow<'s, [u8]>>) -> Result<Features, UpdateError> {
-        Ok(self.online.features(&self.tensor(states)?)?)
-    }
-
     /// The key encoder's vectors [B, rkhs] of the batch's positives, without a gradient.
     ///
     /// # Errors

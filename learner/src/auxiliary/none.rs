@@ -1,5 +1,7 @@
 //! No auxiliary loss: the agent learns the return alone, without a second pass and without heads.
 
+use std::borrow::Cow;
+
 use driml_model::DimHeads;
 
 use super::{
@@ -7,7 +9,7 @@ use super::{
     positives::Positives,
     settings::{AuxiliarySettings, PAIRS},
 };
-use crate::error::UpdateError;
+use crate::{batch::Batch, error::UpdateError};
 
 /// Its line of the menu.
 pub const NONE: MenuItem = MenuItem {
@@ -37,6 +39,10 @@ impl AuxiliaryLoss for ReturnAlone {
 
     fn passes(&self, _positives: usize, _augmented: bool) -> Passes {
         Passes::default()
+    }
+
+    fn later_states<'a>(&self, _batch: &Batch<'a>) -> Cow<'a, [u8]> {
+        Cow::Borrowed(&[])
     }
 
     fn losses(&self, _inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {

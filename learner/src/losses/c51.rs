@@ -209,7 +209,7 @@ mod tests {
     #[test]
     fn the_operation_gives_the_function() -> Result<()> {
         let logits = Var::from_slice(&LOGITS, (2, ACTIONS, 3), &Device::Cpu)?;
-        let loss = kl_loss(&logits, &[1, 0], TARGET.to_vec(), Kernels::Fused)?;
+        let loss = kl_loss(&logits, &[1, 0], TARGET.to_vec(), Kernels::FUSED)?;
         let grads = loss.affine(3.0, 0.0)?.backward()?;
         let mut gradient = [0f32; 12];
         let expected = kl(&LOGITS, &[1, 0], ACTIONS, &TARGET, &mut gradient);

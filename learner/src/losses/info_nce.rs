@@ -211,7 +211,7 @@ mod tests {
     #[test]
     fn the_operation_gives_the_function() -> Result<()> {
         let var = Var::from_vec(dots(), (LOCATIONS, ROWS, ROWS), &Device::Cpu)?;
-        let loss = info_nce_loss(&var, &[1, 1, 1], SCORES, Kernels::Fused)?;
+        let loss = info_nce_loss(&var, &[1, 1, 1], SCORES, Kernels::FUSED)?;
         let grads = loss.affine(2.0, 0.0)?.backward()?;
         let (expected, gradient) = loss_of(&dots(), &[1, 1, 1]);
         assert_eq!(loss.to_scalar::<f32>()?, expected as f32);

@@ -78,7 +78,7 @@ enum Moments {
 impl Moments {
     fn new(m: &Tensor, v: &Tensor, kernels: Kernels) -> candle_core::Result<Self> {
         Ok(match kernels {
-            Kernels::Fused => Self::Fused {
+            Kernels::Fused(_) => Self::Fused {
                 m: m.flatten_all()?.to_vec1()?,
                 v: v.flatten_all()?.to_vec1()?,
             },

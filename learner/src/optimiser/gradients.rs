@@ -45,7 +45,7 @@ impl Gradients {
     /// [`UpdateError::NonFinite`] with the first parameter whose gradient is infinite or NaN.
     pub fn norm(&self, kernels: Kernels) -> Result<f64, UpdateError> {
         let squares: Vec<f64> = match kernels {
-            Kernels::Fused => {
+            Kernels::Fused(_) => {
                 let each = self.by_name.values().map(squares_on_cpu);
                 each.collect::<Result<_, _>>()?
             }

@@ -32,7 +32,7 @@ pub fn follow(
             )));
         };
         match kernels {
-            Kernels::Fused => var.inplace_op2(source, &Follow { tau: tau as f32 })?,
+            Kernels::Fused(_) => var.inplace_op2(source, &Follow { tau: tau as f32 })?,
             Kernels::Candle if tau >= 1.0 => var.set(source)?,
             Kernels::Candle => {
                 let way = (source.as_tensor() - var.as_tensor())?.affine(tau, 0.0)?;

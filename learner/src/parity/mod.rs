@@ -20,11 +20,10 @@ use crate::{
         Objective,
         dim::DIM,
         key_encoder::KeyEncoder,
-        loss::{LossInputs, WeightedLoss},
+        loss::{LossInputs, OnlineFeatures, WeightedLoss},
         settings::{AuxiliarySettings, Lambda},
     },
     losses::scores::{Dots, Scores},
-    tensors::states,
 };
 
 /// Values of s_t, in units of return, as a share of the support's width.
@@ -136,7 +135,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
     let expected = case.expected("q_values_t", &[rows, num_actions])?;
     lines.push(line(
         "q_values_t",
-        largest(&widened(&evaluation.q_values_t), &expected),
+        largest(&widened(&agent.q_values_t(&evaluation)?), &expected),
         Q_VALUES * width,
     ));
     let expected = case.expected("next_action", &[rows])?;
@@ -272,12 +271,12 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
         _ => None,
     };
     let batch = case.batch();
-    let features_t = online.features(&states(&model, batch.states_t, device)?)?;
+    let features = OnlineFeatures::new(&online, &model, &*loss, &batch, device)?;
     let losses = loss.losses(&LossInputs {
         online: &online,
         model: &model,
         batch: &batch,
-        features_t: &features_t,
+        features: &features,
         key: key.as_ref(),
         device,
     })?;

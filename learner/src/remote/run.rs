@@ -46,12 +46,12 @@ pub struct RunArgs {
 /// A device that is not there, no replay server to join, settings that cannot work, an update that failed, a disk that refuses.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let compute = args.device.open()?;
     let Some(shards) = Shards::join(&args.connect, &keys, shutdown)? else {
         return Ok(());
     };
     let part = LearnerPart::from_toml(&shards.config_toml)
         .context("the settings that the replay server sent")?;
+    let compute = args.device.open(part.learner.precision)?;
     let folder = args.run_dir.join(checkpoint::FOLDER);
     let _lock = checkpoint::lock(&folder)?;
     let rows = part.learner.batch_rows;

@@ -415,6 +415,7 @@ fn part(objective: Objective, augment: Option<AugmentSettings>) -> LearnerPart {
         },
         model,
         learner: Config {
+            precision: Default::default(),
             batch_rows: 6,
             batches_in_flight: 1,
             publish_period_updates: 2,

@@ -67,7 +67,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let parameters = Parameters::init(&task.model, &mut rng, &Device::Cpu)?;
     let network = Network::new(&task.model, &parameters)?;
-    let mut adam = Adam::new(task.learner.adam, &parameters, Kernels::Fused)?;
+    let mut adam = Adam::new(task.learner.adam, &parameters, Kernels::FUSED)?;
     let scorer = Scorer {
         task,
         network: &network,
@@ -87,7 +87,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
         let value = scorer.loss(&now, &next)?;
         loss.push(value.to_scalar::<f32>()?);
         let gradients = Gradients::take(&parameters, value.backward()?)?;
-        let factor = clip_factor(gradients.norm(Kernels::Fused)?, task.learner.max_grad_norm);
+        let factor = clip_factor(gradients.norm(Kernels::FUSED)?, task.learner.max_grad_norm);
         adam.step(&parameters, &gradients, factor)?;
         progress.advance(1)?;
     }

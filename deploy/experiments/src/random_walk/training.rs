@@ -179,7 +179,7 @@ impl Heads {
         let parameters = Parameters::init(&model, rng, &Device::Cpu)?;
         Ok(Self {
             network: Network::new(&model, &parameters)?,
-            adam: Adam::new(settings.adam, &parameters, Kernels::Fused)?,
+            adam: Adam::new(settings.adam, &parameters, Kernels::FUSED)?,
             parameters,
             dim: Dim {
                 lambda,
@@ -214,7 +214,7 @@ impl Heads {
             .pair_losses(&self.network, &now, &next, &action, &valid)?;
         for loss in losses.iter().flatten() {
             let gradients = Gradients::take(&self.parameters, loss.backward()?)?;
-            let factor = clip_factor(gradients.norm(Kernels::Fused)?, self.max_grad_norm);
+            let factor = clip_factor(gradients.norm(Kernels::FUSED)?, self.max_grad_norm);
             self.adam.step(&self.parameters, &gradients, factor)?;
         }
         Ok(())

@@ -52,7 +52,7 @@ impl C51Head {
     /// Expected returns [B, A] of logits [B, A, atoms]; no gradient flows.
     pub(crate) fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
         match self.kernels {
-            Kernels::Fused => Ok(logits.contiguous()?.apply_op1_no_bwd(&Expectation {
+            Kernels::Fused(_) => Ok(logits.contiguous()?.apply_op1_no_bwd(&Expectation {
                 support: self.support.clone(),
             })?),
             Kernels::Candle => {

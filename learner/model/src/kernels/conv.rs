@@ -11,11 +11,13 @@ use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result, Shape, Tensor, b
 use rayon::prelude::*;
 
 use crate::geometry::{ConvLayer, ConvShape};
-use crate::kernels::im2col::Images;
+use crate::kernels::convolution::Pixels;
 use crate::kernels::linear::{add_in_order, cpu, floats};
+use crate::kernels::precision::Precision;
 use crate::kernels::stack::{
     SavedActivations, layers, parameters_len, stack_backward, stack_forward, unpacked,
 };
+use crate::kernels::units::{ForUnit, Unit, with_unit};
 
 /// Images that one task takes. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_IMAGES: usize = 16;
@@ -29,19 +31,25 @@ pub fn conv2d_relu(
     weight: &Tensor,
     bias: &Tensor,
     stride: usize,
+    precision: Precision,
 ) -> Result<Tensor> {
-    conv_stack(images, &[(weight, bias, stride)])
+    conv_stack(images, &[(weight, bias, stride)], precision)
 }
 
 /// Convolutions without padding, each with bias and ReLU, differentiable in all floating-point arguments.
 ///
 /// `images` [B, H, W, C] u8 (scaled by 1/255, no gradient) or f32. Each layer is (weight [out, in, k, k] f32, bias [out]
 /// f32, stride) and turns [B, h, w, in] into [B, (h - k) / stride + 1, (w - k) / stride + 1, out], channels last. Where an
-/// output is 0 its gradient is 0, as in PyTorch. Results and gradients have the same bits whatever the number of threads.
+/// output is 0 its gradient is 0, as in PyTorch. Operands of products, and maps between layers, are rounded to `precision`.
+/// Results and gradients have the same bits whatever the number of threads.
 ///
 /// # Errors
 /// No layer, shapes that do not match, a kernel that is not square or larger than its input, a stride of 0, other types.
-pub fn conv_stack(images: &Tensor, layers: &[(&Tensor, &Tensor, usize)]) -> Result<Tensor> {
+pub fn conv_stack(
+    images: &Tensor,
+    layers: &[(&Tensor, &Tensor, usize)],
+    precision: Precision,
+) -> Result<Tensor> {
     let (_, height, width, channels) = images.dims4()?;
     if layers.is_empty() {
         bail!("a stack of no convolutions");
@@ -70,22 +78,41 @@ pub fn conv_stack(images: &Tensor, layers: &[(&Tensor, &Tensor, usize)]) -> Resu
     }
     // An operation has at most three arguments, so the parameters, which are small, travel as one vector.
     let parameters = Tensor::cat(&parameters, 0)?;
-    images.contiguous()?.apply_op2(
-        &parameters,
-        ConvStack {
-            shapes,
-            saved: Mutex::default(),
-        },
-    )
+    let stack = Apply {
+        images: &images.contiguous()?,
+        parameters: &parameters,
+        shapes,
+    };
+    with_unit(precision, stack)
 }
 
-struct ConvStack {
+struct Apply<'a> {
+    images: &'a Tensor,
+    parameters: &'a Tensor,
+    shapes: Vec<ConvShape>,
+}
+
+impl ForUnit for Apply<'_> {
+    type Output = Result<Tensor>;
+
+    fn run<U: Unit>(self, unit: U) -> Result<Tensor> {
+        let stack = ConvStack {
+            unit,
+            shapes: self.shapes,
+            saved: Mutex::default(),
+        };
+        self.images.apply_op2(self.parameters, stack)
+    }
+}
+
+struct ConvStack<U: Unit> {
+    unit: U,
     shapes: Vec<ConvShape>,
     /// Of each task, the maps of all layers but the last: what the forward pass leaves to the backward pass.
-    saved: Mutex<Vec<SavedActivations>>,
+    saved: Mutex<Vec<SavedActivations<U::Element>>>,
 }
 
-impl ConvStack {
+impl<U: Unit> ConvStack<U> {
     fn first(&self) -> &ConvShape {
         &self.shapes[0]
     }
@@ -95,13 +122,13 @@ impl ConvStack {
     }
 
     /// The images of the task with this index.
-    fn task_images<'a>(&self, images: Images<'a>, task: usize) -> Images<'a> {
+    fn task_images<'a>(&self, images: Pixels<'a>, task: usize) -> Pixels<'a> {
         let task_len = TASK_IMAGES * self.first().image_len();
         images.slice(task * task_len..images.len().min((task + 1) * task_len))
     }
 }
 
-impl CustomOp2 for ConvStack {
+impl<U: Unit> CustomOp2 for ConvStack<U> {
     fn name(&self) -> &'static str {
         "conv-stack"
     }
@@ -114,7 +141,8 @@ impl CustomOp2 for ConvStack {
         parameters_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
         let images = pixels(images, images_layout)?;
-        let layers = layers(&self.shapes, floats(parameters, parameters_layout)?);
+        let parameters = floats(parameters, parameters_layout)?;
+        let layers = layers(self.unit, &self.shapes, parameters, false, false);
         let last = self.last();
         let batch = images.len() / self.first().image_len();
         let mut maps = vec![0.0; batch * last.map_len()];
@@ -122,7 +150,9 @@ impl CustomOp2 for ConvStack {
             .par_chunks_mut(TASK_IMAGES * last.map_len())
             .enumerate();
         let saved = tasks
-            .map(|(task, maps)| stack_forward(&layers, self.task_images(images, task), maps))
+            .map(|(task, maps)| {
+                stack_forward(self.unit, &layers, self.task_images(images, task), maps)
+            })
             .collect();
         *self.saved.lock().unwrap_or_else(PoisonError::into_inner) = saved;
         let dims = (
@@ -149,9 +179,13 @@ impl CustomOp2 for ConvStack {
         let (maps_storage, maps_layout) = maps.storage_and_layout();
         let (grad_storage, grad_layout) = grad_maps.storage_and_layout();
         let image_values = pixels(cpu(&images_storage)?, images_layout)?;
+        let parameter_values = floats(cpu(&parameters_storage)?, parameters_layout)?;
         let layers = layers(
+            self.unit,
             &self.shapes,
-            floats(cpu(&parameters_storage)?, parameters_layout)?,
+            parameter_values,
+            true,
+            needs_images,
         );
         let map_values = floats(cpu(&maps_storage)?, maps_layout)?;
         let grad_values = floats(cpu(&grad_storage)?, grad_layout)?;
@@ -169,7 +203,15 @@ impl CustomOp2 for ConvStack {
             .enumerate()
             .map(|(task, (((maps, grad_maps), saved), grad_images))| {
                 let images = self.task_images(image_values, task);
-                stack_backward(&layers, images, saved, maps, grad_maps, grad_images)
+                stack_backward(
+                    self.unit,
+                    &layers,
+                    images,
+                    saved,
+                    maps,
+                    grad_maps,
+                    grad_images,
+                )
             });
         let sum = add_in_order(sums.collect(), parameters_len(&self.shapes));
 
@@ -182,12 +224,12 @@ impl CustomOp2 for ConvStack {
     }
 }
 
-fn pixels<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<Images<'a>> {
+fn pixels<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<Pixels<'a>> {
     match storage {
         CpuStorage::U8(bytes) => match layout.contiguous_offsets() {
-            Some((start, end)) => Ok(Images::Bytes(&bytes[start..end])),
+            Some((start, end)) => Ok(Pixels::Bytes(&bytes[start..end])),
             None => bail!("images must be contiguous"),
         },
-        _ => Ok(Images::Floats(floats(storage, layout)?)),
+        _ => Ok(Pixels::Floats(floats(storage, layout)?)),
     }
 }

@@ -7,7 +7,9 @@
 use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
 use rayon::prelude::*;
 
-use crate::kernels::gemm::{Matrix, Output, Threads, multiply};
+use crate::kernels::precision::Precision;
+use crate::kernels::product::{Matrix, Threads, multiply};
+use crate::kernels::units::Mode;
 
 /// Rows that one task sums. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_ROWS: usize = 256;
@@ -18,20 +20,20 @@ const TASK_LEN: usize = 1 << 15;
 ///
 /// `x` [..., in]; `w` [out, in]; `b` [out], or [groups..., out] where each entry serves an equal share of consecutive
 /// rows of `x`. Result [..., out]. All f32. With as many groups as rows this is x w^T + b for a whole tensor b, which
-/// saves the separate addition. Results and gradients have the same bits whatever the number of threads.
+/// saves the separate addition. Operands of products are rounded to `precision`. Results and gradients have the same bits whatever the number of threads.
 ///
 /// # Errors
 /// Shapes that do not match, or other types.
-pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor) -> Result<Tensor> {
-    apply(x, w, b, false)
+pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Result<Tensor> {
+    apply(x, w, b, false, precision)
 }
 
 /// relu(x w^T + b): [`linear`] with the ReLU fused. Where the result is 0 the gradient is 0, as in PyTorch.
 ///
 /// # Errors
 /// Shapes that do not match, or other types.
-pub fn linear_relu(x: &Tensor, w: &Tensor, b: &Tensor) -> Result<Tensor> {
-    apply(x, w, b, true)
+pub fn linear_relu(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Result<Tensor> {
+    apply(x, w, b, true, precision)
 }
 
 /// max(x, 0), whose gradient at exactly 0 is 0, as in PyTorch.
@@ -42,7 +44,7 @@ pub fn relu(x: &Tensor) -> Result<Tensor> {
     x.contiguous()?.apply_op1(Relu)
 }
 
-fn apply(x: &Tensor, w: &Tensor, b: &Tensor, relu: bool) -> Result<Tensor> {
+fn apply(x: &Tensor, w: &Tensor, b: &Tensor, relu: bool, precision: Precision) -> Result<Tensor> {
     let (inputs, outputs) = (
         x.dims().last().copied().unwrap_or(0),
         w.dims().first().copied().unwrap_or(0),
@@ -67,6 +69,7 @@ fn apply(x: &Tensor, w: &Tensor, b: &Tensor, relu: bool) -> Result<Tensor> {
         outputs,
         groups,
         relu,
+        precision,
     };
     x.contiguous()?
         .apply_op3(&w.contiguous()?, &b.contiguous()?, op)
@@ -79,6 +82,7 @@ struct Linear {
     outputs: usize,
     groups: usize,
     relu: bool,
+    precision: Precision,
 }
 
 impl CustomOp3 for Linear {
@@ -109,7 +113,14 @@ impl CustomOp3 for Linear {
                     y.copy_from_slice(&b[group * self.outputs..][..self.outputs]);
                 }
             });
-        multiply(&mut y, Output::Add, x, w.transposed(), Threads::Pool);
+        multiply(
+            self.precision,
+            &mut y,
+            Mode::Add,
+            x,
+            w.transposed(),
+            Threads::Pool,
+        );
         if self.relu {
             y.par_chunks_mut(TASK_LEN).for_each(relu_in_place);
         }
@@ -147,15 +158,23 @@ impl CustomOp3 for Linear {
                 self.inputs,
             );
             let mut grad_x = vec![0.0; self.rows * self.inputs];
-            multiply(&mut grad_x, Output::Replace, grad, w, Threads::Pool);
+            multiply(
+                self.precision,
+                &mut grad_x,
+                Mode::Replace,
+                grad,
+                w,
+                Threads::Pool,
+            );
             Tensor::from_vec(grad_x, x.shape(), device)
         });
         let grad_w = w.track_op().then(|| -> Result<Tensor> {
             let x = Matrix::new(floats(cpu(&x_storage)?, x_layout)?, self.rows, self.inputs);
             let mut grad_w = vec![0.0; self.outputs * self.inputs];
             multiply(
+                self.precision,
                 &mut grad_w,
-                Output::Replace,
+                Mode::Replace,
                 grad.transposed(),
                 x,
                 Threads::Pool,
@@ -221,14 +240,6 @@ pub(crate) fn add_in_order(parts: Vec<Vec<f32>>, len: usize) -> Vec<f32> {
     sum
 }
 
-/// One layer on the calling thread: `y` [rows, outputs] = x w + b, with `w` given as a matrix [inputs, outputs].
-pub(crate) fn forward(x: Matrix<'_>, w: Matrix<'_>, b: &[f32], y: &mut [f32]) {
-    for row in y.chunks_exact_mut(w.cols()) {
-        row.copy_from_slice(b);
-    }
-    multiply(y, Output::Add, x, w, Threads::Caller);
-}
-
 pub(crate) fn relu_in_place(values: &mut [f32]) {
     for value in values {
         *value = relu_of(*value);
@@ -236,13 +247,13 @@ pub(crate) fn relu_in_place(values: &mut [f32]) {
 }
 
 /// max(value, 0); unlike `f32::max` it keeps NaN, so that a diverged network shows.
-#[inline]
+#[inline(always)]
 pub(crate) fn relu_of(value: f32) -> f32 {
     if value < 0.0 { 0.0 } else { value }
 }
 
 /// The gradient at ReLU's input, from its output `y` and the gradient there.
-#[inline]
+#[inline(always)]
 pub(crate) fn relu_gradient(y: f32, grad: f32) -> f32 {
     if y <= 0.0 { 0.0 } else { grad }
 }

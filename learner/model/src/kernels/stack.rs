@@ -1,77 +1,36 @@
 //! A stack of convolutions over one task's images, forward and backward, on slices.
 //! It knows neither tensors nor threads; `conv` splits the batch and `im2col` computes each layer.
 
-use std::cell::RefCell;
-use std::sync::{Mutex, PoisonError};
-
 use crate::geometry::ConvShape;
-use crate::kernels::im2col::{ConvGradients, ConvScratch, Images, backward, forward, grown};
+use crate::kernels::buffer::Buffer;
+use crate::kernels::convolution::{
+    ConvGradients, Convolution, Images, PADDING, Pixels, backward, forward,
+};
+use crate::kernels::units::{Element, Unit};
 
-/// Spare buffers kept for later passes; more are given back to the allocator.
-const SPARE_MAX: usize = 64;
-
-/// Buffers for maps between layers. Fresh memory for them would cost the forward pass a third of its time in page faults.
-static SPARE: Mutex<Vec<Vec<f32>>> = Mutex::new(Vec::new());
-
-thread_local! {
-    static SCRATCH: RefCell<Scratch> = RefCell::default();
-}
-
-/// Buffers that a thread keeps between calls.
-#[derive(Default)]
-struct Scratch {
-    conv: ConvScratch,
-    grad_output: Vec<f32>,
-    grad_input: Vec<f32>,
-}
-
-/// One convolution with its parameters as the kernels want them.
-pub(crate) struct Layer<'a> {
-    shape: ConvShape,
-    /// [k, k, in, out]
-    packed: Vec<f32>,
-    /// [out]
-    bias: &'a [f32],
-}
-
-/// The maps of all layers but the last, one layer after the other: what forward leaves to backward.
-pub(crate) struct SavedActivations(Vec<f32>);
-
-impl SavedActivations {
-    fn new(len: usize) -> Self {
-        let spare = SPARE.lock().unwrap_or_else(PoisonError::into_inner).pop();
-        let mut maps = spare.unwrap_or_default();
-        maps.resize(len, 0.0);
-        Self(maps)
-    }
-}
-
-impl Drop for SavedActivations {
-    fn drop(&mut self) {
-        let mut spare = SPARE.lock().unwrap_or_else(PoisonError::into_inner);
-        if spare.len() < SPARE_MAX {
-            spare.push(std::mem::take(&mut self.0));
-        }
-    }
-}
+/// The maps of all layers but the last, one layer after the other, each with `PADDING`: what forward leaves to backward.
+pub(crate) type SavedActivations<E> = Buffer<E>;
 
 /// Scalars of all layers' parameters.
 pub(crate) fn parameters_len(shapes: &[ConvShape]) -> usize {
     shapes.iter().map(ConvShape::parameters_len).sum()
 }
 
-/// The layers of `parameters`: for each its weight [out, in, k, k], then its bias [out].
-pub(crate) fn layers<'a>(shapes: &[ConvShape], mut parameters: &'a [f32]) -> Vec<Layer<'a>> {
+/// The layers of `parameters`: for each its weight [out, in, k, k], then its bias [out]. `images` says whether the images of the
+/// first will need a gradient; all other layers' do in a backward pass, for which `backward` stands.
+pub(crate) fn layers<U: Unit>(
+    unit: U,
+    shapes: &[ConvShape],
+    mut parameters: &[f32],
+    backward: bool,
+    images: bool,
+) -> Vec<Convolution<U::Element>> {
     let mut layers = Vec::with_capacity(shapes.len());
-    for &shape in shapes {
+    for (index, &shape) in shapes.iter().enumerate() {
         let (weight, rest) = parameters.split_at(shape.weight_len());
         let (bias, rest) = rest.split_at(shape.channels_out);
-        let packed = shape.pack_weight(weight);
-        layers.push(Layer {
-            shape,
-            packed,
-            bias,
-        });
+        let backward = backward && (index > 0 || images);
+        layers.push(Convolution::new(unit, shape, weight, bias, backward));
         parameters = rest;
     }
     layers
@@ -91,30 +50,39 @@ pub(crate) fn unpacked(shapes: &[ConvShape], mut sums: &[f32]) -> Vec<f32> {
 }
 
 /// Runs `images` through the layers into `maps`, the last layer's output.
-pub(crate) fn stack_forward(
-    layers: &[Layer<'_>],
-    images: Images<'_>,
+pub(crate) fn stack_forward<U: Unit>(
+    unit: U,
+    layers: &[Convolution<U::Element>],
+    images: Pixels<'_>,
     maps: &mut [f32],
-) -> SavedActivations {
+) -> SavedActivations<U::Element> {
     let Some((last, inner)) = layers.split_last() else {
         unreachable!("a stack has at least one layer")
     };
     let count = maps.len() / last.shape.map_len();
-    let map_lens = inner.iter().map(|layer| count * layer.shape.map_len());
-    let mut saved = SavedActivations::new(map_lens.sum());
-    let (mut input, mut free) = (images, &mut saved.0[..]);
-    with_scratch(|Scratch { conv, .. }| {
-        for Layer {
-            shape,
-            packed,
-            bias,
-        } in inner
-        {
-            let (output, rest) = std::mem::take(&mut free).split_at_mut(count * shape.map_len());
-            forward(shape, input, packed, bias, output, conv);
-            (input, free) = (Images::Floats(output), rest);
-        }
-        forward(&last.shape, input, &last.packed, last.bias, maps, conv);
+    let saved_len = inner
+        .iter()
+        .map(|layer| count * layer.shape.map_len() + PADDING);
+    let mut saved = Buffer::new(saved_len.sum());
+    let (pixels, scale) = images.operands(unit);
+    let mut input = Images {
+        values: &pixels,
+        scale,
+    };
+    let mut free = &mut saved[..];
+    for layer in inner {
+        let len = count * layer.shape.map_len();
+        let (output, rest) = std::mem::take(&mut free).split_at_mut(len + PADDING);
+        output[len..].fill(U::Element::default());
+        forward(unit, layer, input, count, |first, row| {
+            for (value, &map) in output[first..].iter_mut().zip(row) {
+                *value = U::Element::of(map);
+            }
+        });
+        (input, free) = (Images::of_maps(output), rest);
+    }
+    forward(unit, last, input, count, |first, row| {
+        maps[first..first + row.len()].copy_from_slice(row);
     });
     saved
 }
@@ -123,74 +91,55 @@ pub(crate) fn stack_forward(
 ///
 /// The result is the parameters' gradients, for each layer the weight's [k, k, in, out], then the bias's. The images' are
 /// added to `grad_images`, if it is there.
-pub(crate) fn stack_backward(
-    layers: &[Layer<'_>],
-    images: Images<'_>,
-    saved: &SavedActivations,
+pub(crate) fn stack_backward<U: Unit>(
+    unit: U,
+    layers: &[Convolution<U::Element>],
+    images: Pixels<'_>,
+    saved: &SavedActivations<U::Element>,
     maps: &[f32],
     grad_maps: &[f32],
     mut grad_images: Option<&mut [f32]>,
 ) -> Vec<f32> {
-    let mut sums = vec![
-        0.0;
-        layers
-            .iter()
-            .map(|layer| layer.shape.parameters_len())
-            .sum()
-    ];
-    let (mut sums_left, mut saved) = (&mut sums[..], &saved.0[..]);
-    with_scratch(|scratch| {
-        let Scratch {
-            conv,
-            grad_output,
-            grad_input,
-        } = scratch;
-        grown(grad_output, grad_maps.len()).copy_from_slice(grad_maps);
-        let mut output = maps;
-        for (index, Layer { shape, packed, .. }) in layers.iter().enumerate().rev() {
-            let before = sums_left.len() - shape.parameters_len();
-            let (left, sums) = std::mem::take(&mut sums_left).split_at_mut(before);
-            sums_left = left;
-            let (packed_sum, bias_sum) = sums.split_at_mut(shape.weight_len());
-            let grad = &grad_output[..output.len()];
-
-            if index == 0 {
-                let images_sum = grad_images.take();
-                let grads = ConvGradients {
-                    packed: packed_sum,
-                    bias: bias_sum,
-                    images: images_sum,
-                };
-                backward(shape, images, packed, output, grad, grads, conv);
-            } else {
-                let input_len = output.len() / shape.map_len() * shape.image_len();
-                let (earlier, input) = saved.split_at(saved.len() - input_len);
-                saved = earlier;
-                let input_sum = grown(grad_input, input_len);
-                input_sum.fill(0.0);
-                let grads = ConvGradients {
-                    packed: packed_sum,
-                    bias: bias_sum,
-                    images: Some(input_sum),
-                };
-                backward(
-                    shape,
-                    Images::Floats(input),
-                    packed,
-                    output,
-                    grad,
-                    grads,
-                    conv,
-                );
-                output = input;
-                std::mem::swap(grad_output, grad_input);
-            }
+    let lens = layers.iter().map(|layer| layer.shape.parameters_len());
+    let mut sums = vec![0.0; lens.sum()];
+    let Some((first, rest)) = layers.split_first() else {
+        return sums;
+    };
+    let count = grad_maps.len() / layers[layers.len() - 1].shape.map_len();
+    let (mut sums_left, mut saved) = (&mut sums[..], &saved[..]);
+    // The output of the layer at hand, and its gradient; the last layer's are f32 and not ours.
+    let mut output: Option<&[U::Element]> = None;
+    let mut grad_output: Option<Buffer<f32>> = None;
+    for layer in rest.iter().rev() {
+        let shape = &layer.shape;
+        let input_len = count * shape.image_len();
+        let (earlier, input) = saved.split_at(saved.len() - input_len - PADDING);
+        saved = earlier;
+        let mut grad_input = Buffer::zeros(input_len);
+        let grads = ConvGradients::cut(&mut sums_left, shape, Some(&mut grad_input));
+        let images = Images::of_maps(input);
+        match (output, &grad_output) {
+            (Some(output), Some(grad)) => backward(unit, layer, images, output, grad, grads),
+            _ => backward(unit, layer, images, maps, grad_maps, grads),
         }
-    });
+        output = Some(&input[..input_len]);
+        grad_output = Some(grad_input);
+    }
+    let (pixels, scale) = images.operands(unit);
+    let images = Images {
+        values: &pixels,
+        scale,
+    };
+    let grads = ConvGradients::cut(&mut sums_left, &first.shape, grad_images.take());
+    match (output, &grad_output) {
+        (Some(output), Some(grad)) => backward(unit, first, images, output, grad, grads),
+        _ => backward(unit, first, images, maps, grad_maps, grads),
+    }
+    // Products with bytes that are scaled after them.
+    if scale != 1.0 {
+        for sum in &mut sums[..first.shape.weight_len()] {
+            *sum *= scale;
+        }
+    }
     sums
-}
-
-/// Lends the thread's buffers to `work`, which must not start parallel work of its own.
-fn with_scratch<R>(work: impl FnOnce(&mut Scratch) -> R) -> R {
-    SCRATCH.with_borrow_mut(work)
 }

@@ -2,9 +2,9 @@
 //! Its speed is measured in the benches.
 
 use candle_core::{DType, Device, Result, Tensor, Var};
-use driml_model::{conv_stack, conv2d_relu};
+use driml_model::{Precision, conv_stack, conv2d_relu};
 
-use crate::support::{assert_close, bytes, double, floats, rng, values, variable};
+use crate::support::{assert_close, bytes, double, floats, rng, rounded, values, variable};
 
 /// Batch, height, width, channels in, channels out, kernel, stride.
 const SHAPES: [[usize; 7]; 8] = [
@@ -17,6 +17,13 @@ const SHAPES: [[usize; 7]; 8] = [
     [33, 15, 15, 8, 16, 4, 2],
     [17, 6, 6, 16, 16, 3, 1],
 ];
+
+/// Every shape in every precision. Where operands are bf16 already, nothing is rounded, and results are as exact as in f32.
+fn shapes_and_precisions() -> impl Iterator<Item = (Precision, [usize; 7])> {
+    Precision::ALL
+        .into_iter()
+        .flat_map(|precision| SHAPES.map(|shape| (precision, shape)))
+}
 
 /// relu(conv2d + bias) of channels-last images by candle's operations.
 ///
@@ -38,21 +45,28 @@ fn stock(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Resu
 #[test]
 fn float_images_match_candle_forward_and_backward() -> Result<()> {
     let rng = &mut rng(1);
-    for [
-        batch,
-        height,
-        width,
-        channels_in,
-        channels_out,
-        kernel,
-        stride,
-    ] in SHAPES
+    for (
+        precision,
+        [
+            batch,
+            height,
+            width,
+            channels_in,
+            channels_out,
+            kernel,
+            stride,
+        ],
+    ) in shapes_and_precisions()
     {
-        let images = variable(&[batch, height, width, channels_in], rng);
-        let weight = variable(&[channels_out, channels_in, kernel, kernel], rng);
+        let images = rounded(
+            &variable(&[batch, height, width, channels_in], rng),
+            precision,
+        );
+        let weight_shape = [channels_out, channels_in, kernel, kernel];
+        let weight = rounded(&variable(&weight_shape, rng), precision);
         let bias = variable(&[channels_out], rng);
-        let maps = conv2d_relu(&images, &weight, &bias, stride)?;
-        let grad_maps = floats(maps.dims(), rng);
+        let maps = conv2d_relu(&images, &weight, &bias, stride, precision)?;
+        let grad_maps = rounded(&floats(maps.dims(), rng), precision).as_detached_tensor();
         let grads = (&maps * &grad_maps)?.sum_all()?.backward()?;
 
         let reference =
@@ -66,7 +80,9 @@ fn float_images_match_candle_forward_and_backward() -> Result<()> {
             ("weight", &weight, &reference[1]),
             ("bias", &bias, &reference[2]),
         ] {
-            let what = format!("gradient of {name}, batch {batch}, {height}x{width}x{channels_in}");
+            let what = format!(
+                "{precision} gradient of {name}, batch {batch}, {height}x{width}x{channels_in}"
+            );
             assert_close(
                 &what,
                 grads.get(var).unwrap(),
@@ -81,7 +97,10 @@ fn float_images_match_candle_forward_and_backward() -> Result<()> {
 #[test]
 fn a_stack_matches_its_layers_one_by_one() -> Result<()> {
     let rng = &mut rng(5);
-    for batch in [1, 3, 7, 35] {
+    for (batch, precision) in [1, 3, 7, 35]
+        .into_iter()
+        .flat_map(|batch| Precision::ALL.map(|precision| (batch, precision)))
+    {
         let images = variable(&[batch, 21, 26, 3], rng);
         let shapes = [([5, 3, 4, 4], 2), ([7, 5, 3, 3], 2), ([6, 7, 2, 2], 1)];
         let layers = shapes
@@ -89,13 +108,13 @@ fn a_stack_matches_its_layers_one_by_one() -> Result<()> {
         let stacked = layers
             .each_ref()
             .map(|(weight, bias, stride)| (weight.as_tensor(), bias.as_tensor(), *stride));
-        let maps = conv_stack(&images, &stacked)?;
+        let maps = conv_stack(&images, &stacked, precision)?;
         let grad_maps = floats(maps.dims(), rng);
         let grads = (&maps * &grad_maps)?.sum_all()?.backward()?;
 
         let mut wanted = images.as_tensor().clone();
         for (weight, bias, stride) in stacked {
-            wanted = conv2d_relu(&wanted, weight, bias, stride)?;
+            wanted = conv2d_relu(&wanted, weight, bias, stride, precision)?;
         }
         let wanted_grads = (&wanted * &grad_maps)?.sum_all()?.backward()?;
         assert_eq!(values(&maps), values(&wanted));
@@ -110,22 +129,25 @@ fn a_stack_matches_its_layers_one_by_one() -> Result<()> {
             );
         }
     }
-    assert!(conv_stack(&floats(&[1, 4, 4, 1], rng), &[]).is_err());
+    assert!(conv_stack(&floats(&[1, 4, 4, 1], rng), &[], Precision::F32).is_err());
     Ok(())
 }
 
 #[test]
 fn byte_images_match_candle_on_scaled_floats() -> Result<()> {
     let rng = &mut rng(2);
-    for [
-        batch,
-        height,
-        width,
-        channels_in,
-        channels_out,
-        kernel,
-        stride,
-    ] in SHAPES
+    for (
+        precision,
+        [
+            batch,
+            height,
+            width,
+            channels_in,
+            channels_out,
+            kernel,
+            stride,
+        ],
+    ) in shapes_and_precisions()
     {
         let shape = (batch, height, width, channels_in);
         let images = Tensor::from_vec(
@@ -133,10 +155,11 @@ fn byte_images_match_candle_on_scaled_floats() -> Result<()> {
             shape,
             &Device::Cpu,
         )?;
-        let weight = variable(&[channels_out, channels_in, kernel, kernel], rng);
+        let weight_shape = [channels_out, channels_in, kernel, kernel];
+        let weight = rounded(&variable(&weight_shape, rng), precision);
         let bias = variable(&[channels_out], rng);
-        let maps = conv2d_relu(&images, &weight, &bias, stride)?;
-        let grad_maps = floats(maps.dims(), rng);
+        let maps = conv2d_relu(&images, &weight, &bias, stride, precision)?;
+        let grad_maps = rounded(&floats(maps.dims(), rng), precision).as_detached_tensor();
         let grads = (&maps * &grad_maps)?.sum_all()?.backward()?;
 
         let scaled = (images.to_dtype(DType::F64)? / 255.0)?;
@@ -187,7 +210,7 @@ fn gradients_match_finite_differences() -> Result<()> {
             variable(&[*channels_out, *channels_in, *kernel, *kernel], rng),
             Var::new(bias, &Device::Cpu)?,
         ];
-        let maps = conv2d_relu(&args[0], &args[1], &args[2], *stride)?;
+        let maps = conv2d_relu(&args[0], &args[1], &args[2], *stride, Precision::F32)?;
         let grad_maps = floats(maps.dims(), rng);
         let grads = (&maps * &grad_maps)?.sum_all()?.backward()?;
         for (index, arg) in args.iter().enumerate() {
@@ -195,7 +218,7 @@ fn gradients_match_finite_differences() -> Result<()> {
             let loss = |step: f64| -> Result<f64> {
                 let mut moved = args.each_ref().map(|arg| arg.as_tensor().clone());
                 moved[index] = (&moved[index] + (&direction * step)?)?;
-                let maps = conv2d_relu(&moved[0], &moved[1], &moved[2], *stride)?;
+                let maps = conv2d_relu(&moved[0], &moved[1], &moved[2], *stride, Precision::F32)?;
                 Ok(values(&maps)
                     .iter()
                     .zip(values(&grad_maps))
@@ -228,7 +251,7 @@ fn relu_passes_no_gradient_at_exactly_zero() -> Result<()> {
     let images = Var::zeros((1, 2, 2, 1), DType::F32, &Device::Cpu)?;
     let weight = Var::ones((1, 1, 2, 2), DType::F32, &Device::Cpu)?;
     let bias = Var::zeros(1, DType::F32, &Device::Cpu)?;
-    let grads = conv2d_relu(&images, &weight, &bias, 1)?
+    let grads = conv2d_relu(&images, &weight, &bias, 1, Precision::F32)?
         .sum_all()?
         .backward()?;
     for var in [&images, &weight, &bias] {
@@ -250,6 +273,7 @@ fn nan_stays_nan() -> Result<()> {
         &weight,
         &Tensor::zeros(1, DType::F32, &Device::Cpu)?,
         1,
+        Precision::F32,
     )?;
     assert!(values(&maps)[0].is_nan());
     Ok(())
@@ -264,9 +288,9 @@ fn shapes_that_do_not_match_are_errors() {
         floats(&[4], rng),
     );
     let fails = |images: &Tensor, weight: &Tensor, bias: &Tensor, stride| {
-        assert!(conv2d_relu(images, weight, bias, stride).is_err());
+        assert!(conv2d_relu(images, weight, bias, stride, Precision::F32).is_err());
     };
-    assert!(conv2d_relu(&images, &weight, &bias, 1).is_ok());
+    assert!(conv2d_relu(&images, &weight, &bias, 1, Precision::F32).is_ok());
     fails(&images, &weight, &bias, 0);
     fails(&images, &floats(&[4, 2, 3, 3], rng), &bias, 1);
     fails(&images, &floats(&[4, 3, 3, 2], rng), &bias, 1);

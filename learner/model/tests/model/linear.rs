@@ -2,9 +2,9 @@
 //! The same for ReLU at zero.
 
 use candle_core::{Device, Result, Tensor, Var};
-use driml_model::{linear, linear_relu, relu};
+use driml_model::{Precision, linear, linear_relu, relu};
 
-use crate::support::{assert_close, double, floats, rng, values, variable};
+use crate::support::{assert_close, double, floats, rng, rounded, values, variable};
 
 /// The layer by candle's operations: x [rows, in], b [groups, out].
 fn stock(x: &Tensor, w: &Tensor, b: &Tensor, with_relu: bool) -> Result<Tensor> {
@@ -31,15 +31,19 @@ fn it_matches_candle_forward_and_backward() -> Result<()> {
         [300, 64, 255, 100],
     ];
     for [rows, inputs, outputs, groups] in shapes {
-        for with_relu in [false, true] {
+        for (with_relu, precision) in [false, true]
+            .into_iter()
+            .flat_map(|with_relu| Precision::ALL.map(|precision| (with_relu, precision)))
+        {
+            // What is bf16 already is not rounded, and the result is as exact as in f32.
             let args = [
-                variable(&[rows, inputs], rng),
-                variable(&[outputs, inputs], rng),
+                rounded(&variable(&[rows, inputs], rng), precision),
+                rounded(&variable(&[outputs, inputs], rng), precision),
                 variable(&[groups, outputs], rng),
             ];
             let layer = if with_relu { linear_relu } else { linear };
-            let y = layer(&args[0], &args[1], &args[2])?;
-            let grad_y = floats(y.dims(), rng);
+            let y = layer(&args[0], &args[1], &args[2], precision)?;
+            let grad_y = rounded(&floats(y.dims(), rng), precision).as_detached_tensor();
             let grads = (&y * &grad_y)?.sum_all()?.backward()?;
 
             let reference = args
@@ -50,7 +54,7 @@ fn it_matches_candle_forward_and_backward() -> Result<()> {
             assert_close("y", &y, &wanted, 1e-6);
             for (index, (arg, reference)) in args.iter().zip(&reference).enumerate() {
                 let what = format!(
-                    "gradient of argument {index}, {rows}x{inputs} to {outputs}, {groups} groups"
+                    "{precision} gradient of argument {index}, {rows}x{inputs} to {outputs}, {groups} groups"
                 );
                 assert_close(
                     &what,
@@ -72,9 +76,9 @@ fn leading_dimensions_and_a_plain_bias_are_kept() -> Result<()> {
         variable(&[7, 5], rng),
         variable(&[7], rng),
     );
-    let y = linear(&x, &w, &b)?;
+    let y = linear(&x, &w, &b, Precision::F32)?;
     assert_eq!(y.dims(), [2, 3, 4, 7]);
-    let flat = linear(&x.reshape((24, 5))?, &w, &b)?;
+    let flat = linear(&x.reshape((24, 5))?, &w, &b, Precision::F32)?;
     assert_eq!(values(&y), values(&flat));
     let grads = y.sqr()?.sum_all()?.backward()?;
     for var in [&x, &w, &b] {
@@ -101,12 +105,12 @@ fn shapes_that_do_not_match_are_errors() {
         floats(&[7, 5], rng),
         floats(&[7], rng),
     );
-    assert!(linear(&x, &w, &b).is_ok());
-    assert!(linear(&x, &w, &floats(&[6], rng)).is_err());
+    assert!(linear(&x, &w, &b, Precision::F32).is_ok());
+    assert!(linear(&x, &w, &floats(&[6], rng), Precision::F32).is_err());
     assert!(
-        linear(&x, &w, &floats(&[4, 7], rng)).is_err(),
+        linear(&x, &w, &floats(&[4, 7], rng), Precision::F32).is_err(),
         "four groups of six rows"
     );
-    assert!(linear(&x, &floats(&[7, 4], rng), &b).is_err());
-    assert!(linear(&double(&x).unwrap(), &w, &b).is_err());
+    assert!(linear(&x, &floats(&[7, 4], rng), &b, Precision::F32).is_err());
+    assert!(linear(&double(&x).unwrap(), &w, &b, Precision::F32).is_err());
 }

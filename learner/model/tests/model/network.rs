@@ -82,7 +82,7 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
     };
     for config in [odd, even] {
         let parameters = with_biases(&config);
-        let (ours, our_gradients) = outputs_and_gradients(&config, &parameters, Kernels::Fused)?;
+        let (ours, our_gradients) = outputs_and_gradients(&config, &parameters, Kernels::FUSED)?;
         let (theirs, their_gradients) =
             outputs_and_gradients(&config, &parameters, Kernels::Candle)?;
         for (index, (ours, theirs)) in ours.iter().zip(&theirs).enumerate() {
@@ -238,14 +238,14 @@ fn values_over_a_support_far_from_0_are_those_near_it_moved() {
         let network = Network::with_kernels(config, &parameters, kernels).unwrap();
         values(&network.q_values(&logits).unwrap())
     };
-    let expected = q_values(&near, Kernels::Fused);
+    let expected = q_values(&near, Kernels::FUSED);
     for (offset, v_min) in [(0.0, 0.0f32), (1e3, 1e3), (-1e6, -1e6)] {
         let far = ModelConfig {
             v_min,
             v_max: v_min + 1.0,
             ..small()
         };
-        for kernels in [Kernels::Fused, Kernels::Candle] {
+        for kernels in [Kernels::FUSED, Kernels::Candle] {
             for (found, near) in q_values(&far, kernels).iter().zip(&expected) {
                 let error = (found - offset - near).abs();
                 // Half of a value's last place, and what the sums of f32 have by themselves.

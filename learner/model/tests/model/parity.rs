@@ -5,7 +5,9 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use candle_core::{Device, Tensor};
-use driml_model::{ConvLayer, DimHeads, ModelConfig, Network, Parameters, PolicyNetwork};
+use driml_model::{
+    ConvLayer, DimHeads, ModelConfig, Network, Parameters, PolicyNetwork, Precision,
+};
 use serde_json::Value;
 
 use crate::support::values;
@@ -97,7 +99,7 @@ fn expected_returns_match_every_case() {
         check("network", &values(&network.q_values(&logits).unwrap()));
 
         let weights = parameters.to_safetensors(|_| true).unwrap();
-        let mut policy = PolicyNetwork::new(&config, &weights).unwrap();
+        let mut policy = PolicyNetwork::new(&config, &weights, Precision::F32).unwrap();
         let mut found = vec![0.0; wanted.len()];
         policy
             .q_values(

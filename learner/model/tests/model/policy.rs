@@ -2,7 +2,7 @@
 //! Loading broken weights is tested with the weights.
 
 use candle_core::{Device, Tensor};
-use driml_model::{ModelConfig, ModelError, Network, PolicyNetwork};
+use driml_model::{ModelConfig, ModelError, Network, PolicyNetwork, Precision};
 
 use crate::support::{bytes, parameters, rng, small};
 
@@ -11,8 +11,12 @@ fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
     let config = small();
     let parameters = parameters(&config, 3);
     let network = Network::new(&config, &parameters).unwrap();
-    let mut policy =
-        PolicyNetwork::new(&config, &parameters.to_safetensors(|_| true).unwrap()).unwrap();
+    let mut policy = PolicyNetwork::new(
+        &config,
+        &parameters.to_safetensors(|_| true).unwrap(),
+        Precision::F32,
+    )
+    .unwrap();
     for batch in [1, 2, 5, 33, 70] {
         let frames = bytes(batch * config.frame_len(), &mut rng(batch as u64));
         let shape = (batch, config.height, config.width, config.channels);
@@ -62,8 +66,12 @@ fn ties_go_to_the_lowest_action() {
     for (_, var) in parameters.iter() {
         var.set(&var.zeros_like().unwrap()).unwrap();
     }
-    let mut policy =
-        PolicyNetwork::new(&config, &parameters.to_safetensors(|_| true).unwrap()).unwrap();
+    let mut policy = PolicyNetwork::new(
+        &config,
+        &parameters.to_safetensors(|_| true).unwrap(),
+        Precision::F32,
+    )
+    .unwrap();
     let mut actions = [9; 3];
     policy
         .greedy_actions(&bytes(3 * config.frame_len(), &mut rng(1)), &mut actions)
@@ -81,7 +89,7 @@ fn new_weights_take_effect() {
         policy.q_values(&frames, &mut values).unwrap();
         values
     };
-    let mut policy = PolicyNetwork::new(&config, &file(1)).unwrap();
+    let mut policy = PolicyNetwork::new(&config, &file(1), Precision::F32).unwrap();
     let first = values(&mut policy);
     policy.load(&file(2)).unwrap();
     assert_ne!(values(&mut policy), first);
@@ -97,8 +105,12 @@ fn wrong_lengths_and_overflow_are_errors() {
         ..small().without_dim()
     };
     let parameters = parameters(&config, 1);
-    let mut policy =
-        PolicyNetwork::new(&config, &parameters.to_safetensors(|_| true).unwrap()).unwrap();
+    let mut policy = PolicyNetwork::new(
+        &config,
+        &parameters.to_safetensors(|_| true).unwrap(),
+        Precision::F32,
+    )
+    .unwrap();
     let frames = bytes(2 * config.frame_len(), &mut rng(1));
     assert!(policy.greedy_actions(&frames, &mut []).is_err());
     assert!(policy.greedy_actions(&[], &mut []).is_ok(), "nothing to do");

@@ -2,7 +2,7 @@
 //! No test lives here.
 
 use candle_core::{DType, Device, Result, Tensor, Var};
-use driml_model::{ConvLayer, DimHeads, ModelConfig, Parameters};
+use driml_model::{ConvLayer, DimHeads, ModelConfig, Parameters, Precision};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 
@@ -111,4 +111,17 @@ pub(crate) fn small() -> ModelConfig {
 
 pub(crate) fn parameters(config: &ModelConfig, seed: u64) -> Parameters {
     Parameters::init(config, &mut rng(seed), &Device::Cpu).unwrap()
+}
+
+/// A variable with the values of `tensor` rounded to `precision`.
+pub(crate) fn rounded(tensor: &Tensor, precision: Precision) -> Var {
+    let rounded = match precision {
+        Precision::F32 => tensor.clone(),
+        Precision::Bf16 => tensor
+            .to_dtype(DType::BF16)
+            .unwrap()
+            .to_dtype(DType::F32)
+            .unwrap(),
+    };
+    Var::from_tensor(&rounded.detach()).unwrap()
 }

@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use candle_core::{DType, Device, Tensor};
-use driml_model::{ModelConfig, ModelError, Parameters, PolicyNetwork};
+use driml_model::{ModelConfig, ModelError, Parameters, PolicyNetwork, Precision};
 
 use crate::support::{bits, bytes, parameters, rng, small, values};
 
@@ -196,7 +196,7 @@ fn assert_rejected(config: &ModelConfig, file: &[u8], what: &str) {
         "{what}"
     );
     let good = parameters(config, 1).to_safetensors(|_| true).unwrap();
-    let mut policy = PolicyNetwork::new(config, &good).unwrap();
+    let mut policy = PolicyNetwork::new(config, &good, Precision::F32).unwrap();
     let frames = bytes(2 * config.frame_len(), &mut rng(1));
     let (mut before, mut after) = ([0.0; 10], [0.0; 10]);
     policy.q_values(&frames, &mut before).unwrap();

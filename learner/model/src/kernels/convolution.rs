@@ -1,0 +1,445 @@
+//! Convolution with bias and ReLU over a few images, forward and backward, as products of windows that are read in place.
+//! It knows neither tensors nor threads: callers split the batch.
+//!
+//! Images and maps are channels-last, so a window is one run of kernel * channels_in scalars for each row of the kernel, and
+//! windows beside each other lie stride * channels_in scalars apart: a tile's rows, without a copy of any window. The gradient
+//! of an image is added straight to the windows it came from.
+
+use crate::geometry::ConvShape;
+use crate::kernels::buffer::Buffer;
+use crate::kernels::linear::{relu_gradient, relu_of};
+use crate::kernels::product::{Matrix, Panels, Threads};
+use crate::kernels::units::{
+    Columns, Element, LANES, Left, Mode, Unit, multiply_tile, row_tiles, tile_vecs,
+};
+
+impl ConvShape {
+    /// Scalars in a row of an image.
+    fn line(&self) -> usize {
+        self.width * self.channels_in
+    }
+
+    /// Scalars in a row of a window.
+    fn run(&self) -> usize {
+        self.kernel * self.channels_in
+    }
+
+    /// Scalars from a window to its right neighbour.
+    fn shift(&self) -> usize {
+        self.stride * self.channels_in
+    }
+
+    /// Weight [out, in, k, k] as [k, k, in, out]: the matrix that windows are multiplied by.
+    fn pack_weight(&self, weight: &[f32]) -> Vec<f32> {
+        let mut packed = vec![0.0; weight.len()];
+        self.for_each_weight(|plain, pack| packed[pack] = weight[plain]);
+        packed
+    }
+
+    /// The inverse of `pack_weight`.
+    pub(crate) fn unpack_weight(&self, packed: &[f32]) -> Vec<f32> {
+        let mut weight = vec![0.0; packed.len()];
+        self.for_each_weight(|plain, pack| weight[plain] = packed[pack]);
+        weight
+    }
+
+    /// Calls `visit` with the index in [out, in, k, k] and the index in [k, k, in, out] of every weight.
+    fn for_each_weight(&self, mut visit: impl FnMut(usize, usize)) {
+        let taps = self.kernel * self.kernel;
+        for tap in 0..taps {
+            for channel_in in 0..self.channels_in {
+                for channel_out in 0..self.channels_out {
+                    visit(
+                        (channel_out * self.channels_in + channel_in) * taps + tap,
+                        (tap * self.channels_in + channel_in) * self.channels_out + channel_out,
+                    );
+                }
+            }
+        }
+    }
+}
+
+/// Images [n, height, width, channels_in], as they are stored.
+#[derive(Clone, Copy)]
+pub(crate) enum Pixels<'a> {
+    /// Scaled by 1/255 when read.
+    Bytes(&'a [u8]),
+    Floats(&'a [f32]),
+}
+
+impl<'a> Pixels<'a> {
+    pub(crate) fn len(&self) -> usize {
+        match self {
+            Self::Bytes(bytes) => bytes.len(),
+            Self::Floats(floats) => floats.len(),
+        }
+    }
+
+    /// The scalars `range` of all images.
+    pub(crate) fn slice(&self, range: std::ops::Range<usize>) -> Self {
+        match self {
+            Self::Bytes(bytes) => Self::Bytes(&bytes[range]),
+            Self::Floats(floats) => Self::Floats(&floats[range]),
+        }
+    }
+
+    /// The images and `PADDING` as operands, and what products with them are multiplied by.
+    pub(crate) fn operands<U: Unit>(&self, unit: U) -> (Buffer<U::Element>, f32) {
+        let mut values = Buffer::new(self.len() + PADDING);
+        values[self.len()..].fill(U::Element::default());
+        let scale = unit.vectorize(|| match self {
+            Self::Bytes(bytes) => {
+                for (value, &byte) in values.iter_mut().zip(*bytes) {
+                    *value = U::Element::of_byte(byte);
+                }
+                U::Element::BYTE_SCALE
+            }
+            Self::Floats(floats) => {
+                for (value, &float) in values.iter_mut().zip(*floats) {
+                    *value = U::Element::of(float);
+                }
+                1.0
+            }
+        });
+        (values, scale)
+    }
+}
+
+/// Scalars after the last image: where a run is odd, the last step of the last window reads one further, times 0.
+pub(crate) const PADDING: usize = 1;
+
+/// Images [n, height, width, channels_in] and `PADDING`, as operands of products.
+#[derive(Clone, Copy)]
+pub(crate) struct Images<'a, E> {
+    pub(crate) values: &'a [E],
+    /// What a product with them is multiplied by.
+    pub(crate) scale: f32,
+}
+
+impl<'a, E> Images<'a, E> {
+    /// The maps of another layer.
+    pub(crate) const fn of_maps(values: &'a [E]) -> Self {
+        Self { values, scale: 1.0 }
+    }
+}
+
+/// One convolution with its parameters as the kernels want them.
+pub(crate) struct Convolution<E: Element> {
+    pub(crate) shape: ConvShape,
+    /// Of the product window x weight: every row of the kernel begins with a new step.
+    forward: Panels<E>,
+    /// Of the product gradient x weight, for each row of the kernel; there if images get a gradient.
+    backward: Vec<Panels<E>>,
+    bias: Vec<f32>,
+}
+
+impl<E: Element> Convolution<E> {
+    /// `weight` [out, in, k, k], `bias` [out]; `backward` says whether images will need a gradient.
+    pub(crate) fn new<U: Unit<Element = E>>(
+        unit: U,
+        shape: ConvShape,
+        weight: &[f32],
+        bias: &[f32],
+        backward: bool,
+    ) -> Self {
+        let (run, out) = (shape.run(), shape.channels_out);
+        let packed = shape.pack_weight(weight);
+        let padded_run = run.next_multiple_of(E::DEPTH);
+        let mut padded = vec![0.0; shape.kernel * padded_run * out];
+        let rows = padded.chunks_exact_mut(padded_run * out);
+        for (row, packed) in rows.zip(packed.chunks_exact(run * out)) {
+            row[..run * out].copy_from_slice(packed);
+        }
+        let matrix = Matrix::new(&padded, shape.kernel * padded_run, out);
+        let rows = packed.chunks_exact(run * out).filter(|_| backward);
+        let backward = rows.map(|row| {
+            let matrix = Matrix::new(row, run, out).transposed();
+            Panels::pack(unit, matrix, Threads::Caller)
+        });
+        Self {
+            shape,
+            forward: Panels::pack(unit, matrix, Threads::Caller),
+            backward: backward.collect(),
+            bias: bias.to_vec(),
+        }
+    }
+}
+
+/// maps = relu(conv(images, weight) + bias), handed to `write` row by row: the index of its first scalar in maps
+/// [count, out_height, out_width, out], and [out_width, out] scalars.
+pub(crate) fn forward<U: Unit>(
+    unit: U,
+    layer: &Convolution<U::Element>,
+    images: Images<'_, U::Element>,
+    count: usize,
+    mut write: impl FnMut(usize, &[f32]),
+) {
+    let shape = &layer.shape;
+    let (out_width, out) = (shape.out_width(), shape.channels_out);
+    let mut row = Buffer::new(out_width * out);
+    let left = Left {
+        values: images.values,
+        start: 0,
+        row_stride: shape.shift(),
+        step: U::Element::DEPTH,
+        steps: shape.run().div_ceil(U::Element::DEPTH),
+        run_stride: shape.line(),
+        runs: shape.kernel,
+    };
+    for index in 0..count * shape.out_height() {
+        let (image, y) = (index / shape.out_height(), index % shape.out_height());
+        let start = image * shape.image_len() + y * shape.stride * shape.line();
+        for (x, windows) in row_tiles::<U>(out_width, layer.forward.vecs()) {
+            let left = Left {
+                start: start + x * shape.shift(),
+                ..left
+            };
+            layer
+                .forward
+                .multiply(unit, windows, left, Mode::Replace, &mut row[x * out..]);
+        }
+        unit.vectorize(|| {
+            for location in row.chunks_exact_mut(out) {
+                for (value, bias) in location.iter_mut().zip(&layer.bias) {
+                    *value = relu_of(*value * images.scale + bias);
+                }
+            }
+            write(index * out_width * out, &row);
+        });
+    }
+}
+
+/// Gradients that `backward` adds to.
+pub(crate) struct ConvGradients<'a> {
+    /// [k, k, in, out]
+    pub(crate) packed: &'a mut [f32],
+    /// [out]
+    pub(crate) bias: &'a mut [f32],
+    /// [n, height, width, in], or None if the images need none.
+    pub(crate) images: Option<&'a mut [f32]>,
+}
+
+impl<'a> ConvGradients<'a> {
+    /// Those of `shape` at the end of all layers' `sums`, which are shortened by them.
+    pub(crate) fn cut<'s: 'a>(
+        sums: &mut &'s mut [f32],
+        shape: &ConvShape,
+        images: Option<&'a mut [f32]>,
+    ) -> Self {
+        let before = sums.len() - shape.parameters_len();
+        let (left, own) = std::mem::take(sums).split_at_mut(before);
+        *sums = left;
+        let (packed, bias) = own.split_at_mut(shape.weight_len());
+        Self {
+            packed,
+            bias,
+            images,
+        }
+    }
+}
+
+/// Adds the gradients of `forward` for `grad_maps` [n, out_h, out_w, out], whose entries count only where `maps` is above 0, as in
+/// PyTorch. The weight's is still to be multiplied by the images' scale.
+pub(crate) fn backward<U: Unit, M: Element>(
+    unit: U,
+    layer: &Convolution<U::Element>,
+    images: Images<'_, U::Element>,
+    maps: &[M],
+    grad_maps: &[f32],
+    mut grads: ConvGradients<'_>,
+) {
+    let shape = &layer.shape;
+    let mut masked = Masked::new::<U>(shape);
+    for (image, (maps, grad_maps)) in maps
+        .chunks_exact(shape.map_len())
+        .zip(grad_maps.chunks_exact(shape.map_len()))
+        .enumerate()
+    {
+        let pixels = image * shape.image_len()..(image + 1) * shape.image_len();
+        masked.mask(unit, maps, grad_maps, grads.bias);
+        masked.write_panels(unit, shape);
+        let values = &images.values[pixels.clone()];
+        weight_gradient(unit, shape, values, &masked.panels, grads.packed);
+        if let Some(grad_images) = &mut grads.images {
+            masked.write_rows(unit, shape.channels_out);
+            image_gradient(unit, layer, &masked.rows, &mut grad_images[pixels]);
+        }
+    }
+}
+
+/// One image's gradients where its maps are above 0, as the operands of two products.
+struct Masked<E: Element> {
+    /// [locations, out]
+    values: Buffer<f32>,
+    /// [locations, out rounded up to steps]: the left operand of the image's gradient.
+    rows: Buffer<E>,
+    /// Panels of [rows of maps * steps of windows, columns, DEPTH]: the right operand of the weight's gradient.
+    panels: Buffer<E>,
+}
+
+impl<E: Element> Masked<E> {
+    fn new<U: Unit<Element = E>>(shape: &ConvShape) -> Self {
+        let out = shape.channels_out;
+        let width = tile_vecs::<U>(out) * LANES;
+        Self {
+            values: Buffer::new(shape.map_len()),
+            rows: Buffer::new(shape.locations() * out.next_multiple_of(E::DEPTH)),
+            panels: Buffer::new(panel_len::<E>(shape, width) * out.div_ceil(width)),
+        }
+    }
+
+    /// Masks one image's gradients, and adds them to the bias's.
+    fn mask<U: Unit, M: Element>(
+        &mut self,
+        unit: U,
+        maps: &[M],
+        grad_maps: &[f32],
+        bias: &mut [f32],
+    ) {
+        let out = bias.len();
+        unit.vectorize(|| {
+            let locations = maps.chunks_exact(out).zip(grad_maps.chunks_exact(out));
+            for (masked, (maps, grads)) in self.values.chunks_exact_mut(out).zip(locations) {
+                for (((masked, bias), &map), &grad) in
+                    masked.iter_mut().zip(&mut *bias).zip(maps).zip(grads)
+                {
+                    *masked = relu_gradient(map.value(), grad);
+                    *bias += *masked;
+                }
+            }
+        });
+    }
+
+    fn write_rows<U: Unit>(&mut self, unit: U, out: usize) {
+        let rows = self.rows.chunks_exact_mut(out.next_multiple_of(E::DEPTH));
+        unit.vectorize(|| {
+            for (row, masked) in rows.zip(self.values.chunks_exact(out)) {
+                let (begin, end) = row.split_at_mut(out);
+                for (value, &masked) in begin.iter_mut().zip(masked) {
+                    *value = E::of(masked);
+                }
+                end.fill(E::default());
+            }
+        });
+    }
+
+    fn write_panels<U: Unit>(&mut self, unit: U, shape: &ConvShape) {
+        let (out, out_width) = (shape.channels_out, shape.out_width());
+        let width = tile_vecs::<U>(out) * LANES;
+        let panels = self.panels.chunks_exact_mut(panel_len::<E>(shape, width));
+        unit.vectorize(|| {
+            for (index, panel) in panels.enumerate() {
+                let cols = index * width..out.min((index + 1) * width);
+                let mut steps = panel.chunks_exact_mut(width * E::DEPTH);
+                for line in self.values.chunks_exact(out_width * out) {
+                    for windows in line.chunks(E::DEPTH * out) {
+                        let second = windows.get(out..).unwrap_or_default();
+                        let second = second.get(cols.clone()).unwrap_or_default();
+                        if let Some(step) = steps.next() {
+                            E::join(&windows[cols.clone()], second, step);
+                        }
+                    }
+                }
+            }
+        });
+    }
+}
+
+/// Scalars of a panel of masked gradients: the windows of an image, two in a step if steps are pairs, by `width` columns.
+fn panel_len<E: Element>(shape: &ConvShape, width: usize) -> usize {
+    let steps = shape.out_height() * shape.out_width().div_ceil(E::DEPTH);
+    steps * width * E::DEPTH
+}
+
+/// Adds one image's part of the weight's gradient: windows, transposed, times masked gradients.
+fn weight_gradient<U: Unit>(
+    unit: U,
+    shape: &ConvShape,
+    image: &[U::Element],
+    panels: &[U::Element],
+    packed: &mut [f32],
+) {
+    let (depth, out) = (U::Element::DEPTH, shape.channels_out);
+    let vecs = tile_vecs::<U>(out);
+    let width = vecs * LANES;
+    let pairs = (depth == 2).then(|| {
+        let mut pairs = Buffer::new(image.len() * 2);
+        unit.vectorize(|| pair_neighbours(image, shape.shift(), &mut pairs));
+        pairs
+    });
+    let values = pairs.as_deref().unwrap_or(image);
+    let steps = shape.out_width().div_ceil(depth);
+    for kernel_y in 0..shape.kernel {
+        let rows = &mut packed[kernel_y * shape.run() * out..][..shape.run() * out];
+        for (first, count) in row_tiles::<U>(shape.run(), vecs) {
+            let left = Left {
+                values,
+                start: (kernel_y * shape.line() + first) * depth,
+                row_stride: depth,
+                step: depth * depth * shape.shift(),
+                steps,
+                run_stride: shape.stride * shape.line() * depth,
+                runs: shape.out_height(),
+            };
+            let panels = panels.chunks_exact(panel_len::<U::Element>(shape, width));
+            for (index, panel) in panels.enumerate() {
+                let col = index * width;
+                let columns = Columns {
+                    out: &mut rows[first * out + col..],
+                    stride: out,
+                    cols: width.min(out - col),
+                    vecs,
+                    mode: Mode::Add,
+                };
+                multiply_tile(unit, count, left, panel, columns);
+            }
+        }
+    }
+}
+
+/// Pairs every scalar with the one `shift` further, or with 0 where the image ends before.
+#[inline(always)]
+fn pair_neighbours<E: Element>(values: &[E], shift: usize, pairs: &mut [E]) {
+    let later = values.get(shift..).unwrap_or_default();
+    let (both, one) = pairs.split_at_mut(later.len() * 2);
+    let (begin, end) = values.split_at(later.len());
+    for ((pair, &value), &later) in both.chunks_exact_mut(2).zip(begin).zip(later) {
+        (pair[0], pair[1]) = (value, later);
+    }
+    for (pair, &value) in one.chunks_exact_mut(2).zip(end) {
+        (pair[0], pair[1]) = (value, E::default());
+    }
+}
+
+/// Adds the gradient of one image: masked gradients times the weight, each to the window it belongs to.
+fn image_gradient<U: Unit>(
+    unit: U,
+    layer: &Convolution<U::Element>,
+    grad_rows: &[U::Element],
+    image: &mut [f32],
+) {
+    let shape = &layer.shape;
+    let stride = shape.channels_out.next_multiple_of(U::Element::DEPTH);
+    let left = Left {
+        values: grad_rows,
+        start: 0,
+        row_stride: stride,
+        step: U::Element::DEPTH,
+        steps: stride / U::Element::DEPTH,
+        run_stride: 0,
+        runs: 1,
+    };
+    for y in 0..shape.out_height() {
+        for (kernel_y, panels) in layer.backward.iter().enumerate() {
+            let line = (y * shape.stride + kernel_y) * shape.line();
+            for (x, windows) in row_tiles::<U>(shape.out_width(), panels.vecs()) {
+                let left = Left {
+                    start: (y * shape.out_width() + x) * stride,
+                    ..left
+                };
+                let out = &mut image[line + x * shape.shift()..];
+                panels.multiply_apart(unit, windows, left, Mode::Add, out, shape.shift());
+            }
+        }
+    }
+}

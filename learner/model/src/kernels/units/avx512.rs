@@ -1,0 +1,218 @@
+//! AVX-512: 16 f32 products an instruction, or with AVX512_BF16 32 bf16 products summed in pairs.
+#![allow(unsafe_code, reason = "instructions of one kind of processor")]
+#![cfg(target_arch = "x86_64")]
+
+use std::arch::x86_64::{
+    __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_dpbf16_ps, _mm512_fmadd_ps, _mm512_loadu_ps,
+    _mm512_loadu_si512, _mm512_mask_storeu_ps, _mm512_maskz_loadu_ps, _mm512_set1_epi32,
+    _mm512_set1_ps, _mm512_setzero_ps,
+};
+use std::mem::transmute;
+
+use half::bf16;
+
+use super::{
+    LANES, Unit,
+    tile::{RawTile, Vector, compute_sizes},
+};
+
+/// Whether this processor, and the operating system, have AVX-512 as server processors do.
+pub(super) fn available() -> bool {
+    is_x86_feature_detected!("avx512f")
+        && is_x86_feature_detected!("avx512bw")
+        && is_x86_feature_detected!("avx512dq")
+        && is_x86_feature_detected!("avx512vl")
+        && is_x86_feature_detected!("fma")
+}
+
+/// Whether it has AVX512_BF16 too.
+pub(super) fn bf16_available() -> bool {
+    is_x86_feature_detected!("avx512bf16")
+}
+
+/// f32 operands.
+#[derive(Clone, Copy)]
+pub(super) struct Single(());
+
+/// bf16 operands in pairs.
+#[derive(Clone, Copy)]
+pub(super) struct Brain(());
+
+impl Single {
+    /// # Panics
+    /// If the processor lacks it.
+    pub(super) fn here() -> Self {
+        assert!(available(), "no AVX-512");
+        Self(())
+    }
+}
+
+impl Brain {
+    /// # Panics
+    /// If the processor lacks it.
+    pub(super) fn here() -> Self {
+        assert!(available() && bf16_available(), "no AVX512_BF16");
+        Self(())
+    }
+}
+
+/// Rows of a tile: with its columns and one row they fill the 32 registers.
+const fn rows_max(vecs: usize) -> usize {
+    if vecs > 2 { 6 } else { 8 }
+}
+
+macro_rules! sizes {
+    ($tile:expr, $rows:expr, $vecs:expr) => {
+        compute_sizes!(Self, $tile, $rows, $vecs;
+            1: 1 2 3 4 5 6 7 8;
+            2: 1 2 3 4 5 6 7 8;
+            4: 1 2 3 4 5 6;
+        )
+    };
+}
+
+impl Unit for Single {
+    type Element = f32;
+    const VECS_MAX: usize = 4;
+
+    fn rows_max(vecs: usize) -> usize {
+        rows_max(vecs)
+    }
+
+    unsafe fn compute(self, tile: &RawTile<f32>, rows: usize, vecs: usize) {
+        // SAFETY: `here` found the instructions; the rest is the caller's.
+        unsafe { Self::compute_sized(tile, rows, vecs) }
+    }
+
+    #[inline(always)]
+    fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
+        // SAFETY: `here` found the instructions.
+        unsafe { vectorized(work) }
+    }
+}
+
+impl Single {
+    #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,fma")]
+    unsafe fn compute_sized(tile: &RawTile<f32>, rows: usize, vecs: usize) {
+        sizes!(tile, rows, vecs);
+    }
+}
+
+impl Unit for Brain {
+    type Element = bf16;
+    const VECS_MAX: usize = 4;
+
+    fn rows_max(vecs: usize) -> usize {
+        rows_max(vecs)
+    }
+
+    unsafe fn compute(self, tile: &RawTile<bf16>, rows: usize, vecs: usize) {
+        // SAFETY: `here` found the instructions; the rest is the caller's.
+        unsafe { Self::compute_sized(tile, rows, vecs) }
+    }
+
+    #[inline(always)]
+    fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
+        // SAFETY: `here` found the instructions.
+        unsafe { vectorized(work) }
+    }
+}
+
+impl Brain {
+    #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
+    unsafe fn compute_sized(tile: &RawTile<bf16>, rows: usize, vecs: usize) {
+        sizes!(tile, rows, vecs);
+    }
+}
+
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,fma")]
+unsafe fn vectorized<R>(work: impl FnOnce() -> R) -> R {
+    work()
+}
+
+/// Writes the first `count` of 16 sums.
+#[inline(always)]
+unsafe fn write(sums: __m512, at: *mut f32, count: usize, add: bool) {
+    debug_assert!(count <= LANES);
+    let mask = ((1u32 << count) - 1) as u16;
+    // SAFETY: the lanes that the mask leaves out are neither read nor written; the caller answers for the others.
+    unsafe {
+        let sums = if add {
+            _mm512_add_ps(_mm512_maskz_loadu_ps(mask, at), sums)
+        } else {
+            sums
+        };
+        _mm512_mask_storeu_ps(at, mask, sums);
+    }
+}
+
+// SAFETY of both: loads and stores are of the addresses that the caller vouches for; none of them asks for alignment.
+
+impl Vector for Single {
+    type Element = f32;
+    type Sums = __m512;
+    type Operand = __m512;
+
+    #[inline(always)]
+    unsafe fn zero() -> __m512 {
+        unsafe { _mm512_setzero_ps() }
+    }
+
+    #[inline(always)]
+    unsafe fn row(at: *const f32) -> __m512 {
+        unsafe { _mm512_set1_ps(*at) }
+    }
+
+    #[inline(always)]
+    unsafe fn columns(at: *const f32) -> __m512 {
+        unsafe { _mm512_loadu_ps(at) }
+    }
+
+    #[inline(always)]
+    unsafe fn mul_add(sums: __m512, row: __m512, columns: __m512) -> __m512 {
+        unsafe { _mm512_fmadd_ps(row, columns, sums) }
+    }
+
+    #[inline(always)]
+    unsafe fn write(sums: __m512, at: *mut f32, count: usize, add: bool) {
+        unsafe { write(sums, at, count, add) }
+    }
+}
+
+impl Vector for Brain {
+    type Element = bf16;
+    type Sums = __m512;
+    type Operand = __m512i;
+
+    #[inline(always)]
+    unsafe fn zero() -> __m512 {
+        unsafe { _mm512_setzero_ps() }
+    }
+
+    #[inline(always)]
+    unsafe fn row(at: *const bf16) -> __m512i {
+        unsafe { _mm512_set1_epi32(at.cast::<i32>().read_unaligned()) }
+    }
+
+    #[inline(always)]
+    unsafe fn columns(at: *const bf16) -> __m512i {
+        unsafe { _mm512_loadu_si512(at.cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn mul_add(sums: __m512, row: __m512i, columns: __m512i) -> __m512 {
+        // SAFETY: two names of one register of 32 bf16.
+        unsafe {
+            _mm512_dpbf16_ps(
+                sums,
+                transmute::<__m512i, __m512bh>(row),
+                transmute::<__m512i, __m512bh>(columns),
+            )
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn write(sums: __m512, at: *mut f32, count: usize, add: bool) {
+        unsafe { write(sums, at, count, add) }
+    }
+}

@@ -1,0 +1,243 @@
+//! What a processor multiplies with: the instruction sets that products can run on, and the choice among them at run time.
+//! It knows neither matrices nor layers: a unit computes one tile, a few rows by a few columns, in registers.
+
+mod avx2;
+mod avx512;
+mod element;
+mod plain;
+mod tile;
+
+pub(crate) use element::Element;
+pub(crate) use tile::{Columns, Left, Mode, multiply_tile, row_tiles, tile_vecs};
+
+use crate::kernels::precision::Precision;
+use tile::RawTile;
+
+/// Columns of one register, on every unit.
+pub(crate) const LANES: usize = 16;
+
+/// An instruction set, with the type that its operands are stored as. Sums are f32.
+///
+/// A value of a unit exists only where the processor has its instructions: [`with_unit`] looks before it makes one.
+pub(crate) trait Unit: Copy + Send + Sync + 'static {
+    /// What operands are stored as.
+    type Element: Element;
+
+    /// Most registers of columns in a tile.
+    const VECS_MAX: usize;
+
+    /// Most rows of a tile that is `vecs` registers wide.
+    fn rows_max(vecs: usize) -> usize;
+
+    /// Computes a tile of `rows` by `vecs` registers.
+    ///
+    /// # Safety
+    /// All that `tile` points to is as [`RawTile`] says; `rows` and `vecs` are within the limits above.
+    #[allow(unsafe_code, reason = "implemented with the unit's instructions")]
+    unsafe fn compute(self, tile: &RawTile<Self::Element>, rows: usize, vecs: usize);
+
+    /// Runs `work` compiled for the unit's instructions, so that its loops use its registers.
+    fn vectorize<R>(self, work: impl FnOnce() -> R) -> R;
+}
+
+/// Work that any unit can do.
+pub(crate) trait ForUnit {
+    /// What it gives.
+    type Output;
+
+    /// Does it on `unit`.
+    fn run<U: Unit>(self, unit: U) -> Self::Output;
+}
+
+/// Instructions that units are made of, the best first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Instructions {
+    Plain,
+    Avx2,
+    Avx512,
+    Avx512Bf16,
+}
+
+/// What this processor has.
+fn instructions() -> Instructions {
+    #[cfg(target_arch = "x86_64")]
+    {
+        if avx512::available() {
+            return if avx512::bf16_available() {
+                Instructions::Avx512Bf16
+            } else {
+                Instructions::Avx512
+            };
+        }
+        if avx2::available() {
+            return Instructions::Avx2;
+        }
+    }
+    Instructions::Plain
+}
+
+/// Does `work` on the fastest unit that this processor has for `precision`.
+pub(crate) fn with_unit<F: ForUnit>(precision: Precision, work: F) -> F::Output {
+    with_unit_of(instructions(), precision, work)
+}
+
+#[cfg(target_arch = "x86_64")]
+fn with_unit_of<F: ForUnit>(best: Instructions, precision: Precision, work: F) -> F::Output {
+    use Instructions::{Avx2, Avx512, Avx512Bf16, Plain};
+    match (precision, best) {
+        (Precision::F32, Avx512 | Avx512Bf16) => work.run(avx512::Single::here()),
+        (Precision::F32, Avx2) => work.run(avx2::Single::here()),
+        (Precision::F32, Plain) => work.run(plain::Single),
+        (Precision::Bf16, Avx512Bf16) => work.run(avx512::Brain::here()),
+        (Precision::Bf16, Avx2 | Avx512) => work.run(avx2::Rounded::here()),
+        (Precision::Bf16, Plain) => work.run(plain::Rounded),
+    }
+}
+
+#[cfg(not(target_arch = "x86_64"))]
+fn with_unit_of<F: ForUnit>(_: Instructions, precision: Precision, work: F) -> F::Output {
+    match precision {
+        Precision::F32 => work.run(plain::Single),
+        Precision::Bf16 => work.run(plain::Rounded),
+    }
+}
+
+/// What products of this precision run on here, in words: for `driml doctor` and the head of a table of figures.
+pub fn kernels_in_words(precision: Precision) -> &'static str {
+    match (precision, instructions()) {
+        (Precision::F32, Instructions::Avx512 | Instructions::Avx512Bf16) => "AVX-512, f32",
+        (Precision::F32, Instructions::Avx2) => "AVX2, f32",
+        (Precision::F32, Instructions::Plain) => "portable code, f32",
+        (Precision::Bf16, Instructions::Avx512Bf16) => "AVX512_BF16: bf16 products, f32 sums",
+        (Precision::Bf16, Instructions::Avx2 | Instructions::Avx512) => {
+            "AVX2 on operands rounded to bf16: no faster than f32"
+        }
+        (Precision::Bf16, Instructions::Plain) => {
+            "portable code on operands rounded to bf16: no faster than f32"
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Product<'a> {
+        rows: usize,
+        vecs: usize,
+        cols: usize,
+        mode: Mode,
+        left: &'a [f32],
+        right: &'a [f32],
+        steps: usize,
+    }
+
+    impl ForUnit for Product<'_> {
+        type Output = Option<Vec<f32>>;
+
+        /// [rows, cols] of ones plus, or else, the product; `None` if the unit has no such tile.
+        fn run<U: Unit>(self, unit: U) -> Option<Vec<f32>> {
+            if self.vecs > U::VECS_MAX || self.rows > U::rows_max(self.vecs) {
+                return None;
+            }
+            let depth = U::Element::DEPTH;
+            let (k, width) = (self.steps * depth, self.vecs * LANES);
+            // Two runs of steps, each row `k` wide, rows and runs in one piece.
+            let left: Vec<_> = (0..self.rows * 2 * k)
+                .map(|at| U::Element::of(self.left[at % self.left.len()]))
+                .collect();
+            let mut panel = vec![U::Element::default(); 2 * k * width];
+            for (at, value) in panel.iter_mut().enumerate() {
+                *value = U::Element::of(self.right[at % self.right.len()]);
+            }
+            let mut out = vec![1.0; self.rows * (self.cols + 3)];
+            multiply_tile(
+                unit,
+                self.rows,
+                Left {
+                    values: &left,
+                    start: 0,
+                    row_stride: 2 * k,
+                    step: depth,
+                    steps: self.steps,
+                    run_stride: k,
+                    runs: 2,
+                },
+                &panel,
+                Columns {
+                    out: &mut out,
+                    stride: self.cols + 3,
+                    cols: self.cols,
+                    vecs: self.vecs,
+                    mode: self.mode,
+                },
+            );
+            for row in 0..self.rows {
+                for col in 0..self.cols + 3 {
+                    let got = out[row * (self.cols + 3) + col];
+                    let wanted = if col < self.cols {
+                        let start = if self.mode == Mode::Add { 1.0 } else { 0.0 };
+                        (0..2 * k).fold(start, |sum, k_at| {
+                            let (step, part) = (k_at / depth, k_at % depth);
+                            let right = panel[(step * width + col) * depth + part].value();
+                            sum + f64::from(left[row * 2 * k + k_at].value()) * f64::from(right)
+                        })
+                    } else {
+                        1.0
+                    };
+                    assert!(
+                        (f64::from(got) - wanted).abs() <= 1e-5 * (1.0 + wanted.abs()),
+                        "row {row}, column {col}: {got}, wanted {wanted}"
+                    );
+                }
+            }
+            Some(out)
+        }
+    }
+
+    #[test]
+    fn every_unit_computes_every_size_of_tile() {
+        let left: Vec<f32> = (0..97).map(|i| (i * 37 % 41) as f32 / 8.0 - 2.5).collect();
+        let right: Vec<f32> = (0..89).map(|i| (i * 29 % 31) as f32 / 8.0 - 1.9).collect();
+        let all = [
+            Instructions::Plain,
+            Instructions::Avx2,
+            Instructions::Avx512,
+            Instructions::Avx512Bf16,
+        ];
+        let mut tried = 0;
+        for best in all.into_iter().filter(|&best| best <= instructions()) {
+            for precision in [Precision::F32, Precision::Bf16] {
+                for (vecs, rows) in [1, 2, 4]
+                    .into_iter()
+                    .flat_map(|vecs| (1..=8).map(move |rows| (vecs, rows)))
+                {
+                    for (cols, mode, steps) in [
+                        (vecs * LANES, Mode::Replace, 5),
+                        (vecs * LANES - 5, Mode::Add, 1),
+                        ((vecs - 1) * LANES + 1, Mode::Add, 3),
+                    ] {
+                        let product = Product {
+                            rows,
+                            vecs,
+                            cols,
+                            mode,
+                            left: &left,
+                            right: &right,
+                            steps,
+                        };
+                        tried += usize::from(with_unit_of(best, precision, product).is_some());
+                    }
+                }
+            }
+        }
+        assert!(tried >= 2 * 3 * 4, "{tried} tiles");
+    }
+
+    #[test]
+    fn the_kernels_of_this_processor_have_names() {
+        for precision in [Precision::F32, Precision::Bf16] {
+            assert!(!kernels_in_words(precision).is_empty());
+        }
+    }
+}

@@ -1,0 +1,90 @@
+//! Portable code for processors without a unit of their own, which the compiler vectorises as far as it can.
+
+use half::bf16;
+
+use super::{
+    Element, LANES, Unit,
+    tile::{RawTile, Vector, compute_sizes},
+};
+
+/// f32 operands.
+#[derive(Clone, Copy)]
+pub(super) struct Single;
+
+/// bf16 operands in pairs, multiplied as f32.
+#[derive(Clone, Copy)]
+pub(super) struct Rounded;
+
+macro_rules! unit {
+    ($unit:ident, $element:ty) => {
+        #[allow(unsafe_code, reason = "units work on pointers")]
+        impl Unit for $unit {
+            type Element = $element;
+            const VECS_MAX: usize = 1;
+
+            fn rows_max(_: usize) -> usize {
+                4
+            }
+
+            unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
+                // SAFETY: it takes no special instruction; the rest is the caller's.
+                compute_sizes!(Self, tile, rows, vecs; 1: 1 2 3 4;);
+            }
+
+            #[inline(always)]
+            fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
+                work()
+            }
+        }
+
+        // SAFETY: reads and writes are of the addresses that the caller vouches for.
+        #[allow(unsafe_code, reason = "units work on pointers")]
+        impl Vector for $unit {
+            type Element = $element;
+            type Sums = [f32; LANES];
+            type Operand = [[$element; <$element>::DEPTH]; LANES];
+
+            #[inline(always)]
+            unsafe fn zero() -> Self::Sums {
+                [0.0; LANES]
+            }
+
+            #[inline(always)]
+            unsafe fn row(at: *const $element) -> Self::Operand {
+                unsafe { [at.cast::<[$element; <$element>::DEPTH]>().read_unaligned(); LANES] }
+            }
+
+            #[inline(always)]
+            unsafe fn columns(at: *const $element) -> Self::Operand {
+                unsafe { at.cast::<Self::Operand>().read_unaligned() }
+            }
+
+            #[inline(always)]
+            unsafe fn mul_add(
+                mut sums: Self::Sums,
+                row: Self::Operand,
+                columns: Self::Operand,
+            ) -> Self::Sums {
+                for ((sum, row), columns) in sums.iter_mut().zip(row).zip(columns) {
+                    for (row, column) in row.into_iter().zip(columns) {
+                        *sum += row.value() * column.value();
+                    }
+                }
+                sums
+            }
+
+            #[inline(always)]
+            unsafe fn write(sums: Self::Sums, at: *mut f32, count: usize, add: bool) {
+                for (index, sum) in sums.into_iter().take(count).enumerate() {
+                    unsafe {
+                        let at = at.add(index);
+                        *at = if add { *at + sum } else { sum };
+                    }
+                }
+            }
+        }
+    };
+}
+
+unit!(Single, f32);
+unit!(Rounded, bf16);
