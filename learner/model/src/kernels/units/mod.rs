@@ -1,6 +1,7 @@
 //! What a processor multiplies with: the instruction sets that products can run on, and the choice among them at run time.
 //! It knows neither matrices nor layers: a unit computes one tile, a few rows by a few columns, in registers.
 
+mod amx;
 mod avx2;
 mod avx512;
 mod element;
@@ -56,6 +57,7 @@ enum Instructions {
     Avx2,
     Avx512,
     Avx512Bf16,
+    Amx,
 }
 
 /// What this processor has.
@@ -63,6 +65,9 @@ fn instructions() -> Instructions {
     #[cfg(target_arch = "x86_64")]
     {
         if avx512::available() {
+            if amx::available() {
+                return Instructions::Amx;
+            }
             return if avx512::bf16_available() {
                 Instructions::Avx512Bf16
             } else {
@@ -83,11 +88,12 @@ pub(crate) fn with_unit<F: ForUnit>(precision: Precision, work: F) -> F::Output 
 
 #[cfg(target_arch = "x86_64")]
 fn with_unit_of<F: ForUnit>(best: Instructions, precision: Precision, work: F) -> F::Output {
-    use Instructions::{Avx2, Avx512, Avx512Bf16, Plain};
+    use Instructions::{Amx, Avx2, Avx512, Avx512Bf16, Plain};
     match (precision, best) {
-        (Precision::F32, Avx512 | Avx512Bf16) => work.run(avx512::Single::here()),
+        (Precision::F32, Avx512 | Avx512Bf16 | Amx) => work.run(avx512::Single::here()),
         (Precision::F32, Avx2) => work.run(avx2::Single::here()),
         (Precision::F32, Plain) => work.run(plain::Single),
+        (Precision::Bf16, Amx) => work.run(amx::Amx::here()),
         (Precision::Bf16, Avx512Bf16) => work.run(avx512::Brain::here()),
         (Precision::Bf16, Avx2 | Avx512) => work.run(avx2::Rounded::here()),
         (Precision::Bf16, Plain) => work.run(plain::Rounded),
@@ -105,9 +111,12 @@ fn with_unit_of<F: ForUnit>(_: Instructions, precision: Precision, work: F) -> F
 /// What products of this precision run on here, in words: for `driml doctor` and the head of a table of figures.
 pub fn kernels_in_words(precision: Precision) -> &'static str {
     match (precision, instructions()) {
-        (Precision::F32, Instructions::Avx512 | Instructions::Avx512Bf16) => "AVX-512, f32",
+        (Precision::F32, Instructions::Avx512 | Instructions::Avx512Bf16 | Instructions::Amx) => {
+            "AVX-512, f32"
+        }
         (Precision::F32, Instructions::Avx2) => "AVX2, f32",
         (Precision::F32, Instructions::Plain) => "portable code, f32",
+        (Precision::Bf16, Instructions::Amx) => "AMX: bf16 products, f32 sums",
         (Precision::Bf16, Instructions::Avx512Bf16) => "AVX512_BF16: bf16 products, f32 sums",
         (Precision::Bf16, Instructions::Avx2 | Instructions::Avx512) => {
             "AVX2 on operands rounded to bf16: no faster than f32"
@@ -130,6 +139,8 @@ mod tests {
         left: &'a [f32],
         right: &'a [f32],
         steps: usize,
+        /// Whether a row's steps lie apart, and the rows side by side.
+        rows_inside: bool,
     }
 
     impl ForUnit for Product<'_> {
@@ -142,7 +153,12 @@ mod tests {
             }
             let depth = U::Element::DEPTH;
             let (k, width) = (self.steps * depth, self.vecs * LANES);
-            // Two runs of steps, each row `k` wide, rows and runs in one piece.
+            // Two runs of `k` terms a row, all in one piece.
+            let (row_stride, step, run_stride) = if self.rows_inside {
+                (depth, depth * self.rows, self.rows * k)
+            } else {
+                (2 * k, depth, k)
+            };
             let left: Vec<_> = (0..self.rows * 2 * k)
                 .map(|at| U::Element::of(self.left[at % self.left.len()]))
                 .collect();
@@ -157,10 +173,10 @@ mod tests {
                 Left {
                     values: &left,
                     start: 0,
-                    row_stride: 2 * k,
-                    step: depth,
+                    row_stride,
+                    step,
                     steps: self.steps,
-                    run_stride: k,
+                    run_stride,
                     runs: 2,
                 },
                 &panel,
@@ -178,9 +194,13 @@ mod tests {
                     let wanted = if col < self.cols {
                         let start = if self.mode == Mode::Add { 1.0 } else { 0.0 };
                         (0..2 * k).fold(start, |sum, k_at| {
-                            let (step, part) = (k_at / depth, k_at % depth);
-                            let right = panel[(step * width + col) * depth + part].value();
-                            sum + f64::from(left[row * 2 * k + k_at].value()) * f64::from(right)
+                            let (at_step, part) = (k_at / depth, k_at % depth);
+                            let right = panel[(at_step * width + col) * depth + part].value();
+                            let left_at = row * row_stride
+                                + at_step / self.steps * run_stride
+                                + at_step % self.steps * step
+                                + part;
+                            sum + f64::from(left[left_at].value()) * f64::from(right)
                         })
                     } else {
                         1.0
@@ -204,31 +224,38 @@ mod tests {
             Instructions::Avx2,
             Instructions::Avx512,
             Instructions::Avx512Bf16,
+            Instructions::Amx,
         ];
         let mut tried = 0;
-        for best in all.into_iter().filter(|&best| best <= instructions()) {
-            for precision in [Precision::F32, Precision::Bf16] {
-                for (vecs, rows) in [1, 2, 4]
-                    .into_iter()
-                    .flat_map(|vecs| (1..=8).map(move |rows| (vecs, rows)))
-                {
-                    for (cols, mode, steps) in [
-                        (vecs * LANES, Mode::Replace, 5),
-                        (vecs * LANES - 5, Mode::Add, 1),
-                        ((vecs - 1) * LANES + 1, Mode::Add, 3),
-                    ] {
-                        let product = Product {
-                            rows,
-                            vecs,
-                            cols,
-                            mode,
-                            left: &left,
-                            right: &right,
-                            steps,
-                        };
-                        tried += usize::from(with_unit_of(best, precision, product).is_some());
+        let sizes = [1, 2, 4].into_iter().flat_map(|vecs| {
+            (1..=8)
+                .chain([16, 17, 40, 64])
+                .map(move |rows| (vecs, rows))
+        });
+        for ((vecs, rows), rows_inside) in sizes.flat_map(|size| [(size, false), (size, true)]) {
+            for (cols, mode, steps) in [
+                (vecs * LANES, Mode::Replace, 5),
+                (vecs * LANES - 5, Mode::Add, 1),
+                ((vecs - 1) * LANES + 1, Mode::Add, 16),
+                (vecs * LANES, Mode::Replace, 35),
+            ] {
+                let product = || Product {
+                    rows,
+                    vecs,
+                    cols,
+                    mode,
+                    left: &left,
+                    right: &right,
+                    steps,
+                    rows_inside,
+                };
+                for best in all.into_iter().filter(|&best| best <= instructions()) {
+                    for precision in Precision::ALL {
+                        tried += usize::from(with_unit_of(best, precision, product()).is_some());
                     }
                 }
+                #[cfg(target_arch = "x86_64")]
+                assert!(product().run(amx::emulated::EmulatedAmx).is_some());
             }
         }
         assert!(tried >= 2 * 3 * 4, "{tried} tiles");
