@@ -348,7 +348,18 @@ impl Agent {
         } else {
             self.target_network.q_values(&target_logits)?
         };
-        let next_greedy: Vec<u8> = flat(&next_q_values)?
+        let next_q_values = flat(&next_q_values)?;
+        if !next_q_values.iter().all(|q| q.is_finite()) {
+            let network = if self.settings.double_dqn {
+                "online"
+            } else {
+                "target"
+            };
+            return Err(UpdateError::NonFinite {
+                what: format!("the {network} network's value of an s_{{t+n}}"),
+            });
+        }
+        let next_greedy: Vec<u8> = next_q_values
             .chunks_exact(num_actions)
             .map(greedy)
             .collect();

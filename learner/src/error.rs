@@ -24,12 +24,14 @@ pub enum UpdateError {
     },
     /// The step itself left the finite numbers: this learner cannot go on, nor be published or saved.
     #[error(
-        "the update took {name} beyond the finite numbers; the learner cannot go on from here: go on from the newest checkpoint with \
+        "update {update} took {name} beyond the finite numbers; the learner cannot go on from here: go on from the newest checkpoint with \
          a learner.update.adam.lr below {lr:e}"
     )]
     Diverged {
         /// The first parameter in which it showed.
         name: String,
+        /// Number of the update, counted from 1.
+        update: u64,
         /// The learning rate of that step.
         lr: f64,
     },

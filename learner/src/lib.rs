@@ -53,11 +53,14 @@ pub mod auxiliary;
 mod batch;
 pub mod checkpoint;
 mod config;
+#[cfg(test)]
+mod edges;
 mod error;
 mod learner;
 pub mod losses;
 pub mod optimiser;
 pub mod parity;
+mod ranges;
 pub mod remote;
 mod settings;
 mod tensors;

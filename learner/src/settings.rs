@@ -1,6 +1,8 @@
 //! Everything that one update depends on beside the network's sizes: the table `[learner.update]`.
 //! It fills in no number: presets do, with their sources.
 
+use std::ops::RangeInclusive;
+
 use driml_model::DimHeads;
 use serde::{Deserialize, Deserializer, Serialize, de::Error};
 
@@ -12,7 +14,14 @@ use crate::{
     },
     error::UpdateError,
     optimiser::adam::AdamSettings,
+    ranges::{TAU, check_range},
 };
+
+/// Bounds of the soft clip at which f32, in which other devices than the CPU clip, holds both a score and its share of the bound.
+const TANH_CLIP: RangeInclusive<f64> = 1e-30..=1e30;
+/// Below it what clipping adds to a norm against a division by 0 is no longer small; above it the square of a gradient that is
+/// within it comes near to the largest f32.
+const MAX_GRAD_NORM: RangeInclusive<f64> = 1e-6..=1e15;
 
 /// Everything that one update depends on beside the network's sizes. No field has a default.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -25,15 +34,16 @@ pub struct LearnerSettings {
     pub condition_on_action: bool,
     /// Weights of the auxiliary losses, by pair of levels; all 0 for an agent without any.
     pub lambda: Lambda,
-    /// Bound c of the auxiliary scores' soft clip `c * tanh(x / c)`, above 0.
+    /// Bound c of the auxiliary scores' soft clip `c * tanh(x / c)`, from 1e-30 to 1e30; the largest clips nothing.
     pub tanh_clip: f64,
-    /// Global 2-norm to which gradients are clipped, above 0.
+    /// Global 2-norm to which gradients are clipped, from 1e-6 to 1e15; the largest clips nothing that Adam can square.
     pub max_grad_norm: f64,
     /// The optimiser's numbers.
     pub adam: AdamSettings,
     /// Updates from one move of the target network to the next, at least 1.
     pub target_period_updates: u64,
-    /// Share of the online network in a move of the target network, in (0, 1].
+    /// Share of the online network in a move of the target network, from 1e-5 to 1. Parameters are f32, and a target stands
+    /// still within a relative 6e-8 / tau of the online network: 6e-4 at 1e-4, and 6e-3 at the least.
     pub target_tau: f64,
     /// The objective's own numbers, a table of its name such as `[learner.update.curl]`; none for an objective that has none.
     #[serde(flatten, deserialize_with = "own_tables")]
@@ -56,24 +66,11 @@ impl LearnerSettings {
     /// # Errors
     /// The first setting out of its range, with its value.
     pub fn validate(&self) -> Result<(), UpdateError> {
-        let above_0 = |x: f64| x > 0.0 && x.is_finite();
-        for (name, value, fine) in [
-            ("tanh_clip", self.tanh_clip, above_0(self.tanh_clip)),
-            (
-                "max_grad_norm",
-                self.max_grad_norm,
-                above_0(self.max_grad_norm),
-            ),
-            (
-                "target_tau",
-                self.target_tau,
-                above_0(self.target_tau) && self.target_tau <= 1.0,
-            ),
-            ("target_period_updates", 0.0, self.target_period_updates > 0),
-        ] {
-            if !fine {
-                return Err(UpdateError::Settings(format!("{name} = {value}")));
-            }
+        check_range("tanh_clip", self.tanh_clip, TANH_CLIP)?;
+        check_range("max_grad_norm", self.max_grad_norm, MAX_GRAD_NORM)?;
+        check_range("target_tau", self.target_tau, TAU)?;
+        if self.target_period_updates == 0 {
+            return Err(UpdateError::Settings("target_period_updates = 0".into()));
         }
         self.lambda.validate()?;
         self.auxiliary()?;

@@ -43,6 +43,9 @@ pub(super) fn log(low: f64, high: f64) -> Vec<f64> {
     among(&[1.0, 1.5, 2.0, 3.0, 5.0, 7.0])
 }
 
+/// Numbers on an axis whose largest is in here are written out; those of others as powers of ten.
+const WRITTEN_OUT: std::ops::Range<f64> = 1e-4..1e10;
+
 /// The numbers as labels of one axis: the same decimals for all, thousands and millions as k and M.
 pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
     let largest = ticks.iter().map(|tick| tick.abs()).fold(0.0, f64::max);
@@ -80,7 +83,9 @@ pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
             if *tick == 0.0 {
                 return "0".to_owned();
             }
-            let text = if wide {
+            let text = if !WRITTEN_OUT.contains(&largest) && !wide {
+                power_of_ten(*tick)
+            } else if wide {
                 plain(*tick)
             } else {
                 format!("{value:.decimals$}{unit}")
@@ -93,16 +98,26 @@ pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
 /// One number on its own, in as few characters as it needs.
 fn plain(value: f64) -> String {
     let size = value.abs();
-    if size >= 1e6 {
+    if !WRITTEN_OUT.contains(&size) {
+        power_of_ten(value)
+    } else if size >= 1e6 {
         format!("{}M", value / 1e6)
     } else if size >= 1e4 {
         format!("{}k", value / 1e3)
-    } else if size >= 1e-4 {
+    } else {
         let text = format!("{value:.6}");
         text.trim_end_matches('0').trim_end_matches('.').to_owned()
-    } else {
-        format!("{value:e}")
     }
+}
+
+/// A number as a few digits and a power of ten; more digits would be the rounding of a multiple of the step.
+fn power_of_ten(value: f64) -> String {
+    let text = format!("{value:.6e}");
+    let (digits, power) = text.split_once('e').unwrap_or((&text, "0"));
+    format!(
+        "{}e{power}",
+        digits.trim_end_matches('0').trim_end_matches('.')
+    )
 }
 
 #[cfg(test)]
@@ -130,5 +145,35 @@ mod tests {
         );
         assert_eq!(labels(&[0.001, 0.01, 10.0]), ["0.001", "0.01", "10"]);
         assert_eq!(labels(&[5e6, 1e7]), ["5M", "10M"]);
+    }
+
+    #[test]
+    fn labels_of_very_small_and_large_numbers_are_powers_of_ten() {
+        assert_eq!(
+            labels(&linear(-1e-7, 1e-7, 4)),
+            [
+                "\u{2212}1e\u{2212}7",
+                "\u{2212}5e\u{2212}8",
+                "0",
+                "5e\u{2212}8",
+                "1e\u{2212}7"
+            ]
+        );
+        assert_eq!(
+            labels(&[2e-5, 4e-5, 3.0 * 2e-5]),
+            ["2e\u{2212}5", "4e\u{2212}5", "6e\u{2212}5"]
+        );
+        assert_eq!(
+            labels(&[0.0, 5e29, 1e30, 1.5e30]),
+            ["0", "5e29", "1e30", "1.5e30"]
+        );
+        assert_eq!(
+            labels(&log(1e-9, 1e-6)),
+            ["1e\u{2212}9", "1e\u{2212}8", "1e\u{2212}7", "1e\u{2212}6"]
+        );
+        assert_eq!(
+            labels(&[1.0, 1e4, 1e9, 1e12]),
+            ["1", "10k", "1000M", "1e12"]
+        );
     }
 }

@@ -11,6 +11,8 @@ use crate::init::InitialLaw;
 const DIMENSION_MAX: usize = 1 << 16;
 /// Largest number of scalars in one parameter; a configuration beyond it is rejected.
 const PARAMETER_LEN_MAX: usize = 1 << 28;
+/// Largest end of a support; a configuration beyond it is rejected, as f32 does not hold a sum of such returns over a batch.
+const RETURN_MAX: f32 = 1e30;
 /// Actions and their number fit one byte; a configuration beyond it is rejected.
 const ACTIONS_MAX: usize = 255;
 
@@ -28,9 +30,9 @@ pub struct ModelConfig {
     pub num_actions: usize,
     /// Atoms of each return distribution, at least 2.
     pub atoms: usize,
-    /// Return at the first atom.
+    /// Return at the first atom, within +-1e30. Values are f32: a support far from 0 and much narrower than that has few of them.
     pub v_min: f32,
-    /// Return at the last atom.
+    /// Return at the last atom, within +-1e30.
     pub v_max: f32,
     /// The convolutions, first to last, each followed by ReLU; at least one. The last one's output is f3.
     pub conv: Vec<ConvLayer>,
@@ -81,7 +83,8 @@ impl ModelConfig {
     ///
     /// # Errors
     /// [`ModelError::Config`] names the field: a size of 0 or above 65,536, a kernel larger than its input, a parameter
-    /// of more than 2^28 scalars, more than 255 actions, fewer than 2 atoms, `v_min` not below `v_max`, no convolution.
+    /// of more than 2^28 scalars, more than 255 actions, fewer than 2 atoms, `v_min` not below `v_max`, one of them beyond 1e30, no
+    /// convolution.
     pub fn validate(&self) -> Result<()> {
         let fail = |what: String| Err(ModelError::Config(what));
         let sizes = [
@@ -108,9 +111,16 @@ impl ModelConfig {
         if self.atoms < 2 {
             return fail(format!("atoms is {}, must be at least 2", self.atoms));
         }
-        if !(self.v_min.is_finite() && self.v_max.is_finite() && self.v_min < self.v_max) {
+        for (name, end) in [("v_min", self.v_min), ("v_max", self.v_max)] {
+            if !(-RETURN_MAX..=RETURN_MAX).contains(&end) {
+                return fail(format!(
+                    "{name} is {end:e}, must be within -{RETURN_MAX:e} and {RETURN_MAX:e}"
+                ));
+            }
+        }
+        if self.v_min >= self.v_max {
             return fail(format!(
-                "v_min {} must be below v_max {}, both finite",
+                "v_min {} must be below v_max {}",
                 self.v_min, self.v_max
             ));
         }
@@ -182,12 +192,15 @@ impl ModelConfig {
         self.height * self.width * self.channels
     }
 
-    /// The atoms z_i = v_min + i (v_max - v_min) / (atoms - 1).
+    /// The atoms z_i = v_min + i (v_max - v_min) / (atoms - 1); the last is `v_max` itself.
     pub fn atoms_support(&self) -> Vec<f32> {
         let (v_min, v_max) = (f64::from(self.v_min), f64::from(self.v_max));
-        let step = (v_max - v_min) / (self.atoms - 1) as f64;
-        (0..self.atoms)
+        let last = self.atoms - 1;
+        let step = (v_max - v_min) / last as f64;
+        // Far from 0 not even an f64 has v_min + (v_max - v_min) = v_max.
+        (0..last)
             .map(|i| (v_min + i as f64 * step) as f32)
+            .chain([self.v_max])
             .collect()
     }
 

@@ -1,11 +1,13 @@
 //! Affinity in closed form, from exponentially decayed counts of action pairs.
-//! It trains nothing; it is what the learned estimate must converge to.
+//! It trains nothing; it is what the learned estimate must converge to, where pairs were seen often as where they never were.
+
+use std::ops::RangeInclusive;
 
 use serde::{Deserialize, Serialize};
 
 use super::{
     alphabet::Alphabet,
-    arrays::{check_array, check_probabilities, row_softmax},
+    arrays::{check_array, check_probabilities},
     bits,
     error::AffinityError,
 };
@@ -16,9 +18,13 @@ use super::{
 pub struct ExactSettings {
     /// Factor on all counts at each update, in (0, 1].
     pub decay: f64,
-    /// Pairs added to the count of each pair, above 0.
+    /// Pairs added to each pair's count and to the count that it would have if actions did not depend on each other, from 1e-100
+    /// to 1e100: how much evidence a ratio other than 1 takes.
     pub smoothing: f64,
 }
+
+/// Bounds of the smoothing, far within f64's, so that ratios of counts are finite and above 0.
+const SMOOTHING: RangeInclusive<f64> = 1e-100..=1e100;
 
 /// Decayed pair counts c and A = row softmax of `ln p(j | i) / p(j)`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -36,12 +42,19 @@ pub struct ExactAffinity {
 impl ExactSettings {
     fn check_valid(&self) -> Result<(), AffinityError> {
         let Self { decay, smoothing } = *self;
-        if decay > 0.0 && decay <= 1.0 && smoothing > 0.0 && smoothing.is_finite() {
-            return Ok(());
+        if !(decay > 0.0 && decay <= 1.0) {
+            return Err(AffinityError(format!(
+                "a decay of {decay:e}, which is not above 0 and at most 1"
+            )));
         }
-        Err(AffinityError(format!(
-            "a decay of {decay} and a smoothing of {smoothing}"
-        )))
+        if !SMOOTHING.contains(&smoothing) {
+            return Err(AffinityError(format!(
+                "a smoothing of {smoothing:e}, which is not within {:e} and {:e}",
+                SMOOTHING.start(),
+                SMOOTHING.end()
+            )));
+        }
+        Ok(())
     }
 }
 
@@ -59,7 +72,7 @@ impl ExactAffinity {
             alphabet,
             settings,
         };
-        exact.matrix = exact.alphabet.expand(&exact.softmax());
+        exact.matrix = exact.alphabet.expand(&exact.ratios());
         Ok(exact)
     }
 
@@ -98,22 +111,39 @@ impl ExactAffinity {
         for (i, j) in pairs {
             self.counts[usize::from(i) * self.alphabet.len() + usize::from(j)] += 1.0;
         }
-        self.matrix = self.alphabet.expand(&self.softmax());
+        self.matrix = self.alphabet.expand(&self.ratios());
         Ok(())
     }
 
-    /// With `w = c + smoothing`: `q[i, j] = ln (w_ij / sum_j w_ij) - ln (sum_i w_ij / sum w)`, then row softmax.
-    fn softmax(&self) -> Vec<f64> {
+    /// With the counts e_ij = sum_j c_ij * sum_i c_ij / sum c that independent actions would have, and smoothing s:
+    /// A_ij = q_ij / sum_j q_ij with q_ij = (c_ij + s) / (e_ij + s), the softmax of ln q.
+    ///
+    /// q is p(j | i) / p(j) where a pair was seen often, and 1 where nothing is known: in the row or column of an action that was
+    /// never taken, and for the only action that ever was. Adding s to c alone would make a ratio of its own there.
+    /// Source of the form: DuMouchel 1999, the shrinking of a ratio of counts towards 1.
+    fn ratios(&self) -> Vec<f64> {
         let m = self.alphabet.len();
-        let weight = |i: usize, j: usize| self.counts[i * m + j] + self.settings.smoothing;
-        let row = |i: usize| (0..m).map(|j| weight(i, j)).sum::<f64>();
-        let column = |j: usize| (0..m).map(|i| weight(i, j)).sum::<f64>();
+        let row = |i: usize| self.counts[i * m..(i + 1) * m].iter().sum::<f64>();
+        let column = |j: usize| (0..m).map(|i| self.counts[i * m + j]).sum::<f64>();
         let rows: Vec<f64> = (0..m).map(row).collect();
         let columns: Vec<f64> = (0..m).map(column).collect();
         let total: f64 = rows.iter().sum();
-        let q = |i: usize, j: usize| (weight(i, j) / rows[i]).ln() - (columns[j] / total).ln();
-        let q: Vec<f64> = (0..m * m).map(|at| q(at / m, at % m)).collect();
-        row_softmax(&q, m)
+        let smoothing = self.settings.smoothing;
+        let ratio = |at: usize| {
+            // A share first: the product of two counts could leave the finite numbers.
+            let share = if total > 0.0 {
+                rows[at / m] / total
+            } else {
+                0.0
+            };
+            (self.counts[at] + smoothing) / (share * columns[at % m] + smoothing)
+        };
+        let mut ratios: Vec<f64> = (0..m * m).map(ratio).collect();
+        for row in ratios.chunks_exact_mut(m) {
+            let sum: f64 = row.iter().sum();
+            row.iter_mut().for_each(|ratio| *ratio /= sum);
+        }
+        ratios
     }
 }
 
@@ -128,22 +158,76 @@ mod tests {
             smoothing: 1.0,
         };
         let mut exact = ExactAffinity::new(Alphabet::raw(2).unwrap(), settings).unwrap();
-        exact.observe(&[(0, 0), (0, 0), (0, 1), (1, 1)]).unwrap();
+        let first = [[(0, 0); 6].as_slice(), &[(0, 1); 2], &[(1, 1); 4]].concat();
+        exact.observe(&first).unwrap();
         exact.observe(&[(1, 0)]).unwrap();
-        // Counts 1, 0.5, 1, 0.5 and one more each: rows 3.5 and 3.5, columns 4 and 3.
-        let q = |w: f64, column: f64| (w / 3.5) / (column / 7.0);
-        let (a, b) = (q(2.0, 4.0), q(1.5, 3.0));
-        for row in exact.matrix().chunks_exact(2) {
+        // Counts 3, 1, 1, 2 of 7, rows and columns 4 and 3: independent ones would be 16/7, 12/7, 12/7, 9/7.
+        let ratios = [
+            [4.0 / (16.0 / 7.0 + 1.0), 2.0 / (12.0 / 7.0 + 1.0)],
+            [2.0 / (12.0 / 7.0 + 1.0), 3.0 / (9.0 / 7.0 + 1.0)],
+        ];
+        for (row, [a, b]) in exact.matrix().chunks_exact(2).zip(ratios) {
             assert!((f64::from(row[0]) - a / (a + b)).abs() < 1e-7);
             assert!((row[0] + row[1] - 1.0).abs() < 1e-6);
         }
     }
 
+    fn of_15(smoothing: f64) -> ExactAffinity {
+        let settings = ExactSettings {
+            decay: 0.999,
+            smoothing,
+        };
+        ExactAffinity::new(Alphabet::raw(15).unwrap(), settings).unwrap()
+    }
+
+    /// What the learned estimate comes to as well: pairs that were never seen say nothing about how one action follows another.
+    #[test]
+    fn actions_that_tell_nothing_leave_a_uniform() {
+        let uniform = |row: &[f32]| row.iter().all(|a| (a * 15.0 - 1.0).abs() < 1e-4);
+        let (mut always_1, mut odd_ones) = (of_15(1.0), of_15(1.0));
+        for _ in 0..100 {
+            always_1.observe(&[(1, 1); 64]).unwrap();
+            // Independent of each other; the even ones never.
+            odd_ones
+                .observe(&[(1, 1), (1, 3), (3, 1), (3, 3)].repeat(64))
+                .unwrap();
+        }
+        for exact in [always_1, odd_ones] {
+            for (action, row) in exact.matrix().chunks_exact(15).enumerate() {
+                assert!(uniform(row), "action {action}: {row:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn rows_are_laws_at_both_ends_of_the_smoothing() {
+        for smoothing in [1e-100, 1e-9, 1e9, 1e100] {
+            let mut exact = of_15(smoothing);
+            for _ in 0..50 {
+                exact.observe(&[(0, 0), (0, 3), (3, 14), (14, 0)]).unwrap();
+                exact.check_valid().unwrap();
+                for row in exact.matrix().chunks_exact(15) {
+                    assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-5, "{row:?}");
+                }
+            }
+        }
+    }
+
     #[test]
     fn settings_are_checked() {
-        for (decay, smoothing) in [(0.0, 1.0), (1.1, 1.0), (0.9, 0.0), (f64::NAN, 1.0)] {
+        for (decay, smoothing) in [
+            (0.0, 1.0),
+            (1.1, 1.0),
+            (f64::NAN, 1.0),
+            (0.9, 0.0),
+            (0.9, 1e-320),
+            (0.9, 1e306),
+            (0.9, f64::NAN),
+        ] {
             let settings = ExactSettings { decay, smoothing };
-            assert!(ExactAffinity::new(Alphabet::raw(2).unwrap(), settings).is_err());
+            let refused = ExactAffinity::new(Alphabet::raw(2).unwrap(), settings).unwrap_err();
+            let named = if decay == 0.9 { "smoothing" } else { "decay" };
+            assert!(refused.to_string().contains(named), "{refused}");
         }
     }
 }

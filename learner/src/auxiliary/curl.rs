@@ -22,6 +22,7 @@ use crate::{
     batch::Batch,
     error::UpdateError,
     losses::{info_nce::info_nce_loss, scores::Scores},
+    ranges::{TAU, check_range},
 };
 
 /// Its line of the menu.
@@ -36,7 +37,8 @@ pub const CURL: MenuItem = MenuItem {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurlSettings {
-    /// Share of the online network in the key encoder's move after each update, in (0, 1].
+    /// Share of the online network in the key encoder's move after each update, from 1e-5 to 1; what f32 leaves of a small one
+    /// stands at `target_tau`.
     pub key_tau: f64,
 }
 
@@ -56,9 +58,7 @@ fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, Upda
             "encodes its keys by a moving average of the network, whose pace is missing (earlier versions had none): take the agent curl, or --set learner.update.curl.key_tau=0.001",
         );
     };
-    if !(key_tau > 0.0 && key_tau <= 1.0) {
-        return Err(UpdateError::Settings(format!("curl.key_tau = {key_tau}")));
-    }
+    check_range("curl.key_tau", key_tau, TAU)?;
     Ok(Box::new(Curl {
         weight: settings.lambda.l4t4,
         tanh_clip: settings.tanh_clip,

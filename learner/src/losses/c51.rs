@@ -11,7 +11,8 @@ use super::{candle, scalar_op::scalar_op};
 /// `logits` [B, A, N]; `action` [B], each below `num_actions`; `target` [B, N], rows sum to 1.
 /// Loss: `1/B * sum_b sum_i target * (ln target - ln softmax)`, with `0 ln 0 = 0`, in nats.
 /// `gradient` [B, A, N] is overwritten with the derivative by the logits: `(softmax - target) / B` for the taken
-/// action, 0 for the others. The arithmetic is f64 and shifts by the largest logit, so any finite logits are fine.
+/// action, 0 for the others. The arithmetic is f64 and shifts by the largest logit, so any finite logits are fine; a loss
+/// beyond the finite f32 needs logits that differ by more than 1e38.
 /// Source: Bellemare et al. 2017, equation 7.
 ///
 /// # Panics
@@ -44,11 +45,11 @@ pub fn kl(
         );
         let at = (row * num_actions + usize::from(action)) * atoms;
         let logits = &logits[at..at + atoms];
-        let log_sum = log_sum_exp(logits);
+        let log_p = LogSoftmax::of(logits);
         let mass: f64 = target.iter().map(|&t| f64::from(t)).sum();
         for ((&logit, &t), gradient) in logits.iter().zip(target).zip(&mut gradient[at..at + atoms])
         {
-            let (log_p, t) = (f64::from(logit) - log_sum, f64::from(t));
+            let (log_p, t) = (log_p.at(logit), f64::from(t));
             if t > 0.0 {
                 total += t * (t.ln() - log_p);
             }
@@ -58,21 +59,38 @@ pub fn kl(
     total / rows as f64
 }
 
-/// `ln(sum_i exp(x_i))` of a row that is not empty, in f64.
-fn log_sum_exp(row: &[f32]) -> f64 {
-    let max = f64::from(row.iter().copied().fold(f32::NEG_INFINITY, f32::max));
-    max + row
-        .iter()
-        .map(|&x| (f64::from(x) - max).exp())
-        .sum::<f64>()
-        .ln()
+/// `ln softmax` of a row that is not empty, in f64.
+///
+/// The largest logit and the logarithm of the sum stay apart: their sum would lose the smaller of the two, and with it the law,
+/// where all logits are large.
+struct LogSoftmax {
+    max: f64,
+    /// `ln(sum_i exp(x_i - max))`, from 0 to `ln N`.
+    log_sum: f64,
 }
 
-/// Writes softmax of `row` to `out`, both of one length.
+impl LogSoftmax {
+    fn of(row: &[f32]) -> Self {
+        let max = f64::from(row.iter().copied().fold(f32::NEG_INFINITY, f32::max));
+        let sum: f64 = row.iter().map(|&x| (f64::from(x) - max).exp()).sum();
+        Self {
+            max,
+            log_sum: sum.ln(),
+        }
+    }
+
+    /// `ln` of the probability of an entry `x` of the row.
+    fn at(&self, x: f32) -> f64 {
+        (f64::from(x) - self.max) - self.log_sum
+    }
+}
+
+/// Writes softmax of `row` to `out`, both of one length. Finite logits of any size give a law whose entries are right to an f32's
+/// last place.
 pub fn softmax(row: &[f32], out: &mut [f32]) {
-    let log_sum = log_sum_exp(row);
+    let log_p = LogSoftmax::of(row);
     for (out, &x) in out.iter_mut().zip(row) {
-        *out = (f64::from(x) - log_sum).exp() as f32;
+        *out = log_p.at(x).exp() as f32;
     }
 }
 
@@ -154,6 +172,38 @@ mod tests {
         let loss = kl(&[1e4, -1e4, 0.0], &[0], 1, &[0.0, 1.0, 0.0], &mut gradient);
         assert!((loss - 2e4).abs() < 1e-6);
         assert_eq!(gradient, [1.0, -1.0, 0.0]);
+    }
+
+    /// Such logits differ by nothing or by whole steps of a float, and their softmax is as plain as that of small ones.
+    #[test]
+    fn a_common_offset_of_any_size_changes_nothing() {
+        const ATOMS: usize = 51;
+        let target = [1.0 / ATOMS as f32; ATOMS];
+        for offset in [0.0f32, 1e6, 1e12, -1e14, 1e30, -1e38, 1e38, f32::MAX] {
+            let (mut probs, mut gradient) = ([0f32; ATOMS], [0f32; ATOMS]);
+            let mut logits = [offset; ATOMS];
+            softmax(&logits, &mut probs);
+            let loss = kl(&logits, &[0], 1, &target, &mut gradient);
+            assert!(
+                probs.iter().all(|p| (p * 51.0 - 1.0).abs() < 1e-6),
+                "{offset}: {probs:?}"
+            );
+            assert!(loss.abs() < 1e-6, "{offset}: {loss}");
+            assert!(
+                gradient.iter().all(|g| g.abs() < 1e-7),
+                "{offset}: {gradient:?}"
+            );
+
+            // Two equal logits far above the rest share all the mass.
+            logits.fill(offset - offset.abs() / 2.0 - 1e3);
+            (logits[3], logits[7]) = (offset, offset);
+            softmax(&logits, &mut probs);
+            let sum: f32 = probs.iter().sum();
+            assert!(
+                (probs[3], probs[7], sum) == (0.5, 0.5, 1.0),
+                "{offset}: {probs:?}"
+            );
+        }
     }
 
     #[test]

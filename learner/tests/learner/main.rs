@@ -7,4 +7,5 @@ mod agents;
 mod augment;
 mod checkpoint;
 mod made_up;
+mod ranges;
 mod update;

@@ -244,6 +244,33 @@ fn double_dqn_chooses_by_the_online_network() {
     assert_eq!(chosen[1], [2; 12]);
 }
 
+/// Double DQN, where the online network overflows on s_{t+n} and not on s_t, and the target network on neither.
+#[test]
+fn a_next_state_whose_values_overflow_is_an_error_that_changes_nothing() {
+    let mut settings = settings(NO_DIM);
+    settings.double_dqn = true;
+    let rng = &mut ChaCha8Rng::seed_from_u64(16);
+    let agent = Agent::new(model(NO_DIM), settings, &Compute::CPU, rng).unwrap();
+    // Black states have features of the biases alone.
+    let mut agent = changed(&agent, |name, values| {
+        if name.starts_with("torso") && name.ends_with("weight") {
+            values.iter_mut().for_each(|v| *v = v.abs() * 1e15);
+        }
+    });
+    let mut rows = Rows::random(4, 18);
+    rows.frames[0].fill(0);
+    let before = values(agent.online());
+    let error = agent.update(&rows.batch()).unwrap_err();
+    assert!(
+        error
+            .to_string()
+            .contains("the online network's value of an s_{t+n}"),
+        "{error}"
+    );
+    assert_eq!(values(agent.online()), before);
+    assert_eq!(agent.updates(), 0);
+}
+
 #[test]
 fn the_target_network_follows_once_a_period() {
     let (mut agent, rows) = (agent(NO_DIM, 17), Rows::random(4, 18));
@@ -360,7 +387,8 @@ fn parameters_that_a_step_took_beyond_the_finite_numbers_are_not_published() {
         assert!(matches!(said, UpdateError::Diverged { .. }), "{said}");
         let said = said.to_string();
         assert!(
-            said.contains(name) && said.contains("newest checkpoint"),
+            said.contains(&format!("update 1 took {name} beyond"))
+                && said.contains("newest checkpoint"),
             "{said}"
         );
         let said = agent.weights().unwrap_err().to_string();

@@ -8,7 +8,7 @@ use super::{
     episodes::Window,
     horizon::{self, Affinity},
 };
-use crate::config::ReproducedBug;
+use crate::{config::ReproducedBug, storage::ring::Step};
 
 /// The states of a row, as indices in the ring.
 #[derive(Clone, Copy)]
@@ -99,7 +99,7 @@ impl Assembler {
         } else {
             NO_ACTION
         };
-        let (n_step_return, follows) = self.n_step_return(window);
+        let (n_step_return, follows) = n_step_return(&self.discounts, self.timeout, window.steps());
         let bootstrap = match self.reproduced_bug {
             None => follows.map(|i| (i, self.discounts[i])),
             Some(ReproducedBug::BootstrapFromNextState) => self.next_state(window),
@@ -109,7 +109,7 @@ impl Assembler {
             row,
             anchor.action,
             next_action,
-            n_step_return as f32,
+            return_f32(n_step_return),
             discount as f32,
         );
         let furthest = self.draw_k(affinity, window, rng).unwrap_or(0);
@@ -130,25 +130,6 @@ impl Assembler {
             states.positives += 1;
         }
         states
-    }
-
-    /// Sum of gamma^i r_{t+i} over i < n, and the i of the state to bootstrap from: n, unless the episode ended before.
-    ///
-    /// After a terminal step nothing follows. A time-out counts as one (`TimeoutRule::Terminal`), or cuts the return short
-    /// of its own step and bootstraps from that step's state (`TimeoutRule::Bootstrap`).
-    fn n_step_return(&self, window: &Window) -> (f64, Option<usize>) {
-        let n = self.discounts.len() - 1;
-        let mut sum = 0.0;
-        for (i, step) in window.steps().take(n).enumerate() {
-            if step.end == End::TimedOut && self.timeout == TimeoutRule::Bootstrap {
-                return (sum, Some(i));
-            }
-            sum += self.discounts[i] * f64::from(step.reward);
-            if step.end.is_episode_end() {
-                return (sum, None);
-            }
-        }
-        (sum, Some(n))
     }
 
     /// s_{t+1} at gamma^n, unless step t ended its episode: the bug of [`ReproducedBug::BootstrapFromNextState`].
@@ -172,5 +153,121 @@ impl Assembler {
             return None;
         }
         horizon::draw_k(self.horizon, affinity, &self.actions, rng)
+    }
+}
+
+/// Sum of gamma^i r_{t+i} over i < n, and the i of the state to bootstrap from: n, unless the episode ended before.
+/// `discounts` are gamma^0 to gamma^n. The sum is f64, so that rewards of very different sizes cancel as they should.
+///
+/// After a terminal step nothing follows. A time-out counts as one (`TimeoutRule::Terminal`), or cuts the return short
+/// of its own step and bootstraps from that step's state (`TimeoutRule::Bootstrap`).
+fn n_step_return<'a>(
+    discounts: &[f64],
+    timeout: TimeoutRule,
+    steps: impl Iterator<Item = &'a Step>,
+) -> (f64, Option<usize>) {
+    let n = discounts.len() - 1;
+    let mut sum = 0.0;
+    for (i, step) in steps.take(n).enumerate() {
+        if step.end == End::TimedOut && timeout == TimeoutRule::Bootstrap {
+            return (sum, Some(i));
+        }
+        sum += discounts[i] * f64::from(step.reward);
+        if step.end.is_episode_end() {
+            return (sum, None);
+        }
+    }
+    (sum, Some(n))
+}
+
+/// A return as it travels. One beyond the finite f32, as rewards at their limit may round to, is the largest there is: the
+/// projection takes both for the end of the support, and a learner refuses what is not finite.
+fn return_f32(sum: f64) -> f32 {
+    sum.clamp(f32::MIN.into(), f32::MAX.into()) as f32
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// Rewards at the limit that the replay server sets, whose sum rounds to more than a float can be for some n.
+    #[test]
+    fn a_return_is_a_number_whatever_the_rewards() {
+        for n in 1..=1000u16 {
+            let reward = f32::MAX / f32::from(n);
+            let sum = f64::from(n) * f64::from(reward);
+            let found = [return_f32(sum), -return_f32(-sum)];
+            let whole = found
+                .iter()
+                .all(|r| (f32::MAX * 0.999_999..=f32::MAX).contains(r));
+            assert!(whole, "{n} steps of {reward:e}: {found:?}");
+        }
+        assert_eq!(
+            (return_f32(1e300), return_f32(-1e300)),
+            (f32::MAX, f32::MIN)
+        );
+        assert_eq!((return_f32(0.1), return_f32(1e-300)), (0.1, 0.0));
+    }
+
+    /// x + y as their rounded sum and what was lost by rounding, exactly.
+    fn two_sum(x: f64, y: f64) -> (f64, f64) {
+        let sum = x + y;
+        let back = sum - x;
+        (sum, (x - (sum - back)) + (y - back))
+    }
+
+    proptest! {
+        /// Rewards over all of an f32's range up to the replay's limit, against a sum that loses nothing to cancellation.
+        #[test]
+        fn a_return_is_the_sum_of_its_rewards(
+            rewards in prop::collection::vec(
+                prop_oneof![
+                    -10.0f32..10.0,
+                    prop::num::f32::NORMAL | prop::num::f32::SUBNORMAL | prop::num::f32::ZERO,
+                    prop::sample::select(vec![0.0, 1e-45, f32::MIN_POSITIVE, 1e30, -1e30, f32::MAX, f32::MIN]),
+                ],
+                1..60,
+            ),
+            gamma in prop_oneof![
+                0.0f64..=1.0,
+                prop::sample::select(vec![0.0, 1e-320, 0.99, 1.0 - 1e-12, 1.0]),
+            ],
+            end in prop::option::of((0usize..60, prop::sample::select(vec![End::Terminal, End::TimedOut]))),
+            timeout in prop::sample::select(vec![TimeoutRule::Terminal, TimeoutRule::Bootstrap]),
+        ) {
+            let n = rewards.len();
+            let limit = f32::MAX / n as f32;
+            let end = end.map(|(at, end)| (at % n, end));
+            let end_of = |i| end.filter(|(at, _)| *at == i).map_or(End::Running, |(_, end)| end);
+            let step = |(i, reward): (usize, &f32)| Step::new(0, reward.clamp(-limit, limit), end_of(i), 0);
+            let steps: Vec<Step> = rewards.iter().enumerate().map(step).collect();
+            let discounts: Vec<f64> = (0..=n as i32).map(|i| gamma.powi(i)).collect();
+            let (found, follows) = n_step_return(&discounts, timeout, steps.iter());
+
+            let bootstraps = timeout == TimeoutRule::Bootstrap;
+            let (counted, expected_follows) = match end {
+                None => (n, Some(n)),
+                Some((at, End::TimedOut)) if bootstraps => (at, Some(at)),
+                Some((at, _)) => (at + 1, None),
+            };
+            prop_assert_eq!(follows, expected_follows);
+            let (mut sum, mut lost, mut sizes) = (0.0, 0.0, 0.0);
+            for (step, discount) in steps[..counted].iter().zip(&discounts) {
+                let term = discount * f64::from(step.reward);
+                let rest;
+                (sum, rest) = two_sum(sum, term);
+                lost += rest;
+                sizes += term.abs();
+            }
+            let expected = sum + lost;
+            let error = (found - expected).abs();
+            prop_assert!(error <= 1e-14 * sizes, "{found:e}, {expected:e}");
+            let sent = return_f32(found);
+            prop_assert!(sent.is_finite());
+            let error = (f64::from(sent) - expected).abs();
+            prop_assert!(error <= 6.1e-8 * expected.abs() + 1e-14 * sizes + 1e-45, "{sent:e}, {expected:e}");
+        }
     }
 }

@@ -10,7 +10,7 @@ use rand::Rng;
 pub(super) struct Chain {
     /// States K, at least 2.
     pub(super) states: usize,
-    /// Probability of a step up, in (0, 1).
+    /// Probability of a step up, in [0, 1].
     pub(super) alpha: f64,
 }
 
@@ -26,33 +26,59 @@ impl Chain {
         matrix
     }
 
-    fn odds(&self) -> f64 {
-        self.alpha / (1.0 - self.alpha)
+    /// theta = |ln(alpha / (1 - alpha))|, by which the stationary law falls from state to state away from the end to which the walk
+    /// tends: 0 at even odds, infinite for a walk that only goes one way.
+    fn rate(&self) -> f64 {
+        let (less, more) = (
+            self.alpha.min(1.0 - self.alpha),
+            self.alpha.max(1.0 - self.alpha),
+        );
+        if less < more / 2.0 {
+            -(less / more).ln()
+        } else {
+            // The difference is exact near even odds, where a quotient would not be.
+            -(-(more - less) / more).ln_1p()
+        }
     }
 
-    /// The stationary law rho(i) = r^i (1 - r) / (1 - r^K), r = alpha / (1 - alpha); 1 / K at r = 1.
+    /// ln of the sum over states of exp(-theta i): ln((1 - exp(-theta K)) / (1 - exp(-theta))); ln K at even odds.
+    fn log_sum(&self) -> f64 {
+        let (rate, k) = (self.rate(), self.states as f64);
+        if rate == 0.0 {
+            return k.ln();
+        }
+        ((-k * rate).exp_m1() / (-rate).exp_m1()).ln()
+    }
+
+    /// ln of the stationary law at each state.
     ///
-    /// Source: the paper's appendix; it holds for this chain exactly, as its steps balance in detail.
+    /// rho(i) = r^i (1 - r) / (1 - r^K), r = alpha / (1 - alpha); 1 / K at r = 1. It is taken from the likelier end, where all powers
+    /// are of a number of at most 1. Source: the paper's appendix; it holds for this chain exactly, as its steps balance in detail.
+    fn log_stationary(&self) -> Vec<f64> {
+        let (rate, log_sum) = (self.rate(), self.log_sum());
+        // 0 times infinity is NaN.
+        let falls = |away: usize| if away == 0 { 0.0 } else { away as f64 * rate };
+        let law = (0..self.states).map(|away| -falls(away) - log_sum);
+        if self.alpha > 0.5 {
+            law.rev().collect()
+        } else {
+            law.collect()
+        }
+    }
+
+    /// The stationary law rho: see [`Chain::log_stationary`].
     pub(super) fn stationary(&self) -> Vec<f64> {
-        let r = self.odds();
-        let powers: Vec<f64> = (0..self.states).map(|i| r.powi(i as i32)).collect();
-        let sum: f64 = powers.iter().sum();
-        powers.iter().map(|power| power / sum).collect()
+        self.log_stationary().into_iter().map(f64::exp).collect()
     }
 
     /// I(S_t; S_{t+1}) at stationarity, in nats: H(rho) - h(alpha), as every row of T is (alpha, 1 - alpha).
     ///
-    /// H(rho) = -ln rho(0) - ln(r) E[i], with E[i] = r / (1 - r) - K r^K / (1 - r^K); ln K at r = 1.
+    /// H(rho) = ln Z + theta E[away], with Z the sum of exp(-theta away) and theta E[away] = f(theta) - f(K theta),
+    /// f(x) = x / (exp(x) - 1). Right to 1e-14 at any alpha and up to 1e8 states.
     pub(super) fn mutual_information(&self) -> f64 {
-        let (r, k) = (self.odds(), self.states as f64);
-        let step = entropy(&[self.alpha, 1.0 - self.alpha]);
-        if (r - 1.0).abs() < 1e-6 {
-            return k.ln() - step;
-        }
-        let r_k = r.powi(self.states as i32);
-        let mean = r / (1.0 - r) - k * r_k / (1.0 - r_k);
-        let first = (1.0 - r) / (1.0 - r_k);
-        -first.ln() - r.ln() * mean - step
+        let (rate, k) = (self.rate(), self.states as f64);
+        let entropy_of_law = self.log_sum() + (bose(rate) - bose(k * rate));
+        entropy_of_law - entropy(&[self.alpha, 1.0 - self.alpha])
     }
 
     /// The same on a ring, which has no ends: ln K - h(alpha), in nats.
@@ -64,24 +90,30 @@ impl Chain {
     ///
     /// Its factor alpha^[j > i] (1 - alpha)^[j < i] is a law of steps only next to i; the printed sum has all i and j.
     pub(super) fn mutual_information_as_printed(&self) -> f64 {
-        let rho = self.stationary();
+        let log_rho = self.log_stationary();
         let factor = |i: usize, j: usize| match j.cmp(&i) {
             std::cmp::Ordering::Greater => self.alpha,
             std::cmp::Ordering::Less => 1.0 - self.alpha,
             std::cmp::Ordering::Equal => 1.0,
         };
         let all = (0..self.states).flat_map(|i| (0..self.states).map(move |j| (i, j)));
-        all.map(|(i, j)| rho[i] * factor(i, j) * (factor(i, j).ln() - rho[j].ln()))
-            .sum()
+        let term = |(i, j): (usize, usize)| match log_rho[i].exp() * factor(i, j) {
+            0.0 => 0.0,
+            p => p * (factor(i, j).ln() - log_rho[j]),
+        };
+        all.map(term).sum()
     }
 
     /// 1 - lambda_2 = 1 - 2 sqrt(alpha (1 - alpha)) cos(pi / K).
     ///
+    /// Taken as (sqrt(1 - alpha) - sqrt(alpha))^2 + 4 sqrt(alpha (1 - alpha)) sin^2(pi / 2K), which cancels nothing.
     /// Source: Feller, An Introduction to Probability Theory, vol. 1, XVI.3. The smallest eigenvalue is -lambda_2, so
     /// this is the absolute gap as well.
     pub(super) fn spectral_gap(&self) -> f64 {
-        let angle = std::f64::consts::PI / self.states as f64;
-        1.0 - 2.0 * (self.alpha * (1.0 - self.alpha)).sqrt() * angle.cos()
+        let (up, down) = (self.alpha.sqrt(), (1.0 - self.alpha).sqrt());
+        let apart = (1.0 - 2.0 * self.alpha) / (up + down);
+        let sine = (std::f64::consts::PI / (2 * self.states) as f64).sin();
+        apart * apart + 4.0 * up * down * sine * sine
     }
 
     /// A step from `state`.
@@ -91,6 +123,17 @@ impl Chain {
         } else {
             state.saturating_sub(1)
         }
+    }
+}
+
+/// x / (exp(x) - 1), from 1 at 0 down to 0.
+fn bose(x: f64) -> f64 {
+    if x == 0.0 {
+        1.0
+    } else if x > 700.0 {
+        0.0
+    } else {
+        x / x.exp_m1()
     }
 }
 
@@ -204,6 +247,87 @@ mod tests {
                     &what,
                 );
             }
+        }
+    }
+
+    /// H(rho) - h(alpha) with H summed over the states, each with its weight by itself.
+    fn summed(states: usize, alpha: f64) -> f64 {
+        let (small, large) = (alpha.min(1.0 - alpha), alpha.max(1.0 - alpha));
+        let rate = -(small / large).ln();
+        let weights = || (0..states).map(|i| (-(i as f64) * rate).exp());
+        let sum: f64 = weights().sum();
+        let law = weights().map(|weight| weight / sum);
+        let h = -law.filter(|p| *p > 0.0).map(|p| p * p.ln()).sum::<f64>();
+        h - entropy(&[alpha, 1.0 - alpha])
+    }
+
+    #[test]
+    fn closed_forms_hold_for_long_walks() {
+        for states in [324, 1_000, 100_000] {
+            for alpha in [
+                1e-9,
+                0.1,
+                0.3,
+                0.499,
+                0.5 - 2.4e-7,
+                0.5,
+                0.5 + 1e-9,
+                0.6,
+                0.7,
+                0.9,
+            ] {
+                let chain = Chain { states, alpha };
+                let what = format!("K = {states}, alpha = {alpha}");
+                assert_near(chain.mutual_information(), summed(states, alpha), &what);
+                let rho = chain.stationary();
+                assert_near(rho.iter().sum(), 1.0, &what);
+                for (here, next) in rho.iter().zip(&rho[1..]) {
+                    // Detailed balance.
+                    let (up, down) = (alpha * here, (1.0 - alpha) * next);
+                    assert!(
+                        (up - down).abs() <= 1e-9 * up + 1e-300,
+                        "{what}: {up}, {down}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn walks_that_only_go_one_way_stand_at_the_end() {
+        for (alpha, end) in [(0.0, 0), (1.0, 9)] {
+            let chain = Chain { states: 10, alpha };
+            let rho = chain.stationary();
+            assert!(
+                (0..10).all(|i| rho[i] == f64::from(u8::from(i == end))),
+                "{rho:?}"
+            );
+            assert_eq!(chain.mutual_information(), 0.0);
+            assert_eq!(chain.mutual_information_as_printed(), 0.0);
+            assert_eq!(chain.spectral_gap(), 1.0);
+        }
+    }
+
+    /// 1 - cos x = x^2 / 2 - x^4 / 24 + ...
+    #[test]
+    fn the_gap_of_a_long_walk_keeps_its_digits() {
+        for states in [100_000usize, 1_000_000, 100_000_000] {
+            let gap = |alpha| Chain { states, alpha }.spectral_gap();
+            let x = std::f64::consts::PI / states as f64;
+            let expected = x * x / 2.0 * (1.0 - x * x / 12.0);
+            assert!(
+                (gap(0.5) / expected - 1.0).abs() < 1e-14,
+                "K = {states}: {}",
+                gap(0.5)
+            );
+            // (1 - sqrt(1 - d^2)) + ... with alpha = (1 + d) / 2.
+            let d = 2f64.powi(-20);
+            let expected = d * d / 2.0 * (1.0 + d * d / 4.0) + expected;
+            let found = gap(0.5 + d / 2.0);
+            assert!(
+                (found / expected - 1.0).abs() < 1e-9,
+                "K = {states}: {found}, {expected}"
+            );
         }
     }
 

@@ -75,7 +75,7 @@ impl Moment<'_> {
     pub(super) fn row(&self) -> Vec<String> {
         let (replay, learner) = (self.replay, self.learner);
         let mean_return = self.episodes.mean_return;
-        let some = |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.6}"));
+        let some = |value: Option<f64>| value.map_or(String::new(), number);
         // What has not been computed is left empty: a 0 would look like a loss.
         let computed = |value: f64| some((learner.updates > 0).then_some(value));
         let mut row = vec![
@@ -107,6 +107,15 @@ impl Moment<'_> {
         let rss = self.rss_mib.iter();
         row.extend(rss.map(|mib| mib.map_or(String::new(), |mib| format!("{mib:.1}"))));
         row
+    }
+}
+
+/// A number with six decimals; in powers of ten where these would leave fewer than four digits of it, or are far more than it has.
+fn number(value: f64) -> String {
+    if value == 0.0 || (1e-3..1e15).contains(&value.abs()) {
+        format!("{value:.6}")
+    } else {
+        format!("{value:.6e}")
     }
 }
 
@@ -182,6 +191,24 @@ pub fn progress(folder: &RunFolder) -> Option<Progress> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn small_and_large_numbers_keep_their_digits() {
+        for (value, text) in [
+            (0.0, "0.000000"),
+            (4.007, "4.007000"),
+            (-0.0125, "-0.012500"),
+            (123_456.789, "123456.789000"),
+            (1e-3, "0.001000"),
+            (4.2e-7, "4.200000e-7"),
+            (-9.87654321e-4, "-9.876543e-4"),
+            (1.5e30, "1.500000e30"),
+        ] {
+            assert_eq!(number(value), text);
+            let read: f64 = text.parse().unwrap();
+            assert!((read - value).abs() <= 5e-4 * value.abs());
+        }
+    }
 
     #[test]
     fn the_last_whole_row_counts() {

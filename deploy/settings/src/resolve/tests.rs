@@ -140,7 +140,7 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
     expect!["500 frames are no more than the warm-up of 1000: ask for more --frames, or --set replay.warmup_transitions=50"].assert_eq(&said("driml-ada", "replay.transitions_max=500"));
     expect!["in the settings' [world] table: invalid value: integer `-1`, expected u32"]
         .assert_eq(&said("driml-ada", "world.num_levels=-1"));
-    expect!["learner.update cannot work: adam.lr = 0: that cannot work; start from a preset"]
+    expect!["learner.update cannot work: adam.lr = 0.0 is not within 1e-30 and 1e38: that cannot work; start from a preset"]
         .assert_eq(&said("driml-ada", "learner.update.adam.lr=0"));
     expect!["replay.capacity_transitions = 100000000000 needs 1147389.4 GiB, and 16.0 GiB are free: --set replay.capacity_transitions=697234"].assert_eq(&said(
         "driml-ada",

@@ -224,6 +224,38 @@ fn q_values_are_expectations_over_the_atoms() -> Result<()> {
     Ok(())
 }
 
+/// An offset of the support is one of the values, whatever computes them.
+#[test]
+fn values_over_a_support_far_from_0_are_those_near_it_moved() {
+    let near = ModelConfig {
+        v_min: 0.0,
+        v_max: 1.0,
+        ..small()
+    };
+    let logits = crate::support::floats(&[30, 5, 11], &mut rng(4));
+    let parameters = parameters(&near, 1);
+    let q_values = |config: &ModelConfig, kernels| {
+        let network = Network::with_kernels(config, &parameters, kernels).unwrap();
+        values(&network.q_values(&logits).unwrap())
+    };
+    let expected = q_values(&near, Kernels::FUSED);
+    for (offset, v_min) in [(0.0, 0.0f32), (1e3, 1e3), (-1e6, -1e6)] {
+        let far = ModelConfig {
+            v_min,
+            v_max: v_min + 1.0,
+            ..small()
+        };
+        for kernels in [Kernels::FUSED, Kernels::Candle] {
+            for (found, near) in q_values(&far, kernels).iter().zip(&expected) {
+                let error = (found - offset - near).abs();
+                // Half of a value's last place, and what the sums of f32 have by themselves.
+                let allowed = offset.abs() / 2f64.powi(24) + 4e-7;
+                assert!(error <= allowed, "{kernels:?} at {offset}: {error:e} off");
+            }
+        }
+    }
+}
+
 #[test]
 fn heads_that_are_left_out_are_not_there() {
     let config = ModelConfig {
@@ -343,6 +375,25 @@ fn inputs_that_do_not_fit_are_errors() {
 }
 
 #[test]
+fn a_support_begins_and_ends_where_it_says() {
+    for (v_min, v_max) in [
+        (-10.0, 10.0),
+        (0.1, 0.7),
+        (-9.174_887e29, -7.596_588_6),
+        (1e6, 1_000_001.0),
+    ] {
+        let config = ModelConfig {
+            v_min,
+            v_max,
+            ..small()
+        };
+        let support = config.atoms_support();
+        assert_eq!((support[0], support[10]), (v_min, v_max));
+        assert!(support.is_sorted(), "{support:?}");
+    }
+}
+
+#[test]
 fn configurations_that_cannot_work_are_errors() {
     let fails = |change: fn(&mut ModelConfig)| {
         let mut config = small();
@@ -361,6 +412,8 @@ fn configurations_that_cannot_work_are_errors() {
     fails(|config| config.atoms = 1);
     fails(|config| config.v_max = config.v_min);
     fails(|config| config.v_min = f32::NAN);
+    fails(|config| config.v_min = -3e38);
+    fails(|config| config.v_max = 1e38);
     fails(|config| config.conv.clear());
     fails(|config| config.conv[1].kernel = 9);
     fails(|config| config.conv[0].stride = 0);

@@ -178,7 +178,7 @@ fn absent_sites_stay_absent_and_bind_nobody() {
 #[test]
 fn unusable_settings_are_errors() {
     let mut rng = ChaCha8Rng::seed_from_u64(5);
-    for temperature in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+    for temperature in [0.0, -1.0, 5.1, 100.0, 1e300, f64::NAN, f64::INFINITY] {
         assert!(IsingLattice::random(3, 3, temperature, Boundary::Free, &mut rng).is_err());
     }
     assert!(IsingLattice::random(0, 3, 1.0, Boundary::Free, &mut rng).is_err());
@@ -186,6 +186,36 @@ fn unusable_settings_are_errors() {
     assert!(IsingLattice::random(usize::MAX, usize::MAX, 1.0, Boundary::Free, &mut rng).is_err());
     assert!(IsingLattice::masked(3, 3, &[true; 4], 1.0, Boundary::Free, &mut rng).is_err());
     assert!(IsingLattice::masked(3, 3, &[false; 9], 1.0, Boundary::Free, &mut rng).is_err());
+}
+
+/// Mean of s(now) s(earlier) over the sites of a large lattice, for states one and two sweeps apart.
+fn overlaps(temperature: f64) -> [f64; 2] {
+    let rng = &mut ChaCha8Rng::seed_from_u64(9);
+    let periodic = Boundary::Periodic;
+    let mut lattice = IsingLattice::random(64, 64, temperature, periodic, rng).unwrap();
+    let mut states: Vec<Vec<i8>> = Vec::new();
+    for _ in 0..120 {
+        lattice.sweep(rng);
+        states.push(lattice.spins().to_vec());
+    }
+    let overlap = |a: &[i8], b: &[i8]| -> f64 {
+        let products = a.iter().zip(b).map(|(a, b)| f64::from(a * b));
+        products.sum::<f64>() / a.len() as f64
+    };
+    let settled = &states[20..];
+    [1, 2].map(|apart| {
+        let pairs = settled.windows(apart + 1);
+        pairs.map(|w| overlap(&w[0], &w[apart])).sum::<f64>() / (settled.len() - apart) as f64
+    })
+}
+
+/// Metropolis takes nearly every proposal of a hot lattice, and in a fixed order that turns all spins over, sweep after sweep.
+#[test]
+fn a_lattice_at_the_hottest_temperature_does_not_blink() {
+    for temperature in [2.5, 4.0, 5.0] {
+        let [one, two] = overlaps(temperature);
+        assert!(one > -0.5 && two < 0.5, "T = {temperature}: {one}, {two}");
+    }
 }
 
 /// Mean energy per site of the L x L periodic lattice, exactly. Source: Kaufman 1949.

@@ -8,10 +8,7 @@ use std::sync::OnceLock;
 
 use half::bf16;
 
-use super::{
-    LANES, Unit,
-    tile::{Mode, RawTile},
-};
+use super::unit::{LANES, Mode, RawTile, Unit};
 
 /// Steps, which are pairs of bf16, in a row of a tile register: 64 bytes.
 const STEPS: usize = 16;

@@ -11,8 +11,8 @@ use std::arch::x86_64::{
 use half::bf16;
 
 use super::{
-    LANES, Unit,
-    tile::{RawTile, Vector, compute_sizes},
+    unit::{LANES, RawTile, Unit},
+    vector::{Vector, compute_sizes},
 };
 
 /// Whether this processor, and the operating system, have AVX2 and fused multiplication and addition.

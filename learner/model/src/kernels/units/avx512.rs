@@ -13,8 +13,8 @@ use std::mem::transmute;
 use half::bf16;
 
 use super::{
-    LANES, Unit,
-    tile::{RawTile, Vector, compute_sizes},
+    unit::{LANES, RawTile, Unit},
+    vector::{Vector, compute_sizes},
 };
 
 /// Whether this processor, and the operating system, have AVX-512 as server processors do.

@@ -3,8 +3,9 @@
 use half::bf16;
 
 use super::{
-    Element, LANES, Unit,
-    tile::{RawTile, Vector, compute_sizes},
+    element::Element,
+    unit::{LANES, RawTile, Unit},
+    vector::{Vector, compute_sizes},
 };
 
 /// f32 operands.
