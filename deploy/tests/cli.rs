@@ -58,7 +58,7 @@ fn names_that_nothing_has() {
     "#]]
     .assert_eq(&usage(&["local", "--preset", "split", "--env", "mspacman"]));
     expect![[r#"
-        error: there is no setting "learner.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, unreachable_max_ms, update
+        error: there is no setting "learner.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, precision, publish_period_updates, unreachable_max_ms, update
     "#]].assert_eq(&usage(&["local", "--set", "learner.lr=1"]));
 }
 
@@ -210,7 +210,7 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
     let output = driml(&["bench", "policy", "--quick", "--json", "-"]);
     let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let figures = report["figures"].as_array().unwrap();
-    assert_eq!((figures.len(), &report["bench"]), (4, &"policy".into()));
+    assert_eq!((figures.len(), &report["bench"]), (8, &"policy".into()));
     assert!(figures.iter().all(|it| it["value"].as_f64().unwrap() > 0.0));
 
     let peers = ["bench", "peers", "--quick", "--only", "policy"];

@@ -210,6 +210,11 @@ impl Agent {
     /// A batch that does not fit, or losses or gradients that are not finite: nothing has then changed. A step beyond the
     /// finite numbers, [`UpdateError::Diverged`]: the learner is then good for nothing, and can be neither published nor saved.
     pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
+        // On a thread of the pool: from outside, every product would wake the pool up and be woken by it.
+        rayon::scope(|_| self.update_here(batch))
+    }
+
+    fn update_here(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
         let evaluation = self.evaluate(batch)?;
         let grad_norm = self.apply(&evaluation.gradients)?;
         let q_sum: f32 = self.taken_values(&evaluation, batch.action)?.iter().sum();

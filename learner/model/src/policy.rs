@@ -16,7 +16,7 @@ use crate::kernels::convolution::{Convolution, Images, PADDING, Pixels, forward}
 use crate::kernels::linear::relu_of;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::{Matrix, Panels, Threads};
-use crate::kernels::units::{Element, ForUnit, Left, Mode, Unit, row_tiles, with_unit};
+use crate::kernels::units::{Element, ForUnit, Left, Mode, Unit, row_tiles, vectorized, with_unit};
 use crate::parameters::{decode, is_dim};
 
 /// Frames that go through the network together on one thread.
@@ -221,17 +221,22 @@ impl<U: Unit> UnitWeights<U> {
         let hidden = self.fc.forward(unit, &maps, count);
         let stride = self.fc.bias.len().next_multiple_of(U::Element::DEPTH);
         let mut active = Buffer::<U::Element>::new(count * stride);
-        unit.vectorize(|| {
-            let rows = active.chunks_exact_mut(stride);
-            for (row, hidden) in rows.zip(hidden.chunks_exact(self.fc.bias.len())) {
-                row.fill(U::Element::default());
-                for (value, &hidden) in row.iter_mut().zip(hidden) {
-                    *value = U::Element::of(relu_of(hidden));
-                }
-            }
-        });
+        activate(unit, &hidden, self.fc.bias.len(), &mut active);
         let logits = self.head.forward(unit, &active, count);
         expected_returns(&logits, support, values);
+    }
+}
+
+vectorized! {
+    /// relu of `hidden` [rows, cols] as rows of whole steps.
+    fn activate<U>(unit, hidden: &'a [f32], cols: usize, active: &'a mut [U::Element]) {
+        let rows = active.chunks_exact_mut(cols.next_multiple_of(U::Element::DEPTH));
+        for (row, hidden) in rows.zip(hidden.chunks_exact(cols)) {
+            row.fill(U::Element::default());
+            for (value, &hidden) in row.iter_mut().zip(hidden) {
+                *value = U::Element::of(relu_of(hidden));
+            }
+        }
     }
 }
 

@@ -78,6 +78,7 @@ fn the_default_run_is_the_papers() {
         epsilon_decay_frames = 100000
         epsilon_end = 0.01
         epsilon_start = 0.1
+        precision = "f32"
         round_transitions_max = 1024
         steps_per_chunk = 16
         unreachable_max_ms = 60000
@@ -120,7 +121,7 @@ fn what_nobody_uses_is_not_there() {
 fn settings_that_cannot_work_are_answered_with_what_to_do() {
     let said = |agent: &str, set: &str| with("procgen:bigfish", agent, &[set]).unwrap_err();
     expect![[r#"there is no setting "learner.update.adam.learning_rate"; [learner.update.adam] has beta1, beta2, eps, lr"#]].assert_eq(&said("driml-ada", "learner.update.adam.learning_rate=1"));
-    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
+    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, precision, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
     expect![[r#"there is no setting "world.num_level" (did you mean "world.num_levels"?); [world] has center_agent, distribution_mode, num_levels, paint_vel_info, restrict_themes, start_level, use_backgrounds, use_sequential_levels"#]].assert_eq(&said("driml-ada", "world.num_level=5"));
     expect!["model.height cannot be set by hand: it follows from input.height"]
         .assert_eq(&said("driml-ada", "model.height=84"));
@@ -204,7 +205,7 @@ fn a_ladder_of_epsilons_is_for_the_actors_of_the_run() {
         .assert_eq(&of(&["actor.epsilon_ladder={base=4.0,alpha=7.0}", "local.actors=2"]).unwrap_err());
     expect!["in the settings' [actor] table: missing field `alpha`"]
         .assert_eq(&of(&["actor.epsilon_ladder={base=0.4}", "local.actors=2"]).unwrap_err());
-    expect![[r#"there is no setting "actor.epsilon_ladder.rungs"; [actor] has ack_timeout_ms, chunks_in_flight_max, envs, epsilon_decay_frames, epsilon_end, epsilon_start, round_transitions_max, steps_per_chunk, unreachable_max_ms, world_threads"#]]
+    expect![[r#"there is no setting "actor.epsilon_ladder.rungs"; [actor] has ack_timeout_ms, chunks_in_flight_max, envs, epsilon_decay_frames, epsilon_end, epsilon_start, precision, round_transitions_max, steps_per_chunk, unreachable_max_ms, world_threads"#]]
         .assert_eq(&of(&["actor.epsilon_ladder.rungs=3"]).unwrap_err());
 }
 
@@ -234,7 +235,7 @@ fn a_file_at_odds_with_itself_is_refused() {
     .assert_eq(&said("= 3".into()));
     expect!["x.toml: the settings lack run.world, a word: use a config.toml that driml wrote"]
         .assert_eq(&said(String::new()));
-    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
+    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
 }
 
 #[test]

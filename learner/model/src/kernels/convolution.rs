@@ -9,8 +9,9 @@ use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::linear::{relu_gradient, relu_of};
 use crate::kernels::product::{Matrix, Panels, Threads};
+use crate::kernels::rounding::{store, store_bytes, write_rows};
 use crate::kernels::units::{
-    Columns, Element, LANES, Left, Mode, Unit, multiply_tile, row_tiles, tile_vecs,
+    Columns, Element, LANES, Left, Mode, Unit, multiply_tile, row_tiles, tile_vecs, vectorized,
 };
 
 impl ConvShape {
@@ -87,20 +88,16 @@ impl<'a> Pixels<'a> {
     pub(crate) fn operands<U: Unit>(&self, unit: U) -> (Buffer<U::Element>, f32) {
         let mut values = Buffer::new(self.len() + PADDING);
         values[self.len()..].fill(U::Element::default());
-        let scale = unit.vectorize(|| match self {
+        let scale = match *self {
             Self::Bytes(bytes) => {
-                for (value, &byte) in values.iter_mut().zip(*bytes) {
-                    *value = U::Element::of_byte(byte);
-                }
+                store_bytes(unit, bytes, &mut values);
                 U::Element::BYTE_SCALE
             }
             Self::Floats(floats) => {
-                for (value, &float) in values.iter_mut().zip(*floats) {
-                    *value = U::Element::of(float);
-                }
+                store(unit, floats, &mut values);
                 1.0
             }
-        });
+        };
         (values, scale)
     }
 }
@@ -198,14 +195,19 @@ pub(crate) fn forward<U: Unit>(
                 .forward
                 .multiply(unit, windows, left, Mode::Replace, &mut row[x * out..]);
         }
-        unit.vectorize(|| {
-            for location in row.chunks_exact_mut(out) {
-                for (value, bias) in location.iter_mut().zip(&layer.bias) {
-                    *value = relu_of(*value * images.scale + bias);
-                }
+        finish_row(unit, &mut row, &layer.bias, images.scale);
+        write(index * out_width * out, &row);
+    }
+}
+
+vectorized! {
+    /// relu(scale * row + bias) for each location of `row` [locations, out].
+    fn finish_row<U>(unit, row: &'a mut [f32], bias: &'a [f32], scale: f32) {
+        for location in row.chunks_exact_mut(bias.len()) {
+            for (value, bias) in location.iter_mut().zip(bias) {
+                *value = relu_of(*value * scale + bias);
             }
-            write(index * out_width * out, &row);
-        });
+        }
     }
 }
 
@@ -296,52 +298,63 @@ impl<E: Element> Masked<E> {
         grad_maps: &[f32],
         bias: &mut [f32],
     ) {
+        mask(unit, maps, grad_maps, bias, &mut self.values);
+    }
+
+    fn write_rows<U: Unit<Element = E>>(&mut self, unit: U, out: usize) {
+        write_rows(unit, &self.values, out, &mut self.rows);
+    }
+
+    fn write_panels<U: Unit<Element = E>>(&mut self, unit: U, shape: &ConvShape) {
+        let width = tile_vecs::<U>(shape.channels_out) * LANES;
+        write_panels(unit, &self.values, *shape, width, &mut self.panels);
+    }
+}
+
+vectorized! {
+    fn mask<U, M>(
+        unit,
+        maps: &'a [M],
+        grad_maps: &'a [f32],
+        bias: &'a mut [f32],
+        masked: &'a mut [f32],
+    ) {
         let out = bias.len();
-        unit.vectorize(|| {
-            let locations = maps.chunks_exact(out).zip(grad_maps.chunks_exact(out));
-            for (masked, (maps, grads)) in self.values.chunks_exact_mut(out).zip(locations) {
-                for (((masked, bias), &map), &grad) in
-                    masked.iter_mut().zip(&mut *bias).zip(maps).zip(grads)
-                {
-                    *masked = relu_gradient(map.value(), grad);
-                    *bias += *masked;
-                }
+        let locations = maps.chunks_exact(out).zip(grad_maps.chunks_exact(out));
+        for (masked, (maps, grads)) in masked.chunks_exact_mut(out).zip(locations) {
+            for (((masked, bias), &map), &grad) in
+                masked.iter_mut().zip(&mut *bias).zip(maps).zip(grads)
+            {
+                *masked = relu_gradient(map.value(), grad);
+                *bias += *masked;
             }
-        });
+        }
     }
+}
 
-    fn write_rows<U: Unit>(&mut self, unit: U, out: usize) {
-        let rows = self.rows.chunks_exact_mut(out.next_multiple_of(E::DEPTH));
-        unit.vectorize(|| {
-            for (row, masked) in rows.zip(self.values.chunks_exact(out)) {
-                let (begin, end) = row.split_at_mut(out);
-                for (value, &masked) in begin.iter_mut().zip(masked) {
-                    *value = E::of(masked);
-                }
-                end.fill(E::default());
-            }
-        });
-    }
-
-    fn write_panels<U: Unit>(&mut self, unit: U, shape: &ConvShape) {
-        let (out, out_width) = (shape.channels_out, shape.out_width());
-        let width = tile_vecs::<U>(out) * LANES;
-        let panels = self.panels.chunks_exact_mut(panel_len::<E>(shape, width));
-        unit.vectorize(|| {
-            for (index, panel) in panels.enumerate() {
-                let cols = index * width..out.min((index + 1) * width);
-                let mut steps = panel.chunks_exact_mut(width * E::DEPTH);
-                for line in self.values.chunks_exact(out_width * out) {
-                    for windows in line.chunks(E::DEPTH * out) {
-                        let second = windows.get(out..).unwrap_or_default();
-                        let second = second.get(cols.clone()).unwrap_or_default();
-                        if let Some(step) = steps.next() {
-                            E::join(&windows[cols.clone()], second, step);
-                        }
+vectorized! {
+    fn write_panels<U>(
+        unit,
+        values: &'a [f32],
+        shape: ConvShape,
+        width: usize,
+        panels: &'a mut [U::Element],
+    ) {
+        let (out, out_width, depth) = (shape.channels_out, shape.out_width(), U::Element::DEPTH);
+        let panels = panels.chunks_exact_mut(panel_len::<U::Element>(&shape, width));
+        for (index, panel) in panels.enumerate() {
+            let cols = index * width..out.min((index + 1) * width);
+            let mut steps = panel.chunks_exact_mut(width * depth);
+            for line in values.chunks_exact(out_width * out) {
+                for windows in line.chunks(depth * out) {
+                    let second = windows.get(out..).unwrap_or_default();
+                    let second = second.get(cols.clone()).unwrap_or_default();
+                    if let Some(step) = steps.next() {
+                        U::Element::join(&windows[cols.clone()], second, step);
                     }
                 }
             }
-        });
+        }
     }
 }
 
@@ -364,7 +377,7 @@ fn weight_gradient<U: Unit>(
     let width = vecs * LANES;
     let pairs = (depth == 2).then(|| {
         let mut pairs = Buffer::new(image.len() * 2);
-        unit.vectorize(|| pair_neighbours(image, shape.shift(), &mut pairs));
+        pair_neighbours(unit, image, shape.shift(), &mut pairs);
         pairs
     });
     let values = pairs.as_deref().unwrap_or(image);
@@ -397,17 +410,23 @@ fn weight_gradient<U: Unit>(
     }
 }
 
-/// Pairs every scalar with the one `shift` further, or with 0 where the image ends before.
-#[inline(always)]
-fn pair_neighbours<E: Element>(values: &[E], shift: usize, pairs: &mut [E]) {
-    let later = values.get(shift..).unwrap_or_default();
-    let (both, one) = pairs.split_at_mut(later.len() * 2);
-    let (begin, end) = values.split_at(later.len());
-    for ((pair, &value), &later) in both.chunks_exact_mut(2).zip(begin).zip(later) {
-        (pair[0], pair[1]) = (value, later);
-    }
-    for (pair, &value) in one.chunks_exact_mut(2).zip(end) {
-        (pair[0], pair[1]) = (value, E::default());
+vectorized! {
+    /// Pairs every scalar with the one `shift` further, or with 0 where the image ends before.
+    fn pair_neighbours<U>(
+        unit,
+        values: &'a [U::Element],
+        shift: usize,
+        pairs: &'a mut [U::Element],
+    ) {
+        let later = values.get(shift..).unwrap_or_default();
+        let (both, one) = pairs.split_at_mut(later.len() * 2);
+        let (begin, end) = values.split_at(later.len());
+        for ((pair, &value), &later) in both.chunks_exact_mut(2).zip(begin).zip(later) {
+            (pair[0], pair[1]) = (value, later);
+        }
+        for (pair, &value) in one.chunks_exact_mut(2).zip(end) {
+            (pair[0], pair[1]) = (value, U::Element::default());
+        }
     }
 }
 

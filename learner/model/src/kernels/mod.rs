@@ -7,5 +7,6 @@ pub(crate) mod convolution;
 pub(crate) mod linear;
 pub(crate) mod precision;
 pub(crate) mod product;
+pub(crate) mod rounding;
 pub(crate) mod stack;
 pub(crate) mod units;

@@ -5,9 +5,10 @@ use rayon::prelude::*;
 
 use crate::kernels::buffer::Buffer;
 use crate::kernels::precision::Precision;
+use crate::kernels::rounding::write_rows;
 use crate::kernels::units::{
     Columns, Element, ForUnit, LANES, Left, Mode, Unit, multiply_tile, row_tiles, tile_vecs,
-    with_unit,
+    vectorized, with_unit,
 };
 
 /// A matrix laid over a slice: its rows one after the other, or its columns if it is transposed.
@@ -155,7 +156,7 @@ impl<E: Element> Panels<E> {
         let panel_len = steps * width * E::DEPTH;
         let mut values = Buffer::new(panel_len * b.cols.div_ceil(width));
         let pack = |panel: usize, values: &mut [E]| {
-            unit.vectorize(|| pack_panel(unit, b, panel * width, width, values));
+            pack_panel(unit, b, panel * width, width, values);
         };
         match threads {
             Threads::Caller => {
@@ -224,26 +225,27 @@ impl<E: Element> Panels<E> {
     }
 }
 
-/// Packs columns `first..` of `b` as one panel of this width.
-#[inline(always)]
-fn pack_panel<U: Unit>(
-    unit: U,
-    b: Matrix<'_>,
-    first: usize,
-    width: usize,
-    panel: &mut [U::Element],
-) {
-    let cols = width.min(b.cols - first);
-    if b.transposed {
-        return pack_transposed(unit, b, first, width, panel);
-    }
-    let steps = panel.chunks_exact_mut(width * U::Element::DEPTH);
-    for (step, rows) in steps.zip(b.data.chunks(b.cols * U::Element::DEPTH)) {
-        let part = |row: usize| {
-            let row = rows.get(row * b.cols..).unwrap_or_default();
-            row.get(first..first + cols).unwrap_or_default()
-        };
-        U::Element::join(part(0), part(1), step);
+vectorized! {
+    /// Packs columns `first..` of `b` as one panel of this width.
+    fn pack_panel<U>(
+        unit,
+        b: Matrix<'a>,
+        first: usize,
+        width: usize,
+        panel: &'a mut [U::Element],
+    ) {
+        if b.transposed {
+            return pack_transposed(unit, b, first, width, panel);
+        }
+        let (cols, depth) = (width.min(b.cols - first), U::Element::DEPTH);
+        let steps = panel.chunks_exact_mut(width * depth);
+        for (step, rows) in steps.zip(b.data.chunks(b.cols * depth)) {
+            let part = |row: usize| {
+                let row = rows.get(row * b.cols..).unwrap_or_default();
+                row.get(first..first + cols).unwrap_or_default()
+            };
+            U::Element::join(part(0), part(1), step);
+        }
     }
 }
 
@@ -359,15 +361,7 @@ fn pack_rows<U: Unit>(
 ) {
     let rows = (TASK_LEN / stride).max(1);
     let pack = |values: &mut [U::Element], data: &[f32]| {
-        unit.vectorize(|| {
-            for (values, row) in values.chunks_exact_mut(stride).zip(data.chunks_exact(cols)) {
-                let (values, rest) = values.split_at_mut(cols);
-                for (to, &from) in values.iter_mut().zip(row) {
-                    *to = U::Element::of(from);
-                }
-                rest.fill(U::Element::default());
-            }
-        });
+        write_rows(unit, data, cols, values);
     };
     match threads {
         Threads::Caller => pack(values, data),
@@ -384,7 +378,7 @@ fn pack_steps<U: Unit>(unit: U, b: Matrix<'_>, values: &mut [U::Element], thread
     let steps = (TASK_LEN / (cols * depth)).max(1);
     let pack = |values: &mut [U::Element], data: &[f32]| {
         let part = Matrix::new(data, data.len() / cols, cols);
-        unit.vectorize(|| pack_panel(unit, part, 0, cols, values));
+        pack_panel(unit, part, 0, cols, values);
     };
     match threads {
         Threads::Caller => pack(values, b.data),

@@ -8,7 +8,7 @@ use std::sync::OnceLock;
 
 use half::bf16;
 
-use super::unit::{LANES, Mode, RawTile, Unit};
+use super::unit::{LANES, Loop, Mode, RawTile, Unit};
 
 /// Steps, which are pairs of bf16, in a row of a tile register: 64 bytes.
 const STEPS: usize = 16;
@@ -262,7 +262,7 @@ impl Unit for Amx {
     }
 
     #[inline(always)]
-    fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
+    fn vectorize<W: Loop>(self, work: W) {
         super::avx512::Single::here().vectorize(work)
     }
 }
@@ -512,8 +512,8 @@ pub(super) mod emulated {
             unsafe { compute(&mut Registers::default(), tile, rows, vecs) }
         }
 
-        fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
-            work()
+        fn vectorize<W: Loop>(self, work: W) {
+            work.run()
         }
     }
 }

@@ -11,7 +11,7 @@ use std::arch::x86_64::{
 use half::bf16;
 
 use super::{
-    unit::{LANES, RawTile, Unit},
+    unit::{LANES, Loop, RawTile, Unit},
     vector::{Vector, compute_sizes},
 };
 
@@ -58,7 +58,7 @@ macro_rules! unit {
             }
 
             #[inline(always)]
-            fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
+            fn vectorize<W: Loop>(self, work: W) {
                 // SAFETY: `here` found the instructions.
                 unsafe { vectorized(work) }
             }
@@ -70,8 +70,8 @@ unit!(Single, f32);
 unit!(Rounded, bf16);
 
 #[target_feature(enable = "avx2,fma")]
-unsafe fn vectorized<R>(work: impl FnOnce() -> R) -> R {
-    work()
+unsafe fn vectorized<W: Loop>(work: W) {
+    work.run();
 }
 
 /// Sums of 16 columns.

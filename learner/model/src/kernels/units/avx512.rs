@@ -13,7 +13,7 @@ use std::mem::transmute;
 use half::bf16;
 
 use super::{
-    unit::{LANES, RawTile, Unit},
+    unit::{LANES, Loop, RawTile, Unit},
     vector::{Vector, compute_sizes},
 };
 
@@ -92,7 +92,7 @@ impl Unit for Single {
     }
 
     #[inline(always)]
-    fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
+    fn vectorize<W: Loop>(self, work: W) {
         // SAFETY: `here` found the instructions.
         unsafe { vectorized(work) }
     }
@@ -125,7 +125,7 @@ impl Unit for Brain {
     }
 
     #[inline(always)]
-    fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
+    fn vectorize<W: Loop>(self, work: W) {
         // SAFETY: `here` found the instructions.
         unsafe { vectorized(work) }
     }
@@ -139,7 +139,8 @@ impl Brain {
 }
 
 /// Transposes 16 registers of 16: pairs of 32 bits, of 64 bits, then quarters of registers twice.
-#[target_feature(enable = "avx512f")]
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,fma")]
 unsafe fn transposed(block: &mut [[u32; LANES]; LANES]) {
     // SAFETY: every row of the block is the 64 bytes of a register, read and written where it is.
     let rows: [__m512i; LANES] =
@@ -188,8 +189,8 @@ unsafe fn transposed(block: &mut [[u32; LANES]; LANES]) {
 }
 
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,fma")]
-unsafe fn vectorized<R>(work: impl FnOnce() -> R) -> R {
-    work()
+unsafe fn vectorized<W: Loop>(work: W) {
+    work.run();
 }
 
 /// Writes the first `count` of 16 sums.

@@ -17,4 +17,4 @@ pub(crate) use choice::with_every_unit;
 pub(crate) use choice::with_unit;
 pub(crate) use element::Element;
 pub(crate) use tile::{Columns, Left, multiply_tile, row_tiles, tile_vecs};
-pub(crate) use unit::{ForUnit, LANES, Mode, Unit};
+pub(crate) use unit::{ForUnit, LANES, Loop, Mode, Unit, vectorized};

@@ -4,7 +4,7 @@ use half::bf16;
 
 use super::{
     element::Element,
-    unit::{LANES, RawTile, Unit},
+    unit::{LANES, Loop, RawTile, Unit},
     vector::{Vector, compute_sizes},
 };
 
@@ -33,8 +33,8 @@ macro_rules! unit {
             }
 
             #[inline(always)]
-            fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
-                work()
+            fn vectorize<W: Loop>(self, work: W) {
+                work.run()
             }
         }
 

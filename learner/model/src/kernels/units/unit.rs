@@ -62,7 +62,7 @@ pub(crate) trait Unit: Copy + Send + Sync + 'static {
     }
 
     /// Runs `work` compiled for the unit's instructions, so that its loops use its registers.
-    fn vectorize<R>(self, work: impl FnOnce() -> R) -> R;
+    fn vectorize<W: Loop>(self, work: W);
 }
 
 /// Work that any unit can do.
@@ -73,3 +73,44 @@ pub(crate) trait ForUnit {
     /// Does it on `unit`.
     fn run<U: Unit>(self, unit: U) -> Self::Output;
 }
+
+/// Loops over slices, made by [`vectorized!`](crate::kernels::units::vectorized).
+pub(crate) trait Loop {
+    /// Runs them. To be `#[inline(always)]`: a function of its own, or a closure, would be compiled for the least that any
+    /// processor has.
+    fn run(self);
+}
+
+/// Defines a function whose body is compiled for the instructions of the unit that is its first argument.
+///
+/// `fn name<U>(unit, argument: &'a [U::Element], ..) { .. }`; further type parameters are elements, and references live for `'a`.
+macro_rules! vectorized {
+    (
+        $(#[$meta:meta])*
+        $vis:vis fn $name:ident<$U:ident $(, $E:ident)*>($unit:ident $(, $arg:ident: $ty:ty)* $(,)?) $body:block
+    ) => {
+        $(#[$meta])*
+        $vis fn $name<'a, $U: $crate::kernels::units::Unit $(, $E: $crate::kernels::units::Element)*>(
+            $unit: $U
+            $(, $arg: $ty)*
+        ) {
+            struct Work<'a, $U: $crate::kernels::units::Unit $(, $E: $crate::kernels::units::Element)*>(
+                $U,
+                $($ty,)*
+                std::marker::PhantomData<(&'a (), $($E,)*)>,
+            );
+            impl<'a, $U: $crate::kernels::units::Unit $(, $E: $crate::kernels::units::Element)*>
+                $crate::kernels::units::Loop for Work<'a, $U $(, $E)*>
+            {
+                #[inline(always)]
+                #[allow(unused_variables, reason = "few loops need the unit itself")]
+                fn run(self) {
+                    let Self($unit, $($arg,)* _) = self;
+                    $body
+                }
+            }
+            $unit.vectorize(Work::<$U $(, $E)*>($unit, $($arg,)* std::marker::PhantomData));
+        }
+    };
+}
+pub(crate) use vectorized;
