@@ -16,7 +16,7 @@ use crate::kernels::convolution::{Convolution, Images, PADDING, Pixels, forward}
 use crate::kernels::linear::relu_of;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::{Matrix, Panels, Threads};
-use crate::kernels::units::{Element, ForUnit, Left, Mode, Unit, row_tiles, vectorized, with_unit};
+use crate::kernels::units::{Element, ForUnit, Left, Mode, Unit, vectorized, with_unit};
 use crate::parameters::{decode, is_dim};
 
 /// Frames that go through the network together on one thread.
@@ -277,19 +277,17 @@ impl<U: Unit> Dense<U> {
         }
         let depth = U::Element::DEPTH;
         let row_stride = self.inputs.next_multiple_of(depth);
-        for (row, rows) in row_tiles::<U>(count, self.weight.vecs()) {
-            let left = Left {
-                values: x,
-                start: row * row_stride,
-                row_stride,
-                step: depth,
-                steps: row_stride / depth,
-                run_stride: 0,
-                runs: 1,
-            };
-            self.weight
-                .multiply(unit, rows, left, Mode::Add, &mut y[row * outputs..]);
-        }
+        let left = Left {
+            values: x,
+            start: 0,
+            row_stride,
+            step: depth,
+            steps: row_stride / depth,
+            run_stride: 0,
+            runs: 1,
+        };
+        self.weight
+            .multiply_rows(unit, count, left, Mode::Add, &mut y);
         y
     }
 }

@@ -51,6 +51,15 @@ use Component::{Env, Learner, Policy, Replay};
 pub(super) const PAIRS: &[Pair] = &[
     same(Learner, "C51, 64x64x3", None),
     same(Learner, "C51 + global-global DIM, 64x64x3", Some(1.3)),
+    // Beside the faster of PyTorch's f32 and bf16 autocast; the goal is that for AVX512_BF16, with AMX it is 3.
+    same(Learner, "C51, 64x64x3, bf16", None),
+    same(Learner, "C51 + global-global DIM, 64x64x3, bf16", Some(1.6)),
+    same(
+        Learner,
+        "C51 + local-local + global-global DIM, 64x64x3, bf16",
+        None,
+    ),
+    same(Learner, "C51 + global-global DIM, 104x80x3, bf16", None),
     Pair {
         component: Learner,
         ours: "C51 + global-global DIM, 64x64x3",
@@ -68,6 +77,10 @@ pub(super) const PAIRS: &[Pair] = &[
     same(Learner, "C51 + global-global DIM, 104x80x3", Some(1.2)),
     same(Policy, "32 frames of 64x64x3", Some(1.3)),
     same(Policy, "256 frames of 64x64x3", Some(1.3)),
+    same(Policy, "32 frames of 64x64x3, bf16", None),
+    same(Policy, "256 frames of 64x64x3, bf16", None),
+    same(Policy, "32 frames of 104x80x3, bf16", None),
+    same(Policy, "256 frames of 104x80x3, bf16", None),
     same(Policy, "32 frames of 104x80x3", Some(1.3)),
     same(Policy, "256 frames of 104x80x3", Some(1.3)),
     // Chunks of 256 transitions are what an actor sends.

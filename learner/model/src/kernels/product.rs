@@ -58,6 +58,8 @@ pub(crate) enum Threads {
 
 /// Rows of the output that one task computes. Fixed, so that a product's bits do not depend on the number of threads.
 const TASK_ROWS: usize = 32;
+/// Steps of a panel that are multiplied by all rows of a task before the next: 32 KiB of the widest panel.
+const STEPS_IN_CACHE: usize = 128;
 /// Multiplications below which a product is not split.
 const SPLIT_MIN: usize = 1 << 18;
 
@@ -118,18 +120,7 @@ fn multiply_with<U: Unit>(
     let panels = Panels::pack(unit, b, threads);
     let rows = Rows::pack(unit, a, threads);
     let task = |first: usize, out: &mut [f32]| {
-        let count = out.len() / n;
-        for tile in row_tiles::<U>(count, panels.vecs) {
-            // Panels inside: a few rows of `a` stay in the first cache while all of `b` passes.
-            let (row, tile_rows) = tile;
-            panels.multiply(
-                unit,
-                tile_rows,
-                rows.left(first + row),
-                mode,
-                &mut out[row * n..],
-            );
-        }
+        panels.multiply_rows(unit, out.len() / n, rows.left(first), mode, out);
     };
     match threads {
         Threads::Caller => task(0, out),
@@ -192,6 +183,45 @@ impl<E: Element> Panels<E> {
         out: &mut [f32],
     ) {
         self.multiply_apart(unit, rows, left, mode, out, self.cols);
+    }
+
+    /// Multiplies any number of rows of one run into `out`, whose rows are this operand's columns long.
+    ///
+    /// A block of a panel stays in the first cache while all rows pass it.
+    pub(crate) fn multiply_rows<U: Unit<Element = E>>(
+        &self,
+        unit: U,
+        rows: usize,
+        left: Left<'_, E>,
+        mode: Mode,
+        out: &mut [f32],
+    ) {
+        let width = self.vecs * LANES;
+        let panels = self.values.chunks_exact(self.steps * width * E::DEPTH);
+        for (index, panel) in panels.enumerate() {
+            let first = index * width;
+            let blocks = panel.chunks(STEPS_IN_CACHE * width * E::DEPTH);
+            for (block, panel) in blocks.enumerate() {
+                let mode = if block == 0 { mode } else { Mode::Add };
+                let start = left.start + block * STEPS_IN_CACHE * left.step;
+                let steps = panel.len() / (width * E::DEPTH);
+                for (row, count) in row_tiles::<U>(rows, self.vecs) {
+                    let left = Left {
+                        start: start + row * left.row_stride,
+                        steps,
+                        ..left
+                    };
+                    let columns = Columns {
+                        out: &mut out[row * self.cols + first..],
+                        stride: self.cols,
+                        cols: width.min(self.cols - first),
+                        vecs: self.vecs,
+                        mode,
+                    };
+                    multiply_tile(unit, count, left, panel, columns);
+                }
+            }
+        }
     }
 
     /// [`Panels::multiply`] into rows of `out` that begin `stride` scalars apart.
