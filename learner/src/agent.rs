@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use candle_core::Tensor;
-use driml_model::{Compute, DimHeads, ModelConfig, Network, Parameters};
+use driml_model::{Compute, DimHeads, ModelConfig, Network, Parameters, StoredAs};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
@@ -199,9 +199,16 @@ impl Agent {
     /// # Errors
     /// A weight that is not finite; a failing serialisation.
     pub fn weights(&self) -> Result<Vec<u8>, UpdateError> {
-        Ok(self
-            .online
-            .to_safetensors(|name| !name.starts_with(target::AUXILIARY_PREFIX))?)
+        self.weights_as(StoredAs::F32)
+    }
+
+    /// [`Agent::weights`] with scalars of another type.
+    ///
+    /// # Errors
+    /// As there, and a weight that is too large for the type.
+    pub fn weights_as(&self, stored: StoredAs) -> Result<Vec<u8>, UpdateError> {
+        let acting = |name: &str| !name.starts_with(target::AUXILIARY_PREFIX);
+        Ok(self.online.to_safetensors_as(stored, acting)?)
     }
 
     /// Learns from one batch.

@@ -1,7 +1,7 @@
 //! The learner's settings, and what it takes from the run's other tables.
 //! It fills in no number: presets do, with their sources.
 
-use driml_model::{ModelConfig, Precision};
+use driml_model::{ModelConfig, Precision, StoredAs};
 use driml_protocol::{
     RunSpec, RunSpecError,
     config::{Settings, TransportConfig},
@@ -32,6 +32,9 @@ pub struct Config {
     pub precision: Precision,
     /// Batches asked for ahead of the one being learned from.
     pub batches_in_flight: u32,
+    /// What the scalars of published weights are. Settings of earlier versions do not have it: f32.
+    #[serde(default)]
+    pub publish_as: StoredAs,
     /// Updates from one version of the weights to the next.
     pub publish_period_updates: u64,
     /// Updates from one checkpoint to the next.

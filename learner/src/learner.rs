@@ -255,7 +255,7 @@ impl Learner {
     /// # Errors
     /// The tensor library failed.
     pub fn next_weights(&mut self) -> Result<Weights, LearnerError> {
-        let safetensors = self.agent.weights()?;
+        let safetensors = self.agent.weights_as(self.config.learner.publish_as)?;
         self.weights_version += 1;
         let header = WeightsHeader::new(self.weights_version, self.updates(), &safetensors);
         Ok(Weights {

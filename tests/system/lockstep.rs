@@ -32,6 +32,20 @@ fn the_seed_decides_the_weights() {
     assert_eq!(first.weights_sha256, again.weights_sha256);
 }
 
+#[test]
+fn the_seed_decides_the_weights_in_bf16_too() {
+    let system = system();
+    let flags = format!("{SHORT} --agent driml-ada --seed 3");
+    let bf16 = format!(
+        "{flags} --set learner.precision=bf16 --set actor.precision=bf16 --set learner.publish_as=f16"
+    );
+    let first = run(&system, &bf16, "first");
+    let same = run(&system, &bf16, "same");
+    let f32 = run(&system, &flags, "f32");
+    assert_eq!(first.weights_sha256, same.weights_sha256);
+    assert_ne!(first.weights_sha256, f32.weights_sha256);
+}
+
 /// The augmentation draws from the learner's generator, which the seed decides.
 #[test]
 fn the_seed_decides_the_augmentation_too() {

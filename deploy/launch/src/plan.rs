@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use driml_learner::{DeviceName, auxiliary::loss::Passes};
+use driml_learner::{DeviceName, Precision, auxiliary::loss::Passes};
 use driml_machine::{resources::Machine, units::duration};
 use driml_model::ModelConfig;
 use driml_settings::{
@@ -125,7 +125,13 @@ pub fn describe(
             shards => format!("{shards} replay servers"),
         };
         let learner = match local.learner_device {
-            DeviceName::Cpu => format!("with {} threads", local.learner_threads),
+            DeviceName::Cpu if learner.precision == Precision::F32 => {
+                format!("with {} threads", local.learner_threads)
+            }
+            DeviceName::Cpu => {
+                let (threads, precision) = (local.learner_threads, learner.precision);
+                format!("with {threads} threads, in {precision}")
+            }
             gpu => format!("on {gpu}"),
         };
         let actors = if local.actors == 1 { "actor" } else { "actors" };

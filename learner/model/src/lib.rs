@@ -40,6 +40,7 @@ mod kernels;
 mod network;
 mod parameters;
 mod policy;
+mod stored;
 mod torso;
 
 pub use compute::{Compute, DeviceError, DeviceName, Kernels};
@@ -56,3 +57,4 @@ pub use kernels::units::kernels_in_words;
 pub use network::{Features, Network};
 pub use parameters::Parameters;
 pub use policy::PolicyNetwork;
+pub use stored::StoredAs;

@@ -206,7 +206,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
     lines.push(line(
         "grad_norm",
         (got - global_norm).abs(),
-        allowed.gradient * global_norm,
+        allowed.norm * global_norm,
     ));
 
     let mut worst = Worst::default();

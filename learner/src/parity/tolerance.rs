@@ -18,10 +18,12 @@ pub(super) struct Tolerances {
     pub(super) saturated_loss: f64,
     /// Losses, absolute.
     pub(super) least_loss: f64,
-    /// Gradients, as a share of the tensor's own 2-norm, to which that of the global one is added; the norm, as a share of itself.
+    /// Gradients, as a share of the tensor's own 2-norm, to which that of the global one is added.
     pub(super) gradient: f64,
     /// Gradients, as a share of the global 2-norm.
     pub(super) gradient_of_global: f64,
+    /// The global 2-norm, as a share of itself.
+    pub(super) norm: f64,
     /// 1 - cosine of a gradient whose 2-norm is at least a tenth of the global one; where that is looked at.
     pub(super) angle: Option<f64>,
     /// Parameters after the step, absolute.
@@ -41,6 +43,7 @@ impl Tolerances {
         least_loss: 1e-6,
         gradient: 1e-4,
         gradient_of_global: 1e-6,
+        norm: 1e-4,
         angle: None,
         updated: 4e-6,
         updated_rates: 0.0,
@@ -48,7 +51,7 @@ impl Tolerances {
 
     /// Derived from bf16's unit roundoff, 2^-9 = 2e-3: one of it for what is a mean over many products (values, probabilities), a few
     /// for losses, and for gradients the share of ReLUs that open or close. Found on the open cases, at most: values 1.0e-3 of the
-    /// width, probabilities 5.7e-4, losses 4.5e-3. Adam's first step is one learning rate up or down whatever the gradient's size,
+    /// width, probabilities 5.7e-4, losses 4.5e-3, the gradients' norm 2.6e-2, 1 - cosine 1.4e-2. Adam's first step is one learning rate up or down whatever the gradient's size,
     /// so a gradient near 0 that changes its sign moves a parameter by two.
     const BF16: Self = Self {
         q_values: 2e-3,
@@ -59,6 +62,7 @@ impl Tolerances {
         least_loss: 2e-3,
         gradient: 0.15,
         gradient_of_global: 0.03,
+        norm: 0.05,
         angle: Some(0.03),
         updated: 4e-6,
         updated_rates: 2.0,

@@ -416,6 +416,7 @@ fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConf
         model,
         learner: Config {
             precision: Default::default(),
+            publish_as: Default::default(),
             batch_size: 6,
             batches_in_flight: 1,
             publish_period_updates: 2,

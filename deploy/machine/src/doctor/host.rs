@@ -1,8 +1,9 @@
-//! What every run needs of the machine: cores, vector instructions, memory, shared memory, disk.
+//! What every run needs of the machine: cores, vector instructions and what the kernels make of them, memory, shared memory, disk.
 //! The numbers are what is free now; how large a run becomes is for `plan`.
 
 use std::path::Path;
 
+use driml_model::{Precision, kernels_in_words};
 use driml_protocol::shared_memory::{self, lockable_bytes};
 use nix::sys::statvfs::statvfs;
 
@@ -36,6 +37,7 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
     vec![
         cores(machine.cores),
         vectors(Vectors::this()),
+        kernels(),
         memory(&machine),
         shared_memory(free(Path::new(shared_memory::FOLDER))),
         locked_memory(lockable_bytes()),
@@ -95,6 +97,13 @@ fn vectors(found: Option<Vectors>) -> Fact {
             "no AVX2 with FMA: matrix products are many times slower; does a virtual machine hide them?",
         ),
     }
+}
+
+/// What the network's products run on, in either precision.
+fn kernels() -> Fact {
+    let [f32, bf16] = Precision::ALL.map(kernels_in_words);
+    let text = format!("precision \"f32\": {f32}; \"bf16\": {bf16}");
+    Fact::ok("kernels", text)
 }
 
 fn memory(machine: &Machine) -> Fact {

@@ -44,6 +44,7 @@ const PINNED: &[(&str, &[Pinned])] = &[
         ("learner.batch_size", "256", "code"),
         ("learner.precision", r#""f32""#, "ours"),
         ("learner.batches_in_flight", "2", "ours"),
+        ("learner.publish_as", r#""f32""#, "ours"),
         ("learner.publish_period_updates", "8", "ours"),
         ("learner.checkpoint_period_updates", "1000", "ours"),
         ("learner.checkpoints_kept", "3", "ours"),

@@ -2,7 +2,9 @@
 //! Values against another framework are in `parity`.
 
 use candle_core::{DType, Device, Result, Tensor};
-use driml_model::{ConvLayer, DimHeads, Kernels, ModelConfig, ModelError, Network, Parameters};
+use driml_model::{
+    Backward, ConvLayer, DimHeads, Kernels, ModelConfig, ModelError, Network, Parameters, Precision,
+};
 
 use crate::support::{assert_close, bits, frames, parameters, rng, small, values};
 
@@ -166,9 +168,16 @@ fn the_dim_heads_follow_their_formula_with_gradients() -> Result<()> {
 
 #[test]
 fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
+    for precision in Precision::ALL {
+        the_same_bits_for_any_number_of_threads(precision);
+    }
+}
+
+fn the_same_bits_for_any_number_of_threads(precision: Precision) {
     let config = small();
     let parameters = with_biases(&config);
-    let network = Network::new(&config, &parameters).unwrap();
+    let kernels = Kernels::Fused(precision);
+    let network = Network::with_kernels(&config, &parameters, kernels).unwrap();
     let batch = frames(&config, 61, &mut rng(2));
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new()
@@ -182,10 +191,10 @@ fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
             let loss = (logits.sqr().unwrap().sum_all().unwrap()
                 + phi3.sqr().unwrap().sum_all().unwrap())
             .unwrap();
-            let grads = loss.backward().unwrap();
+            let mut grads = Backward::of(&loss).unwrap();
             let grads = parameters
                 .iter()
-                .filter_map(|(_, var)| grads.get(var).map(bits))
+                .filter_map(|(_, var)| grads.remove(var).unwrap().as_ref().map(bits))
                 .collect::<Vec<_>>();
             (bits(&logits), grads)
         })
@@ -419,4 +428,29 @@ fn configurations_that_cannot_work_are_errors() {
     fails(|config| config.conv[0].stride = 0);
     fails(|config| config.conv[2].out = 0);
     fails(|config| (config.hidden, config.rkhs) = (65_536, 65_536));
+}
+
+#[test]
+fn gradients_that_are_summed_in_place_are_candle_s() -> Result<()> {
+    let config = small();
+    let (parameters, batch) = (with_biases(&config), frames(&config, 9, &mut rng(4)));
+    let network = Network::new(&config, &parameters).unwrap();
+    // Every parameter twice, once through each half of the batch.
+    let features = network.features(&batch).unwrap();
+    let halves = [features.narrow(0, 4)?, features.narrow(4, 5)?];
+    let losses = halves.map(|half| network.logits(&half.f4).unwrap().sqr()?.sum_all());
+    let [first, second] = losses;
+    let loss = (first? + second?)?;
+    let (wanted, mut found) = (loss.backward()?, Backward::of(&loss)?);
+    let mut compared = 0;
+    for (name, var) in parameters.iter() {
+        let gradient = found.remove(var)?;
+        assert_eq!(gradient.is_some(), wanted.get(var).is_some(), "{name}");
+        if let (Some(found), Some(wanted)) = (gradient, wanted.get(var)) {
+            assert_close(name, &found, wanted, 1e-6);
+            compared += 1;
+        }
+    }
+    assert_eq!(compared, 8 + 2, "torso and head");
+    Ok(())
 }
