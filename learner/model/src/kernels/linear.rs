@@ -103,13 +103,7 @@ impl CustomOp3 for Linear {
         let x = Matrix::new(floats(x, x_layout)?, self.rows, self.inputs);
         let w = Matrix::new(floats(w, w_layout)?, self.outputs, self.inputs);
         let b = floats(b, b_layout)?;
-        // Biases first, to which the products are added: written once, without zeros before them.
-        let mut y = Vec::with_capacity(self.rows * self.outputs);
-        for bias in b.chunks_exact(self.outputs) {
-            for _ in 0..self.rows / self.groups {
-                y.extend_from_slice(bias);
-            }
-        }
+        let mut y = rows_of_biases(b, self.outputs, self.rows / self.groups);
         multiply(
             self.precision,
             &mut y,
@@ -186,7 +180,10 @@ impl CustomOp3 for Linear {
             Some(Tensor::from_vec(grad_w, w.shape(), device)?)
         };
         let add_to_b = |sum: &mut [f32], _: bool| {
-            for (sum, value) in sum.iter_mut().zip(self.group_sums(grad_values)) {
+            for (sum, value) in
+                sum.iter_mut()
+                    .zip(group_sums(grad_values, self.groups, self.outputs))
+            {
                 *sum += value;
             }
         };
@@ -197,31 +194,39 @@ impl CustomOp3 for Linear {
         } else if gradients::add_in_place(b, add_to_b) {
             None
         } else {
-            let sums = self.group_sums(grad_values);
+            let sums = group_sums(grad_values, self.groups, self.outputs);
             Some(Tensor::from_vec(sums, b.shape(), device)?)
         };
         Ok((grad_x.transpose()?, grad_w, grad_b))
     }
 }
 
-impl Linear {
-    /// Sums of each group's rows: [rows, outputs] to [groups, outputs].
-    fn group_sums(&self, grad: &[f32]) -> Vec<f32> {
-        let outputs = self.outputs;
-        if self.groups > 1 {
-            let mut sums = vec![0.0; self.groups * outputs];
-            sums.par_chunks_mut(outputs)
-                .zip(grad.par_chunks(self.rows / self.groups * outputs))
-                .for_each(|(sum, rows)| add_rows(sum, rows));
-            return sums;
-        }
-        let parts = grad.par_chunks(TASK_ROWS * outputs).map(|rows| {
-            let mut sum = vec![0.0; outputs];
-            add_rows(&mut sum, rows);
-            sum
-        });
-        add_in_order(parts.collect(), outputs)
+/// Sums of each group's rows: `grads` [rows, outputs] to [groups, outputs].
+pub(crate) fn group_sums(grads: &[f32], groups: usize, outputs: usize) -> Vec<f32> {
+    if groups > 1 {
+        let mut sums = vec![0.0; groups * outputs];
+        sums.par_chunks_mut(outputs)
+            .zip(grads.par_chunks(grads.len() / groups))
+            .for_each(|(sum, rows)| add_rows(sum, rows));
+        return sums;
     }
+    let parts = grads.par_chunks(TASK_ROWS * outputs).map(|rows| {
+        let mut sum = vec![0.0; outputs];
+        add_rows(&mut sum, rows);
+        sum
+    });
+    add_in_order(parts.collect(), outputs)
+}
+
+/// Rows of `biases` [groups, outputs], each `times` times: what products are added to. Written once, without zeros before them.
+pub(crate) fn rows_of_biases(biases: &[f32], outputs: usize, times: usize) -> Vec<f32> {
+    let mut y = Vec::with_capacity(biases.len() * times);
+    for bias in biases.chunks_exact(outputs) {
+        for _ in 0..times {
+            y.extend_from_slice(bias);
+        }
+    }
+    y
 }
 
 fn add_rows(sum: &mut [f32], rows: &[f32]) {

@@ -44,7 +44,7 @@ fn outputs_and_gradients(
     config: &ModelConfig,
     parameters: &Parameters,
     kernels: Kernels,
-) -> Result<(Vec<Tensor>, candle_core::backprop::GradStore)> {
+) -> Result<(Vec<Tensor>, Backward)> {
     let network = Network::with_kernels(config, parameters, kernels).unwrap();
     let features = network.features(&frames(config, 6, &mut rng(1))).unwrap();
     let actions = Tensor::new(&[0u32, 4, 2, 2, 1, 3], &Device::Cpu)?;
@@ -64,8 +64,7 @@ fn outputs_and_gradients(
         let weights = crate::support::floats(output.dims(), &mut rng(seed));
         total = (total + (output * weights)?.sum_all()?)?;
     }
-    let gradients = total.backward()?;
-    Ok((outputs, gradients))
+    Ok((outputs, Backward::of(&total)?))
 }
 
 #[test]
@@ -84,15 +83,16 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
     };
     for config in [odd, even] {
         let parameters = with_biases(&config);
-        let (ours, our_gradients) = outputs_and_gradients(&config, &parameters, Kernels::FUSED)?;
-        let (theirs, their_gradients) =
+        let (ours, mut our_gradients) =
+            outputs_and_gradients(&config, &parameters, Kernels::FUSED)?;
+        let (theirs, mut their_gradients) =
             outputs_and_gradients(&config, &parameters, Kernels::Candle)?;
         for (index, (ours, theirs)) in ours.iter().zip(&theirs).enumerate() {
             assert_close(&format!("output {index}"), theirs, ours, 1e-6);
         }
         for (name, var) in parameters.iter() {
-            let (ours, theirs) = (our_gradients.get(var), their_gradients.get(var));
-            assert_close(name, theirs.unwrap(), ours.unwrap(), 2e-6);
+            let (ours, theirs) = (our_gradients.remove(var)?, their_gradients.remove(var)?);
+            assert_close(name, &theirs.unwrap(), &ours.unwrap(), 2e-6);
         }
     }
     Ok(())
@@ -150,14 +150,14 @@ fn the_dim_heads_follow_their_formula_with_gradients() -> Result<()> {
         for (name, found, wanted) in pairs {
             let found = found.unwrap();
             assert_close(name, &found, &wanted, 1e-6);
-            let (found, wanted) = (
-                found.sqr()?.sum_all()?.backward()?,
+            let (mut found, wanted) = (
+                Backward::of(&found.sqr()?.sum_all()?)?,
                 wanted.sqr()?.sum_all()?.backward()?,
             );
             for (parameter, var) in parameters.iter() {
-                match (found.get(var), wanted.get(var)) {
+                match (found.remove(var)?, wanted.get(var)) {
                     (None, None) => {}
-                    (Some(found), Some(wanted)) => assert_close(parameter, found, wanted, 3e-6),
+                    (Some(found), Some(wanted)) => assert_close(parameter, &found, wanted, 3e-6),
                     _ => panic!("{name}: only one way has a gradient for {parameter}"),
                 }
             }
