@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::kernels::{
     candle::{self, ConvLayerTensors},
-    conv, linear,
+    conv, dots, linear,
     precision::Precision,
 };
 
@@ -61,6 +61,18 @@ impl Kernels {
         match self {
             Self::Fused(precision) => linear::linear_relu(x, w, b, precision),
             Self::Candle => candle::relu(&candle::linear(x, w, b)?),
+        }
+    }
+
+    /// Dot products [L, B, B] of anchors and candidates, location by location, in f32. `psi` and `phi` are [B, L, R], or [B, R] where
+    /// one vector meets every location of the other.
+    ///
+    /// # Errors
+    /// Vectors that do not fit each other.
+    pub fn dot_products(self, psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
+        match self {
+            Self::Fused(_) => dots::dot_products(psi, phi),
+            Self::Candle => candle::dot_products(psi, phi),
         }
     }
 

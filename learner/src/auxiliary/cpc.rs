@@ -170,6 +170,7 @@ fn of_offset(
             .transpose()
     };
     Ok(Vectors {
+        kernels: vectors.kernels,
         psi3: psi(&vectors.psi3)?,
         phi3: phi(&vectors.phi3)?,
         psi4: psi(&vectors.psi4)?,

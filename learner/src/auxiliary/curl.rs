@@ -107,7 +107,7 @@ impl AuxiliaryLoss for Curl {
         let keys = inputs.keys()?;
         let anchors = &inputs.features.anchors;
         let query = inputs.online.psi4(&anchors.f4, &inputs.action()?)?;
-        let dots = dim::global_dots(&query, &keys)?;
+        let dots = dim::dots_of(inputs.online.kernels(), &query, &keys)?;
         let all = vec![1; inputs.batch.rows];
         let scores = Scores::new(dots.rkhs, self.tanh_clip);
         let loss = info_nce_loss(&dots.dots, &all, scores, inputs.online.kernels())?;

@@ -44,6 +44,53 @@ pub(crate) fn relu(x: &Tensor) -> Result<Tensor> {
     x * above
 }
 
+/// As `dots::dot_products`: psi and phi [B, L, R] or [B, R] to [L, B, B].
+pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
+    match (psi.rank(), phi.rank()) {
+        (3, 3) => local_local_dots(psi, phi),
+        (3, _) => local_global_dots(psi, phi),
+        (_, 3) => global_local_dots(psi, phi),
+        _ => global_global_dots(psi, phi),
+    }
+}
+
+/// `batch` as a batched product takes it: the CPU's in any layout, others in one piece.
+fn as_operand(batch: Tensor) -> Result<Tensor> {
+    if batch.device().is_cpu() {
+        Ok(batch)
+    } else {
+        batch.contiguous()
+    }
+}
+
+/// `psi` [B, L, R], `phi` [B, L, R].
+fn local_local_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
+    as_operand(psi.transpose(0, 1)?)?.matmul(&as_operand(phi.permute((1, 2, 0))?)?)
+}
+
+/// `psi` [B, L, R], `phi` [B, R].
+fn local_global_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
+    let (rows, locations, rkhs) = psi.dims3()?;
+    let dots = psi.reshape((rows * locations, rkhs))?.matmul(&phi.t()?)?;
+    dots.reshape((rows, locations, rows))?
+        .transpose(0, 1)?
+        .contiguous()
+}
+
+/// `psi` [B, R], `phi` [B, L, R].
+fn global_local_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
+    let (rows, locations, rkhs) = phi.dims3()?;
+    let dots = phi.reshape((rows * locations, rkhs))?.matmul(&psi.t()?)?;
+    dots.reshape((rows, locations, rows))?
+        .permute((1, 2, 0))?
+        .contiguous()
+}
+
+/// `psi` [B, R], `phi` [B, R].
+fn global_global_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
+    psi.matmul(&phi.t()?)?.unsqueeze(0)
+}
+
 /// Images [B, H, W, in] to [B, h, w, out], without ReLU.
 fn conv2d(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
     let (batch, height, width, _) = images.dims4()?;

@@ -1,6 +1,6 @@
 //! What the network is computed with: this project's kernels for the CPU, and the same from candle's operations for the rest.
 //!
-//! From the outside in: [`conv`], [`linear`] and [`residual`] are candle operations with gradients, which split their work over the rayon pool.
+//! From the outside in: [`conv`], [`linear`], [`residual`] and [`dots`] are candle operations with gradients, which split their work over the rayon pool.
 //! [`stack`] takes a task's images through all convolutions, [`convolution`] computes one of them, [`product`] a matrix product. Both cut
 //! their work into tiles for a [`units`] unit, an instruction set with the type that it multiplies; all unsafe code of the crate is there.
 //! [`rounding`] makes operands, [`buffer`] keeps memory, [`precision`] is the setting. [`candle`] needs none of them.
@@ -9,6 +9,7 @@ pub(crate) mod buffer;
 pub(crate) mod candle;
 pub(crate) mod conv;
 pub(crate) mod convolution;
+pub(crate) mod dots;
 pub(crate) mod linear;
 pub(crate) mod precision;
 pub(crate) mod product;

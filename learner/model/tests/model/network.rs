@@ -6,7 +6,7 @@ use driml_model::{
     Backward, ConvLayer, DimHeads, Kernels, ModelConfig, ModelError, Network, Parameters, Precision,
 };
 
-use crate::support::{assert_close, bits, frames, parameters, rng, small, values};
+use crate::support::{assert_close, bits, frames, parameters, rng, small, values, variable};
 
 /// out(relu(hidden(x))) + skip(x) by candle's operations, x [rows, in].
 fn stock_block(parameters: &Parameters, name: &str, x: &Tensor) -> Result<Tensor> {
@@ -452,5 +452,38 @@ fn gradients_that_are_summed_in_place_are_candle_s() -> Result<()> {
         }
     }
     assert_eq!(compared, 8 + 2, "torso and head");
+    Ok(())
+}
+
+#[test]
+fn dot_products_and_their_gradients_are_candle_s() -> Result<()> {
+    let rng = &mut rng(6);
+    let (local, global) = ([5, 3, 7], [5, 7]);
+    for (psi, phi) in [
+        (&local[..], &local[..]),
+        (&local, &global),
+        (&global, &local),
+        (&global, &global),
+    ] {
+        let (psi, phi) = (variable(psi, rng), variable(phi, rng));
+        let ours = Kernels::FUSED.dot_products(&psi, &phi)?;
+        let theirs = Kernels::Candle.dot_products(&psi, &phi)?;
+        assert_close("dots", &ours, &theirs, 1e-6);
+        let grad = crate::support::floats(ours.dims(), rng);
+        let (found, wanted) = (
+            (ours * &grad)?.sum_all()?.backward()?,
+            (theirs * &grad)?.sum_all()?.backward()?,
+        );
+        for (name, var) in [("psi", &psi), ("phi", &phi)] {
+            assert_close(
+                name,
+                found.get(var).unwrap(),
+                wanted.get(var).unwrap(),
+                1e-6,
+            );
+        }
+    }
+    let (psi, phi) = (variable(&[5, 3, 7], rng), variable(&[5, 2, 7], rng));
+    assert!(Kernels::FUSED.dot_products(&psi, &phi).is_err());
     Ok(())
 }
