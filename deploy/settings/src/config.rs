@@ -187,6 +187,10 @@ impl RunConfig {
                 self.local.learner_threads
             ));
         }
+        self.local
+            .learner_device
+            .check(self.learner.precision)
+            .map_err(|e| said(&e))?;
         self.check_objective()?;
         let learns_affinity = self.learner.affinity.estimator != EstimatorKind::None;
         let affinity = self

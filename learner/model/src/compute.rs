@@ -154,17 +154,28 @@ pub enum DeviceError {
 }
 
 impl DeviceName {
+    /// Checks that products can be computed in `precision` on such a device, whether or not it is there.
+    ///
+    /// # Errors
+    /// bf16 on a GPU.
+    pub fn check(self, precision: Precision) -> Result<(), DeviceError> {
+        match (self, precision) {
+            (Self::Cuda(_), Precision::Bf16) => Err(DeviceError::Precision {
+                device: self,
+                precision,
+            }),
+            _ => Ok(()),
+        }
+    }
+
     /// The device with the faster kernels that it has, products in `precision`.
     ///
     /// # Errors
     /// A GPU that is not there, or a program that was built without the feature `cuda`; bf16 on a GPU.
     pub fn open(self, precision: Precision) -> Result<Compute, DeviceError> {
+        self.check(precision)?;
         match self {
             Self::Cpu => Ok(Compute::cpu(precision)),
-            Self::Cuda(_) if precision != Precision::F32 => Err(DeviceError::Precision {
-                device: self,
-                precision,
-            }),
             Self::Cuda(ordinal) => {
                 let device = Device::new_cuda(ordinal)
                     .map_err(|why| DeviceError::Open { device: self, why })?;

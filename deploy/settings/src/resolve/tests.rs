@@ -121,7 +121,7 @@ fn what_nobody_uses_is_not_there() {
 fn settings_that_cannot_work_are_answered_with_what_to_do() {
     let said = |agent: &str, set: &str| with("procgen:bigfish", agent, &[set]).unwrap_err();
     expect![[r#"there is no setting "learner.update.adam.learning_rate"; [learner.update.adam] has beta1, beta2, eps, lr"#]].assert_eq(&said("driml-ada", "learner.update.adam.learning_rate=1"));
-    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, precision, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
+    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, precision, publish_as, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
     expect![[r#"there is no setting "world.num_level" (did you mean "world.num_levels"?); [world] has center_agent, distribution_mode, num_levels, paint_vel_info, restrict_themes, start_level, use_backgrounds, use_sequential_levels"#]].assert_eq(&said("driml-ada", "world.num_level=5"));
     expect!["model.height cannot be set by hand: it follows from input.height"]
         .assert_eq(&said("driml-ada", "model.height=84"));
@@ -143,6 +143,13 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
         .assert_eq(&said("driml-ada", "world.num_levels=-1"));
     expect!["learner.update cannot work: adam.lr = 0.0 is not within 1e-30 and 1e38: that cannot work; start from a preset"]
         .assert_eq(&said("driml-ada", "learner.update.adam.lr=0"));
+    expect!["in the settings' [learner] table: unknown variant `f16`, expected `f32` or `bf16`"]
+        .assert_eq(&said("driml-ada", "learner.precision=f16"));
+    let gpu = ["learner.precision=bf16", "local.learner_device=cuda"];
+    expect![[
+        r#"cuda:0 computes in f32 alone: set learner.precision = "f32", or compute bf16 on the CPU"#
+    ]]
+    .assert_eq(&with("procgen:bigfish", "driml-ada", &gpu).unwrap_err());
     expect!["replay.capacity_transitions = 100000000000 needs 1147389.4 GiB, and 16.0 GiB are free: --set replay.capacity_transitions=697234"].assert_eq(&said(
         "driml-ada",
         "replay.capacity_transitions=100000000000",
