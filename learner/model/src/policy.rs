@@ -12,10 +12,11 @@ use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
 use crate::heads::c51::expected_returns;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::convolution::{Convolution, Images, PADDING, Pixels, forward};
+use crate::kernels::convolution::{Convolution, forward};
+use crate::kernels::images::{Images, PADDING, Pixels};
 use crate::kernels::linear::relu_of;
+use crate::kernels::panels::{Matrix, Panels, Threads};
 use crate::kernels::precision::Precision;
-use crate::kernels::product::{Matrix, Panels, Threads};
 use crate::kernels::units::{Element, ForUnit, Left, Mode, Unit, vectorized, with_unit};
 use crate::parameters::{decode, is_dim};
 

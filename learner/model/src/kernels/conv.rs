@@ -11,7 +11,7 @@ use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result, Shape, Tensor, b
 use rayon::prelude::*;
 
 use crate::geometry::{ConvLayer, ConvShape};
-use crate::kernels::convolution::Pixels;
+use crate::kernels::images::Pixels;
 use crate::kernels::linear::{add_in_order, cpu, floats};
 use crate::kernels::precision::Precision;
 use crate::kernels::stack::{

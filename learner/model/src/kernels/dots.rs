@@ -8,8 +8,9 @@ use rayon::prelude::*;
 
 use crate::kernels::buffer::Buffer;
 use crate::kernels::linear::{cpu, floats};
+use crate::kernels::panels::{Matrix, Threads};
 use crate::kernels::precision::Precision;
-use crate::kernels::product::{Matrix, Threads, multiply};
+use crate::kernels::product::multiply;
 use crate::kernels::units::Mode;
 
 /// Dot products [L, B, B] of `psi` and `phi`, each [B, L, R], or [B, R] where one vector meets every location of the other.

@@ -8,8 +8,9 @@ use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Stora
 use rayon::prelude::*;
 
 use crate::gradients;
+use crate::kernels::panels::{Matrix, Threads};
 use crate::kernels::precision::Precision;
-use crate::kernels::product::{Matrix, Threads, multiply};
+use crate::kernels::product::multiply;
 use crate::kernels::units::Mode;
 
 /// Rows that one task sums. Fixed, so that sums are taken in the same order whatever the number of threads.

@@ -13,8 +13,9 @@ use crate::kernels::buffer::Buffer;
 use crate::kernels::linear::{
     cpu, floats, group_sums, relu_gradient, relu_in_place, rows_of_biases,
 };
+use crate::kernels::panels::{Matrix, Threads};
 use crate::kernels::precision::Precision;
-use crate::kernels::product::{Matrix, Threads, multiply};
+use crate::kernels::product::multiply;
 use crate::kernels::units::Mode;
 
 /// Scalars of an elementwise pass that one task takes.

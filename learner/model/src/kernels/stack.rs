@@ -3,9 +3,8 @@
 
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::convolution::{
-    ConvGradients, Convolution, Images, PADDING, Pixels, backward, forward,
-};
+use crate::kernels::convolution::{ConvGradients, Convolution, backward, forward};
+use crate::kernels::images::{Images, PADDING, Pixels};
 use crate::kernels::units::{Element, Unit};
 
 /// The maps of all layers but the last, one layer after the other, each with `PADDING`: what forward leaves to backward.

@@ -11,11 +11,11 @@ use half::bf16;
 use super::unit::{LANES, Loop, Mode, RawTile, Unit};
 
 /// Steps, which are pairs of bf16, in a row of a tile register: 64 bytes.
-const STEPS: usize = 16;
+pub(super) const STEPS: usize = 16;
 /// Rows of a tile register.
-const ROWS: usize = 16;
+pub(super) const ROWS: usize = 16;
 /// Tile registers that hold sums.
-const SUMS: usize = 4;
+pub(super) const SUMS: usize = 4;
 
 /// Whether this processor and kernel have AMX for bf16, and it multiplies right. Asks the kernel once for leave to use the tile
 /// registers.
@@ -106,7 +106,7 @@ fn granted() -> bool {
 /// # Safety
 /// Of all methods: `configure` came before, pointers may be read or written as the sizes given to it say, and the processor has
 /// what the implementation needs.
-trait Tiles {
+pub(super) trait Tiles {
     /// Sizes: left operands [rows, steps], right ones [steps, cols], sums [rows, cols]; `tail` steps in the second pair of
     /// operands, 0 if there are none. Sums are 0 afterwards.
     unsafe fn configure(&mut self, rows: usize, cols: usize, tail: usize);
@@ -241,7 +241,7 @@ impl Amx {
 }
 
 /// Most rows of a tile as the products are cut: four registers of them.
-const ROWS_MAX: usize = SUMS * ROWS;
+pub(super) const ROWS_MAX: usize = SUMS * ROWS;
 
 impl Unit for Amx {
     type Element = bf16;
@@ -271,7 +271,12 @@ impl Unit for Amx {
 ///
 /// # Safety
 /// As for `Unit::compute`, on a processor that `tiles` is for.
-unsafe fn compute<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize, vecs: usize) {
+pub(super) unsafe fn compute<T: Tiles>(
+    tiles: &mut T,
+    tile: &RawTile<bf16>,
+    rows: usize,
+    vecs: usize,
+) {
     // SAFETY: the caller's.
     unsafe {
         // Steps that lie side by side fill the row of a left register; else the rows do, and the product is turned round.
@@ -425,95 +430,5 @@ unsafe fn add_row(tile: &RawTile<bf16>, row: usize, first: usize, sums: &[f32]) 
         } else {
             *sum
         };
-    }
-}
-
-/// Tiles in plain Rust, which do what the instructions do: for tests on any processor.
-#[cfg(test)]
-pub(super) mod emulated {
-    use super::*;
-
-    #[derive(Clone, Copy, Default)]
-    struct Registers {
-        rows: usize,
-        cols: usize,
-        tail: usize,
-        left: [[[u32; STEPS]; ROWS]; 2],
-        sums: [[[f32; LANES]; ROWS]; SUMS],
-    }
-
-    /// Both of a pair.
-    fn pair(pair: u32) -> [f32; 2] {
-        [
-            f32::from_bits(pair << 16),
-            f32::from_bits(pair & 0xffff_0000),
-        ]
-    }
-
-    impl Tiles for Registers {
-        unsafe fn configure(&mut self, rows: usize, cols: usize, tail: usize) {
-            assert!(rows <= ROWS && cols <= LANES && tail < STEPS);
-            *self = Self {
-                rows,
-                cols,
-                tail,
-                ..Self::default()
-            };
-        }
-
-        unsafe fn load_left(&mut self, at: *const bf16, stride: usize, tail: bool) {
-            let steps = if tail { self.tail } else { STEPS };
-            for row in 0..self.rows {
-                for step in 0..steps {
-                    let at = at.cast::<u8>().wrapping_add(row * stride + step * 4);
-                    self.left[usize::from(tail)][row][step] =
-                        unsafe { at.cast::<u32>().read_unaligned() };
-                }
-            }
-        }
-
-        unsafe fn dot(&mut self, sums: usize, right: *const bf16, stride: usize, tail: bool) {
-            let steps = if tail { self.tail } else { STEPS };
-            for row in 0..self.rows {
-                for step in 0..steps {
-                    let left = pair(self.left[usize::from(tail)][row][step]);
-                    for col in 0..self.cols {
-                        let at = right.cast::<u8>().wrapping_add(step * stride + col * 4);
-                        let right = pair(unsafe { at.cast::<u32>().read_unaligned() });
-                        self.sums[sums][row][col] += left[0] * right[0] + left[1] * right[1];
-                    }
-                }
-            }
-        }
-
-        unsafe fn store(&mut self, sums: usize, at: *mut f32, stride: usize) {
-            for row in 0..self.rows {
-                for col in 0..self.cols {
-                    let at = at.cast::<u8>().wrapping_add(row * stride + col * 4);
-                    unsafe { at.cast::<f32>().write_unaligned(self.sums[sums][row][col]) };
-                }
-            }
-        }
-    }
-
-    /// [`Amx`](super::Amx) without AMX.
-    #[derive(Clone, Copy)]
-    pub(in super::super) struct EmulatedAmx;
-
-    impl Unit for EmulatedAmx {
-        type Element = bf16;
-        const VECS_MAX: usize = SUMS;
-
-        fn rows_max(_: usize) -> usize {
-            ROWS_MAX
-        }
-
-        unsafe fn compute(self, tile: &RawTile<bf16>, rows: usize, vecs: usize) {
-            unsafe { compute(&mut Registers::default(), tile, rows, vecs) }
-        }
-
-        fn vectorize<W: Loop>(self, work: W) {
-            work.run()
-        }
     }
 }

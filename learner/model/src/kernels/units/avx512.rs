@@ -62,81 +62,53 @@ const fn rows_max(vecs: usize) -> usize {
     if vecs > 2 { 6 } else { 8 }
 }
 
-macro_rules! sizes {
-    ($tile:expr, $rows:expr, $vecs:expr) => {
-        compute_sizes!(Self, $tile, $rows, $vecs;
-            1: 1 2 3 4 5 6 7 8;
-            2: 1 2 3 4 5 6 7 8;
-            4: 1 2 3 4 5 6;
-        )
+macro_rules! unit {
+    ($unit:ident, $element:ty, $features:literal) => {
+        impl Unit for $unit {
+            type Element = $element;
+            const VECS_MAX: usize = 4;
+
+            fn rows_max(vecs: usize) -> usize {
+                rows_max(vecs)
+            }
+
+            unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
+                // SAFETY: `here` found the instructions; the rest is the caller's.
+                unsafe { Self::compute_sized(tile, rows, vecs) }
+            }
+
+            #[inline(always)]
+            fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
+                // SAFETY: `here` found the instructions.
+                unsafe { transposed(block) }
+            }
+
+            #[inline(always)]
+            fn vectorize<W: Loop>(self, work: W) {
+                // SAFETY: `here` found the instructions.
+                unsafe { vectorized(work) }
+            }
+        }
+
+        impl $unit {
+            #[target_feature(enable = $features)]
+            unsafe fn compute_sized(tile: &RawTile<$element>, rows: usize, vecs: usize) {
+                compute_sizes!(Self, tile, rows, vecs;
+                    1: 1 2 3 4 5 6 7 8;
+                    2: 1 2 3 4 5 6 7 8;
+                    4: 1 2 3 4 5 6;
+                )
+            }
+        }
     };
 }
 
-impl Unit for Single {
-    type Element = f32;
-    const VECS_MAX: usize = 4;
-
-    fn rows_max(vecs: usize) -> usize {
-        rows_max(vecs)
-    }
-
-    unsafe fn compute(self, tile: &RawTile<f32>, rows: usize, vecs: usize) {
-        // SAFETY: `here` found the instructions; the rest is the caller's.
-        unsafe { Self::compute_sized(tile, rows, vecs) }
-    }
-
-    #[inline(always)]
-    fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
-        // SAFETY: `here` found the instructions.
-        unsafe { transposed(block) }
-    }
-
-    #[inline(always)]
-    fn vectorize<W: Loop>(self, work: W) {
-        // SAFETY: `here` found the instructions.
-        unsafe { vectorized(work) }
-    }
-}
-
-impl Single {
-    #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,fma")]
-    unsafe fn compute_sized(tile: &RawTile<f32>, rows: usize, vecs: usize) {
-        sizes!(tile, rows, vecs);
-    }
-}
-
-impl Unit for Brain {
-    type Element = bf16;
-    const VECS_MAX: usize = 4;
-
-    fn rows_max(vecs: usize) -> usize {
-        rows_max(vecs)
-    }
-
-    unsafe fn compute(self, tile: &RawTile<bf16>, rows: usize, vecs: usize) {
-        // SAFETY: `here` found the instructions; the rest is the caller's.
-        unsafe { Self::compute_sized(tile, rows, vecs) }
-    }
-
-    #[inline(always)]
-    fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
-        // SAFETY: `here` found the instructions.
-        unsafe { transposed(block) }
-    }
-
-    #[inline(always)]
-    fn vectorize<W: Loop>(self, work: W) {
-        // SAFETY: `here` found the instructions.
-        unsafe { vectorized(work) }
-    }
-}
-
-impl Brain {
-    #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
-    unsafe fn compute_sized(tile: &RawTile<bf16>, rows: usize, vecs: usize) {
-        sizes!(tile, rows, vecs);
-    }
-}
+unit!(Single, f32, "avx512f,avx512bw,avx512dq,avx512vl,fma");
+unit!(
+    Brain,
+    bf16,
+    "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma"
+);
 
 /// Transposes 16 registers of 16: pairs of 32 bits, of 64 bits, then quarters of registers twice.
 #[inline]

@@ -100,7 +100,7 @@ pub(crate) fn with_every_unit<F: ForUnit + Copy>(precision: Precision, work: F) 
         .collect();
     #[cfg(target_arch = "x86_64")]
     if precision == Precision::Bf16 {
-        results.push(work.run(amx::emulated::EmulatedAmx));
+        results.push(work.run(super::emulated::EmulatedAmx));
     }
     results
 }

@@ -6,6 +6,7 @@ mod avx2;
 mod avx512;
 mod choice;
 mod element;
+mod emulated;
 mod plain;
 mod tile;
 mod unit;
