@@ -223,7 +223,7 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
             .lines()
             .filter(|line| line.ends_with("  skipped"))
             .count(),
-        4,
+        8,
         "{table}"
     );
     assert_eq!(
