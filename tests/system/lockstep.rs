@@ -36,9 +36,7 @@ fn the_seed_decides_the_weights() {
 fn the_seed_decides_the_weights_in_bf16_too() {
     let system = system();
     let flags = format!("{SHORT} --agent driml-ada --seed 3");
-    let bf16 = format!(
-        "{flags} --set learner.precision=bf16 --set actor.precision=bf16 --set learner.publish_as=f16"
-    );
+    let bf16 = format!("{flags} --set learner.precision=bf16 --set actor.precision=bf16");
     let first = run(&system, &bf16, "first");
     let same = run(&system, &bf16, "same");
     let f32 = run(&system, &flags, "f32");

@@ -74,7 +74,7 @@ pub(crate) trait ForUnit {
     fn run<U: Unit>(self, unit: U) -> Self::Output;
 }
 
-/// Loops over slices, made by [`vectorized!`](crate::kernels::units::vectorized).
+/// Loops over slices, made by `vectorized!`.
 pub(crate) trait Loop {
     /// Runs them. To be `#[inline(always)]`: a function of its own, or a closure, would be compiled for the least that any
     /// processor has.
@@ -90,17 +90,17 @@ macro_rules! vectorized {
         $vis:vis fn $name:ident<$U:ident $(, $E:ident)*>($unit:ident $(, $arg:ident: $ty:ty)* $(,)?) $body:block
     ) => {
         $(#[$meta])*
-        $vis fn $name<'a, $U: $crate::kernels::units::Unit $(, $E: $crate::kernels::units::Element)*>(
+        $vis fn $name<'a, $U: $crate::kernels::units::unit::Unit $(, $E: $crate::kernels::units::element::Element)*>(
             $unit: $U
             $(, $arg: $ty)*
         ) {
-            struct Work<'a, $U: $crate::kernels::units::Unit $(, $E: $crate::kernels::units::Element)*>(
+            struct Work<'a, $U: $crate::kernels::units::unit::Unit $(, $E: $crate::kernels::units::element::Element)*>(
                 $U,
                 $($ty,)*
                 std::marker::PhantomData<(&'a (), $($E,)*)>,
             );
-            impl<'a, $U: $crate::kernels::units::Unit $(, $E: $crate::kernels::units::Element)*>
-                $crate::kernels::units::Loop for Work<'a, $U $(, $E)*>
+            impl<'a, $U: $crate::kernels::units::unit::Unit $(, $E: $crate::kernels::units::element::Element)*>
+                $crate::kernels::units::unit::Loop for Work<'a, $U $(, $E)*>
             {
                 #[inline(always)]
                 #[allow(unused_variables, reason = "few loops need the unit itself")]
