@@ -24,7 +24,7 @@ impl Features {
     /// Those of `rows` rows from `first` on.
     ///
     /// # Errors
-    /// Fewer rows.
+    /// There are fewer rows than that.
     pub fn narrow(&self, first: usize, rows: usize) -> candle_core::Result<Self> {
         Ok(Self {
             f3: self.f3.narrow(0, first, rows)?,

@@ -87,7 +87,7 @@ mod tests {
         for (stored, unit) in [
             (StoredAs::F32, 0.0),
             (StoredAs::F16, 2f32.powi(-11)),
-            (StoredAs::Bf16, 2f32.powi(-9)),
+            (StoredAs::Bf16, 2f32.powi(-8)),
         ] {
             let bytes = stored.encode(&values).unwrap();
             let read = decode(stored.dtype(), &bytes).unwrap();

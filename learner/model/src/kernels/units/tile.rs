@@ -23,7 +23,7 @@ pub(crate) struct Left<'a, E> {
     pub(crate) steps: usize,
     /// Scalars from one run to the next.
     pub(crate) run_stride: usize,
-    /// Runs.
+    /// Runs that make up a row.
     pub(crate) runs: usize,
 }
 
