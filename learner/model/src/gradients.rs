@@ -9,16 +9,30 @@ use std::collections::HashMap;
 
 use candle_core::{Result, Tensor, TensorId, Var, backprop::GradStore};
 
+type Sums = HashMap<TensorId, Vec<f32>>;
+
 thread_local! {
     /// The sums of the backward pass that runs on this thread, if it is one of [`Backward::of`].
-    static SUMS: RefCell<Option<HashMap<TensorId, Vec<f32>>>> = const { RefCell::new(None) };
+    ///
+    /// A thread of the pool that waits for its products may take up another learner's whole update: a pass that begins here
+    /// therefore puts the sums of the one below it aside and gives them back, and nobody holds the cell while others may run.
+    static SUMS: RefCell<Option<Sums>> = const { RefCell::new(None) };
+}
+
+/// Gives the pass below its sums back, also when this one panics.
+struct PassBelow(Option<Sums>);
+
+impl Drop for PassBelow {
+    fn drop(&mut self) {
+        SUMS.set(self.0.take());
+    }
 }
 
 /// The gradients of one loss.
 #[derive(Debug)]
 pub struct Backward {
     store: GradStore,
-    sums: HashMap<TensorId, Vec<f32>>,
+    sums: Sums,
 }
 
 impl Backward {
@@ -27,7 +41,7 @@ impl Backward {
     /// # Errors
     /// An operation without a gradient, or one that failed.
     pub fn of(loss: &Tensor) -> Result<Self> {
-        SUMS.set(Some(HashMap::new()));
+        let _below = PassBelow(SUMS.replace(Some(Sums::new())));
         let store = loss.backward();
         let sums = SUMS.take().unwrap_or_default();
         Ok(Self {
@@ -60,14 +74,15 @@ pub(crate) fn add_in_place(parameter: &Tensor, add: impl FnOnce(&mut [f32], bool
     if !parameter.is_variable() {
         return false;
     }
+    let kept = SUMS.with_borrow_mut(|sums| Some(sums.as_mut()?.remove(&parameter.id())));
+    let Some(kept) = kept else { return false };
+    let there = kept.is_some();
+    let mut sum = kept.unwrap_or_else(|| vec![0.0; parameter.elem_count()]);
+    add(&mut sum, there);
     SUMS.with_borrow_mut(|sums| {
-        let Some(sums) = sums else { return false };
-        let mut there = true;
-        let sum = sums.entry(parameter.id()).or_insert_with(|| {
-            there = false;
-            vec![0.0; parameter.elem_count()]
-        });
-        add(sum, there);
-        true
-    })
+        if let Some(sums) = sums {
+            sums.insert(parameter.id(), sum);
+        }
+    });
+    true
 }

@@ -484,3 +484,25 @@ fn gradients_hold_nothing_of_the_pass_that_they_come_from() {
         );
     }
 }
+
+#[test]
+fn learners_of_one_process_do_not_touch_each_other() {
+    // They share the pool: a thread that waits for one's products takes up another's whole update.
+    const UPDATES: u64 = 12;
+    let learned = |lambda| {
+        let mut agent = agent(lambda, 1);
+        for seed in 0..UPDATES {
+            agent.update(&Rows::random(64, seed).batch()).unwrap();
+        }
+        values(agent.online())
+    };
+    let alone = [learned(ALL_DIM), learned(NO_DIM)];
+    std::thread::scope(|scope| {
+        let start = |i: usize| scope.spawn(move || learned([ALL_DIM, NO_DIM][i % 2]));
+        let all: Vec<_> = (0..16).map(start).collect();
+        for (i, learner) in all.into_iter().enumerate() {
+            let learned = learner.join().expect("no learner is refused or panics");
+            assert!(learned == alone[i % 2], "learner {i} learnt something else");
+        }
+    });
+}
