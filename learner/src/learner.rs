@@ -144,6 +144,11 @@ impl Learner {
         Ok(this)
     }
 
+    /// The networks, and how they learn.
+    pub const fn agent(&self) -> &Agent {
+        &self.agent
+    }
+
     /// Hash of the run spec.
     pub const fn spec_hash(&self) -> u64 {
         self.spec_hash

@@ -29,6 +29,7 @@
 
 mod compute;
 mod config;
+mod cost;
 mod encoder;
 mod error;
 mod geometry;
@@ -45,6 +46,7 @@ mod torso;
 
 pub use compute::{Compute, DeviceError, DeviceName, Kernels};
 pub use config::{DimHeads, ModelConfig};
+pub use cost::LayerCost;
 pub use encoder::Encoder;
 pub use error::{ModelError, Result};
 pub use geometry::{ConvLayer, ConvShape};
