@@ -59,16 +59,6 @@ pub struct EpsilonLadder {
     pub actors: u32,
 }
 
-/// The `[input]` table: the size at which the network sees a frame.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct InputSize {
-    /// Rows after enlargement.
-    pub height: u32,
-    /// Columns after enlargement.
-    pub width: u32,
-}
-
 /// Everything an actor needs to know of a run.
 #[derive(Clone, Debug)]
 pub struct ActorSettings {
@@ -77,7 +67,7 @@ pub struct ActorSettings {
     /// The world that its copies are of.
     pub world: driml_envs::WorldConfig,
     /// The size at which the network sees it.
-    pub input: InputSize,
+    pub input: driml_model::InputSize,
     /// The network that chooses actions.
     pub model: driml_model::ModelConfig,
     /// The actor's own.

@@ -44,6 +44,7 @@
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::print_stdout))]
 
 mod copies;
+mod cut_frames;
 mod environment;
 mod error;
 mod frame_stack;
@@ -51,6 +52,7 @@ mod registry;
 mod settings;
 mod worlds;
 
+pub use cut_frames::CutFrames;
 pub use environment::{Environment, FrameShape, StepEnd};
 pub use error::EnvError;
 pub use frame_stack::FrameStack;

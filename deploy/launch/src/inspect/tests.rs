@@ -35,8 +35,8 @@ fn the_paper_s_agent_is_described() {
         driml-ada on procgen:bigfish
 
         parameters                              is      everything  why
-        torso.conv1                          6,176           6,176  64x64x3 to 15x15x32, kernel 8, stride 4
-        torso.conv2                         32,832          32,832  15x15x32 to 6x6x64, kernel 4, stride 2
+        torso.conv1                          6,176           6,176  60x60x3 to 14x14x32, kernel 8, stride 4
+        torso.conv2                         32,832          32,832  14x14x32 to 6x6x64, kernel 4, stride 2
         torso.conv3                         36,928          36,928  6x6x64 to 4x4x64, kernel 3, stride 1
         torso.fc                           524,800         524,800  f4, 512 numbers of the last map
         head                               392,445         392,445  C51: 15 actions of 51 atoms each
@@ -50,29 +50,29 @@ fn the_paper_s_agent_is_described() {
         all                              3,633,018       5,809,690  63% of everything
 
         FLOPs of an update                      is      everything  why
-        s_t, torso and head          5,540,413,440   5,540,413,440  256 rows forward and backward: the loss of C51
-        s_{t+n}, target network      2,082,734,080   2,082,734,080  forward: what is bootstrapped
+        s_t, torso and head          5,357,961,216   5,540,413,440  256 rows forward and backward: the loss of C51
+        s_{t+n}, target network      1,991,507,968   2,082,734,080  forward: what is bootstrapped
         s_{t+n}, online network                  0   2,082,734,080  not done: double_dqn = false
-        more states, torso           4,938,792,960  29,632,757,760  one positive a row (run.horizon)
+        more states, torso           4,756,340,736  29,632,757,760  one positive a row (run.horizon)
         states, key encoder                      0   2,318,401,536  not done: there is no key encoder
         psi and phi                  2,524,839,936  55,775,723,520  forward and backward
         scores                         201,326,592  32,883,343,360  each row with each, and their gradients
-        all                         15,288,107,008 130,316,107,776  12% of everything
+        all                         14,831,976,448 130,316,107,776  11% of everything
 
         FLOPs of a decision                     is      everything  why
-        torso.conv1                      2,764,800       2,764,800  for 96.7% of states; in the others chance decides (epsilon)
+        torso.conv1                      2,408,448       2,764,800  for 96.7% of states; in the others chance decides (epsilon)
         torso.conv2                      2,359,296       2,359,296
         torso.conv3                      1,179,648       1,179,648
         torso.fc                         1,048,576       1,048,576
         head                               783,360         783,360  Q of every action, of which the largest is taken
-        all                              8,135,680       8,135,680  100% of everything
+        all                              7,779,328       8,135,680  96% of everything
 
         bytes                                   is      everything  why
-        a transition in a chunk             12,294          12,294  a frame of 64x64x3; action, end and reward
-        a transition in the replay          12,320          12,320  the same, and its place; stored once, however often it is read
-        a batch                          9,440,256      22,025,216  256 rows
-          s_t and s_{t+n}                6,291,456       6,291,456  one frame each
-          s_{t+k}                        3,145,728      15,728,640  1 a row: what driml-ada is served
+        a transition in a chunk             10,806          12,294  60x60x3 of a frame of 64x64x3: no convolution reads the rest; action, end and reward
+        a transition in the replay          10,832          12,320  the same, and its place; stored once, however often it is read
+        a batch                          8,297,472      22,025,216  256 rows
+          s_t and s_{t+n}                5,529,600       6,291,456  one frame each
+          s_{t+k}                        2,764,800      15,728,640  1 a row: what driml-ada is served
           numbers                            3,072           5,120  returns, discounts, actions, k
         a broadcast                      3,973,556      13,454,228  torso and head, as f32: what acts has no other layer
 

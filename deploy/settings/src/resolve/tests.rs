@@ -99,6 +99,51 @@ fn the_default_run_is_the_papers() {
     assert_eq!(config.updates(), 6_218);
 }
 
+/// Frames are recorded and sent as far as the network reads them; settings of earlier versions have them whole, and stay as they are.
+#[test]
+fn frames_are_cut_where_nothing_reads_them() {
+    let sizes = |config: &RunConfig| {
+        let (run, model) = (&config.run, &config.model);
+        let frame = (run.frame_height, run.frame_width);
+        (frame, (model.height, model.width))
+    };
+    let cut = with("procgen:bigfish", "driml-ada", &[]).unwrap();
+    assert_eq!(sizes(&cut), ((60, 60), (60, 60)));
+    let large = source("paper-observation", "procgen:bigfish", "driml-ada");
+    let large = resolve(&large, &sets(&[]), &MACHINE).unwrap();
+    assert_eq!(sizes(&large), ((62, 61), (100, 76)));
+    let pacman = with("mspacman", "driml-ada", &[]).unwrap();
+    assert_eq!(sizes(&pacman), ((21, 19), (84, 84)));
+    // A random crop reads all of a state.
+    let augmented = with("procgen:bigfish", "curl", &[]).unwrap();
+    assert_eq!(sizes(&augmented), ((64, 64), (64, 64)));
+
+    let old = cut.with_whole_frames().unwrap();
+    assert_eq!(sizes(&old), ((64, 64), (64, 64)));
+    assert_eq!(old.run.seed, cut.run.seed);
+    let text = old.to_toml();
+    assert!(!text.contains("[input.frame]"), "{text}");
+    assert_eq!(RunConfig::parse("old.toml", &text).unwrap(), old);
+    let file = Source::File("old.toml".into(), text);
+    let again = resolve(&file, &sets(&["run.seed=7"]), &MACHINE).unwrap();
+    assert_eq!((sizes(&again), again.run.seed), (sizes(&old), 7));
+    let file = Source::File("new.toml".into(), cut.to_toml());
+    let again = resolve(
+        &file,
+        &sets(&["input.height=104", "input.width=80"]),
+        &MACHINE,
+    )
+    .unwrap();
+    assert_eq!(sizes(&again), sizes(&large));
+    let wrong = cut
+        .to_toml()
+        .replace("frame_height = 60", "frame_height = 64");
+    expect!["wrong.toml: run.frame_height = 64, but it follows from the world and what model.conv reads and is 60; correct the one or the other"]
+        .assert_eq(&RunConfig::parse("wrong.toml", &wrong).unwrap_err().to_string());
+    expect!["input.frame cannot be set by hand: it follows from the world"]
+        .assert_eq(&with("chain", "c51", &["input.frame.height=3"]).unwrap_err());
+}
+
 #[test]
 fn what_nobody_uses_is_not_there() {
     let config = with("mspacman", "c51", &[]).unwrap();
@@ -123,8 +168,10 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
     expect![[r#"there is no setting "learner.update.adam.learning_rate"; [learner.update.adam] has beta1, beta2, eps, lr"#]].assert_eq(&said("driml-ada", "learner.update.adam.learning_rate=1"));
     expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, precision, publish_as, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
     expect![[r#"there is no setting "world.num_level" (did you mean "world.num_levels"?); [world] has center_agent, distribution_mode, num_levels, paint_vel_info, restrict_themes, start_level, use_backgrounds, use_sequential_levels"#]].assert_eq(&said("driml-ada", "world.num_level=5"));
-    expect!["model.height cannot be set by hand: it follows from input.height"]
-        .assert_eq(&said("driml-ada", "model.height=84"));
+    expect![
+        "model.height cannot be set by hand: it follows from input.height and what model.conv reads"
+    ]
+    .assert_eq(&said("driml-ada", "model.height=84"));
     expect!["model.dim cannot be set by hand: it follows from learner.update"]
         .assert_eq(&said("driml-ada", "model.dim.psi3=true"));
     expect!["run.gamma = 1.5 cannot work: a discount lies between 0 and 1"]
@@ -150,7 +197,7 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
         r#"cuda:0 computes in f32 alone: set learner.precision = "f32", or compute bf16 on the CPU"#
     ]]
     .assert_eq(&with("procgen:bigfish", "driml-ada", &gpu).unwrap_err());
-    expect!["replay.capacity_transitions = 100000000000 needs 1147389.4 GiB, and 16.0 GiB are free: --set replay.capacity_transitions=697234"].assert_eq(&said(
+    expect!["replay.capacity_transitions = 100000000000 needs 1008808.6 GiB, and 16.0 GiB are free: --set replay.capacity_transitions=793014"].assert_eq(&said(
         "driml-ada",
         "replay.capacity_transitions=100000000000",
     ));
@@ -364,7 +411,7 @@ fn a_compressed_replay_is_bounded_in_bytes_instead() {
     let said = |set: &str| with("procgen:bigfish", "c51", &[lz4, two_million, set]).unwrap_err();
     expect!["replay.compressed_bytes_max = 100000000000 is 93.1 GiB, and 16.0 GiB are free: --set replay.compressed_bytes_max=8333934592"].assert_eq(&said("replay.compressed_bytes_max=100000000000"));
     expect!["replay.capacity_transitions = 100000000000 needs 11920.9 GiB beside the frames, and 16.0 GiB are free: --set replay.capacity_transitions=33554432"].assert_eq(&said("replay.capacity_transitions=100000000000"));
-    expect!["replay.compressed_bytes_max = 1000 cannot work: one sample spans 8 transitions, which may not compress; use at least 3244032"].assert_eq(&said("replay.compressed_bytes_max=1000"));
+    expect!["replay.compressed_bytes_max = 1000 cannot work: one sample spans 8 transitions, which may not compress; use at least 3232128"].assert_eq(&said("replay.compressed_bytes_max=1000"));
     expect!["in the settings' [replay] table: unknown variant `zip`, expected `none` or `lz4`"]
         .assert_eq(&said("replay.compression=zip"));
 }
