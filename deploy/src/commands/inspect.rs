@@ -3,7 +3,12 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use driml_launch::{console::print, inspect::Inspection, run_folder::RunFolder};
+use driml_envs::WorldName;
+use driml_launch::{
+    console::{self, print},
+    inspect::{Inspection, worlds},
+    run_folder::RunFolder,
+};
 use driml_machine::{
     error::{Usage, usage},
     resources::Machine,
@@ -20,6 +25,12 @@ pub(crate) struct InspectArgs {
     /// The settings of the run in this folder
     #[arg(long, value_name = "DIR", conflicts_with_all = ["RunFlags", "Flags"])]
     pub(crate) run: Option<PathBuf>,
+    /// Also play all --frames, without learning, and count what the rows of batches hold; some thousand frames are enough
+    #[arg(long, requires = "frames")]
+    pub(crate) play: bool,
+    /// The agent in every world, a Markdown table
+    #[arg(long, conflicts_with_all = ["env", "config", "run", "json"])]
+    pub(crate) worlds: bool,
     /// Print it as JSON
     #[arg(long)]
     pub(crate) json: bool,
@@ -30,16 +41,46 @@ pub(crate) struct InspectArgs {
 /// # Errors
 /// Settings that cannot work, or a folder that is no run's.
 pub(crate) fn run(args: &InspectArgs) -> anyhow::Result<()> {
+    if args.worlds {
+        return print(&in_every_world(args)?);
+    }
     let config = match &args.run {
         Some(folder) => of_run(&RunFolder::new(folder))?,
         None => resolve(&args.settings, &Machine::this())?.0,
     };
-    let inspection = Inspection::of(&config)?;
+    let mut inspection = Inspection::of(&config)?;
+    if args.play {
+        config.world.install(&mut console::line)?;
+        inspection.played = Some(Inspection::play(&config)?);
+    }
     if args.json {
         print(&inspection.json()?)
     } else {
         print(&inspection.describe())
     }
+}
+
+/// The table of the agent in every world.
+fn in_every_world(args: &InspectArgs) -> anyhow::Result<String> {
+    let machine = Machine::this();
+    let mut configs = Vec::new();
+    for world in WorldName::all() {
+        let name = world.to_string();
+        let flags = RunFlags {
+            env: Some(name.clone()),
+            ..args.settings.clone()
+        };
+        let config = resolve(&flags, &machine)?.0;
+        let played = if args.play {
+            console::line(&format!("playing {name}"));
+            config.world.install(&mut console::line)?;
+            Some(Inspection::play(&config)?)
+        } else {
+            None
+        };
+        configs.push((config, played));
+    }
+    worlds::markdown(&configs)
 }
 
 /// The settings of a run.

@@ -1,12 +1,14 @@
 //! `driml inspect`: what a world and an agent build, compute and send, what it would be if everything were on, and why each part is there.
-//! It runs nothing: all follows from the settings.
+//! It follows from the settings, but for what rows of batches hold, which is found by playing.
 
 mod bytes;
 mod everything;
 mod line;
 mod networks;
+mod play;
 mod text;
 mod update;
+pub mod worlds;
 
 use anyhow::Context;
 use driml_settings::config::RunConfig;
@@ -14,9 +16,10 @@ use serde::Serialize;
 
 use everything::{EVERYTHING, Everything};
 pub use line::Line;
+pub use play::RowShares;
 
 /// What a world and an agent cost.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Inspection {
     /// The world.
     pub world: String,
@@ -32,6 +35,9 @@ pub struct Inspection {
     pub decision_flops: Vec<Line>,
     /// Bytes of what travels and of what is kept. These are no parts of one sum.
     pub bytes: Vec<Line>,
+    /// What rows hold, if that was looked at.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub played: Option<RowShares>,
 }
 
 impl Inspection {
@@ -49,7 +55,16 @@ impl Inspection {
             update_flops: update::update_flops(config, &every),
             decision_flops: networks::decision_flops(config, &every),
             bytes: bytes::bytes(config, &every).context("the size of the weights")?,
+            played: None,
         })
+    }
+
+    /// Plays a run of `config`, all its frames, without learning, and counts what the rows of its batches hold.
+    ///
+    /// # Errors
+    /// A world that cannot be had or fails.
+    pub fn play(config: &RunConfig) -> anyhow::Result<RowShares> {
+        play::play(config).with_context(|| format!("playing {}", config.run.world))
     }
 
     /// As JSON.
@@ -69,8 +84,9 @@ impl Inspection {
             text::table("FLOPs of a decision", &self.decision_flops, true),
             text::table("bytes", &self.bytes, false),
         ];
+        let played = self.played.as_ref().map(text::played).unwrap_or_default();
         format!(
-            "{heading}\n\n{}\neverything: {}\n",
+            "{heading}\n\n{}\n{played}everything: {}\n",
             tables.join("\n"),
             self.everything
         )

@@ -126,6 +126,22 @@ fn what_is_counted_is_what_is_built() {
 }
 
 #[test]
+fn a_world_that_needs_nothing_is_played() {
+    let smoke = PRESETS.iter().position(|it| it.name == "smoke").unwrap();
+    let config = config("chain", "driml-ada", smoke, &["replay.transitions_max=600"]);
+    let shares = Inspection::play(&config).unwrap();
+    // Whole chunks of 32 frames; at a ratio of 1 as many rows as the 600 have after the warm-up, in whole batches of 16.
+    assert_eq!((shares.frames, shares.rows), (608, 400));
+    // Episodes are a few steps long, and the corridor has eight frames.
+    assert!(shares.without_bootstrap > 0.2 && shares.without_positive > 0.02);
+    assert!(shares.zero_bytes > 0.05 && shares.zero_bytes < 0.5);
+    assert!(shares.repeated_online > 0.5 && shares.repeated_target > 0.0);
+    let text = worlds::markdown(&[(config, Some(shares))]).unwrap();
+    assert_eq!(text.lines().count(), 3);
+    assert!(text.contains("| chain | 12x12 | 150 | "), "{text}");
+}
+
+#[test]
 fn no_agent_has_more_than_everything() {
     for agent in AGENTS.iter().map(|agent| agent.name) {
         let sets: &[&str] = if agent == "c51" {

@@ -1,7 +1,7 @@
 //! An inspection as tables for a terminal.
 //! It counts nothing.
 
-use super::line::Line;
+use super::{line::Line, play::RowShares};
 
 /// Columns of the first table's names; longer names push their row to the right.
 const WHAT_COLUMNS: usize = 26;
@@ -22,6 +22,45 @@ pub(super) fn table(heading: &str, lines: &[Line], summed: bool) -> String {
         text += &row("all", &thousands(is), &thousands(everything), &why);
     }
     text
+}
+
+/// What rows hold, with an empty line after it.
+pub(super) fn played(shares: &RowShares) -> String {
+    let RowShares {
+        frames,
+        rows,
+        without_bootstrap,
+        without_positive,
+        zero_bytes,
+        repeated_online,
+        repeated_target,
+    } = *shares;
+    let heading = format!(
+        "{} rows of batches, from {} frames played with the first weights",
+        thousands(rows),
+        thousands(frames)
+    );
+    let lines = [
+        (
+            "bootstrap from nothing: their s_{t+n} is zeros",
+            without_bootstrap,
+        ),
+        (
+            "positives that rows do not have: zeros too",
+            without_positive,
+        ),
+        ("of a batch's bytes are these zeros", zero_bytes),
+        (
+            "of s_t and s_{t+k} are equal to another of the batch",
+            repeated_online,
+        ),
+        (
+            "of s_{t+n} are equal to another of the batch",
+            repeated_target,
+        ),
+    ];
+    let lines = lines.map(|(what, share)| format!("{:>6.2}%  {what}\n", 100.0 * share));
+    format!("{heading}\n{}\n", lines.concat())
 }
 
 fn row(what: &str, is: &str, everything: &str, why: &str) -> String {
