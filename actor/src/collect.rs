@@ -1,7 +1,7 @@
 //! One actor's work without its network connections: act with the newest weights, give chunk after chunk.
 //! The processes and the lockstep mode run this same code; it neither sends nor waits.
 
-use driml_envs::CutFrames;
+use driml_envs::{CutFrames, FewerActions};
 use driml_protocol::{BufferPool, Chunk, RunSpec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -72,6 +72,12 @@ impl Collector {
                 world: spec.world.clone(),
                 source,
             })?;
+        let no_world = |source| ActError::NoWorld {
+            world: spec.world.clone(),
+            source,
+        };
+        let world =
+            FewerActions::of(world, settings.world.actions(config.actions)).map_err(no_world)?;
         let shape = world.frame_shape();
         let sent = (spec.frame_height as usize, spec.frame_width as usize);
         let (whole_height, whole_width) = settings.input.whole_frame(sent);
@@ -95,10 +101,7 @@ impl Collector {
             });
         }
         let rng = ChaCha8Rng::from_seed(life.seed(spec, "exploration"));
-        let world = CutFrames::of(world, sent).map_err(|source| ActError::NoWorld {
-            world: spec.world.clone(),
-            source,
-        })?;
+        let world = CutFrames::of(world, sent).map_err(no_world)?;
         let policy = NetworkPolicy::new(
             &settings.model,
             settings.input.enlarge(sent, &settings.model)?,
@@ -220,6 +223,7 @@ mod tests {
                 dim: DimHeads::NONE,
             },
             actor: Config {
+                actions: driml_envs::ActionSet::All,
                 precision: driml_model::Precision::F32,
                 envs: ENVS,
                 steps_per_chunk: STEPS,

@@ -29,6 +29,9 @@ pub struct Config {
     /// In which numbers the network's products are computed. Settings of earlier versions do not have it: f32.
     #[serde(default)]
     pub precision: driml_model::Precision,
+    /// Which of the world's actions are chosen among. Settings of earlier versions do not have it: all.
+    #[serde(default)]
+    pub actions: driml_envs::ActionSet,
     /// Threads that step the copies; 0 steps them in the acting thread.
     pub world_threads: u32,
     /// Probability of a random action at the run's first frame.
@@ -280,6 +283,7 @@ mod tests {
     #[test]
     fn chunks_get_shorter_as_actors_get_many() {
         let config = |envs, steps_per_chunk, round_transitions_max| Config {
+            actions: driml_envs::ActionSet::All,
             precision: driml_model::Precision::F32,
             envs,
             steps_per_chunk,

@@ -76,6 +76,26 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
 }
 
 #[test]
+fn an_agent_chooses_among_the_actions_that_differ() {
+    if skipped_offline("procgen::an_agent_chooses_among_the_actions_that_differ") {
+        return;
+    }
+    let system = system();
+    system
+        .run(
+            "local --lockstep --env procgen:plunder --agent driml-ada --preset smoke --frames 416 \
+             --set actor.actions=visible --set learner.affinity.alphabet=visible --run-dir run",
+        )
+        .expect_code(0);
+    system.run_folder("run").check_finished();
+    let config = system.run_folder("run").config();
+    assert_eq!(config["model"]["num_actions"].as_integer(), Some(4));
+    system
+        .run("evaluate --run run --episodes 2 --levels unseen")
+        .expect_code(0);
+}
+
+#[test]
 fn an_experiment_of_whole_runs_normalises_and_plays_unseen_levels() {
     if skipped_offline("procgen::an_experiment_of_whole_runs_normalises_and_plays_unseen_levels") {
         return;

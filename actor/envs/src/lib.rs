@@ -43,6 +43,7 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::print_stdout))]
 
+mod action_set;
 mod copies;
 mod cut_frames;
 mod environment;
@@ -52,6 +53,7 @@ mod registry;
 mod settings;
 mod worlds;
 
+pub use action_set::{ActionSet, FewerActions};
 pub use cut_frames::CutFrames;
 pub use environment::{Environment, FrameShape, StepEnd};
 pub use error::EnvError;

@@ -4,7 +4,7 @@
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_actor::{NetworkPolicy, Policy, RandomPolicy, episode_returns};
-use driml_envs::{CutFrames, WorldConfig};
+use driml_envs::{CutFrames, FewerActions, WorldConfig};
 use driml_learner::{Compute, checkpoint};
 use driml_machine::error::{Usage, usage};
 use driml_settings::config::RunConfig;
@@ -129,9 +129,11 @@ impl Player {
             Who::Random => Box::new(RandomPolicy::new(u8::try_from(spec.num_actions)?)),
         };
         let copies = episodes.min(COPIES_MAX);
+        let actions = world.actions(self.config.actor.actions);
+        let fewer = FewerActions::of(world.build(copies, seed, 0)?, actions)?;
         let rounds = episodes.div_ceil(copies) as u64;
         episode_returns(
-            CutFrames::of(world.build(copies, seed, 0)?, sent)?,
+            CutFrames::of(fewer, sent)?,
             spec.frame_stack as usize,
             policy.as_mut(),
             EPSILON,

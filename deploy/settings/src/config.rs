@@ -146,6 +146,16 @@ impl RunConfig {
         Self::from_table(&table)
     }
 
+    /// The names of the run's actions; an action is a place in this list.
+    pub fn action_names(&self) -> Vec<&'static str> {
+        let actions = self.world.actions(self.actor.actions);
+        let names = self.world.action_names();
+        actions
+            .into_iter()
+            .map(|it| names[usize::from(it)])
+            .collect()
+    }
+
     /// Transitions of the whole run.
     pub fn frames(&self) -> u64 {
         self.replay.transitions_max.unwrap_or(u64::MAX)

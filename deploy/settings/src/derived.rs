@@ -1,7 +1,7 @@
 //! The settings that follow from others: filled in, checked when read back, refused when set by hand.
 //! It decides nothing of its own.
 
-use driml_envs::{WorldConfig, WorldName};
+use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::LearnerSettings;
 use driml_machine::error::{Usage, usage};
 use driml_model::{ConvLayer, FrameSize, InputRead, InputSize};
@@ -22,7 +22,10 @@ const FOLLOWS: [(&str, &str); 15] = [
         "follows from the world and what model.conv reads",
     ),
     ("run.frame_channels", "follows from the world"),
-    ("run.num_actions", "follows from the world"),
+    (
+        "run.num_actions",
+        "follows from the world and actor.actions",
+    ),
     ("world.kind", "is chosen by --env"),
     ("world.game", "is chosen by --env"),
     ("input.frame", "follows from the world"),
@@ -38,7 +41,10 @@ const FOLLOWS: [(&str, &str); 15] = [
         "model.channels",
         "follows from the world and run.frame_stack",
     ),
-    ("model.num_actions", "follows from the world"),
+    (
+        "model.num_actions",
+        "follows from the world and actor.actions",
+    ),
     ("model.dim", "follows from learner.update"),
     (
         "replay.reproduced_bug",
@@ -133,7 +139,11 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
             read = input.read(&conv, frame);
         }
     }
-    let num_actions = config.num_actions();
+    let set: ActionSet = match find(table, "actor.actions") {
+        Some(_) => table_at(table, "actor.actions")?,
+        None => ActionSet::All,
+    };
+    let num_actions = config.actions(set).len();
     let stack = whole(table, "run.frame_stack")?;
     let dim = update.dim_heads(num_actions);
     let size = |value: usize| Value::Integer(value as i64);
@@ -154,7 +164,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     ] {
         put(table, path, value);
     }
-    visible_actions(table, &config);
+    visible_actions(table, &config, set);
     ladder(table);
     Ok(())
 }
@@ -171,10 +181,15 @@ fn ladder(table: &mut Table) {
 }
 
 /// Fills in what each action amounts to in the world, where that is asked for and not given.
-fn visible_actions(table: &mut Table, world: &WorldConfig) {
+fn visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
     let asked = find(table, "learner.affinity.alphabet").and_then(Value::as_str) == Some("visible");
     if asked && find(table, "learner.affinity.visible").is_none() {
-        let map = world.visible_actions().into_iter();
+        let map = match set {
+            ActionSet::All => world.visible_actions(),
+            // They are told apart already.
+            ActionSet::Visible => (0..world.actions(set).len()).map(|it| it as u8).collect(),
+        };
+        let map = map.into_iter();
         let map = map.map(|action| Value::Integer(action.into())).collect();
         put(table, "learner.affinity.visible", Value::Array(map));
     }

@@ -26,6 +26,7 @@ impl Everything {
         let model = ModelConfig {
             height: input.height as usize,
             width: input.width as usize,
+            num_actions: config.world.num_actions(),
             dim: DimHeads {
                 psi3: true,
                 phi3: true,

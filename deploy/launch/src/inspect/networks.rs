@@ -84,10 +84,16 @@ fn why_layer(config: &RunConfig, name: &str) -> String {
     };
     match name {
         "torso.fc" => format!("f4, {} numbers of the last map", model.hidden),
-        "head" => format!(
-            "C51: {} actions of {} atoms each",
-            model.num_actions, model.atoms
-        ),
+        "head" => {
+            let all = config.world.num_actions();
+            let of = if model.num_actions == all {
+                String::new()
+            } else {
+                format!(" of {all} (actor.actions)")
+            };
+            let (actions, atoms) = (model.num_actions, model.atoms);
+            format!("C51: {actions} actions{of}, {atoms} atoms each")
+        }
         "dim.action" if heads.embeds_action() => "psi is given a_t (condition_on_action)".into(),
         "dim.action" if heads == DimHeads::NONE => "not built: there is no psi".into(),
         "dim.action" if model.num_actions == 1 => "not built: there is one action".into(),

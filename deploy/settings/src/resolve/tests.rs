@@ -73,6 +73,7 @@ fn the_default_run_is_the_papers() {
     expect![[r#"
         [actor]
         ack_timeout_ms = 10000
+        actions = "all"
         chunks_in_flight_max = 4
         envs = 16
         epsilon_decay_frames = 100000
@@ -142,6 +143,40 @@ fn frames_are_cut_where_nothing_reads_them() {
         .assert_eq(&RunConfig::parse("wrong.toml", &wrong).unwrap_err().to_string());
     expect!["input.frame cannot be set by hand: it follows from the world"]
         .assert_eq(&with("chain", "c51", &["input.frame.height=3"]).unwrap_err());
+}
+
+/// Everything that has an entry for each action follows from which actions there are.
+#[test]
+fn an_agent_may_choose_among_the_actions_that_differ_alone() {
+    let visible = "actor.actions=visible";
+    for (world, count) in [
+        ("procgen:plunder", 4),
+        ("procgen:maze", 5),
+        ("procgen:coinrun", 9),
+        ("procgen:starpilot", 15),
+        ("mspacman", 5),
+        ("chain", 3),
+    ] {
+        let config = with(world, "driml-ada", &[visible]).unwrap();
+        assert_eq!(config.run.num_actions, count, "{world}");
+        assert_eq!(config.model.num_actions, count as usize);
+        assert_eq!(config.action_names().len(), count as usize);
+        let read = RunConfig::parse("config.toml", &config.to_toml()).unwrap();
+        assert_eq!(read, config);
+        let both = [visible, "learner.affinity.alphabet=visible"];
+        let merged = with(world, "driml-ada", &both).unwrap();
+        assert_eq!(
+            merged.learner.affinity.visible.unwrap().len(),
+            count as usize
+        );
+        let all = with(world, "driml-ada", &[]).unwrap();
+        assert_eq!(all.run.num_actions as usize, all.world.num_actions());
+        // Settings of earlier versions say nothing of it.
+        let old = all.to_toml().replace("actions = \"all\"\n", "");
+        assert_eq!(RunConfig::parse("old.toml", &old).unwrap(), all);
+    }
+    let names = with("procgen:plunder", "c51", &[visible]).unwrap();
+    assert_eq!(names.action_names(), ["left", "no-op", "right", "d"]);
 }
 
 #[test]
