@@ -52,6 +52,19 @@ impl Kernels {
         }
     }
 
+    /// The layer on maps [B, h, w, c], flattened as PyTorch's weights expect: channel, row, column.
+    pub(crate) fn linear_of_maps(
+        self,
+        maps: &Tensor,
+        w: &Tensor,
+        b: &Tensor,
+    ) -> candle_core::Result<Tensor> {
+        match self {
+            Self::Fused(precision) => linear::linear_of_maps(maps, w, b, precision),
+            Self::Candle => candle::linear(&maps.permute((0, 3, 1, 2))?.flatten_from(1)?, w, b),
+        }
+    }
+
     pub(crate) fn linear_relu(
         self,
         x: &Tensor,
