@@ -39,7 +39,7 @@ fn the_paper_s_agent_is_described() {
         torso.conv2                         32,832          32,832  14x14x32 to 6x6x64, kernel 4, stride 2
         torso.conv3                         36,928          36,928  6x6x64 to 4x4x64, kernel 3, stride 1
         torso.fc                           524,800         524,800  f4, 512 numbers of the last map
-        head                               392,445         392,445  C51: 15 actions of 51 atoms each
+        head                               392,445         392,445  C51: 15 actions, 51 atoms each
         dim.action                           6,208           6,208  psi is given a_t (condition_on_action)
         dim.psi3                                 0         394,240  not built: lambda 3t3 and 3t4 are 0
         dim.phi3                                 0         328,704  not built: lambda 3t3 and 4t3 are 0

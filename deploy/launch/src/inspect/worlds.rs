@@ -7,12 +7,13 @@ use driml_settings::config::RunConfig;
 
 use super::{Inspection, play::RowShares};
 
-const HEADINGS: [&str; 6] = [
+const HEADINGS: [&str; 7] = [
     "world",
     "frame",
     "transition, bytes",
     "batch, MB",
     "update, GFLOP",
+    "broadcast, MB",
     "actions that differ",
 ];
 
@@ -76,6 +77,7 @@ fn cells(config: &RunConfig) -> anyhow::Result<Vec<String>> {
         beside(transition(&is), transition(&whole)),
         beside(batch(&is), batch(&whole)),
         beside(update(&is), update(&whole)),
+        format!("{:.2}", bytes(&is, "a broadcast") as f64 / 1e6),
         format!("{} of {}", differ.len(), config.world.num_actions()),
     ])
 }

@@ -294,7 +294,7 @@ fn a_ladder_of_epsilons_is_for_the_actors_of_the_run() {
         .assert_eq(&of(&["actor.epsilon_ladder={base=4.0,alpha=7.0}", "local.actors=2"]).unwrap_err());
     expect!["in the settings' [actor] table: missing field `alpha`"]
         .assert_eq(&of(&["actor.epsilon_ladder={base=0.4}", "local.actors=2"]).unwrap_err());
-    expect![[r#"there is no setting "actor.epsilon_ladder.rungs"; [actor] has ack_timeout_ms, chunks_in_flight_max, envs, epsilon_decay_frames, epsilon_end, epsilon_start, precision, round_transitions_max, steps_per_chunk, unreachable_max_ms, world_threads"#]]
+    expect![[r#"there is no setting "actor.epsilon_ladder.rungs"; [actor] has ack_timeout_ms, actions, chunks_in_flight_max, envs, epsilon_decay_frames, epsilon_end, epsilon_start, precision, round_transitions_max, steps_per_chunk, unreachable_max_ms, world_threads"#]]
         .assert_eq(&of(&["actor.epsilon_ladder.rungs=3"]).unwrap_err());
 }
 
@@ -310,7 +310,7 @@ fn a_file_at_odds_with_itself_is_refused() {
         .unwrap_err()
         .to_string()
     };
-    expect!["x.toml: run.num_actions = 6, but it follows from the world and is 5; correct the one or the other"].assert_eq(&said(text.replace("num_actions = 5", "num_actions = 6")));
+    expect!["x.toml: run.num_actions = 6, but it follows from the world and actor.actions and is 5; correct the one or the other"].assert_eq(&said(text.replace("num_actions = 5", "num_actions = 6")));
     expect![
         "x.toml: the settings lack input.height, a whole number: use a config.toml that driml wrote"
     ]
@@ -324,7 +324,7 @@ fn a_file_at_odds_with_itself_is_refused() {
     .assert_eq(&said("= 3".into()));
     expect!["x.toml: the settings lack run.world, a word: use a config.toml that driml wrote"]
         .assert_eq(&said(String::new()));
-    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
+    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `actions`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
 }
 
 #[test]
