@@ -49,6 +49,15 @@ impl C51Head {
         Ok(logits.reshape(((), self.actions, self.atoms))?)
     }
 
+    /// Of those logits the ones [B, atoms] of one action a row.
+    pub(crate) fn taken_logits(&self, f4: &Tensor, actions: &[u8]) -> Result<Tensor> {
+        let active = self.kernels.relu(f4)?;
+        let (weight, bias) = (&self.weight, &self.bias);
+        Ok(self
+            .kernels
+            .grouped_linear(&active, weight, bias, actions, self.atoms)?)
+    }
+
     /// Expected returns [B, A] of logits [B, A, atoms]; no gradient flows.
     pub(crate) fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
         match self.kernels {
