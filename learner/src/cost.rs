@@ -10,6 +10,8 @@ use crate::{auxiliary::loss::Passes, config::Config};
 pub struct UpdateShape {
     /// Rows, B.
     pub rows: u64,
+    /// Whether the C51 head gives s_t's distributions for every action; the loss reads that of the action taken alone.
+    pub every_action: bool,
     /// Whether the online network chooses the action in s_{t+n}.
     pub double_dqn: bool,
     /// What the auxiliary loss needs.
@@ -26,6 +28,7 @@ impl UpdateShape {
         );
         Self {
             rows: learner.batch_size.into(),
+            every_action: false,
             double_dqn: learner.update.double_dqn,
             passes,
         }
@@ -35,9 +38,11 @@ impl UpdateShape {
 /// Multiplications and additions of one update, each counted as one: matrix products alone, of all rows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct UpdateCost {
-    /// s_t through torso and C51 head, forward and backward.
+    /// s_t through the torso, forward and backward.
     pub online: u64,
-    /// s_{t+n} through the target network, forward.
+    /// s_t through the C51 head, forward and backward.
+    pub head: u64,
+    /// s_{t+n} through the target network, forward; rows that do not bootstrap are left out of it, and counted here.
     pub target: u64,
     /// s_{t+n} through the online network, forward, to choose an action.
     pub double_dqn: u64,
@@ -63,16 +68,23 @@ impl UpdateCost {
         let learning = |parts: &[&str]| sum(parts, LayerCost::learning);
         let UpdateShape {
             rows,
+            every_action,
             double_dqn,
             passes,
         } = *shape;
+        let actions = if every_action {
+            1
+        } else {
+            model.num_actions as u64
+        };
         let (height, width, _) = model.local_shape();
         let matrices = passes.local_scores * (height * width) as u64 + passes.global_scores;
         // Forward, and the gradients of both sides; a key has none.
         let products = if passes.keys > 0 { 2 } else { 3 };
         let value = forward(&["torso", "head"]);
         Self {
-            online: rows * learning(&["torso", "head"]),
+            online: rows * learning(&["torso"]),
+            head: rows * learning(&["head"]) / actions,
             target: rows * value,
             double_dqn: rows * value * u64::from(double_dqn),
             states: rows * passes.states * learning(&["torso"]),
@@ -88,6 +100,7 @@ impl UpdateCost {
     pub const fn total(&self) -> u64 {
         let Self {
             online,
+            head,
             target,
             double_dqn,
             states,
@@ -95,7 +108,7 @@ impl UpdateCost {
             heads,
             scores,
         } = *self;
-        online + target + double_dqn + states + keys + heads + scores
+        online + head + target + double_dqn + states + keys + heads + scores
     }
 }
 
@@ -134,12 +147,15 @@ mod tests {
         let value = conv + fc + head;
         let c51 = UpdateShape {
             rows: 10,
+            every_action: false,
             double_dqn: false,
             passes: Passes::default(),
         };
         let plain = UpdateCost {
             // The image needs no gradient.
-            online: 10 * (2 * conv + 3 * fc + 3 * head),
+            online: 10 * (2 * conv + 3 * fc),
+            // One of the two actions.
+            head: 10 * 3 * head / 2,
             target: 10 * value,
             ..UpdateCost::default()
         };
@@ -152,6 +168,7 @@ mod tests {
         };
         let passes = Passes::of_pairs(lambda, 2, true);
         let dim = UpdateShape {
+            every_action: true,
             double_dqn: true,
             passes,
             ..c51
@@ -163,6 +180,7 @@ mod tests {
         let psi4 = 2 * (2 * (5 * 4 + 2 * 4) + 4 * 4);
         let phi4 = 2 * (2 * (5 * 4) + 4 * 4);
         let expected = UpdateCost {
+            head: 10 * 3 * head,
             double_dqn: 10 * value,
             // Two positives and the augmented s_t.
             states: 10 * 3 * (2 * conv + 3 * fc),
@@ -176,6 +194,7 @@ mod tests {
         assert_eq!(
             found.total(),
             expected.online
+                + expected.head
                 + expected.target
                 + expected.double_dqn
                 + expected.states
@@ -192,6 +211,7 @@ mod tests {
         };
         let shape = UpdateShape {
             rows: 10,
+            every_action: false,
             double_dqn: false,
             passes: Passes {
                 states: 1,

@@ -49,6 +49,7 @@ impl Everything {
         };
         let shape = UpdateShape {
             rows: config.learner.batch_size.into(),
+            every_action: true,
             double_dqn: true,
             passes: Passes {
                 keys: 1,

@@ -50,14 +50,15 @@ fn the_paper_s_agent_is_described() {
         all                              3,633,018       5,809,690  63% of everything
 
         FLOPs of an update                      is      everything  why
-        s_t, torso and head          5,357,961,216   5,540,413,440  256 rows forward and backward: the loss of C51
-        s_{t+n}, target network      1,991,507,968   2,082,734,080  forward: what is bootstrapped
+        s_t, torso                   4,756,340,736   4,938,792,960  256 rows forward and backward
+        s_t, C51 head                   40,108,032     601,620,480  of the action taken alone: its loss reads no other
+        s_{t+n}, target network      1,991,507,968   2,082,734,080  forward: what is bootstrapped; at most, as rows without a bootstrap are left out
         s_{t+n}, online network                  0   2,082,734,080  not done: double_dqn = false
         more states, torso           4,756,340,736  29,632,757,760  one positive a row (run.horizon)
         states, key encoder                      0   2,318,401,536  not done: there is no key encoder
         psi and phi                  2,524,839,936  55,775,723,520  forward and backward
         scores                         201,326,592  32,883,343,360  each row with each, and their gradients
-        all                         14,831,976,448 130,316,107,776  11% of everything
+        all                         14,270,464,000 130,316,107,776  11% of everything
 
         FLOPs of a decision                     is      everything  why
         torso.conv1                      2,408,448       2,764,800  for 96.7% of states; in the others chance decides (epsilon)

@@ -25,16 +25,22 @@ pub(super) fn update_flops(config: &RunConfig, every: &Everything) -> Vec<Line> 
     let rows = shape.rows;
     vec![
         Line::new(
-            "s_t, torso and head",
+            "s_t, torso",
             is.online,
             all.online,
-            format!("{rows} rows forward and backward: the loss of C51"),
+            format!("{rows} rows forward and backward"),
+        ),
+        Line::new(
+            "s_t, C51 head",
+            is.head,
+            all.head,
+            "of the action taken alone: its loss reads no other",
         ),
         Line::new(
             "s_{t+n}, target network",
             is.target,
             all.target,
-            "forward: what is bootstrapped",
+            "forward: what is bootstrapped; at most, as rows without a bootstrap are left out",
         ),
         Line::new(
             "s_{t+n}, online network",

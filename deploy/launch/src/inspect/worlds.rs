@@ -1,8 +1,9 @@
-//! What one agent costs in several worlds: a Markdown table with a line for each, beside the same with whole frames.
-//! It is the table of `deploy/experiments/results/inspect/README.md`.
+//! What one agent costs in several worlds: a Markdown table with a line for each, and in brackets what it would be with whole frames,
+//! every action's distribution of s_t, and targets of all rows. It is the table of `deploy/experiments/results/inspect/README.md`.
 
 use std::collections::BTreeSet;
 
+use driml_learner::cost::{UpdateCost, UpdateShape};
 use driml_settings::config::RunConfig;
 
 use super::{Inspection, play::RowShares};
@@ -38,7 +39,7 @@ pub fn markdown(configs: &[(RunConfig, Option<RowShares>)]) -> anyhow::Result<St
     let mut text = line(&headings.iter().map(|&it| it.to_owned()).collect::<Vec<_>>());
     text += &line(&vec!["---".to_owned(); headings.len()]);
     for (config, shares) in configs {
-        let mut cells = cells(config)?;
+        let mut cells = cells(config, *shares)?;
         if played {
             cells.extend(shares.map_or_else(|| vec![String::new(); PLAYED.len()], played_cells));
         }
@@ -47,14 +48,13 @@ pub fn markdown(configs: &[(RunConfig, Option<RowShares>)]) -> anyhow::Result<St
     Ok(text)
 }
 
-fn cells(config: &RunConfig) -> anyhow::Result<Vec<String>> {
-    let is = Inspection::of(config)?;
-    let whole = Inspection::of(&config.with_whole_frames()?)?;
+fn cells(config: &RunConfig, shares: Option<RowShares>) -> anyhow::Result<Vec<String>> {
+    let whole_frames = config.with_whole_frames()?;
+    let (is, whole) = (Inspection::of(config)?, Inspection::of(&whole_frames)?);
     let bytes = |it: &Inspection, what: &str| {
         let line = it.bytes.iter().find(|line| line.what == what);
         line.map_or(0, |line| line.is)
     };
-    let flops = |it: &Inspection| it.update_flops.iter().map(|line| line.is).sum::<u64>();
     let beside = |is: String, whole: String| {
         if is == whole {
             is
@@ -67,7 +67,8 @@ fn cells(config: &RunConfig) -> anyhow::Result<Vec<String>> {
     let differ: BTreeSet<_> = config.world.visible_actions().into_iter().collect();
     let transition = |it| bytes(it, "a transition in a chunk").to_string();
     let batch = |it| format!("{:.2}", bytes(it, "a batch") as f64 / 1e6);
-    let update = |it| format!("{:.2}", flops(it) as f64 / 1e9);
+    let update = |flops: f64| format!("{:.2}", flops / 1e9);
+    let without_bootstrap = shares.map_or(0.0, |shares| shares.without_bootstrap);
     Ok(vec![
         run.world.clone(),
         beside(
@@ -76,10 +77,23 @@ fn cells(config: &RunConfig) -> anyhow::Result<Vec<String>> {
         ),
         beside(transition(&is), transition(&whole)),
         beside(batch(&is), batch(&whole)),
-        beside(update(&is), update(&whole)),
+        beside(
+            update(flops(config, false, without_bootstrap)),
+            update(flops(&whole_frames, true, 0.0)),
+        ),
         format!("{:.2}", bytes(&is, "a broadcast") as f64 / 1e6),
         format!("{} of {}", differ.len(), config.world.num_actions()),
     ])
+}
+
+/// FLOPs of an update, of which this share of rows does not bootstrap.
+fn flops(config: &RunConfig, every_action: bool, without_bootstrap: f64) -> f64 {
+    let shape = UpdateShape {
+        every_action,
+        ..UpdateShape::of(&config.learner, config.run.horizon.positives())
+    };
+    let cost = UpdateCost::of(&config.model, &shape);
+    cost.total() as f64 - without_bootstrap * (cost.target + cost.double_dqn) as f64
 }
 
 fn played_cells(shares: RowShares) -> Vec<String> {
