@@ -49,6 +49,7 @@ pub use encoder::Encoder;
 pub use error::{ModelError, Result};
 pub use geometry::{ConvLayer, ConvShape};
 pub use gradients::Backward;
+pub use heads::c51::EXPECTED_RETURN_ERROR;
 pub use input::Enlarge;
 pub use kernels::conv::{conv_stack, conv2d_relu};
 pub use kernels::linear::{linear, linear_relu, relu};

@@ -114,7 +114,8 @@ impl Network {
         self.head.logits(f4)
     }
 
-    /// Expected returns [B, A] of `logits` [B, A, atoms]. No gradient flows through them.
+    /// Expected returns [B, A] of `logits` [B, A, atoms]. No gradient flows through them. On the CPU they are right to
+    /// [`EXPECTED_RETURN_ERROR`](crate::EXPECTED_RETURN_ERROR) of the support's width beside their own last place.
     ///
     /// # Errors
     /// Another shape.

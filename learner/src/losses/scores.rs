@@ -2,6 +2,15 @@
 
 use candle_core::Tensor;
 
+/// Largest error of a clipped score, as a share of it.
+pub const CLIP_ERROR: f64 = 2e-15;
+
+/// Largest error of a clipped score's slope, as a share of it: where the score saturates, the exponent `2 |x| / c` is known to its
+/// own last place only. Below 1e-300 it is that share of 1e-300.
+pub fn slope_error(score: f64, tanh_clip: f64) -> f64 {
+    CLIP_ERROR + 1e-15 * (2.0 * score / tanh_clip).abs()
+}
+
 /// Dot products of every anchor with every candidate.
 #[derive(Debug)]
 pub struct Dots {
@@ -38,8 +47,9 @@ impl Scores {
     ///
     /// With `e = exp(-2 |x| / c)`: `tanh = (1 - e) / (1 + e)` and its slope `4 e / (1 + e)^2`, which, unlike
     /// `1 - tanh^2`, keeps its precision where the score saturates. `1 - e` is taken as `expm1`, which keeps its own where the
-    /// bound is far above the score: both results are within a relative 2e-15 for scores and bounds from 1e-150 to 1e150.
-    pub(super) fn clip(&self, dot: f32) -> (f64, f64) {
+    /// bound is far above the score: for scores and bounds from 1e-150 to 1e150 the score is right to [`CLIP_ERROR`], its slope to
+    /// [`slope_error`] of the score before the clip.
+    pub fn clip(&self, dot: f32) -> (f64, f64) {
         let x = f64::from(dot) * self.scale;
         let exponent = -2.0 * x.abs() / self.tanh_clip;
         let e = exponent.exp();
