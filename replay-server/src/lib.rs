@@ -78,7 +78,7 @@ pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use rate_limiter::RateLimiter;
 pub use replay::{Replay, Unready};
 pub use sampling::{
-    assemble::{RETURN_ERROR, RETURN_SUM_ERROR},
+    assemble::{RETURN_ERROR, return_sum_error},
     horizon,
     packed_batch::PackedBatch,
 };

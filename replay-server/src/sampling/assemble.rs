@@ -159,12 +159,16 @@ impl Assembler {
 /// Largest error of a return that is sent, as a share of it (of 1.2e-38, the least normal number, if that is larger): an f32's last
 /// place.
 pub const RETURN_ERROR: f64 = 6.1e-8;
-/// Largest error of its sum beside that, as a share of the sum of its terms' sizes: they may cancel.
-pub const RETURN_SUM_ERROR: f64 = 1e-14;
+
+/// Largest error of the sum of `n` terms beside that, as a share of the sum of their sizes, as they may cancel: the rounding in f64 of
+/// each power of gamma, product and sum.
+pub fn return_sum_error(n: usize) -> f64 {
+    (2 * n + 2) as f64 * f64::EPSILON / 2.0
+}
 
 /// Sum of gamma^i r_{t+i} over i < n, and the i of the state to bootstrap from: n, unless the episode ended before.
 /// `discounts` are gamma^0 to gamma^n. The sum is f64, so that rewards of very different sizes cancel as they should: it is right to
-/// [`RETURN_SUM_ERROR`].
+/// [`return_sum_error`].
 ///
 /// After a terminal step nothing follows. A time-out counts as one (`TimeoutRule::Terminal`), or cuts the return short
 /// of its own step and bootstraps from that step's state (`TimeoutRule::Bootstrap`).
@@ -270,12 +274,12 @@ mod tests {
             }
             let expected = sum + lost;
             let error = (found - expected).abs();
-            prop_assert!(error <= RETURN_SUM_ERROR * sizes, "{found:e}, {expected:e}");
+            prop_assert!(error <= return_sum_error(n) * sizes, "{found:e}, {expected:e}");
             let sent = return_f32(found);
             prop_assert!(sent.is_finite());
             let error = (f64::from(sent) - expected).abs();
             let scale = expected.abs().max(f32::MIN_POSITIVE.into());
-            prop_assert!(error <= RETURN_ERROR * scale + RETURN_SUM_ERROR * sizes, "{sent:e}, {expected:e}");
+            prop_assert!(error <= RETURN_ERROR * scale + return_sum_error(n) * sizes, "{sent:e}, {expected:e}");
         }
     }
 }
