@@ -116,7 +116,8 @@ proptest! {
         let ratio = f64::from(dot) * scores.scale / tanh_clip;
         let expected = tanh_clip * ratio.tanh();
         prop_assert!((score - expected).abs() <= CLIP_ERROR * expected.abs(), "{score:e}, {expected:e}");
-        let expected = scores.scale / ratio.cosh().powi(2);
+        // The square of the cosh may be too large for a float where the slope is not yet too small for one.
+        let expected = scores.scale / ratio.cosh() / ratio.cosh();
         let error = (slope - expected).abs();
         let allowed = scores::slope_error(ratio * tanh_clip, tanh_clip) * expected.max(1e-300);
         prop_assert!(error <= allowed, "{slope:e}, {expected:e}");
