@@ -4,6 +4,7 @@
 use driml_envs::{WorldConfig, WorldName};
 use driml_learner::LearnerSettings;
 use driml_machine::error::{Usage, usage};
+use driml_protocol::config::in_words;
 use toml::{Table, Value};
 
 use crate::overrides::inline;
@@ -232,5 +233,5 @@ fn table_at<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result
     value
         .clone()
         .try_into()
-        .map_err(|e: toml::de::Error| usage!("in the settings' [{path}] table: {}", e.message()))
+        .map_err(|e: toml::de::Error| usage!("in the settings' [{path}] table: {}", in_words(&e)))
 }
