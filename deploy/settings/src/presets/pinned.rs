@@ -78,6 +78,8 @@ const PINNED: &[(&str, &[Pinned])] = &[
         ("world.use_backgrounds", "true", "Procgen's default"),
         ("world.center_agent", "true", "Procgen's default"),
         ("world.restrict_themes", "false", "Procgen's default"),
+        ("world.frame_side", "64", "the engine's own"),
+        ("world.grey", "false", "the engine's own"),
         ("learner.update.lambda.3t3", "0.0", "paper"),
         ("learner.update.lambda.3t4", "0.0", "paper"),
         ("learner.update.lambda.4t3", "0.0", "paper"),
