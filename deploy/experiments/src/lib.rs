@@ -42,8 +42,9 @@ mod runs;
 mod session;
 mod statistics;
 mod template;
+mod tradeoff;
 
-use crate::flags::ExperimentCommand;
+use crate::flags::{ExperimentCommand, TradeoffArgs};
 
 /// Runs the experiment that the command names.
 ///
@@ -56,4 +57,12 @@ pub fn run(command: &ExperimentCommand) -> anyhow::Result<()> {
         ExperimentCommand::Pacman(args) => pacman::run(args),
         ExperimentCommand::Procgen(args) => procgen::run(args),
     }
+}
+
+/// Measures what each dial that buys speed costs.
+///
+/// # Errors
+/// As [`run`].
+pub fn tradeoff(args: &TradeoffArgs) -> anyhow::Result<()> {
+    tradeoff::run(args)
 }
