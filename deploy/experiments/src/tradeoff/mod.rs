@@ -3,6 +3,7 @@
 //! The menu of dials is in `dials`, what fits a budget in `plan`, data, figures and page in `report`.
 
 mod dials;
+mod exactness;
 mod figures;
 mod held;
 mod page;
@@ -25,7 +26,7 @@ use self::{
     plan::{Candidate, Cost},
     results::{LevelOf, PointResult, Results, SeedResult},
     settings::{Common, Settings},
-    speed::Speed,
+    speed::{Effort, Speed},
 };
 use crate::{
     flags::TradeoffArgs,
@@ -62,12 +63,13 @@ pub(super) fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     if !report_only && settings.common.env.starts_with("procgen:") {
         procgen_sys::Engine::install(&mut console::line)?;
     }
+    let effort = Effort::of(args.flags.smoke);
     let started = Instant::now();
     if settings.frames_open {
-        shorten(&mut settings)?;
+        shorten(&mut settings, effort)?;
     }
     let mut session = Session::open_queue(&name, &args.flags, &settings.common, 0, report_only)?;
-    let speeds = speeds(&mut session, &settings, report_only)?;
+    let speeds = speeds(&mut session, &settings, effort, report_only)?;
     let left = settings.budget_seconds - started.elapsed().as_secs_f64();
     let planned = planned(
         &session,
@@ -104,7 +106,7 @@ fn folder_name(args: &TradeoffArgs) -> anyhow::Result<String> {
 }
 
 /// Makes the runs shorter if not even the first level fits into the budget.
-fn shorten(settings: &mut Settings) -> anyhow::Result<()> {
+fn shorten(settings: &mut Settings, effort: Effort) -> anyhow::Result<()> {
     let Some(dial) = settings.dials.first() else {
         return Ok(());
     };
@@ -113,7 +115,7 @@ fn shorten(settings: &mut Settings) -> anyhow::Result<()> {
     let base_config = settings.common.config(&base)?;
     for point in [&base, &level] {
         let config = settings.common.config(point)?;
-        let speed = speed::measure(&base_config, &config)?;
+        let speed = speed::measure(&base_config, &config, effort)?;
         seconds += f64::from(settings.seeds) * estimate(&config, &speed);
     }
     settings.common.frames = plan::frames(settings.common.frames, seconds, settings.budget_seconds);
@@ -131,6 +133,7 @@ fn estimate(config: &driml_settings::config::RunConfig, speed: &Speed) -> f64 {
 fn speeds(
     session: &mut Session,
     settings: &Settings,
+    effort: Effort,
     report_only: bool,
 ) -> anyhow::Result<BTreeMap<String, Speed>> {
     let mut speeds = BTreeMap::new();
@@ -151,7 +154,7 @@ fn speeds(
             let config = settings.common.config(&point)?;
             session.work().1.again(units);
             let speed = session.piece(&key, units, |progress| {
-                let speed = speed::measure(&base_config, &config)?;
+                let speed = speed::measure(&base_config, &config, effort)?;
                 progress.advance(units)?;
                 Ok(speed)
             })?;
@@ -343,9 +346,25 @@ fn made(
             results.random = play("random", "", Who::Random)?;
         }
         let (point, _) = &points[at];
+        // One run is enough: seeds differ in what they learned, not in how exactly it is computed.
+        let exactness = match results.points.contains_key(&point.key) {
+            true => None,
+            false => {
+                let config = results.settings.common.config(point)?;
+                session.work().1.again(units);
+                let key = format!("exactness-{}", point.key);
+                let made = session.piece_of(&of, &key, units, |progress| {
+                    let made = exactness::measure(&config, &ran.folder)?;
+                    progress.advance(units)?;
+                    Ok(made)
+                })?;
+                Some(made)
+            }
+        };
         let entry = results.points.entry(point.key.clone());
         let entry = entry.or_insert_with(|| PointResult {
             speed: speeds.get(&point.key).cloned(),
+            exactness,
             seeds: Vec::new(),
         });
         entry.seeds.push(SeedResult { seed, ran, greedy });

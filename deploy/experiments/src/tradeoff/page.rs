@@ -19,6 +19,17 @@ pub(super) const SPEEDS: [&str; 6] = [
     "weights_bytes",
     "frame_bytes",
 ];
+/// The errors against float64, as the data has them.
+pub(super) const ERRORS: [&str; 8] = [
+    "loss_error",
+    "gradient_error",
+    "gradient_angle",
+    "q_rms_error",
+    "q_max_error",
+    "same_action_learner",
+    "same_action_actor",
+    "actor_q_rms_error",
+];
 /// The dial that turns DIM on.
 const DIM: &str = "DIM";
 
@@ -35,6 +46,24 @@ pub(super) fn speed_cells(point: &PointResult) -> [String; 6] {
         speed.weights_bytes.to_string(),
         speed.frame_bytes.to_string(),
     ]
+}
+
+/// The cells of [`ERRORS`].
+pub(super) fn error_cells(point: &PointResult) -> [String; 8] {
+    let Some(it) = &point.exactness else {
+        return [const { String::new() }; 8];
+    };
+    [
+        it.loss,
+        it.gradient,
+        it.angle,
+        it.q_rms,
+        it.q_max,
+        it.same_learner,
+        it.same_actor,
+        it.actor_q_rms,
+    ]
+    .map(|number| format!("{number:.3e}"))
 }
 
 /// The page of what was run.
@@ -63,6 +92,7 @@ pub(super) fn page(results: &Results) -> anyhow::Result<Page> {
         )
         .set("gains", gains(results))
         .set("rest", rest(results))
+        .set("errors", errors(results))
         .set(
             "dim",
             if equal.is_empty() {
@@ -263,6 +293,37 @@ fn rest(results: &Results) -> Table {
         "training return",
         "weights behind [updates]",
         "[s]",
+    ];
+    table(&header, by_level(results, cells, |_, point| cells(point)))
+}
+
+fn errors(results: &Results) -> Table {
+    let cells = |point: &PointResult| {
+        let of = point.exactness.as_ref();
+        let share = |share: f64| format!("{:.1}%", 100.0 * share);
+        vec![
+            cell(of, |it| format!("{:.1e}", it.loss)),
+            cell(of, |it| format!("{:.1e}", it.gradient)),
+            cell(of, |it| format!("{:.1e}", it.angle)),
+            cell(of, |it| format!("{:.1e}", it.q_rms)),
+            cell(of, |it| format!("{:.1e}", it.q_max)),
+            cell(of, |it| share(it.same_learner)),
+            cell(of, |it| format!("{:.1e}", it.actor_q_rms)),
+            cell(of, |it| share(it.same_actor)),
+        ]
+    };
+    let header = [
+        "dial",
+        "level",
+        "agent",
+        "loss",
+        "gradient",
+        "1 - cosine",
+        "Q, learner (rms)",
+        "(largest)",
+        "same action, learner",
+        "Q, actor (rms)",
+        "same action, actor",
     ];
     table(&header, by_level(results, cells, |_, point| cells(point)))
 }

@@ -65,6 +65,7 @@ fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
         .map(String::from)
         .to_vec();
     header.extend(page::SPEEDS.map(String::from));
+    header.extend(page::ERRORS.map(String::from));
     for (name, _) in MEASURES {
         header.extend(["", "_low", "_high"].map(|end| format!("{name}{end}")));
         header.extend(
@@ -81,6 +82,7 @@ fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
             point.seeds.len().to_string(),
         ];
         row.extend(page::speed_cells(point));
+        row.extend(page::error_cells(point));
         for (_, measure) in MEASURES {
             for found in [point.mean(measure), results.difference(of, measure)] {
                 let ends = found.and_then(|it| it.ends);

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use super::{
     dials::{Dial, Point},
+    exactness::Exactness,
     settings::Settings,
     speed::Speed,
 };
@@ -31,6 +32,8 @@ impl LevelOf {
 /// What a point gave.
 pub(super) struct PointResult {
     pub(super) speed: Option<Speed>,
+    /// At the weights of its first seed.
+    pub(super) exactness: Option<Exactness>,
     pub(super) seeds: Vec<SeedResult>,
 }
 

@@ -12,10 +12,30 @@ use serde::{Deserialize, Serialize};
 
 use super::held::HeldBatch;
 
-/// Turns of each side.
-const ROUNDS: usize = 7;
-/// How long a turn takes, at least; a turn has one call or more.
-const TURN: Duration = Duration::from_millis(150);
+/// How long is measured.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Effort {
+    /// Turns of each side, an odd number.
+    rounds: usize,
+    /// How long a turn takes, at least; a turn has one call or more.
+    turn: Duration,
+}
+
+impl Effort {
+    /// Some seconds a level; a tenth of one for the smoke length.
+    pub(super) const fn of(smoke: bool) -> Self {
+        match smoke {
+            true => Self {
+                rounds: 1,
+                turn: Duration::from_millis(20),
+            },
+            false => Self {
+                rounds: 9,
+                turn: Duration::from_millis(80),
+            },
+        }
+    }
+}
 
 /// Times of one update and one action, of a level and of its base in turns with it. Medians over the turns.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -67,13 +87,15 @@ impl Side {
     }
 
     /// Seconds of an update, over a turn.
-    fn update(&mut self) -> anyhow::Result<f64> {
-        timed(|| Ok(self.agent.update(&self.held.batch()).map(drop)?))
+    fn update(&mut self, turn: Duration) -> anyhow::Result<f64> {
+        timed(turn, || {
+            Ok(self.agent.update(&self.held.batch()).map(drop)?)
+        })
     }
 
     /// Seconds of an action, over a turn.
-    fn act(&mut self) -> anyhow::Result<f64> {
-        let seconds = timed(|| {
+    fn act(&mut self, turn: Duration) -> anyhow::Result<f64> {
+        let seconds = timed(turn, || {
             Ok(self
                 .policy
                 .greedy_actions(&self.frames, &mut self.actions)?)
@@ -83,10 +105,10 @@ impl Side {
 }
 
 /// Mean seconds of a call, over a turn.
-fn timed(mut work: impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<f64> {
+fn timed(turn: Duration, mut work: impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<f64> {
     let started = Instant::now();
     let mut calls = 0;
-    while calls == 0 || started.elapsed() < TURN {
+    while calls == 0 || started.elapsed() < turn {
         work()?;
         calls += 1;
     }
@@ -97,19 +119,23 @@ fn timed(mut work: impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<f64> {
 ///
 /// # Errors
 /// A world that cannot be had, an update that failed.
-pub(super) fn measure(base: &RunConfig, level: &RunConfig) -> anyhow::Result<Speed> {
+pub(super) fn measure(
+    base: &RunConfig,
+    level: &RunConfig,
+    Effort { rounds, turn }: Effort,
+) -> anyhow::Result<Speed> {
     let (mut from, mut to) = (Side::new(base)?, Side::new(level)?);
     // Buffers are made in the first call.
     for side in [&mut from, &mut to] {
-        side.update()?;
-        side.act()?;
+        side.update(Duration::ZERO)?;
+        side.act(Duration::ZERO)?;
     }
     let [mut updates, mut update_gains, mut acts, mut act_gains] = [const { Vec::new() }; 4];
-    for _ in 0..ROUNDS {
-        let (one, other) = (from.update()?, to.update()?);
+    for _ in 0..rounds {
+        let (one, other) = (from.update(turn)?, to.update(turn)?);
         updates.push(other);
         update_gains.push(one / other);
-        let (one, other) = (from.act()?, to.act()?);
+        let (one, other) = (from.act(turn)?, to.act(turn)?);
         acts.push(other);
         act_gains.push(one / other);
     }
