@@ -2,12 +2,11 @@
 //! weights and rows for which there is no file. Its own tests hold it to the files.
 //! It knows C51 alone and C51 with DIM, takes no step, and is slow: seconds for 64 rows of Procgen.
 
+mod network;
+
 use std::collections::BTreeMap;
 
-use candle_core::{D, DType, Device, Tensor, Var};
-use candle_nn::ops::{log_softmax, softmax};
-use driml_model::{ModelConfig, Parameters};
-
+use self::network::{Levels, Net, support};
 use crate::{
     agent::Agent,
     auxiliary::{Objective, dim::DIM},
@@ -16,6 +15,8 @@ use crate::{
     losses::scores::Scores,
     settings::LearnerSettings,
 };
+use candle_core::{D, DType, Device, Tensor};
+use candle_nn::ops::{log_softmax, softmax};
 
 /// Losses, values and gradients of a batch in float64.
 #[derive(Clone, Debug)]
@@ -49,124 +50,6 @@ pub fn float64(agent: &Agent, batch: &Batch<'_>) -> Result<Float64, UpdateError>
     let online = Net::of(agent.model(), agent.online())?;
     let target = Net::of(agent.model(), agent.target())?;
     Ok(evaluate(settings, &online, &target, batch)?)
-}
-
-/// A network's parameters in float64.
-struct Net<'a> {
-    model: &'a ModelConfig,
-    vars: BTreeMap<String, Var>,
-}
-
-/// f3 [B, L, C] and f4 [B, hidden] of states.
-struct Levels {
-    local: Tensor,
-    global: Tensor,
-}
-
-impl<'a> Net<'a> {
-    fn of(model: &'a ModelConfig, parameters: &Parameters) -> candle_core::Result<Self> {
-        let wide = |(name, var): (&str, &Var)| {
-            let tensor = var.as_detached_tensor().to_device(&Device::Cpu)?;
-            Ok((
-                name.to_owned(),
-                Var::from_tensor(&tensor.to_dtype(DType::F64)?)?,
-            ))
-        };
-        let vars = parameters
-            .iter()
-            .map(wide)
-            .collect::<candle_core::Result<_>>()?;
-        Ok(Self { model, vars })
-    }
-
-    /// `x` W^T + b, or without b where the layer has none.
-    fn linear(&self, name: &str, x: &Tensor) -> candle_core::Result<Tensor> {
-        let weight = self.vars[&format!("{name}.weight")].t()?;
-        let y = x.broadcast_matmul(&weight)?;
-        match self.vars.get(&format!("{name}.bias")) {
-            Some(bias) => y.broadcast_add(bias),
-            None => Ok(y),
-        }
-    }
-
-    fn features(&self, frames: &[u8]) -> candle_core::Result<Levels> {
-        let ModelConfig {
-            height,
-            width,
-            channels,
-            ..
-        } = *self.model;
-        let rows = frames.len() / self.model.frame_len();
-        let frames = Tensor::from_slice(frames, (rows, height, width, channels), &Device::Cpu)?;
-        let frames = frames.to_dtype(DType::F64)?.affine(1.0 / 255.0, 0.0)?;
-        let mut maps = frames.permute((0, 3, 1, 2))?.contiguous()?;
-        for (index, layer) in self.model.conv.iter().enumerate() {
-            let name = format!("torso.conv{}", index + 1);
-            let bias = self.vars[&format!("{name}.bias")].reshape((1, (), 1, 1))?;
-            let weight = self.vars[&format!("{name}.weight")].as_tensor();
-            maps = maps
-                .conv2d(weight, 0, layer.stride, 1, 1)?
-                .broadcast_add(&bias)?
-                .relu()?;
-        }
-        Ok(Levels {
-            global: self.linear("torso.fc", &maps.flatten_from(1)?)?,
-            local: maps.flatten_from(2)?.transpose(1, 2)?.contiguous()?,
-        })
-    }
-
-    /// Logits [B, A, N].
-    fn logits(&self, f4: &Tensor) -> candle_core::Result<Tensor> {
-        let (actions, atoms) = (self.model.num_actions, self.model.atoms);
-        self.linear("head", &f4.relu()?)?
-            .reshape(((), actions, atoms))
-    }
-
-    /// Values [B, A] of `logits` [B, A, N].
-    fn q_values(&self, logits: &Tensor) -> candle_core::Result<Vec<f64>> {
-        let support = support(self.model);
-        let atoms = Tensor::from_slice(&support, (1, 1, support.len()), &Device::Cpu)?;
-        let values = softmax(&logits.detach(), D::Minus1)?.broadcast_mul(&atoms)?;
-        values.sum(D::Minus1)?.flatten_all()?.to_vec1()
-    }
-
-    /// A DIM head: out(relu(hidden(x))) + skip(x).
-    fn head(&self, name: &str, x: &Tensor) -> candle_core::Result<Tensor> {
-        let hidden = self.linear(&format!("{name}.hidden"), x)?.relu()?;
-        self.linear(&format!("{name}.out"), &hidden)? + self.linear(&format!("{name}.skip"), x)?
-    }
-
-    /// A head of (s_t, a_t), on `features` [B, f] or [B, L, f].
-    fn psi(&self, name: &str, features: &Tensor, action: &[u8]) -> candle_core::Result<Tensor> {
-        if !self.vars.contains_key("dim.action.out.weight") {
-            return self.head(name, features);
-        }
-        let actions = self.model.num_actions;
-        let mut one_hot = vec![0f64; action.len() * actions];
-        for (row, &action) in one_hot.chunks_exact_mut(actions).zip(action) {
-            row[usize::from(action)] = 1.0;
-        }
-        let one_hot = Tensor::from_vec(one_hot, (action.len(), actions), &Device::Cpu)?;
-        let embedded = self.head("dim.action", &one_hot)?;
-        let joined = match features.dims3() {
-            Ok((rows, locations, _)) => {
-                let wide = embedded.dim(1)?;
-                embedded
-                    .unsqueeze(1)?
-                    .broadcast_as((rows, locations, wide))?
-                    .contiguous()?
-            }
-            Err(_) => embedded,
-        };
-        self.head(name, &Tensor::cat(&[features, &joined], D::Minus1)?)
-    }
-}
-
-/// The atoms, in units of return.
-fn support(model: &ModelConfig) -> Vec<f64> {
-    let (low, high) = (f64::from(model.v_min), f64::from(model.v_max));
-    let spacing = (high - low) / (model.atoms - 1) as f64;
-    (0..model.atoms).map(|i| low + i as f64 * spacing).collect()
 }
 
 fn evaluate(
