@@ -81,6 +81,33 @@ impl Interval {
         Some(Self { mean, ends })
     }
 
+    /// Of the mean of `to` minus that of `from`, of runs that have nothing in common: Welch's, with his degrees of freedom rounded down.
+    /// No ends where either has a single value.
+    pub(super) fn of_difference(from: &[f64], to: &[f64]) -> Option<Self> {
+        let (from, to) = (
+            Spread::of(from.iter().copied())?,
+            Spread::of(to.iter().copied())?,
+        );
+        let mean = to.mean - from.mean;
+        if from.count < 2 || to.count < 2 {
+            return Some(Self { mean, ends: None });
+        }
+        let square = |it: &Spread| it.sd.powi(2) / it.count as f64;
+        let (a, b) = (square(&from), square(&to));
+        let by = match a + b {
+            0.0 => 0.0,
+            sum => {
+                let each = a * a / (from.count - 1) as f64 + b * b / (to.count - 1) as f64;
+                let freedom = (sum * sum / each) as usize;
+                T.get(freedom.max(1) - 1).unwrap_or(&NORMAL) * sum.sqrt()
+            }
+        };
+        Some(Self {
+            mean,
+            ends: Some((mean - by, mean + by)),
+        })
+    }
+
     /// Whether 0 is outside of it.
     pub(super) fn is_apart_from_zero(&self) -> bool {
         self.ends.is_some_and(|(low, high)| low > 0.0 || high < 0.0)
@@ -168,6 +195,18 @@ mod tests {
         assert_eq!((one.ends, one.is_apart_from_zero()), (None, false));
         assert_eq!(format!("{one} {found:.1}"), "3.00 2.0 [-0.5, 4.5]");
         assert_eq!(Interval::of(&[]), None);
+        // By hand: both of variance 1 and three values, so 4 degrees of freedom, and 2.776 * sqrt(2 / 3) = 2.267.
+        let apart = Interval::of_difference(&[1.0, 2.0, 3.0], &[4.0, 5.0, 6.0]).unwrap();
+        let (low, high) = apart.ends.unwrap();
+        assert!(apart.mean == 3.0 && (low - 0.733).abs() < 1e-3 && (high - 5.267).abs() < 1e-3);
+        assert_eq!(
+            Interval::of_difference(&[1.0], &[4.0, 5.0]).unwrap().ends,
+            None
+        );
+        assert_eq!(
+            Interval::of_difference(&[1.0; 2], &[2.0; 2]).unwrap().ends,
+            Some((1.0, 1.0))
+        );
     }
 
     #[test]

@@ -33,6 +33,7 @@ use crate::{
     queue,
     runs::{FinishedRun, PlannedRun, Runs},
     session::{self, Session},
+    statistics::Spread,
 };
 
 /// Seed of the played episodes: the same for every level.
@@ -113,10 +114,10 @@ fn shorten(settings: &mut Settings, effort: Effort) -> anyhow::Result<()> {
     let (base, level) = (dial.base_point(), dial.point(&dial.levels[0]));
     let mut seconds = 0.0;
     let base_config = settings.common.config(&base)?;
-    for point in [&base, &level] {
+    for (point, is_base) in [(&base, true), (&level, false)] {
         let config = settings.common.config(point)?;
         let speed = speed::measure(&base_config, &config, effort)?;
-        seconds += f64::from(settings.seeds) * estimate(&config, &speed);
+        seconds += f64::from(settings.seeds_of(is_base)) * estimate(&config, &speed);
     }
     settings.common.frames = plan::frames(settings.common.frames, seconds, settings.budget_seconds);
     Ok(())
@@ -180,30 +181,37 @@ fn planned(
     report_only: bool,
 ) -> anyhow::Result<Vec<Planned>> {
     let runs = Runs::open(session.folder())?;
-    let cost = |point: &Point| -> anyhow::Result<Cost> {
-        let plans = (1..=settings.seeds).map(|seed| settings.common.run(point, seed));
-        let (mut unfinished, mut seconds) = (0, Vec::new());
-        for plan in plans {
-            match runs.finished(&plan) {
-                Some(ran) => {
-                    seconds.push(ran.summary.wall_seconds / f64::from(settings.common.jobs))
-                }
-                None => unfinished += 1,
+    // Seconds of this machine for each finished run of a point.
+    let taken = |point: &Point, seeds: u32| {
+        let plans = (1..=seeds).map(|seed| settings.common.run(point, seed));
+        let finished = plans.filter_map(|plan| runs.finished(&plan));
+        let seconds =
+            finished.map(|ran| ran.summary.wall_seconds / f64::from(settings.common.jobs));
+        Spread::of(seconds)
+    };
+    let estimated = |point: &Point| -> anyhow::Result<Option<f64>> {
+        let config = settings.common.config(point)?;
+        Ok(speeds.get(&point.key).map(|speed| estimate(&config, speed)))
+    };
+    let cost = |point: &Point, base: &Point| -> anyhow::Result<Cost> {
+        let seeds = settings.seeds_of(point == base);
+        let own = taken(point, seeds);
+        let unfinished = seeds as usize - own.map_or(0, |it| it.count);
+        let each = match own {
+            Some(own) => own.mean,
+            // What a finished base took corrects what a bench lets expect.
+            None => {
+                let corrected = taken(base, settings.seeds_of(true)).zip(estimated(base)?);
+                let factor = corrected.map_or(1.0, |(taken, estimated)| taken.mean / estimated);
+                estimated(point)?.map_or(f64::INFINITY, |seconds| factor * seconds)
             }
-        }
-        let each = match speeds.get(&point.key) {
-            _ if !seconds.is_empty() => seconds.iter().sum::<f64>() / seconds.len() as f64,
-            Some(speed) => estimate(&settings.common.config(point)?, speed),
-            None => f64::INFINITY,
-        };
-        let seconds = if unfinished == 0 {
-            0.0
-        } else {
-            each * f64::from(unfinished)
         };
         Ok(Cost {
             key: point.key.clone(),
-            seconds,
+            seconds: match unfinished {
+                0 => 0.0,
+                several => each * several as f64,
+            },
         })
     };
     let mut planned = Vec::new();
@@ -211,8 +219,8 @@ fn planned(
         for level in &dial.levels {
             let (base, point) = (dial.base_point(), dial.point(level));
             let candidate = Candidate {
-                base: cost(&base)?,
-                level: cost(&point)?,
+                base: cost(&base, &base)?,
+                level: cost(&point, &base)?,
             };
             planned.push(Planned {
                 of: LevelOf {
@@ -287,22 +295,28 @@ fn made(
     planned: &[Planned],
     speeds: BTreeMap<String, Speed>,
 ) -> anyhow::Result<Results> {
-    let mut points: Vec<(Point, bool)> = Vec::new();
+    // How many seeds of each point are to be there: none of what was not chosen.
+    let mut points: Vec<(Point, u32)> = Vec::new();
     for it in planned {
-        for point in [&it.of.base, &it.of.point] {
+        for (point, is_base) in [(&it.of.base, true), (&it.of.point, false)] {
+            let seeds = if it.chosen {
+                settings.seeds_of(is_base)
+            } else {
+                0
+            };
             match points.iter_mut().find(|(known, _)| known == point) {
-                Some((_, chosen)) => *chosen |= it.chosen,
-                None => points.push((point.clone(), it.chosen)),
+                Some((_, known)) => *known = seeds.max(*known),
+                None => points.push((point.clone(), seeds)),
             }
         }
     }
     let runs = Runs::open(session.folder())?;
     let mut wanted: Vec<(usize, u32, PlannedRun)> = Vec::new();
     // Seed by seed, so that what was stopped has one seed of everything before it has two of anything.
-    for seed in 1..=settings.seeds {
-        for (at, (point, chosen)) in points.iter().enumerate() {
+    for seed in 1..=settings.seeds_of(true) {
+        for (at, (point, seeds)) in points.iter().enumerate() {
             let run = settings.common.run(point, seed);
-            if *chosen || runs.finished(&run).is_some() {
+            if seed <= *seeds || runs.finished(&run).is_some() {
                 wanted.push((at, seed, run));
             }
         }

@@ -150,7 +150,7 @@ fn found(results: &Results, of: &LevelOf) -> String {
     let frames = frames.map(|it| format!("x{it:.2} frames/s"));
     let gains: Vec<String> = speed.into_iter().chain(frames).collect();
     let cost = results.difference(of, Measure::Greedy).map_or_else(
-        || "no seed in common with its base".to_owned(),
+        || "no return".to_owned(),
         |it| format!("return {}{}", signed(&it), verdict(&it)),
     );
     format!(
@@ -351,62 +351,48 @@ struct EqualTime {
     row: Vec<String>,
 }
 
-/// C51 and the agents with DIM at equal frames and at equal wall-clock time: when the first of the two is done.
+/// C51 and the agents with DIM at equal frames and at equal wall-clock time: when runs of the faster of the two are done.
 fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
     let mut all = Vec::new();
     for of in results.levels.iter().filter(|of| of.dial.name == DIM) {
-        let (base, level) = (
-            &results.points[&of.base.key],
-            &results.points[&of.point.key],
-        );
-        let (mut frames, mut time, mut seconds) = (Vec::new(), Vec::new(), Vec::new());
-        let (mut of_base, mut of_level) = (Vec::new(), Vec::new());
-        for level in &level.seeds {
-            let Some(base) = base.seeds.iter().find(|base| base.seed == level.seed) else {
-                continue;
-            };
-            let curves = [base, level].map(|it| -> anyhow::Result<_> {
-                Ok(Run::read(&it.ran.folder)?.values_over_seconds("mean_return")?)
-            });
-            let [base_curve, level_curve] = curves;
-            let (base_curve, level_curve) = (base_curve?, level_curve?);
-            let end = |curve: &[(f64, f64)]| curve.last().copied();
-            let (Some(a), Some(b)) = (end(&base_curve), end(&level_curve)) else {
-                continue;
-            };
-            let until = a.0.min(b.0);
-            let (Some(at_base), Some(at_level)) = (at(&base_curve, until), at(&level_curve, until))
-            else {
-                continue;
-            };
-            frames.push(b.1 - a.1);
-            time.push(at_level - at_base);
-            of_base.push(at_base);
-            of_level.push(at_level);
-            seconds.push(until);
-        }
-        let both = (
-            Interval::of(&frames),
-            Interval::of(&time),
-            Interval::of(&seconds),
-        );
-        let (Some(frames), Some(time), Some(seconds)) = both else {
+        let base = training_curves(&results.points[&of.base.key])?;
+        let level = training_curves(&results.points[&of.point.key])?;
+        let ends = |curves: &[Vec<(f64, f64)>], of: fn(&(f64, f64)) -> f64| -> Vec<f64> {
+            curves
+                .iter()
+                .filter_map(|curve| curve.last().map(of))
+                .collect()
+        };
+        let means = [&base, &level].map(|it| Interval::of(&ends(it, |end| end.0)));
+        let [Some(one), Some(other)] = means else {
+            continue;
+        };
+        let seconds = one.mean.min(other.mean);
+        let then = |curves: &[Vec<(f64, f64)>]| -> Vec<f64> {
+            curves
+                .iter()
+                .filter_map(|curve| at(curve, seconds))
+                .collect()
+        };
+        let (of_base, of_level) = (then(&base), then(&level));
+        let frames = Interval::of_difference(&ends(&base, |end| end.1), &ends(&level, |end| end.1));
+        let time = Interval::of_difference(&of_base, &of_level);
+        let (Some(frames), Some(time)) = (frames, time) else {
             continue;
         };
         let mean = |values: &[f64]| cell(Interval::of(values), |it| it.to_string());
         let agent = of.point.agent.clone();
         all.push(EqualTime {
             in_words: format!(
-                "{agent} minus {}, training return: {} at equal frames, {} at equal wall-clock time ({:.0} s)",
+                "{agent} minus {}, training return: {} at equal frames, {} at equal wall-clock time ({seconds:.0} s)",
                 of.base.agent,
                 signed(&frames),
                 signed(&time),
-                seconds.mean
             ),
             row: vec![
                 agent.clone(),
                 signed(&frames),
-                format!("{:.0}", seconds.mean),
+                format!("{seconds:.0}"),
                 mean(&of_base),
                 mean(&of_level),
                 signed(&time),
@@ -415,6 +401,15 @@ fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
         });
     }
     Ok(all)
+}
+
+/// Training return over seconds, of each run.
+fn training_curves(point: &PointResult) -> anyhow::Result<Vec<Vec<(f64, f64)>>> {
+    let each = point
+        .seeds
+        .iter()
+        .map(|it| Ok(Run::read(&it.ran.folder)?.values_over_seconds("mean_return")?));
+    each.collect()
 }
 
 /// The value at a time: the last one before it.

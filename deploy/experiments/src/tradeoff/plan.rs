@@ -43,7 +43,8 @@ pub(super) fn seconds(candidates: &[Candidate], chosen: &[bool]) -> f64 {
     let chosen = candidates.iter().zip(chosen).filter(|(_, chosen)| **chosen);
     let costs = chosen.flat_map(|(it, _)| [&it.base, &it.level]);
     let new = costs.filter(|cost| paid.insert(cost.key.as_str()));
-    new.map(|cost| cost.seconds).sum()
+    // A sum of nothing is -0.
+    new.map(|cost| cost.seconds).sum::<f64>() + 0.0
 }
 
 /// Frames of a run: `full`, or a half or a quarter of it, so that at least the first level fits into the budget with its base.

@@ -112,27 +112,15 @@ impl PointResult {
 }
 
 impl Results {
-    /// Level minus base over the seeds that both have, with its interval.
+    /// Level minus base, with its interval. Seeds are not paired: through real processes no two runs of a seed are alike.
     pub(super) fn difference(&self, of: &LevelOf, measure: Measure) -> Option<Interval> {
-        Interval::of(
-            &self
-                .pairs(of, measure)
-                .map(|(base, level)| level - base)
-                .collect::<Vec<_>>(),
-        )
+        let [base, level] = [&of.base, &of.point].map(|it| self.points[&it.key].values(measure));
+        Interval::of_difference(&base, &level)
     }
 
-    /// Level over base, mean over the seeds that both have.
+    /// The level's mean over the base's.
     pub(super) fn factor(&self, of: &LevelOf, measure: Measure) -> Option<f64> {
-        let ratios = self.pairs(of, measure).map(|(base, level)| level / base);
-        Spread::of(ratios).map(|it| it.mean)
-    }
-
-    fn pairs(&self, of: &LevelOf, measure: Measure) -> impl Iterator<Item = (f64, f64)> {
-        let (base, level) = (&self.points[&of.base.key], &self.points[&of.point.key]);
-        level.seeds.iter().filter_map(move |level| {
-            let base = base.seeds.iter().find(|base| base.seed == level.seed)?;
-            Some((base.value(measure)?, level.value(measure)?))
-        })
+        let [base, level] = [&of.base, &of.point].map(|it| self.points[&it.key].mean(measure));
+        Some(level?.mean / base?.mean)
     }
 }

@@ -18,6 +18,8 @@ use crate::{flags::TradeoffArgs, runs::PlannedRun};
 
 /// Seeds of each level unless --seeds says.
 const SEEDS: u32 = 3;
+/// Seeds of a base for each of a level's: all levels are compared with it, so that its luck is in all of their differences.
+const BASE_SEEDS: u32 = 2;
 /// Episodes played with each run's weights.
 const EPISODES: u32 = 100;
 const PRESET: &str = "paper";
@@ -94,6 +96,17 @@ pub(super) fn of(args: &TradeoffArgs, found: Option<Common>) -> Result<Settings,
     })
 }
 
+impl Settings {
+    /// Seeds of a point, from 1.
+    pub(super) const fn seeds_of(&self, is_base: bool) -> u32 {
+        if is_base {
+            BASE_SEEDS * self.seeds
+        } else {
+            self.seeds
+        }
+    }
+}
+
 impl Common {
     /// The resolved settings of a run at `point`.
     ///
@@ -149,7 +162,11 @@ mod tests {
     use super::*;
 
     fn common(world: WorldName, smoke: bool) -> Common {
-        let args = TradeoffArgs::of(&world.to_string(), smoke);
+        let mut args = TradeoffArgs::of(&world.to_string(), smoke);
+        // Else the free memory of the moment decides.
+        args.queue
+            .sets
+            .push("replay.capacity_transitions=10000".into());
         of(&args, None).unwrap().common
     }
 

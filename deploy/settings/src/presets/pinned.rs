@@ -85,6 +85,21 @@ const PINNED: &[(&str, &[Pinned])] = &[
         ("learner.update.lambda.4t3", "0.0", "paper"),
         ("learner.update.lambda.4t4", "1.0", "paper"),
     ]),
+    ("variant/exact", &[
+        ("actor.precision", r#""f32""#, "ours"),
+        ("learner.precision", r#""f32""#, "ours"),
+        ("learner.publish_as", r#""f32""#, "ours"),
+    ]),
+    ("variant/balanced", &[
+        ("actor.precision", r#""bf16""#, "prices.toml"),
+        ("learner.precision", r#""f32""#, "ours"),
+        ("learner.publish_as", r#""f16""#, "prices.toml"),
+    ]),
+    ("variant/fast", &[
+        ("actor.precision", r#""bf16""#, "prices.toml"),
+        ("learner.precision", r#""bf16""#, "prices.toml"),
+        ("learner.publish_as", r#""f16""#, "prices.toml"),
+    ]),
     ("world/mspacman", &[
         ("run.frame_stack", "4", "paper"),
         ("input.height", "84", "paper"),

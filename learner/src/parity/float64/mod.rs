@@ -6,6 +6,9 @@ mod network;
 
 use std::collections::BTreeMap;
 
+use candle_core::{D, DType, Device, Tensor};
+use candle_nn::ops::{log_softmax, softmax};
+
 use self::network::{Levels, Net, support};
 use crate::{
     agent::Agent,
@@ -15,8 +18,6 @@ use crate::{
     losses::scores::Scores,
     settings::LearnerSettings,
 };
-use candle_core::{D, DType, Device, Tensor};
-use candle_nn::ops::{log_softmax, softmax};
 
 /// Losses, values and gradients of a batch in float64.
 #[derive(Clone, Debug)]
