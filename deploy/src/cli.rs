@@ -3,7 +3,7 @@
 use clap::{Parser, Subcommand};
 use driml_bench::flags::BenchCommand;
 use driml_experiments::{
-    flags::ExperimentCommand,
+    flags::{ExperimentCommand, TradeoffArgs},
     plot::{self, flags::PlotArgs},
 };
 
@@ -50,6 +50,8 @@ pub(crate) enum Command {
     /// Run one of the paper's experiments: figures, data and a page
     #[command(subcommand)]
     Experiment(ExperimentCommand),
+    /// Measure what each setting that buys speed costs in accuracy: benches, short trainings, a page
+    Tradeoff(TradeoffArgs),
     /// Measure how fast the parts are, alone and beside what others use
     #[command(subcommand)]
     Bench(BenchCommand),
@@ -75,6 +77,7 @@ impl Command {
             Self::Parity(args) => parity::run(&args),
             Self::Plot(args) => plot::run(&args),
             Self::Experiment(command) => driml_experiments::run(&command),
+            Self::Tradeoff(args) => driml_experiments::tradeoff(&args),
             Self::Bench(command) => driml_bench::run(&command),
             Self::Presets(args) => presets::run(&args),
             Self::Doctor(args) => doctor::run(&args),

@@ -131,6 +131,14 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
         _ => e,
     })?;
     config.notes.extend(note);
+    if let Source::Layers(preset, ..) = source
+        && preset.is_priced
+    {
+        let given_up = presets::prices::given_up(&table).into_iter();
+        config
+            .notes
+            .extend(given_up.map(|it| format!("{} gives up {it}", preset.name)));
+    }
     Ok(config)
 }
 

@@ -2,6 +2,8 @@
 //! It has no arithmetic of its own beyond the comparison, and does not print.
 
 mod case;
+pub mod deviation;
+pub mod float64;
 mod tolerance;
 
 use std::{
@@ -106,17 +108,7 @@ pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityRep
 }
 
 fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError> {
-    let sizes = case.model(DimHeads::NONE);
-    let model = case.model(case.settings.dim_heads(sizes.num_actions));
-    let slow = model.without_dim();
-    let device = &compute.device;
-    let parameters = NetworkParameters {
-        online: Parameters::from_tensors(&model, case.parameters("online.", &model), device)?,
-        target: Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?,
-        key: key_parameters(case, &model, compute)?,
-    };
-    let mut agent =
-        Agent::from_parameters(model.clone(), case.settings.clone(), compute, parameters)?;
+    let (mut agent, model) = agent_of(case, compute)?;
 
     let allowed = Tolerances::of(compute.kernels);
     let mut lines = Vec::new();
@@ -238,6 +230,21 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
     lines.extend(worst.lines);
     case.check_all_expectations_used()?;
     Ok(lines)
+}
+
+/// The agent of a case before its update, and its model.
+fn agent_of(case: &Case, compute: &Compute) -> Result<(Agent, ModelConfig), ParityError> {
+    let sizes = case.model(DimHeads::NONE);
+    let model = case.model(case.settings.dim_heads(sizes.num_actions));
+    let slow = model.without_dim();
+    let device = &compute.device;
+    let parameters = NetworkParameters {
+        online: Parameters::from_tensors(&model, case.parameters("online.", &model), device)?,
+        target: Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?,
+        key: key_parameters(case, &model, compute)?,
+    };
+    let agent = Agent::from_parameters(model.clone(), case.settings.clone(), compute, parameters)?;
+    Ok((agent, model))
 }
 
 /// The parameters of the case's key encoder, if its objective has one.

@@ -79,10 +79,27 @@ const PINNED: &[(&str, &[Pinned])] = &[
         ("world.use_backgrounds", "true", "Procgen's default"),
         ("world.center_agent", "true", "Procgen's default"),
         ("world.restrict_themes", "false", "Procgen's default"),
+        ("world.frame_side", "64", "the engine's own"),
+        ("world.grey", "false", "the engine's own"),
         ("learner.update.lambda.3t3", "0.0", "paper"),
         ("learner.update.lambda.3t4", "0.0", "paper"),
         ("learner.update.lambda.4t3", "0.0", "paper"),
         ("learner.update.lambda.4t4", "1.0", "paper"),
+    ]),
+    ("variant/exact", &[
+        ("actor.precision", r#""f32""#, "ours"),
+        ("learner.precision", r#""f32""#, "ours"),
+        ("learner.publish_as", r#""f32""#, "ours"),
+    ]),
+    ("variant/balanced", &[
+        ("actor.precision", r#""bf16""#, "prices.toml"),
+        ("learner.precision", r#""f32""#, "ours"),
+        ("learner.publish_as", r#""f16""#, "prices.toml"),
+    ]),
+    ("variant/fast", &[
+        ("actor.precision", r#""bf16""#, "prices.toml"),
+        ("learner.precision", r#""bf16""#, "prices.toml"),
+        ("learner.publish_as", r#""f16""#, "prices.toml"),
     ]),
     ("world/mspacman", &[
         ("run.frame_stack", "4", "paper"),
