@@ -53,6 +53,7 @@ pub use geometry::{ConvLayer, ConvShape, reach};
 pub use gradients::Backward;
 pub use input::{Enlarge, FrameSize, InputRead, InputSize};
 pub use kernels::conv::{conv_stack, conv2d_relu};
+pub use kernels::exponentials::{exp_below, soft_clip};
 pub use kernels::linear::{linear, linear_relu, relu};
 pub use kernels::precision::{Precision, UnknownPrecision};
 pub use kernels::units::kernels_in_words;

@@ -10,6 +10,7 @@ use rayon::prelude::*;
 use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::Result;
+use crate::kernels::exponentials::exp_below;
 use crate::kernels::linear::floats;
 use crate::parameters::Parameters;
 
@@ -114,11 +115,15 @@ impl CustomOp1 for Expectation {
 pub(crate) fn expected_returns(logits: &[f32], support: &[f32], values: &mut [f32]) {
     let (v_min, spacing) = ends(support);
     let v_max = f64::from(support[support.len() - 1]);
+    let mut weights = vec![0.0; support.len()];
     for (value, logits) in values.iter_mut().zip(logits.chunks_exact(support.len())) {
         let max = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        for (weight, &logit) in weights.iter_mut().zip(logits) {
+            *weight = logit.into();
+        }
+        exp_below(&mut weights, max.into());
         let (mut weighted, mut total) = (0.0, 0.0);
-        for (i, logit) in (0..).zip(logits) {
-            let weight = f64::from((logit - max).exp());
+        for (i, weight) in (0..).zip(&weights) {
             weighted += weight * f64::from(i);
             total += weight;
         }
