@@ -283,6 +283,74 @@ fn pacman() {
     assert!(!config("ghosts-c51-seed1").contains("[world.ising]"));
 }
 
+/// A plan, then one dial, then one more in the same folder: what is finished stays as it is.
+#[test]
+fn tradeoff() {
+    let root = tempfile::tempdir().unwrap();
+    let call = |more: &[&str]| {
+        let args = ["tradeoff", "--env", "chain", "--smoke", "--out", "t"];
+        run(root.path(), &[&args[..], more].concat())
+    };
+    let folder = root.path().join("t");
+    let precision = ["--dials", "learner.precision"];
+    let planned = call(&[&precision[..], &["--plan"]].concat());
+    assert!(
+        planned.contains("level       learner.precision = bf16: about"),
+        "{planned}"
+    );
+    assert!(
+        !folder.join("runs/c51-seed1").exists(),
+        "a plan runs nothing"
+    );
+
+    call(&precision);
+    let summary = |run: &str| fs::read(folder.join("runs").join(run).join("summary.json"));
+    let first = summary("c51-seed1").unwrap();
+    let planned = call(&[
+        "--dials",
+        "learner.precision,DIM",
+        "--plan",
+        "--budget",
+        "0",
+    ]);
+    assert!(
+        planned.contains("learner.precision = bf16: finished\n")
+            && planned.contains("DIM = driml-fix: does not fit"),
+        "{planned}"
+    );
+    call(&["--dials", "DIM"]);
+    assert_eq!(summary("c51-seed1").unwrap(), first, "it was not run again");
+    let files = data(&folder);
+    let names = [
+        "levels.csv",
+        "pareto.png",
+        "pareto.svg",
+        "runs.csv",
+        "wall.png",
+        "wall.svg",
+    ];
+    assert_eq!(files.keys().collect::<Vec<_>>(), names);
+    let rows = |name: &str| String::from_utf8_lossy(&files[name]).lines().count() - 1;
+    // Of the base two seeds, of each level one.
+    assert_eq!((rows("levels.csv"), rows("runs.csv")), (3, 2 + 3));
+    let page = fs::read_to_string(folder.join("README.md")).unwrap();
+    for part in [
+        "smoke length",
+        "| learner.precision | bf16 | c51 |",
+        "| DIM | driml-ada | driml-ada |",
+        "at equal wall-clock time",
+        "against float64",
+    ] {
+        assert!(page.contains(part), "{part}\n{page}");
+    }
+    let again = call(&["--report"]);
+    assert!(
+        again.contains("learner.precision = bf16 (c51): x"),
+        "{again}"
+    );
+    assert_eq!(data(&folder), files);
+}
+
 /// A killed experiment takes its runs with it, and goes on at the next call.
 #[test]
 fn killed_and_resumed() {

@@ -83,6 +83,8 @@ fn chunks(engine: &ProcgenEngine, game: Game, runs_right: bool) -> Vec<Chunk> {
         use_backgrounds: true,
         center_agent: true,
         restrict_themes: false,
+        frame_side: 64,
+        grey: false,
     };
     let mut world = ProcgenWorld::with_engine(engine, &config, COPIES, 1, 0).unwrap();
     let frame_bytes = world.frame_shape().bytes();

@@ -94,6 +94,58 @@ pub struct ProcgenArgs {
     pub(crate) screen: bool,
 }
 
+/// What `driml tradeoff` takes.
+#[derive(Clone, Debug, Args)]
+pub struct TradeoffArgs {
+    /// World, such as mspacman, coinrun or chain
+    #[arg(long, value_name = "WORLD", default_value = "mspacman")]
+    pub(crate) env: String,
+    /// Minutes of this machine for the runs that are not there yet; it decides how many levels fit, each with all its seeds
+    #[arg(long, value_name = "MINUTES", default_value_t = 180, value_parser = clap::value_parser!(u32).range(0..=100_000))]
+    pub(crate) budget: u32,
+    /// Dials, such as learner.precision,DIM [default: all that the world has; a wrong name lists them]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) dials: Vec<String>,
+    /// Measure speeds and print the plan; run nothing
+    #[arg(long)]
+    pub(crate) plan: bool,
+    /// Frames of each run [default: as the world's settings say, fewer where the budget is small]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1_000..=1_000_000_000))]
+    pub(crate) frames: Option<u64>,
+    /// Episodes played with each run's weights [default: 100]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub(crate) episodes: Option<u32>,
+    #[command(flatten)]
+    pub(crate) flags: ExperimentFlags,
+    #[command(flatten)]
+    pub(crate) queue: QueueFlags,
+}
+
+#[cfg(test)]
+impl TradeoffArgs {
+    /// A call that names the world alone.
+    pub(crate) fn of(env: &str, smoke: bool) -> Self {
+        Self {
+            env: env.into(),
+            budget: 180,
+            dials: Vec::new(),
+            plan: false,
+            frames: None,
+            episodes: None,
+            flags: ExperimentFlags {
+                smoke,
+                out: None,
+                seeds: None,
+            },
+            queue: QueueFlags {
+                jobs: None,
+                report: false,
+                sets: Vec::new(),
+            },
+        }
+    }
+}
+
 /// The settings of an experiment, of its full or its smoke length; both are built in.
 pub(crate) fn settings<T: DeserializeOwned>(
     name: &str,

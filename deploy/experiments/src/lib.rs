@@ -43,8 +43,9 @@ mod session;
 mod stability;
 mod statistics;
 mod template;
+mod tradeoff;
 
-use crate::flags::ExperimentCommand;
+use crate::flags::{ExperimentCommand, TradeoffArgs};
 
 /// Runs the experiment that the command names.
 ///
@@ -58,4 +59,12 @@ pub fn run(command: &ExperimentCommand) -> anyhow::Result<()> {
         ExperimentCommand::Procgen(args) => procgen::run(args),
         ExperimentCommand::Stability(flags) => stability::run(flags),
     }
+}
+
+/// Measures what each dial that buys speed costs.
+///
+/// # Errors
+/// As [`run`].
+pub fn tradeoff(args: &TradeoffArgs) -> anyhow::Result<()> {
+    tradeoff::run(args)
 }

@@ -107,6 +107,14 @@ impl Session {
         Self::open(name, flags, settings, units)
     }
 
+    /// Whether the piece of this name was made.
+    pub(super) fn has_piece(&self, key: &str) -> bool {
+        self.folder
+            .join(PIECES)
+            .join(format!("{key}.json"))
+            .is_file()
+    }
+
     /// Where everything goes.
     pub(super) fn folder(&self) -> &Path {
         &self.folder
@@ -219,6 +227,12 @@ impl Session {
             self.folder.join("README.md").display()
         ))
     }
+}
+
+/// The settings that the experiment's pieces were made with; none if there are none yet, or they cannot be read.
+pub(super) fn settings_of<T: DeserializeOwned>(name: &str, flags: &ExperimentFlags) -> Option<T> {
+    let text = fs::read_to_string(folder(name, flags).join(PIECES).join(SETTINGS)).ok()?;
+    serde_json::from_str(&renamed::update_json(&text)).ok()
 }
 
 /// The folder of the experiment `name`, by what the flags say.

@@ -3,6 +3,7 @@
 
 #[cfg(test)]
 mod pinned;
+pub(crate) mod prices;
 
 use driml_envs::WorldName;
 use driml_machine::error::{Usage, nearest, usage};
@@ -38,6 +39,8 @@ pub struct Preset {
     layers: &'static [Layer],
     /// The worlds it is made for; none means all.
     families: &'static [&'static str],
+    /// Whether a run says what it gives up for speed, with its measured price.
+    pub(crate) is_priced: bool,
 }
 
 /// Every preset, the default first.
@@ -47,24 +50,49 @@ pub const PRESETS: &[Preset] = &[
         about: "as the paper's authors ran it, at the world's own frame size (the default)",
         layers: &[],
         families: &[],
+        is_priced: false,
     },
     Preset {
         name: "paper-observation",
         about: "`paper` with Procgen's frame enlarged to the paper's 104 x 80: 2.3 times the arithmetic",
         layers: &[layer!("variant/paper-observation")],
         families: &["procgen"],
+        is_priced: false,
     },
     Preset {
         name: "split",
         about: "`paper` with each of the 500 Procgen levels an episode of its own, and unseen ones to test on",
         layers: &[layer!("variant/split")],
         families: &["procgen"],
+        is_priced: false,
+    },
+    Preset {
+        name: "exact",
+        about: "`paper`, with nothing given up for speed, whatever its own choices become",
+        layers: &[layer!("variant/exact")],
+        families: &[],
+        is_priced: false,
+    },
+    Preset {
+        name: "balanced",
+        about: "`exact` in the learner; actors and broadcasts give up what costs the least, and a run says what",
+        layers: &[layer!("variant/balanced")],
+        families: &[],
+        is_priced: true,
+    },
+    Preset {
+        name: "fast",
+        about: "bf16 in learner and actors, half the bytes of a broadcast; a run says what that costs",
+        layers: &[layer!("variant/fast")],
+        families: &[],
+        is_priced: true,
     },
     Preset {
         name: "smoke",
         about: "a tiny network, batch and replay: shows within a minute that all parts work together",
         layers: &[layer!("variant/smoke")],
         families: &[],
+        is_priced: false,
     },
 ];
 

@@ -84,6 +84,7 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
         Source::Layers(preset, world, agent) => {
             let mut table = presets::layers(preset, *world, presets::agent(agent)?)?;
             derived::name(&mut table, &world.to_string(), agent);
+            derived::cut_frames(&mut table);
             table
         }
         Source::File(name, text) => {
@@ -130,6 +131,14 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
         _ => e,
     })?;
     config.notes.extend(note);
+    if let Source::Layers(preset, ..) = source
+        && preset.is_priced
+    {
+        let given_up = presets::prices::given_up(&table).into_iter();
+        config
+            .notes
+            .extend(given_up.map(|it| format!("{} gives up {it}", preset.name)));
+    }
     Ok(config)
 }
 

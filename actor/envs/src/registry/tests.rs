@@ -148,6 +148,8 @@ fn procgen(start_level: u32, num_levels: u32) -> WorldConfig {
         use_backgrounds: true,
         center_agent: true,
         restrict_themes: false,
+        frame_side: 64,
+        grey: false,
     })
 }
 

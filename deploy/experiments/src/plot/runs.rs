@@ -68,6 +68,23 @@ impl Run {
     /// # Errors
     /// A column that is not there, or holds words.
     pub(crate) fn values(&self, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
+        self.values_over(self.frames, column)
+    }
+
+    /// The values of a column over the seconds of the run; rows without a value are left out.
+    ///
+    /// # Errors
+    /// As for [`Run::values`], and metrics without seconds.
+    pub(crate) fn values_over_seconds(&self, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
+        let path = self.folder.metrics();
+        let seconds = self.columns.place("seconds");
+        let seconds =
+            seconds.ok_or_else(|| usage!("{} has no column \"seconds\"", path.display()))?;
+        self.values_over(seconds, column)
+    }
+
+    /// The values of a column over those in the column at `x`.
+    fn values_over(&self, x: usize, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
         let place = self.columns.place(column);
         let path = self.folder.metrics();
         let place = place.filter(|_| !WORDS.contains(&column)).ok_or_else(|| {
@@ -95,7 +112,7 @@ impl Run {
             };
             // What was not known yet at a time is empty.
             if !row[place].is_empty() {
-                values.push((number(&row[self.frames])?, number(&row[place])?));
+                values.push((number(&row[x])?, number(&row[place])?));
             }
         }
         Ok(values)

@@ -1,5 +1,5 @@
 //! The Procgen world: what the engine's flags mean for episodes and levels.
-//! It does not fetch or load the engine itself (`procgen-sys` does), nor enlarge or stack frames.
+//! It does not fetch or load the engine itself (`procgen-sys` does), nor enlarge or stack frames; it makes them smaller or grey on request.
 //!
 //! # Ends
 //! After a step the engine shows the next episode's first frame at once, so the terminal frame is never seen.
@@ -28,18 +28,18 @@
 //! lies in the set (sets of more than 997 levels, or all levels), the engine's own choice stays.
 
 mod config;
+mod shrink;
 #[cfg(test)]
 mod tests;
 mod visible_actions;
 
-use procgen_sys::{
-    Engine, FRAME_BYTES, FRAME_SIDE, Game, NUM_ACTIONS, ProcgenError, RESET, VecGame,
-};
+use procgen_sys::{Engine, Game, NUM_ACTIONS, ProcgenError, RESET, VecGame};
 
 use crate::copies::check_step;
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
 use crate::settings::{Levels, Variants, WorldSettings};
+use shrink::Shrink;
 
 pub use config::ProcgenConfig;
 pub use visible_actions::visible_actions;
@@ -62,6 +62,10 @@ pub struct ProcgenWorld {
     actions: Vec<i32>,
     /// What keeps sequential levels in their set; `None` where the engine does so itself.
     levels: Option<LevelSet>,
+    /// The shape of a frame as it leaves this world.
+    shape: FrameShape,
+    /// What makes frames smaller or grey; `None` where they leave as the engine drew them.
+    shrink: Option<Shrink>,
 }
 
 /// The set of levels, and the spare copy of the game in which a copy that has left it is reset.
@@ -71,13 +75,6 @@ struct LevelSet {
 }
 
 impl ProcgenWorld {
-    /// The shape of one frame, in every game.
-    pub const FRAME_SHAPE: FrameShape = FrameShape {
-        height: FRAME_SIDE,
-        width: FRAME_SIDE,
-        channels: 3,
-    };
-
     /// What each action presses, by the engine's numbering. Source: `get_combos` in `procgen/env.py`.
     pub const ACTION_NAMES: [&'static str; NUM_ACTIONS] = [
         "left+down",
@@ -151,6 +148,8 @@ impl ProcgenWorld {
             time_limit_steps: config.game.time_limit_steps(config.distribution_mode),
             actions: vec![0; num_envs],
             levels,
+            shape: config.frame_shape(),
+            shrink: config.shrink(),
         })
     }
 
@@ -195,7 +194,7 @@ impl WorldSettings for ProcgenConfig {
     }
 
     fn frame_shape(&self) -> FrameShape {
-        ProcgenWorld::FRAME_SHAPE
+        ProcgenConfig::frame_shape(self)
     }
 
     fn action_names(&self) -> &'static [&'static str] {
@@ -253,7 +252,7 @@ impl WorldSettings for ProcgenConfig {
 
 impl Environment for ProcgenWorld {
     fn frame_shape(&self) -> FrameShape {
-        Self::FRAME_SHAPE
+        self.shape
     }
 
     fn num_actions(&self) -> usize {
@@ -267,10 +266,13 @@ impl Environment for ProcgenWorld {
     fn observe(&mut self, frames: &mut [u8]) {
         assert_eq!(
             frames.len(),
-            self.num_envs() * FRAME_BYTES,
+            self.num_envs() * self.shape.bytes(),
             "the buffer holds one frame for each copy"
         );
-        frames.copy_from_slice(self.game.frames());
+        match &self.shrink {
+            None => frames.copy_from_slice(self.game.frames()),
+            Some(shrink) => shrink.apply(self.game.frames(), frames),
+        }
     }
 
     fn step(

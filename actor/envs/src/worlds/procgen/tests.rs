@@ -4,7 +4,7 @@
 use std::hash::{Hash, Hasher};
 use std::sync::OnceLock;
 
-use procgen_sys::{DistributionMode, Game, Options};
+use procgen_sys::{DistributionMode, FRAME_BYTES, Game, Options};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -31,6 +31,8 @@ fn config(game: Game) -> ProcgenConfig {
         use_backgrounds: true,
         center_agent: true,
         restrict_themes: false,
+        frame_side: 64,
+        grey: false,
     }
 }
 
@@ -64,6 +66,45 @@ fn alone(engine: &Engine, config: &ProcgenConfig, level: i32, last_move: u8) -> 
     game.act(&[i32::from(last_move)]).unwrap();
     game.act(&[RESET]).unwrap();
     game
+}
+
+#[test]
+fn smaller_and_grey_frames_are_the_engines_own_made_so() {
+    let Some(engine) = engine("smaller_and_grey_frames_are_the_engines_own_made_so") else {
+        return;
+    };
+    let world = |frame_side, grey| {
+        let config = ProcgenConfig {
+            frame_side,
+            grey,
+            ..config(Game::Coinrun)
+        };
+        assert_eq!(
+            config.frame_shape().bytes(),
+            (frame_side * frame_side) as usize * if grey { 1 } else { 3 }
+        );
+        ProcgenWorld::with_engine(engine, &config, 3, 7, 0).unwrap()
+    };
+    let mut whole = world(64, false);
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    let mut others = [world(32, false), world(48, true), world(64, true)];
+    for _ in 0..20 {
+        let actions = draw(&mut rng, 3);
+        let (frames, rewards, ends) = step(&mut whole, &actions);
+        for other in &mut others {
+            let (mut own_rewards, mut own_ends) = ([0.0; 3], [StepEnd::Running; 3]);
+            other
+                .step(&actions, &mut own_rewards, &mut own_ends)
+                .unwrap();
+            assert_eq!((&own_rewards[..], &own_ends[..]), (&rewards[..], &ends[..]));
+            let shape = other.frame_shape();
+            let mut seen = vec![0; 3 * shape.bytes()];
+            other.observe(&mut seen);
+            let mut expected = vec![0; seen.len()];
+            Shrink::new(shape.height, shape.channels == 1).apply(&frames, &mut expected);
+            assert_eq!(seen, expected);
+        }
+    }
 }
 
 #[test]
@@ -103,6 +144,13 @@ fn wrong_settings_are_refused_without_an_engine() {
         },
         "no effect",
     );
+    for frame_side in [0, 7, 65] {
+        let config = ProcgenConfig {
+            frame_side,
+            ..maze()
+        };
+        refused(config, &format!("frame_side = {frame_side}"));
+    }
     for (num_envs, threads, text) in [(0, 0, "0 copies"), (1, 1000, "1000 threads")] {
         let error = ProcgenWorld::new(&maze(), num_envs, 1, threads)
             .err()

@@ -235,52 +235,40 @@ pub(super) fn worse(a: f64, b: f64) -> f64 {
     }
 }
 
-/// A batch: logits [B, A, N], actions [B], targets [B, N].
+/// A batch: logits and targets [B, N].
 struct Batch {
-    actions: usize,
+    atoms: usize,
     logits: Vec<f32>,
-    action: Vec<u8>,
     target: Vec<f32>,
 }
 
 fn see_kl(loss_row: &mut Row, slope_row: &mut Row, batch: &Batch) {
-    let rows = batch.action.len();
-    let atoms = batch.target.len() / rows;
+    let (atoms, rows) = (batch.atoms, batch.logits.len() / batch.atoms);
     let mut gradient = vec![f32::NAN; batch.logits.len()];
-    let loss = product_kl(
-        &batch.logits,
-        &batch.action,
-        batch.actions,
-        &batch.target,
-        &mut gradient,
-    );
+    let loss = product_kl(&batch.logits, &batch.target, atoms, &mut gradient);
     let (mut terms, mut scale, mut slope) = (Vec::new(), 0.0, 0.0);
-    for (b, target) in batch.target.chunks_exact(atoms).enumerate() {
-        for action in 0..batch.actions {
-            let at = (b * batch.actions + action) * atoms;
-            let gradient = &gradient[at..at + atoms];
-            if action != usize::from(batch.action[b]) {
-                let none = gradient.iter().all(|g| *g == 0.0);
-                slope = worse(slope, if none { 0.0 } else { f64::MAX });
-                continue;
-            }
-            let x = widened(&batch.logits[at..at + atoms]);
-            let max = x.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-            let log_sum = exact_sum(x.iter().map(|x| (x - max).exp())).ln();
-            let t = widened(target);
-            let mass = exact_sum(t.iter().copied());
-            let there = || x.iter().zip(&t).filter(|(_, t)| **t > 0.0);
-            // t ln t, t (max - x) and t ln sum apart, as their sizes are.
-            terms.extend(there().map(|(_, t)| t * t.ln()));
-            terms.extend(there().map(|(x, t)| t * (max - x)));
-            terms.push(mass * log_sum);
-            scale += 10.0 + exact_sum(there().map(|(x, t)| t * (max - x)));
-            for ((g, p), t) in gradient.iter().zip(shares(&x)).zip(&t) {
-                let expected = (mass * p - t) / rows as f64;
-                let least = f64::from(f32::MIN_POSITIVE);
-                let allowed = ENTRY_ERROR * expected.abs().max(least) + SLOPE_ERROR;
-                slope = worse(slope, (f64::from(*g) - expected).abs() / allowed);
-            }
+    for ((target, logits), gradient) in batch
+        .target
+        .chunks_exact(atoms)
+        .zip(batch.logits.chunks_exact(atoms))
+        .zip(gradient.chunks_exact(atoms))
+    {
+        let x = widened(logits);
+        let max = x.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let log_sum = exact_sum(x.iter().map(|x| (x - max).exp())).ln();
+        let t = widened(target);
+        let mass = exact_sum(t.iter().copied());
+        let there = || x.iter().zip(&t).filter(|(_, t)| **t > 0.0);
+        // t ln t, t (max - x) and t ln sum apart, as their sizes are.
+        terms.extend(there().map(|(_, t)| t * t.ln()));
+        terms.extend(there().map(|(x, t)| t * (max - x)));
+        terms.push(mass * log_sum);
+        scale += 10.0 + exact_sum(there().map(|(x, t)| t * (max - x)));
+        for ((g, p), t) in gradient.iter().zip(shares(&x)).zip(&t) {
+            let expected = (mass * p - t) / rows as f64;
+            let least = f64::from(f32::MIN_POSITIVE);
+            let allowed = ENTRY_ERROR * expected.abs().max(least) + SLOPE_ERROR;
+            slope = worse(slope, (f64::from(*g) - expected).abs() / allowed);
         }
     }
     let input = || format!("{rows} rows, logits {}", shown(&batch.logits));
@@ -300,7 +288,7 @@ pub(super) fn kl(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
             Row::new(
                 KL,
                 extreme,
-                "error of a slope, as a share of 6.1e-8 of it + 1e-15; 0 for actions not taken",
+                "error of a slope, as a share of 6.1e-8 of it + 1e-15",
                 1.0,
             ),
         ]
@@ -314,9 +302,8 @@ pub(super) fn kl(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
         one_hot[atoms / 2] = 1.0;
         for target in [one_hot, law(atoms, &mut context.rng)] {
             let batch = Batch {
-                actions: 1,
+                atoms,
                 logits: logits.clone(),
-                action: vec![0],
                 target,
             };
             see_kl(&mut loss, &mut slope, &batch);
@@ -330,34 +317,21 @@ pub(super) fn kl(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
         0.0,
     );
     context.draw(1.0, |_, rng| {
-        let (rows, actions, atoms) = (
-            rng.random_range(1..4),
-            rng.random_range(1..4),
-            rng.random_range(2..60),
-        );
+        let (rows, atoms) = (rng.random_range(1..4), rng.random_range(2..60));
         let mut batch = Batch {
-            actions,
-            logits: finites(rows * actions * atoms, rng),
-            action: (0..rows)
-                .map(|_| rng.random_range(0..actions as u8))
-                .collect(),
+            atoms,
+            logits: finites(rows * atoms, rng),
             target: (0..rows).flat_map(|_| law(atoms, rng)).collect(),
         };
         see_kl(&mut drawn_loss, &mut drawn_slope, &batch);
-        // The same with a bad logit where the loss looks, under a target that is nowhere 0.
+        // The same with a bad logit, under a target that is nowhere 0.
         let bad = [f32::INFINITY, f32::NEG_INFINITY, f32::NAN];
         let bad = bad.choose(rng).copied().unwrap_or(f32::NAN);
-        let at = usize::from(batch.action[0]) * atoms + rng.random_range(0..atoms);
+        let at = rng.random_range(0..atoms);
         batch.logits[at] = bad;
         batch.target.fill(1.0 / atoms as f32);
         let mut gradient = vec![0.0; batch.logits.len()];
-        let loss = product_kl(
-            &batch.logits,
-            &batch.action,
-            actions,
-            &batch.target,
-            &mut gradient,
-        );
+        let loss = product_kl(&batch.logits, &batch.target, atoms, &mut gradient);
         hidden.must(!loss.is_finite(), || format!("{bad} at {at}"));
         Ok(())
     })?;
