@@ -325,7 +325,7 @@ impl Rule {
     /// Takes the step on one stretch of parameters `p`, gradients `g` and moments `m` and `v`, all of one length; says whether its parameters and second moments are finite after it. (So are then the
     /// first moments, as a mean is no larger than the root of the mean square.)
     ///
-    /// Once in [`FLUSH_PERIOD`] steps, moments below the normal numbers become 0. Those of a gradient that is gone would else stay
+    /// Once in 32 steps, moments below the normal numbers become 0. Those of a gradient that is gone would else stay
     /// there for good, as 0.9 times the smallest numbers rounds back to them, and make each later step several times as slow.
     #[allow(clippy::eq_op, reason = "x - x tells finite numbers from others")]
     pub fn apply(&self, p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32]) -> bool {
