@@ -1,6 +1,7 @@
 //! One actor's work without its network connections: act with the newest weights, give chunk after chunk.
 //! The processes and the lockstep mode run this same code; it neither sends nor waits.
 
+use driml_envs::{CutFrames, FewerActions};
 use driml_protocol::{BufferPool, Chunk, RunSpec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -71,10 +72,18 @@ impl Collector {
                 world: spec.world.clone(),
                 source,
             })?;
+        let no_world = |source| ActError::NoWorld {
+            world: spec.world.clone(),
+            source,
+        };
+        let world =
+            FewerActions::of(world, settings.world.actions(config.actions)).map_err(no_world)?;
         let shape = world.frame_shape();
+        let sent = (spec.frame_height as usize, spec.frame_width as usize);
+        let (whole_height, whole_width) = settings.input.whole_frame(sent);
         let promised = (
-            spec.frame_height,
-            spec.frame_width,
+            whole_height as u32,
+            whole_width as u32,
             spec.frame_channels,
             spec.num_actions,
         );
@@ -92,9 +101,10 @@ impl Collector {
             });
         }
         let rng = ChaCha8Rng::from_seed(life.seed(spec, "exploration"));
+        let world = CutFrames::of(world, sent).map_err(no_world)?;
         let policy = NetworkPolicy::new(
             &settings.model,
-            (shape.height, shape.width),
+            settings.input.enlarge(sent, &settings.model)?,
             safetensors,
             settings.actor.precision,
         )?;
@@ -150,11 +160,11 @@ impl Collector {
 #[cfg(test)]
 mod tests {
     use driml_envs::{CorridorConfig, WorldConfig};
-    use driml_model::{Compute, ConvLayer, DimHeads, ModelConfig, Parameters};
+    use driml_model::{Compute, ConvLayer, DimHeads, InputSize, ModelConfig, Parameters};
     use driml_protocol::{Horizon, TimeoutRule, config::TransportConfig};
 
     use super::*;
-    use crate::config::{Config, EpsilonLadder, InputSize};
+    use crate::config::{Config, EpsilonLadder};
 
     const ENVS: u32 = 32;
     const STEPS: u32 = 32;
@@ -192,6 +202,7 @@ mod tests {
             input: InputSize {
                 height: 12,
                 width: 12,
+                frame: None,
             },
             model: ModelConfig {
                 height: 12,
@@ -212,6 +223,7 @@ mod tests {
                 dim: DimHeads::NONE,
             },
             actor: Config {
+                actions: driml_envs::ActionSet::All,
                 precision: driml_model::Precision::F32,
                 envs: ENVS,
                 steps_per_chunk: STEPS,

@@ -29,6 +29,9 @@ pub struct Config {
     /// In which numbers the network's products are computed. Settings of earlier versions do not have it: f32.
     #[serde(default)]
     pub precision: driml_model::Precision,
+    /// Which of the world's actions are chosen among. Settings of earlier versions do not have it: all.
+    #[serde(default)]
+    pub actions: driml_envs::ActionSet,
     /// Threads that step the copies; 0 steps them in the acting thread.
     pub world_threads: u32,
     /// Probability of a random action at the run's first frame.
@@ -59,16 +62,6 @@ pub struct EpsilonLadder {
     pub actors: u32,
 }
 
-/// The `[input]` table: the size at which the network sees a frame.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct InputSize {
-    /// Rows after enlargement.
-    pub height: u32,
-    /// Columns after enlargement.
-    pub width: u32,
-}
-
 /// Everything an actor needs to know of a run.
 #[derive(Clone, Debug)]
 pub struct ActorSettings {
@@ -77,7 +70,7 @@ pub struct ActorSettings {
     /// The world that its copies are of.
     pub world: driml_envs::WorldConfig,
     /// The size at which the network sees it.
-    pub input: InputSize,
+    pub input: driml_model::InputSize,
     /// The network that chooses actions.
     pub model: driml_model::ModelConfig,
     /// The actor's own.
@@ -290,6 +283,7 @@ mod tests {
     #[test]
     fn chunks_get_shorter_as_actors_get_many() {
         let config = |envs, steps_per_chunk, round_transitions_max| Config {
+            actions: driml_envs::ActionSet::All,
             precision: driml_model::Precision::F32,
             envs,
             steps_per_chunk,

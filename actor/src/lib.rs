@@ -76,7 +76,7 @@ mod weights;
 
 pub use acting::{Acting, Step};
 pub use collect::{Collector, Incarnation};
-pub use config::{ActorSettings, Config, ConfigError, EpsilonLadder, InputSize, SettingsError};
+pub use config::{ActorSettings, Config, ConfigError, EpsilonLadder, SettingsError};
 pub use delivery::{Delivery, DeliveryError, DeliveryLimits};
 pub use error::ActError;
 pub use evaluate::episode_returns;

@@ -85,6 +85,7 @@ mod tests {
     use super::*;
 
     const CONFIG: Config = Config {
+        actions: driml_envs::ActionSet::All,
         precision: driml_model::Precision::F32,
         envs: 1,
         steps_per_chunk: 1,

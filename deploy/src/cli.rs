@@ -11,6 +11,7 @@ use crate::commands::{
     actor::{self, ActorArgs},
     doctor::{self, DoctorArgs},
     evaluate::{self, EvaluateArgs},
+    inspect::{self, InspectArgs},
     learner::{self, LearnerArgs},
     parity::{self, ParityArgs},
     presets::{self, PresetsArgs},
@@ -40,6 +41,8 @@ pub(crate) enum Command {
     Learner(LearnerArgs),
     /// Play whole episodes with a run's newest weights, beside a random policy
     Evaluate(EvaluateArgs),
+    /// What a world and an agent build, compute and send, what it would be if everything were on, and why
+    Inspect(InspectArgs),
     /// Check the learner's arithmetic against updates computed elsewhere in float64
     Parity(ParityArgs),
     /// Draw what runs recorded over their frames: return, losses, k, speed; or their action affinity
@@ -70,6 +73,7 @@ impl Command {
             Self::ReplayServer(args) => replay_server::run(args),
             Self::Learner(args) => learner::run(args),
             Self::Evaluate(args) => evaluate::run(&args),
+            Self::Inspect(args) => inspect::run(&args),
             Self::Parity(args) => parity::run(&args),
             Self::Plot(args) => plot::run(&args),
             Self::Experiment(command) => driml_experiments::run(&command),

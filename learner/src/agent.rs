@@ -1,10 +1,11 @@
 //! One update: C51 plus the auxiliary objective, clipped, through Adam; then the target network's turn.
 //! It does not fetch batches, publish weights or keep checkpoints, and knows no process but its own.
 
-use std::collections::HashMap;
+use std::{borrow::Cow, collections::HashMap};
 
 use candle_core::Tensor;
 use driml_model::{Compute, DimHeads, ModelConfig, Network, Parameters, StoredAs};
+use driml_protocol::NO_ACTION;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
@@ -51,9 +52,9 @@ pub struct Evaluation {
     pub losses: Vec<(&'static str, f32)>,
     /// `c51_kl + sum of weight * loss`.
     pub total: f32,
-    /// Online logits of s_t [B, A, N], without a graph.
-    pub logits_t: Tensor,
-    /// Greedy action in s_{t+n} [B].
+    /// Online logits [B, N] of the actions taken in s_t, without a graph.
+    pub taken_logits: Tensor,
+    /// Greedy action in s_{t+n} [B]; [`NO_ACTION`] where the row does not bootstrap, as nothing is computed of that state.
     pub next_greedy_action: Vec<u8>,
     /// Projected target distributions [B, N].
     pub target_projection: Vec<f32>,
@@ -224,7 +225,8 @@ impl Agent {
     fn update_here(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
         let evaluation = self.evaluate(batch)?;
         let grad_norm = self.apply(&evaluation.gradients)?;
-        let q_sum: f32 = self.taken_values(&evaluation, batch.action)?.iter().sum();
+        let taken = evaluation.taken_logits.unsqueeze(1)?;
+        let q_sum: f32 = flat(&self.online_network.q_values(&taken)?)?.iter().sum();
         Ok(UpdateReport {
             c51_kl: evaluation.c51_kl,
             losses: evaluation.losses,
@@ -257,10 +259,11 @@ impl Agent {
             batch,
             &self.compute.device,
         )?;
-        let logits = self.online_network.logits(&features.now.f4)?;
+        let taken_logits = self
+            .online_network
+            .taken_logits(&features.now.f4, batch.action)?;
         let kl = kl_loss(
-            &logits,
-            batch.action,
+            &taken_logits,
             target_projection.clone(),
             self.compute.kernels,
         )?;
@@ -287,34 +290,21 @@ impl Agent {
             c51_kl,
             losses,
             total: finite("the total loss", &total)?,
-            logits_t: logits.detach(),
+            taken_logits: taken_logits.detach(),
             next_greedy_action,
             target_projection,
             gradients,
         })
     }
 
-    /// Online values of s_t [B, A], of an evaluation by this agent.
+    /// Online values [B, A] of the batch's s_t, by a pass of their own: an update needs those of the actions taken alone.
     ///
     /// # Errors
-    /// A failing allocation.
-    pub fn q_values_t(&self, evaluation: &Evaluation) -> Result<Vec<f32>, UpdateError> {
-        flat(&self.online_network.q_values(&evaluation.logits_t)?)
-    }
-
-    /// Online values [B] of the actions taken in s_t.
-    fn taken_values(
-        &self,
-        evaluation: &Evaluation,
-        action: &[u8],
-    ) -> Result<Vec<f32>, UpdateError> {
-        let (rows, _, atoms) = evaluation.logits_t.dims3()?;
-        let indices: Vec<u32> = action.iter().map(|&action| action.into()).collect();
-        let indices = Tensor::from_vec(indices, (rows, 1, 1), evaluation.logits_t.device())?
-            .broadcast_as((rows, 1, atoms))?
-            .contiguous()?;
-        let taken = evaluation.logits_t.gather(&indices, 1)?;
-        flat(&self.online_network.q_values(&taken)?)
+    /// States that do not fit the network.
+    pub fn q_values_t(&self, batch: &Batch<'_>) -> Result<Vec<f32>, UpdateError> {
+        let states = self.states(batch.states_t)?;
+        let logits = distribution(&self.online_network, &states)?;
+        flat(&self.online_network.q_values(&logits)?)
     }
 
     /// Clips `gradients` and takes one step with them; moves the slow networks whose turn it is.
@@ -344,43 +334,33 @@ impl Agent {
     }
 
     /// Greedy actions in s_{t+n} [B] and their distributions one Bellman step earlier [B, N], without a graph.
+    ///
+    /// Rows without a bootstrap are left out of the pass: whatever s_{t+n} is, all of their mass goes to their return.
     fn make_target(&self, batch: &Batch<'_>) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
         let ModelConfig {
-            num_actions,
             atoms,
             v_min,
             v_max,
             ..
         } = self.model;
-        let states_n = self.states(batch.states_n)?;
-        let target_logits = distribution(&self.target_network, &states_n)?;
-        let next_q_values = if self.settings.double_dqn {
-            self.online_network
-                .q_values(&distribution(&self.online_network, &states_n)?)?
-        } else {
-            self.target_network.q_values(&target_logits)?
-        };
-        let next_q_values = flat(&next_q_values)?;
-        if !next_q_values.iter().all(|q| q.is_finite()) {
-            let network = if self.settings.double_dqn {
-                "online"
-            } else {
-                "target"
-            };
-            return Err(UpdateError::NonFinite {
-                what: format!("the {network} network's value of an s_{{t+n}}"),
-            });
-        }
-        let next_greedy: Vec<u8> = next_q_values
-            .chunks_exact(num_actions)
-            .map(greedy)
-            .collect();
-
-        let logits = flat(&target_logits)?;
+        let mut next_greedy = vec![NO_ACTION; batch.rows];
         let mut probs = vec![0f32; batch.rows * atoms];
-        for (row, (probs, &action)) in probs.chunks_exact_mut(atoms).zip(&next_greedy).enumerate() {
-            let at = (row * num_actions + usize::from(action)) * atoms;
-            softmax(&logits[at..at + atoms], probs);
+        for probs in probs.chunks_exact_mut(atoms) {
+            probs[0] = 1.0;
+        }
+        let bootstraps: Vec<usize> = (0..batch.rows)
+            .filter(|&row| batch.bootstrap_discount[row] != 0.0)
+            .collect();
+        if !bootstraps.is_empty() {
+            let (actions, logits) = self.next_greedy(batch, &bootstraps)?;
+            for ((&row, action), logits) in bootstraps
+                .iter()
+                .zip(actions)
+                .zip(logits.chunks_exact(atoms))
+            {
+                next_greedy[row] = action;
+                softmax(logits, &mut probs[row * atoms..][..atoms]);
+            }
         }
         if !probs.iter().all(|p| p.is_finite()) {
             return Err(UpdateError::NonFinite {
@@ -397,6 +377,47 @@ impl Agent {
             &mut projected,
         );
         Ok((next_greedy, projected))
+    }
+
+    /// Greedy actions in s_{t+n} of these rows [n], and the target network's logits [n, N] of them.
+    fn next_greedy(
+        &self,
+        batch: &Batch<'_>,
+        rows: &[usize],
+    ) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
+        let ModelConfig {
+            num_actions, atoms, ..
+        } = self.model;
+        let states_n = if rows.len() == batch.rows {
+            Cow::Borrowed(batch.states_n)
+        } else {
+            let len = self.model.frame_len();
+            let frames = rows.iter().map(|row| &batch.states_n[row * len..][..len]);
+            Cow::Owned(frames.collect::<Vec<_>>().concat())
+        };
+        let states_n = states(&self.model, states_n, &self.compute.device)?;
+        let target_logits = distribution(&self.target_network, &states_n)?;
+        let (network, values) = if self.settings.double_dqn {
+            let logits = distribution(&self.online_network, &states_n)?;
+            ("online", self.online_network.q_values(&logits)?)
+        } else {
+            ("target", self.target_network.q_values(&target_logits)?)
+        };
+        let values = flat(&values)?;
+        if !values.iter().all(|q| q.is_finite()) {
+            return Err(UpdateError::NonFinite {
+                what: format!("the {network} network's value of an s_{{t+n}}"),
+            });
+        }
+        let actions: Vec<u8> = values.chunks_exact(num_actions).map(greedy).collect();
+        let logits = flat(&target_logits)?;
+        let of_row = logits.chunks_exact(num_actions * atoms);
+        let chosen = of_row.zip(&actions).map(|(logits, &action)| {
+            let at = usize::from(action) * atoms;
+            &logits[at..at + atoms]
+        });
+        let chosen = chosen.collect::<Vec<_>>().concat();
+        Ok((actions, chosen))
     }
 
     fn states(&self, bytes: &[u8]) -> candle_core::Result<Tensor> {

@@ -1,7 +1,7 @@
 //! The learner's settings, and what it takes from the run's other tables.
 //! It fills in no number: presets do, with their sources.
 
-use driml_model::{ModelConfig, Precision, StoredAs};
+use driml_model::{InputSize, ModelConfig, Precision, StoredAs};
 use driml_protocol::{
     RunSpec, RunSpecError,
     config::{Settings, TransportConfig},
@@ -229,14 +229,6 @@ impl Config {
     }
 }
 
-/// The size at which the network sees a frame: the `[input]` table.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct InputSize {
-    height: usize,
-    width: usize,
-}
-
 /// Why a run's settings are none that a learner can work with.
 #[derive(Debug, thiserror::Error)]
 pub enum LearnerConfigError {
@@ -269,6 +261,8 @@ pub struct LearnerConfig {
     pub spec: RunSpec,
     /// The network's sizes: the `[model]` table.
     pub model: ModelConfig,
+    /// The size at which the network sees a frame: the `[input]` table.
+    pub input: InputSize,
     /// The learner's own numbers: the `[learner]` table.
     pub learner: Config,
     /// How messages travel: the `[transport]` table.
@@ -285,18 +279,30 @@ impl LearnerConfig {
         let this = Self {
             spec: settings.table("run")?,
             model: settings.table("model")?,
+            input: settings.table("input")?,
             learner: settings.table("learner")?,
             transport: settings.table("transport")?,
         };
-        let input: InputSize = settings.table("input")?;
         this.spec.validate()?;
         this.model.validate()?;
         this.learner.validate()?;
         this.learner.update.validate()?;
+        let (height, width) = this.input.whole_input();
+        let sent = (
+            this.spec.frame_height as usize,
+            this.spec.frame_width as usize,
+        );
         let states = (this.spec.frame_channels * this.spec.frame_stack) as usize;
-        let sizes = (this.model.height, this.model.width, this.model.channels);
-        let follows = sizes == (input.height, input.width, states)
-            && this.model.num_actions == this.spec.num_actions as usize;
+        let whole = ModelConfig {
+            height,
+            width,
+            ..this.model.clone()
+        };
+        // What is cut of the input is nothing that a layer reads.
+        let follows = this.model.channels == states
+            && this.model.num_actions == this.spec.num_actions as usize
+            && this.model.local_shape() == whole.local_shape()
+            && this.input.enlarge(sent, &this.model).is_ok();
         if !follows {
             return Err(LearnerConfigError::Sizes);
         }

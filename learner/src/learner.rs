@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use driml_model::{Compute, Enlarge};
+use driml_model::{Compute, Enlarge, ModelConfig};
 use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, Weights, WeightsHeader};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -81,13 +81,16 @@ impl Learner {
             .learner
             .affinity
             .estimator(config.model.num_actions, &mut rng)?;
-        let from = (spec.frame_height as usize, spec.frame_width as usize);
-        let to = (config.model.height, config.model.width);
-        let enlarge = (from != to)
-            .then(|| Enlarge::new(from, to, config.model.channels))
-            .transpose()?;
+        let sent = (spec.frame_height as usize, spec.frame_width as usize);
+        let enlarge = config.input.enlarge(sent, &config.model)?;
         let augment = config.learner.augment.map(|settings| {
-            let size = (to.0, to.1, config.model.channels);
+            let ModelConfig {
+                height,
+                width,
+                channels,
+                ..
+            } = config.model;
+            let size = (height, width, channels);
             Augment::new(settings, size, spec.frame_channels as usize)
         });
         Ok(Self {
@@ -142,6 +145,11 @@ impl Learner {
             folder.display()
         );
         Ok(this)
+    }
+
+    /// The networks, and how they learn.
+    pub const fn agent(&self) -> &Agent {
+        &self.agent
     }
 
     /// Hash of the run spec.

@@ -53,6 +53,7 @@ pub mod auxiliary;
 mod batch;
 pub mod checkpoint;
 mod config;
+pub mod cost;
 #[cfg(test)]
 mod edges;
 mod error;

@@ -43,7 +43,9 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::print_stdout))]
 
+mod action_set;
 mod copies;
+mod cut_frames;
 mod environment;
 mod error;
 mod frame_stack;
@@ -51,6 +53,8 @@ mod registry;
 mod settings;
 mod worlds;
 
+pub use action_set::{ActionSet, FewerActions};
+pub use cut_frames::CutFrames;
 pub use environment::{Environment, FrameShape, StepEnd};
 pub use error::EnvError;
 pub use frame_stack::FrameStack;

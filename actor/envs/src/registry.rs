@@ -6,6 +6,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use crate::action_set::ActionSet;
 use crate::environment::{Environment, FrameShape};
 use crate::error::EnvError;
 use crate::settings::{Levels, Variants, WorldSettings};
@@ -92,6 +93,17 @@ impl WorldConfig {
     /// For each action, the one that it amounts to in this world; an action that stands for itself maps to itself.
     pub fn visible_actions(&self) -> Vec<u8> {
         self.settings().1.visible_actions()
+    }
+
+    /// The actions of `set`, in their order: each is a place in [`action_names`](Self::action_names).
+    pub fn actions(&self, set: ActionSet) -> Vec<u8> {
+        let mut actions = match set {
+            ActionSet::All => (0..self.num_actions()).map(|action| action as u8).collect(),
+            ActionSet::Visible => self.visible_actions(),
+        };
+        actions.sort_unstable();
+        actions.dedup();
+        actions
     }
 
     /// Whether a run in this world can be resumed: no episode depends on how many were played before.

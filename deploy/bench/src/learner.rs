@@ -45,7 +45,7 @@ pub(super) fn measure(
     let compute = device.open(precision)?;
     let mut figures = Vec::new();
     for (name, agent, preset, sets) in CASES {
-        let config = settings::of_run(settings::WORLD, agent, preset, sets)?;
+        let config = settings::of_run(settings::WORLD, agent, preset, sets)?.with_whole_frames()?;
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let rows = SyntheticBatch::draw(&config, &mut rng);
         let batch = rows.batch();

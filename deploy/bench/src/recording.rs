@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use driml_envs::StepEnd;
+use driml_envs::{CutFrames, StepEnd};
 use driml_launch::console;
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 use rand::{Rng, SeedableRng};
@@ -34,7 +34,11 @@ impl Recording {
     pub(super) fn play() -> anyhow::Result<Self> {
         procgen_sys::Engine::install(&mut console::line)?;
         let config = settings::of_run(settings::WORLD, "c51", "paper", &[])?;
-        let mut world = config.world.build(STREAMS, 1, 0)?;
+        let sent = (
+            config.run.frame_height as usize,
+            config.run.frame_width as usize,
+        );
+        let mut world = CutFrames::of(config.world.build(STREAMS, 1, 0)?, sent)?;
         let frame_bytes = world.frame_shape().bytes();
         let mut frames = vec![0; STEPS * STREAMS * frame_bytes];
         let mut steps = Vec::with_capacity(STEPS * STREAMS);

@@ -4,7 +4,7 @@
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_actor::{NetworkPolicy, Policy, RandomPolicy, episode_returns};
-use driml_envs::WorldConfig;
+use driml_envs::{CutFrames, FewerActions, WorldConfig};
 use driml_learner::{Compute, checkpoint};
 use driml_machine::error::{Usage, usage};
 use driml_settings::config::RunConfig;
@@ -118,20 +118,22 @@ impl Player {
         seed: u64,
     ) -> anyhow::Result<Vec<f64>> {
         let spec = &self.config.run;
-        let frame = (spec.frame_height as usize, spec.frame_width as usize);
+        let sent = (spec.frame_height as usize, spec.frame_width as usize);
         let mut policy: Box<dyn Policy> = match who {
             Who::Agent => Box::new(NetworkPolicy::new(
                 &self.config.model,
-                frame,
+                self.config.input.enlarge(sent, &self.config.model)?,
                 &self.weights,
                 self.config.actor.precision,
             )?),
             Who::Random => Box::new(RandomPolicy::new(u8::try_from(spec.num_actions)?)),
         };
         let copies = episodes.min(COPIES_MAX);
+        let actions = world.actions(self.config.actor.actions);
+        let fewer = FewerActions::of(world.build(copies, seed, 0)?, actions)?;
         let rounds = episodes.div_ceil(copies) as u64;
         episode_returns(
-            world.build(copies, seed, 0)?,
+            CutFrames::of(fewer, sent)?,
             spec.frame_stack as usize,
             policy.as_mut(),
             EPSILON,

@@ -238,3 +238,88 @@ impl Lockstep {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use driml_machine::resources::Machine;
+    use driml_settings::{
+        presets::preset,
+        resolve::{Flags, Source, resolve},
+    };
+
+    use super::*;
+
+    fn config(world: &str, agent: &'static str, frames: u64, sets: &[&str]) -> RunConfig {
+        let machine = Machine {
+            cores: 2,
+            memory_bytes: 16 << 30,
+        };
+        let source = Source::Layers(preset("smoke").unwrap(), world.parse().unwrap(), agent);
+        let flags = Flags {
+            frames: Some(frames),
+            actors: Some(2),
+            sets: sets.iter().map(|&set| set.into()).collect(),
+            ..Flags::default()
+        };
+        resolve(&source, &flags, &machine).unwrap()
+    }
+
+    fn frame(config: &RunConfig) -> (u32, u32) {
+        (config.run.frame_height, config.run.frame_width)
+    }
+
+    /// The SHA-256 of the weights after a whole run.
+    fn weights(config: &RunConfig) -> String {
+        let mut lockstep = Lockstep::new(config).unwrap();
+        while lockstep.round().unwrap() {}
+        lockstep.end().unwrap();
+        lockstep.status.weights_sha256
+    }
+
+    /// Worlds that are made so large that a convolution leaves a border out: as it is drawn, and enlarged.
+    #[test]
+    fn a_border_that_no_convolution_reads_changes_no_bit() {
+        let chain = [
+            "world.height=15",
+            "world.width=17",
+            "input.height=15",
+            "input.width=17",
+        ];
+        let pacman = ["input.height=88", "input.width=90"];
+        for (world, sets, cut, whole) in [
+            ("chain", &chain[..], (14, 16), (15, 17)),
+            ("mspacman", &pacman, (20, 18), (21, 19)),
+        ] {
+            for precision in ["f32", "bf16"] {
+                let precision = [
+                    format!("learner.precision={precision}"),
+                    format!("actor.precision={precision}"),
+                ];
+                let sets: Vec<&str> = sets
+                    .iter()
+                    .copied()
+                    .chain(precision.iter().map(String::as_str))
+                    .collect();
+                let config = config(world, "driml-ada", 400, &sets);
+                let before = config.with_whole_frames().unwrap();
+                assert_eq!((frame(&config), frame(&before)), (cut, whole));
+                assert_eq!(weights(&config), weights(&before), "{world}, {sets:?}");
+            }
+        }
+    }
+
+    /// A random crop reads what no convolution of the whole frame does.
+    #[test]
+    fn where_states_are_augmented_frames_stay_whole() {
+        let sets = [
+            "world.height=15",
+            "world.width=17",
+            "input.height=15",
+            "input.width=17",
+        ];
+        let config = config("chain", "curl", 400, &sets);
+        assert_eq!(frame(&config), (15, 17));
+        assert_eq!((config.model.height, config.model.width), (15, 17));
+        weights(&config);
+    }
+}

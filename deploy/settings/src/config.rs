@@ -1,11 +1,10 @@
 //! The resolved settings of a run: one TOML with a table for each part, checked as a whole.
 //! It fills in no number: `resolve` does.
 
-use driml_actor::InputSize;
 use driml_envs::WorldConfig;
 use driml_learner::{DeviceName, EstimatorKind};
 use driml_machine::error::{Usage, usage};
-use driml_model::ModelConfig;
+use driml_model::{InputSize, ModelConfig};
 use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -133,6 +132,28 @@ impl RunConfig {
         // As text, a number of 32 bits has the digits that were set; as a value of 64 it would have more.
         let sorted: Table = text.parse().expect("it was just written");
         toml::to_string(&sorted).expect("a table of plain values is TOML")
+    }
+
+    /// The same settings with frames that are recorded and sent whole, as those of earlier versions: what is computed is the same.
+    ///
+    /// # Errors
+    /// None, of settings that were resolved.
+    pub fn with_whole_frames(&self) -> Result<Self, Usage> {
+        let text = self.to_toml();
+        let mut table: Table = text.parse().map_err(|e| usage!("the settings: {e}"))?;
+        derived::keep_whole_frames(&mut table);
+        derived::derive(&mut table)?;
+        Self::from_table(&table)
+    }
+
+    /// The names of the run's actions; an action is a place in this list.
+    pub fn action_names(&self) -> Vec<&'static str> {
+        let actions = self.world.actions(self.actor.actions);
+        let names = self.world.action_names();
+        actions
+            .into_iter()
+            .map(|it| names[usize::from(it)])
+            .collect()
     }
 
     /// Transitions of the whole run.

@@ -1,30 +1,50 @@
 //! The settings that follow from others: filled in, checked when read back, refused when set by hand.
 //! It decides nothing of its own.
 
-use driml_envs::{WorldConfig, WorldName};
+use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::LearnerSettings;
 use driml_machine::error::{Usage, usage};
+use driml_model::{ConvLayer, FrameSize, InputRead, InputSize};
 use toml::{Table, Value};
 
 use crate::overrides::inline;
 
 /// What follows, and from what.
-const FOLLOWS: [(&str, &str); 14] = [
+const FOLLOWS: [(&str, &str); 15] = [
     ("run.world", "is chosen by --env"),
     ("run.agent", "is chosen by --agent"),
-    ("run.frame_height", "follows from the world"),
-    ("run.frame_width", "follows from the world"),
+    (
+        "run.frame_height",
+        "follows from the world and what model.conv reads",
+    ),
+    (
+        "run.frame_width",
+        "follows from the world and what model.conv reads",
+    ),
     ("run.frame_channels", "follows from the world"),
-    ("run.num_actions", "follows from the world"),
+    (
+        "run.num_actions",
+        "follows from the world and actor.actions",
+    ),
     ("world.kind", "is chosen by --env"),
     ("world.game", "is chosen by --env"),
-    ("model.height", "follows from input.height"),
-    ("model.width", "follows from input.width"),
+    ("input.frame", "follows from the world"),
+    (
+        "model.height",
+        "follows from input.height and what model.conv reads",
+    ),
+    (
+        "model.width",
+        "follows from input.width and what model.conv reads",
+    ),
     (
         "model.channels",
         "follows from the world and run.frame_stack",
     ),
-    ("model.num_actions", "follows from the world"),
+    (
+        "model.num_actions",
+        "follows from the world and actor.actions",
+    ),
     ("model.dim", "follows from learner.update"),
     (
         "replay.reproduced_bug",
@@ -32,10 +52,25 @@ const FOLLOWS: [(&str, &str); 14] = [
     ),
 ];
 
+/// Where a whole frame's size is, if frames are cut.
+const FRAME: &str = "input.frame";
+
 /// Writes the names that everything else follows from.
 pub(crate) fn name(table: &mut Table, world: &str, agent: &str) {
     put(table, "run.world", Value::String(world.into()));
     put(table, "run.agent", Value::String(agent.into()));
+}
+
+/// Lets frames be cut to what the network reads. Settings of earlier versions do not: what they say of a run stays true of it.
+pub(crate) fn cut_frames(table: &mut Table) {
+    put(table, FRAME, Value::Table(Table::new()));
+}
+
+/// Lets frames be recorded and sent whole.
+pub(crate) fn keep_whole_frames(table: &mut Table) {
+    if let Some(input) = table.get_mut("input").and_then(Value::as_table_mut) {
+        input.remove("frame");
+    }
 }
 
 /// Refuses a `--set` of something that follows from something else.
@@ -82,21 +117,44 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     let config: WorldConfig = table_at(table, "world")?;
     let update: LearnerSettings = table_at(table, "learner.update")?;
     let shape = config.frame_shape();
-    let num_actions = config.num_actions();
+    let frame = (shape.height, shape.width);
+    let mut read = InputRead {
+        input: (
+            whole_size(table, "input.height")?,
+            whole_size(table, "input.width")?,
+        ),
+        frame,
+    };
+    if find(table, FRAME).is_some() {
+        let size = FrameSize {
+            height: shape.height as u32,
+            width: shape.width as u32,
+        };
+        let size = Value::try_from(size).map_err(|e| usage!("a frame's size as TOML: {e}"))?;
+        put(table, FRAME, size);
+        // A crop reads the borders too.
+        if find(table, "learner.augment").is_none() {
+            let input: InputSize = table_at(table, "input")?;
+            let conv: Vec<ConvLayer> = table_at(table, "model.conv")?;
+            read = input.read(&conv, frame);
+        }
+    }
+    let set: ActionSet = match find(table, "actor.actions") {
+        Some(_) => table_at(table, "actor.actions")?,
+        None => ActionSet::All,
+    };
+    let num_actions = config.actions(set).len();
     let stack = whole(table, "run.frame_stack")?;
     let dim = update.dim_heads(num_actions);
     let size = |value: usize| Value::Integer(value as i64);
     let dim = Value::try_from(dim).map_err(|e| usage!("the DIM heads as TOML: {e}"))?;
     for (path, value) in [
-        ("run.frame_height", size(shape.height)),
-        ("run.frame_width", size(shape.width)),
+        ("run.frame_height", size(read.frame.0)),
+        ("run.frame_width", size(read.frame.1)),
         ("run.frame_channels", size(shape.channels)),
         ("run.num_actions", size(num_actions)),
-        (
-            "model.height",
-            Value::Integer(whole(table, "input.height")?),
-        ),
-        ("model.width", Value::Integer(whole(table, "input.width")?)),
+        ("model.height", size(read.input.0)),
+        ("model.width", size(read.input.1)),
         (
             "model.channels",
             Value::Integer(stack.saturating_mul(shape.channels as i64)),
@@ -106,7 +164,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     ] {
         put(table, path, value);
     }
-    visible_actions(table, &config);
+    visible_actions(table, &config, set);
     ladder(table);
     Ok(())
 }
@@ -123,10 +181,15 @@ fn ladder(table: &mut Table) {
 }
 
 /// Fills in what each action amounts to in the world, where that is asked for and not given.
-fn visible_actions(table: &mut Table, world: &WorldConfig) {
+fn visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
     let asked = find(table, "learner.affinity.alphabet").and_then(Value::as_str) == Some("visible");
     if asked && find(table, "learner.affinity.visible").is_none() {
-        let map = world.visible_actions().into_iter();
+        let map = match set {
+            ActionSet::All => world.visible_actions(),
+            // They are told apart already.
+            ActionSet::Visible => (0..world.actions(set).len()).map(|it| it as u8).collect(),
+        };
+        let map = map.into_iter();
         let map = map.map(|action| Value::Integer(action.into())).collect();
         put(table, "learner.affinity.visible", Value::Array(map));
     }
@@ -223,6 +286,12 @@ fn whole(table: &Table, path: &str) -> Result<i64, Usage> {
     value.ok_or_else(|| {
         usage!("the settings lack {path}, a whole number: use a config.toml that driml wrote")
     })
+}
+
+/// A whole number that is a size; one that cannot be is left to the model's check.
+fn whole_size(table: &Table, path: &str) -> Result<usize, Usage> {
+    let size = whole(table, path)?;
+    usize::try_from(size).map_err(|_| usage!("{path} = {size}: a size is not below 0"))
 }
 
 fn table_at<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {

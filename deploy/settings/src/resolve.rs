@@ -84,6 +84,7 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
         Source::Layers(preset, world, agent) => {
             let mut table = presets::layers(preset, *world, presets::agent(agent)?)?;
             derived::name(&mut table, &world.to_string(), agent);
+            derived::cut_frames(&mut table);
             table
         }
         Source::File(name, text) => {

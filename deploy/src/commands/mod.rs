@@ -3,6 +3,7 @@
 pub(crate) mod actor;
 pub(crate) mod doctor;
 pub(crate) mod evaluate;
+pub(crate) mod inspect;
 pub(crate) mod learner;
 pub(crate) mod parity;
 pub(crate) mod presets;

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::kernels::{
     candle::{self, ConvLayerTensors},
-    conv, dots, linear,
+    conv, dots, grouped, linear,
     precision::Precision,
 };
 
@@ -49,6 +49,34 @@ impl Kernels {
         match self {
             Self::Fused(precision) => linear::linear(x, w, b, precision),
             Self::Candle => candle::linear(x, w, b),
+        }
+    }
+
+    /// The layer on maps [B, h, w, c], flattened as PyTorch's weights expect: channel, row, column.
+    pub(crate) fn linear_of_maps(
+        self,
+        maps: &Tensor,
+        w: &Tensor,
+        b: &Tensor,
+    ) -> candle_core::Result<Tensor> {
+        match self {
+            Self::Fused(precision) => linear::linear_of_maps(maps, w, b, precision),
+            Self::Candle => candle::linear(&maps.permute((0, 3, 1, 2))?.flatten_from(1)?, w, b),
+        }
+    }
+
+    /// Of the layer on `x` [B, in] the outputs [B, out] of one group a row, of `w` [groups * out, in].
+    pub(crate) fn grouped_linear(
+        self,
+        x: &Tensor,
+        w: &Tensor,
+        b: &Tensor,
+        groups: &[u8],
+        out: usize,
+    ) -> candle_core::Result<Tensor> {
+        match self {
+            Self::Fused(precision) => grouped::grouped_linear(x, w, b, groups, out, precision),
+            Self::Candle => candle::grouped_linear(x, w, b, groups, out),
         }
     }
 

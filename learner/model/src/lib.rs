@@ -29,6 +29,7 @@
 
 mod compute;
 mod config;
+mod cost;
 mod encoder;
 mod error;
 mod geometry;
@@ -45,12 +46,14 @@ mod torso;
 
 pub use compute::{Compute, DeviceError, DeviceName, Kernels};
 pub use config::{DimHeads, ModelConfig};
+pub use cost::LayerCost;
 pub use encoder::Encoder;
 pub use error::{ModelError, Result};
-pub use geometry::{ConvLayer, ConvShape};
+pub use geometry::{ConvLayer, ConvShape, reach};
 pub use gradients::Backward;
-pub use input::Enlarge;
+pub use input::{Enlarge, FrameSize, InputRead, InputSize};
 pub use kernels::conv::{conv_stack, conv2d_relu};
+pub use kernels::exponentials::{exp_below, soft_clip};
 pub use kernels::linear::{linear, linear_relu, relu};
 pub use kernels::precision::{Precision, UnknownPrecision};
 pub use kernels::units::kernels_in_words;

@@ -114,6 +114,15 @@ impl Network {
         self.head.logits(f4)
     }
 
+    /// Of [`Network::logits`] those [B, atoms] of the actions [B] that were taken, each below the number of actions; the others
+    /// are not computed.
+    ///
+    /// # Errors
+    /// Another shape, or an action out of range.
+    pub fn taken_logits(&self, f4: &Tensor, actions: &[u8]) -> Result<Tensor> {
+        self.head.taken_logits(f4, actions)
+    }
+
     /// Expected returns [B, A] of `logits` [B, A, atoms]. No gradient flows through them.
     ///
     /// # Errors

@@ -212,11 +212,7 @@ impl<U: Unit> UnitWeights<U> {
                 values: &maps,
                 scale,
             };
-            forward(unit, layer, images, count, |first, row| {
-                for (value, &map) in output[first..].iter_mut().zip(row) {
-                    *value = U::Element::of(map);
-                }
-            });
+            forward(unit, layer, images, &mut output[..len]);
             (maps, scale) = (output, 1.0);
         }
         let hidden = self.fc.forward(unit, &maps, count);

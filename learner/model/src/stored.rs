@@ -28,6 +28,14 @@ impl StoredAs {
         }
     }
 
+    /// Bytes of one scalar.
+    pub const fn bytes(self) -> usize {
+        match self {
+            Self::F32 => 4,
+            Self::F16 | Self::Bf16 => 2,
+        }
+    }
+
     /// Little-endian bytes of `values`; the index of the first that is too large for the type, which would be infinite.
     pub(crate) fn encode(self, values: &[f32]) -> Result<Vec<u8>, usize> {
         let largest = match self {

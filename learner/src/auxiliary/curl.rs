@@ -89,10 +89,11 @@ impl AuxiliaryLoss for Curl {
     /// The query forward and backward, the key forward.
     fn passes(&self, _positives: usize, _augmented: bool) -> Passes {
         Passes {
-            torso: 4.0,
-            heads: 4.0,
-            scores: 1.0,
-            local: false,
+            states: 1,
+            keys: 1,
+            psi: 1,
+            global_scores: 1,
+            ..Passes::default()
         }
     }
 

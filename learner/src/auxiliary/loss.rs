@@ -37,7 +37,7 @@ pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
         None
     }
 
-    /// What an update costs beyond C51's, where a row has `positives` later states; for an estimate of a run's time.
+    /// What an update costs beyond C51's, where a row has `positives` later states; as `cost` counts it.
     fn passes(&self, positives: usize, augmented: bool) -> Passes;
 
     /// The later states [.., H, W, C] that the loss needs the online network's features of, if any. They pass through it together
@@ -51,30 +51,35 @@ pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError>;
 }
 
-/// Passes through parts of the network beyond C51's, a row; one with its backward pass counts three times.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// What passes through parts of the networks beyond what C51 needs, for each row of a batch.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Passes {
-    /// Passes through the torso, f4 included.
-    pub torso: f64,
-    /// Passes through all heads that the loss needs.
-    pub heads: f64,
-    /// Matrices of scores [B, B], a location.
-    pub scores: f64,
-    /// Whether there are scores at every location of f3, not of the global features alone.
-    pub local: bool,
+    /// States beyond s_t through the torso, forward and backward.
+    pub states: u64,
+    /// States through the key encoder, torso and Psi_4, forward alone.
+    pub keys: u64,
+    /// Vectors of every Psi that there is, forward and backward.
+    pub psi: u64,
+    /// Vectors of every Phi that there is, forward and backward.
+    pub phi: u64,
+    /// Matrices of dot products [B, B] at each location of f3.
+    pub local_scores: u64,
+    /// Matrices of dot products [B, B] of global features alone.
+    pub global_scores: u64,
 }
 
 impl Passes {
     /// Those of InfoNCE between levels of (s_t, a_t) and of each of `positives` later states: each state forward and backward.
     pub fn of_pairs(lambda: Lambda, positives: usize, augmented: bool) -> Self {
-        let [pairs @ .., _] = lambda.wanted();
-        let positives = positives as f64;
+        let [local @ .., global] = lambda.wanted();
+        let positives = positives as u64;
         Self {
-            torso: 3.0 * (positives + f64::from(u8::from(augmented))),
-            // Half of the heads are for s_t.
-            heads: 3.0 * (1.0 + positives) / 2.0,
-            scores: positives,
-            local: pairs.contains(&true),
+            states: positives + u64::from(augmented),
+            keys: 0,
+            psi: 1,
+            phi: positives,
+            local_scores: positives * local.into_iter().map(u64::from).sum::<u64>(),
+            global_scores: positives * u64::from(global),
         }
     }
 }

@@ -2,7 +2,7 @@
 //! It does not compute the scores, and does not know which features they compare.
 
 use candle_core::{Result, Tensor, bail};
-use driml_model::Kernels;
+use driml_model::{Kernels, exp_below, soft_clip};
 use rayon::prelude::*;
 
 use super::{candle, scalar_op::scalar_op, scores::Scores};
@@ -42,7 +42,7 @@ pub fn info_nce(dots: &[f32], valid: &[u8], scores: Scores, gradient: &mut [f32]
         .zip(gradient.par_chunks_exact_mut(rows))
         .enumerate()
         .map_init(
-            || vec![(0f64, 0f64); candidates.len()],
+            || Scratch::new(candidates.len()),
             |scratch, (at, (dots, gradient))| {
                 gradient.fill(0.0);
                 let anchor = at % rows;
@@ -57,6 +57,24 @@ pub fn info_nce(dots: &[f32], valid: &[u8], scores: Scores, gradient: &mut [f32]
     losses.iter().sum::<f64>() * weight
 }
 
+/// Room for one anchor's numbers, one a candidate.
+struct Scratch {
+    dots: Vec<f32>,
+    /// First the scores, then their exponentials.
+    scores: Vec<f64>,
+    slopes: Vec<f64>,
+}
+
+impl Scratch {
+    fn new(candidates: usize) -> Self {
+        Self {
+            dots: vec![0.0; candidates],
+            scores: vec![0.0; candidates],
+            slopes: vec![0.0; candidates],
+        }
+    }
+}
+
 /// One anchor's `ln sum exp(s) - s_positive`; its `gradient` row, times `weight`.
 fn anchor_loss(
     dots: &[f32],
@@ -64,26 +82,25 @@ fn anchor_loss(
     candidates: &[usize],
     scores: Scores,
     weight: f64,
-    scratch: &mut [(f64, f64)],
+    scratch: &mut Scratch,
     gradient: &mut [f32],
 ) -> f64 {
-    let mut max = f64::NEG_INFINITY;
-    let mut positive = 0.0;
-    for (entry, &j) in scratch.iter_mut().zip(candidates) {
-        *entry = scores.clip(dots[j]);
-        max = max.max(entry.0);
-        if j == anchor {
-            positive = entry.0;
-        }
+    for (dot, &j) in scratch.dots.iter_mut().zip(candidates) {
+        *dot = dots[j];
     }
-    let mut sum = 0.0;
-    for (score, _) in scratch.iter_mut() {
-        *score = (*score - max).exp();
-        sum += *score;
-    }
-    for (&(exp, slope), &j) in scratch.iter().zip(candidates) {
+    let Scores { scale, tanh_clip } = scores;
+    let (values, slopes) = (&mut scratch.scores[..], &mut scratch.slopes[..]);
+    soft_clip(&scratch.dots, scale, tanh_clip, values, slopes);
+    let positive = candidates
+        .binary_search(&anchor)
+        .map_or(f64::NAN, |at| values[at]);
+    let max = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    exp_below(values, max);
+    let sum: f64 = values.iter().sum();
+    let share = 1.0 / sum;
+    for ((&exp, &slope), &j) in values.iter().zip(&*slopes).zip(candidates) {
         let target = if j == anchor { 1.0 } else { 0.0 };
-        gradient[j] = ((exp / sum - target) * slope * weight) as f32;
+        gradient[j] = ((exp * share - target) * slope * weight) as f32;
     }
     sum.ln() + max - positive
 }

@@ -69,7 +69,7 @@ proptest! {
         }),
     ) {
         let mut gradient = vec![f32::NAN; logits.len()];
-        let loss = kl(&logits, &[0], 1, &target, &mut gradient);
+        let loss = kl(&logits, &target, logits.len(), &mut gradient);
         let mass: f64 = widened(&target).iter().sum();
         // The sum of terms t ln t - t (x - max) + t ln sum, its parts apart.
         let x = widened(&logits);
@@ -100,7 +100,7 @@ proptest! {
         let atoms = logits.len();
         logits[at.index(atoms)] = bad;
         let mut gradient = vec![0.0; atoms];
-        let loss = kl(&logits, &[0], 1, &vec![1.0 / atoms as f32; atoms], &mut gradient);
+        let loss = kl(&logits, &vec![1.0 / atoms as f32; atoms], atoms, &mut gradient);
         prop_assert!(!loss.is_finite(), "{loss}");
     }
 

@@ -2,6 +2,7 @@
 //! It judges nothing: tolerances are for the cases of the parity check.
 
 use candle_core::DType;
+use driml_protocol::NO_ACTION;
 
 use super::float64::Float64;
 use crate::{agent::Agent, batch::Batch, error::UpdateError};
@@ -21,7 +22,7 @@ pub struct ErrorOfUpdate {
     pub q_max: f64,
     /// Share of rows whose greedy action in s_t is the reference's.
     pub same_action: f64,
-    /// Share of rows whose greedy action in s_{t+n} is the reference's.
+    /// Share of rows whose greedy action in s_{t+n} is the reference's, or is not needed.
     pub same_next_action: f64,
 }
 
@@ -46,14 +47,14 @@ impl ErrorOfUpdate {
             }
         }
         let values = QError::of(
-            &agent.q_values_t(&own)?,
+            &agent.q_values_t(batch)?,
             &reference.q_values_t,
             agent.model().num_actions,
         );
-        let next = own
-            .next_greedy_action
-            .iter()
-            .zip(&reference.next_greedy_action);
+        // Of a row that does not bootstrap no action is chosen.
+        let agree = |(own, reference): (&u8, &u8)| *own == NO_ACTION || own == reference;
+        let next = own.next_greedy_action.iter();
+        let next = next.zip(&reference.next_greedy_action).map(agree);
         Ok(Self {
             loss: (f64::from(own.total) - reference.total).abs() / reference.total.abs(),
             gradient: (apart / square).sqrt(),
@@ -61,7 +62,7 @@ impl ErrorOfUpdate {
             q_rms: values.rms,
             q_max: values.max,
             same_action: values.same_action,
-            same_next_action: next.filter(|(a, b)| a == b).count() as f64 / batch.rows as f64,
+            same_next_action: next.filter(|same| *same).count() as f64 / batch.rows as f64,
         })
     }
 }

@@ -7,7 +7,7 @@ use driml_learner::{
     AffinityConfig, Agent, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner,
     LearnerConfig, LearnerSettings, NetworkParameters, Objective, UpdateError,
 };
-use driml_model::{Compute, DimHeads, ModelConfig, Parameters};
+use driml_model::{Compute, DimHeads, InputSize, ModelConfig, Parameters};
 use driml_protocol::{
     Batch as WireBatch, BatchHeader, Horizon, RunSpec, Tally, TimeoutRule, config::TransportConfig,
 };
@@ -412,6 +412,11 @@ fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConf
             gamma: 0.9,
             horizon,
             timeout: TimeoutRule::Terminal,
+        },
+        input: InputSize {
+            height: model.height as u32,
+            width: model.width as u32,
+            frame: None,
         },
         model,
         learner: Config {

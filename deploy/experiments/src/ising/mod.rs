@@ -41,7 +41,8 @@ fn task(settings: &Settings) -> anyhow::Result<Task> {
         sets: settings.sets.clone(),
         ..Flags::default()
     };
-    let config = resolve(&source, &flags, &Machine::this())?;
+    // The experiment plays in the world itself, whose frames are whole.
+    let config = resolve(&source, &flags, &Machine::this())?.with_whole_frames()?;
     let WorldConfig::Ising(world) = config.world else {
         return Err(usage!("the Ising world's settings are those of another world").into());
     };

@@ -27,6 +27,7 @@ const PINNED: &[(&str, &[Pinned])] = &[
         ("actor.steps_per_chunk", "16", "ours"),
         ("actor.round_transitions_max", "1024", "ours"),
         ("actor.chunks_in_flight_max", "4", "ours"),
+        ("actor.actions", r#""all""#, "paper"),
         ("actor.precision", r#""f32""#, "ours"),
         ("actor.epsilon_start", "0.1", "paper"),
         ("actor.epsilon_end", "0.01", "paper"),

@@ -73,6 +73,7 @@ fn the_default_run_is_the_papers() {
     expect![[r#"
         [actor]
         ack_timeout_ms = 10000
+        actions = "all"
         chunks_in_flight_max = 4
         envs = 16
         epsilon_decay_frames = 100000
@@ -99,6 +100,85 @@ fn the_default_run_is_the_papers() {
     assert_eq!(config.updates(), 6_218);
 }
 
+/// Frames are recorded and sent as far as the network reads them; settings of earlier versions have them whole, and stay as they are.
+#[test]
+fn frames_are_cut_where_nothing_reads_them() {
+    let sizes = |config: &RunConfig| {
+        let (run, model) = (&config.run, &config.model);
+        let frame = (run.frame_height, run.frame_width);
+        (frame, (model.height, model.width))
+    };
+    let cut = with("procgen:bigfish", "driml-ada", &[]).unwrap();
+    assert_eq!(sizes(&cut), ((60, 60), (60, 60)));
+    let large = source("paper-observation", "procgen:bigfish", "driml-ada");
+    let large = resolve(&large, &sets(&[]), &MACHINE).unwrap();
+    assert_eq!(sizes(&large), ((62, 61), (100, 76)));
+    let pacman = with("mspacman", "driml-ada", &[]).unwrap();
+    assert_eq!(sizes(&pacman), ((21, 19), (84, 84)));
+    // A random crop reads all of a state.
+    let augmented = with("procgen:bigfish", "curl", &[]).unwrap();
+    assert_eq!(sizes(&augmented), ((64, 64), (64, 64)));
+
+    let old = cut.with_whole_frames().unwrap();
+    assert_eq!(sizes(&old), ((64, 64), (64, 64)));
+    assert_eq!(old.run.seed, cut.run.seed);
+    let text = old.to_toml();
+    assert!(!text.contains("[input.frame]"), "{text}");
+    assert_eq!(RunConfig::parse("old.toml", &text).unwrap(), old);
+    let file = Source::File("old.toml".into(), text);
+    let again = resolve(&file, &sets(&["run.seed=7"]), &MACHINE).unwrap();
+    assert_eq!((sizes(&again), again.run.seed), (sizes(&old), 7));
+    let file = Source::File("new.toml".into(), cut.to_toml());
+    let again = resolve(
+        &file,
+        &sets(&["input.height=104", "input.width=80"]),
+        &MACHINE,
+    )
+    .unwrap();
+    assert_eq!(sizes(&again), sizes(&large));
+    let wrong = cut
+        .to_toml()
+        .replace("frame_height = 60", "frame_height = 64");
+    expect!["wrong.toml: run.frame_height = 64, but it follows from the world and what model.conv reads and is 60; correct the one or the other"]
+        .assert_eq(&RunConfig::parse("wrong.toml", &wrong).unwrap_err().to_string());
+    expect!["input.frame cannot be set by hand: it follows from the world"]
+        .assert_eq(&with("chain", "c51", &["input.frame.height=3"]).unwrap_err());
+}
+
+/// Everything that has an entry for each action follows from which actions there are.
+#[test]
+fn an_agent_may_choose_among_the_actions_that_differ_alone() {
+    let visible = "actor.actions=visible";
+    for (world, count) in [
+        ("procgen:plunder", 4),
+        ("procgen:maze", 5),
+        ("procgen:coinrun", 9),
+        ("procgen:starpilot", 15),
+        ("mspacman", 5),
+        ("chain", 3),
+    ] {
+        let config = with(world, "driml-ada", &[visible]).unwrap();
+        assert_eq!(config.run.num_actions, count, "{world}");
+        assert_eq!(config.model.num_actions, count as usize);
+        assert_eq!(config.action_names().len(), count as usize);
+        let read = RunConfig::parse("config.toml", &config.to_toml()).unwrap();
+        assert_eq!(read, config);
+        let both = [visible, "learner.affinity.alphabet=visible"];
+        let merged = with(world, "driml-ada", &both).unwrap();
+        assert_eq!(
+            merged.learner.affinity.visible.unwrap().len(),
+            count as usize
+        );
+        let all = with(world, "driml-ada", &[]).unwrap();
+        assert_eq!(all.run.num_actions as usize, all.world.num_actions());
+        // Settings of earlier versions say nothing of it.
+        let old = all.to_toml().replace("actions = \"all\"\n", "");
+        assert_eq!(RunConfig::parse("old.toml", &old).unwrap(), all);
+    }
+    let names = with("procgen:plunder", "c51", &[visible]).unwrap();
+    assert_eq!(names.action_names(), ["left", "no-op", "right", "d"]);
+}
+
 #[test]
 fn what_nobody_uses_is_not_there() {
     let config = with("mspacman", "c51", &[]).unwrap();
@@ -123,8 +203,10 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
     expect![[r#"there is no setting "learner.update.adam.learning_rate"; [learner.update.adam] has beta1, beta2, eps, lr"#]].assert_eq(&said("driml-ada", "learner.update.adam.learning_rate=1"));
     expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, precision, publish_as, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
     expect![[r#"there is no setting "world.num_level" (did you mean "world.num_levels"?); [world] has center_agent, distribution_mode, frame_side, grey, num_levels, paint_vel_info, restrict_themes, start_level, use_backgrounds, use_sequential_levels"#]].assert_eq(&said("driml-ada", "world.num_level=5"));
-    expect!["model.height cannot be set by hand: it follows from input.height"]
-        .assert_eq(&said("driml-ada", "model.height=84"));
+    expect![
+        "model.height cannot be set by hand: it follows from input.height and what model.conv reads"
+    ]
+    .assert_eq(&said("driml-ada", "model.height=84"));
     expect!["model.dim cannot be set by hand: it follows from learner.update"]
         .assert_eq(&said("driml-ada", "model.dim.psi3=true"));
     expect!["run.gamma = 1.5 cannot work: a discount lies between 0 and 1"]
@@ -150,7 +232,7 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
         r#"cuda:0 computes in f32 alone: set learner.precision = "f32", or compute bf16 on the CPU"#
     ]]
     .assert_eq(&with("procgen:bigfish", "driml-ada", &gpu).unwrap_err());
-    expect!["replay.capacity_transitions = 100000000000 needs 1147389.4 GiB, and 16.0 GiB are free: --set replay.capacity_transitions=697234"].assert_eq(&said(
+    expect!["replay.capacity_transitions = 100000000000 needs 1008808.6 GiB, and 16.0 GiB are free: --set replay.capacity_transitions=793014"].assert_eq(&said(
         "driml-ada",
         "replay.capacity_transitions=100000000000",
     ));
@@ -212,7 +294,7 @@ fn a_ladder_of_epsilons_is_for_the_actors_of_the_run() {
         .assert_eq(&of(&["actor.epsilon_ladder={base=4.0,alpha=7.0}", "local.actors=2"]).unwrap_err());
     expect!["in the settings' [actor] table: missing field `alpha`"]
         .assert_eq(&of(&["actor.epsilon_ladder={base=0.4}", "local.actors=2"]).unwrap_err());
-    expect![[r#"there is no setting "actor.epsilon_ladder.rungs"; [actor] has ack_timeout_ms, chunks_in_flight_max, envs, epsilon_decay_frames, epsilon_end, epsilon_start, precision, round_transitions_max, steps_per_chunk, unreachable_max_ms, world_threads"#]]
+    expect![[r#"there is no setting "actor.epsilon_ladder.rungs"; [actor] has ack_timeout_ms, actions, chunks_in_flight_max, envs, epsilon_decay_frames, epsilon_end, epsilon_start, precision, round_transitions_max, steps_per_chunk, unreachable_max_ms, world_threads"#]]
         .assert_eq(&of(&["actor.epsilon_ladder.rungs=3"]).unwrap_err());
 }
 
@@ -228,7 +310,7 @@ fn a_file_at_odds_with_itself_is_refused() {
         .unwrap_err()
         .to_string()
     };
-    expect!["x.toml: run.num_actions = 6, but it follows from the world and is 5; correct the one or the other"].assert_eq(&said(text.replace("num_actions = 5", "num_actions = 6")));
+    expect!["x.toml: run.num_actions = 6, but it follows from the world and actor.actions and is 5; correct the one or the other"].assert_eq(&said(text.replace("num_actions = 5", "num_actions = 6")));
     expect![
         "x.toml: the settings lack input.height, a whole number: use a config.toml that driml wrote"
     ]
@@ -242,7 +324,7 @@ fn a_file_at_odds_with_itself_is_refused() {
     .assert_eq(&said("= 3".into()));
     expect!["x.toml: the settings lack run.world, a word: use a config.toml that driml wrote"]
         .assert_eq(&said(String::new()));
-    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
+    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `actions`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
 }
 
 #[test]
@@ -364,7 +446,7 @@ fn a_compressed_replay_is_bounded_in_bytes_instead() {
     let said = |set: &str| with("procgen:bigfish", "c51", &[lz4, two_million, set]).unwrap_err();
     expect!["replay.compressed_bytes_max = 100000000000 is 93.1 GiB, and 16.0 GiB are free: --set replay.compressed_bytes_max=8333934592"].assert_eq(&said("replay.compressed_bytes_max=100000000000"));
     expect!["replay.capacity_transitions = 100000000000 needs 11920.9 GiB beside the frames, and 16.0 GiB are free: --set replay.capacity_transitions=33554432"].assert_eq(&said("replay.capacity_transitions=100000000000"));
-    expect!["replay.compressed_bytes_max = 1000 cannot work: one sample spans 8 transitions, which may not compress; use at least 3244032"].assert_eq(&said("replay.compressed_bytes_max=1000"));
+    expect!["replay.compressed_bytes_max = 1000 cannot work: one sample spans 8 transitions, which may not compress; use at least 3232128"].assert_eq(&said("replay.compressed_bytes_max=1000"));
     expect!["in the settings' [replay] table: unknown variant `zip`, expected `none` or `lz4`"]
         .assert_eq(&said("replay.compression=zip"));
 }

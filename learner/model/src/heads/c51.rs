@@ -10,6 +10,7 @@ use rayon::prelude::*;
 use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::Result;
+use crate::kernels::exponentials::exp_below;
 use crate::kernels::linear::floats;
 use crate::parameters::Parameters;
 
@@ -47,6 +48,15 @@ impl C51Head {
         let active = self.kernels.relu(f4)?;
         let logits = self.kernels.linear(&active, &self.weight, &self.bias)?;
         Ok(logits.reshape(((), self.actions, self.atoms))?)
+    }
+
+    /// Of those logits the ones [B, atoms] of one action a row.
+    pub(crate) fn taken_logits(&self, f4: &Tensor, actions: &[u8]) -> Result<Tensor> {
+        let active = self.kernels.relu(f4)?;
+        let (weight, bias) = (&self.weight, &self.bias);
+        Ok(self
+            .kernels
+            .grouped_linear(&active, weight, bias, actions, self.atoms)?)
     }
 
     /// Expected returns [B, A] of logits [B, A, atoms]; no gradient flows.
@@ -105,11 +115,15 @@ impl CustomOp1 for Expectation {
 pub(crate) fn expected_returns(logits: &[f32], support: &[f32], values: &mut [f32]) {
     let (v_min, spacing) = ends(support);
     let v_max = f64::from(support[support.len() - 1]);
+    let mut weights = vec![0.0; support.len()];
     for (value, logits) in values.iter_mut().zip(logits.chunks_exact(support.len())) {
         let max = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        for (weight, &logit) in weights.iter_mut().zip(logits) {
+            *weight = logit.into();
+        }
+        exp_below(&mut weights, max.into());
         let (mut weighted, mut total) = (0.0, 0.0);
-        for (i, logit) in (0..).zip(logits) {
-            let weight = f64::from((logit - max).exp());
+        for (i, weight) in (0..).zip(&weights) {
             weighted += weight * f64::from(i);
             total += weight;
         }

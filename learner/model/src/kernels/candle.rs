@@ -38,6 +38,23 @@ pub(crate) fn linear(x: &Tensor, w: &Tensor, b: &Tensor) -> Result<Tensor> {
     y.reshape(shape)
 }
 
+/// As `grouped::grouped_linear`: the whole layer, of which a row keeps its group.
+pub(crate) fn grouped_linear(
+    x: &Tensor,
+    w: &Tensor,
+    b: &Tensor,
+    groups: &[u8],
+    out: usize,
+) -> Result<Tensor> {
+    let rows = x.dim(0)?;
+    let groups = groups.iter().map(|&group| u32::from(group)).collect();
+    let groups = Tensor::from_vec(groups, (rows, 1, 1), x.device())?
+        .broadcast_as((rows, 1, out))?
+        .contiguous()?;
+    let all = linear(x, w, b)?.reshape((rows, (), out))?;
+    all.gather(&groups, 1)?.squeeze(1)
+}
+
 /// max(x, 0), whose gradient at exactly 0 is 0, unlike that of candle's `relu`; it keeps NaN.
 pub(crate) fn relu(x: &Tensor) -> Result<Tensor> {
     let above = x.gt(0f32)?.to_dtype(x.dtype())?.detach();

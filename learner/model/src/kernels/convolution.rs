@@ -33,28 +33,27 @@ impl ConvShape {
 
     /// Weight [out, in, k, k] as [k, k, in, out]: the matrix that windows are multiplied by.
     fn pack_weight(&self, weight: &[f32]) -> Vec<f32> {
+        let (taps, inputs) = (self.kernel * self.kernel, self.channels_in);
         let mut packed = vec![0.0; weight.len()];
-        self.for_each_weight(|plain, pack| packed[pack] = weight[plain]);
+        for (row, packed) in packed.chunks_exact_mut(self.channels_out).enumerate() {
+            let at = row % inputs * taps + row / inputs;
+            let outs = weight[at..].iter().step_by(inputs * taps);
+            for (packed, &value) in packed.iter_mut().zip(outs) {
+                *packed = value;
+            }
+        }
         packed
     }
 
-    /// The inverse of `pack_weight`.
-    pub(crate) fn unpack_weight(&self, packed: &[f32]) -> Vec<f32> {
-        let mut weight = vec![0.0; packed.len()];
-        self.for_each_weight(|plain, pack| weight[plain] = packed[pack]);
-        weight
-    }
-
-    /// Calls `visit` with the index in [out, in, k, k] and the index in [k, k, in, out] of every weight.
-    fn for_each_weight(&self, mut visit: impl FnMut(usize, usize)) {
-        let taps = self.kernel * self.kernel;
-        for tap in 0..taps {
-            for channel_in in 0..self.channels_in {
-                for channel_out in 0..self.channels_out {
-                    visit(
-                        (channel_out * self.channels_in + channel_in) * taps + tap,
-                        (tap * self.channels_in + channel_in) * self.channels_out + channel_out,
-                    );
+    /// The inverse of `pack_weight`, into `weight`.
+    pub(crate) fn unpack_weight(&self, packed: &[f32], weight: &mut [f32]) {
+        let (taps, inputs) = (self.kernel * self.kernel, self.channels_in);
+        for (out, weight) in weight.chunks_exact_mut(inputs * taps).enumerate() {
+            for (channel_in, weight) in weight.chunks_exact_mut(taps).enumerate() {
+                let at = channel_in * self.channels_out + out;
+                let values = packed[at..].iter().step_by(inputs * self.channels_out);
+                for (weight, &value) in weight.iter_mut().zip(values) {
+                    *weight = value;
                 }
             }
         }
@@ -103,14 +102,12 @@ impl<E: Element> Convolution<E> {
     }
 }
 
-/// maps = relu(conv(images, weight) + bias), handed to `write` row by row: the index of its first scalar in maps
-/// [count, out_height, out_width, out], and [out_width, out] scalars.
-pub(crate) fn forward<U: Unit>(
+/// maps = relu(conv(images, weight) + bias), as `maps` [n, out_height, out_width, out] stores them.
+pub(crate) fn forward<U: Unit, M: Element>(
     unit: U,
     layer: &Convolution<U::Element>,
     images: Images<'_, U::Element>,
-    count: usize,
-    mut write: impl FnMut(usize, &[f32]),
+    maps: &mut [M],
 ) {
     let shape = &layer.shape;
     let (out_width, out) = (shape.out_width(), shape.channels_out);
@@ -124,7 +121,7 @@ pub(crate) fn forward<U: Unit>(
         run_stride: shape.line(),
         runs: shape.kernel,
     };
-    for index in 0..count * shape.out_height() {
+    for (index, maps) in maps.chunks_exact_mut(out_width * out).enumerate() {
         let (image, y) = (index / shape.out_height(), index % shape.out_height());
         let start = image * shape.image_len() + y * shape.stride * shape.line();
         for (x, windows) in row_tiles::<U>(out_width, layer.forward.vecs()) {
@@ -136,17 +133,23 @@ pub(crate) fn forward<U: Unit>(
                 .forward
                 .multiply(unit, windows, left, Mode::Replace, &mut row[x * out..]);
         }
-        finish_row(unit, &mut row, &layer.bias, images.scale);
-        write(index * out_width * out, &row);
+        finish_row(unit, &row, &layer.bias, images.scale, maps);
     }
 }
 
 vectorized! {
-    /// relu(scale * row + bias) for each location of `row` [locations, out].
-    fn finish_row<U>(unit, row: &'a mut [f32], bias: &'a [f32], scale: f32) {
-        for location in row.chunks_exact_mut(bias.len()) {
-            for (value, bias) in location.iter_mut().zip(bias) {
-                *value = relu_of(*value * scale + bias);
+    /// relu(scale * row + bias) for each location of `row` [locations, out], into `maps`.
+    fn finish_row<U, M>(
+        unit,
+        row: &'a [f32],
+        bias: &'a [f32],
+        scale: f32,
+        maps: &'a mut [M],
+    ) {
+        let locations = row.chunks_exact(bias.len());
+        for (maps, row) in maps.chunks_exact_mut(bias.len()).zip(locations) {
+            for ((map, &value), &bias) in maps.iter_mut().zip(row).zip(bias) {
+                *map = M::of(relu_of(value * scale + bias));
             }
         }
     }

@@ -1,13 +1,16 @@
-//! The fully connected layer as a candle operation with gradients, with optional ReLU, and ReLU by itself.
+//! The fully connected layer as a candle operation with gradients, with optional ReLU or on maps, and ReLU by itself.
 //! It knows no network; it runs on the CPU only.
 //!
 //! candle's own path is a matrix product and a broadcast addition, whose backward pass sums the bias on a single thread,
 //! and its ReLU passes a gradient at exactly 0, which PyTorch's does not.
 
+use std::sync::{Mutex, PoisonError};
+
 use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
 use rayon::prelude::*;
 
 use crate::gradients;
+use crate::kernels::buffer::Buffer;
 use crate::kernels::panels::{Matrix, Threads};
 use crate::kernels::precision::Precision;
 use crate::kernels::product::multiply;
@@ -18,6 +21,9 @@ const TASK_ROWS: usize = 256;
 /// Scalars that one task of an elementwise pass takes.
 const TASK_LEN: usize = 1 << 15;
 
+/// Scalars of a sum of vectors that one task takes.
+const SUM_LEN: usize = 1 << 12;
+
 /// y = x w^T + b, differentiable in all arguments.
 ///
 /// `x` [..., in]; `w` [out, in]; `b` [out], or [groups..., out] where each entry serves an equal share of consecutive
@@ -27,7 +33,25 @@ const TASK_LEN: usize = 1 << 15;
 /// # Errors
 /// Shapes that do not match, or other types.
 pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Result<Tensor> {
-    apply(x, w, b, false, precision)
+    apply(x, w, b, Form::Plain, precision)
+}
+
+/// [`linear`] on maps [B, height, width, channels], flattened in the order of PyTorch's weights: channel, row, column.
+///
+/// # Errors
+/// As [`linear`].
+pub(crate) fn linear_of_maps(
+    maps: &Tensor,
+    w: &Tensor,
+    b: &Tensor,
+    precision: Precision,
+) -> Result<Tensor> {
+    let (_, height, width, channels) = maps.dims4()?;
+    let form = Form::OfMaps {
+        locations: height * width,
+        channels,
+    };
+    apply(maps, w, b, form, precision)
 }
 
 /// relu(x w^T + b): [`linear`] with the ReLU fused. Where the result is 0 the gradient is 0, as in PyTorch.
@@ -35,7 +59,7 @@ pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Resul
 /// # Errors
 /// Shapes that do not match, or other types.
 pub fn linear_relu(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Result<Tensor> {
-    apply(x, w, b, true, precision)
+    apply(x, w, b, Form::WithRelu, precision)
 }
 
 /// max(x, 0), whose gradient at exactly 0 is 0, as in PyTorch.
@@ -46,11 +70,15 @@ pub fn relu(x: &Tensor) -> Result<Tensor> {
     x.contiguous()?.apply_op1(Relu)
 }
 
-fn apply(x: &Tensor, w: &Tensor, b: &Tensor, relu: bool, precision: Precision) -> Result<Tensor> {
-    let (inputs, outputs) = (
-        x.dims().last().copied().unwrap_or(0),
-        w.dims().first().copied().unwrap_or(0),
-    );
+fn apply(x: &Tensor, w: &Tensor, b: &Tensor, form: Form, precision: Precision) -> Result<Tensor> {
+    let inputs = match form {
+        Form::OfMaps {
+            locations,
+            channels,
+        } => locations * channels,
+        Form::Plain | Form::WithRelu => x.dims().last().copied().unwrap_or(0),
+    };
+    let outputs = w.dims().first().copied().unwrap_or(0);
     let fits =
         w.dims() == [outputs, inputs] && b.dims().last() == Some(&outputs) && inputs * outputs > 0;
     let (rows, groups) = (
@@ -70,21 +98,35 @@ fn apply(x: &Tensor, w: &Tensor, b: &Tensor, relu: bool, precision: Precision) -
         inputs,
         outputs,
         groups,
-        relu,
+        form,
         precision,
+        flat: Mutex::new(None),
     };
     x.contiguous()?
         .apply_op3(&w.contiguous()?, &b.contiguous()?, op)
 }
 
-#[derive(Clone, Copy)]
+/// What a layer does beside x w^T + b.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Form {
+    Plain,
+    WithRelu,
+    /// x are maps [.., locations, channels], to be flattened to [.., channels * locations].
+    OfMaps {
+        locations: usize,
+        channels: usize,
+    },
+}
+
 struct Linear {
     rows: usize,
     inputs: usize,
     outputs: usize,
     groups: usize,
-    relu: bool,
+    form: Form,
     precision: Precision,
+    /// The flattened maps: what the forward pass leaves to the backward pass.
+    flat: Mutex<Option<Buffer<f32>>>,
 }
 
 impl CustomOp3 for Linear {
@@ -101,22 +143,32 @@ impl CustomOp3 for Linear {
         b: &CpuStorage,
         b_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let x = Matrix::new(floats(x, x_layout)?, self.rows, self.inputs);
+        let x = floats(x, x_layout)?;
         let w = Matrix::new(floats(w, w_layout)?, self.outputs, self.inputs);
         let b = floats(b, b_layout)?;
         let mut y = rows_of_biases(b, self.outputs, self.rows / self.groups);
-        multiply(
-            self.precision,
-            &mut y,
-            Mode::Add,
-            x,
-            w.transposed(),
-            Threads::Pool,
-        );
-        if self.relu {
-            y.par_chunks_mut(TASK_LEN).for_each(relu_in_place);
-        }
+        let mut multiply = |x: &[f32]| {
+            let (x, w) = (Matrix::new(x, self.rows, self.inputs), w.transposed());
+            multiply(self.precision, &mut y, Mode::Add, x, w, Threads::Pool);
+        };
         let mut dims = x_layout.dims().to_vec();
+        match self.form {
+            Form::Plain => multiply(x),
+            Form::WithRelu => {
+                multiply(x);
+                y.par_chunks_mut(TASK_LEN).for_each(relu_in_place);
+            }
+            Form::OfMaps {
+                locations,
+                channels,
+            } => {
+                let mut flat = Buffer::new(x.len());
+                transpose_each(x, locations, channels, &mut flat);
+                multiply(&flat);
+                *self.flat.lock().unwrap_or_else(PoisonError::into_inner) = Some(flat);
+                dims.truncate(2);
+            }
+        }
         if let Some(last) = dims.last_mut() {
             *last = self.outputs;
         }
@@ -131,7 +183,7 @@ impl CustomOp3 for Linear {
         y: &Tensor,
         grad_y: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let grad_y = if self.relu {
+        let grad_y = if self.form == Form::WithRelu {
             masked(&y.detach(), &grad_y.detach())?
         } else {
             grad_y.detach().contiguous()?
@@ -150,17 +202,28 @@ impl CustomOp3 for Linear {
                 self.inputs,
             );
             let mut grad_x = vec![0.0; self.rows * self.inputs];
-            multiply(
-                self.precision,
-                &mut grad_x,
-                Mode::Replace,
-                grad,
-                w,
-                Threads::Pool,
-            );
+            let multiply = |grad_x: &mut [f32]| {
+                let mode = Mode::Replace;
+                multiply(self.precision, grad_x, mode, grad, w, Threads::Pool);
+            };
+            if let Form::OfMaps {
+                locations,
+                channels,
+            } = self.form
+            {
+                let mut grad_flat = Buffer::new(grad_x.len());
+                multiply(&mut grad_flat);
+                transpose_each(&grad_flat, channels, locations, &mut grad_x);
+            } else {
+                multiply(&mut grad_x);
+            }
             Tensor::from_vec(grad_x, x.shape(), device)
         });
-        let x_values = floats(cpu(&x_storage)?, x_layout)?;
+        let flat = self.flat.lock().unwrap_or_else(PoisonError::into_inner);
+        let x_values = match &*flat {
+            Some(flat) => flat,
+            None => floats(cpu(&x_storage)?, x_layout)?,
+        };
         let add_to_w = |sum: &mut [f32], there: bool| {
             let mode = if there { Mode::Add } else { Mode::Replace };
             let x = Matrix::new(x_values, self.rows, self.inputs);
@@ -200,6 +263,22 @@ impl CustomOp3 for Linear {
         };
         Ok((grad_x.transpose()?, grad_w, grad_b))
     }
+}
+
+/// Transposes every image [rows, cols] of a batch.
+fn transpose_each(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) {
+    let len = rows * cols;
+    result
+        .par_chunks_mut(len)
+        .zip(values.par_chunks(len))
+        .with_min_len(16)
+        .for_each(|(result, values)| {
+            for (col, result) in result.chunks_exact_mut(rows).enumerate() {
+                for (to, &value) in result.iter_mut().zip(values[col..].iter().step_by(cols)) {
+                    *to = value;
+                }
+            }
+        });
 }
 
 /// Sums of each group's rows: `grads` [rows, outputs] to [groups, outputs].
@@ -242,11 +321,16 @@ fn add_rows(sum: &mut [f32], rows: &[f32]) {
 pub(crate) fn add_in_order(parts: Vec<Vec<f32>>, len: usize) -> Vec<f32> {
     let mut parts = parts.into_iter();
     let mut sum = parts.next().unwrap_or_else(|| vec![0.0; len]);
-    for part in parts {
-        for (sum, value) in sum.iter_mut().zip(part) {
-            *sum += value;
-        }
-    }
+    let parts: Vec<_> = parts.collect();
+    sum.par_chunks_mut(SUM_LEN)
+        .enumerate()
+        .for_each(|(index, sum)| {
+            for part in &parts {
+                for (sum, value) in sum.iter_mut().zip(&part[index * SUM_LEN..]) {
+                    *sum += value;
+                }
+            }
+        });
     sum
 }
 

@@ -1,11 +1,11 @@
 //! A stack of convolutions over one task's images, forward and backward, on slices.
-//! It knows neither tensors nor threads; `conv` splits the batch and `im2col` computes each layer.
+//! It knows neither tensors nor threads; `conv` splits the batch and `convolution` computes each layer.
 
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::convolution::{ConvGradients, Convolution, backward, forward};
 use crate::kernels::images::{Images, PADDING, Pixels};
-use crate::kernels::units::{Element, Unit};
+use crate::kernels::units::Unit;
 
 /// The maps of all layers but the last, one layer after the other, each with `PADDING`: what forward leaves to backward.
 pub(crate) type SavedActivations<E> = Buffer<E>;
@@ -36,14 +36,17 @@ pub(crate) fn layers<U: Unit>(
 }
 
 /// Gradients as `stack_backward` sums them, with the weights back as [out, in, k, k].
-pub(crate) fn unpacked(shapes: &[ConvShape], mut sums: &[f32]) -> Vec<f32> {
-    let mut result = Vec::with_capacity(sums.len());
+pub(crate) fn unpacked(shapes: &[ConvShape], sums: &[f32]) -> Vec<f32> {
+    let mut result = vec![0.0; sums.len()];
+    let (mut sums, mut free) = (sums, &mut result[..]);
     for shape in shapes {
-        let (packed, rest) = sums.split_at(shape.weight_len());
-        let (bias, rest) = rest.split_at(shape.channels_out);
-        result.extend(shape.unpack_weight(packed));
-        result.extend_from_slice(bias);
-        sums = rest;
+        let (own, rest) = sums.split_at(shape.parameters_len());
+        let (to, free_rest) = std::mem::take(&mut free).split_at_mut(own.len());
+        let (packed, bias) = own.split_at(shape.weight_len());
+        let (weight, bias_to) = to.split_at_mut(shape.weight_len());
+        shape.unpack_weight(packed, weight);
+        bias_to.copy_from_slice(bias);
+        (sums, free) = (rest, free_rest);
     }
     result
 }
@@ -73,16 +76,10 @@ pub(crate) fn stack_forward<U: Unit>(
         let len = count * layer.shape.map_len();
         let (output, rest) = std::mem::take(&mut free).split_at_mut(len + PADDING);
         output[len..].fill(U::Element::default());
-        forward(unit, layer, input, count, |first, row| {
-            for (value, &map) in output[first..].iter_mut().zip(row) {
-                *value = U::Element::of(map);
-            }
-        });
+        forward(unit, layer, input, &mut output[..len]);
         (input, free) = (Images::of_maps(output), rest);
     }
-    forward(unit, last, input, count, |first, row| {
-        maps[first..first + row.len()].copy_from_slice(row);
-    });
+    forward(unit, last, input, maps);
     saved
 }
 
