@@ -25,13 +25,20 @@ pub struct Incarnation {
 }
 
 impl Incarnation {
-    /// The seed of one of its generators. Lives that differ in `actor`, `after_updates` or `earlier_incarnations` have others.
-    fn seed(&self, spec: &RunSpec, used_for: &str) -> [u8; 32] {
+    /// The seed of one of its generators. Lives that differ in `actor`, `after_updates` or `earlier_incarnations` have others,
+    /// whatever these counts are.
+    pub fn seed(&self, spec: &RunSpec, used_for: &str) -> [u8; 32] {
         let index = u64::from(self.actor) | self.after_updates << u32::BITS;
-        match self.earlier_incarnations {
-            0 => spec.seed_for(used_for, index),
-            lives => spec.seed_for(&format!("{used_for} after {lives} lives"), index),
+        let mut used_for = used_for.to_owned();
+        if self.earlier_incarnations > 0 {
+            used_for += &format!(" after {} lives", self.earlier_incarnations);
         }
+        // What the index has no room for.
+        let beyond = self.after_updates >> u32::BITS;
+        if beyond > 0 {
+            used_for += &format!(" after {beyond} times 2^32 updates");
+        }
+        spec.seed_for(&used_for, index)
     }
 }
 
@@ -281,6 +288,14 @@ mod tests {
             },
             Incarnation {
                 after_updates: 7,
+                ..at(1)
+            },
+            Incarnation {
+                after_updates: (1 << 32) + 7,
+                ..FIRST
+            },
+            Incarnation {
+                after_updates: 1 << 32,
                 ..at(1)
             },
         ];

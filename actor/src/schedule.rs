@@ -31,6 +31,9 @@ pub struct BeyondLadder {
 }
 
 impl Schedule {
+    /// Largest error of an epsilon, a probability, for any counts of frames.
+    pub const ERROR: f64 = 1e-15;
+
     /// The schedule of actor number `actor`.
     ///
     /// # Errors
@@ -46,7 +49,8 @@ impl Schedule {
         }
     }
 
-    /// Epsilon after `frames` frames of the run.
+    /// Epsilon after `frames` frames of the run, right to [`Schedule::ERROR`]; it never leaves the range from start to end, and never
+    /// goes back.
     pub fn epsilon(&self, frames: u64) -> f64 {
         match *self {
             Self::Fixed(epsilon) => epsilon,

@@ -124,6 +124,15 @@ fn ising() {
     );
 }
 
+/// Every routine keeps what it promises here too, in whatever build this is, or the command would have failed.
+#[test]
+fn stability() {
+    check(
+        "stability",
+        &["promises.csv", "refused.csv", "worst.png", "worst.svg"],
+    );
+}
+
 /// The parts of a page, and the files beside it.
 fn check_page(folder: &Path, files: &[&str]) -> String {
     let page = fs::read_to_string(folder.join("README.md")).unwrap();

@@ -77,6 +77,10 @@ pub use config::{Compression, Config, ConfigError, ReproducedBug};
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use rate_limiter::RateLimiter;
 pub use replay::{Replay, Unready};
-pub use sampling::{horizon, packed_batch::PackedBatch};
+pub use sampling::{
+    assemble::{RETURN_ERROR, return_sum_error},
+    horizon,
+    packed_batch::PackedBatch,
+};
 pub use service::{RunArgs, run};
 pub use storage::frame_store::{PackedChunk, Packer};

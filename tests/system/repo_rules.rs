@@ -83,6 +83,8 @@ const ARROWS: &[(&str, &str, &[&str])] = &[
             "driml-protocol",
             "driml-envs",
             "driml-model",
+            "driml-actor",
+            "driml-replay-server",
             "driml-learner",
             "driml-figure",
             "driml-machine",

@@ -6,6 +6,7 @@ use std::{fs, path::Path};
 use anyhow::Context;
 use driml_launch::console::{self, print};
 use driml_learner::{DeviceName, Precision};
+use driml_machine::resources::{self, Machine};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::{flags::BenchFlags, table};
@@ -47,10 +48,9 @@ pub(super) struct MachineNote {
 impl MachineNote {
     /// What this machine is, and how busy it is now.
     pub(super) fn this() -> Self {
-        let cpuinfo = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
         Self {
-            processor: processor(&cpuinfo).unwrap_or("unknown").to_owned(),
-            cores: driml_machine::resources::Machine::this().cores,
+            processor: resources::processor(),
+            cores: Machine::this().cores,
             load: load(&fs::read_to_string("/proc/loadavg").unwrap_or_default()).unwrap_or(0.0),
             gpu: None,
         }
@@ -84,15 +84,6 @@ pub(super) fn named(what: impl Into<String>, precision: Precision) -> String {
 /// The mean over the last minute in the kernel's table.
 fn load(loadavg: &str) -> Option<f64> {
     loadavg.split_whitespace().next()?.parse().ok()
-}
-
-/// The processor's name in the kernel's table.
-fn processor(cpuinfo: &str) -> Option<&str> {
-    let mut lines = cpuinfo.lines();
-    let (_, name) = lines
-        .find(|line| line.starts_with("model name"))?
-        .split_once(':')?;
-    Some(name.trim())
 }
 
 /// A bench's figures as JSON has them.
@@ -174,10 +165,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_machine_is_described() {
-        let cpuinfo = "processor\t: 0\nmodel name\t: AMD EPYC 9999\nflags\t: fpu\n";
-        assert_eq!(processor(cpuinfo), Some("AMD EPYC 9999"));
-        assert_eq!(processor(""), None);
+    fn the_load_is_described() {
         assert_eq!(load("6.60 5.35 4.10 3/200 1234"), Some(6.6));
     }
 

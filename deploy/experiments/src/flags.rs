@@ -17,6 +17,8 @@ pub enum ExperimentCommand {
     Pacman(PacmanArgs),
     /// Table 1: agents on Procgen's games, from a queue of whole runs
     Procgen(ProcgenArgs),
+    /// Every numeric routine at the extremes of its range beside float64: what it promises, and the worst that was found
+    Stability(ExperimentFlags),
 }
 
 /// What every experiment takes.

@@ -40,6 +40,7 @@ mod queue;
 mod random_walk;
 mod runs;
 mod session;
+mod stability;
 mod statistics;
 mod template;
 mod tradeoff;
@@ -49,13 +50,14 @@ use crate::flags::{ExperimentCommand, TradeoffArgs};
 /// Runs the experiment that the command names.
 ///
 /// # Errors
-/// A folder of other settings, a file system that refuses, an interrupt.
+/// A folder of other settings, a file system that refuses, an interrupt; a promise of a routine that is not kept.
 pub fn run(command: &ExperimentCommand) -> anyhow::Result<()> {
     match command {
         ExperimentCommand::RandomWalk(flags) => random_walk::run(flags),
         ExperimentCommand::Ising(flags) => ising::run(flags),
         ExperimentCommand::Pacman(args) => pacman::run(args),
         ExperimentCommand::Procgen(args) => procgen::run(args),
+        ExperimentCommand::Stability(flags) => stability::run(flags),
     }
 }
 

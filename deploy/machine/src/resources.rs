@@ -84,6 +84,21 @@ impl Machine {
     }
 }
 
+/// The processor's name; "unknown" where the kernel does not say it.
+pub fn processor() -> String {
+    let cpuinfo = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    processor_in(&cpuinfo).unwrap_or("unknown").to_owned()
+}
+
+/// The processor's name in the kernel's table.
+fn processor_in(cpuinfo: &str) -> Option<&str> {
+    let mut lines = cpuinfo.lines();
+    let (_, name) = lines
+        .find(|line| line.starts_with("model name"))?
+        .split_once(':')?;
+    Some(name.trim())
+}
+
 /// The kernel's estimate of available memory, or what the control group leaves, if that is less.
 fn free_memory_bytes() -> Option<u64> {
     let system = meminfo_available(&fs::read_to_string("/proc/meminfo").ok()?)?;
@@ -112,6 +127,13 @@ mod tests {
             "MemTotal:       24600000 kB\nMemFree:        1000 kB\nMemAvailable:    2000 kB\n";
         assert_eq!(meminfo_available(text), Some(2000 * 1024));
         assert_eq!(meminfo_available("MemTotal: 1 kB"), None);
+    }
+
+    #[test]
+    fn the_processor_is_named() {
+        let cpuinfo = "processor\t: 0\nmodel name\t: AMD EPYC 9999\nflags\t: fpu\n";
+        assert_eq!(processor_in(cpuinfo), Some("AMD EPYC 9999"));
+        assert_eq!(processor_in(""), None);
     }
 
     #[test]

@@ -5,7 +5,10 @@ use driml_envs::WorldConfig;
 use driml_learner::{DeviceName, EstimatorKind};
 use driml_machine::error::{Usage, usage};
 use driml_model::{InputSize, ModelConfig};
-use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
+use driml_protocol::{
+    Horizon, RunSpec,
+    config::{TransportConfig, in_words},
+};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -62,7 +65,7 @@ pub(crate) fn read<T: DeserializeOwned>(table: &Table, name: &'static str) -> Re
     value
         .clone()
         .try_into()
-        .map_err(|e: toml::de::Error| usage!("in the settings' [{name}] table: {}", e.message()))
+        .map_err(|e: toml::de::Error| usage!("in the settings' [{name}] table: {}", in_words(&e)))
 }
 
 /// Reads every table as its part will.

@@ -5,6 +5,7 @@ use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::LearnerSettings;
 use driml_machine::error::{Usage, usage};
 use driml_model::{ConvLayer, FrameSize, InputRead, InputSize};
+use driml_protocol::config::in_words;
 use toml::{Table, Value};
 
 use crate::overrides::inline;
@@ -301,5 +302,5 @@ fn table_at<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result
     value
         .clone()
         .try_into()
-        .map_err(|e: toml::de::Error| usage!("in the settings' [{path}] table: {}", e.message()))
+        .map_err(|e: toml::de::Error| usage!("in the settings' [{path}] table: {}", in_words(&e)))
 }

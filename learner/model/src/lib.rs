@@ -51,6 +51,7 @@ pub use encoder::Encoder;
 pub use error::{ModelError, Result};
 pub use geometry::{ConvLayer, ConvShape, reach};
 pub use gradients::Backward;
+pub use heads::c51::EXPECTED_RETURN_ERROR;
 pub use input::{Enlarge, FrameSize, InputRead, InputSize};
 pub use kernels::conv::{conv_stack, conv2d_relu};
 pub use kernels::exponentials::{exp_below, soft_clip};

@@ -123,7 +123,8 @@ impl Network {
         self.head.taken_logits(f4, actions)
     }
 
-    /// Expected returns [B, A] of `logits` [B, A, atoms]. No gradient flows through them.
+    /// Expected returns [B, A] of `logits` [B, A, atoms]. No gradient flows through them. On the CPU they are right to
+    /// [`EXPECTED_RETURN_ERROR`](crate::EXPECTED_RETURN_ERROR) of the support's width beside their own last place.
     ///
     /// # Errors
     /// Another shape.

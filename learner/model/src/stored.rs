@@ -19,6 +19,35 @@ pub enum StoredAs {
 }
 
 impl StoredAs {
+    /// Largest error of a stored scalar, as a share of it, or of the least normal number of the type if that is larger.
+    pub const fn error(self) -> f64 {
+        match self {
+            Self::F32 => 0.0,
+            // 2^-11 and 2^-8.
+            Self::F16 => 1.0 / 2048.0,
+            Self::Bf16 => 1.0 / 256.0,
+        }
+    }
+
+    /// The least number that keeps all of its digits. Below it there are steps of a fixed size: twice [`StoredAs::error`] of it.
+    pub const fn least_normal(self) -> f32 {
+        match self {
+            Self::F32 | Self::Bf16 => f32::MIN_POSITIVE,
+            // 2^-14.
+            Self::F16 => 1.0 / 16384.0,
+        }
+    }
+
+    /// The largest number; one that is larger is refused, though it might round to it.
+    pub const fn largest(self) -> f32 {
+        match self {
+            Self::F32 => f32::MAX,
+            Self::F16 => 65_504.0,
+            // 2^128 - 2^120.
+            Self::Bf16 => f32::from_bits(0x7f7f_0000),
+        }
+    }
+
     /// The type's name in a safetensors file.
     pub(crate) const fn dtype(self) -> Dtype {
         match self {
@@ -38,11 +67,7 @@ impl StoredAs {
 
     /// Little-endian bytes of `values`; the index of the first that is too large for the type, which would be infinite.
     pub(crate) fn encode(self, values: &[f32]) -> Result<Vec<u8>, usize> {
-        let largest = match self {
-            Self::F32 => f32::MAX,
-            Self::F16 => f16::MAX.to_f32(),
-            Self::Bf16 => bf16::MAX.to_f32(),
-        };
+        let largest = self.largest();
         if let Some(at) = values.iter().position(|value| value.abs() > largest) {
             return Err(at);
         }
@@ -92,18 +117,17 @@ mod tests {
     #[test]
     fn every_type_is_read_back_rounded_to_nearest() {
         let values = [0.0f32, -1.0, 0.1, 1.0 / 3.0, 60_000.0, -1e-6];
-        for (stored, unit) in [
-            (StoredAs::F32, 0.0),
-            (StoredAs::F16, 2f32.powi(-11)),
-            (StoredAs::Bf16, 2f32.powi(-8)),
-        ] {
+        assert_eq!(StoredAs::F16.largest(), f16::MAX.to_f32());
+        assert_eq!(StoredAs::Bf16.largest(), bf16::MAX.to_f32());
+        assert_eq!(StoredAs::F16.least_normal(), f16::MIN_POSITIVE.to_f32());
+        for stored in [StoredAs::F32, StoredAs::F16, StoredAs::Bf16] {
             let bytes = stored.encode(&values).unwrap();
             let read = decode(stored.dtype(), &bytes).unwrap();
             for (value, read) in values.iter().zip(read) {
-                // Below 6e-5 f16 has fixed steps of 6e-8.
-                let error = (value - read).abs();
+                let error = f64::from((value - read).abs());
+                let size = value.abs().max(stored.least_normal());
                 assert!(
-                    error <= unit * value.abs() + 3e-8,
+                    error <= stored.error() * f64::from(size),
                     "{stored:?}: {value}, {read}"
                 );
             }

@@ -6,12 +6,22 @@ use driml_model::Kernels;
 
 use super::{candle, scalar_op::scalar_op};
 
+/// Largest error of a probability or of a slope of the loss, as a share of it: an f32's last place. Below 1.2e-38, the least normal
+/// number, it is that share of 1.2e-38.
+pub const ENTRY_ERROR: f64 = 6.1e-8;
+/// Largest error of a slope beside [`ENTRY_ERROR`], where probability and target cancel in f64.
+pub const SLOPE_ERROR: f64 = 1e-15;
+/// Largest error of a row's divergence, as a share of `10 + sum_i target_i (max logit - logit_i)`.
+pub const KL_ERROR: f64 = 1e-13;
+
 /// Mean over rows of `KL(target || softmax(logits))`, and its gradient.
 ///
 /// `logits` [B, N], those of the action that each row took; `target` [B, N], rows sum to 1; N is `atoms`.
 /// Loss: `1/B * sum_b sum_i target * (ln target - ln softmax)`, with `0 ln 0 = 0`, in nats.
 /// `gradient` [B, N] is overwritten with the derivative by the logits: `(softmax - target) / B`. The arithmetic is f64 and shifts by
-/// the largest logit, so any finite logits are fine; a loss beyond the finite f32 needs logits that differ by more than 1e38.
+/// the largest logit, so any finite logits are fine: the loss is right to [`KL_ERROR`], its slopes to [`ENTRY_ERROR`] and
+/// [`SLOPE_ERROR`]. A loss beyond the finite f32 needs logits that differ by more than 1e38. A logit that is not finite gives a loss
+/// that is not, which the update refuses.
 /// Source: Bellemare et al. 2017, equation 7.
 ///
 /// # Panics
@@ -73,8 +83,8 @@ impl LogSoftmax {
     }
 }
 
-/// Writes softmax of `row` to `out`, both of one length. Finite logits of any size give a law whose entries are right to an f32's
-/// last place.
+/// Writes softmax of `row` to `out`, both of one length. Finite logits of any size give a law whose entries are right to
+/// [`ENTRY_ERROR`].
 pub fn softmax(row: &[f32], out: &mut [f32]) {
     let log_p = LogSoftmax::of(row);
     for (out, &x) in out.iter_mut().zip(row) {

@@ -7,14 +7,23 @@ use rayon::prelude::*;
 
 use super::{candle, scalar_op::scalar_op, scores::Scores};
 
+/// Largest error of the loss, as a share of 10 plus the largest score, in nats.
+pub const LOSS_ERROR: f64 = 1e-13;
+
+/// Largest error of a slope: 1e-7 of itself, an f32's last place, and what the rounding of scores up to `largest` leaves open of a
+/// probability. `weight` is 1 / (L valid rows).
+pub fn slope_error(slope: f64, weight: f64, scores: Scores, largest: f64) -> f64 {
+    1e-7 * slope.abs() + weight * scores.scale * (1e-14 * largest).min(1.0) + 1e-15
+}
+
 /// InfoNCE of every valid row against every valid row of its batch, at each location, and its gradient.
 ///
 /// `dots` [L, B, B]: `dots[l, i, j]` is anchor i's dot product with candidate j at location l; the pair (i, i) is the
 /// positive. `valid` [B]: a row with 0 is neither anchor nor candidate. With `s = clip(dots)` the loss is the mean over
 /// l and valid i of `ln sum_{valid j} exp(s_lij) - s_lii`, in nats: 0 if fewer than two rows are valid.
 /// `gradient` [L, B, B] is overwritten with the derivative by `dots`, 0 in the rows and columns that are not valid.
-/// Every finite input gives a finite result. It is computed in f64: the loss is right to 1e-12 beside the largest score's last
-/// place, the gradient to that of an f32.
+/// Every finite input gives a finite result. It is computed in f64: the loss is right to [`LOSS_ERROR`], its slopes to
+/// [`slope_error`].
 /// Source: van den Oord et al. 2018, equation 4; the clip is Bachman et al. 2019, section 3.
 ///
 /// # Panics

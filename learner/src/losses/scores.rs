@@ -3,6 +3,15 @@
 use candle_core::Tensor;
 use driml_model::soft_clip;
 
+/// Largest error of a clipped score, as a share of it.
+pub const CLIP_ERROR: f64 = 2e-15;
+
+/// Largest error of a clipped score's slope, as a share of it: where the score saturates, the exponent `2 |x| / c` is known to its
+/// own last place only. Below 1e-300 it is that share of 1e-300.
+pub fn slope_error(score: f64, tanh_clip: f64) -> f64 {
+    CLIP_ERROR + 1e-15 * (2.0 * score / tanh_clip).abs()
+}
+
 /// Dot products of every anchor with every candidate.
 #[derive(Debug)]
 pub struct Dots {
@@ -35,8 +44,9 @@ impl Scores {
         self.clip(dot).0
     }
 
-    /// The clipped score of a dot product, and its derivative by the dot product, as [`soft_clip`] has them.
-    pub(super) fn clip(&self, dot: f32) -> (f64, f64) {
+    /// The clipped score of a dot product, and its derivative by the dot product, as [`soft_clip`] has them: for scores and bounds
+    /// from 1e-150 to 1e150 the score is right to [`CLIP_ERROR`], its slope to [`slope_error`] of the score before the clip.
+    pub fn clip(&self, dot: f32) -> (f64, f64) {
         let (mut score, mut slope) = ([0.0], [0.0]);
         soft_clip(&[dot], self.scale, self.tanh_clip, &mut score, &mut slope);
         (score[0], slope[0])

@@ -35,11 +35,28 @@ const BETA: RangeInclusive<f64> = 0.0..=0.99999;
 /// The least is 10,000 times the root of the least second moment that f32 holds.
 const EPS: RangeInclusive<f64> = 1e-15..=1e30;
 
+/// Largest error of a parameter against the same steps in f64, as a share of the way it went, beside [`step_floor`].
+pub const STEP_ERROR: f64 = 0.004;
+
+/// Largest error of a moment against f64 while gradients go on, as a share of the decayed mean of their sizes, or of their squares:
+/// `beta` and each product and sum are rounded to f32, and 1 / (1 - beta) steps add up.
+pub fn moment_error(beta: f64) -> f64 {
+    2e-7 / (1.0 - beta)
+}
+
+/// What each step may add to the error of a parameter beside [`STEP_ERROR`]: half of the last place of a parameter of size
+/// `parameter`, and what `lr * m` loses below the normal numbers before it is divided.
+pub fn step_floor(parameter: f64, eps: f64) -> f64 {
+    let least = f64::from(f32::MIN_POSITIVE);
+    parameter.abs().max(least) / 2f64.powi(24) + least / eps.min(1.0)
+}
+
 /// Adam's numbers. Source: Kingma and Ba 2015, algorithm 1.
 ///
 /// A step is taken in f32, and the ranges are those in which it is what it would be in f64: the second moments that f32 does not
 /// hold, below 1.2e-38, are of gradients below `1.1e-19 / sqrt(1 - beta2)`, beside which `eps` must be large. At its least
-/// `eps` and `beta2` = 0.999 a step is within 0.4%.
+/// `eps` and `beta2` = 0.999 a step is within [`STEP_ERROR`], 0.4%. Gradients are within 1e15, the largest `max_grad_norm`: the square
+/// of one above 1e19 is not finite.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AdamSettings {
@@ -267,9 +284,9 @@ impl Adam {
     }
 }
 
-/// One step's numbers, the same for every element.
-#[derive(Clone, Copy)]
-struct Rule {
+/// One step's numbers, the same for every element: what [`Adam::step`] does to a stretch of a parameter.
+#[derive(Clone, Copy, Debug)]
+pub struct Rule {
     factor: f32,
     beta1: f32,
     rest1: f32,
@@ -284,7 +301,7 @@ struct Rule {
 
 impl Rule {
     /// The numbers of step number `step`, counted from 1, on gradients times `factor`.
-    fn new(settings: AdamSettings, step: u64, factor: f64) -> Self {
+    pub fn new(settings: AdamSettings, step: u64, factor: f64) -> Self {
         let AdamSettings {
             lr,
             beta1,
@@ -305,13 +322,13 @@ impl Rule {
         }
     }
 
-    /// Takes the step on one stretch; says whether its parameters and second moments are finite after it. (So are then the
+    /// Takes the step on one stretch of parameters `p`, gradients `g` and moments `m` and `v`, all of one length; says whether its parameters and second moments are finite after it. (So are then the
     /// first moments, as a mean is no larger than the root of the mean square.)
     ///
     /// Once in [`FLUSH_PERIOD`] steps, moments below the normal numbers become 0. Those of a gradient that is gone would else stay
     /// there for good, as 0.9 times the smallest numbers rounds back to them, and make each later step several times as slow.
     #[allow(clippy::eq_op, reason = "x - x tells finite numbers from others")]
-    fn apply(&self, p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32]) -> bool {
+    pub fn apply(&self, p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32]) -> bool {
         if self.flushes {
             flush(m);
             flush(v);

@@ -12,6 +12,9 @@ use crate::{error::UpdateError, tensors::slice};
 /// Elements a thread sums at a time.
 const CHUNK: usize = 1 << 14;
 
+/// Largest error of the norm of up to 2^32 gradients, as a share of it.
+pub const NORM_ERROR: f64 = 1e-12;
+
 /// Gradients of one loss, by parameter name. A parameter that the loss does not touch has none.
 #[derive(Debug)]
 pub struct Gradients {
@@ -39,7 +42,7 @@ impl Gradients {
         self.by_name.get(name)
     }
 
-    /// Global 2-norm of all gradients together, accumulated in f64.
+    /// Global 2-norm of all gradients together, accumulated in f64: right to [`NORM_ERROR`] for any finite gradients.
     ///
     /// # Errors
     /// [`UpdateError::NonFinite`] with the first parameter whose gradient is infinite or NaN.
@@ -99,7 +102,8 @@ fn sum_of_squares(values: &[f32]) -> f64 {
 
 /// Factor on gradients of global norm `norm` so that their norm stays within `max_norm`.
 ///
-/// `max_norm / (norm + 1e-6)` where that is below 1, else 1. Source: PyTorch's `clip_grad_norm_`.
+/// `max_norm / (norm + 1e-6)` where that is below 1, else 1. It is used as an f32, whose last place it keeps for norms up to 8e37
+/// times `max_norm`. Source: PyTorch's `clip_grad_norm_`.
 pub fn clip_factor(norm: f64, max_norm: f64) -> f64 {
     (max_norm / (norm + 1e-6)).min(1.0)
 }

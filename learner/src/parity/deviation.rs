@@ -22,7 +22,7 @@ pub struct ErrorOfUpdate {
     pub q_max: f64,
     /// Share of rows whose greedy action in s_t is the reference's.
     pub same_action: f64,
-    /// Share of rows whose greedy action in s_{t+n} is the reference's, or is not needed.
+    /// Share of rows that bootstrap whose greedy action in s_{t+n} is the reference's; 1 if none does.
     pub same_next_action: f64,
 }
 
@@ -51,10 +51,14 @@ impl ErrorOfUpdate {
             &reference.q_values_t,
             agent.model().num_actions,
         );
-        // Of a row that does not bootstrap no action is chosen.
-        let agree = |(own, reference): (&u8, &u8)| *own == NO_ACTION || own == reference;
-        let next = own.next_greedy_action.iter();
-        let next = next.zip(&reference.next_greedy_action).map(agree);
+        let next: Vec<bool> = own
+            .next_greedy_action
+            .iter()
+            .zip(&reference.next_greedy_action)
+            .filter(|(own, _)| **own != NO_ACTION)
+            .map(|(own, expected)| own == expected)
+            .collect();
+        let same_next = next.iter().filter(|same| **same).count() as f64;
         Ok(Self {
             loss: (f64::from(own.total) - reference.total).abs() / reference.total.abs(),
             gradient: (apart / square).sqrt(),
@@ -62,7 +66,11 @@ impl ErrorOfUpdate {
             q_rms: values.rms,
             q_max: values.max,
             same_action: values.same_action,
-            same_next_action: next.filter(|same| *same).count() as f64 / batch.rows as f64,
+            same_next_action: if next.is_empty() {
+                1.0
+            } else {
+                same_next / next.len() as f64
+            },
         })
     }
 }

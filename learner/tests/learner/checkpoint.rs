@@ -458,7 +458,7 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
     for (key, value) in [("hidden", u64::MAX), ("lr", 0), ("keep", 1)] {
         let change =
             |state: &mut serde_json::Value| state["affinity"]["settings"][key] = value.into();
-        refused(&run, &change, "settings out of range");
+        refused(&run, &change, &format!("{key} = "));
     }
     for key in ["updates", "adam_step", "weights_version"] {
         let change = |state: &mut serde_json::Value| state[key] = u64::MAX.into();

@@ -213,7 +213,7 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
         .assert_eq(&said("driml-ada", "run.gamma=1.5"));
     expect!["run.horizon = 0 cannot work: k lies between 1 and 1000"]
         .assert_eq(&said("driml-ada", "run.horizon={rule=\"fixed\",k=0}"));
-    expect!["in the settings' [run] table: unknown variant `always`, expected one of `none`, `fixed`, `uniform`, `nhg`, `all`"].assert_eq(&said("driml-ada", "run.horizon.rule=always"));
+    expect!["in the settings' [run] table: unknown variant `always`, expected one of `none`, `fixed`, `uniform`, `nhg`, `all`, in `horizon.rule`"].assert_eq(&said("driml-ada", "run.horizon.rule=always"));
     expect!["learner.update cannot work: objective = dim, but all lambdas are 0: set one above 0, or take the agent c51"].assert_eq(&said("driml-ada", "learner.update.lambda.4t4=0"));
     expect!["learner.update cannot work: objective = none computes no auxiliary loss, but lambda.4t4 is above 0: set it to 0, or take another agent"].assert_eq(&said("c51", "learner.update.lambda.4t4=1"));
     expect!["run.horizon follows the action affinity, which nobody estimates: --set learner.affinity.estimator=learned"].assert_eq(&said("driml-ada", "learner.affinity.estimator=none"));
@@ -225,7 +225,7 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
         .assert_eq(&said("driml-ada", "world.num_levels=-1"));
     expect!["learner.update cannot work: adam.lr = 0.0 is not within 1e-30 and 1e38: that cannot work; start from a preset"]
         .assert_eq(&said("driml-ada", "learner.update.adam.lr=0"));
-    expect!["in the settings' [learner] table: unknown variant `f16`, expected `f32` or `bf16`"]
+    expect!["in the settings' [learner] table: unknown variant `f16`, expected `f32` or `bf16`, in `precision`"]
         .assert_eq(&said("driml-ada", "learner.precision=f16"));
     let gpu = ["learner.precision=bf16", "local.learner_device=cuda"];
     expect![[
@@ -253,7 +253,7 @@ fn agents_and_what_their_objectives_need() {
     ));
     expect!["learner.augment.hue = 0.6 cannot work: it must lie between 0 and 0.5, half a turn either way"]
         .assert_eq(&said("curl", &["learner.augment.hue=0.6"]));
-    expect!["in the settings' [learner.update] table: unknown variant `clear`, expected one of `none`, `dim`, `cpc`, `curl`"].assert_eq(&said("curl", &["learner.update.objective=clear"]));
+    expect!["in the settings' [learner.update] table: unknown variant `clear`, expected one of `none`, `dim`, `cpc`, `curl`, in `objective`"].assert_eq(&said("curl", &["learner.update.objective=clear"]));
     let five = with("procgen:heist", "driml-noact", &["run.horizon.k=5"]).unwrap();
     assert_eq!(five.run.horizon, Horizon::Fixed { k: 5 });
     assert!(!five.model.dim.action && five.model.dim.psi4);
@@ -292,7 +292,7 @@ fn a_ladder_of_epsilons_is_for_the_actors_of_the_run() {
         .assert_eq(&of(&[ladder, "local.actors=1"]).unwrap_err());
     expect!["actor.epsilon_ladder.base = 4 cannot work: the first actor's probability lies between 0 and 1, without the two"]
         .assert_eq(&of(&["actor.epsilon_ladder={base=4.0,alpha=7.0}", "local.actors=2"]).unwrap_err());
-    expect!["in the settings' [actor] table: missing field `alpha`"]
+    expect!["in the settings' [actor] table: missing field `alpha`, in `epsilon_ladder`"]
         .assert_eq(&of(&["actor.epsilon_ladder={base=0.4}", "local.actors=2"]).unwrap_err());
     expect![[r#"there is no setting "actor.epsilon_ladder.rungs"; [actor] has ack_timeout_ms, actions, chunks_in_flight_max, envs, epsilon_decay_frames, epsilon_end, epsilon_start, precision, round_transitions_max, steps_per_chunk, unreachable_max_ms, world_threads"#]]
         .assert_eq(&of(&["actor.epsilon_ladder.rungs=3"]).unwrap_err());
@@ -447,7 +447,7 @@ fn a_compressed_replay_is_bounded_in_bytes_instead() {
     expect!["replay.compressed_bytes_max = 100000000000 is 93.1 GiB, and 16.0 GiB are free: --set replay.compressed_bytes_max=8333934592"].assert_eq(&said("replay.compressed_bytes_max=100000000000"));
     expect!["replay.capacity_transitions = 100000000000 needs 11920.9 GiB beside the frames, and 16.0 GiB are free: --set replay.capacity_transitions=33554432"].assert_eq(&said("replay.capacity_transitions=100000000000"));
     expect!["replay.compressed_bytes_max = 1000 cannot work: one sample spans 8 transitions, which may not compress; use at least 3232128"].assert_eq(&said("replay.compressed_bytes_max=1000"));
-    expect!["in the settings' [replay] table: unknown variant `zip`, expected `none` or `lz4`"]
+    expect!["in the settings' [replay] table: unknown variant `zip`, expected `none` or `lz4`, in `compression`"]
         .assert_eq(&said("replay.compression=zip"));
 }
 

@@ -41,6 +41,7 @@ pub fn conv2d_relu(
 /// `images` [B, H, W, C] u8 (scaled by 1/255, no gradient) or f32. Each layer is (weight [out, in, k, k] f32, bias [out]
 /// f32, stride) and turns [B, h, w, in] into [B, (h - k) / stride + 1, (w - k) / stride + 1, out], channels last. Where an
 /// output is 0 its gradient is 0, as in PyTorch. Operands of products, and maps between layers, are rounded to `precision`.
+/// Each result of a layer and each gradient of its parameters is right to [`Precision::product_error`] of what it is the sum of.
 /// Results and gradients have the same bits whatever the number of threads.
 ///
 /// # Errors

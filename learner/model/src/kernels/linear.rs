@@ -28,7 +28,8 @@ const SUM_LEN: usize = 1 << 12;
 ///
 /// `x` [..., in]; `w` [out, in]; `b` [out], or [groups..., out] where each entry serves an equal share of consecutive
 /// rows of `x`. Result [..., out]. All f32. With as many groups as rows this is x w^T + b for a whole tensor b, which
-/// saves the separate addition. Operands of products are rounded to `precision`. Results and gradients have the same bits whatever the number of threads.
+/// saves the separate addition. Operands of products are rounded to `precision`: each result and gradient is right to
+/// [`Precision::product_error`]. Results and gradients have the same bits whatever the number of threads.
 ///
 /// # Errors
 /// Shapes that do not match, or other types.

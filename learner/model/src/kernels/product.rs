@@ -14,7 +14,7 @@ const SPLIT_MIN: usize = 1 << 18;
 
 /// Multiplies `a` [m, k] by `b` [k, n] into `out` [m, n], rows one after the other; operands are rounded to `precision`.
 ///
-/// Each entry is summed in the order of k, in f32, whatever the number of threads.
+/// Each entry is summed in the order of k, in f32, whatever the number of threads; it is right to [`Precision::product_error`].
 ///
 /// # Panics
 /// If the shapes do not match.
