@@ -2,9 +2,9 @@
 //! Frames, stacks and enlargement are the run's own; k is 1, and nothing is augmented.
 
 use anyhow::Context;
-use driml_envs::{FrameStack, StepEnd};
+use driml_envs::{CutFrames, FewerActions, FrameStack, StepEnd};
 use driml_learner::Batch;
-use driml_model::{Enlarge, PolicyNetwork};
+use driml_model::PolicyNetwork;
 use driml_protocol::NO_ACTION;
 use driml_settings::config::RunConfig;
 use rand::{Rng, SeedableRng};
@@ -132,18 +132,20 @@ fn history(
     steps: usize,
 ) -> anyhow::Result<Vec<Moment>> {
     let mut rng = ChaCha8Rng::seed_from_u64(SEED);
-    let mut world = config
+    let actions = config.world.actions(config.actor.actions);
+    let sent = (
+        config.run.frame_height as usize,
+        config.run.frame_width as usize,
+    );
+    let world = config
         .world
         .build(COPIES, SEED, 0)
         .context("building the world")?;
+    let mut world = CutFrames::of(FewerActions::of(world, actions)?, sent)?;
     let frame = world.frame_shape();
     let mut stack = FrameStack::new(frame, config.run.frame_stack as usize, COPIES)?;
-    let (model, channels) = (&config.model, stack.shape().channels);
-    let enlarge = Enlarge::new(
-        (frame.height, frame.width),
-        (model.height, model.width),
-        channels,
-    )?;
+    let model = &config.model;
+    let enlarge = config.input.enlarge(sent, model)?;
     let mut policy = weights
         .map(|weights| PolicyNetwork::new(model, weights, config.actor.precision))
         .transpose()?;
@@ -159,7 +161,10 @@ fn history(
             rewards: vec![0.0; COPIES],
             ends: vec![StepEnd::Running; COPIES],
         };
-        enlarge.apply(stack.stacked(), &mut moment.states);
+        match &enlarge {
+            Some(enlarge) => enlarge.apply(stack.stacked(), &mut moment.states),
+            None => moment.states.copy_from_slice(stack.stacked()),
+        }
         if let Some(policy) = &mut policy {
             policy.greedy_actions(&moment.states, &mut moment.actions)?;
         }
