@@ -119,7 +119,7 @@ proptest! {
         // The square of the cosh may be too large for a float where the slope is not yet too small for one.
         let expected = scores.scale / ratio.cosh() / ratio.cosh();
         let error = (slope - expected).abs();
-        let allowed = scores::slope_error(ratio * tanh_clip, tanh_clip) * expected.max(1e-300);
+        let allowed = scores::slope_error(ratio * tanh_clip, tanh_clip) * expected.max(scores::LEAST_SLOPE);
         prop_assert!(error <= allowed, "{slope:e}, {expected:e}");
     }
 

@@ -6,8 +6,11 @@ use driml_model::soft_clip;
 /// Largest error of a clipped score, as a share of it.
 pub const CLIP_ERROR: f64 = 2e-15;
 
+/// Slopes below it are as good as 0: what is far enough below is given as 0.
+pub const LEAST_SLOPE: f64 = 1e-290;
+
 /// Largest error of a clipped score's slope, as a share of it: where the score saturates, the exponent `2 |x| / c` is known to its
-/// own last place only. Below 1e-300 it is that share of 1e-300.
+/// own last place only. Below [`LEAST_SLOPE`] it is that share of it.
 pub fn slope_error(score: f64, tanh_clip: f64) -> f64 {
     CLIP_ERROR + 1e-15 * (2.0 * score / tanh_clip).abs()
 }

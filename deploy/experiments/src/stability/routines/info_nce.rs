@@ -53,7 +53,7 @@ pub(super) fn clip(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
         score_row.see(error, input);
         // Divided twice, as the square of the cosh may be too large for a float where the slope is not yet too small for one.
         let expected = 1.0 / (rkhs as f64).sqrt() / ratio.cosh() / ratio.cosh();
-        let allowed = scores::slope_error(x, bound) * expected.max(1e-300);
+        let allowed = scores::slope_error(x, bound) * expected.max(scores::LEAST_SLOPE);
         slope_row.see((slope - expected).abs() / allowed, input);
     };
     let [mut score, mut slope] =
