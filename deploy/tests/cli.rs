@@ -213,6 +213,19 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
     assert_eq!((figures.len(), &report["bench"]), (8, &"policy".into()));
     assert!(figures.iter().all(|it| it["value"].as_f64().unwrap() > 0.0));
 
+    let growth = [
+        "bench",
+        "learner",
+        "--growth",
+        "--quick",
+        "--precision",
+        "bf16",
+    ];
+    let output = driml(&[&growth[..], &["--json", "-"]].concat());
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let figures = report["figures"].as_array().unwrap();
+    let speeds = figures.iter().filter(|it| it["unit"] == "GFLOP/s").count();
+    assert_eq!((figures.len(), speeds), (26, 13));
     let peers = ["bench", "peers", "--quick", "--only", "policy"];
     let output = driml(&[&peers[..], &["--python", "no-such-python"]].concat());
     let table = String::from_utf8(output.stdout).unwrap();

@@ -12,12 +12,13 @@ use crate::{
     measurements::{Measurement, Report},
 };
 
-/// Runs this program again for one component's figures. Its progress goes to stderr.
+/// Runs this program again for one component's figures, those that it gives with the flags `more`. Its progress goes to stderr.
 ///
 /// # Errors
 /// A process that could not be started or failed.
 pub(super) fn figures(
     component: Component,
+    more: &[&str],
     flags: &BenchFlags,
     device: DeviceName,
 ) -> anyhow::Result<Vec<Measurement>> {
@@ -26,6 +27,7 @@ pub(super) fn figures(
     command
         .args(["bench", component.name(), "--here", "--json", "-"])
         .args(["--threads", &flags.threads.to_string()])
+        .args(more)
         .args(flags.quick.then_some("--quick"))
         .args(
             flags

@@ -64,6 +64,9 @@ impl BenchFlags {
 /// What `driml bench learner` takes.
 #[derive(Clone, Debug, Args)]
 pub struct BenchLearnerArgs {
+    /// Instead: C51 + global DIM as batch, observation, atoms and vectors grow, beside the FLOPs of an update
+    #[arg(long)]
+    pub(crate) growth: bool,
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
     #[command(flatten)]

@@ -28,6 +28,7 @@ mod candle_baseline;
 mod effort;
 mod env;
 pub mod flags;
+mod growth;
 mod launched;
 mod learner;
 mod measurements;
@@ -56,12 +57,16 @@ use crate::{
 /// A component that failed, an engine that cannot be had, a file that cannot be written.
 pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
     let machine = MachineNote::this();
-    let alone = |component, flags: &BenchFlags, device: DeviceName| {
+    let alone = |component, flags: &BenchFlags, device: DeviceName, growth: bool| {
         ready_for(device)?;
-        let figures = if flags.here {
-            measure(component, flags, device)?
+        let figures = if !flags.here {
+            let more = if growth { &["--growth"][..] } else { &[] };
+            alone::figures(component, more, flags, device)?
+        } else if growth {
+            let effort = &Effort::new(flags);
+            by_precision(flags, device, &|it| growth::measure(effort, device, it))?
         } else {
-            alone::figures(component, flags, device)?
+            measure(component, flags, device)?
         };
         measurements::report(
             component.name(),
@@ -71,10 +76,13 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
         )
     };
     match command {
-        BenchCommand::Learner(args) => alone(Component::Learner, &args.flags, args.on.device),
-        BenchCommand::Policy(flags) => alone(Component::Policy, flags, DeviceName::Cpu),
-        BenchCommand::Replay(flags) => alone(Component::Replay, flags, DeviceName::Cpu),
-        BenchCommand::Env(flags) => alone(Component::Env, flags, DeviceName::Cpu),
+        BenchCommand::Learner(args) => {
+            let (flags, device) = (&args.flags, args.on.device);
+            alone(Component::Learner, flags, device, args.growth)
+        }
+        BenchCommand::Policy(flags) => alone(Component::Policy, flags, DeviceName::Cpu, false),
+        BenchCommand::Replay(flags) => alone(Component::Replay, flags, DeviceName::Cpu, false),
+        BenchCommand::Env(flags) => alone(Component::Env, flags, DeviceName::Cpu, false),
         BenchCommand::System(args) => {
             measurements::report("system", &system::measure(args)?, machine, &args.flags)
         }
@@ -89,19 +97,25 @@ fn measure(
     device: DeviceName,
 ) -> anyhow::Result<Vec<Measurement>> {
     let effort = &Effort::new(flags);
-    let by_precision = |measure: &dyn Fn(Precision) -> anyhow::Result<Vec<Measurement>>| {
-        let mut figures = Vec::new();
-        for precision in flags.precisions(device) {
-            figures.extend(measure(precision)?);
-        }
-        Ok(figures)
-    };
     match component {
         Component::Learner => {
-            by_precision(&|precision| learner::measure(effort, device, precision))
+            by_precision(flags, device, &|it| learner::measure(effort, device, it))
         }
-        Component::Policy => by_precision(&|precision| policy::measure(effort, precision)),
+        Component::Policy => by_precision(flags, device, &|it| policy::measure(effort, it)),
         Component::Replay => replay::measure(effort),
         Component::Env => env::measure(effort),
     }
+}
+
+/// The figures of each precision that is asked for.
+fn by_precision(
+    flags: &BenchFlags,
+    device: DeviceName,
+    measure: &dyn Fn(Precision) -> anyhow::Result<Vec<Measurement>>,
+) -> anyhow::Result<Vec<Measurement>> {
+    let mut figures = Vec::new();
+    for precision in flags.precisions(device) {
+        figures.extend(measure(precision)?);
+    }
+    Ok(figures)
 }

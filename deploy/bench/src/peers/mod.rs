@@ -114,7 +114,12 @@ pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
                 "round {round} of {rounds}: {} of ours",
                 component.name()
             ));
-            sides.add_ours(alone::figures(*component, &args.flags, DeviceName::Cpu)?);
+            sides.add_ours(alone::figures(
+                *component,
+                &[],
+                &args.flags,
+                DeviceName::Cpu,
+            )?);
             if sides.absent.is_none() {
                 console::line(&format!("round {round} of {rounds}: {}", sides.peer));
                 match script.run() {
