@@ -25,9 +25,9 @@ pub struct InputSize {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FrameSize {
-    /// Rows.
+    /// Rows of pixels.
     pub height: u32,
-    /// Columns.
+    /// Pixels in a row.
     pub width: u32,
 }
 

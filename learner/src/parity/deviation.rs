@@ -16,9 +16,9 @@ pub struct ErrorOfUpdate {
     pub gradient: f64,
     /// 1 - cosine of the angle between the gradients.
     pub angle: f64,
-    /// Root mean square and largest error of a value of s_t, in units of return.
+    /// Root mean square error of a value of s_t, in units of return.
     pub q_rms: f64,
-    /// As said.
+    /// Largest error of a value of s_t, in units of return.
     pub q_max: f64,
     /// Share of rows whose greedy action in s_t is the reference's.
     pub same_action: f64,

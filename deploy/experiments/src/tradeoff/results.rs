@@ -97,7 +97,7 @@ impl SeedResult {
 }
 
 impl PointResult {
-    /// By seed.
+    /// What each run gave, by its seed.
     pub(super) fn values(&self, measure: Measure) -> Vec<f64> {
         self.seeds
             .iter()

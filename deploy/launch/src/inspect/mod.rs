@@ -21,9 +21,9 @@ pub use play::RowShares;
 /// What a world and an agent cost.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Inspection {
-    /// The world.
+    /// The world's name, as `--env` takes it.
     pub world: String,
-    /// The agent.
+    /// The agent's name, as `--agent` takes it.
     pub agent: String,
     /// What [`Line::everything`] stands for.
     pub everything: &'static str,
