@@ -226,6 +226,7 @@ mod tests {
         });
         let packer = Packer {
             compression: Compression::None,
+            seal_for: None,
         };
         packer.pack(Cow::Owned(chunk))
     }

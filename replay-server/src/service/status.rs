@@ -8,8 +8,13 @@ use super::server::Service;
 impl Service {
     pub(super) fn goodbye(&self, incoming: Incoming<Goodbye>) {
         if let Some(goodbye) = self.read(&incoming) {
-            self.state().replay.goodbye(&goodbye);
-            incoming.into_responder().reply(&Done);
+            let mut state = self.state();
+            state.replay.goodbye(&goodbye);
+            let is_ready = state.replay.is_ready();
+            drop(state);
+            if is_ready {
+                incoming.into_responder().reply(&Done);
+            }
         }
     }
 
@@ -18,7 +23,7 @@ impl Service {
             return;
         };
         let mut state = self.state();
-        let set = match state.members.check_learner(update.learner) {
+        let set = match state.check_learner(update.learner) {
             Ok(()) => state
                 .replay
                 .set_affinity(&update)
@@ -28,8 +33,10 @@ impl Service {
                 Err(why)
             }
         };
+        let is_ready = state.replay.is_ready();
         drop(state);
         match set {
+            Ok(()) if !is_ready => {}
             Ok(()) => incoming.into_responder().reply(&Done),
             Err(why) => tracing::warn!("an affinity matrix was refused: {why}"),
         }
