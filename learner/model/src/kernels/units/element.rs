@@ -3,6 +3,7 @@
 
 use half::bf16;
 
+use super::unit::{LANES, Unit};
 use crate::kernels::buffer::Pooled;
 
 /// A stored scalar of an operand.
@@ -16,6 +17,9 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     /// The nearest element, ties to even.
     fn of(value: f32) -> Self;
 
+    /// Stores `values` as [`Element::of`] in `to`, which is as long, with the unit's instructions.
+    fn store<U: Unit>(unit: U, values: &[f32], to: &mut [Self]);
+
     /// A pixel: times [`Element::BYTE_SCALE`] it is the byte / 255.
     fn of_byte(byte: u8) -> Self;
 
@@ -24,10 +28,14 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
 
     /// Stores `DEPTH` rows that follow each other along the sum: `step` [columns, DEPTH], with 0 for what the rows do not have.
     /// `second` is for a depth of 2.
-    fn join(first: &[f32], second: &[f32], step: &mut [Self]);
+    fn join<U: Unit>(unit: U, first: &[f32], second: &[f32], step: &mut [Self]);
 
-    /// The step that `values` begin with, as 32 bits; 0 for what they do not have.
-    fn step(values: &[f32]) -> u32;
+    /// `LANES` steps of `values`, [`LANES`, DEPTH], each as 32 bits.
+    fn steps<U: Unit>(unit: U, values: &[f32], steps: &mut [u32; LANES]);
+
+    /// Pixels as [`Element::of_byte`], each with the one `shift` further if `DEPTH` is 2, or with 0 where they end before:
+    /// `steps` [pixels, DEPTH].
+    fn steps_of_bytes(bytes: &[u8], shift: usize, steps: &mut [Self]);
 
     /// The scalars of a step, into `step` [DEPTH].
     fn unpack(bits: u32, step: &mut [Self]);
@@ -56,15 +64,29 @@ impl Element for f32 {
     }
 
     #[inline(always)]
-    fn join(first: &[f32], _: &[f32], step: &mut [Self]) {
+    fn store<U: Unit>(_: U, values: &[f32], to: &mut [Self]) {
+        to.copy_from_slice(values);
+    }
+
+    #[inline(always)]
+    fn join<U: Unit>(_: U, first: &[f32], _: &[f32], step: &mut [Self]) {
         let (begin, end) = step.split_at_mut(first.len());
         begin.copy_from_slice(first);
         end.fill(0.0);
     }
 
     #[inline(always)]
-    fn step(values: &[f32]) -> u32 {
-        values.first().map_or(0, |value| value.to_bits())
+    fn steps<U: Unit>(_: U, values: &[f32], steps: &mut [u32; LANES]) {
+        for (step, value) in steps.iter_mut().zip(values) {
+            *step = value.to_bits();
+        }
+    }
+
+    #[inline(always)]
+    fn steps_of_bytes(bytes: &[u8], _: usize, steps: &mut [Self]) {
+        for (step, &byte) in steps.iter_mut().zip(bytes) {
+            *step = Self::of_byte(byte);
+        }
     }
 
     #[inline(always)]
@@ -103,29 +125,43 @@ impl Element for bf16 {
     }
 
     #[inline(always)]
-    fn join(first: &[f32], second: &[f32], step: &mut [Self]) {
+    fn store<U: Unit>(unit: U, values: &[f32], to: &mut [Self]) {
+        unit.round(values, to);
+    }
+
+    #[inline(always)]
+    fn join<U: Unit>(unit: U, first: &[f32], second: &[f32], step: &mut [Self]) {
         let (begin, end) = step.split_at_mut(first.len() * 2);
         if second.is_empty() {
             for (pair, &first) in begin.chunks_exact_mut(2).zip(first) {
                 (pair[0], pair[1]) = (Self::of(first), Self::default());
             }
         } else {
-            for ((pair, &first), &second) in begin.chunks_exact_mut(2).zip(first).zip(second) {
-                (pair[0], pair[1]) = (Self::of(first), Self::of(second));
-            }
+            unit.round_pairs(first, second, begin);
         }
         end.fill(Self::default());
     }
 
     #[inline(always)]
-    fn step(values: &[f32]) -> u32 {
-        let bits = |at: usize| {
-            let value = values
-                .get(at)
-                .map_or(Self::default(), |&value| Self::of(value));
-            u32::from(value.to_bits())
-        };
-        bits(0) | bits(1) << 16
+    fn steps<U: Unit>(unit: U, values: &[f32], steps: &mut [u32; LANES]) {
+        let mut rounded = [Self::default(); 2 * LANES];
+        unit.round(values, &mut rounded);
+        for (step, pair) in steps.iter_mut().zip(rounded.chunks_exact(2)) {
+            *step = u32::from(pair[0].to_bits()) | u32::from(pair[1].to_bits()) << 16;
+        }
+    }
+
+    #[inline(always)]
+    fn steps_of_bytes(bytes: &[u8], shift: usize, steps: &mut [Self]) {
+        let later = bytes.get(shift..).unwrap_or_default();
+        let (begin, end) = bytes.split_at(later.len());
+        let (both, one) = steps.split_at_mut(later.len() * 2);
+        for ((pair, &byte), &later) in both.chunks_exact_mut(2).zip(begin).zip(later) {
+            (pair[0], pair[1]) = (Self::of_byte(byte), Self::of_byte(later));
+        }
+        for (pair, &byte) in one.chunks_exact_mut(2).zip(end) {
+            (pair[0], pair[1]) = (Self::of_byte(byte), Self::default());
+        }
     }
 
     #[inline(always)]
