@@ -1,7 +1,11 @@
 //! What is known of each part beyond its counts: whether it is there, since when, when it was last heard, what it says it does.
 //! It decides nothing: it is what a person is told.
 
-use std::{collections::BTreeMap, mem::discriminant, time::Instant};
+use std::{
+    collections::{BTreeMap, HashSet},
+    mem::discriminant,
+    time::Instant,
+};
 
 use driml_protocol::{
     Alive, PartName, PartStatus, Report, WARNINGS_MAX, Waiting, Warning, last_warning,
@@ -146,18 +150,12 @@ impl Accounts {
         now: Instant,
         held_since: impl Fn(PartName) -> Option<Instant>,
     ) -> Vec<PartStatus> {
-        let mut ages: Vec<f64> = self
-            .parts
-            .values()
-            .filter_map(|it| it.warning_age(now))
-            .collect();
-        ages.sort_by(f64::total_cmp);
-        let oldest = ages.get(WARNINGS_MAX - 1).copied().unwrap_or(f64::INFINITY);
-        let mut left = WARNINGS_MAX;
+        let age = |(&who, account): (_, &Account)| Some((account.warning_age(now)?, who));
+        let mut ages: Vec<(f64, PartName)> = self.parts.iter().filter_map(age).collect();
+        ages.sort_by(|(one, _), (other, _)| one.total_cmp(other));
+        let newest: HashSet<_> = ages.iter().take(WARNINGS_MAX).map(|(_, who)| who).collect();
         let part = |(&who, account): (&PartName, &Account)| {
             let report = account.report.as_ref();
-            let is_new = account.warning_age(now).is_some_and(|age| age <= oldest) && left > 0;
-            left -= usize::from(is_new);
             PartStatus {
                 who,
                 connected: account.is_connected,
@@ -170,13 +168,15 @@ impl Accounts {
                     let said = seconds(now, *at);
                     (report.doing.clone(), report.since_s + said, said)
                 }),
-                last_warning: report.filter(|_| is_new).and_then(|(report, at)| {
-                    let warning = report.last_warning.as_ref()?;
-                    Some(Warning::new(
-                        &warning.text,
-                        warning.age_s + seconds(now, *at),
-                    ))
-                }),
+                last_warning: report
+                    .filter(|_| newest.contains(&who))
+                    .and_then(|(report, at)| {
+                        let warning = report.last_warning.as_ref()?;
+                        Some(Warning::new(
+                            &warning.text,
+                            warning.age_s + seconds(now, *at),
+                        ))
+                    }),
             }
         };
         self.parts.iter().map(part).collect()

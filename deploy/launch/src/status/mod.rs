@@ -2,6 +2,7 @@
 //! It asks as any client would and changes nothing.
 
 mod advice;
+mod connection;
 mod run_of_folder;
 mod snapshot;
 mod text;
@@ -11,8 +12,9 @@ use std::time::Duration;
 use driml_machine::error::Interrupted;
 
 pub use self::{
+    connection::Connection,
     run_of_folder::{Live, endpoints_of},
-    snapshot::{Connection, ServerAnswer, Snapshot},
+    snapshot::{ServerAnswer, Snapshot},
 };
 use crate::{console, interrupts::Interrupts};
 

@@ -9,6 +9,7 @@ use std::sync::OnceLock;
 use half::bf16;
 
 use super::avx512::Brain;
+use super::element::Rounding;
 use super::unit::{LANES, Loop, Mode, RawTile, Unit};
 
 /// Steps, which are pairs of bf16, in a row of a tile register: 64 bytes.
@@ -246,6 +247,18 @@ impl Amx {
 /// Most rows of a tile as the products are cut: four registers of them.
 pub(super) const ROWS_MAX: usize = SUMS * ROWS;
 
+impl Rounding for Amx {
+    #[inline(always)]
+    fn round(self, values: &[f32], to: &mut [bf16]) {
+        self.0.round(values, to);
+    }
+
+    #[inline(always)]
+    fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
+        self.0.round_pairs(first, second, pairs);
+    }
+}
+
 impl Unit for Amx {
     type Element = bf16;
     const VECS_MAX: usize = SUMS;
@@ -262,16 +275,6 @@ impl Unit for Amx {
     #[inline(always)]
     fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
         self.0.transpose(block);
-    }
-
-    #[inline(always)]
-    fn round(self, values: &[f32], to: &mut [bf16]) {
-        self.0.round(values, to);
-    }
-
-    #[inline(always)]
-    fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
-        self.0.round_pairs(first, second, pairs);
     }
 
     #[inline(always)]

@@ -15,6 +15,7 @@ use std::mem::transmute;
 use half::bf16;
 
 use super::{
+    element::Rounding,
     unit::{LANES, Loop, RawTile, Unit},
     vector::{Vector, compute_sizes},
 };
@@ -65,7 +66,7 @@ const fn rows_max(vecs: usize) -> usize {
 }
 
 macro_rules! unit {
-    ($unit:ident, $element:ty, $features:literal, { $($rounding:item)* }) => {
+    ($unit:ident, $element:ty, $features:literal) => {
         impl Unit for $unit {
             type Element = $element;
             const VECS_MAX: usize = 4;
@@ -84,8 +85,6 @@ macro_rules! unit {
                 // SAFETY: `here` found the instructions.
                 unsafe { transposed(block) }
             }
-
-            $($rounding)*
 
             #[inline(always)]
             fn vectorize<W: Loop>(self, work: W) {
@@ -112,27 +111,30 @@ macro_rules! unit {
     };
 }
 
-unit!(Single, f32, "avx512f,avx512bw,avx512dq,avx512vl,fma", {});
+unit!(Single, f32, "avx512f,avx512bw,avx512dq,avx512vl,fma");
 unit!(
     Brain,
     bf16,
-    "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma",
-    {
-        #[inline(always)]
-        fn round(self, values: &[f32], to: &mut [bf16]) {
-            // SAFETY: `here` found the instructions.
-            unsafe { rounded(values, to) }
-        }
-
-        #[inline(always)]
-        fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
-            // SAFETY: `here` found the instructions.
-            unsafe { rounded_pairs(first, second, pairs) }
-        }
-    }
+    "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma"
 );
 
-/// `Unit::round`, 32 values at a time.
+impl Rounding for Single {}
+
+impl Rounding for Brain {
+    #[inline(always)]
+    fn round(self, values: &[f32], to: &mut [bf16]) {
+        // SAFETY: `here` found the instructions.
+        unsafe { rounded(values, to) }
+    }
+
+    #[inline(always)]
+    fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
+        // SAFETY: `here` found the instructions.
+        unsafe { rounded_pairs(first, second, pairs) }
+    }
+}
+
+/// `Rounding::round`, 32 values at a time.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
 unsafe fn rounded(values: &[f32], to: &mut [bf16]) {
@@ -161,7 +163,7 @@ unsafe fn rounded(values: &[f32], to: &mut [bf16]) {
     }
 }
 
-/// `Unit::round_pairs`, 16 pairs at a time.
+/// `Rounding::round_pairs`, 16 pairs at a time.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
 unsafe fn rounded_pairs(first: &[f32], second: &[f32], pairs: &mut [bf16]) {

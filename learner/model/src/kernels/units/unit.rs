@@ -1,12 +1,8 @@
 //! What a unit is: an instruction set that computes one tile of a product in registers.
 //! It names none; the choice is in `choice`.
 
-use half::bf16;
-
-use super::element::Element;
-
-/// Columns of one register, on every unit.
-pub(crate) const LANES: usize = 16;
+pub(crate) use super::element::LANES;
+use super::element::{Element, Rounding};
 
 /// What a product does to the output's old content.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,7 +34,7 @@ pub(crate) struct RawTile<E> {
 /// An instruction set, with the type that its operands are stored as. Sums are f32.
 ///
 /// A value of a unit exists only where the processor has its instructions: [`with_unit`] looks before it makes one.
-pub(crate) trait Unit: Copy + Send + Sync + 'static {
+pub(crate) trait Unit: Rounding + Send + Sync + 'static {
     /// What operands are stored as.
     type Element: Element;
 
@@ -61,23 +57,6 @@ pub(crate) trait Unit: Copy + Send + Sync + 'static {
         let turned: [[u32; LANES]; LANES] =
             std::array::from_fn(|step| std::array::from_fn(|column| block[column][step]));
         *block = turned;
-    }
-
-    /// The nearest bf16 of each of `values`, ties to even, into the first of `to`. A subnormal may become a 0 of its sign, which is
-    /// what such a unit's products take it for.
-    #[inline(always)]
-    fn round(self, values: &[f32], to: &mut [bf16]) {
-        for (to, &value) in to.iter_mut().zip(values) {
-            *to = bf16::of(value);
-        }
-    }
-
-    /// As [`Unit::round`], of two rows as pairs: `pairs` [columns, 2].
-    #[inline(always)]
-    fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
-        for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
-            (pair[0], pair[1]) = (bf16::of(first), bf16::of(second));
-        }
     }
 
     /// Runs `work` compiled for the unit's instructions, so that its loops use its registers.
