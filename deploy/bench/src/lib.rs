@@ -25,6 +25,7 @@
 mod alone;
 mod assemble;
 mod candle_baseline;
+mod durable;
 mod effort;
 mod env;
 pub mod flags;
@@ -81,7 +82,13 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
             alone(Component::Learner, flags, device, args.growth)
         }
         BenchCommand::Policy(flags) => alone(Component::Policy, flags, DeviceName::Cpu, false),
-        BenchCommand::Replay(flags) => alone(Component::Replay, flags, DeviceName::Cpu, false),
+        BenchCommand::Replay(args) => match &args.replay_dir {
+            Some(dir) => {
+                let figures = durable::measure(args, dir)?;
+                measurements::report("durable replay", &figures, machine, &args.flags)
+            }
+            None => alone(Component::Replay, &args.flags, DeviceName::Cpu, false),
+        },
         BenchCommand::Env(flags) => alone(Component::Env, flags, DeviceName::Cpu, false),
         BenchCommand::System(args) => {
             measurements::report("system", &system::measure(args)?, machine, &args.flags)
