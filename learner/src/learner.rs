@@ -76,7 +76,8 @@ impl Learner {
             config.learner.update.clone(),
             compute,
             &mut init,
-        )?;
+        )?
+        .with_equal_states(config.learner.equal_states);
         let affinity = config
             .learner
             .affinity
@@ -136,7 +137,9 @@ impl Learner {
             return Err(LearnerError::OtherAffinity(folder.to_owned()));
         }
         this.weights_version = restored.weights_version;
-        this.agent = restored.agent;
+        this.agent = restored
+            .agent
+            .with_equal_states(this.config.learner.equal_states);
         this.affinity = restored.affinity;
         this.rng = restored.rng;
         tracing::info!(

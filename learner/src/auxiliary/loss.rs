@@ -11,7 +11,13 @@ use super::{
     positives::Positives,
     settings::{AuxiliarySettings, Lambda},
 };
-use crate::{batch::Batch, error::UpdateError, losses::scores::Dots, tensors::states};
+use crate::{
+    batch::Batch,
+    error::UpdateError,
+    losses::scores::Dots,
+    repeats::{Distinct, EqualStates},
+    tensors::states,
+};
 
 /// An item of the menu: what is known of a loss before its settings are read.
 #[derive(Debug)]
@@ -111,7 +117,7 @@ pub struct OnlineFeatures {
 }
 
 impl OnlineFeatures {
-    /// Passes what `loss` needs of `batch` through `network`.
+    /// Passes what `loss` needs of `batch` through `network`; augmented states are taken for distinct, as each is drawn by itself.
     ///
     /// # Errors
     /// States that do not fit the network.
@@ -120,10 +126,27 @@ impl OnlineFeatures {
         model: &ModelConfig,
         loss: &dyn AuxiliaryLoss,
         batch: &Batch<'_>,
+        equal_states: EqualStates,
         device: &Device,
     ) -> Result<Self, UpdateError> {
         let later = loss.later_states(batch);
         let parts = [batch.states_t, batch.anchors.unwrap_or_default(), &later];
+        if batch.anchors.is_none() && equal_states.once_by(network.kernels()) {
+            let frames = parts.map(|part| part.chunks_exact(model.frame_len()));
+            let frames: Vec<_> = frames.into_iter().flatten().collect();
+            if let Some(distinct) = Distinct::of(&frames) {
+                let all = states(model, distinct.gather(&frames), device)?;
+                let features = network.features(&all)?;
+                let (now, later) = distinct.places().split_at(batch.rows);
+                let now = features.select(now)?;
+                let later = (!later.is_empty()).then(|| features.select(later));
+                return Ok(Self {
+                    anchors: now.clone(),
+                    now,
+                    later: later.transpose()?,
+                });
+            }
+        }
         let all = if parts[1..].iter().all(|part| part.is_empty()) {
             Cow::Borrowed(batch.states_t)
         } else {

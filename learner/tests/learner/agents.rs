@@ -4,8 +4,8 @@
 use std::{collections::BTreeMap, fs};
 
 use driml_learner::{
-    AffinityConfig, Agent, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner,
-    LearnerConfig, LearnerSettings, NetworkParameters, Objective, UpdateError,
+    AffinityConfig, Agent, AugmentSettings, Batch, Config, EqualStates, EstimatorKind, Lambda,
+    Learner, LearnerConfig, LearnerSettings, NetworkParameters, Objective, UpdateError,
 };
 use driml_model::{Compute, DimHeads, InputSize, ModelConfig, Parameters};
 use driml_protocol::{
@@ -420,6 +420,7 @@ fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConf
         },
         model,
         learner: Config {
+            equal_states: EqualStates::Once,
             precision: Default::default(),
             publish_as: Default::default(),
             batch_size: 6,
