@@ -24,7 +24,7 @@ use crate::{
         gradients::{Gradients, clip_factor},
         target,
     },
-    repeats::{Distinct, EqualStates},
+    repeats::{Distinct, EqualStates, State, one_after_another},
     settings::LearnerSettings,
     tensors::states,
 };
@@ -359,11 +359,9 @@ impl Agent {
         for probs in probs.chunks_exact_mut(atoms) {
             probs[0] = 1.0;
         }
-        let bootstraps: Vec<usize> = (0..batch.rows)
-            .filter(|&row| batch.bootstrap_discount[row] != 0.0)
-            .collect();
+        let bootstraps: Vec<usize> = batch.bootstraps().collect();
         if !bootstraps.is_empty() {
-            let (actions, logits) = self.next_greedy(batch, &bootstraps)?;
+            let (actions, logits) = self.next_greedy(batch)?;
             for ((&row, action), logits) in bootstraps
                 .iter()
                 .zip(actions)
@@ -390,24 +388,19 @@ impl Agent {
         Ok((next_greedy, projected))
     }
 
-    /// Greedy actions in s_{t+n} of these rows [n], and the target network's logits [n, N] of them.
-    fn next_greedy(
-        &self,
-        batch: &Batch<'_>,
-        rows: &[usize],
-    ) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
+    /// Greedy actions in s_{t+n} of the rows that bootstrap [n], and the target network's logits [n, N] of them.
+    fn next_greedy(&self, batch: &Batch<'_>) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
         let ModelConfig {
             num_actions, atoms, ..
         } = self.model;
         let len = self.model.frame_len();
-        let frames = rows.iter().map(|row| &batch.states_n[row * len..][..len]);
-        let frames: Vec<_> = frames.collect();
+        let frames: Vec<State<'_>> = batch.next_states(len).into_iter().map(Some).collect();
         let once = self.equal_states.once_by(self.compute.kernels);
         let distinct = once.then(|| Distinct::of(&frames)).flatten();
         let states_n = match &distinct {
-            Some(distinct) => Cow::Owned(distinct.gather(&frames)),
-            None if rows.len() == batch.rows => Cow::Borrowed(batch.states_n),
-            None => Cow::Owned(frames.concat()),
+            Some(distinct) => Cow::Owned(distinct.gather(&frames, len)),
+            None if batch.states_n.len() == frames.len() * len => Cow::Borrowed(batch.states_n),
+            None => Cow::Owned(one_after_another(frames.iter().copied(), len)),
         };
         let states_n = states(&self.model, states_n, &self.compute.device)?;
         let target_logits = distribution(&self.target_network, &states_n)?;
@@ -425,8 +418,8 @@ impl Agent {
         }
         let of_state: Vec<u8> = values.chunks_exact(num_actions).map(greedy).collect();
         let logits = flat(&target_logits)?;
-        let (mut actions, mut chosen) = (Vec::new(), Vec::with_capacity(rows.len() * atoms));
-        for row in 0..rows.len() {
+        let (mut actions, mut chosen) = (Vec::new(), Vec::with_capacity(frames.len() * atoms));
+        for row in 0..frames.len() {
             let state = distinct
                 .as_ref()
                 .map_or(row, |it| it.places()[row] as usize);

@@ -18,6 +18,9 @@ const PAYS_ONE_IN: usize = 32;
 /// States that one task looks at.
 const TASK_STATES: usize = 16;
 
+/// The bytes of a state; none of a blank one, which stands where there is no state.
+pub(crate) type State<'a> = Option<&'a [u8]>;
+
 /// What is done with equal states of a batch.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -48,17 +51,17 @@ pub(crate) struct Distinct {
 
 impl Distinct {
     /// That of `states`, if it pays to compute the distinct ones alone.
-    pub(crate) fn of(states: &[&[u8]]) -> Option<Self> {
+    pub(crate) fn of(states: &[State<'_>]) -> Option<Self> {
         let distinct = Self::find(states);
         (distinct.repeats() * PAYS_ONE_IN >= states.len() && distinct.repeats() > 0)
             .then_some(distinct)
     }
 
-    fn find(states: &[&[u8]]) -> Self {
+    fn find(states: &[State<'_>]) -> Self {
         let sums: Vec<u32> = states
             .par_iter()
             .with_min_len(TASK_STATES)
-            .map(|state| crc32fast::hash(state))
+            .map(|state| state.map_or(0, crc32fast::hash))
             .collect();
         let mut distinct = Self {
             firsts: Vec::with_capacity(states.len()),
@@ -84,9 +87,8 @@ impl Distinct {
     }
 
     /// The distinct ones of the pass's `states`, one after the other.
-    pub(crate) fn gather(&self, states: &[&[u8]]) -> Vec<u8> {
-        let firsts: Vec<_> = self.firsts.iter().map(|&first| states[first]).collect();
-        firsts.concat()
+    pub(crate) fn gather(&self, states: &[State<'_>], state_bytes: usize) -> Vec<u8> {
+        one_after_another(self.firsts.iter().map(|&first| states[first]), state_bytes)
     }
 
     /// Of each state of the pass its place among the distinct ones.
@@ -95,42 +97,62 @@ impl Distinct {
     }
 }
 
+/// The bytes of `states` of this length.
+pub(crate) fn one_after_another<'a>(
+    states: impl ExactSizeIterator<Item = State<'a>>,
+    state_bytes: usize,
+) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(states.len() * state_bytes);
+    for state in states {
+        match state {
+            Some(state) => bytes.extend_from_slice(state),
+            None => bytes.resize(bytes.len() + state_bytes, 0),
+        }
+    }
+    bytes
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn states_that_repeat_are_found() {
-        let states: Vec<&[u8]> = vec![&[1, 1], &[2, 2], &[1, 1], &[3, 3], &[2, 2], &[1, 1]];
+        let states: Vec<State<'_>> = [Some([1, 1]), None, Some([2, 2]), Some([1, 1]), None]
+            .iter()
+            .map(|state| state.as_ref().map(|it: &[u8; 2]| &it[..]))
+            .collect();
         let distinct = Distinct::of(&states).unwrap();
-        assert_eq!(distinct.firsts, [0, 1, 3]);
-        assert_eq!(distinct.places(), [0, 1, 0, 2, 1, 0]);
-        assert_eq!(distinct.repeats(), 3);
-        assert_eq!(distinct.gather(&states), [1, 1, 2, 2, 3, 3]);
+        assert_eq!(distinct.firsts, [0, 1, 2]);
+        assert_eq!(distinct.places(), [0, 1, 2, 0, 1]);
+        assert_eq!(distinct.repeats(), 2);
+        assert_eq!(distinct.gather(&states, 2), [1, 1, 0, 0, 2, 2]);
     }
 
     #[test]
     fn states_of_one_checksum_are_told_apart() {
         // "plumless" and "buckeroo" have the same CRC-32.
-        let states: Vec<&[u8]> = vec![b"plumless", b"buckeroo", b"plumless", b"buckeroo"];
-        assert_eq!(crc32fast::hash(states[0]), crc32fast::hash(states[1]));
+        let [a, b] = [b"plumless", b"buckeroo"].map(|it| Some(&it[..]));
+        let states = [a, b, a, b];
+        assert_eq!(crc32fast::hash(b"plumless"), crc32fast::hash(b"buckeroo"));
         let distinct = Distinct::of(&states).unwrap();
         assert_eq!(distinct.places(), [0, 1, 0, 2]);
-        assert_eq!(distinct.gather(&states), *b"plumlessbuckeroobuckeroo");
+        assert_eq!(distinct.gather(&states, 8), *b"plumlessbuckeroobuckeroo");
     }
 
     #[test]
     fn few_repeats_are_not_worth_it() {
         let numbers: Vec<u16> = (0..200).collect();
         let bytes: Vec<[u8; 2]> = numbers.iter().map(|number| number.to_le_bytes()).collect();
-        let mut states: Vec<&[u8]> = bytes.iter().map(|bytes| &bytes[..]).collect();
+        let mut states: Vec<State<'_>> = bytes.iter().map(|bytes| Some(&bytes[..])).collect();
         assert_eq!(Distinct::of(&states), None);
         assert_eq!(Distinct::of(&[]), None);
-        for repeated in 0..states.len() / PAYS_ONE_IN {
+        let enough = states.len().div_ceil(PAYS_ONE_IN);
+        for repeated in 1..enough {
             states[100 + repeated] = states[0];
         }
         assert_eq!(Distinct::of(&states), None);
         states[150] = states[0];
-        assert_eq!(Distinct::of(&states).unwrap().repeats(), 7);
+        assert_eq!(Distinct::of(&states).unwrap().repeats(), enough);
     }
 }

@@ -25,8 +25,8 @@ pub struct RowShares {
     pub without_bootstrap: f64,
     /// Positives that their rows do not have; 0 where none is served.
     pub without_positive: f64,
-    /// Bytes of a batch that are zeros in place of states that its rows do not have.
-    pub zero_bytes: f64,
+    /// Bytes that a batch would have if every row had all of its states, and does not have.
+    pub absent_bytes: f64,
     /// Of a batch's states s_t and s_{t+k}, those that are equal to another of them.
     pub repeated_online: f64,
     /// Of a batch's states s_{t+n}, those that are equal to another of them.
@@ -38,7 +38,7 @@ pub struct RowShares {
 struct Counts {
     rows: usize,
     bytes: usize,
-    zero_bytes: usize,
+    absent_bytes: usize,
     without_bootstrap: usize,
     positives: usize,
     without_positive: usize,
@@ -74,24 +74,20 @@ impl Counts {
     fn count(&mut self, batch: &Batch) {
         let state_bytes = batch.header.state_bytes as usize;
         let (discounts, valid) = (batch.bootstrap_discounts(), batch.positive_valid());
-        let is_there = |there: &bool| *there;
-        let bootstraps = discounts.iter().map(|&discount| discount > 0.0);
-        let positives = valid.iter().map(|&valid| valid != 0);
-        let no_bootstrap = batch.rows() - bootstraps.clone().filter(is_there).count();
-        let no_positive = valid.len() - positives.clone().filter(is_there).count();
+        let no_bootstrap = discounts.iter().filter(|discount| **discount == 0.0);
+        let no_bootstrap = no_bootstrap.count();
+        let no_positive = valid.iter().filter(|valid| **valid == 0).count();
+        let absent_bytes = (no_bootstrap + no_positive) * state_bytes;
         self.rows += batch.rows();
-        self.bytes += batch.header.payload_bytes();
-        self.zero_bytes += (no_bootstrap + no_positive) * state_bytes;
+        self.bytes += batch.header.payload_bytes() + absent_bytes;
+        self.absent_bytes += absent_bytes;
         self.without_bootstrap += no_bootstrap;
         self.positives += valid.len();
         self.without_positive += no_positive;
-        let later = batch.states_k().chunks_exact(state_bytes).zip(positives);
-        let later = later.filter(|(_, there)| *there).map(|(state, _)| state);
-        self.online
-            .count(batch.states_t().chunks_exact(state_bytes).chain(later));
-        let next = batch.states_n().chunks_exact(state_bytes).zip(bootstraps);
-        self.target
-            .count(next.filter(|(_, there)| *there).map(|(state, _)| state));
+        let [now, later, next] = [batch.states_t(), batch.states_k(), batch.states_n()]
+            .map(|plane| plane.chunks_exact(state_bytes));
+        self.online.count(now.chain(later));
+        self.target.count(next);
     }
 }
 
@@ -149,7 +145,7 @@ fn shares(counts: &Counts, replay: &Replay) -> RowShares {
         rows: counts.rows as u64,
         without_bootstrap: share(counts.without_bootstrap, counts.rows),
         without_positive: share(counts.without_positive, counts.positives),
-        zero_bytes: share(counts.zero_bytes, counts.bytes),
+        absent_bytes: share(counts.absent_bytes, counts.bytes),
         repeated_online: counts.online.share(),
         repeated_target: counts.target.share(),
     }
@@ -157,7 +153,7 @@ fn shares(counts: &Counts, replay: &Replay) -> RowShares {
 
 #[cfg(test)]
 mod tests {
-    use driml_protocol::BatchHeader;
+    use driml_protocol::{BatchHeader, Buffer, RowScalars};
 
     use super::*;
 
@@ -167,28 +163,36 @@ mod tests {
             rows: 4,
             positives: 1,
             state_bytes: 2,
+            states_k: 0,
+            states_n: 0,
             tally: Default::default(),
             held: 0,
             mean_age: 0.0,
             weights_versions: (0, 0),
         };
-        let mut batch = Batch::zeroed(header);
-        let mut rows = batch.rows_mut();
-        for (row, (now, next, later)) in [
+        let states = [
             ([1, 1], Some([9, 9]), Some([2, 2])),
             ([1, 1], Some([9, 9]), Some([1, 1])),
             ([3, 3], Some([9, 8]), None),
             ([4, 4], None, None),
-        ]
-        .into_iter()
-        .enumerate()
-        {
-            rows.state_t(row).copy_from_slice(&now);
-            rows.set(row, 0, 0, 0.0, if next.is_some() { 0.9 } else { 0.0 });
-            rows.state_n(row).copy_from_slice(&next.unwrap_or_default());
-            match later {
-                Some(state) => rows.positive(0, row, 1).copy_from_slice(&state),
-                None => rows.no_positive(0, row),
+        ];
+        let rows = states.map(|(_, next, later)| RowScalars {
+            action: 0,
+            next_action: 0,
+            n_step_return: 0.0,
+            bootstrap_discount: if next.is_some() { 0.9 } else { 0.0 },
+            positives: later.iter().len() as u32,
+            k_first: 1,
+        });
+        let mut batch = Batch::of_rows(header, &rows, Buffer::zeroed);
+        let mut places = batch.states_mut();
+        for (row, (now, next, later)) in states.into_iter().enumerate() {
+            places.t(row).copy_from_slice(&now);
+            if let (Some(place), Some(next)) = (places.n(row), next) {
+                place.copy_from_slice(&next);
+            }
+            if let (Some(place), Some(later)) = (places.k(0, row), later) {
+                place.copy_from_slice(&later);
             }
         }
         let mut counts = Counts::default();
@@ -200,6 +204,6 @@ mod tests {
         assert_eq!((counts.online.states, counts.online.repeated), (12, 4));
         assert_eq!((counts.target.states, counts.target.repeated), (6, 2));
         assert_eq!(counts.bytes, 2 * 4 * (3 * 2 + 12));
-        assert_eq!(counts.zero_bytes, 2 * 3 * 2);
+        assert_eq!(counts.absent_bytes, 2 * 3 * 2);
     }
 }

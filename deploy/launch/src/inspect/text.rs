@@ -31,7 +31,7 @@ pub(super) fn played(shares: &RowShares) -> String {
         rows,
         without_bootstrap,
         without_positive,
-        zero_bytes,
+        absent_bytes,
         repeated_online,
         repeated_target,
     } = *shares;
@@ -42,14 +42,14 @@ pub(super) fn played(shares: &RowShares) -> String {
     );
     let lines = [
         (
-            "bootstrap from nothing: their s_{t+n} is zeros",
+            "bootstrap from nothing: they have no s_{t+n}",
             without_bootstrap,
         ),
+        ("positives that rows do not have", without_positive),
         (
-            "positives that rows do not have: zeros too",
-            without_positive,
+            "of a batch's bytes do not travel, as rows do not have these states",
+            absent_bytes,
         ),
-        ("of a batch's bytes are these zeros", zero_bytes),
         (
             "of s_t and s_{t+k} are equal to another of the batch",
             repeated_online,

@@ -21,7 +21,7 @@ const HEADINGS: [&str; 7] = [
 const PLAYED: [&str; 6] = [
     "no bootstrap",
     "no positive",
-    "zeros in a batch",
+    "bytes of a batch that do not travel",
     "s_t, s_{t+k} that repeat",
     "s_{t+n} that repeat",
     "rows",
@@ -101,7 +101,7 @@ fn played_cells(shares: RowShares) -> Vec<String> {
         rows,
         without_bootstrap,
         without_positive,
-        zero_bytes,
+        absent_bytes,
         repeated_online,
         repeated_target,
         ..
@@ -109,7 +109,7 @@ fn played_cells(shares: RowShares) -> Vec<String> {
     let percents = [
         without_bootstrap,
         without_positive,
-        zero_bytes,
+        absent_bytes,
         repeated_online,
         repeated_target,
     ];

@@ -59,11 +59,13 @@ impl CustomOp1 for Select {
         let len: usize = dims[1..].iter().product();
         dims[0] = self.rows.len();
         let x = floats(x, layout)?;
-        let parts = self.rows.par_chunks(TASK_ROWS).map(|rows| {
-            let rows = rows.iter().map(|&row| &x[row as usize * len..][..len]);
-            rows.collect::<Vec<_>>().concat()
-        });
-        Ok((CpuStorage::F32(parts.flatten_iter().collect()), dims.into()))
+        let mut selected = vec![0.0; self.rows.len() * len];
+        selected
+            .par_chunks_mut(len.max(1))
+            .zip(&self.rows)
+            .with_min_len(TASK_ROWS)
+            .for_each(|(to, &row)| to.copy_from_slice(&x[row as usize * len..][..len]));
+        Ok((CpuStorage::F32(selected), dims.into()))
     }
 
     fn bwd(&self, x: &Tensor, _selected: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
