@@ -33,6 +33,11 @@ pub enum EqualStates {
 }
 
 impl EqualStates {
+    /// Whether a pass of so many `states`, of which `repeats` are equal to one before them, is made shorter.
+    pub const fn pays(repeats: usize, states: usize) -> bool {
+        repeats > 0 && repeats * PAYS_ONE_IN >= states
+    }
+
     /// Whether it is to be tried where a network computes with `kernels`. Another device's arithmetic takes less time than the CPU's
     /// checksums.
     pub(crate) fn once_by(self, kernels: Kernels) -> bool {
@@ -53,8 +58,7 @@ impl Distinct {
     /// That of `states`, if it pays to compute the distinct ones alone.
     pub(crate) fn of(states: &[State<'_>]) -> Option<Self> {
         let distinct = Self::find(states);
-        (distinct.repeats() * PAYS_ONE_IN >= states.len() && distinct.repeats() > 0)
-            .then_some(distinct)
+        EqualStates::pays(distinct.repeats(), states.len()).then_some(distinct)
     }
 
     fn find(states: &[State<'_>]) -> Self {

@@ -1,7 +1,7 @@
 //! Updates of the learner at the paper's sizes, and one of them by candle's stock operations.
 //! Batches are made up: nothing but the arithmetic is measured.
 
-use driml_learner::{Agent, Batch, Compute, DeviceName, EqualStates, Precision};
+use driml_learner::{Agent, Batch, Compute, DeviceName, EqualStates, Precision, UpdateError};
 use driml_settings::config::RunConfig;
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -86,26 +86,32 @@ pub(super) fn measure(
     Ok(figures)
 }
 
-/// Updates a second where states of a batch repeat.
+/// Updates a second where states of a batch repeat, in turn.
 fn repeats(effort: &Effort, precision: Precision) -> anyhow::Result<Vec<Measurement>> {
     let config = settings::of_run(settings::WORLD, "driml-ada", "paper", &[])?;
-    let mut figures = Vec::new();
-    for (share, equal_states, what) in REPEATS {
+    let compute = Compute::cpu(precision);
+    let mut updates = Vec::new();
+    for (share, equal_states, _) in REPEATS {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let mut rows = SyntheticBatch::draw(&config, &mut rng);
         rows.repeat(share);
         let (model, update) = (config.model.clone(), config.learner.update.clone());
-        let compute = Compute::cpu(precision);
         let mut learner =
             Agent::new(model, update, &compute, &mut rng)?.with_equal_states(equal_states);
-        let batch = rows.batch();
-        let rate = effort.rate_by_median(|| learner.update(&batch).map(drop))?;
-        let name = format!("C51 + global-global DIM, 60x60x3, {what}");
-        figures.push(Measurement::found(
-            named(&name, precision),
-            rate,
-            "updates/s",
-        ));
+        updates.push(move |_: usize| learner.update(&rows.batch()).map(drop));
+    }
+    let mut works: Vec<&mut dyn FnMut(usize) -> Result<(), UpdateError>> = Vec::new();
+    for update in &mut updates {
+        works.push(update);
+    }
+    let rates = effort.rates_in_turn(&mut works)?;
+    let mut figures = Vec::new();
+    for ((_, _, what), rate) in REPEATS.into_iter().zip(rates) {
+        let name = named(
+            format!("C51 + global-global DIM, 60x60x3, {what}"),
+            precision,
+        );
+        figures.push(Measurement::found(name, rate, "updates/s"));
     }
     Ok(figures)
 }

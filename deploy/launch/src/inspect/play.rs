@@ -5,7 +5,7 @@ use std::collections::HashSet;
 
 use anyhow::bail;
 use driml_actor::{ActorSettings, Collector, Incarnation};
-use driml_learner::{Compute, Learner, LearnerConfig};
+use driml_learner::{Compute, EqualStates, Learner, LearnerConfig, Positives};
 use driml_protocol::{ActorJoin, Batch, BufferPool, InsertReply};
 use driml_replay_server::{Replay, Unready};
 use driml_settings::config::RunConfig;
@@ -31,6 +31,10 @@ pub struct RowShares {
     pub repeated_online: f64,
     /// Of a batch's states s_{t+n}, those that are equal to another of them.
     pub repeated_target: f64,
+    /// States that pass through the online network for their features, of those that would if none were left out.
+    pub computed_online: f64,
+    /// The same of states s_{t+n} and the target network.
+    pub computed_target: f64,
 }
 
 /// What is counted of batches.
@@ -48,21 +52,54 @@ struct Counts {
 
 #[derive(Default)]
 struct Repeats {
+    /// States that there are.
     states: usize,
     repeated: usize,
+    /// Places for states, also for those that rows do not have.
+    places: usize,
+    computed: usize,
 }
 
 impl Repeats {
-    fn count<'a>(&mut self, states: impl Iterator<Item = &'a [u8]>) {
-        let mut seen = HashSet::new();
+    /// Counts the states of a pass and what a learner computes of them. `blank` of them stand for states that rows do not have.
+    fn count<'a>(
+        &mut self,
+        states: impl Iterator<Item = &'a [u8]>,
+        learner: &Learning,
+        blank: usize,
+    ) {
+        let (mut seen, mut there) = (HashSet::new(), 0);
         for state in states {
-            self.states += 1;
-            self.repeated += usize::from(!seen.insert(state));
+            there += 1;
+            seen.insert(state);
         }
+        self.states += there;
+        self.repeated += there - seen.len();
+        let passed = there + blank;
+        let distinct = seen.len() + usize::from(blank > 0);
+        let shorter = learner.equal_once && EqualStates::pays(passed - distinct, passed);
+        self.computed += if shorter { distinct } else { passed };
     }
 
     fn share(&self) -> f64 {
         share(self.repeated, self.states)
+    }
+}
+
+/// What decides which states a learner computes.
+struct Learning {
+    /// Equal states once, where states are not augmented each by itself.
+    equal_once: bool,
+    /// A blank state is computed where a row has no positive, so that row meets row.
+    blank_positives: bool,
+}
+
+impl Learning {
+    fn of(config: &driml_learner::Config) -> Self {
+        Self {
+            equal_once: config.equal_states == EqualStates::Once && config.augment.is_none(),
+            blank_positives: config.update.objective.positives() == Positives::One,
+        }
     }
 }
 
@@ -71,7 +108,7 @@ fn share(some: usize, all: usize) -> f64 {
 }
 
 impl Counts {
-    fn count(&mut self, batch: &Batch) {
+    fn count(&mut self, batch: &Batch, learner: &Learning) {
         let state_bytes = batch.header.state_bytes as usize;
         let (discounts, valid) = (batch.bootstrap_discounts(), batch.positive_valid());
         let no_bootstrap = discounts.iter().filter(|discount| **discount == 0.0);
@@ -86,8 +123,15 @@ impl Counts {
         self.without_positive += no_positive;
         let [now, later, next] = [batch.states_t(), batch.states_k(), batch.states_n()]
             .map(|plane| plane.chunks_exact(state_bytes));
-        self.online.count(now.chain(later));
-        self.target.count(next);
+        let blank = if learner.blank_positives {
+            no_positive
+        } else {
+            0
+        };
+        self.online.places += batch.rows() + valid.len();
+        self.online.count(now.chain(later), learner, blank);
+        self.target.places += batch.rows();
+        self.target.count(next, learner, 0);
     }
 }
 
@@ -96,6 +140,22 @@ impl Counts {
 /// # Errors
 /// A world that cannot be had or fails, a replay that refuses.
 pub(super) fn play(config: &RunConfig) -> anyhow::Result<RowShares> {
+    let (mut counts, learner) = (Counts::default(), Learning::of(&config.learner));
+    let frames = each_batch(config, |batch| {
+        counts.count(&batch, &learner);
+        true
+    })?;
+    Ok(shares(&counts, frames))
+}
+
+/// Plays a run of these settings until `take` has enough batches or the run ends, and gives the frames that were played.
+///
+/// # Errors
+/// A world that cannot be had or fails, a replay that refuses.
+pub(super) fn each_batch(
+    config: &RunConfig,
+    mut take: impl FnMut(Batch) -> bool,
+) -> anyhow::Result<u64> {
     let text = config.to_toml();
     let settings = ActorSettings::from_toml(&text)?;
     let (rows, steps) = (config.learner.batch_size, config.actor.steps_per_chunk);
@@ -115,14 +175,17 @@ pub(super) fn play(config: &RunConfig) -> anyhow::Result<RowShares> {
     };
     let (pool, version) = (BufferPool::new(1), weights.header.version);
     let mut actor = Collector::new(settings, pool, life, version, &weights.safetensors)?;
-    let mut counts = Counts::default();
     loop {
         let chunk = actor.collect(replay.inserted_total(), steps)?;
         loop {
             match replay.insert(&chunk) {
                 InsertReply::Stored { .. } | InsertReply::Finished { .. } => break,
                 InsertReply::Wait { .. } => match replay.sample(rows) {
-                    Ok(batch) => counts.count(&batch),
+                    Ok(batch) => {
+                        if !take(batch) {
+                            return Ok(replay.inserted_total());
+                        }
+                    }
                     Err(unready) => bail!("actor and replay wait for each other: {unready:?}"),
                 },
                 refused => bail!("the replay refused a chunk: {refused:?}"),
@@ -130,24 +193,30 @@ pub(super) fn play(config: &RunConfig) -> anyhow::Result<RowShares> {
         }
         loop {
             match replay.sample(rows) {
-                Ok(batch) => counts.count(&batch),
+                Ok(batch) => {
+                    if !take(batch) {
+                        return Ok(replay.inserted_total());
+                    }
+                }
                 Err(Unready::Wait(_)) => break,
-                Err(Unready::Finished) => return Ok(shares(&counts, &replay)),
+                Err(Unready::Finished) => return Ok(replay.inserted_total()),
                 Err(Unready::Refused { why }) => bail!("the replay refuses to sample: {why}"),
             }
         }
     }
 }
 
-fn shares(counts: &Counts, replay: &Replay) -> RowShares {
+fn shares(counts: &Counts, frames: u64) -> RowShares {
     RowShares {
-        frames: replay.inserted_total(),
+        frames,
         rows: counts.rows as u64,
         without_bootstrap: share(counts.without_bootstrap, counts.rows),
         without_positive: share(counts.without_positive, counts.positives),
         absent_bytes: share(counts.absent_bytes, counts.bytes),
         repeated_online: counts.online.share(),
         repeated_target: counts.target.share(),
+        computed_online: share(counts.online.computed, counts.online.places),
+        computed_target: share(counts.target.computed, counts.target.places),
     }
 }
 
@@ -196,13 +265,24 @@ mod tests {
             }
         }
         let mut counts = Counts::default();
-        counts.count(&batch);
-        counts.count(&batch);
+        let learner = Learning {
+            equal_once: true,
+            blank_positives: true,
+        };
+        counts.count(&batch, &learner);
+        let each = Learning {
+            equal_once: false,
+            blank_positives: false,
+        };
+        counts.count(&batch, &each);
         assert_eq!((counts.rows, counts.without_bootstrap), (8, 2));
         assert_eq!((counts.positives, counts.without_positive), (8, 4));
         // Of 1, 1, 3, 4, 2, 1 two are repeated, of 99, 99, 98 one.
         assert_eq!((counts.online.states, counts.online.repeated), (12, 4));
         assert_eq!((counts.target.states, counts.target.repeated), (6, 2));
+        // At first 1, 3, 4, 2 and a blank one are computed for eight places, then each of the six that are there.
+        assert_eq!((counts.online.places, counts.online.computed), (16, 5 + 6));
+        assert_eq!((counts.target.places, counts.target.computed), (8, 2 + 3));
         assert_eq!(counts.bytes, 2 * 4 * (3 * 2 + 12));
         assert_eq!(counts.absent_bytes, 2 * 3 * 2);
     }

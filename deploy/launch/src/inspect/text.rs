@@ -34,6 +34,8 @@ pub(super) fn played(shares: &RowShares) -> String {
         absent_bytes,
         repeated_online,
         repeated_target,
+        computed_online,
+        computed_target,
     } = *shares;
     let heading = format!(
         "{} rows of batches, from {} frames played with the first weights",
@@ -57,6 +59,14 @@ pub(super) fn played(shares: &RowShares) -> String {
         (
             "of s_{t+n} are equal to another of the batch",
             repeated_target,
+        ),
+        (
+            "of places for s_t and s_{t+k} are computed: equal states once, where it pays (learner.equal_states)",
+            computed_online,
+        ),
+        (
+            "of places for s_{t+n} are computed: equal states once, and none of rows that bootstrap from nothing",
+            computed_target,
         ),
     ];
     let lines = lines.map(|(what, share)| format!("{:>6.2}%  {what}\n", 100.0 * share));
