@@ -33,9 +33,19 @@ const CASES: [(&str, &str, &str, &[&str]); 4] = [
 /// The update that candle's stock operations do too.
 const GLOBAL_DIM: &str = "C51 + global-global DIM, 64x64x3";
 /// That update where this share of s_t and s_{t+k}, and of s_{t+n}, repeats another state; what is done with them.
-const REPEATS: [(f64, EqualStates, &str); 4] = [
+const REPEATS: [(f64, EqualStates, &str); 6] = [
     (0.0, EqualStates::Each, "no states repeat, each computed"),
     (0.0, EqualStates::Once, "no states repeat, equal ones once"),
+    (
+        0.04,
+        EqualStates::Each,
+        "4% of states repeat, each computed",
+    ),
+    (
+        0.04,
+        EqualStates::Once,
+        "4% of states repeat, equal ones once",
+    ),
     (
         0.38,
         EqualStates::Each,
