@@ -38,8 +38,9 @@ mod wire;
 pub use client::{Announcer, PendingReply, RunClient, Sealed};
 pub use messages::{
     affinity::AffinityUpdate,
-    batch::{Batch, BatchHeader, BatchReply, BatchRowsMut, NO_ACTION, POOL_BATCHES},
+    batch::{Batch, BatchHeader, BatchReply, NO_ACTION, POOL_BATCHES},
     batch_request::{BatchRequest, RequestId},
+    batch_rows::{BatchStatesMut, RowScalars},
     chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES},
     done::Done,
     goodbye::Goodbye,

@@ -5,6 +5,7 @@ pub(crate) mod affinity;
 pub(crate) mod batch;
 mod batch_layout;
 pub(crate) mod batch_request;
+pub(crate) mod batch_rows;
 pub(crate) mod chunk;
 pub(crate) mod done;
 pub(crate) mod goodbye;

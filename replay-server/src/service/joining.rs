@@ -12,6 +12,10 @@ impl Service {
     pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {
         let (mut state, is_connected) = (self.state(), kind == SampleKind::Put);
         state.members.note(who, is_connected);
+        // A part that this server's predecessor took, whose replay it goes on with, does not join again.
+        if state.takes_part(who) {
+            state.open_account(who);
+        }
         state
             .accounts
             .note_connected(who, is_connected, Instant::now());
@@ -86,6 +90,16 @@ impl State {
     fn count_actors(&mut self) {
         let actors = self.members.actors(&self.replay);
         self.replay.set_actors(actors);
+    }
+
+    /// Whether this life of a part is the one that takes part.
+    fn takes_part(&self, who: Alive) -> bool {
+        match who {
+            Alive::Actor { actor, incarnation } => {
+                self.replay.actor_incarnation(actor) == Some(incarnation)
+            }
+            Alive::Learner(learner) => self.replay.learner() == Some(learner),
+        }
     }
 
     /// Whether `learner` is the one that is served.
