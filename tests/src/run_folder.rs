@@ -40,6 +40,8 @@ pub struct Summary {
     pub chunks_retried: u64,
     #[serde(default)]
     pub replay_servers_restarted: u32,
+    /// How often an actor that had died was started again.
+    pub actors_restarted: u32,
     pub messages_refused: u64,
 }
 

@@ -25,7 +25,7 @@ use crate::{
     meeting::Meeting,
     processes::{Processes, stop},
     resume,
-    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     status_client::Statuses,
 };
 
@@ -45,6 +45,8 @@ const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
 /// How often replay servers that keep their replay on disk are started again in a run, all together.
 const RESTARTS_MAX: u32 = 8;
+/// How often actors that have died are started again in one run, all together; one more is an error.
+const ACTOR_RESTARTS_MAX: u32 = 16;
 /// How often a learner that saves is asked whether it is done.
 const DRAIN_POLL: Duration = Duration::from_millis(100);
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
@@ -89,6 +91,7 @@ pub fn run(
     if let Some(listen) = listen {
         endpoints[0] = listen;
     }
+    write_whole(&run_dir.endpoints(), endpoints.join("\n").as_bytes())?;
     let screen = Screen::new(config.frames(), TEMPLATE);
     let display = Display::new(
         screen.clone(),
@@ -108,6 +111,7 @@ pub fn run(
         interrupts,
         processes: Processes::default(),
         restarts: 0,
+        actor_restarts: 0,
         statuses: None,
     };
 
@@ -122,6 +126,10 @@ pub fn run(
         _ => Outcome::Failed,
     };
     let (summary, written) = launch.conclude(&mut recorder, outcome);
+    // Nobody is there any more who could be asked; where this file is left, the lock tells.
+    if let Err(e) = std::fs::remove_file(run_dir.endpoints()) {
+        tracing::debug!("removing {}: {e}", run_dir.endpoints().display());
+    }
     if let Err(failed) = ran.and(ended) {
         // It is what the run is remembered by; that the disk is full too is said before.
         if let Err(e) = written {
@@ -165,6 +173,8 @@ struct Launch<'a> {
     processes: Processes,
     /// How often a replay server that had died was started again.
     restarts: u32,
+    /// How often an actor was.
+    actor_restarts: u32,
     statuses: Option<Statuses>,
 }
 
@@ -219,21 +229,45 @@ impl Launch<'_> {
             self.surroundings(&logs),
         )?);
         for id in 0..self.config.local.actors {
-            let args = words(&[
-                "actor",
-                "--connect",
-                &self.endpoints[id as usize % self.endpoints.len()],
-                "--id",
-                &id.to_string(),
-            ]);
-            self.processes.actors.push(ManagedProcess::start(
-                &format!("actor-{id}"),
-                &args,
-                PROCESS_THREADS,
-                self.surroundings(&logs),
-            )?);
+            let actor = self.start_actor(id)?;
+            self.processes.actors.push(actor);
         }
         self.watch(recorder)
+    }
+
+    fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
+        let args = words(&[
+            "actor",
+            "--connect",
+            &self.endpoints[id as usize % self.endpoints.len()],
+            "--id",
+            &id.to_string(),
+        ]);
+        let logs = self.run_dir.logs();
+        let name = format!("actor-{id}");
+        ManagedProcess::start(&name, &args, PROCESS_THREADS, self.surroundings(&logs))
+    }
+
+    /// Starts actors that have died again. What one had not delivered is gone with it; the run goes on.
+    ///
+    /// # Errors
+    /// The process cannot be started.
+    fn revive_actors(&mut self) -> anyhow::Result<()> {
+        for id in 0..self.processes.actors.len() {
+            let actor = &mut self.processes.actors[id];
+            if self.actor_restarts == ACTOR_RESTARTS_MAX || !actor.may_be_started_again() {
+                continue;
+            }
+            self.actor_restarts += 1;
+            let report = actor.exit_report();
+            self.screen.line(&format!(
+                "{report}\nactor-{id} is started again ({} of {ACTOR_RESTARTS_MAX} times in a run)",
+                self.actor_restarts
+            ));
+            session::sweep_shared_memory();
+            self.processes.actors[id] = self.start_actor(id as u32)?;
+        }
+        Ok(())
     }
 
     /// Starts the replay server of one shard, in a run that goes on after so many updates.
@@ -299,6 +333,7 @@ impl Launch<'_> {
                 return Ok(Outcome::Interrupted);
             }
             self.revive_servers()?;
+            self.revive_actors()?;
             self.processes.check_alive()?;
             let statuses = self
                 .statuses
@@ -442,6 +477,7 @@ impl Launch<'_> {
         missing.for_each(|line| console::line(&line));
         let mut summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);
         summary.replay_servers_restarted = self.restarts;
+        summary.actors_restarted = self.actor_restarts;
         let written = summary.write(self.run_dir);
         (summary, written)
     }

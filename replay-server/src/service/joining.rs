@@ -1,6 +1,8 @@
 //! Parts that join: what they are told of the run, and whether they are let in.
 //! Who is connected and who is served is kept in `members`.
 
+use std::time::Instant;
+
 use driml_protocol::{ActorJoin, Alive, Hello, Incoming, JoinReply, LearnerJoin, Responder};
 use zenoh::sample::SampleKind;
 
@@ -8,8 +10,15 @@ use super::server::{Service, State};
 
 impl Service {
     pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {
-        let mut state = self.state();
-        state.members.note(who, kind == SampleKind::Put);
+        let (mut state, is_connected) = (self.state(), kind == SampleKind::Put);
+        state.members.note(who, is_connected);
+        // A part that this server's predecessor took, whose replay it goes on with, does not join again.
+        if state.takes_part(who) {
+            state.open_account(who);
+        }
+        state
+            .accounts
+            .note_connected(who, is_connected, Instant::now());
         state.count_actors();
     }
 
@@ -83,6 +92,16 @@ impl State {
         self.replay.set_actors(actors);
     }
 
+    /// Whether this life of a part is the one that takes part.
+    fn takes_part(&self, who: Alive) -> bool {
+        match who {
+            Alive::Actor { actor, incarnation } => {
+                self.replay.actor_incarnation(actor) == Some(incarnation)
+            }
+            Alive::Learner(learner) => self.replay.learner() == Some(learner),
+        }
+    }
+
     /// Whether `learner` is the one that is served.
     ///
     /// # Errors
@@ -116,6 +135,7 @@ impl State {
             )));
         }
         let earlier_incarnations = self.replay.join_actor(join).map_err(Rejection::Refused)?;
+        self.open_account(Alive::Actor { actor, incarnation });
         self.count_actors();
         if other.is_some() {
             // A chunk that was left behind.
@@ -141,7 +161,13 @@ impl State {
                 .learner_starts(learner, rows_sampled)
                 .map_err(Rejection::Refused)?;
             self.requests.keep_only(learner);
+            self.open_account(Alive::Learner(learner));
         }
         Ok(0)
+    }
+
+    fn open_account(&mut self, who: Alive) {
+        let is_connected = self.members.connected.contains(&who);
+        self.accounts.joined(who, is_connected, Instant::now());
     }
 }

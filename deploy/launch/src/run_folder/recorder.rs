@@ -257,6 +257,7 @@ impl RunRecorder {
             chunks_retried: replay.chunks_retried,
             batches_retried: replay.batches_retried,
             replay_servers_restarted: 0,
+            actors_restarted: 0,
             replay_frame_mib: replay.frame_bytes_held.div_ceil(1 << 20),
             messages_refused: replay.messages_refused,
             insert_ms: replay.insert_ms,
