@@ -40,6 +40,8 @@ pub(super) struct Journal {
     /// Number of the next record.
     ordinal: u64,
     limits: Limits,
+    /// Bytes of the largest record so far, by which a segment may become larger than it should.
+    largest: u64,
     syncer: Syncer,
     /// Records that the disk has refused so far; nothing is written before them.
     pending: Vec<u8>,
@@ -120,6 +122,7 @@ impl Journal {
             file,
             ordinal: ordinal + 1,
             limits,
+            largest: 0,
             syncer,
             pending: Vec::new(),
             failing: None,
@@ -198,7 +201,8 @@ impl Journal {
     /// Writes at the end of the newest segment; on an error the segment ends where it did.
     fn write(&mut self, record: &[u8], payload: &[u8]) -> io::Result<()> {
         let at = self.newest().bytes;
-        let end = at + (record.len() + payload.len()) as u64;
+        let bytes = (record.len() + payload.len()) as u64;
+        self.largest = self.largest.max(bytes);
         let written = self
             .file
             .write_all_at(record, at)
@@ -211,7 +215,7 @@ impl Journal {
             }
             return written;
         }
-        self.newest().bytes = end;
+        self.newest().bytes = at + bytes;
         Ok(())
     }
 
@@ -246,7 +250,7 @@ impl Journal {
     /// Where the disk budget does not allow another segment: the oldest transition that may stay.
     pub(super) fn over_budget(&self) -> Option<u64> {
         let max = self.limits.disk_bytes_max?;
-        let mut bytes = self.bytes() + self.limits.segment_bytes;
+        let mut bytes = self.bytes() + self.limits.segment_bytes + self.largest;
         let mut keep = None;
         for (segment, next) in self.segments.iter().zip(self.segments.iter().skip(1)) {
             if bytes <= max {
