@@ -14,8 +14,19 @@ use crate::{
     history::{History, identity, spec, unlimited},
 };
 
-/// Checks every row of `batch` against the reference.
+/// Checks every row of `batch`, and what it says of itself, against the reference.
 pub(crate) fn check_batch(batch: &Batch, history: &History) {
+    let (mean_age, versions) = check_rows(batch, history);
+    assert_eq!(batch.header.mean_age, mean_age);
+    assert_eq!(batch.header.weights_versions, versions);
+    assert_eq!(
+        (batch.header.tally.inserted, batch.header.held),
+        (history.inserted, history.inserted.min(history.capacity))
+    );
+}
+
+/// Checks every row of `batch` against the reference; gives their mean age, and the newest and oldest weights that acted.
+pub(crate) fn check_rows(batch: &Batch, history: &History) -> (f64, (u64, u64)) {
     let spec = &history.spec;
     let (rows, bytes) = (batch.rows(), spec.state_bytes());
     let state = |plane: &[u8], row: usize| plane[row * bytes..(row + 1) * bytes].to_vec();
@@ -81,12 +92,7 @@ pub(crate) fn check_batch(batch: &Batch, history: &History) {
     assert!(next.next().is_none(), "no state that no row has");
     let positives = batch.positive_valid().iter().filter(|it| **it != 0);
     assert_eq!(batch.states_k().len(), positives.count() * bytes);
-    assert_eq!(batch.header.mean_age, ages as f64 / rows as f64);
-    assert_eq!(batch.header.weights_versions, versions);
-    assert_eq!(
-        (batch.header.tally.inserted, batch.header.held),
-        (history.inserted, history.inserted.min(history.capacity))
-    );
+    (ages as f64 / rows as f64, versions)
 }
 
 /// What an actor knows of itself.

@@ -9,8 +9,12 @@ use std::{
 use driml_protocol::{Buffer, Chunk, ChunkHeader, InsertReply, RequestId};
 use driml_replay_server::{Config, DurableArgs, DurableReplay, Recovery};
 
+use proptest::prelude::*;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
 use crate::{
-    batches::check_batch,
+    batches::{check_batch, check_rows},
     durable::{Life, ROWS, args, open, segments, state, test_spec},
     history::{History, unlimited},
 };
@@ -82,6 +86,60 @@ fn flip(path: &Path, at: impl FnOnce(usize) -> usize) {
     let at = at(bytes.len());
     bytes[at] ^= 4;
     fs::write(path, bytes).unwrap();
+}
+
+/// Damage of any kind at any place: a bit, a range, a cut, a missing file, one in the place of another.
+fn damage(dir: &Path, rng: &mut ChaCha8Rng) {
+    let all = segments(dir);
+    let path = &all[rng.random_range(0..all.len())];
+    let mut bytes = fs::read(path).unwrap();
+    let at = rng.random_range(0..bytes.len().max(1));
+    match rng.random_range(0..6) {
+        0 => return fs::remove_file(path).unwrap(),
+        1 => bytes.truncate(at),
+        2 => bytes[at..].fill(0),
+        3 => {
+            let end = bytes.len().min(at + rng.random_range(1..600));
+            rng.fill(&mut bytes[at..end]);
+        }
+        4 => bytes = fs::read(&all[rng.random_range(0..all.len())]).unwrap(),
+        _ => bytes[at] ^= 1 << rng.random_range(0..8),
+    }
+    fs::write(path, bytes).unwrap();
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
+
+    /// Whatever happens to the files, the server starts or says why not; what it serves is right, and it comes back once more.
+    #[test]
+    fn whatever_is_damaged_what_is_served_is_right(seed in any::<u64>(), damages in 1usize..5, capacity in 300u64..2_000) {
+        let mut kept = Kept::new(capacity);
+        // Where the end was cut off, older ones are held.
+        kept.history.capacity = u64::MAX;
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        for _ in 0..damages {
+            if !kept.segments().is_empty() {
+                damage(&kept.args.dir, &mut rng);
+            }
+        }
+        let Ok((mut replay, _)) = open(&kept.args, &kept.config) else {
+            return Ok(());
+        };
+        replay.check_valid();
+        let status = replay.status();
+        prop_assert!(status.transitions_inserted <= kept.history.inserted);
+        for client in 0..20 {
+            let drawn = replay.draw_for(RequestId::first(1_000 + client), ROWS, Buffer::zeroed);
+            // There may be nothing left.
+            let Ok(batch) = drawn else { break };
+            check_rows(&batch.unpack(), &kept.history);
+        }
+        let before = state(&replay);
+        drop(replay);
+        let (replay, _) = kept.open();
+        prop_assert_eq!(state(&replay), before);
+    }
 }
 
 fn said(recovery: &Recovery, words: &str) -> bool {
