@@ -26,6 +26,7 @@ mod parity;
 mod procgen;
 mod repo_rules;
 mod resume;
+mod several_machines;
 mod status;
 mod successors;
 mod tiny_replay;
