@@ -5,10 +5,12 @@ use std::{collections::BTreeSet, fs, process::Command, time::Duration};
 
 use driml_actor::{Delivery, DeliveryLimits};
 use driml_protocol::{
-    Batch, BatchReply, BatchRequest, BufferPool, Chunk, ChunkHeader, End, Keys, RequestId,
-    RunClient, Shutdown,
+    Batch, BatchReply, BatchRequest, Buffer, BufferPool, Chunk, ChunkHeader, End, Keys, RequestId,
+    RunClient, RunSpec, Shutdown,
+    config::Settings,
     session::{self, Endpoints},
 };
+use driml_replay_server::{Config, DurableArgs, DurableReplay};
 use driml_tests::{Process, RunFolder, TestSystem, skip, wait_for};
 use nix::sys::signal::Signal;
 
@@ -24,8 +26,10 @@ const TRANSITIONS: u64 = ACTORS as u64 * OF_AN_ACTOR;
 /// What the preset `smoke` says.
 const WARMUP: u64 = 200;
 const ROWS: u32 = 16;
-/// How often each transition is sampled, on average: that one is never drawn has a probability of exp(-60).
+/// Rows for each transition.
 const RATIO: u64 = 64;
+/// How often each transition is drawn at the end, on average: that one is never drawn has a probability of exp(-64).
+const DRAWN: u64 = 64;
 /// How often the server is killed.
 const KILLS: u64 = 6;
 
@@ -76,10 +80,10 @@ fn deliver(run: RunClient, actor: u32, frame_bytes: u32) {
     assert_eq!(delivery.finish().unwrap(), 0);
 }
 
-/// Learns from all batches there are, as a learner that asks again; gives their number and the numbers in their rows.
-fn learn(run: &RunClient, learner: u64) -> (u64, BTreeSet<u64>) {
+/// Asks for all batches there are, as a learner that asks again; gives their number.
+fn learn(run: &RunClient, learner: u64) -> u64 {
     let pool = BufferPool::new(2);
-    let (mut batches, mut numbers) = (0, BTreeSet::new());
+    let mut batches = 0;
     let mut id = RequestId::first(learner);
     let ask = |id| {
         let request = BatchRequest {
@@ -96,19 +100,50 @@ fn learn(run: &RunClient, learner: u64) -> (u64, BTreeSet<u64>) {
         id = id.again();
         match ask(id) {
             Ok((BatchReply::Batch(header), payload)) => {
-                let batch = Batch::from_payload(header, payload).unwrap();
-                let returns = batch.n_step_returns();
-                numbers.extend(returns.into_iter().map(|it| it as u64));
+                Batch::from_payload(header, payload).unwrap();
                 batches += 1;
                 id = id.next();
             }
             Ok((BatchReply::Wait(_), _)) => id = id.next(),
-            Ok((BatchReply::Finished, _)) => return (batches, numbers),
+            Ok((BatchReply::Finished, _)) => return batches,
             Ok((BatchReply::Refused { why }, _)) => panic!("{why}"),
             // The server is away; it is asked again, as the same request.
             Err(_) => std::thread::sleep(Duration::from_millis(20)),
         }
     }
+}
+
+/// The numbers of all transitions in a replay that nobody uses any more: of rows that are drawn from it as often as need be.
+fn numbers_in(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSet<u64> {
+    let mut config: Config = Settings::parse(config_toml)
+        .unwrap()
+        .table("replay")
+        .unwrap();
+    config.replay_ratio = 1e6;
+    let args = DurableArgs {
+        dir: system.path("replay"),
+        shard: 0,
+        after_updates: 0,
+        segment_bytes: None,
+    };
+    let (mut replay, recovery) = DurableReplay::open(&args, spec, &config, ROWS).unwrap();
+    assert!(
+        recovery.found && recovery.warnings.is_empty(),
+        "{recovery:?}"
+    );
+    replay.check_valid();
+    let mut numbers = BTreeSet::new();
+    for number in 0..TRANSITIONS * DRAWN / u64::from(ROWS) {
+        let id = RequestId {
+            client_id: 1,
+            number,
+            attempt: 0,
+        };
+        let batch = replay.draw_for(id, ROWS, Buffer::zeroed).unwrap().unpack();
+        let returns = batch.n_step_returns();
+        numbers.extend(returns.into_iter().map(|it| it as u64));
+    }
+    numbers
 }
 
 /// Numbered transitions and counted batches through six deaths of the server: the sets are equal, and so are the counts.
@@ -132,7 +167,7 @@ fn a_killed_server_loses_and_doubles_no_transition_and_no_batch() {
             spec_hash,
         )
     };
-    let (batches, numbers) = std::thread::scope(|scope| {
+    let batches = std::thread::scope(|scope| {
         for actor in 0..ACTORS {
             let run = run();
             scope.spawn(move || deliver(run, actor, frame_bytes));
@@ -149,17 +184,23 @@ fn a_killed_server_loses_and_doubles_no_transition_and_no_batch() {
         }
         learning.join().unwrap()
     });
-    assert_eq!(numbers, (0..TRANSITIONS).collect());
     assert_eq!(batches, (TRANSITIONS - WARMUP) * RATIO / u64::from(ROWS));
     let replay = client.replay().unwrap();
-    // As many are stored as there are numbers: if each number is there, none is there twice.
-    assert_eq!(replay.transitions_inserted, TRANSITIONS);
     assert_eq!(
         (replay.transitions_lost, replay.transitions_duplicated),
         (0, 0)
     );
+    // As many are stored as there are numbers: if each number is there, none is there twice.
+    assert_eq!(replay.transitions_inserted, TRANSITIONS);
+    let (spec, config_toml) = (client.spec.clone(), client.config_toml.clone());
     drop(client);
-    server.unwrap().stop().expect_code(0);
+    server.into_iter().for_each(kill);
+    let numbers = numbers_in(&system, &spec, &config_toml);
+    let missing: Vec<_> = (0..TRANSITIONS)
+        .filter(|it| !numbers.contains(it))
+        .collect();
+    assert_eq!(missing, [0; 0]);
+    assert_eq!(numbers.len() as u64, TRANSITIONS);
 }
 
 /// Updates that the settings of `SHORT` and `LONG` plan for so many frames.
@@ -438,7 +479,7 @@ fn a_folder_that_cannot_be_used_is_said() {
     other(&flags.replace("--replay-dir replay", "--replay-dir disk/replay"))
         .wait()
         .expect_code(1)
-        .expect_said("Read-only file system (os error 30); --replay-dir needs a folder that this process may write");
+        .expect_said("Read-only file system (os error 30); --replay-dir needs a folder with room that this process may write");
     drop(disk);
     assert!(fs::read_dir(system.path("replay")).unwrap().count() > 2);
 }

@@ -213,7 +213,7 @@ fn random_faults_lose_nothing() {
     };
     let (seed, faults) = (number("DRIML_FAULTS_SEED", 1), number("DRIML_FAULTS", 200));
     // The replay ratio makes the learner the slower side, so that the run lasts as long as the faults.
-    let Some(mut run) = Run::start(name, 3, 250 * faults, 64) else {
+    let Some(mut run) = Run::start(name, 3, 1_500 * faults, 64) else {
         return;
     };
     run.wait_for_frames(500);
@@ -265,5 +265,10 @@ fn random_faults_lose_nothing() {
     note(&format!(
         "seed {seed}: kills, freezes, cuts, restarts {tried:?}"
     ));
+    let status = wait_for("an answer", || run.status());
+    assert_eq!(
+        status["replay"]["finished"], false,
+        "faults after the end prove nothing"
+    );
     run.check_end(Duration::from_secs(900));
 }

@@ -10,7 +10,7 @@ use crate::config::ConfigError;
 #[derive(Debug, thiserror::Error)]
 pub enum DurableError {
     /// A file or folder that cannot be read or written.
-    #[error("{doing} {}: {source}; --replay-dir needs a folder that this process may write", path.display())]
+    #[error("{doing} {}: {source}; --replay-dir needs a folder with room that this process may write", path.display())]
     Io {
         /// What was being done.
         doing: &'static str,

@@ -112,7 +112,7 @@ impl Journal {
             first_row,
             bytes: head.len() as u64,
         });
-        syncer.opened(file.clone());
+        syncer.opened(number, file.clone());
         Ok(Self {
             folder,
             id,
@@ -278,7 +278,7 @@ impl Journal {
                 }
                 self.ordinal += 2;
                 self.file = file.clone();
-                self.syncer.opened(file);
+                self.syncer.opened(number, file);
                 self.segments.push_back(Segment {
                     number,
                     first_row,
@@ -293,7 +293,9 @@ impl Journal {
     /// Removes the oldest segments, whose transitions are all before `oldest_row`.
     pub(super) fn prune(&mut self, oldest_row: u64) {
         while self.segments.len() > 1 && self.segments[1].first_row <= oldest_row {
-            let path = segment::path(&self.folder, self.segments[0].number);
+            let number = self.segments[0].number;
+            let path = segment::path(&self.folder, number);
+            self.syncer.removed(number);
             match fs::remove_file(&path) {
                 Err(e) if e.kind() != io::ErrorKind::NotFound => {
                     tracing::debug!("removing {}: {e}", path.display());

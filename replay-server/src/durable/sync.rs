@@ -20,8 +20,8 @@ const OPEN_MAX: usize = 32;
 /// What the thread flushes next.
 #[derive(Default)]
 struct Files {
-    /// The segment that is written, and older ones that are not flushed yet.
-    open: Vec<Arc<File>>,
+    /// The segment that is written, and older ones that are not flushed yet, by their numbers.
+    open: Vec<(u64, Arc<File>)>,
     /// The folder, if a file was made or removed.
     folder: Option<Arc<File>>,
     stop: bool,
@@ -68,10 +68,10 @@ impl Syncer {
         })
     }
 
-    /// `file` is written from now on, and was made just now.
-    pub(super) fn opened(&self, file: Arc<File>) {
+    /// Segment `number` is written from now on, and was made just now.
+    pub(super) fn opened(&self, number: u64, file: Arc<File>) {
         let mut files = self.shared.files();
-        files.open.push(file);
+        files.open.push((number, file));
         files.folder = Some(self.folder.clone());
         let too_many = files.open.len() > OPEN_MAX;
         drop(files);
@@ -79,6 +79,11 @@ impl Syncer {
         if too_many {
             self.flush();
         }
+    }
+
+    /// Segment `number` is gone: nobody needs it on the disk.
+    pub(super) fn removed(&self, number: u64) {
+        self.shared.files().open.retain(|(open, _)| *open != number);
     }
 
     /// Something was written to the newest file.
@@ -150,7 +155,7 @@ fn flush(shared: &Shared) -> io::Result<()> {
     let older = files.open.len().saturating_sub(1);
     files.open.drain(..older);
     drop(files);
-    for file in &open {
+    for (_, file) in &open {
         file.sync_data()?;
     }
     folder.map_or(Ok(()), |folder| folder.sync_all())

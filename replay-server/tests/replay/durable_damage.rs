@@ -312,7 +312,10 @@ fn a_folder_is_one_servers_and_one_runs() {
 
     let file = kept.args.dir.join("log.toml");
     let no_folder = args(&file, 1000);
-    assert!(error(&no_folder, &kept.config).contains("needs a folder that this process may write"));
+    assert!(
+        error(&no_folder, &kept.config)
+            .contains("needs a folder with room that this process may write")
+    );
 
     let text = fs::read_to_string(&file).unwrap();
     fs::write(&file, text.replace("format = 1", "format = 2")).unwrap();
