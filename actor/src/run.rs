@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use driml_protocol::{
-    ActorJoin, Alive, Keys, RunClient, Shutdown, Weights, join,
+    Activity, ActorJoin, Alive, Keys, RunClient, Shutdown, Weights, join, reporter,
     session::{self, Endpoints},
 };
 use zenoh::Wait;
@@ -73,6 +73,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let Some(welcome) = join::as_actor(&client, join, shutdown)? else {
         return Ok(());
     };
+    let activity = Activity::new("waits for the learner's first weights");
+    let who = Alive::Actor {
+        actor: join.actor,
+        incarnation: join.incarnation,
+    };
+    reporter::start(
+        vec![client.clone()],
+        who,
+        activity.clone(),
+        shutdown.clone(),
+    )?;
     let source = WeightsSource {
         client: client.clone(),
     };
@@ -123,12 +134,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         }
         // At the start not all are connected yet.
         let steps = config.chunk_steps(delivery.actors().max(actors_planned));
+        activity.begin("plays");
         let chunk = collector.collect(delivery.inserted_total(), steps)?;
+        if let Some(waits) = delivery.waits_in_words() {
+            activity.begin(waits);
+        }
         if !delivery.send(chunk) {
             break;
         }
     }
     let produced = collector.produced();
+    activity.begin("delivers its last chunks");
     let unwanted = delivery.finish()?;
     tracing::info!(
         "actor {} leaves: {} transitions delivered",

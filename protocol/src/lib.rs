@@ -31,6 +31,7 @@ pub mod session;
 mod messages;
 mod process;
 mod query_workers;
+pub mod reporter;
 mod run_spec;
 mod wire;
 
@@ -46,6 +47,8 @@ pub use messages::{
     hello::Hello,
     insert_reply::{Claim, InsertReply},
     join::{ActorJoin, JoinReply, LearnerJoin},
+    parts::{PartName, PartStatus, PartsStatus, WARNINGS_MAX},
+    report::{Report, Warning},
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
     tally::Tally,
     weights::{
@@ -54,7 +57,8 @@ pub use messages::{
     },
 };
 pub use process::{
-    end_signs, fault, lock_file,
+    activity::Activity,
+    end_signs, fault, last_warning, lock_file,
     seldom::Seldom,
     shutdown::{Shutdown, join_within},
     whole_file,

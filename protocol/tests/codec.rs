@@ -5,11 +5,12 @@
 use std::fmt::Debug;
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, BufferPool,
-    Chunk, ChunkHeader, Claim, CodecError, Done, End, Goodbye, Hello, Horizon, InsertReply,
-    JoinReply, Kind, LearnerJoin, LearnerStatus, Message, NO_ACTION, PROTOCOL_VERSION,
-    ReplayStatus, RequestId, Returns, RowScalars, RunSpec, Tally, TimeoutRule, Waiting,
-    WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
+    ActorJoin, AffinityUpdate, Alive, Batch, BatchHeader, BatchReply, BatchRequest, Buffer,
+    BufferPool, Chunk, ChunkHeader, Claim, CodecError, Done, End, Goodbye, Hello, Horizon,
+    InsertReply, JoinReply, Kind, LearnerJoin, LearnerStatus, Message, NO_ACTION, PROTOCOL_VERSION,
+    PartName, PartStatus, PartsStatus, ReplayStatus, Report, RequestId, Returns, RowScalars,
+    RunSpec, Tally, TimeoutRule, Waiting, Warning, WeightsHeader, WeightsReply, WeightsRequest,
+    WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -139,6 +140,31 @@ fn weights() -> Vec<u8> {
     codec::encode(SPEC, &upload, &payload).unwrap()
 }
 
+fn parts_status() -> PartsStatus {
+    PartsStatus {
+        up_s: 60.0,
+        waiting: Waiting::ActorsWaitForLearner,
+        waiting_s: 2.5,
+        requests_waiting: 1,
+        chunks_waiting: 2,
+        chunk_bytes_waiting: 1 << 20,
+        weights_version: 4,
+        weights_age_s: Some(1.0),
+        last_warning: None,
+        parts: vec![PartStatus {
+            who: PartName::Actor(3),
+            connected: true,
+            since_s: 50.0,
+            lives: 2,
+            heard_s: Some(0.5),
+            held_s: None,
+            weights_version: Some(3),
+            doing: Some(("plays".into(), 5.0, 1.0)),
+            last_warning: Some(Warning::new("late", 9.0)),
+        }],
+    }
+}
+
 /// One or more messages of every kind.
 fn samples() -> Vec<Sample> {
     let replies = [
@@ -258,6 +284,13 @@ fn samples() -> Vec<Sample> {
             offset: 0,
         }),
         Sample::of(&Done),
+        Sample::of(&Report::new(
+            Alive::Learner(5),
+            "learns",
+            1.5,
+            Some(Warning::new("a chunk was refused", 3.0)),
+        )),
+        Sample::of(&parts_status()),
     ]);
     let with_payload = [
         (
@@ -448,7 +481,7 @@ fn parts_are_merged_row_by_row() {
 #[test]
 fn every_kind_has_a_sample_that_is_read() {
     let samples = samples();
-    for kind in 1..=18 {
+    for kind in 1..=20 {
         assert!(
             samples.iter().any(|sample| sample.kind as u16 == kind),
             "kind {kind}"

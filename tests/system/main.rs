@@ -25,6 +25,7 @@ mod parity;
 mod procgen;
 mod repo_rules;
 mod resume;
+mod status;
 mod successors;
 mod tiny_replay;
 

@@ -179,7 +179,9 @@ impl Run {
                 black_box(planes.map(touched));
                 Ok(())
             }
-            Next::NotYet => bail!("no batch came within {} s", ANSWER_MAX.as_secs()),
+            Next::NotYet(waiting) => {
+                bail!("no batch came within {} s: {waiting}", ANSWER_MAX.as_secs())
+            }
             Next::Finished => bail!("the replay server says that the run is over"),
         });
         // A request that is on its way wants its answer before the session is closed.

@@ -5,8 +5,17 @@ use std::io::{self, ErrorKind, IsTerminal, Write, stderr};
 
 use anyhow::Context;
 use console::Term;
+use driml_protocol::last_warning;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
-use tracing_subscriber::EnvFilter;
+use tracing::{
+    Event, Level, Subscriber,
+    field::{Field, Visit},
+};
+use tracing_subscriber::{
+    EnvFilter, Layer,
+    layer::{Context as LayerContext, SubscriberExt},
+    util::SubscriberInitExt,
+};
 
 /// How often a progress bar is drawn at most, times a second.
 const DRAWS_PER_SECOND: u8 = 20;
@@ -73,7 +82,31 @@ pub fn log_to_stderr() {
         // It would say with `eprintln!`, which panics, that stderr cannot be written to.
         .log_internal_errors(false)
         .with_ansi(stderr().is_terminal())
+        .finish()
+        .with(LastWarning)
         .init();
+}
+
+/// Keeps the last warning or error of the log for those who ask this process how it is.
+struct LastWarning;
+
+impl<S: Subscriber> Layer<S> for LastWarning {
+    fn on_event(&self, event: &Event<'_>, _: LayerContext<'_, S>) {
+        if *event.metadata().level() > Level::WARN {
+            return;
+        }
+        struct Message(String);
+        impl Visit for Message {
+            fn record_debug(&mut self, field: &Field, value: &dyn std::fmt::Debug) {
+                if field.name() == "message" {
+                    self.0 = format!("{value:?}");
+                }
+            }
+        }
+        let mut message = Message(String::new());
+        event.record(&mut message);
+        last_warning::note(message.0);
+    }
 }
 
 /// Where messages go: stderr, above a progress bar if stderr is a terminal. Clones share the bar.
@@ -124,6 +157,30 @@ impl Screen {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
+    }
+}
+
+/// Pages on stdout that each take the place of the one before, on a terminal; elsewhere they follow each other.
+pub struct Pages(Option<Term>);
+
+impl Pages {
+    /// None shown yet.
+    pub fn on_stdout() -> Self {
+        Self(io::stdout().is_terminal().then(Term::stdout))
+    }
+
+    /// Shows one.
+    ///
+    /// # Errors
+    /// As [`print`].
+    pub fn show(&self, text: &str) -> anyhow::Result<()> {
+        if let Some(term) = &self.0 {
+            term.clear_screen().or_else(|e| match is_gone(&e) {
+                true => Ok(()),
+                false => Err(e),
+            })?;
+        }
+        print(text)
     }
 }
 

@@ -25,7 +25,7 @@ use crate::{
     meeting::Meeting,
     processes::{Processes, stop},
     resume,
-    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     status_client::Statuses,
 };
 
@@ -87,6 +87,7 @@ pub fn run(
     if let Some(listen) = listen {
         endpoints[0] = listen;
     }
+    write_whole(&run_dir.endpoints(), endpoints.join("\n").as_bytes())?;
     let screen = Screen::new(config.frames(), TEMPLATE);
     let display = Display::new(
         screen.clone(),
@@ -111,6 +112,10 @@ pub fn run(
     session::sweep_shared_memory();
     let ran = launch.start_and_watch(&mut recorder);
     let ended = launch.end(&ran);
+    // Nobody is there any more who could be asked; one that is left is told from this by the lock.
+    if let Err(e) = std::fs::remove_file(run_dir.endpoints()) {
+        tracing::debug!("removing {}: {e}", run_dir.endpoints().display());
+    }
     session::sweep_shared_memory();
     launch.screen.clear();
     let outcome = match (&ran, &ended) {

@@ -12,6 +12,8 @@ pub(crate) mod goodbye;
 pub(crate) mod hello;
 pub(crate) mod insert_reply;
 pub(crate) mod join;
+pub(crate) mod parts;
+pub(crate) mod report;
 pub(crate) mod status;
 pub(crate) mod tally;
 pub(crate) mod weights;

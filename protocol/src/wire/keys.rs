@@ -1,6 +1,8 @@
 //! Where each message travels: its own key under the run's namespace, and one for each part that is connected.
 //! Identities of actors and versions are in the messages, never in a key.
 
+use serde::{Deserialize, Serialize};
+
 use super::message::Keyed;
 
 /// The key expressions of one run.
@@ -68,7 +70,7 @@ impl Keys {
 }
 
 /// A part whose liveliness token was seen.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Alive {
     /// One life of an actor.
     Actor {

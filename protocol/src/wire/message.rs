@@ -85,4 +85,8 @@ pub enum Kind {
     WeightsUpload = 17,
     /// A request for a piece of the newest weights, actor to replay server.
     WeightsRequest = 18,
+    /// What a part says of itself, actor or learner to replay server.
+    Report = 19,
+    /// The replay server's account of who takes part.
+    PartsStatus = 20,
 }

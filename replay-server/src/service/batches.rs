@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use driml_protocol::{BatchReply, BatchRequest, Buffer, Incoming, Responder, fault};
+use driml_protocol::{Alive, BatchReply, BatchRequest, Buffer, Incoming, Responder, fault};
 
 use super::{
     parked::ParkedRequest,
@@ -44,6 +44,8 @@ impl Service {
             Some(_) => SHARD_HOLD_MAX,
             None => HOLD_MAX,
         };
+        let learner = Alive::Learner(request.learner);
+        state.accounts.heard(learner, None, Instant::now());
         state.requests.park(ParkedRequest {
             request,
             question: responder,

@@ -1,6 +1,8 @@
 //! Parts that join: what they are told of the run, and whether they are let in.
 //! Who is connected and who is served is kept in `members`.
 
+use std::time::Instant;
+
 use driml_protocol::{ActorJoin, Alive, Hello, Incoming, JoinReply, LearnerJoin, Responder};
 use zenoh::sample::SampleKind;
 
@@ -8,8 +10,11 @@ use super::server::{Service, State};
 
 impl Service {
     pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {
-        let mut state = self.state();
-        state.members.note(who, kind == SampleKind::Put);
+        let (mut state, is_connected) = (self.state(), kind == SampleKind::Put);
+        state.members.note(who, is_connected);
+        state
+            .accounts
+            .note_connected(who, is_connected, Instant::now());
         state.count_actors();
     }
 
@@ -94,6 +99,7 @@ impl State {
             )));
         }
         let earlier_incarnations = self.replay.join_actor(join).map_err(Rejection::Refused)?;
+        self.open_account(Alive::Actor { actor, incarnation });
         self.count_actors();
         if other.is_some() {
             // A chunk that was left behind.
@@ -120,7 +126,13 @@ impl State {
                 .map_err(Rejection::Refused)?;
             self.members.learner = Some(learner);
             self.requests.keep_only(learner);
+            self.open_account(Alive::Learner(learner));
         }
         Ok(0)
+    }
+
+    fn open_account(&mut self, who: Alive) {
+        let is_connected = self.members.connected.contains(&who);
+        self.accounts.joined(who, is_connected, Instant::now());
     }
 }

@@ -4,7 +4,7 @@
 use std::{
     sync::{Arc, Condvar, Mutex},
     thread::JoinHandle,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use anyhow::Context;
@@ -19,6 +19,7 @@ use driml_protocol::{
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
 use super::{
+    accounts::Accounts,
     members::Members,
     parked::{ParkedChunks, ParkedRequests},
     server::{Service, State},
@@ -109,6 +110,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         state: Mutex::new(State {
             replay,
             members: Members::default(),
+            accounts: Accounts::new(Instant::now()),
             chunks: ParkedChunks::default(),
             requests: ParkedRequests::default(),
             timings: Timings::default(),
@@ -197,7 +199,9 @@ impl<'a> Answers<'a> {
         this.answer("goodbye", 1, Service::goodbye)?;
         this.answer("weights-upload", 1, Service::take_weights)?;
         this.answer("weights", WEIGHTS_THREADS, Service::give_weights)?;
+        this.answer("report", 1, Service::report)?;
         this.offer("status", 1, Service::status)?;
+        this.offer("parts", 1, Service::parts)?;
         Ok(this)
     }
 
@@ -257,7 +261,10 @@ impl Service {
                 .name(name.into())
                 .spawn(move || work(&service))
         };
-        let mut threads = vec![work("admit", Self::admit_parked)?];
+        let mut threads = vec![
+            work("admit", Self::admit_parked)?,
+            work("missing", Self::say_who_is_missing)?,
+        ];
         for i in 0..BATCH_THREADS {
             threads.push(work(&format!("sample-{i}"), Self::serve_parked)?);
         }

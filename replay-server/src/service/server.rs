@@ -12,6 +12,7 @@ use driml_protocol::{
 };
 
 use super::{
+    accounts::Accounts,
     members::Members,
     parked::{ParkedChunks, ParkedRequests},
     timings::Timings,
@@ -45,6 +46,7 @@ pub(super) struct Service {
 pub(super) struct State {
     pub(super) replay: Replay,
     pub(super) members: Members,
+    pub(super) accounts: Accounts,
     pub(super) chunks: ParkedChunks<Question>,
     pub(super) requests: ParkedRequests<Responder<BatchReply>>,
     pub(super) timings: Timings,
@@ -78,9 +80,11 @@ impl Service {
     /// Waits until something has changed, or for `wait_max`.
     pub(super) fn wait<'a>(
         &'a self,
-        state: MutexGuard<'a, State>,
+        mut state: MutexGuard<'a, State>,
         wait_max: Duration,
     ) -> MutexGuard<'a, State> {
+        let waiting = state.replay.waiting();
+        state.accounts.note_waiting(waiting, Instant::now());
         self.changed
             .wait_timeout(state, wait_max)
             .unwrap_or_else(PoisonError::into_inner)

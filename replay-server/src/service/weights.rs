@@ -31,7 +31,10 @@ impl Service {
             Ok(is_new) => {
                 if is_new {
                     let now = Instant::now();
-                    self.state().timings.weights_came(&weights, now);
+                    let mut state = self.state();
+                    state.timings.weights_came(&weights, now);
+                    state.accounts.weights_came(now);
+                    drop(state);
                     self.announce(weights.version);
                 }
                 incoming.into_responder().reply(&Done);
