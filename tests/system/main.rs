@@ -12,6 +12,7 @@ mod company;
 mod disk_full;
 mod diverging;
 mod doctor;
+mod durable;
 mod evaluate;
 mod failures;
 mod leftovers;

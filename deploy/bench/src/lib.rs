@@ -25,6 +25,7 @@
 mod alone;
 mod assemble;
 mod candle_baseline;
+mod durable;
 mod effort;
 mod env;
 pub mod flags;
@@ -94,7 +95,13 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
             alone(Component::Learner, flags, device, instead)
         }
         BenchCommand::Policy(flags) => alone(Component::Policy, flags, cpu, Instead::No),
-        BenchCommand::Replay(flags) => alone(Component::Replay, flags, cpu, Instead::No),
+        BenchCommand::Replay(args) => match &args.replay_dir {
+            Some(dir) => {
+                let figures = durable::measure(args, dir)?;
+                measurements::report("durable replay", &figures, machine, &args.flags)
+            }
+            None => alone(Component::Replay, &args.flags, cpu, Instead::No),
+        },
         BenchCommand::Env(flags) => alone(Component::Env, flags, cpu, Instead::No),
         BenchCommand::System(args) => {
             measurements::report("system", &system::measure(args)?, machine, &args.flags)

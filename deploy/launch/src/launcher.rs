@@ -43,6 +43,10 @@ const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 /// How long the replay server may take to end, once it is told to stop.
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
+/// How often replay servers that keep their replay on disk are started again in a run, all together.
+const RESTARTS_MAX: u32 = 8;
+/// How often actors that have died are started again in one run, all together; one more is an error.
+const ACTOR_RESTARTS_MAX: u32 = 16;
 /// How often a learner that saves is asked whether it is done.
 const DRAIN_POLL: Duration = Duration::from_millis(100);
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
@@ -106,16 +110,14 @@ pub fn run(
         display,
         interrupts,
         processes: Processes::default(),
+        restarts: 0,
+        actor_restarts: 0,
         statuses: None,
     };
 
     session::sweep_shared_memory();
     let ran = launch.start_and_watch(&mut recorder);
     let ended = launch.end(&ran);
-    // Nobody is there any more who could be asked; one that is left is told from this by the lock.
-    if let Err(e) = std::fs::remove_file(run_dir.endpoints()) {
-        tracing::debug!("removing {}: {e}", run_dir.endpoints().display());
-    }
     session::sweep_shared_memory();
     launch.screen.clear();
     let outcome = match (&ran, &ended) {
@@ -124,6 +126,10 @@ pub fn run(
         _ => Outcome::Failed,
     };
     let (summary, written) = launch.conclude(&mut recorder, outcome);
+    // Nobody is there any more who could be asked; where this file is left, the lock tells.
+    if let Err(e) = std::fs::remove_file(run_dir.endpoints()) {
+        tracing::debug!("removing {}: {e}", run_dir.endpoints().display());
+    }
     if let Err(failed) = ran.and(ended) {
         // It is what the run is remembered by; that the disk is full too is said before.
         if let Err(e) = written {
@@ -165,7 +171,15 @@ struct Launch<'a> {
     display: Display,
     interrupts: Interrupts,
     processes: Processes,
+    /// How often a replay server that had died was started again.
+    restarts: u32,
+    /// How often an actor was.
+    actor_restarts: u32,
     statuses: Option<Statuses>,
+}
+
+fn words(args: &[&str]) -> Vec<String> {
+    args.iter().map(|&arg| arg.to_owned()).collect()
 }
 
 /// `replay-server`, or one for each of several shards.
@@ -188,27 +202,8 @@ impl Launch<'_> {
     fn start_and_watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
         let logs = self.run_dir.logs();
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
-        let config = recorder.config_path().display().to_string();
-        let words =
-            |args: &[&str]| -> Vec<String> { args.iter().map(|&arg| arg.to_owned()).collect() };
-        for (shard, (name, endpoint)) in self.servers.iter().zip(&self.endpoints).enumerate() {
-            let (shard, after) = (shard.to_string(), self.resume_point.updates.to_string());
-            let mut args = words(&[
-                "replay-server",
-                "--listen",
-                endpoint,
-                "--shard",
-                &shard,
-                "--after-updates",
-                &after,
-                "--config",
-                &config,
-            ]);
-            if let Some(bug) = self.config.replay.reproduced_bug {
-                args.extend(words(&["--reproduce-bug", bug.name()]));
-            }
-            let server =
-                ManagedProcess::start(name, &args, PROCESS_THREADS, self.surroundings(&logs))?;
+        for shard in 0..self.servers.len() {
+            let server = self.start_server(shard, self.resume_point.updates)?;
             self.processes.replay_servers.push(server);
         }
         let mut sessions = Vec::new();
@@ -234,21 +229,99 @@ impl Launch<'_> {
             self.surroundings(&logs),
         )?);
         for id in 0..self.config.local.actors {
-            let args = words(&[
-                "actor",
-                "--connect",
-                &self.endpoints[id as usize % self.endpoints.len()],
-                "--id",
-                &id.to_string(),
-            ]);
-            self.processes.actors.push(ManagedProcess::start(
-                &format!("actor-{id}"),
-                &args,
-                PROCESS_THREADS,
-                self.surroundings(&logs),
-            )?);
+            let actor = self.start_actor(id)?;
+            self.processes.actors.push(actor);
         }
         self.watch(recorder)
+    }
+
+    fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
+        let args = words(&[
+            "actor",
+            "--connect",
+            &self.endpoints[id as usize % self.endpoints.len()],
+            "--id",
+            &id.to_string(),
+        ]);
+        let logs = self.run_dir.logs();
+        let name = format!("actor-{id}");
+        ManagedProcess::start(&name, &args, PROCESS_THREADS, self.surroundings(&logs))
+    }
+
+    /// Starts actors that have died again. What one had not delivered is gone with it; the run goes on.
+    ///
+    /// # Errors
+    /// The process cannot be started.
+    fn revive_actors(&mut self) -> anyhow::Result<()> {
+        for id in 0..self.processes.actors.len() {
+            let actor = &mut self.processes.actors[id];
+            if self.actor_restarts == ACTOR_RESTARTS_MAX || !actor.may_be_started_again() {
+                continue;
+            }
+            self.actor_restarts += 1;
+            let report = actor.exit_report();
+            self.screen.line(&format!(
+                "{report}\nactor-{id} is started again ({} of {ACTOR_RESTARTS_MAX} times in a run)",
+                self.actor_restarts
+            ));
+            session::sweep_shared_memory();
+            self.processes.actors[id] = self.start_actor(id as u32)?;
+        }
+        Ok(())
+    }
+
+    /// Starts the replay server of one shard, in a run that goes on after so many updates.
+    fn start_server(&self, shard: usize, after_updates: u64) -> anyhow::Result<ManagedProcess> {
+        let config = self.run_dir.config().display().to_string();
+        let (number, after) = (shard.to_string(), after_updates.to_string());
+        let mut args = words(&[
+            "replay-server",
+            "--listen",
+            &self.endpoints[shard],
+            "--shard",
+            &number,
+            "--after-updates",
+            &after,
+            "--config",
+            &config,
+        ]);
+        if let Some(bug) = self.config.replay.reproduced_bug {
+            args.extend(words(&["--reproduce-bug", bug.name()]));
+        }
+        if self.config.local.durable {
+            let folder = self.run_dir.replay().display().to_string();
+            args.extend(words(&["--replay-dir", &folder]));
+        }
+        let logs = self.run_dir.logs();
+        let name = &self.servers[shard];
+        ManagedProcess::start(name, &args, PROCESS_THREADS, self.surroundings(&logs))
+    }
+
+    /// Starts replay servers that have died again, if they go on with what they have kept.
+    ///
+    /// # Errors
+    /// It has happened too often, or the process cannot be started.
+    fn revive_servers(&mut self) -> anyhow::Result<()> {
+        if !self.config.local.durable {
+            return Ok(());
+        }
+        for shard in 0..self.processes.replay_servers.len() {
+            let server = &mut self.processes.replay_servers[shard];
+            if server.end().is_none() || self.restarts == RESTARTS_MAX {
+                continue;
+            }
+            self.restarts += 1;
+            let report = server.exit_report();
+            self.screen.line(&format!(
+                "{report}\n{} is started again with what it has kept ({} of {RESTARTS_MAX} times in a run)",
+                self.servers[shard], self.restarts
+            ));
+            session::sweep_shared_memory();
+            // What the learner has learned meanwhile, the log knows.
+            let server = self.start_server(shard, self.resume_point.updates)?;
+            self.processes.replay_servers[shard] = server;
+        }
+        Ok(())
     }
 
     /// Asks, shows and records once a second until the run is over.
@@ -259,6 +332,8 @@ impl Launch<'_> {
             if self.interrupts.wait_timeout(POLL) > 0 {
                 return Ok(Outcome::Interrupted);
             }
+            self.revive_servers()?;
+            self.revive_actors()?;
             self.processes.check_alive()?;
             let statuses = self
                 .statuses
@@ -400,7 +475,9 @@ impl Launch<'_> {
         let logs = self.processes.missing_log_lines();
         let missing = recorder.missing().into_iter().chain(logs);
         missing.for_each(|line| console::line(&line));
-        let summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);
+        let mut summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);
+        summary.replay_servers_restarted = self.restarts;
+        summary.actors_restarted = self.actor_restarts;
         let written = summary.write(self.run_dir);
         (summary, written)
     }

@@ -16,6 +16,8 @@ use nix::{
 
 use crate::{console::Screen, meeting::Meeting, process_log::ProcessLog};
 
+/// A process that ends with an error within this time of its start would do so again.
+const AT_ONCE: Duration = Duration::from_secs(10);
 /// How often a process that should end is looked at.
 const POLL: Duration = Duration::from_millis(20);
 
@@ -25,6 +27,7 @@ pub struct ManagedProcess {
     /// Its name: `replay-server`, `learner`, `actor-0`.
     pub name: String,
     child: Child,
+    started: Instant,
     end: Option<ExitStatus>,
     log: ProcessLog,
 }
@@ -106,6 +109,7 @@ impl ManagedProcess {
         Ok(Self {
             name: name.into(),
             child,
+            started: Instant::now(),
             end: None,
             log,
         })
@@ -114,6 +118,16 @@ impl ManagedProcess {
     /// The process's number.
     pub fn pid(&self) -> u32 {
         self.child.id()
+    }
+
+    /// Whether it has died in a way that another start may mend: somebody killed it, or it had run for a while. A broken
+    /// invariant of our own aborts it.
+    pub(crate) fn may_be_started_again(&mut self) -> bool {
+        let killed = |signal| signal != Signal::SIGABRT as i32;
+        self.end().is_some_and(|status| {
+            let was_killed = status.signal().is_some_and(killed);
+            !status.success() && (was_killed || self.started.elapsed() > AT_ONCE)
+        })
     }
 
     /// How it ended, if it has.

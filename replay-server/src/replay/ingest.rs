@@ -3,7 +3,7 @@
 
 use std::borrow::Cow;
 
-use driml_protocol::{ActorJoin, Chunk, Claim, Goodbye, InsertReply};
+use driml_protocol::{ActorJoin, Chunk, ChunkHeader, Claim, Goodbye, InsertReply};
 
 use super::Replay;
 use crate::{
@@ -23,6 +23,7 @@ impl Replay {
     pub fn packer(&self) -> Packer {
         Packer {
             compression: self.config.compression,
+            seal_for: None,
         }
     }
 
@@ -74,6 +75,7 @@ impl Replay {
             _ if self.limiter.all_in() => Some(InsertReply::Finished {
                 inserted_total: self.inserted_total(),
             }),
+            Verdict::OutOfOrder { .. } if self.actors.insists(&chunk.header) => None,
             Verdict::OutOfOrder { expected } => Some(InsertReply::OutOfOrder { expected }),
             Verdict::Next => None,
         }
@@ -82,19 +84,28 @@ impl Replay {
     /// Stores a chunk that [`Replay::settle`] has nothing to say of, if the limiter lets it pass or its actor leaves; else the
     /// answer is to wait.
     pub fn admit(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
-        let leaving = packed.chunk.header.leaving;
-        if self.limiter.may_insert() || self.starving || leaving {
+        if self.may_admit(&packed.chunk.header) {
             self.store(packed);
             self.stored()
         } else {
-            InsertReply::Wait {
-                inserted_total: self.inserted_total(),
-                kept: false,
-            }
+            self.wait()
         }
     }
 
-    fn stored(&self) -> InsertReply {
+    /// Whether the limiter lets a chunk pass now, or its actor leaves.
+    pub(crate) fn may_admit(&self, header: &ChunkHeader) -> bool {
+        self.limiter.may_insert() || self.starving || header.leaving
+    }
+
+    /// The answer to a chunk that is not stored yet.
+    pub(crate) const fn wait(&self) -> InsertReply {
+        InsertReply::Wait {
+            inserted_total: self.inserted_total(),
+            kept: false,
+        }
+    }
+
+    pub(crate) fn stored(&self) -> InsertReply {
         InsertReply::Stored {
             inserted_total: self.inserted_total(),
             actors: self.statistics.actors.saturating_mul(self.config.shards),
@@ -117,7 +128,7 @@ impl Replay {
         }
     }
 
-    fn unfit(&self, chunk: &Chunk) -> Option<String> {
+    pub(crate) fn unfit(&self, chunk: &Chunk) -> Option<String> {
         let header = &chunk.header;
         let frame_bytes = self.spec.frame_bytes();
         if header.frame_bytes as usize != frame_bytes {
@@ -166,7 +177,8 @@ impl Replay {
         ))
     }
 
-    fn store(&mut self, packed: &PackedChunk<'_>) {
+    /// Stores a chunk that is the next of its actor.
+    pub(crate) fn store(&mut self, packed: &PackedChunk<'_>) {
         let chunk = &*packed.chunk;
         let header = chunk.header;
         let (streams, difference) = self.actors.accept(&header);
@@ -197,7 +209,7 @@ impl Replay {
     }
 
     fn count(&mut self, actor: u32, Difference { lost, duplicated }: Difference) {
-        if lost > 0 || duplicated > 0 {
+        if (lost > 0 || duplicated > 0) && !self.quiet {
             tracing::warn!(
                 "actor {actor}: {lost} transitions lost, {duplicated} stored twice, by its own count"
             );

@@ -122,19 +122,27 @@ impl Replay {
         rows: u32,
         memory: impl FnOnce(usize) -> Buffer,
     ) -> Result<PackedBatch, Unready> {
-        match self.requests.begin(id) {
-            Dedup::Superseded => return Err(Unready::Wait(self.limiter.waiting(rows))),
-            Dedup::Fresh(lost) => {
-                if !lost.is_empty() {
-                    tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
-                    self.limiter.refund(lost.len() as u64);
-                    self.statistics.refund(&lost);
-                }
-            }
+        if !self.begin_request(id) {
+            return Err(Unready::Wait(self.limiter.waiting(rows)));
         }
         let draft = self.draw_in(rows, memory)?;
         self.requests.complete(id.client_id, draft.ks.clone());
         Ok(draft)
+    }
+
+    /// Takes note of a request, and takes back what an earlier attempt at it was given; `false` if nobody waits for it any more.
+    pub(crate) fn begin_request(&mut self, id: RequestId) -> bool {
+        let Dedup::Fresh(lost) = self.requests.begin(id) else {
+            return false;
+        };
+        if !lost.is_empty() {
+            if !self.quiet {
+                tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
+            }
+            self.limiter.refund(lost.len() as u64);
+            self.statistics.refund(&lost);
+        }
+        true
     }
 
     /// What a batch of `rows` rows says of itself before any row is written.

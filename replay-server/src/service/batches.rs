@@ -9,10 +9,7 @@ use super::{
     parked::ParkedRequest,
     server::{Service, State},
 };
-use crate::{
-    replay::{Replay, Unready},
-    sampling::packed_batch::PackedBatch,
-};
+use crate::{durable::DurableReplay, replay::Unready, sampling::packed_batch::PackedBatch};
 
 /// How long a request waits before it is told to come back: far below every learner's time-out.
 const HOLD_MAX: Duration = Duration::from_secs(1);
@@ -33,7 +30,7 @@ impl Service {
             return responder.reply(&BatchReply::Refused { why });
         };
         let mut state = self.state();
-        let is_allowed = state.members.check_learner(request.learner);
+        let is_allowed = state.check_learner(request.learner);
         let heard = is_allowed.and_then(|()| self.hear_of_others(&mut state.replay, &request));
         if let Err(why) = heard {
             state.replay.note_refused_message();
@@ -57,7 +54,11 @@ impl Service {
     }
 
     /// Takes what the learner says of the other shards.
-    fn hear_of_others(&self, replay: &mut Replay, request: &BatchRequest) -> Result<(), String> {
+    fn hear_of_others(
+        &self,
+        replay: &mut DurableReplay,
+        request: &BatchRequest,
+    ) -> Result<(), String> {
         let (_, shards) = self.shard;
         match request.other_shards {
             None if shards > 1 => Err(format!(

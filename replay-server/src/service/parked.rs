@@ -245,6 +245,7 @@ mod tests {
         });
         let packer = Packer {
             compression: Compression::None,
+            seal_for: None,
         };
         packer.pack(Cow::Owned(chunk))
     }

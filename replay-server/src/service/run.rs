@@ -2,6 +2,7 @@
 //! What an answer is, is in the files named for the messages.
 
 use std::{
+    path::{Path, PathBuf},
     sync::{Arc, Condvar, Mutex},
     thread::JoinHandle,
     time::{Duration, Instant},
@@ -24,8 +25,13 @@ use super::{
     parked::{ParkedChunks, ParkedRequests},
     server::{Service, State},
     timings::Timings,
+    weights_store::WeightsStore,
 };
-use crate::{config::Config, replay::Replay};
+use crate::{
+    config::Config,
+    durable::{DurableArgs, DurableReplay, shard_dir},
+    replay::Replay,
+};
 
 /// Threads that make batches: one assembles while another's reply is being sent.
 const BATCH_THREADS: usize = 2;
@@ -54,6 +60,8 @@ pub struct RunArgs {
     pub shard: u32,
     /// Updates of the learner after which the run goes on; 0 starts it.
     pub after_updates: u64,
+    /// The folder in which the replay is kept, if it is kept on disk; of several shards each has a folder of its own there.
+    pub dir: Option<PathBuf>,
     /// The run's resolved settings, which it hands to whoever joins.
     pub config_toml: String,
 }
@@ -69,10 +77,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let config: Config = settings.table("replay")?;
     let batch_size = number(&settings, "learner", "batch_size")?;
     let ack_timeout = Duration::from_millis(number(&settings, "actor", "ack_timeout_ms")?.into());
-    let mut replay = Replay::shard(&spec, &config, batch_size, args.shard)?;
-    if args.after_updates > 0 {
-        replay = replay.resumed_at(args.after_updates, args.shard);
-    }
+    let (replay, weights) = match &args.dir {
+        Some(dir) => open_durable(&args, dir, &spec, &config, batch_size)?,
+        None => {
+            let mut replay = Replay::shard(&spec, &config, batch_size, args.shard)?;
+            if args.after_updates > 0 {
+                replay = replay.resumed_at(args.after_updates, args.shard);
+            }
+            let replay = DurableReplay::in_memory(replay, args.after_updates);
+            (replay, WeightsStore::default())
+        }
+    };
     let transport: TransportConfig = settings.table("transport")?;
     let batch = BatchHeader::of(&spec, batch_size);
     let pool = if transport.shared_memory {
@@ -101,22 +116,21 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let service = Arc::new(Service {
         num_actions: spec.num_actions,
         shard: (args.shard, config.shards),
-        after_updates: args.after_updates,
         config_toml: args.config_toml,
         shared_memory: reads_shared_memory,
         hold_max: HOLD_MAX.min(ack_timeout / 4),
         pool,
         packer: replay.packer(),
         state: Mutex::new(State {
+            members: Members::with_acting(replay.actors_delivered()),
             replay,
-            members: Members::default(),
             accounts: Accounts::new(Instant::now()),
             chunks: ParkedChunks::default(),
             requests: ParkedRequests::default(),
             timings: Timings::default(),
         }),
         changed: Condvar::new(),
-        weights: Mutex::default(),
+        weights: Mutex::new(weights),
         announcements: client.announce().map_err(declaring)?,
         shutdown: shutdown.clone(),
     });
@@ -143,7 +157,44 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     drop(queryables);
     let closed = client.session().close().wait();
     join_within(threads, THREADS_END_MAX);
+    service.state().replay.flush();
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+}
+
+/// The replay that is kept in `dir`, and the newest weights that were handed over.
+fn open_durable(
+    args: &RunArgs,
+    dir: &Path,
+    spec: &RunSpec,
+    config: &Config,
+    batch_size: u32,
+) -> anyhow::Result<(DurableReplay, WeightsStore)> {
+    let dir = shard_dir(dir, args.shard, config.shards);
+    let durable = DurableArgs {
+        dir: dir.clone(),
+        shard: args.shard,
+        after_updates: args.after_updates,
+        segment_bytes: None,
+    };
+    let (replay, recovery) = DurableReplay::open(&durable, spec, config, batch_size)?;
+    for warning in &recovery.warnings {
+        tracing::warn!("{}: {warning}", dir.display());
+    }
+    if recovery.found {
+        let status = replay.status();
+        tracing::info!(
+            "goes on with the replay in {}: {} transitions stored, {} held, {} rows served; {} MiB read in {:.1} s",
+            dir.display(),
+            status.transitions_inserted,
+            status.transitions_held,
+            status.rows_sampled,
+            recovery.bytes >> 20,
+            recovery.took.as_secs_f64()
+        );
+    } else {
+        tracing::info!("keeps the replay in {}", dir.display());
+    }
+    Ok((replay, WeightsStore::kept_in(&dir, spec.hash())))
 }
 
 /// One whole number of another part's settings.

@@ -18,13 +18,12 @@ use super::{
     timings::Timings,
     weights_store::WeightsStore,
 };
-use crate::{replay::Replay, storage::frame_store::Packer};
+use crate::{durable::DurableReplay, storage::frame_store::Packer};
 
 /// What all threads share.
 pub(super) struct Service {
     pub(super) num_actions: u32,
     pub(super) shard: (u32, u32),
-    pub(super) after_updates: u64,
     pub(super) config_toml: String,
     /// Whether chunks may come through shared memory.
     pub(super) shared_memory: bool,
@@ -44,7 +43,7 @@ pub(super) struct Service {
 
 /// What changes, under one lock.
 pub(super) struct State {
-    pub(super) replay: Replay,
+    pub(super) replay: DurableReplay,
     pub(super) members: Members,
     pub(super) accounts: Accounts,
     pub(super) chunks: ParkedChunks<Question>,

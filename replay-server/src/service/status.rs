@@ -17,8 +17,13 @@ const SILENT_MAX: Duration = Duration::from_secs(10);
 impl Service {
     pub(super) fn goodbye(&self, incoming: Incoming<Goodbye>) {
         if let Some(goodbye) = self.read(&incoming) {
-            self.state().replay.goodbye(&goodbye);
-            incoming.into_responder().reply(&Done);
+            let mut state = self.state();
+            state.replay.goodbye(&goodbye);
+            let is_ready = state.replay.is_ready();
+            drop(state);
+            if is_ready {
+                incoming.into_responder().reply(&Done);
+            }
         }
     }
 
@@ -27,7 +32,7 @@ impl Service {
             return;
         };
         let mut state = self.state();
-        let set = match state.members.check_learner(update.learner) {
+        let set = match state.check_learner(update.learner) {
             Ok(()) => state
                 .replay
                 .set_affinity(&update)
@@ -37,8 +42,10 @@ impl Service {
                 Err(why)
             }
         };
+        let is_ready = state.replay.is_ready();
         drop(state);
         match set {
+            Ok(()) if !is_ready => {}
             Ok(()) => incoming.into_responder().reply(&Done),
             Err(why) => tracing::warn!("an affinity matrix was refused: {why}"),
         }

@@ -15,7 +15,7 @@ use crate::{
 };
 
 /// Checks every row of `batch` against the reference.
-fn check_batch(batch: &Batch, history: &History) {
+pub(crate) fn check_batch(batch: &Batch, history: &History) {
     let spec = &history.spec;
     let (rows, bytes) = (batch.rows(), spec.state_bytes());
     let state = |plane: &[u8], row: usize| plane[row * bytes..(row + 1) * bytes].to_vec();

@@ -62,6 +62,11 @@ impl RunFolder {
         self.path.join(driml_learner::checkpoint::FOLDER)
     }
 
+    /// The replay, where it is kept on disk.
+    pub fn replay(&self) -> PathBuf {
+        self.path.join("replay")
+    }
+
     /// A file for each process.
     pub fn logs(&self) -> PathBuf {
         self.path.join("logs")
