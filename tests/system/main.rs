@@ -27,6 +27,7 @@ mod procgen;
 mod repo_rules;
 mod resume;
 mod several_machines;
+mod soak;
 mod status;
 mod successors;
 mod tiny_replay;
