@@ -14,8 +14,8 @@ use rand::{Rng, SeedableRng, rngs::StdRng};
 use crate::system;
 
 const ACTORS: usize = 32;
-/// Time before the first look: buffers fill, every actor has been there once.
-const WARM: Duration = Duration::from_secs(120);
+/// Time before the first look: buffers fill, and as many actors have come and gone as may send through shared memory.
+const WARM: Duration = Duration::from_secs(300);
 
 /// What a process holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
