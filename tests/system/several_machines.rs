@@ -213,7 +213,7 @@ fn random_faults_lose_nothing() {
     };
     let (seed, faults) = (number("DRIML_FAULTS_SEED", 1), number("DRIML_FAULTS", 200));
     // The replay ratio makes the learner the slower side, so that the run lasts as long as the faults.
-    let Some(mut run) = Run::start(name, 3, 1_500 * faults, 64) else {
+    let Some(mut run) = Run::start(name, 3, 600 * faults, 64) else {
         return;
     };
     run.wait_for_frames(500);
