@@ -8,12 +8,14 @@
 )]
 
 mod client;
+mod network;
 mod process;
 mod run_folder;
 mod system;
 mod waiting;
 
 pub use client::Client;
+pub use network::Network;
 pub use process::{Ended, Process};
 pub use run_folder::{RunFolder, Summary};
 pub use system::{Survivor, TestSystem};
@@ -25,9 +27,13 @@ use std::io::Write;
 ///
 /// The line does not go through `eprintln!`, whose output the test runner keeps to itself when a test passes.
 pub fn skip(test: &str, why: &str) {
-    let line = format!("skipped: {test} ({why})\n");
+    note(&format!("skipped: {test} ({why})"));
+}
+
+/// Says a line on stderr, past the test runner.
+pub fn note(line: &str) {
     std::io::stderr()
-        .write_all(line.as_bytes())
+        .write_all(format!("{line}\n").as_bytes())
         .expect("stderr is there while tests run");
 }
 

@@ -88,8 +88,17 @@ impl TestSystem {
 
     /// How the program is started, for tests that do it in their own way.
     pub fn command(&self, args: &str) -> Command {
-        let mut command = Command::new(&self.program);
+        self.command_after(&[], args)
+    }
+
+    /// [`Self::command`] with other words before the program, such as those that put it on another machine.
+    pub fn command_after(&self, words: &[String], args: &str) -> Command {
+        let program = self.program.as_os_str();
+        let mut words = words.iter().map(AsRef::as_ref).chain([program]);
+        let first = words.next().unwrap_or(program);
+        let mut command = Command::new(first);
         command
+            .args(words)
             .args(args.split_whitespace())
             .current_dir(self.folder.path())
             .env(MARK, &self.mark)
@@ -106,6 +115,17 @@ impl TestSystem {
     pub fn start_part(&self, args: &str) -> Process {
         let parent = std::process::id();
         self.start(&format!("{args} --exit-with-parent {parent}"))
+    }
+
+    /// [`Self::start_part`] with other words before the program.
+    pub fn start_part_after(&self, words: &[String], args: &str) -> Process {
+        let args = format!("{args} --exit-with-parent {}", std::process::id());
+        Process::start(args.clone(), self.command_after(words, &args))
+    }
+
+    /// Runs the program to its end, with other words before it.
+    pub fn run_after(&self, words: &[String], args: &str) -> Ended {
+        Process::start(args.to_owned(), self.command_after(words, args)).wait()
     }
 
     /// Starts a replay server on this system's endpoint, with the settings that `flags` ask for.

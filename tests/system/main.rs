@@ -26,6 +26,8 @@ mod parity;
 mod procgen;
 mod repo_rules;
 mod resume;
+mod several_machines;
+mod soak;
 mod status;
 mod successors;
 mod tiny_replay;

@@ -68,6 +68,13 @@ impl Accounts {
         self.parts.insert(name(who), account);
     }
 
+    /// How often actors have joined, all together.
+    pub(super) fn actor_lives(&self) -> u32 {
+        let actors = self.parts.iter();
+        let actors = actors.filter(|(who, _)| **who != PartName::Learner);
+        actors.map(|(_, account)| account.lives).sum()
+    }
+
     /// The account of this life, if it takes part.
     fn of(&mut self, who: Alive) -> Option<&mut Account> {
         let account = self.parts.get_mut(&name(who))?;
@@ -248,7 +255,9 @@ mod tests {
         assert_eq!(accounts.parts(at(12), |_| Some(at(11))), [expected]);
 
         accounts.joined(actor(2), true, at(20));
-        let again = &accounts.parts(at(21), |_| None)[0];
+        accounts.joined(Alive::Learner(1), true, at(20));
+        assert_eq!(accounts.actor_lives(), 2);
+        let again = &accounts.parts(at(21), |_| None)[1];
         assert_eq!(
             (again.lives, again.connected, again.heard_s),
             (2, true, None)

@@ -8,6 +8,10 @@ use zenoh::sample::SampleKind;
 
 use super::server::{Service, State};
 
+/// Lives of actors that may send through shared memory. What a reader has mapped stays mapped until it ends, also when whoever made
+/// it is gone (zenoh issue 2571): about 3 MiB and two descriptors a life. Later ones send through sockets.
+const SHARED_LIVES_MAX: u32 = 128;
+
 impl Service {
     pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {
         let (mut state, is_connected) = (self.state(), kind == SampleKind::Put);
@@ -26,6 +30,7 @@ impl Service {
         let state = self.state();
         let (inserted_total, tally) = (state.replay.inserted_total(), state.replay.tally());
         let after_updates = state.replay.after_updates();
+        let shared_memory = self.shared_memory && state.accounts.actor_lives() < SHARED_LIVES_MAX;
         drop(state);
         let hello = Hello {
             config_toml: self.config_toml.clone(),
@@ -33,7 +38,7 @@ impl Service {
             tally,
             after_updates,
             shard: self.shard,
-            shared_memory: self.shared_memory,
+            shared_memory,
         };
         responder.reply(&hello);
     }

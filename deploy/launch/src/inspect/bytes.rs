@@ -57,7 +57,7 @@ pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Resu
             "a batch",
             batch(run),
             batch(&every.run),
-            format!("{rows} rows"),
+            format!("{rows} rows that have every state; what a row does not have does not travel"),
         ),
         Line::new(
             "  s_t and s_{t+n}",

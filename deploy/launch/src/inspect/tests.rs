@@ -50,9 +50,9 @@ fn the_paper_s_agent_is_described() {
         all                              3,633,018       5,809,690  63% of everything
 
         FLOPs of an update                      is      everything  why
-        s_t, torso                   4,756,340,736   4,938,792,960  256 rows forward and backward
+        s_t, torso                   4,756,340,736   4,938,792,960  256 rows forward and backward; at most, as equal states are computed once where it pays
         s_t, C51 head                   40,108,032     601,620,480  of the action taken alone: its loss reads no other
-        s_{t+n}, target network      1,991,507,968   2,082,734,080  forward: what is bootstrapped; at most, as rows without a bootstrap are left out
+        s_{t+n}, target network      1,991,507,968   2,082,734,080  forward: what is bootstrapped; at most, as rows without a bootstrap are left out, and equal states but one
         s_{t+n}, online network                  0   2,082,734,080  not done: double_dqn = false
         more states, torso           4,756,340,736  29,632,757,760  one positive a row (run.horizon)
         states, key encoder                      0   2,318,401,536  not done: there is no key encoder
@@ -71,7 +71,7 @@ fn the_paper_s_agent_is_described() {
         bytes                                   is      everything  why
         a transition in a chunk             10,806          12,294  60x60x3 of a frame of 64x64x3: no convolution reads the rest; action, end and reward
         a transition in the replay          10,832          12,320  the same, and its place; stored once, however often it is read
-        a batch                          8,297,472      22,025,216  256 rows
+        a batch                          8,297,472      22,025,216  256 rows that have every state; what a row does not have does not travel
           s_t and s_{t+n}                5,529,600       6,291,456  one frame each
           s_{t+k}                        2,764,800      15,728,640  1 a row: what driml-ada is served
           numbers                            3,072           5,120  returns, discounts, actions, k

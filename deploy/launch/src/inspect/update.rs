@@ -28,7 +28,9 @@ pub(super) fn update_flops(config: &RunConfig, every: &Everything) -> Vec<Line> 
             "s_t, torso",
             is.online,
             all.online,
-            format!("{rows} rows forward and backward"),
+            format!(
+                "{rows} rows forward and backward; at most, as equal states are computed once where it pays"
+            ),
         ),
         Line::new(
             "s_t, C51 head",
@@ -40,7 +42,7 @@ pub(super) fn update_flops(config: &RunConfig, every: &Everything) -> Vec<Line> 
             "s_{t+n}, target network",
             is.target,
             all.target,
-            "forward: what is bootstrapped; at most, as rows without a bootstrap are left out",
+            "forward: what is bootstrapped; at most, as rows without a bootstrap are left out, and equal states but one",
         ),
         Line::new(
             "s_{t+n}, online network",

@@ -82,7 +82,7 @@ fn the_default_run_is_the_papers() {
         precision = "f32"
         round_transitions_max = 1024
         steps_per_chunk = 16
-        unreachable_max_ms = 60000
+        unreachable_max_ms = 300000
         world_threads = 0
     "#]]
     .assert_eq(&format!(
