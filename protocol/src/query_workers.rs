@@ -28,6 +28,7 @@ use crate::{
         buffers::{Buffer, BufferPool},
         codec,
         error::CodecError,
+        keys::Keys,
         message::{Keyed, Message, Request},
     },
 };
@@ -53,7 +54,9 @@ impl<R: Request> Incoming<R> {
     /// Whatever makes it unfit to be answered.
     pub fn read(&self) -> Result<R, CodecError> {
         let bytes = self.query.payload().map(ZBytes::to_bytes);
-        codec::decode(&bytes.unwrap_or_default(), Some(self.spec_hash)).map(|(request, _)| request)
+        let (request, _) = codec::decode(&bytes.unwrap_or_default(), Some(self.spec_hash))?;
+        self.check_actor(&request)?;
+        Ok(request)
     }
 
     /// Reads a request and copies its payload into own memory of `pool`.
@@ -63,7 +66,22 @@ impl<R: Request> Incoming<R> {
     pub fn receive(&self, pool: &BufferPool) -> Result<(R, Buffer), CodecError> {
         let nothing = ZBytes::new();
         let bytes = self.query.payload().unwrap_or(&nothing);
-        codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))
+        let (request, payload) =
+            codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))?;
+        self.check_actor(&request)?;
+        Ok((request, payload))
+    }
+
+    /// Checks that a request that speaks for an actor came at this actor's own key, which others may have no access to.
+    fn check_actor(&self, request: &R) -> Result<(), CodecError> {
+        let key = self.query.key_expr().as_str();
+        match request.actor() {
+            Some(actor) if R::BY_ACTOR && Keys::actor(key) != Some(actor) => {
+                let key = key.to_owned();
+                Err(CodecError::Actor { actor, key })
+            }
+            _ => Ok(()),
+        }
     }
 
     /// What the reply goes through.

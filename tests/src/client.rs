@@ -141,16 +141,16 @@ impl Client {
 
     /// Sends a chunk as an actor would.
     pub fn insert(&self, chunk: &Chunk) -> InsertReply {
-        self.insert_bytes(sealed(chunk, self.spec.hash()))
+        self.insert_bytes(chunk.header.actor, sealed(chunk, self.spec.hash()))
     }
 
-    /// Sends bytes to the place where chunks go.
+    /// Sends bytes to the place where the chunks of `actor` go.
     ///
     /// # Panics
     /// If nobody answers, or not in the run's own words.
-    pub fn insert_bytes(&self, bytes: Vec<u8>) -> InsertReply {
+    pub fn insert_bytes(&self, actor: u32, bytes: Vec<u8>) -> InsertReply {
         let reply = self
-            .ask(&self.keys.of::<ChunkHeader>(), bytes)
+            .ask(&self.keys.of_actor::<ChunkHeader>(actor), bytes)
             .expect("chunks are always answered");
         codec::decode(&reply, Some(self.spec.hash())).unwrap().0
     }

@@ -87,10 +87,15 @@ impl Message for ChunkHeader {
             payload.len()
         )))
     }
+
+    fn actor(&self) -> Option<u32> {
+        Some(self.actor)
+    }
 }
 
 impl Keyed for ChunkHeader {
     const KEY: &'static str = "ingest";
+    const BY_ACTOR: bool = true;
 }
 
 impl Request for ChunkHeader {

@@ -47,6 +47,16 @@ pub enum CodecError {
         /// What this part has, or expects here.
         ours: u64,
     },
+    /// A message of one actor at the key of another.
+    #[error(
+        "the message speaks for actor {actor} at the key {key:?}: each actor speaks for itself alone"
+    )]
+    Actor {
+        /// Whom the message speaks for.
+        actor: u32,
+        /// Where it came.
+        key: String,
+    },
     /// Bytes that were changed on the way.
     #[error("the message's checksum is wrong: it was damaged on the way")]
     Checksum,

@@ -1,5 +1,5 @@
 //! Where each message travels: its own key under the run's namespace, and one for each part that is connected.
-//! Identities of actors and versions are in the messages, never in a key.
+//! What an actor says stands under its number, so that access can be given by key; versions and lives are in the messages.
 
 use super::message::Keyed;
 
@@ -32,9 +32,27 @@ impl Keys {
         format!("{}/{name}", self.namespace)
     }
 
-    /// Where messages of type `M` are asked, fetched or announced.
+    /// Where messages of type `M` are answered, fetched or announced: of those that have a key an actor, all of them.
     pub fn of<M: Keyed>(&self) -> String {
-        self.key(M::KEY)
+        if M::BY_ACTOR {
+            self.key(&format!("{}/*", M::KEY))
+        } else {
+            self.key(M::KEY)
+        }
+    }
+
+    /// Where `actor` asks messages of type `M`.
+    pub fn of_actor<M: Keyed>(&self, actor: u32) -> String {
+        if M::BY_ACTOR {
+            self.key(&format!("{}/{actor}", M::KEY))
+        } else {
+            self.key(M::KEY)
+        }
+    }
+
+    /// The actor under whose number `key` stands; none where it stands under no single one.
+    pub(crate) fn actor(key: &str) -> Option<u32> {
+        key.rsplit('/').next()?.parse().ok()
     }
 
     /// The key of the liveliness token of one life of an actor, or of a learner.
@@ -84,6 +102,19 @@ pub enum Alive {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::messages::{affinity::AffinityUpdate, goodbye::Goodbye};
+
+    #[test]
+    fn what_an_actor_says_stands_under_its_number() {
+        let keys = Keys::new("a/7").unwrap();
+        assert_eq!(keys.of::<Goodbye>(), "a/7/goodbye/*");
+        assert_eq!(keys.of_actor::<Goodbye>(7), "a/7/goodbye/7");
+        assert_eq!(keys.of_actor::<AffinityUpdate>(7), "a/7/affinity");
+        assert_eq!(Keys::actor("a/7/goodbye/7"), Some(7));
+        for nobody_s in ["a/7/goodbye/*", "a/7/affinity", "", "a/4294967296", "a/-1"] {
+            assert_eq!(Keys::actor(nobody_s), None, "{nobody_s}");
+        }
+    }
 
     #[test]
     fn liveliness_tokens_say_whose_they_are() {
