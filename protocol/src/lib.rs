@@ -27,6 +27,7 @@ mod client;
 pub mod config;
 pub mod join;
 pub mod session;
+pub mod tls;
 
 mod messages;
 mod process;
@@ -54,7 +55,7 @@ pub use messages::{
 };
 pub use process::{
     end_signs, fault, lock_file,
-    seldom::Seldom,
+    seldom::{Seldom, SeldomEach},
     shutdown::{Shutdown, join_within},
     whole_file,
 };

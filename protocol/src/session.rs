@@ -12,7 +12,10 @@ use zenoh::{
     query::{ConsolidationMode, Query, QueryTarget, Reply},
 };
 
-use crate::wire::error::CodecError;
+use crate::{
+    tls::{self, Credentials, Role, TlsError},
+    wire::{error::CodecError, keys::Keys},
+};
 
 /// How a part reaches the others.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -39,13 +42,17 @@ pub enum SessionError {
     },
     /// Nobody listens where the session was to connect.
     #[error(
-        "nobody listens on {}, after {} s: is the replay server running, and is the endpoint right?",
+        "nobody listens on {}, after {} s: is the replay server running, and is the endpoint right? One that wants TLS is reached with \
+         tls/HOST:PORT and --tls-dir",
         .connect.join(", "), CONNECT_MAX.as_secs()
     )]
     NobodyListens {
         /// Endpoints to connect to.
         connect: Vec<String>,
     },
+    /// A certificate, or the other side's, is not good.
+    #[error(transparent)]
+    Tls(#[from] TlsError),
     /// Nobody is there who could answer.
     #[error("{key}: nobody is there to answer")]
     Nobody {
@@ -105,6 +112,45 @@ const MESSAGE_BYTES_MAX: usize = 1 << 29;
 /// # Errors
 /// An endpoint that cannot be listened on; a client whose endpoint nobody listens on after ten seconds.
 pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
+    open_with(endpoints, &[])
+}
+
+/// As [`open`], with certificates where there are any: then endpoints are `tls/HOST:PORT` or unix sockets, and a replay server
+/// gives each role of the run with these keys what it needs and no more.
+///
+/// # Errors
+/// As [`open`]; a certificate that either side refuses, and why.
+pub fn open_as(
+    endpoints: &Endpoints,
+    keys: &Keys,
+    credentials: Option<&Credentials>,
+) -> Result<Session, SessionError> {
+    let Some(credentials) = credentials else {
+        return open(endpoints);
+    };
+    credentials.warn_if_it_expires_soon();
+    for endpoint in endpoints.connect.iter().filter(|it| is_tls(it)) {
+        tls::check(endpoint, credentials, CONNECT_MAX)?;
+    }
+    let mut settings = vec![
+        ("transport/link/tls", credentials.zenoh_settings()),
+        (
+            "transport/link/protocols",
+            "[\"tls\", \"unixsock-stream\"]".into(),
+        ),
+    ];
+    if credentials.role() == Role::ReplayServer {
+        settings.push(("access_control", tls::rules(keys)));
+    }
+    open_with(endpoints, &settings)
+}
+
+/// Whether an endpoint is reached over TLS.
+pub fn is_tls(endpoint: &str) -> bool {
+    endpoint.starts_with("tls/")
+}
+
+fn open_with(endpoints: &Endpoints, more: &[(&str, String)]) -> Result<Session, SessionError> {
     let fail = |why: String| SessionError::Open {
         listen: endpoints.listen.clone(),
         connect: endpoints.connect.clone(),
@@ -163,8 +209,9 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
     ];
     let open_with = |shared_memory: &str| {
         let mut config = zenoh::Config::default();
-        let last = ("transport/shared_memory/enabled", shared_memory);
-        for (key, value) in settings.iter().chain([&last]) {
+        let more = more.iter().map(|(key, value)| (*key, value.as_str()));
+        let last = [("transport/shared_memory/enabled", shared_memory)];
+        for (key, value) in settings.iter().copied().chain(more).chain(last) {
             config
                 .insert_json5(key, value)
                 .map_err(|e| format!("{key} = {value}: {e}"))?;

@@ -33,18 +33,8 @@ pub struct Client {
 }
 
 impl Client {
-    pub(crate) fn join(endpoint: &str, deadline: Instant) -> Self {
-        let endpoints = Endpoints {
-            listen: Vec::new(),
-            connect: vec![endpoint.to_owned()],
-        };
-        // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
-        let session = loop {
-            match session::open(&endpoints) {
-                Ok(session) => break session,
-                Err(e) => assert!(Instant::now() < deadline, "{e}"),
-            }
-        };
+    /// A client over a session that a test has opened in its own way.
+    pub fn over(session: Session) -> Self {
         let keys = Keys::new(NAMESPACE).unwrap();
         let hello = join::hello(&session, &keys, &Shutdown::default())
             .unwrap()
@@ -59,6 +49,21 @@ impl Client {
             spec,
             config_toml: hello.config_toml,
         }
+    }
+
+    pub(crate) fn join(endpoint: &str, deadline: Instant) -> Self {
+        let endpoints = Endpoints {
+            listen: Vec::new(),
+            connect: vec![endpoint.to_owned()],
+        };
+        // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
+        let session = loop {
+            match session::open(&endpoints) {
+                Ok(session) => break session,
+                Err(e) => assert!(Instant::now() < deadline, "{e}"),
+            }
+        };
+        Self::over(session)
     }
 
     /// Sends bytes and gives the bytes of the answer.

@@ -7,12 +7,14 @@
     reason = "a harness fails by panicking in the test that uses it, and says there what it knows"
 )]
 
+mod certificates;
 mod client;
 mod process;
 mod run_folder;
 mod system;
 mod waiting;
 
+pub use certificates::{Certificates, Valid, skipped_without_openssl};
 pub use client::Client;
 pub use process::{Ended, Process};
 pub use run_folder::{RunFolder, Summary};

@@ -27,6 +27,7 @@ mod repo_rules;
 mod resume;
 mod successors;
 mod tiny_replay;
+mod tls;
 
 use driml_tests::{Process, TestSystem};
 

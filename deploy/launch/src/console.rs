@@ -1,12 +1,25 @@
 //! Everything that this program writes to stdout and stderr: messages, the log, progress bars, results.
 //! A terminal or pipe that is gone takes nothing and is no error here; `driml_protocol::end_signs` notices it.
 
-use std::io::{self, ErrorKind, IsTerminal, Write, stderr};
+use std::{
+    fmt,
+    io::{self, ErrorKind, IsTerminal, Write, stderr},
+};
 
-use anyhow::Context;
+use anyhow::Context as _;
 use console::Term;
+use driml_protocol::tls;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
-use tracing_subscriber::EnvFilter;
+use tracing::{
+    Event, Level, Subscriber,
+    field::{Field, Visit},
+};
+use tracing_subscriber::{
+    EnvFilter, Layer,
+    filter::Targets,
+    layer::{Context, SubscriberExt},
+    util::SubscriberInitExt,
+};
 
 /// How often a progress bar is drawn at most, times a second.
 const DRAWS_PER_SECOND: u8 = 20;
@@ -53,7 +66,9 @@ pub fn describe(error: &anyhow::Error) -> String {
 /// zenoh warns of each try to reach a process that is not there yet or any more, which is ours to judge: so only its errors are
 /// logged, and of those neither what its session says of messages that come while it closes, as at the end of every run, nor
 /// that no answer is wanted any more.
-pub fn log_to_stderr() {
+///
+/// With `guarded`, what zenoh says of those whom it refuses is heard too: [`tls::overhear`].
+pub fn log_to_stderr(guarded: bool) {
     let usual = "warn,driml=info,zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off";
     let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
     let filter = wanted.map_or_else(
@@ -67,13 +82,44 @@ pub fn log_to_stderr() {
             })
         },
     );
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let log = tracing_subscriber::fmt::layer()
         .with_writer(stderr)
         // It would say with `eprintln!`, which panics, that stderr cannot be written to.
         .log_internal_errors(false)
         .with_ansi(stderr().is_terminal())
+        .with_filter(filter);
+    let refusals = guarded.then(|| {
+        let targets = Targets::new()
+            .with_target(tls::HANDSHAKE_TARGET, Level::WARN)
+            .with_target(tls::ACCESS_TARGET, Level::TRACE);
+        Refusals.with_filter(targets)
+    });
+    tracing_subscriber::registry()
+        .with(log)
+        .with(refusals)
         .init();
+}
+
+/// Hands on what zenoh says of those whom it refuses.
+struct Refusals;
+
+impl<S: Subscriber> Layer<S> for Refusals {
+    fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
+        let mut text = Text(String::new());
+        event.record(&mut text);
+        tls::overhear(event.metadata().target(), &text.0);
+    }
+}
+
+/// The text of a line of the log.
+struct Text(String);
+
+impl Visit for Text {
+    fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+        if field.name() == "message" {
+            self.0 = format!("{value:?}");
+        }
+    }
 }
 
 /// Where messages go: stderr, above a progress bar if stderr is a terminal. Clones share the bar.

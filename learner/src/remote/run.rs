@@ -3,12 +3,13 @@
 
 use std::{
     path::{Path, PathBuf},
+    sync::Arc,
     time::{Duration, Instant},
 };
 
 use anyhow::Context;
 use driml_model::DeviceName;
-use driml_protocol::{BatchHeader, Keys, Shutdown, shared_memory, whole_file};
+use driml_protocol::{BatchHeader, Keys, Shutdown, shared_memory, tls::Credentials, whole_file};
 
 use super::{
     batch_source::{BatchSource, Next, Requests},
@@ -31,6 +32,8 @@ const TICK: Duration = Duration::from_millis(200);
 pub struct RunArgs {
     /// Endpoints of the replay server; one for each shard.
     pub connect: Vec<String>,
+    /// With which certificate it takes part; none without TLS.
+    pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
     /// Where checkpoints go: `RUN_DIR/checkpoints`.
@@ -46,7 +49,8 @@ pub struct RunArgs {
 /// A device that is not there, no replay server to join, settings that cannot work, an update that failed, a disk that refuses.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let Some(shards) = Shards::join(&args.connect, &keys, shutdown)? else {
+    let credentials = args.credentials.as_deref();
+    let Some(shards) = Shards::join(&args.connect, &keys, credentials, shutdown)? else {
         return Ok(());
     };
     let config = LearnerConfig::from_toml(&shards.config_toml)

@@ -1,6 +1,8 @@
 //! Where each message travels: its own key under the run's namespace, and one for each part that is connected.
 //! What an actor says stands under its number, so that access can be given by key; versions and lives are in the messages.
 
+use sha2::{Digest, Sha256};
+
 use super::message::Keyed;
 
 /// The key expressions of one run.
@@ -58,11 +60,19 @@ impl Keys {
     /// The key of the liveliness token of one life of an actor, or of a learner.
     pub fn alive_key(&self, who: Alive) -> String {
         match who {
-            Alive::Actor { actor, incarnation } => {
-                self.key(&format!("alive/actor/{actor}/{incarnation:016x}"))
-            }
-            Alive::Learner(learner) => self.key(&format!("alive/learner/{learner:016x}")),
+            Alive::Actor { actor, mark } => self.key(&format!("alive/actor/{actor}/{mark:016x}")),
+            Alive::Learner { mark } => self.key(&format!("alive/learner/{mark:016x}")),
         }
+    }
+
+    /// The keys of the liveliness tokens of all lives of an actor.
+    pub(crate) fn lives_of_actor(&self, actor: u32) -> String {
+        self.key(&format!("alive/actor/{actor}/*"))
+    }
+
+    /// The keys of the liveliness tokens of all learners.
+    pub(crate) fn lives_of_learner(&self) -> String {
+        self.key("alive/learner/*")
     }
 
     /// Liveliness tokens of all actors and learners.
@@ -75,28 +85,52 @@ impl Keys {
         let rest = key.strip_prefix(&self.namespace)?.strip_prefix("/alive/")?;
         let hex = |text| u64::from_str_radix(text, 16).ok();
         match rest.split('/').collect::<Vec<_>>()[..] {
-            ["actor", actor, incarnation] => Some(Alive::Actor {
+            ["actor", actor, mark] => Some(Alive::Actor {
                 actor: actor.parse().ok()?,
-                incarnation: hex(incarnation)?,
+                mark: hex(mark)?,
             }),
-            ["learner", learner] => Some(Alive::Learner(hex(learner)?)),
+            ["learner", mark] => Some(Alive::Learner { mark: hex(mark)? }),
             _ => None,
         }
     }
 }
 
-/// A part whose liveliness token was seen.
+/// A part whose liveliness token was seen. Anybody may see tokens, so they do not show the numbers by which the replay server
+/// knows its actors and its learner: who knew such a number could speak for them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Alive {
     /// One life of an actor.
     Actor {
         /// The actor's number in the run.
         actor: u32,
-        /// Which life of it.
-        incarnation: u64,
+        /// The mark of one life of it.
+        mark: u64,
     },
-    /// A learner, by its random number.
-    Learner(u64),
+    /// A learner.
+    Learner {
+        /// Its mark.
+        mark: u64,
+    },
+}
+
+impl Alive {
+    /// This life of an actor.
+    pub fn actor(actor: u32, incarnation: u64) -> Self {
+        let mark = mark(incarnation);
+        Self::Actor { actor, mark }
+    }
+
+    /// The learner of this number.
+    pub fn learner(learner: u64) -> Self {
+        let mark = mark(learner);
+        Self::Learner { mark }
+    }
+}
+
+/// What shows that somebody knows `number`, and does not tell it: the first 8 bytes of its SHA-256.
+fn mark(number: u64) -> u64 {
+    let digest = Sha256::digest(number.to_le_bytes());
+    u64::from_le_bytes(digest[..8].try_into().expect("SHA-256 has 32 bytes"))
 }
 
 #[cfg(test)]
@@ -119,17 +153,17 @@ mod tests {
     #[test]
     fn liveliness_tokens_say_whose_they_are() {
         let keys = Keys::new("a/b").unwrap();
-        let actor = Alive::Actor {
-            actor: 7,
-            incarnation: u64::MAX,
-        };
+        let actor = Alive::actor(7, u64::MAX);
         assert_eq!(keys.alive(&keys.alive_key(actor)), Some(actor));
-        let learner = Alive::Learner(9);
+        let learner = Alive::learner(9);
         assert_eq!(keys.alive(&keys.alive_key(learner)), Some(learner));
-        assert_eq!(
-            keys.alive_key(learner),
-            "a/b/alive/learner/0000000000000009"
+        let seen = keys.alive_key(learner);
+        assert!(seen.starts_with("a/b/alive/learner/"), "{seen}");
+        assert!(
+            !seen.ends_with("0000000000000009"),
+            "the number is not shown"
         );
+        assert_ne!(Alive::actor(7, 1), Alive::actor(7, 2));
         for strange in [
             "a/b/alive/actor/7",
             "a/alive/learner/9",

@@ -243,15 +243,30 @@ impl Actors {
         (&mut actor.streams, difference)
     }
 
-    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second goodbye,
-    /// and that of a life that never joined, reveal nothing.
-    pub(crate) fn goodbye(&mut self, goodbye: &Goodbye) -> Difference {
-        let Some(actor) = self.actors.get_mut(&goodbye.actor) else {
-            return Difference::default();
-        };
-        let mut lives = std::iter::once(&mut actor.current).chain(&mut actor.past);
+    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second goodbye
+    /// reveals nothing.
+    ///
+    /// # Errors
+    /// A life that never joined; the reason, for a person.
+    pub(crate) fn goodbye(&mut self, goodbye: &Goodbye) -> Result<Difference, String> {
+        let actor = self.actors.get_mut(&goodbye.actor);
+        let mut lives = actor
+            .into_iter()
+            .flat_map(|it| std::iter::once(&mut it.current).chain(&mut it.past));
         let life = lives.find(|life| life.incarnation == goodbye.incarnation);
-        life.map_or_else(Difference::default, |life| life.goodbye(goodbye.produced))
+        life.map(|life| life.goodbye(goodbye.produced))
+            .ok_or_else(|| format!("no such life of actor {} has joined", goodbye.actor))
+    }
+
+    /// Forgets actors that never sent a chunk and are not connected, if there is no room for one more.
+    pub(crate) fn forget_absent(&mut self, is_connected: impl Fn(u32, u64) -> bool) {
+        if self.actors.len() < ACTORS_MAX {
+            return;
+        }
+        self.actors.retain(|&number, actor| {
+            let has_sent = actor.expected > 0 || !actor.past.is_empty();
+            has_sent || is_connected(number, actor.current.incarnation)
+        });
     }
 }
 

@@ -37,6 +37,10 @@ impl Service {
         let heard = is_allowed.and_then(|()| self.hear_of_others(&mut state.replay, &request));
         if let Err(why) = heard {
             state.replay.note_refused_message();
+            state.say(
+                "batch",
+                &format!("a request for a batch was refused: {why}"),
+            );
             drop(state);
             return responder.reply(&BatchReply::Refused { why });
         }

@@ -97,6 +97,7 @@ impl State {
             chunks,
             members,
             timings,
+            said,
             ..
         } = self;
         let reply = match replay.settle(&packed) {
@@ -115,6 +116,12 @@ impl State {
                 reply => reply,
             },
         };
+        if let InsertReply::Refused { why } = &reply
+            && let Some(more) = said.due("chunk")
+        {
+            let actor = header.actor;
+            tracing::warn!("a chunk of actor {actor} was refused: {why}{more}");
+        }
         let mut answers = Answers::new();
         match reply {
             InsertReply::Wait { .. } => {
@@ -138,6 +145,9 @@ impl State {
     /// Says what became of a chunk, or notes who asks about a parked one; that of an actor that leaves is stored.
     fn take_claim(&mut self, claim: &Claim, question: Question) -> Answers {
         if let Some(reply) = self.replay.claim(claim) {
+            if let InsertReply::Refused { why } = &reply {
+                self.say("claim", &format!("a claim was refused: {why}"));
+            }
             return vec![(question, reply)];
         }
         let Some(parked) = self.chunks.claimed(claim) else {

@@ -53,8 +53,9 @@ impl Service {
             },
             Err(Rejection::Taken(why)) => JoinReply::Taken { why },
             Err(Rejection::Refused(why)) => {
-                tracing::warn!("a part was not let in: {why}");
-                self.state().replay.note_refused_message();
+                let mut state = self.state();
+                state.replay.note_refused_message();
+                state.say("join", &format!("a part was not let in: {why}"));
                 JoinReply::Refused { why }
             }
         };
@@ -83,16 +84,13 @@ impl State {
             .replay
             .actor_incarnation(actor)
             .filter(|&other| other != incarnation);
-        let connected = |incarnation| {
-            self.members
-                .connected
-                .contains(&Alive::Actor { actor, incarnation })
-        };
-        if other.is_some_and(connected) {
+        if other.is_some_and(|life| self.members.is_connected(actor, life)) {
             return Err(Rejection::Taken(format!(
                 "another process is actor {actor} of this run: give each actor a number of its own (--id)"
             )));
         }
+        self.replay
+            .forget_absent_actors(|actor, life| self.members.is_connected(actor, life));
         let earlier_incarnations = self.replay.join_actor(join).map_err(Rejection::Refused)?;
         self.count_actors();
         if other.is_some() {
@@ -108,7 +106,7 @@ impl State {
             rows_sampled,
         } = join;
         let other = self.members.learner.filter(|&other| other != learner);
-        let connected = |other| self.members.connected.contains(&Alive::Learner(other));
+        let connected = |other| self.members.connected.contains(&Alive::learner(other));
         if other.is_some_and(connected) {
             let why = "another learner takes part in this run, which has one alone";
             return Err(Rejection::Taken(why.into()));

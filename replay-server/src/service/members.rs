@@ -27,13 +27,18 @@ impl Members {
         }
     }
 
+    /// Whether this life of an actor is connected.
+    pub(super) fn is_connected(&self, actor: u32, incarnation: u64) -> bool {
+        self.connected.contains(&Alive::actor(actor, incarnation))
+    }
+
     /// Actors that are connected and have joined.
     pub(super) fn actors(&self, replay: &Replay) -> u32 {
         let takes_part = |who: &&Alive| match **who {
-            Alive::Actor { actor, incarnation } => {
-                replay.actor_incarnation(actor) == Some(incarnation)
-            }
-            Alive::Learner(_) => false,
+            Alive::Actor { actor, .. } => replay
+                .actor_incarnation(actor)
+                .is_some_and(|life| Alive::actor(actor, life) == **who),
+            Alive::Learner { .. } => false,
         };
         self.connected.iter().filter(takes_part).count() as u32
     }

@@ -9,6 +9,7 @@ mod chunks;
 mod joining;
 mod members;
 mod parked;
+mod refused;
 mod run;
 mod server;
 mod status;

@@ -10,11 +10,12 @@ use std::{
 use anyhow::Context;
 use driml_protocol::{
     BatchHeader, BufferPool, Incoming, Keyed, Keys, POOL_BATCHES, QueryWorkers, Request, Responder,
-    RunClient, RunSpec, Shutdown, TRANSITION_BYTES,
+    RunClient, RunSpec, SeldomEach, Shutdown, TRANSITION_BYTES,
     config::{Settings, TransportConfig},
     join_within,
     session::{self, Endpoints},
     shared_memory,
+    tls::{self, Credentials},
 };
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
@@ -47,6 +48,8 @@ pub struct RunArgs {
     pub listen: Vec<String>,
     /// Routers to connect to, if any.
     pub connect: Vec<String>,
+    /// With which certificate it takes part; none without TLS.
+    pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
     /// Which of the replay's shards this is, from 0.
@@ -90,10 +93,13 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             }
         };
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let session = session::open(&Endpoints {
+    let endpoints = Endpoints {
         listen: args.listen.clone(),
         connect: args.connect,
-    })?;
+    };
+    // From the first connection on.
+    let reports = args.credentials.is_some().then(tls::listen);
+    let session = session::open_as(&endpoints, &keys, args.credentials.as_deref())?;
     let client = RunClient::new(session, keys, spec.hash());
     let declaring =
         |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
@@ -112,6 +118,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             chunks: ParkedChunks::default(),
             requests: ParkedRequests::default(),
             timings: Timings::default(),
+            connections_refused: 0,
+            said: SeldomEach::default(),
         }),
         changed: Condvar::new(),
         weights: Mutex::default(),
@@ -126,6 +134,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         ..
     } = Answers::declare(&client, &service).map_err(declaring)?;
     threads.extend(service.clone().start_working()?);
+    if let Some(reports) = reports {
+        threads.push(service.clone().start_hearing(reports)?);
+    }
     tracing::info!(
         "replay server listens on {:?}, run {:016x}",
         args.listen,

@@ -8,7 +8,7 @@ use std::{
 
 use driml_protocol::{
     Announcer, BatchReply, BufferPool, CodecError, Incoming, InsertReply, Request, Responder,
-    Shutdown, WeightsVersion,
+    SeldomEach, Shutdown, WeightsVersion,
 };
 
 use super::{
@@ -48,6 +48,10 @@ pub(super) struct State {
     pub(super) chunks: ParkedChunks<Question>,
     pub(super) requests: ParkedRequests<Responder<BatchReply>>,
     pub(super) timings: Timings,
+    /// Connections refused for want of a good certificate.
+    pub(super) connections_refused: u64,
+    /// Lines about what was refused, which a stranger could make come at any rate.
+    pub(super) said: SeldomEach,
 }
 
 /// Who asks about a chunk, and since when.
@@ -63,8 +67,9 @@ impl Service {
 
     /// Counts and logs a message that cannot be read.
     pub(super) fn refuse(&self, what: &str, e: &CodecError) {
-        tracing::warn!("{what} was refused: {e}");
-        self.state().replay.note_refused_message();
+        let mut state = self.state();
+        state.replay.note_refused_message();
+        state.say(what, &format!("{what} was refused: {e}"));
     }
 
     /// Reads a request without payload, or counts it as refused.
@@ -85,5 +90,14 @@ impl Service {
             .wait_timeout(state, wait_max)
             .unwrap_or_else(PoisonError::into_inner)
             .0
+    }
+}
+
+impl State {
+    /// Logs a line of this kind, or counts it where one was logged a short while ago.
+    pub(super) fn say(&mut self, kind: &str, line: &str) {
+        if let Some(more) = self.said.due(kind) {
+            tracing::warn!("{line}{more}");
+        }
     }
 }

@@ -8,7 +8,12 @@ use super::server::Service;
 impl Service {
     pub(super) fn goodbye(&self, incoming: Incoming<Goodbye>) {
         if let Some(goodbye) = self.read(&incoming) {
-            self.state().replay.goodbye(&goodbye);
+            let mut state = self.state();
+            if let Some(why) = state.replay.goodbye(&goodbye) {
+                state.say("goodbye", &format!("a goodbye was refused: {why}"));
+            }
+            drop(state);
+            // Whoever says goodbye has nothing to do any more, with whatever it has said.
             incoming.into_responder().reply(&Done);
         }
     }
@@ -28,16 +33,21 @@ impl Service {
                 Err(why)
             }
         };
-        drop(state);
-        match set {
-            Ok(()) => incoming.into_responder().reply(&Done),
-            Err(why) => tracing::warn!("an affinity matrix was refused: {why}"),
+        if let Err(why) = set {
+            state.say(
+                "affinity",
+                &format!("an affinity matrix was refused: {why}"),
+            );
+            return;
         }
+        drop(state);
+        incoming.into_responder().reply(&Done);
     }
 
     pub(super) fn status(&self, responder: Responder<ReplayStatus>) {
         let state = self.state();
         let mut status = state.replay.status();
+        status.connections_refused = state.connections_refused;
         status.actors_acting = state.members.actors_acting();
         status.actors_waiting = state.chunks.len() as u32;
         status.answer_ms = state.timings.answer_ms();
