@@ -46,16 +46,19 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         listen: Vec::new(),
         connect: args.connect,
     };
-    let session = session::open_as(&endpoints, &keys, args.credentials.as_deref())?;
+    let session = session::open_as(
+        &endpoints,
+        &keys,
+        args.credentials.as_deref(),
+        session::SMALL_MESSAGE_BYTES_MAX,
+    )?;
     let Some(hello) = join::hello(&session, &keys, shutdown)? else {
         return Ok(());
     };
     let mut settings = ActorSettings::from_toml(&hello.config_toml)
         .context("the settings that the replay server sent")?;
     if let Some(envs) = args.envs {
-        settings.actor.envs = envs;
-        settings.actor.validate()?;
-        settings.check_chunk()?;
+        settings.set_envs(envs)?;
     }
     if settings.transport.shared_memory && !hello.shared_memory {
         tracing::info!("chunks go through sockets: the replay server cannot read shared memory");

@@ -40,7 +40,7 @@ pub use messages::{
     affinity::AffinityUpdate,
     batch::{Batch, BatchHeader, BatchReply, BatchRowsMut, NO_ACTION, POOL_BATCHES},
     batch_request::{BatchRequest, RequestId},
-    chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES},
+    chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES, transitions_max},
     done::Done,
     goodbye::Goodbye,
     hello::Hello,

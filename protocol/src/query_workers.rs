@@ -26,7 +26,7 @@ use crate::{
     session,
     wire::{
         buffers::{Buffer, BufferPool},
-        codec,
+        codec::{self, PAYLOAD_BYTES_MAX},
         error::CodecError,
         keys::Keys,
         message::{Keyed, Message, Request},
@@ -207,9 +207,26 @@ impl<M: Keyed + 'static> QueryWorkers<M> {
     /// # Errors
     /// zenoh refused to declare it.
     pub fn declare(&self, client: &RunClient) -> zenoh::Result<Queryable<()>> {
+        self.declare_limited(client, PAYLOAD_BYTES_MAX, |_| ())
+    }
+
+    /// As [`QueryWorkers::declare`], for queries of at most `bytes_max` bytes: longer ones are dropped before anything is copied,
+    /// and `refused` is told their bytes, on the thread that reads the socket.
+    ///
+    /// # Errors
+    /// As [`QueryWorkers::declare`].
+    pub fn declare_limited(
+        &self,
+        client: &RunClient,
+        bytes_max: usize,
+        refused: impl Fn(usize) + Send + Sync + 'static,
+    ) -> zenoh::Result<Queryable<()>> {
         let (queries, waiting_bytes) = (self.queries.clone(), self.waiting_bytes.clone());
         let take = move |query: Query| {
             let bytes = payload_bytes(&query);
+            if bytes > bytes_max {
+                return refused(bytes);
+            }
             let before = waiting_bytes.fetch_add(bytes, Ordering::Relaxed);
             // A query that is dropped ends: its asker hears that nobody answers.
             if before > WAITING_BYTES_MAX || queries.try_send(query).is_err() {

@@ -67,7 +67,13 @@ impl TlsSystem {
             connect: vec![self.endpoint.clone()],
         };
         let keys = Keys::new("driml").unwrap();
-        let session = session::open_as(&endpoints, &keys, Some(&credentials)).unwrap();
+        let session = session::open_as(
+            &endpoints,
+            &keys,
+            Some(&credentials),
+            session::SMALL_MESSAGE_BYTES_MAX,
+        )
+        .unwrap();
         Client::over(session)
     }
 

@@ -53,6 +53,7 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
         namespace: args.join.namespace,
         shard: args.shard,
         after_updates: args.after_updates,
+        weights_bytes_max: config.weights_bytes()?,
         config_toml: config.to_toml(),
     };
     clean_up_after(driml_replay_server::run(run, &shutdown))

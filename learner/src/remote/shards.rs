@@ -45,7 +45,8 @@ impl Shards {
                 listen: Vec::new(),
                 connect: vec![endpoint.clone()],
             };
-            let session = session::open_as(&endpoints, keys, credentials)?;
+            let session =
+                session::open_as(&endpoints, keys, credentials, session::MESSAGE_BYTES_MAX)?;
             let Some(hello) = join::hello(&session, keys, shutdown)? else {
                 return Ok(None);
             };

@@ -5,7 +5,10 @@ use std::collections::HashSet;
 
 use driml_protocol::Alive;
 
-use crate::replay::Replay;
+use crate::{ledger::actors::ACTORS_MAX, replay::Replay};
+
+/// Parts that are known to be connected at a time, far more than take part: further ones count as absent.
+const CONNECTED_MAX: usize = 4 * ACTORS_MAX;
 
 /// What is known of the parts of the run.
 #[derive(Default)]
@@ -21,7 +24,9 @@ impl Members {
     /// Takes note that a part is connected, or no longer.
     pub(super) fn note(&mut self, who: Alive, is_connected: bool) {
         if is_connected {
-            self.connected.insert(who);
+            if self.connected.len() < CONNECTED_MAX {
+                self.connected.insert(who);
+            }
         } else {
             self.connected.remove(&who);
         }

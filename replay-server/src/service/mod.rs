@@ -7,6 +7,7 @@
 mod batches;
 mod chunks;
 mod joining;
+mod limits;
 mod members;
 mod parked;
 mod refused;

@@ -20,6 +20,7 @@ use driml_protocol::{
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
 use super::{
+    limits::Limits,
     members::Members,
     parked::{ParkedChunks, ParkedRequests},
     server::{Service, State},
@@ -56,6 +57,8 @@ pub struct RunArgs {
     pub shard: u32,
     /// Updates of the learner after which the run goes on; 0 starts it.
     pub after_updates: u64,
+    /// Bytes of a version of the weights, of which the replay server itself knows nothing; longer uploads are refused.
+    pub weights_bytes_max: usize,
     /// The run's resolved settings, which it hands to whoever joins.
     pub config_toml: String,
 }
@@ -92,6 +95,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
                 false
             }
         };
+    let limits = Limits::of(&settings, &spec, args.weights_bytes_max)?;
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let endpoints = Endpoints {
         listen: args.listen.clone(),
@@ -99,12 +103,18 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     };
     // From the first connection on.
     let reports = args.credentials.is_some().then(tls::listen);
-    let session = session::open_as(&endpoints, &keys, args.credentials.as_deref())?;
+    let session = session::open_as(
+        &endpoints,
+        &keys,
+        args.credentials.as_deref(),
+        limits.largest(),
+    )?;
     let client = RunClient::new(session, keys, spec.hash());
     let declaring =
         |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
     let service = Arc::new(Service {
         num_actions: spec.num_actions,
+        limits,
         shard: (args.shard, config.shards),
         after_updates: args.after_updates,
         config_toml: args.config_toml,
@@ -156,7 +166,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
 }
 
 /// One whole number of another part's settings.
-fn number(settings: &Settings, table: &'static str, key: &str) -> anyhow::Result<u32> {
+pub(super) fn number(settings: &Settings, table: &'static str, key: &str) -> anyhow::Result<u32> {
     let values: toml::Table = settings.table(table)?;
     let value = values.get(key).and_then(toml::Value::as_integer);
     let value = value.with_context(|| format!("{table}.{key} is missing or not a whole number"))?;
@@ -198,46 +208,63 @@ impl<'a> Answers<'a> {
             queryables: Vec::new(),
             threads: Threads::new(),
         };
-        this.answer("insert", 1, Service::insert)?;
-        this.answer("claim", 1, Service::claim)?;
-        this.answer("request", 1, Service::request)?;
-        this.answer("affinity", 1, Service::affinity)?;
+        let limits = service.limits;
+        this.answer("insert", 1, limits.chunk, Service::insert)?;
+        this.answer("claim", 1, limits.small, Service::claim)?;
+        this.answer("request", 1, limits.small, Service::request)?;
+        this.answer("affinity", 1, limits.affinity, Service::affinity)?;
         this.offer("hello", 1, Service::hello)?;
-        this.answer("join-actor", 1, Service::join_actor)?;
-        this.answer("join-learner", 1, Service::join_learner)?;
-        this.answer("goodbye", 1, Service::goodbye)?;
-        this.answer("weights-upload", 1, Service::take_weights)?;
-        this.answer("weights", WEIGHTS_THREADS, Service::give_weights)?;
+        this.answer("join-actor", 1, limits.small, Service::join_actor)?;
+        this.answer("join-learner", 1, limits.small, Service::join_learner)?;
+        this.answer("goodbye", 1, limits.small, Service::goodbye)?;
+        this.answer("weights-upload", 1, limits.weights, Service::take_weights)?;
+        this.answer(
+            "weights",
+            WEIGHTS_THREADS,
+            limits.small,
+            Service::give_weights,
+        )?;
         this.offer("status", 1, Service::status)?;
         Ok(this)
     }
 
-    /// Answers requests `R` with `answer`, on so many threads of this name.
+    /// Answers requests `R` of at most `bytes_max` bytes with `answer`, on so many threads of this name.
     fn answer<R: Request + 'static>(
         &mut self,
-        name: &str,
+        name: &'static str,
         threads: usize,
+        bytes_max: usize,
         answer: fn(&Service, Incoming<R>),
     ) -> zenoh::Result<()> {
         let (service, spec_hash) = (self.service.clone(), self.client.spec_hash());
         let answer = move |incoming| answer(&service, incoming);
-        self.add(QueryWorkers::answer(name, threads, spec_hash, answer)?)
+        let workers = QueryWorkers::answer(name, threads, spec_hash, answer)?;
+        self.add(name, bytes_max, workers)
     }
 
     /// Gives an `M` to whoever fetches it, on so many threads of this name.
     fn offer<M: Keyed + 'static>(
         &mut self,
-        name: &str,
+        name: &'static str,
         threads: usize,
         give: fn(&Service, Responder<M>),
     ) -> zenoh::Result<()> {
         let (service, spec_hash) = (self.service.clone(), self.client.spec_hash());
         let give = move |responder| give(&service, responder);
-        self.add(QueryWorkers::offer(name, threads, spec_hash, give)?)
+        let workers = QueryWorkers::offer(name, threads, spec_hash, give)?;
+        self.add(name, self.service.limits.small, workers)
     }
 
-    fn add<M: Keyed + 'static>(&mut self, workers: QueryWorkers<M>) -> zenoh::Result<()> {
-        self.queryables.push(workers.declare(self.client)?);
+    fn add<M: Keyed + 'static>(
+        &mut self,
+        name: &'static str,
+        bytes_max: usize,
+        workers: QueryWorkers<M>,
+    ) -> zenoh::Result<()> {
+        let service = self.service.clone();
+        let refused = move |bytes| service.refuse_long(name, bytes, bytes_max);
+        let queryable = workers.declare_limited(self.client, bytes_max, refused)?;
+        self.queryables.push(queryable);
         self.threads.extend(workers.into_threads());
         Ok(())
     }

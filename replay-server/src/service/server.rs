@@ -12,6 +12,7 @@ use driml_protocol::{
 };
 
 use super::{
+    limits::Limits,
     members::Members,
     parked::{ParkedChunks, ParkedRequests},
     timings::Timings,
@@ -22,6 +23,7 @@ use crate::{replay::Replay, storage::frame_store::Packer};
 /// What all threads share.
 pub(super) struct Service {
     pub(super) num_actions: u32,
+    pub(super) limits: Limits,
     pub(super) shard: (u32, u32),
     pub(super) after_updates: u64,
     pub(super) config_toml: String,
@@ -70,6 +72,17 @@ impl Service {
         let mut state = self.state();
         state.replay.note_refused_message();
         state.say(what, &format!("{what} was refused: {e}"));
+    }
+
+    /// Counts and logs a message that is longer than any of its kind.
+    pub(super) fn refuse_long(&self, kind: &'static str, bytes: usize, bytes_max: usize) {
+        let mut state = self.state();
+        state.replay.note_refused_message();
+        let why = "has more than a message of this kind can have in this run";
+        state.say(
+            kind,
+            &format!("a message of {bytes} bytes to {kind:?} was refused: it {why}, {bytes_max}"),
+        );
     }
 
     /// Reads a request without payload, or counts it as refused.
