@@ -104,19 +104,22 @@ const NOBODY_LISTENS: &str = "Unable to connect to any of";
 const STALLED_MAX: Duration = Duration::from_secs(8);
 /// How long a client tries to connect.
 const CONNECT_MAX: Duration = Duration::from_secs(10);
-/// Longest message accepted from a peer, bytes.
-const MESSAGE_BYTES_MAX: usize = 1 << 29;
+/// Longest message accepted from a peer, bytes, where a part does not know its run's sizes yet.
+pub const MESSAGE_BYTES_MAX: usize = 1 << 29;
+/// The same for whoever receives settings, status and pieces of weights alone.
+pub const SMALL_MESSAGE_BYTES_MAX: usize = 1 << 22;
 
 /// Opens a session. A part that listens is the run's router; one that only connects is a client.
 ///
 /// # Errors
 /// An endpoint that cannot be listened on; a client whose endpoint nobody listens on after ten seconds.
 pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
-    open_with(endpoints, &[])
+    open_with(endpoints, MESSAGE_BYTES_MAX, &[])
 }
 
 /// As [`open`], with certificates where there are any: then endpoints are `tls/HOST:PORT` or unix sockets, and a replay server
-/// gives each role of the run with these keys what it needs and no more.
+/// gives each role of the run with these keys what it needs and no more. Messages of more than `message_bytes_max` bytes, which no
+/// peer of this run sends, are dropped while they come in.
 ///
 /// # Errors
 /// As [`open`]; a certificate that either side refuses, and why.
@@ -124,13 +127,17 @@ pub fn open_as(
     endpoints: &Endpoints,
     keys: &Keys,
     credentials: Option<&Credentials>,
+    message_bytes_max: usize,
 ) -> Result<Session, SessionError> {
     let Some(credentials) = credentials else {
-        return open(endpoints);
+        return open_with(endpoints, message_bytes_max, &[]);
     };
     credentials.warn_if_it_expires_soon();
     for endpoint in endpoints.connect.iter().filter(|it| is_tls(it)) {
-        tls::check(endpoint, credentials, CONNECT_MAX)?;
+        if !tls::check(endpoint, credentials, CONNECT_MAX)? {
+            let connect = vec![endpoint.clone()];
+            return Err(SessionError::NobodyListens { connect });
+        }
     }
     let mut settings = vec![
         ("transport/link/tls", credentials.zenoh_settings()),
@@ -142,7 +149,7 @@ pub fn open_as(
     if credentials.role() == Role::ReplayServer {
         settings.push(("access_control", tls::rules(keys)));
     }
-    open_with(endpoints, &settings)
+    open_with(endpoints, message_bytes_max, &settings)
 }
 
 /// Whether an endpoint is reached over TLS.
@@ -150,7 +157,11 @@ pub fn is_tls(endpoint: &str) -> bool {
     endpoint.starts_with("tls/")
 }
 
-fn open_with(endpoints: &Endpoints, more: &[(&str, String)]) -> Result<Session, SessionError> {
+fn open_with(
+    endpoints: &Endpoints,
+    message_bytes_max: usize,
+    more: &[(&str, String)],
+) -> Result<Session, SessionError> {
     let fail = |why: String| SessionError::Open {
         listen: endpoints.listen.clone(),
         connect: endpoints.connect.clone(),
@@ -167,7 +178,7 @@ fn open_with(endpoints: &Endpoints, more: &[(&str, String)]) -> Result<Session, 
         )
     };
     let router = !endpoints.listen.is_empty();
-    let max = MESSAGE_BYTES_MAX.to_string();
+    let max = message_bytes_max.to_string();
     let stalled_us = STALLED_MAX.as_micros().to_string();
     let connect_ms = CONNECT_MAX.as_millis().to_string();
     let settings: &[(&str, &str)] = &[

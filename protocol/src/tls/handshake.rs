@@ -26,7 +26,7 @@ const VERDICT_MAX: Duration = Duration::from_millis(1500);
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// Checks that whoever listens on `endpoint`, `tls/HOST:PORT`, is a replay server of the same authority and takes this part's
-/// certificate. Nobody there within `wait_max` is no error here: opening the session says so.
+/// certificate. False if nobody listens there within `wait_max`.
 ///
 /// # Errors
 /// Which side refuses the other, why, and what to do.
@@ -34,7 +34,7 @@ pub(crate) fn check(
     endpoint: &str,
     credentials: &Credentials,
     wait_max: Duration,
-) -> Result<(), TlsError> {
+) -> Result<bool, TlsError> {
     let started = Instant::now();
     let Some(tcp) = std::iter::repeat_with(|| connect(endpoint))
         .inspect(|tried| {
@@ -46,13 +46,13 @@ pub(crate) fn check(
         .flatten()
         .next()
     else {
-        return Ok(());
+        return Ok(false);
     };
-    Handshake {
+    let handshake = Handshake {
         endpoint,
         credentials,
-    }
-    .run(tcp)
+    };
+    handshake.run(tcp).map(|()| true)
 }
 
 /// The host and the port of an endpoint.

@@ -3,6 +3,7 @@
 
 use std::{
     cell::RefCell,
+    collections::BTreeMap,
     sync::{Mutex, PoisonError, mpsc},
 };
 
@@ -107,20 +108,54 @@ fn message(line: &str) -> Option<Report> {
             *left = left.saturating_sub(1);
             !is_worked_out
         });
-    let (who, what) = line.split_once(" is unauthorized to ")?;
+    // `ID on Interface(lo)+CertCommonName(actor-1)+...`, or of a permission that is looked up `Using cached result: ID`.
+    let (who, what) = [" is unauthorized to ", " is authorized to "]
+        .iter()
+        .find_map(|verb| line.split_once(verb))?;
+    let name = name_of(who);
     // What is not sent to somebody is no deed of theirs.
-    if !is_asked || !what.contains("(ingress)") {
+    if !is_asked || line.contains(" is authorized to ") || !what.contains("(ingress)") {
         return None;
     }
-    let what = what.replace(" (ingress)", "");
-    // zenoh has the name among others of the same peer: `ID on Interface(lo)+CertCommonName(actor-1)+...`.
-    let name = who
-        .split_once("CertCommonName(")
-        .and_then(|(_, name)| name.split(')').next())
-        .unwrap_or("a part");
+    let what = what.split(" (ingress)").next().unwrap_or(what);
+    let deed = match what {
+        "Query" => "ask",
+        "Reply" | "Declare Queryable" => "answer",
+        "Put" | "Delete" => "announce",
+        "Declare Subscriber" => "listen",
+        "Liveliness Token" => "be alive",
+        other => other,
+    };
     Some(Report::Message(format!(
-        "{name} may not {what}: its certificate is for another role or number"
+        "{name} may not {deed} at {key}: its certificate is for another role or number"
     )))
+}
+
+/// Peers whose names are remembered, by zenoh's number of them; of further ones the name is not said each time.
+const NAMES_MAX: usize = 4096;
+
+static NAMES: Mutex<BTreeMap<String, String>> = Mutex::new(BTreeMap::new());
+
+/// The name in the certificate of whoever a line is about.
+fn name_of(who: &str) -> String {
+    let mut names = NAMES.lock().unwrap_or_else(PoisonError::into_inner);
+    let number = who.split(" on ").next().unwrap_or(who);
+    let number = number.trim_start_matches("Using cached result: ");
+    let named = who
+        .split_once("CertCommonName(")
+        .and_then(|(_, name)| name.split(')').next());
+    match named {
+        Some(name) => {
+            if names.len() < NAMES_MAX && !names.contains_key(number) {
+                names.insert(number.to_owned(), name.to_owned());
+            }
+            name.to_owned()
+        }
+        None => names
+            .get(number)
+            .map_or("a part", String::as_str)
+            .to_owned(),
+    }
 }
 
 #[cfg(test)]
@@ -139,10 +174,7 @@ mod tests {
         let Some(Report::Message(text)) = message(denied) else {
             panic!("{denied}");
         };
-        assert!(
-            text.starts_with("actor-1 may not Query on d/batch"),
-            "{text}"
-        );
+        assert!(text.starts_with("actor-1 may not ask at d/batch"), "{text}");
         // Permissions for a key that was declared are worked out at once, and then looked up.
         assert_eq!(
             message("ACL (ingress): caching permissions for `d/batch` ..."),
@@ -152,7 +184,11 @@ mod tests {
             assert_eq!(message(denied), None);
         }
         let looked_up = "Using cached result: 1f is unauthorized to Query (ingress) on d/batch";
-        assert!(message(denied).is_some() && message(looked_up).is_some());
+        let Some(Report::Message(text)) = message(looked_up) else {
+            panic!("{looked_up}");
+        };
+        assert!(text.starts_with("actor-1 may not ask at d/batch"), "{text}");
+        assert!(message(denied).is_some());
         for quiet in [
             "1f on x is authorized to Query (ingress) on driml/batch",
             "1f on x is unauthorized to Put (egress) on driml/weights-version",
