@@ -5,7 +5,7 @@ use std::{sync::Arc, time::Duration};
 
 use anyhow::Context;
 use driml_protocol::{
-    ActorJoin, Alive, Keys, RunClient, Shutdown, Weights, join,
+    Activity, ActorJoin, Keys, Life, RunClient, Shutdown, Weights, join, reporter,
     session::{self, Endpoints},
     tls::Credentials,
 };
@@ -69,14 +69,25 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         actor: args.actor,
         incarnation: rand::random(),
     };
+    let who = Life::Actor {
+        actor: join.actor,
+        incarnation: join.incarnation,
+    };
     // Before it joins, so that no other process can take its place from then on.
     let client = RunClient::new(session, keys, spec_hash);
     let alive = client
-        .declare_alive(Alive::actor(join.actor, join.incarnation))
+        .declare_alive(who.alive())
         .map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
     let Some(welcome) = join::as_actor(&client, join, shutdown)? else {
         return Ok(());
     };
+    let activity = Activity::new("waits for the learner's first weights");
+    reporter::start(
+        vec![client.clone()],
+        who,
+        activity.clone(),
+        shutdown.clone(),
+    )?;
     let source = WeightsSource {
         client: client.clone(),
     };
@@ -127,12 +138,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         }
         // At the start not all are connected yet.
         let steps = config.chunk_steps(delivery.actors().max(actors_planned));
+        activity.begin("plays");
         let chunk = collector.collect(delivery.inserted_total(), steps)?;
+        if let Some(waits) = delivery.waits_in_words() {
+            activity.begin(waits);
+        }
         if !delivery.send(chunk) {
             break;
         }
     }
     let produced = collector.produced();
+    activity.begin("delivers its last chunks");
     let unwanted = delivery.finish()?;
     tracing::info!(
         "actor {} leaves: {} transitions delivered",

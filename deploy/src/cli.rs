@@ -17,6 +17,7 @@ use crate::commands::{
     presets::{self, PresetsArgs},
     procgen::{self, ProcgenCommand},
     replay_server::{self, ReplayServerArgs},
+    status::{self, StatusArgs},
     train::{self, TrainArgs},
 };
 
@@ -39,6 +40,8 @@ pub(crate) enum Command {
     ReplayServer(ReplayServerArgs),
     /// The learner of a run whose replay server is reached at ENDPOINT
     Learner(LearnerArgs),
+    /// Who takes part in a run, who waits for whom and since when, and what it would take to go on
+    Status(StatusArgs),
     /// Play whole episodes with a run's newest weights, beside a random policy
     Evaluate(EvaluateArgs),
     /// What a world and an agent build, compute and send, what it would be if everything were on, and why
@@ -80,6 +83,7 @@ impl Command {
             Self::Actor(args) => actor::run(args),
             Self::ReplayServer(args) => replay_server::run(args),
             Self::Learner(args) => learner::run(args),
+            Self::Status(args) => status::run(&args),
             Self::Evaluate(args) => evaluate::run(&args),
             Self::Inspect(args) => inspect::run(&args),
             Self::Parity(args) => parity::run(&args),

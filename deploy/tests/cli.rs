@@ -58,7 +58,7 @@ fn names_that_nothing_has() {
     "#]]
     .assert_eq(&usage(&["local", "--preset", "split", "--env", "mspacman"]));
     expect![[r#"
-        error: there is no setting "learner.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, precision, publish_as, publish_period_updates, unreachable_max_ms, update
+        error: there is no setting "learner.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, equal_states, precision, publish_as, publish_period_updates, unreachable_max_ms, update
     "#]].assert_eq(&usage(&["local", "--set", "learner.lr=1"]));
 }
 

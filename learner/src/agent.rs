@@ -24,6 +24,7 @@ use crate::{
         gradients::{Gradients, clip_factor},
         target,
     },
+    repeats::{Distinct, EqualStates, State, one_after_another},
     settings::LearnerSettings,
     tensors::states,
 };
@@ -79,6 +80,7 @@ pub struct Agent {
     model: ModelConfig,
     settings: LearnerSettings,
     compute: Compute,
+    equal_states: EqualStates,
     auxiliary: Box<dyn AuxiliaryLoss>,
     pub(crate) online: Parameters,
     pub(crate) target: Parameters,
@@ -156,6 +158,7 @@ impl Agent {
             key,
             adam: Adam::new(settings.adam, &online, kernels)?,
             compute: compute.clone(),
+            equal_states: EqualStates::default(),
             auxiliary,
             updates: 0,
             model,
@@ -163,6 +166,13 @@ impl Agent {
             online,
             target,
         })
+    }
+
+    /// The same, with equal states of a batch computed so. Without this each is computed.
+    #[must_use]
+    pub const fn with_equal_states(mut self, equal_states: EqualStates) -> Self {
+        self.equal_states = equal_states;
+        self
     }
 
     /// The online network's sizes, its auxiliary heads included.
@@ -257,6 +267,7 @@ impl Agent {
             &self.model,
             &*self.auxiliary,
             batch,
+            self.equal_states,
             &self.compute.device,
         )?;
         let taken_logits = self
@@ -348,11 +359,9 @@ impl Agent {
         for probs in probs.chunks_exact_mut(atoms) {
             probs[0] = 1.0;
         }
-        let bootstraps: Vec<usize> = (0..batch.rows)
-            .filter(|&row| batch.bootstrap_discount[row] != 0.0)
-            .collect();
+        let bootstraps: Vec<usize> = batch.bootstraps().collect();
         if !bootstraps.is_empty() {
-            let (actions, logits) = self.next_greedy(batch, &bootstraps)?;
+            let (actions, logits) = self.next_greedy(batch)?;
             for ((&row, action), logits) in bootstraps
                 .iter()
                 .zip(actions)
@@ -379,21 +388,19 @@ impl Agent {
         Ok((next_greedy, projected))
     }
 
-    /// Greedy actions in s_{t+n} of these rows [n], and the target network's logits [n, N] of them.
-    fn next_greedy(
-        &self,
-        batch: &Batch<'_>,
-        rows: &[usize],
-    ) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
+    /// Greedy actions in s_{t+n} of the rows that bootstrap [n], and the target network's logits [n, N] of them.
+    fn next_greedy(&self, batch: &Batch<'_>) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
         let ModelConfig {
             num_actions, atoms, ..
         } = self.model;
-        let states_n = if rows.len() == batch.rows {
-            Cow::Borrowed(batch.states_n)
-        } else {
-            let len = self.model.frame_len();
-            let frames = rows.iter().map(|row| &batch.states_n[row * len..][..len]);
-            Cow::Owned(frames.collect::<Vec<_>>().concat())
+        let len = self.model.frame_len();
+        let frames: Vec<State<'_>> = batch.next_states(len).into_iter().map(Some).collect();
+        let once = self.equal_states.once_by(self.compute.kernels);
+        let distinct = once.then(|| Distinct::of(&frames)).flatten();
+        let states_n = match &distinct {
+            Some(distinct) => Cow::Owned(distinct.gather(&frames, len)),
+            None if batch.states_n.len() == frames.len() * len => Cow::Borrowed(batch.states_n),
+            None => Cow::Owned(one_after_another(frames.iter().copied(), len)),
         };
         let states_n = states(&self.model, states_n, &self.compute.device)?;
         let target_logits = distribution(&self.target_network, &states_n)?;
@@ -409,14 +416,18 @@ impl Agent {
                 what: format!("the {network} network's value of an s_{{t+n}}"),
             });
         }
-        let actions: Vec<u8> = values.chunks_exact(num_actions).map(greedy).collect();
+        let of_state: Vec<u8> = values.chunks_exact(num_actions).map(greedy).collect();
         let logits = flat(&target_logits)?;
-        let of_row = logits.chunks_exact(num_actions * atoms);
-        let chosen = of_row.zip(&actions).map(|(logits, &action)| {
-            let at = usize::from(action) * atoms;
-            &logits[at..at + atoms]
-        });
-        let chosen = chosen.collect::<Vec<_>>().concat();
+        let (mut actions, mut chosen) = (Vec::new(), Vec::with_capacity(frames.len() * atoms));
+        for row in 0..frames.len() {
+            let state = distinct
+                .as_ref()
+                .map_or(row, |it| it.places()[row] as usize);
+            let action = of_state[state];
+            let at = (state * num_actions + usize::from(action)) * atoms;
+            chosen.extend_from_slice(&logits[at..at + atoms]);
+            actions.push(action);
+        }
         Ok((actions, chosen))
     }
 

@@ -17,6 +17,7 @@ use crate::{
     augment::AugmentSettings,
     auxiliary::positives::Positives,
     error::UpdateError,
+    repeats::EqualStates,
     settings::LearnerSettings,
 };
 
@@ -30,6 +31,9 @@ pub struct Config {
     /// earlier versions do not have it: f32.
     #[serde(default)]
     pub precision: Precision,
+    /// What is done with states of a batch that are equal. Settings of earlier versions do not have it: each is computed.
+    #[serde(default)]
+    pub equal_states: EqualStates,
     /// Batches asked for ahead of the one being learned from.
     pub batches_in_flight: u32,
     /// What the scalars of published weights are. Settings of earlier versions do not have it: f32.

@@ -76,7 +76,8 @@ impl Learner {
             config.learner.update.clone(),
             compute,
             &mut init,
-        )?;
+        )?
+        .with_equal_states(config.learner.equal_states);
         let affinity = config
             .learner
             .affinity
@@ -136,7 +137,9 @@ impl Learner {
             return Err(LearnerError::OtherAffinity(folder.to_owned()));
         }
         this.weights_version = restored.weights_version;
-        this.agent = restored.agent;
+        this.agent = restored
+            .agent
+            .with_equal_states(this.config.learner.equal_states);
         this.affinity = restored.affinity;
         this.rng = restored.rng;
         tracing::info!(
@@ -189,7 +192,15 @@ impl Learner {
             }
             let [seen_t, seen_k] = &mut self.seen;
             augment.apply(states_t, seen_t, &mut rng);
-            augment.apply(states_k, seen_k, &mut rng);
+            // Draws for every positive, also for those that rows do not have: a run's views do not depend on which came.
+            let missing = states_k.len() < valid.len() * self.config.model.frame_len();
+            if missing {
+                spread(states_k, valid, self.config.model.frame_len(), seen_k);
+                let spread = std::mem::take(seen_k);
+                augment.apply(&spread, seen_k, &mut rng);
+            } else {
+                augment.apply(states_k, seen_k, &mut rng);
+            }
             (anchors, states_k) = (Some(seen_t.as_slice()), seen_k);
         }
         let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
@@ -291,6 +302,17 @@ impl Learner {
         )?;
         tracing::info!("saved {}", path.display());
         Ok(())
+    }
+}
+
+/// Puts `states`, those that are `there`, each in its place among blank ones, into `all`.
+fn spread(states: &[u8], there: &[u8], state_bytes: usize, all: &mut Vec<u8>) {
+    all.clear();
+    all.resize(there.len() * state_bytes, 0);
+    let places = all.chunks_exact_mut(state_bytes).zip(there);
+    let places = places.filter(|(_, there)| **there != 0);
+    for ((place, _), state) in places.zip(states.chunks_exact(state_bytes)) {
+        place.copy_from_slice(state);
     }
 }
 

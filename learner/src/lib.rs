@@ -63,6 +63,7 @@ pub mod optimiser;
 pub mod parity;
 mod ranges;
 pub mod remote;
+mod repeats;
 mod settings;
 mod tensors;
 
@@ -82,4 +83,5 @@ pub use error::UpdateError;
 pub use learner::{Learner, LearnerError};
 pub use optimiser::adam::AdamSettings;
 pub use remote::run::{RunArgs, run};
+pub use repeats::EqualStates;
 pub use settings::LearnerSettings;

@@ -170,7 +170,7 @@ impl RunClient {
     ) -> Result<PendingReply<R::Reply>, SessionError> {
         let key = match request.actor {
             Some(actor) => self.keys.of_actor::<R>(actor),
-            None => self.keys.of::<R>(),
+            None => self.keys.of_learner::<R>(),
         };
         self.query::<R, R::Reply>(key, request.bytes, timeout)
     }

@@ -32,20 +32,24 @@ pub mod tls;
 mod messages;
 mod process;
 mod query_workers;
+pub mod reporter;
 mod run_spec;
 mod wire;
 
 pub use client::{Announcer, PendingReply, RunClient, Sealed};
 pub use messages::{
     affinity::AffinityUpdate,
-    batch::{Batch, BatchHeader, BatchReply, BatchRowsMut, NO_ACTION, POOL_BATCHES},
+    batch::{Batch, BatchHeader, BatchReply, NO_ACTION, POOL_BATCHES},
     batch_request::{BatchRequest, RequestId},
+    batch_rows::{BatchStatesMut, RowScalars},
     chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES, transitions_max},
     done::Done,
     goodbye::Goodbye,
     hello::Hello,
     insert_reply::{Claim, InsertReply},
     join::{ActorJoin, JoinReply, LearnerJoin},
+    parts::{PartName, PartStatus, PartsStatus, WARNINGS_MAX},
+    report::{Life, Report, Warning},
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
     tally::Tally,
     weights::{
@@ -54,7 +58,8 @@ pub use messages::{
     },
 };
 pub use process::{
-    end_signs, fault, lock_file,
+    activity::Activity,
+    end_signs, fault, last_warning, lock_file,
     seldom::{Seldom, SeldomEach},
     shutdown::{Shutdown, join_within},
     whole_file,

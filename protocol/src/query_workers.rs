@@ -72,16 +72,15 @@ impl<R: Request> Incoming<R> {
         Ok((request, payload))
     }
 
-    /// Checks that a request that speaks for an actor came at this actor's own key, which others may have no access to.
+    /// Checks that a request that speaks for an actor, or for the learner beside them, came at its own key, which others may have
+    /// no access to.
     fn check_actor(&self, request: &R) -> Result<(), CodecError> {
-        let key = self.query.key_expr().as_str();
-        match request.actor() {
-            Some(actor) if R::BY_ACTOR && Keys::actor(key) != Some(actor) => {
-                let key = key.to_owned();
-                Err(CodecError::Actor { actor, key })
-            }
-            _ => Ok(()),
+        let (key, actor) = (self.query.key_expr().as_str(), request.actor());
+        if R::BY_ACTOR && Keys::actor(key) != actor {
+            let key = key.to_owned();
+            return Err(CodecError::Actor { actor, key });
         }
+        Ok(())
     }
 
     /// What the reply goes through.

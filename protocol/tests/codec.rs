@@ -7,9 +7,10 @@ use std::fmt::Debug;
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, BufferPool,
     Chunk, ChunkHeader, Claim, CodecError, Done, End, Goodbye, Hello, Horizon, InsertReply,
-    JoinReply, Kind, LearnerJoin, LearnerStatus, Message, NO_ACTION, PROTOCOL_VERSION,
-    ReplayStatus, RequestId, Returns, RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader,
-    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
+    JoinReply, Kind, LearnerJoin, LearnerStatus, Life, Message, NO_ACTION, PROTOCOL_VERSION,
+    PartName, PartStatus, PartsStatus, ReplayStatus, Report, RequestId, Returns, RowScalars,
+    RunSpec, Tally, TimeoutRule, Waiting, Warning, WeightsHeader, WeightsReply, WeightsRequest,
+    WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -79,11 +80,14 @@ fn chunk() -> Chunk {
     chunk
 }
 
+/// Of its rows the first does not bootstrap, the second has no positive and ends its episode.
 fn batch() -> Batch {
-    let mut batch = Batch::zeroed(BatchHeader {
+    let header = BatchHeader {
         rows: 3,
         positives: 1,
         state_bytes: 4,
+        states_k: 2,
+        states_n: 1,
         tally: Tally {
             inserted: 99,
             rows_sampled: 12,
@@ -91,22 +95,27 @@ fn batch() -> Batch {
         held: 9,
         mean_age: 12.5,
         weights_versions: (8, 2),
-    });
-    let mut rows = batch.rows_mut();
+    };
+    let rows = [(4, 0.0, 2), (NO_ACTION, 0.0, 0), (6, 0.5, 300)];
+    let scalars = |(row, (next_action, bootstrap_discount, k)): (u8, _)| RowScalars {
+        action: row,
+        next_action,
+        n_step_return: 0.5 + f32::from(row),
+        bootstrap_discount,
+        positives: u32::from(k > 0),
+        k_first: k,
+    };
+    let rows: Vec<_> = (0..).zip(rows).map(scalars).collect();
+    let mut batch = Batch::of_rows(header, &rows, |bytes| Buffer::from(vec![0xAB; bytes]));
+    assert_eq!(batch.header, header);
+    let mut places = batch.states_mut();
     for row in 0..3 {
-        rows.state_t(row).fill(10 + row as u8);
-        rows.state_n(row).fill(20 + row as u8);
-        rows.set(
-            row,
-            row as u8,
-            4 + row as u8,
-            0.5 + row as f32,
-            0.25 * row as f32,
-        );
+        places.t(row).fill(10 + row as u8);
     }
-    rows.set(1, 1, NO_ACTION, 1.5, 0.0);
-    rows.positive(0, 0, 2).fill(30);
-    rows.positive(0, 2, 300).fill(32);
+    assert!(places.n(0).is_none() && places.n(1).is_none() && places.k(0, 1).is_none());
+    places.n(2).unwrap().fill(22);
+    places.k(0, 0).unwrap().fill(30);
+    places.k(0, 2).unwrap().fill(32);
     batch
 }
 
@@ -129,6 +138,31 @@ fn weights() -> Vec<u8> {
         weights: WeightsHeader::new(4, 312, &payload),
     };
     codec::encode(SPEC, &upload, &payload).unwrap()
+}
+
+fn parts_status() -> PartsStatus {
+    PartsStatus {
+        up_s: 60.0,
+        waiting: Waiting::ActorsWaitForLearner,
+        waiting_s: 2.5,
+        requests_waiting: 1,
+        chunks_waiting: 2,
+        chunk_bytes_waiting: 1 << 20,
+        weights_version: 4,
+        weights_age_s: Some(1.0),
+        last_warning: None,
+        parts: vec![PartStatus {
+            who: PartName::Actor(3),
+            connected: true,
+            since_s: 50.0,
+            lives: 2,
+            heard_s: Some(0.5),
+            held_s: None,
+            weights_version: Some(3),
+            doing: Some(("plays".into(), 5.0, 1.0)),
+            last_warning: Some(Warning::new("late", 9.0)),
+        }],
+    }
 }
 
 /// One or more messages of every kind.
@@ -250,6 +284,13 @@ fn samples() -> Vec<Sample> {
             offset: 0,
         }),
         Sample::of(&Done),
+        Sample::of(&Report::new(
+            Life::Learner(5),
+            "learns",
+            1.5,
+            Some(Warning::new("a chunk was refused", 3.0)),
+        )),
+        Sample::of(&parts_status()),
     ]);
     let with_payload = [
         (
@@ -320,14 +361,8 @@ fn chunk_batch_and_weights_come_back() {
         back.states_t(),
         [10, 10, 10, 10, 11, 11, 11, 11, 12, 12, 12, 12]
     );
-    assert_eq!(
-        back.states_n(),
-        [20, 20, 20, 20, 21, 21, 21, 21, 22, 22, 22, 22]
-    );
-    assert_eq!(
-        back.states_k(),
-        [30, 30, 30, 30, 0, 0, 0, 0, 32, 32, 32, 32]
-    );
+    assert_eq!(back.states_n(), [22; 4], "no state that a row lacks");
+    assert_eq!(back.states_k(), [30, 30, 30, 30, 32, 32, 32, 32]);
     assert_eq!(
         (back.actions(), back.next_actions()),
         (&[0, 1, 2][..], &[4, NO_ACTION, 6][..])
@@ -377,10 +412,12 @@ fn pieces_are_received_as_the_whole_is() {
 
 #[test]
 fn parts_are_merged_row_by_row() {
-    let header = |rows, mean_age, versions| BatchHeader {
-        rows,
-        positives: 2,
+    let header = |mean_age, versions| BatchHeader {
+        rows: 0,
+        positives: 3,
         state_bytes: 3,
+        states_k: 0,
+        states_n: 0,
         tally: Tally {
             inserted: 10,
             rows_sampled: 1,
@@ -389,38 +426,54 @@ fn parts_are_merged_row_by_row() {
         mean_age,
         weights_versions: versions,
     };
-    let part = |header: BatchHeader, first: u8| {
-        let mut batch = Batch::zeroed(header);
-        let mut rows = batch.rows_mut();
-        for row in 0..header.rows as usize {
-            let value = first + row as u8;
-            rows.set(row, value, value + 100, f32::from(value), 0.5);
-            rows.state_t(row).fill(value);
-            rows.state_n(row).fill(value + 20);
-            rows.positive(0, row, 1).fill(value + 40);
-            rows.positive(1, row, 2).fill(value + 60);
+    // Rows from `first` on, which have fewer positives and bootstraps, the higher their number.
+    let part = |header: BatchHeader, values: std::ops::Range<u8>| {
+        let scalars = |value: u8| RowScalars {
+            action: value,
+            next_action: value + 100,
+            n_step_return: value.into(),
+            bootstrap_discount: if value.is_multiple_of(2) { 0.5 } else { 0.0 },
+            positives: 3 - u32::from(value) % 4,
+            k_first: 1,
+        };
+        let rows: Vec<_> = values.clone().map(scalars).collect();
+        let mut batch = Batch::of_rows(header, &rows, Buffer::zeroed);
+        let mut places = batch.states_mut();
+        for (row, value) in values.enumerate() {
+            places.t(row).fill(value);
+            if let Some(place) = places.n(row) {
+                place.fill(value + 20);
+            }
+            for p in 0..3 {
+                if let Some(place) = places.k(p, row) {
+                    place.fill(value + 40 + 20 * p as u8);
+                }
+            }
         }
         batch
     };
     let parts = [
-        part(header(2, 1.0, (7, 3)), 0),
-        part(header(1, 4.0, (9, 5)), 2),
+        part(header(1.0, (7, 3)), 0..4),
+        part(header(4.0, (9, 5)), 4..6),
+        part(header(1.0, (8, 4)), 6..8),
     ];
     let whole = Batch::merged_header(&parts).unwrap();
     let merged = Batch::merge(&parts, Buffer::from(vec![0xAB; whole.payload_bytes()]));
-    let mut expected = part(whole, 0);
-    assert_eq!((whole.mean_age, whole.weights_versions), (2.0, (9, 3)));
-    assert_eq!((whole.tally.inserted, whole.held), (20, 10));
-    expected.header = whole;
+    let expected = part(whole, 0..8);
+    assert_eq!((whole.mean_age, whole.weights_versions), (1.75, (9, 3)));
+    assert_eq!((whole.tally.inserted, whole.held), (30, 15));
+    assert_eq!((whole.rows, whole.states_k, whole.states_n), (8, 12, 4));
     assert_eq!(merged, expected);
-
-    let other = part(
-        BatchHeader {
-            state_bytes: 4,
-            ..header(1, 0.0, (1, 1))
-        },
-        0,
+    assert_eq!(
+        merged.states_n(),
+        [[20; 3], [22; 3], [24; 3], [26; 3]].concat()
     );
+
+    let other = BatchHeader {
+        state_bytes: 4,
+        ..header(0.0, (1, 1))
+    };
+    let other = part(other, 0..1);
     assert_eq!(Batch::merged_header(&[parts[0].clone(), other]), None);
     assert_eq!(Batch::merged_header(&[]), None);
 }
@@ -428,7 +481,7 @@ fn parts_are_merged_row_by_row() {
 #[test]
 fn every_kind_has_a_sample_that_is_read() {
     let samples = samples();
-    for kind in 1..=18 {
+    for kind in 1..=20 {
         assert!(
             samples.iter().any(|sample| sample.kind as u16 == kind),
             "kind {kind}"
@@ -668,17 +721,27 @@ fn counts_that_do_not_fit_their_payload_are_refused() {
             positives: 0,
             ..header
         },
+        // As long, but other states than those of its rows.
+        BatchHeader {
+            states_k: 1,
+            states_n: 2,
+            ..header
+        },
+        BatchHeader {
+            states_k: most,
+            ..header
+        },
         BatchHeader {
             rows: most,
             positives: most,
             state_bytes: most,
+            states_k: most,
+            states_n: most,
             ..header
         },
     ] {
-        assert!(
-            Batch::from_payload(wrong, Buffer::zeroed(3 * 24)).is_err(),
-            "{wrong:?}"
-        );
+        let (_, payload) = batch().into_payload();
+        assert!(Batch::from_payload(wrong, payload).is_err(), "{wrong:?}");
     }
     assert!(
         Batch::from_payload(BatchHeader { rows: 0, ..header }, Buffer::zeroed(0)).is_err(),

@@ -66,6 +66,8 @@ fn filled(frame_stack: u32) -> (Replay, Chunk) {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
+        disk_bytes_max: None,
+        fsync_ms: None,
         reproduced_bug: None,
         replay_ratio: 1e9,
         warmup_transitions: 0,

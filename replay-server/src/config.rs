@@ -1,13 +1,18 @@
 //! What can be set about the replay server, and the checks that keep a run from stalling.
 //! It does not hold the rules of the return or of k: those are the run spec's, shared by every part.
 
-use driml_protocol::{BatchHeader, RunSpec, RunSpecError, codec::PAYLOAD_BYTES_MAX};
+use driml_protocol::{
+    BatchHeader, RunSpec, RunSpecError, TRANSITION_BYTES, codec::PAYLOAD_BYTES_MAX,
+};
 use serde::{Deserialize, Serialize};
 
 use crate::storage::frame_store::log::OVERHEAD_BYTES_MAX;
 
 /// Most shards of one replay.
 pub(crate) const SHARDS_MAX: u32 = 256;
+
+/// Smallest segment of a replay that is kept on disk.
+pub(crate) const SEGMENT_BYTES_MIN: u64 = 1 << 20;
 
 /// A known bug of the paper's published code, reproduced to show what it does. No other run has one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -65,6 +70,15 @@ pub struct Config {
     pub slack_transitions: u64,
     /// Transitions of the whole run, warm-up included: once that many are stored, no more are taken. None runs on.
     pub transitions_max: Option<u64>,
+    /// Where the replay is kept on disk (`--replay-dir`, `--durable`): most bytes that all shards may take there. Beyond it the oldest
+    /// transitions go, from memory too, before `capacity_transitions` are held. Without it they take as much as uncompressed ones
+    /// in memory, and up to a segment more.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub disk_bytes_max: Option<u64>,
+    /// Where the replay is kept on disk: milliseconds after which what was written is flushed, so that it survives a power cut too;
+    /// the death of the process it always survives. 0 flushes before each answer. Without it 1,000.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fsync_ms: Option<u64>,
     /// A known bug to train with, chosen by `--reproduce-bug`; none in every other run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reproduced_bug: Option<ReproducedBug>,
@@ -165,6 +179,15 @@ impl Config {
                 return bad("replay.compressed_bytes_max", max.to_string(), why);
             }
         }
+        if let Some(max) = self.disk_bytes_max {
+            let least = disk_bytes_least(spec, self);
+            if max < least {
+                let why = format!(
+                    "it must hold the transitions before the first batch twice, and some segments; use at least {least}"
+                );
+                return bad("replay.disk_bytes_max", max.to_string(), why);
+            }
+        }
         if self.warmup_transitions > self.capacity_transitions {
             let why = format!(
                 "the first of them would be overwritten before any is sampled; use at most capacity_transitions = {}",
@@ -206,6 +229,14 @@ pub(crate) const fn compressed_bytes_least(transitions: u64, frame_bytes: usize)
     transitions
         .saturating_mul(frame_bytes as u64)
         .saturating_add(OVERHEAD_BYTES_MAX)
+}
+
+/// Least disk budget of a replay: room for the transitions before the first batch, and for the segments that come and go.
+fn disk_bytes_least(spec: &RunSpec, config: &Config) -> u64 {
+    let row_bytes = (spec.frame_bytes() + TRANSITION_BYTES) as u64;
+    let warmup = config.warmup_transitions.saturating_mul(row_bytes);
+    let segments = u64::from(config.shards) * 4 * SEGMENT_BYTES_MIN;
+    warmup.saturating_mul(2).saturating_add(segments)
 }
 
 /// Most rows of one batch of this run, so that it stays below the codec's limit; larger requests are refused.

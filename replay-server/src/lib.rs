@@ -29,6 +29,8 @@
 //!     shards: 1,
 //!     compression: Compression::None,
 //!     compressed_bytes_max: None,
+//!     disk_bytes_max: None,
+//!     fsync_ms: None,
 //!     replay_ratio: 8.0,
 //!     warmup_transitions: 10,
 //!     slack_transitions: 100,
@@ -66,6 +68,7 @@
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 mod config;
+mod durable;
 mod ledger;
 mod rate_limiter;
 mod replay;
@@ -74,6 +77,7 @@ mod service;
 mod storage;
 
 pub use config::{Compression, Config, ConfigError, ReproducedBug};
+pub use durable::{DurableArgs, DurableError, DurableReplay, Recovery};
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use rate_limiter::RateLimiter;
 pub use replay::{Replay, Unready};

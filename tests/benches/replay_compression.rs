@@ -55,6 +55,8 @@ fn replay(compression: Compression, frame_stack: u32) -> Replay {
         shards: 1,
         compression,
         compressed_bytes_max: None,
+        disk_bytes_max: None,
+        fsync_ms: None,
         reproduced_bug: None,
         replay_ratio: 1e9,
         warmup_transitions: 0,

@@ -130,7 +130,7 @@ fn every_batch_comes_once(shards: u32) {
                 batches += 1;
             }
             Next::Finished => break,
-            Next::NotYet => panic!("no batch in a minute, after {batches}"),
+            Next::NotYet(_) => panic!("no batch in a minute, after {batches}"),
         }
     }
     assert_eq!(batches * u64::from(ROWS), TRANSITIONS);

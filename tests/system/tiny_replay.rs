@@ -28,6 +28,8 @@ pub(crate) fn config(transitions: u64) -> Config {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
+        disk_bytes_max: None,
+        fsync_ms: None,
         replay_ratio: 1.0,
         warmup_transitions: 0,
         slack_transitions: transitions,

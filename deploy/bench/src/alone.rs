@@ -18,7 +18,7 @@ use crate::{
 /// A process that could not be started or failed.
 pub(super) fn figures(
     component: Component,
-    more: &[&str],
+    more: &[String],
     flags: &BenchFlags,
     device: DeviceName,
 ) -> anyhow::Result<Vec<Measurement>> {

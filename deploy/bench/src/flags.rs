@@ -4,6 +4,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
+use driml_envs::WorldName;
 use driml_learner::{DeviceName, Precision};
 use driml_machine::device::DeviceFlag;
 
@@ -15,7 +16,7 @@ pub enum BenchCommand {
     /// Frames through an actor's policy
     Policy(BenchFlags),
     /// Transitions into a replay server and batches out of it, over the wire; and its batches without the wire
-    Replay(BenchFlags),
+    Replay(BenchReplayArgs),
     /// Procgen's steps through our wrapper
     Env(BenchFlags),
     /// A short run with real processes: its speed, how long the learner computes and waits, its memory
@@ -67,8 +68,38 @@ pub struct BenchLearnerArgs {
     /// Instead: C51 + global DIM as batch, observation, atoms and vectors grow, beside the FLOPs of an update
     #[arg(long)]
     pub(crate) growth: bool,
+    /// Instead: driml-ada on batches that random play gave in these worlds, equal states computed once and each
+    #[arg(
+        long,
+        value_name = "WORLD,..",
+        value_delimiter = ',',
+        conflicts_with = "growth"
+    )]
+    pub(crate) played: Vec<WorldName>,
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
+    #[command(flatten)]
+    pub(crate) flags: BenchFlags,
+}
+
+/// What `driml bench replay` takes.
+#[derive(Clone, Debug, Args)]
+pub struct BenchReplayArgs {
+    /// Instead: a server that keeps its replay on disk in this folder, which is emptied, in turn with one that does not; and how long it
+    /// takes to read it back
+    #[arg(long, value_name = "DIR")]
+    pub(crate) replay_dir: Option<PathBuf>,
+    /// With it: transitions that are held and read back, of 10.8 kB each
+    #[arg(
+        long,
+        value_name = "N",
+        default_value_t = 20_000,
+        requires = "replay_dir"
+    )]
+    pub(crate) held: u64,
+    /// With it: rounds of both
+    #[arg(long, value_name = "N", default_value_t = 3, requires = "replay_dir")]
+    pub(crate) rounds: u32,
     #[command(flatten)]
     pub(crate) flags: BenchFlags,
 }

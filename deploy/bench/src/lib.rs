@@ -25,6 +25,7 @@
 mod alone;
 mod assemble;
 mod candle_baseline;
+mod durable;
 mod effort;
 mod env;
 pub mod flags;
@@ -33,6 +34,7 @@ mod launched;
 mod learner;
 mod measurements;
 mod peers;
+mod played;
 mod policy;
 mod recording;
 mod replay;
@@ -42,6 +44,7 @@ mod system;
 mod table;
 mod taking_part;
 
+use driml_envs::WorldName;
 use driml_learner::{DeviceName, Precision};
 use driml_machine::device::ready_for;
 
@@ -57,16 +60,21 @@ use crate::{
 /// A component that failed, an engine that cannot be had, a file that cannot be written.
 pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
     let machine = MachineNote::this();
-    let alone = |component, flags: &BenchFlags, device: DeviceName, growth: bool| {
+    let alone = |component, flags: &BenchFlags, device: DeviceName, instead: Instead<'_>| {
         ready_for(device)?;
+        let effort = &Effort::new(flags);
         let figures = if !flags.here {
-            let more = if growth { &["--growth"][..] } else { &[] };
-            alone::figures(component, more, flags, device)?
-        } else if growth {
-            let effort = &Effort::new(flags);
-            by_precision(flags, device, &|it| growth::measure(effort, device, it))?
+            alone::figures(component, &instead.flags(), flags, device)?
         } else {
-            measure(component, flags, device)?
+            match instead {
+                Instead::No => measure(component, flags, device)?,
+                Instead::Growth => {
+                    by_precision(flags, device, &|it| growth::measure(effort, device, it))?
+                }
+                Instead::Played(worlds) => by_precision(flags, device, &|it| {
+                    played::measure(worlds, effort, device, it)
+                })?,
+            }
         };
         measurements::report(
             component.name(),
@@ -75,19 +83,53 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
             flags,
         )
     };
+    let cpu = DeviceName::Cpu;
     match command {
         BenchCommand::Learner(args) => {
             let (flags, device) = (&args.flags, args.on.device);
-            alone(Component::Learner, flags, device, args.growth)
+            let instead = match (args.growth, &args.played[..]) {
+                (true, _) => Instead::Growth,
+                (false, []) => Instead::No,
+                (false, worlds) => Instead::Played(worlds),
+            };
+            alone(Component::Learner, flags, device, instead)
         }
-        BenchCommand::Policy(flags) => alone(Component::Policy, flags, DeviceName::Cpu, false),
-        BenchCommand::Replay(flags) => alone(Component::Replay, flags, DeviceName::Cpu, false),
-        BenchCommand::Env(flags) => alone(Component::Env, flags, DeviceName::Cpu, false),
+        BenchCommand::Policy(flags) => alone(Component::Policy, flags, cpu, Instead::No),
+        BenchCommand::Replay(args) => match &args.replay_dir {
+            Some(dir) => {
+                let figures = durable::measure(args, dir)?;
+                measurements::report("durable replay", &figures, machine, &args.flags)
+            }
+            None => alone(Component::Replay, &args.flags, cpu, Instead::No),
+        },
+        BenchCommand::Env(flags) => alone(Component::Env, flags, cpu, Instead::No),
         BenchCommand::System(args) => {
             measurements::report("system", &system::measure(args)?, machine, &args.flags)
         }
         BenchCommand::Scale(args) => scale::run(args, machine),
         BenchCommand::Peers(args) => peers::run(args),
+    }
+}
+
+/// What is measured of the learner instead of its updates at the paper's sizes.
+#[derive(Clone, Copy)]
+enum Instead<'a> {
+    No,
+    Growth,
+    Played(&'a [WorldName]),
+}
+
+impl Instead<'_> {
+    /// The flags that ask another process for it.
+    fn flags(self) -> Vec<String> {
+        match self {
+            Self::No => Vec::new(),
+            Self::Growth => vec!["--growth".into()],
+            Self::Played(worlds) => {
+                let worlds: Vec<_> = worlds.iter().map(ToString::to_string).collect();
+                vec!["--played".into(), worlds.join(",")]
+            }
+        }
     }
 }
 

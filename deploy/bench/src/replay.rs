@@ -19,7 +19,7 @@ use driml_learner::{
     remote::batch_source::{BatchSource, Next, Requests},
 };
 use driml_protocol::{
-    Keys, RunClient, Shutdown, join,
+    BufferPool, Keys, RunClient, Shutdown, join,
     session::{self, Endpoints},
 };
 use zenoh::{Session, Wait};
@@ -30,9 +30,9 @@ use crate::{
 };
 
 /// Transitions of a chunk: streams and steps of each. An actor of 16 copies sends the last size.
-const CHUNKS: [(u32, u32); 4] = [(4, 1), (8, 4), (8, 16), (8, 32)];
+pub(super) const CHUNKS: [(u32, u32); 4] = [(4, 1), (8, 4), (8, 16), (8, 32)];
 /// How long the server may take to listen, and a batch or an insert to come.
-const ANSWER_MAX: Duration = Duration::from_secs(30);
+pub(super) const ANSWER_MAX: Duration = Duration::from_secs(30);
 
 /// Transitions stored a second and batches a second, over each wire; batches without a wire, and a plain copy.
 ///
@@ -49,7 +49,7 @@ pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
         ("tcp", format!("tcp/{}", free_port()?), false),
     ];
     for (wire, endpoint, shared_memory) in wires {
-        let mut run = Run::start(&endpoint, shared_memory, folder.path())?;
+        let mut run = Run::start(&endpoint, shared_memory, folder.path(), &[])?;
         run.deliver(&recording, CHUNKS[3], |sent, _| sent >= settings::CAPACITY)?;
         for chunk in CHUNKS {
             let transitions = chunk.0 * chunk.1;
@@ -71,18 +71,24 @@ fn free_port() -> std::io::Result<std::net::SocketAddr> {
 }
 
 /// A replay server and a client of its run.
-struct Run {
+pub(super) struct Run {
     server: ManagedProcess,
     session: Session,
     keys: Keys,
     actor: ActorSettings,
-    learner: LearnerConfig,
+    pub(super) learner: LearnerConfig,
     /// Deliveries so far; each is another actor.
     deliveries: u32,
 }
 
 impl Run {
-    fn start(endpoint: &str, shared_memory: bool, folder: &Path) -> anyhow::Result<Self> {
+    /// Starts a server whose flags are those of every bench and `more`.
+    pub(super) fn start(
+        endpoint: &str,
+        shared_memory: bool,
+        folder: &Path,
+        more: &[String],
+    ) -> anyhow::Result<Self> {
         let words = ["replay-server", "--listen", endpoint];
         let run = ["--env", settings::WORLD, "--agent", settings::AGENT];
         let transport = format!("transport.shared_memory={shared_memory}");
@@ -91,6 +97,7 @@ impl Run {
         let args: Vec<String> = words
             .chain(sets.flat_map(|set| ["--set", set]))
             .map(Into::into)
+            .chain(more.iter().cloned())
             .collect();
         let surroundings = Surroundings {
             logs: folder,
@@ -114,16 +121,13 @@ impl Run {
 
     /// Delivers chunks until `is_enough` of what was sent and since when, and gives transitions stored a second, from the
     /// first chunk's making to the last one's acknowledgement.
-    fn deliver(
+    pub(super) fn deliver(
         &mut self,
         recording: &Recording,
         chunk: (u32, u32),
         is_enough: impl Fn(u64, Instant) -> bool,
     ) -> anyhow::Result<f64> {
-        let pool = self.actor.chunk_memory();
-        self.deliveries += 1;
-        let (spec_hash, actor) = (self.actor.spec.hash(), self.deliveries);
-        let client = self.client(spec_hash);
+        let (client, actor, pool) = self.next_actor();
         let alive = taking_part::join_as_actor(&client, actor)?;
         let delivery = Delivery::start(
             client,
@@ -147,6 +151,28 @@ impl Run {
         Ok(chunks.transitions() as f64 / seconds)
     }
 
+    /// A client of an actor that has not been there before, its number, and memory for its chunks.
+    pub(super) fn next_actor(&mut self) -> (RunClient, u32, BufferPool) {
+        self.deliveries += 1;
+        let client = self.client(self.actor.spec.hash());
+        (client, self.deliveries, self.actor.chunk_memory())
+    }
+
+    /// A client of the learner.
+    pub(super) fn learner_client(&self) -> RunClient {
+        self.client(self.learner.spec.hash())
+    }
+
+    /// Ends the server at once, as when its process dies.
+    pub(super) fn kill(mut self) {
+        if let Err(e) = self.session.close().wait() {
+            tracing::debug!("closing the session: {e}");
+        }
+        self.server.kill();
+        self.server
+            .wait_until(Instant::now() + ANSWER_MAX, || false);
+    }
+
     fn client(&self, spec_hash: u64) -> RunClient {
         RunClient::new(self.session.clone(), self.keys.clone(), spec_hash)
     }
@@ -155,12 +181,9 @@ impl Run {
     fn fetch(&self, effort: &Effort) -> anyhow::Result<f64> {
         let shutdown = Shutdown::default();
         let LearnerConfig {
-            spec,
-            learner,
-            transport,
-            ..
+            learner, transport, ..
         } = &self.learner;
-        let client = self.client(spec.hash());
+        let client = self.learner_client();
         let _alive = taking_part::join_as_learner(&client)?;
         let mut source = BatchSource::start(
             std::slice::from_ref(&client),
@@ -179,7 +202,9 @@ impl Run {
                 black_box(planes.map(touched));
                 Ok(())
             }
-            Next::NotYet => bail!("no batch came within {} s", ANSWER_MAX.as_secs()),
+            Next::NotYet(waiting) => {
+                bail!("no batch came within {} s: {waiting}", ANSWER_MAX.as_secs())
+            }
             Next::Finished => bail!("the replay server says that the run is over"),
         });
         // A request that is on its way wants its answer before the session is closed.
@@ -188,7 +213,7 @@ impl Run {
         rate
     }
 
-    fn end(mut self) {
+    pub(super) fn end(mut self) {
         if let Err(e) = self.session.close().wait() {
             tracing::debug!("closing the session: {e}");
         }
@@ -216,6 +241,6 @@ pub(super) fn reach(endpoint: &str, server: &mut ManagedProcess) -> anyhow::Resu
 }
 
 /// A sum over one byte of each cache line, so that all of a plane has come.
-fn touched(plane: &[u8]) -> u64 {
+pub(super) fn touched(plane: &[u8]) -> u64 {
     plane.iter().step_by(64).map(|&byte| u64::from(byte)).sum()
 }

@@ -8,7 +8,7 @@ use std::{
 
 use anyhow::Context as _;
 use console::Term;
-use driml_protocol::tls;
+use driml_protocol::{last_warning, tls};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
 use tracing::{
     Event, Level, Subscriber,
@@ -17,7 +17,7 @@ use tracing::{
 use tracing_subscriber::{
     EnvFilter, Layer,
     filter::Targets,
-    layer::{Context, SubscriberExt},
+    layer::{Context as LayerContext, SubscriberExt},
     util::SubscriberInitExt,
 };
 
@@ -87,7 +87,7 @@ pub fn log_to_stderr(guarded: bool) {
         // It would say with `eprintln!`, which panics, that stderr cannot be written to.
         .log_internal_errors(false)
         .with_ansi(stderr().is_terminal())
-        .with_filter(filter);
+        .with_filter(filter.clone());
     let refusals = guarded.then(|| {
         let targets = Targets::new()
             .with_target(tls::HANDSHAKE_TARGET, Level::WARN)
@@ -96,6 +96,7 @@ pub fn log_to_stderr(guarded: bool) {
     });
     tracing_subscriber::registry()
         .with(log)
+        .with(LastWarning.with_filter(filter))
         .with(refusals)
         .init();
 }
@@ -104,22 +105,35 @@ pub fn log_to_stderr(guarded: bool) {
 struct Refusals;
 
 impl<S: Subscriber> Layer<S> for Refusals {
-    fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
-        let mut text = Text(String::new());
-        event.record(&mut text);
-        tls::overhear(event.metadata().target(), &text.0);
+    fn on_event(&self, event: &Event<'_>, _: LayerContext<'_, S>) {
+        tls::overhear(event.metadata().target(), &text(event));
+    }
+}
+
+/// Keeps the last warning or error of the log for those who ask this process how it is.
+struct LastWarning;
+
+impl<S: Subscriber> Layer<S> for LastWarning {
+    fn on_event(&self, event: &Event<'_>, _: LayerContext<'_, S>) {
+        if *event.metadata().level() <= Level::WARN {
+            last_warning::note(text(event));
+        }
     }
 }
 
 /// The text of a line of the log.
-struct Text(String);
-
-impl Visit for Text {
-    fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
-        if field.name() == "message" {
-            self.0 = format!("{value:?}");
+fn text(event: &Event<'_>) -> String {
+    struct Text(String);
+    impl Visit for Text {
+        fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+            if field.name() == "message" {
+                self.0 = format!("{value:?}");
+            }
         }
     }
+    let mut text = Text(String::new());
+    event.record(&mut text);
+    text.0
 }
 
 /// Where messages go: stderr, above a progress bar if stderr is a terminal. Clones share the bar.
@@ -170,6 +184,30 @@ impl Screen {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
+    }
+}
+
+/// Pages on stdout that each take the place of the one before, on a terminal; elsewhere they follow each other.
+pub struct Pages(Option<Term>);
+
+impl Pages {
+    /// None shown yet.
+    pub fn on_stdout() -> Self {
+        Self(io::stdout().is_terminal().then(Term::stdout))
+    }
+
+    /// Shows one.
+    ///
+    /// # Errors
+    /// As [`print`].
+    pub fn show(&self, text: &str) -> anyhow::Result<()> {
+        if let Some(term) = &self.0 {
+            term.clear_screen().or_else(|e| match is_gone(&e) {
+                true => Ok(()),
+                false => Err(e),
+            })?;
+        }
+        print(text)
     }
 }
 

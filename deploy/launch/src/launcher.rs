@@ -25,7 +25,7 @@ use crate::{
     meeting::Meeting,
     processes::{Processes, stop},
     resume,
-    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     status_client::Statuses,
 };
 
@@ -43,6 +43,8 @@ const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 /// How long the replay server may take to end, once it is told to stop.
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
+/// How often replay servers that keep their replay on disk are started again in a run, all together.
+const RESTARTS_MAX: u32 = 8;
 /// How often a learner that saves is asked whether it is done.
 const DRAIN_POLL: Duration = Duration::from_millis(100);
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
@@ -98,6 +100,7 @@ pub fn run(
     if let (Some(listen), None) = (&outside.listen, &outside.tls_dir) {
         endpoints[0].clone_from(listen);
     }
+    write_whole(&run_dir.endpoints(), endpoints.join("\n").as_bytes())?;
     let screen = Screen::new(config.frames(), TEMPLATE);
     let display = Display::new(
         screen.clone(),
@@ -117,12 +120,17 @@ pub fn run(
         display,
         interrupts,
         processes: Processes::default(),
+        restarts: 0,
         statuses: None,
     };
 
     session::sweep_shared_memory();
     let ran = launch.start_and_watch(&mut recorder);
     let ended = launch.end(&ran);
+    // Nobody is there any more who could be asked; one that is left is told from this by the lock.
+    if let Err(e) = std::fs::remove_file(run_dir.endpoints()) {
+        tracing::debug!("removing {}: {e}", run_dir.endpoints().display());
+    }
     session::sweep_shared_memory();
     launch.screen.clear();
     let outcome = match (&ran, &ended) {
@@ -173,7 +181,13 @@ struct Launch<'a> {
     display: Display,
     interrupts: Interrupts,
     processes: Processes,
+    /// How often a replay server that had died was started again.
+    restarts: u32,
     statuses: Option<Statuses>,
+}
+
+fn words(args: &[&str]) -> Vec<String> {
+    args.iter().map(|&arg| arg.to_owned()).collect()
 }
 
 /// `replay-server`, or one for each of several shards.
@@ -211,30 +225,8 @@ impl Launch<'_> {
     fn start_and_watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
         let logs = self.run_dir.logs();
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
-        let config = recorder.config_path().display().to_string();
-        let words =
-            |args: &[&str]| -> Vec<String> { args.iter().map(|&arg| arg.to_owned()).collect() };
-        for (shard, (name, endpoint)) in self.servers.iter().zip(&self.endpoints).enumerate() {
-            let (shard, after) = (shard.to_string(), self.resume_point.updates.to_string());
-            let mut args = words(&[
-                "replay-server",
-                "--listen",
-                endpoint,
-                "--shard",
-                &shard,
-                "--after-updates",
-                &after,
-                "--config",
-                &config,
-            ]);
-            if shard == "0" {
-                args.extend(self.outside.flags());
-            }
-            if let Some(bug) = self.config.replay.reproduced_bug {
-                args.extend(words(&["--reproduce-bug", bug.name()]));
-            }
-            let server =
-                ManagedProcess::start(name, &args, PROCESS_THREADS, self.surroundings(&logs))?;
+        for shard in 0..self.servers.len() {
+            let server = self.start_server(shard, self.resume_point.updates)?;
             self.processes.replay_servers.push(server);
         }
         let mut sessions = Vec::new();
@@ -277,6 +269,63 @@ impl Launch<'_> {
         self.watch(recorder)
     }
 
+    /// Starts the replay server of one shard, in a run that goes on after so many updates.
+    fn start_server(&self, shard: usize, after_updates: u64) -> anyhow::Result<ManagedProcess> {
+        let config = self.run_dir.config().display().to_string();
+        let (number, after) = (shard.to_string(), after_updates.to_string());
+        let mut args = words(&[
+            "replay-server",
+            "--listen",
+            &self.endpoints[shard],
+            "--shard",
+            &number,
+            "--after-updates",
+            &after,
+            "--config",
+            &config,
+        ]);
+        if shard == 0 {
+            args.extend(self.outside.flags());
+        }
+        if let Some(bug) = self.config.replay.reproduced_bug {
+            args.extend(words(&["--reproduce-bug", bug.name()]));
+        }
+        if self.config.local.durable {
+            let folder = self.run_dir.replay().display().to_string();
+            args.extend(words(&["--replay-dir", &folder]));
+        }
+        let logs = self.run_dir.logs();
+        let name = &self.servers[shard];
+        ManagedProcess::start(name, &args, PROCESS_THREADS, self.surroundings(&logs))
+    }
+
+    /// Starts replay servers that have died again, if they go on with what they have kept.
+    ///
+    /// # Errors
+    /// It has happened too often, or the process cannot be started.
+    fn revive_servers(&mut self) -> anyhow::Result<()> {
+        if !self.config.local.durable {
+            return Ok(());
+        }
+        for shard in 0..self.processes.replay_servers.len() {
+            let server = &mut self.processes.replay_servers[shard];
+            if server.end().is_none() || self.restarts == RESTARTS_MAX {
+                continue;
+            }
+            self.restarts += 1;
+            let report = server.exit_report();
+            self.screen.line(&format!(
+                "{report}\n{} is started again with what it has kept ({} of {RESTARTS_MAX} times in a run)",
+                self.servers[shard], self.restarts
+            ));
+            session::sweep_shared_memory();
+            // What the learner has learned meanwhile, the log knows.
+            let server = self.start_server(shard, self.resume_point.updates)?;
+            self.processes.replay_servers[shard] = server;
+        }
+        Ok(())
+    }
+
     /// Asks, shows and records once a second until the run is over.
     fn watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
         let mut heard = [Instant::now(); 2];
@@ -285,6 +334,7 @@ impl Launch<'_> {
             if self.interrupts.wait_timeout(POLL) > 0 {
                 return Ok(Outcome::Interrupted);
             }
+            self.revive_servers()?;
             self.processes.check_alive()?;
             let statuses = self
                 .statuses
@@ -426,7 +476,8 @@ impl Launch<'_> {
         let logs = self.processes.missing_log_lines();
         let missing = recorder.missing().into_iter().chain(logs);
         missing.for_each(|line| console::line(&line));
-        let summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);
+        let mut summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);
+        summary.replay_servers_restarted = self.restarts;
         let written = summary.write(self.run_dir);
         (summary, written)
     }

@@ -39,4 +39,5 @@ mod rates;
 pub mod resume;
 pub mod run_folder;
 pub mod shared_memory;
+pub mod status;
 pub mod status_client;

@@ -101,8 +101,12 @@ pub fn describe(
         (
             "replay",
             format!(
-                "the newest {held} transitions, up to {} of memory",
-                size(bytes)
+                "the newest {held} transitions, up to {} of memory{}",
+                size(bytes),
+                match local.durable && !lockstep {
+                    true => " and about as much of disk, in the run folder",
+                    false => "",
+                }
             ),
         ),
         ("run folder", run_dir.display().to_string()),

@@ -110,5 +110,11 @@ pub fn find(
     let rows = updates as f64 * f64::from(config.learner.batch_size);
     let frames =
         config.replay.warmup_transitions + (rows / config.replay.replay_ratio).ceil() as u64;
-    Ok((config, ResumePoint { updates, frames }))
+    let replay_is_kept = config.local.durable && folder.replay().is_dir();
+    let resume_point = ResumePoint {
+        updates,
+        frames,
+        replay_is_kept,
+    };
+    Ok((config, resume_point))
 }

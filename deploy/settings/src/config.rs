@@ -26,6 +26,10 @@ pub struct LocalConfig {
     pub learner_threads: u32,
     /// What the learner computes on.
     pub learner_device: DeviceName,
+    /// Whether the replay is kept on disk, in the run folder: a replay server that died is started again with it, and a resumed
+    /// run goes on with it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub durable: bool,
 }
 
 /// The resolved settings of a run. TOML is what they come from and travel as; between, there is this form alone.

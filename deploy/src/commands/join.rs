@@ -29,7 +29,7 @@ pub(crate) struct JoinFlags {
 #[derive(Debug, Args)]
 pub(crate) struct TlsFlags {
     /// Talk over mutual TLS, with the certificates in DIR that deploy/certs.sh makes: ca.pem, and ROLE.pem and ROLE.key, where
-    /// ROLE is actor-N (N is its --id), learner or replay-server. Endpoints are then tls/HOST:PORT, or unix sockets, and the replay
+    /// ROLE is actor-N (N is its --id), learner, replay-server or, to only look, observer. Endpoints are then tls/HOST:PORT, or unix sockets, and the replay
     /// server lets each role do what it needs and no more
     #[arg(long, value_name = "DIR")]
     pub(crate) tls_dir: Option<PathBuf>,

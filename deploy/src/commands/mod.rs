@@ -9,6 +9,7 @@ pub(crate) mod parity;
 pub(crate) mod presets;
 pub(crate) mod procgen;
 pub(crate) mod replay_server;
+pub(crate) mod status;
 pub(crate) mod train;
 
 mod join;

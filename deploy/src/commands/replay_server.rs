@@ -1,5 +1,7 @@
 //! `driml replay-server`: the replay server of a run, which hands its settings to the others.
 
+use std::path::PathBuf;
+
 use clap::Args;
 use driml_launch::endpoint::{check_endpoints, check_listening};
 use driml_machine::resources::Machine;
@@ -23,6 +25,10 @@ pub(crate) struct ReplayServerArgs {
     /// Go on after so many updates: those of the newest checkpoint in the learner's run folder
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=u64::from(u32::MAX)))]
     pub(crate) after_updates: u64,
+    /// Keep the replay on disk in this folder, and go on with the one that is there: a server that died is started again with the
+    /// same flags [default: in memory alone]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) replay_dir: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) run: RunFlags,
     #[command(flatten)]
@@ -54,6 +60,7 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
         shard: args.shard,
         after_updates: args.after_updates,
         weights_bytes_max: config.weights_bytes()?,
+        dir: args.replay_dir,
         config_toml: config.to_toml(),
     };
     clean_up_after(driml_replay_server::run(run, &shutdown))

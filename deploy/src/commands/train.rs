@@ -53,6 +53,9 @@ pub(crate) struct TrainArgs {
     /// What the learner computes on: cpu, cuda (the first GPU) or cuda:N [default: as the settings say, cpu]
     #[arg(long, value_name = "DEVICE")]
     pub(crate) device: Option<DeviceName>,
+    /// Keep the replay on disk too, in the run folder: a replay server that dies goes on with it, and so does --resume
+    #[arg(long, conflicts_with = "lockstep")]
+    pub(crate) durable: bool,
     /// All parts in one process in a fixed order: the same seed gives the same weights
     #[arg(long, conflicts_with = "listen")]
     pub(crate) lockstep: bool,
@@ -80,6 +83,9 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             .over
             .sets
             .push(format!("local.learner_device={device}"));
+    }
+    if args.durable {
+        args.run.over.sets.push("local.durable=true".into());
     }
     let (config, from, resume_point) = match &args.resume {
         Some(folder) => {
@@ -130,6 +136,12 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     ))?;
     config.world.install(&mut console::line)?;
     if args.lockstep {
+        if config.local.durable {
+            return Err(usage!(
+                "--lockstep runs everything in one process, which keeps no replay on disk: leave --durable out"
+            )
+            .into());
+        }
         if shards > 1 {
             return Err(usage!(
                 "--lockstep runs everything in one process, with one replay: leave --replay-shards out"

@@ -8,6 +8,7 @@ use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
 use crate::heads::c51::C51Head;
 use crate::heads::dim::{ActionEmbedding, Head};
+use crate::kernels::rows::select_rows;
 use crate::parameters::Parameters;
 use crate::torso::Torso;
 
@@ -29,6 +30,17 @@ impl Features {
         Ok(Self {
             f3: self.f3.narrow(0, first, rows)?,
             f4: self.f4.narrow(0, first, rows)?,
+        })
+    }
+
+    /// Those of these rows, each as often as it is asked for. On the CPU alone; gradients of a row's copies are summed first to last.
+    ///
+    /// # Errors
+    /// A row that is not there.
+    pub fn select(&self, rows: &[u32]) -> candle_core::Result<Self> {
+        Ok(Self {
+            f3: select_rows(&self.f3, rows)?,
+            f4: select_rows(&self.f4, rows)?,
         })
     }
 }

@@ -203,17 +203,17 @@ impl<U: Unit> UnitWeights<U> {
     fn tile_q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]) {
         let unit = self.unit;
         let count = values.len() * support.len() / self.head.bias.len();
-        let (mut maps, mut scale) = Pixels::Bytes(frames).operands(unit);
-        for layer in &self.convolutions {
+        let mut maps = Buffer::<U::Element>::new(0);
+        for (index, layer) in self.convolutions.iter().enumerate() {
             let len = count * layer.shape.map_len();
             let mut output = Buffer::<U::Element>::new(len + PADDING);
             output[len..].fill(U::Element::default());
-            let images = Images {
-                values: &maps,
-                scale,
+            let images = match index {
+                0 => Images::Pixels(Pixels::Bytes(frames)),
+                _ => Images::Maps(&maps),
             };
             forward(unit, layer, images, &mut output[..len]);
-            (maps, scale) = (output, 1.0);
+            maps = output;
         }
         let hidden = self.fc.forward(unit, &maps, count);
         let stride = self.fc.bias.len().next_multiple_of(U::Element::DEPTH);

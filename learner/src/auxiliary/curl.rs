@@ -7,8 +7,6 @@
 //! "exactly the same networks for measuring similarity (i.e. one residual block for CURL and CPC)", hence no bilinear
 //! product and no second head.
 
-use std::borrow::Cow;
-
 use driml_model::DimHeads;
 use serde::{Deserialize, Serialize};
 
@@ -23,6 +21,7 @@ use crate::{
     error::UpdateError,
     losses::{info_nce::info_nce_loss, scores::Scores},
     ranges::{TAU, check_range},
+    repeats::State,
 };
 
 /// Its line of the menu.
@@ -98,8 +97,8 @@ impl AuxiliaryLoss for Curl {
     }
 
     /// None: the other view is the key encoder's.
-    fn later_states<'a>(&self, _batch: &Batch<'a>) -> Cow<'a, [u8]> {
-        Cow::Borrowed(&[])
+    fn later_states<'a>(&self, _batch: &Batch<'a>, _state_bytes: usize) -> Vec<State<'a>> {
+        Vec::new()
     }
 
     /// InfoNCE of the online network's vectors of one view with the key encoder's of the other. All rows take part: a state

@@ -1,8 +1,6 @@
 //! Deep InfoMax: InfoNCE between features of (s_t, a_t) and of s_{t+k}, for up to four pairs of levels.
 //! It holds no parameters (the model does) and does not mask beyond `positive_valid`.
 
-use std::borrow::Cow;
-
 use candle_core::Tensor;
 use driml_model::{DimHeads, Features, Kernels, Network};
 
@@ -18,6 +16,7 @@ use crate::{
         info_nce::info_nce_loss,
         scores::{Dots, Scores},
     },
+    repeats::State,
 };
 
 /// Its line of the menu.
@@ -102,8 +101,9 @@ impl AuxiliaryLoss for Dim {
         Passes::of_pairs(self.lambda, positives, augmented)
     }
 
-    fn later_states<'a>(&self, batch: &Batch<'a>) -> Cow<'a, [u8]> {
-        Cow::Borrowed(batch.states_k)
+    /// A row without a positive keeps its place, so that row meets row; what the blank state gives is masked.
+    fn later_states<'a>(&self, batch: &Batch<'a>, state_bytes: usize) -> Vec<State<'a>> {
+        batch.positive_states(state_bytes)
     }
 
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {

@@ -29,6 +29,7 @@ use crate::{
         settings::{AuxiliarySettings, Lambda},
     },
     losses::scores::{Dots, Scores},
+    repeats::EqualStates,
 };
 
 /// One tensor group's comparison.
@@ -294,7 +295,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
         _ => None,
     };
     let batch = case.batch();
-    let features = OnlineFeatures::new(&online, &model, &*loss, &batch, device)?;
+    let features = OnlineFeatures::new(&online, &model, &*loss, &batch, EqualStates::Each, device)?;
     let losses = loss.losses(&LossInputs {
         online: &online,
         model: &model,

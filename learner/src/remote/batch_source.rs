@@ -9,8 +9,8 @@ use std::{
 
 use driml_protocol::{
     Batch, BatchHeader, BatchReply, BatchRequest, BufferPool, PendingReply, ReplayStatus,
-    RequestId, RunClient, Seldom, Shutdown, Tally, fault, join_within, session::SessionError,
-    shared_memory::Trust,
+    RequestId, RunClient, Seldom, Shutdown, Tally, Waiting, fault, join_within,
+    session::SessionError, shared_memory::Trust,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -58,6 +58,8 @@ pub struct BatchSource {
     /// Threads that have not said that they are finished.
     fetching: u32,
     threads: Vec<JoinHandle<()>>,
+    /// Who waits for whom, by the last answer that was no batch.
+    waiting: Arc<Mutex<Waiting>>,
     shutdown: Shutdown,
 }
 
@@ -65,8 +67,8 @@ pub struct BatchSource {
 pub enum Next {
     /// A batch to learn from.
     Batch(Batch),
-    /// No batch came within the time given; ask again.
-    NotYet,
+    /// No batch came within the time given; ask again. The replay server says who waits for whom.
+    NotYet(Waiting),
     /// The run is over: no further batch will come.
     Finished,
 }
@@ -85,6 +87,7 @@ impl BatchSource {
         // A batch a thread, and the one that is learned from.
         let pool = BufferPool::new(requests.in_flight as usize + clients.len());
         let partial = Arc::new(Mutex::new(PartialBatch::new(clients.len())));
+        let waiting = Arc::<Mutex<Waiting>>::default();
         let mut threads = Vec::new();
         for i in 0..requests.in_flight {
             // Which rows come from which shard follows from the order of answers, so this need not be the run's.
@@ -98,6 +101,7 @@ impl BatchSource {
                 pool: pool.clone(),
                 trust: Trust::default(),
                 said: Seldom::default(),
+                waiting: waiting.clone(),
                 shutdown: shutdown.clone(),
             };
             let sender = sender.clone();
@@ -110,6 +114,7 @@ impl BatchSource {
             fetched,
             fetching: requests.in_flight,
             threads,
+            waiting,
             shutdown: shutdown.clone(),
         })
     }
@@ -132,7 +137,12 @@ impl BatchSource {
                 Ok(Fetched::Batch(batch)) => return Ok(Next::Batch(batch)),
                 Ok(Fetched::Finished) => self.fetching -= 1,
                 Ok(Fetched::Failed(e)) => return Err(e),
-                Err(mpsc::RecvTimeoutError::Timeout) => return Ok(Next::NotYet),
+                Err(mpsc::RecvTimeoutError::Timeout) => {
+                    let waiting = self.waiting.lock();
+                    return Ok(Next::NotYet(
+                        *waiting.unwrap_or_else(PoisonError::into_inner),
+                    ));
+                }
                 Err(mpsc::RecvTimeoutError::Disconnected) if self.shutdown.is_set() => break,
                 Err(mpsc::RecvTimeoutError::Disconnected) => {
                     return Err(BatchError::ThreadsEnded);
@@ -176,6 +186,7 @@ struct Fetcher {
     /// Whether batches may come through shared memory.
     trust: Trust,
     said: Seldom,
+    waiting: Arc<Mutex<Waiting>>,
     shutdown: Shutdown,
 }
 
@@ -352,7 +363,10 @@ impl Fetcher {
                 }
                 Answer::Batch(Batch::from_payload(header, payload)?)
             }
-            BatchReply::Wait(_) => Answer::Wait,
+            BatchReply::Wait(waiting) => {
+                *self.waiting.lock().unwrap_or_else(PoisonError::into_inner) = waiting;
+                Answer::Wait
+            }
             BatchReply::Finished => Answer::Finished,
             BatchReply::Refused { why } => Answer::Refused(why),
         })

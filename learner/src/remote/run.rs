@@ -9,7 +9,10 @@ use std::{
 
 use anyhow::Context;
 use driml_model::DeviceName;
-use driml_protocol::{BatchHeader, Keys, Shutdown, shared_memory, tls::Credentials, whole_file};
+use driml_protocol::{
+    Activity, BatchHeader, Keys, Life, Shutdown, reporter, shared_memory, tls::Credentials,
+    whole_file,
+};
 
 use super::{
     batch_source::{BatchSource, Next, Requests},
@@ -24,6 +27,8 @@ use crate::{
 
 /// How long a learner that was told to stop stays to be asked for its last status.
 const LAST_WORD_MAX: Duration = Duration::from_secs(3);
+/// How long a batch may take before a person hears what it is waited for.
+const SILENT_MAX: Duration = Duration::from_secs(10);
 /// How often a waiting learner looks whether it should stop.
 const TICK: Duration = Duration::from_millis(200);
 
@@ -106,6 +111,13 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             outlets.send_affinity(affinity);
         }
     }
+    let activity = Activity::new("waits for its first batch");
+    reporter::start(
+        clients.clone(),
+        Life::Learner(requests.learner),
+        activity.clone(),
+        shutdown.clone(),
+    )?;
     let mut batches = BatchSource::start(&clients, requests, shutdown)?;
     tracing::info!(
         "learning on {} from batches of {rows} rows, run {spec_hash:016x}",
@@ -113,16 +125,25 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     );
 
     let mut saving = Saving::new(folder);
-    let learned = learn(&mut learner, &mut batches, &outlets, &mut saving, shutdown);
+    let learned = learn(
+        &mut learner,
+        &mut batches,
+        &outlets,
+        &mut saving,
+        &activity,
+        shutdown,
+    );
     if let Err(e) = &learned {
         tracing::error!("ends after {} updates: {e:#}", learner.updates());
     }
+    activity.begin("saves its last checkpoint");
     let saved = saving.finish(&learner);
     if learned.is_ok() && !learner.publication_is_due() {
         outlets.publish(learner.next_weights()?);
     }
     learned.and(saved.map_err(Into::into))?;
     outlets.with_status(|status| status.finished = true);
+    activity.begin("has finished and stays to be asked");
     tracing::info!("finished after {} updates", learner.updates());
     shutdown.wait();
     outlets.wait_until_heard(LAST_WORD_MAX);
@@ -141,15 +162,28 @@ fn learn(
     batches: &mut BatchSource,
     outlets: &Outlets,
     saving: &mut Saving,
+    activity: &Activity,
     shutdown: &Shutdown,
 ) -> anyhow::Result<()> {
-    let mut waiting_since = Instant::now();
+    // A wait is said after some seconds, then ever more seldom.
+    let (mut waiting_since, mut said_next) = (Instant::now(), SILENT_MAX);
     while !shutdown.is_set() {
         let batch = match batches.next(TICK)? {
             Next::Batch(batch) => batch,
-            Next::NotYet => continue,
+            Next::NotYet(waiting) => {
+                activity.begin("waits for a batch");
+                let since = waiting_since.elapsed();
+                if since > said_next {
+                    let since = since.as_secs();
+                    tracing::info!("waiting for a batch since {since} s: {waiting}");
+                    said_next *= 2;
+                }
+                continue;
+            }
             Next::Finished => break,
         };
+        activity.begin("learns");
+        said_next = SILENT_MAX;
         let started = Instant::now();
         let report = learner.update(&batch)?;
         if let Some(affinity) = learner.affinity_update(outlets.learner()) {

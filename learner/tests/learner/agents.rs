@@ -4,12 +4,13 @@
 use std::{collections::BTreeMap, fs};
 
 use driml_learner::{
-    AffinityConfig, Agent, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner,
-    LearnerConfig, LearnerSettings, NetworkParameters, Objective, UpdateError,
+    AffinityConfig, Agent, AugmentSettings, Batch, Config, EqualStates, EstimatorKind, Lambda,
+    Learner, LearnerConfig, LearnerSettings, NetworkParameters, Objective, UpdateError,
 };
 use driml_model::{Compute, DimHeads, InputSize, ModelConfig, Parameters};
 use driml_protocol::{
-    Batch as WireBatch, BatchHeader, Horizon, RunSpec, Tally, TimeoutRule, config::TransportConfig,
+    Batch as WireBatch, BatchHeader, Buffer, Horizon, RowScalars, RunSpec, TimeoutRule,
+    config::TransportConfig,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -145,6 +146,62 @@ fn positives_that_are_missing_change_nothing() {
     }
     let after = agent.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
     assert_eq!((before.losses, before.total), (after.losses, after.total));
+}
+
+/// `states` without those that are not `there`.
+fn packed(states: &[u8], there: &[bool]) -> Vec<u8> {
+    let states = states.chunks_exact(states.len() / there.len());
+    let present = states.zip(there).filter(|(_, there)| **there);
+    present.flat_map(|(state, _)| state.to_vec()).collect()
+}
+
+#[test]
+fn states_that_rows_do_not_have_may_be_left_out() {
+    for (objective, lambda) in [(Objective::NONE, NO_DIM), (DIM, ALL_DIM), (CPC, ALL_DIM)] {
+        let mut rows = Rows::random(6, 4);
+        rows.bootstrap_discount = vec![0.9, 0.0, 0.9, 0.9, 0.0, 0.9];
+        rows.positive_valid = vec![0, 1, 0, 1, 1, 1];
+        let several = later(&rows);
+        let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]].concat();
+        let whole = if objective == CPC {
+            cpc(&rows, &several, &valid)
+        } else {
+            rows.batch()
+        };
+        let there: Vec<_> = whole.positive_valid.iter().map(|it| *it != 0).collect();
+        let states_k = packed(whole.states_k, &there);
+        let there: Vec<_> = rows
+            .bootstrap_discount
+            .iter()
+            .map(|it| *it != 0.0)
+            .collect();
+        let states_n = packed(whole.states_n, &there);
+        let parts = Batch {
+            states_k: &states_k,
+            states_n: &states_n,
+            ..whole
+        };
+        assert!(states_k.len() < whole.states_k.len() && states_n.len() < whole.states_n.len());
+        let learned = [whole, parts].map(|batch| {
+            let mut agent = agent(objective, lambda);
+            let reports = [agent.update(&batch).unwrap(), agent.update(&batch).unwrap()];
+            (reports, values(agent.online()))
+        });
+        assert!(learned[0] == learned[1], "{objective:?}");
+
+        for (states_k, states_n, what) in [
+            (&states_k[1..], &states_n[..], "states_k"),
+            (&states_k, &states_n[1..], "states_n"),
+        ] {
+            let batch = Batch {
+                states_k,
+                states_n,
+                ..whole
+            };
+            let error = agent(objective, lambda).evaluate(&batch).unwrap_err();
+            assert!(error.to_string().contains(what), "{error}");
+        }
+    }
 }
 
 #[test]
@@ -420,6 +477,7 @@ fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConf
         },
         model,
         learner: Config {
+            equal_states: EqualStates::Once,
             precision: Default::default(),
             publish_as: Default::default(),
             batch_size: 6,
@@ -446,29 +504,42 @@ fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConf
 
 /// A batch as the replay server of this run would send it.
 fn served(config: &LearnerConfig, seed: u64) -> WireBatch {
+    served_with(config, seed, |_| {})
+}
+
+/// [`served`], with its rows changed.
+fn served_with(config: &LearnerConfig, seed: u64, change: impl Fn(&mut [RowScalars])) -> WireBatch {
     let positives = config.spec.horizon.positives();
-    let mut batch = WireBatch::zeroed(BatchHeader {
-        rows: 6,
-        positives: positives as u32,
-        state_bytes: STATE as u32,
-        tally: Tally::default(),
-        held: 9,
-        mean_age: 0.0,
-        weights_versions: (1, 1),
-    });
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut rows = batch.rows_mut();
+    let row = |row: usize| RowScalars {
+        action: (row % 4) as u8,
+        next_action: 0,
+        n_step_return: rng.random_range(-1.0..1.0),
+        // The last one's episode ends.
+        bootstrap_discount: if row < 5 { 0.9 } else { 0.0 },
+        positives: positives.min(row) as u32,
+        k_first: 1,
+    };
+    let mut rows: Vec<_> = (0..6).map(row).collect();
+    change(&mut rows);
+    let header = BatchHeader {
+        state_bytes: STATE as u32,
+        held: 9,
+        weights_versions: (1, 1),
+        ..BatchHeader::of(&config.spec, 6)
+    };
+    let mut batch = WireBatch::of_rows(header, &rows, Buffer::zeroed);
+    let mut places = batch.states_mut();
     for row in 0..6 {
-        rng.fill(rows.state_t(row));
-        rng.fill(rows.state_n(row));
+        rng.fill(places.t(row));
+        if let Some(place) = places.n(row) {
+            rng.fill(place);
+        }
         for p in 0..positives {
-            if row > p {
-                rng.fill(rows.positive(p, row, p as u32 + 1));
-            } else {
-                rows.no_positive(p, row);
+            if let Some(place) = places.k(p, row) {
+                rng.fill(place);
             }
         }
-        rows.set(row, (row % 4) as u8, 0, rng.random_range(-1.0..1.0), 0.9);
     }
     batch
 }
@@ -587,8 +658,7 @@ fn a_curl_checkpoint_without_a_key_encoder_is_refused() {
 fn a_refused_batch_draws_nothing() {
     let config = config(CURL, Some(STRONG));
     let good = served(&config, 1);
-    let mut bad = served(&config, 2);
-    bad.rows_mut().set(0, 77, 0, 0.0, 0.9);
+    let bad = served_with(&config, 2, |rows| rows[0].action = 77);
     let mut learner = Learner::new(config.clone(), &Compute::CPU).unwrap();
     assert!(learner.update(&bad).is_err());
     let after = learner.update(&good).unwrap();

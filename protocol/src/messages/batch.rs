@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     batch_layout::{BatchLayout, Column},
+    batch_rows::{BatchStatesMut, RowScalars},
     status::Waiting,
     tally::Tally,
 };
@@ -33,6 +34,10 @@ pub struct BatchHeader {
     pub positives: u32,
     /// Bytes of one state.
     pub state_bytes: u32,
+    /// States s_{t+k} that travel: one for each positive that a row has, at most P for each row.
+    pub states_k: u32,
+    /// States s_{t+n} that travel: one for each row that bootstraps, at most B.
+    pub states_n: u32,
     /// What the replay server that drew this had counted then, this batch included.
     pub tally: Tally,
     /// Transitions that it held.
@@ -44,12 +49,15 @@ pub struct BatchHeader {
 }
 
 impl BatchHeader {
-    /// A batch of `rows` rows of this run, before any row is written.
+    /// A batch of `rows` rows of this run, before any row is drawn: as large as one can be.
     pub fn of(spec: &RunSpec, rows: u32) -> Self {
+        let positives = spec.horizon.positives() as u32;
         Self {
             rows,
-            positives: spec.horizon.positives() as u32,
+            positives,
             state_bytes: spec.state_bytes() as u32,
+            states_k: rows.saturating_mul(positives),
+            states_n: rows,
             tally: Tally::default(),
             held: 0,
             mean_age: 0.0,
@@ -77,21 +85,35 @@ impl BatchHeader {
             rows: self.rows as usize,
             positives: self.positives as usize,
             state_bytes: self.state_bytes as usize,
+            states_k: self.states_k as usize,
+            states_n: self.states_n as usize,
         }
     }
 
-    /// Checks that `payload` is as long as such a batch's.
+    /// Checks that `payload` is as long as such a batch's, and has as many states as its rows say.
     fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
-        if self.layout().bytes() == Some(payload.len()) && self.rows > 0 {
-            return Ok(());
+        let layout = self.layout();
+        if layout.bytes() != Some(payload.len()) || self.rows == 0 {
+            return Err(CodecError::Header(format!(
+                "{} rows with {} positives of {} bytes, {} and {} of them there, do not fill {} bytes of payload",
+                self.rows,
+                self.positives,
+                self.state_bytes,
+                self.states_k,
+                self.states_n,
+                payload.len()
+            )));
         }
-        Err(CodecError::Header(format!(
-            "{} rows with {} positives of {} bytes do not fill {} bytes of payload",
-            self.rows,
-            self.positives,
-            self.state_bytes,
-            payload.len()
-        )))
+        let rows = (layout.positives_there(payload), layout.bootstraps(payload));
+        let count = |there: &[bool]| there.iter().filter(|there| **there).count();
+        let counted = (count(&rows.0), count(&rows.1));
+        if counted != (layout.states_k, layout.states_n) {
+            return Err(CodecError::Header(format!(
+                "rows with {} positives and {} bootstraps come with {} and {} states",
+                counted.0, counted.1, self.states_k, self.states_n
+            )));
+        }
+        Ok(())
     }
 }
 
@@ -124,8 +146,9 @@ impl Message for BatchReply {
 
 /// Rows (s_t, a_t, a_{t+1}, R_t, discount, s_{t+k}, s_{t+n}), as the replay server made them.
 ///
-/// Buffer, one after the other, B rows each: states_t, states_k [P, B, ..], states_n [B, state bytes]; n-step return f32,
-/// bootstrap discount f32 (little-endian); action, next action, positive valid [P, B], k [P, B] (u8).
+/// Buffer, one after the other: states_t [B, state bytes]; states_k of the positives that rows have, in the order of [P, B];
+/// states_n of the rows that bootstrap; then B rows each: n-step return f32, bootstrap discount f32 (little-endian); action, next action,
+/// positive valid [P, B], k [P, B] (u8). No state travels that a row does not have.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Batch {
     /// What it says of itself.
@@ -134,17 +157,32 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// A batch of zeros, to be filled in place.
-    pub fn zeroed(header: BatchHeader) -> Self {
-        let payload = Buffer::zeroed(header.payload_bytes());
-        Self { header, payload }
-    }
-
-    /// A batch in memory that may hold anything: every row is to be written with [`Batch::rows_mut`].
+    /// A batch of `rows`, whose states are then to be written with [`Batch::states_mut`]; rows and states of `header` are set to
+    /// what `rows` has. `memory` gives so many bytes, with anything in them.
     ///
     /// # Panics
-    /// If the memory is not of [`BatchHeader::payload_bytes`].
-    pub fn in_memory(header: BatchHeader, payload: Buffer) -> Self {
+    /// If the memory is of another size, or a row has more positives than the header.
+    pub fn of_rows(
+        header: BatchHeader,
+        rows: &[RowScalars],
+        memory: impl FnOnce(usize) -> Buffer,
+    ) -> Self {
+        let header = BatchHeader {
+            rows: rows.len() as u32,
+            states_k: rows.iter().map(|row| row.positives).sum(),
+            states_n: rows.iter().filter(|row| row.bootstraps()).count() as u32,
+            ..header
+        };
+        let mut batch = Self::in_memory(header, memory(header.payload_bytes()));
+        let layout = header.layout();
+        for (row, scalars) in rows.iter().enumerate() {
+            scalars.write(&layout, &mut batch.payload, row);
+        }
+        batch
+    }
+
+    /// A batch in memory that may hold anything.
+    fn in_memory(header: BatchHeader, payload: Buffer) -> Self {
         assert_eq!(payload.len(), header.payload_bytes(), "memory for a batch");
         Self { header, payload }
     }
@@ -158,23 +196,37 @@ impl Batch {
         let header = Self::merged_header(parts).expect("parts of one batch");
         let mut merged = Self::in_memory(header, memory);
         let whole = header.layout();
-        let mut first_row = 0;
-        for part in parts {
-            let rows = part.rows();
-            for column in Column::ALL {
-                let row_bytes = whole.value_bytes(column);
-                let to = &mut merged.payload[whole.range(column)];
-                let from = part.column(column);
-                // Of each positive, the rows of the part come together.
-                for positive in 0..whole.values_a_row(column) {
-                    let from = &from[positive * rows * row_bytes..][..rows * row_bytes];
-                    let row = positive * whole.rows + first_row;
-                    to[row * row_bytes..][..from.len()].copy_from_slice(from);
+        for column in Column::ALL {
+            let mut to = &mut merged.payload[whole.range(column)];
+            // Of each positive, the rows of the part come together.
+            for positive in 0..whole.values_a_row(column) {
+                for part in parts {
+                    let from = part.of_positive(column, positive);
+                    let place = to.split_off_mut(..from.len());
+                    place
+                        .expect("the parts fill the column")
+                        .copy_from_slice(from);
                 }
             }
-            first_row += rows;
         }
         merged
+    }
+
+    /// The values of a column that are of this positive; all of a column that is not of positives.
+    fn of_positive(&self, column: Column, positive: usize) -> &[u8] {
+        let values = self.column(column);
+        match column {
+            Column::StatesK => {
+                let valid = self.positive_valid().chunks_exact(self.rows());
+                let there = |valid: &[u8]| valid.iter().filter(|valid| **valid != 0).count();
+                let before: usize = valid.clone().take(positive).map(there).sum();
+                let own = valid.clone().nth(positive).map_or(0, there);
+                let state_bytes = self.header.state_bytes as usize;
+                &values[before * state_bytes..(before + own) * state_bytes]
+            }
+            Column::PositiveValid | Column::K => &values[positive * self.rows()..][..self.rows()],
+            _ => values,
+        }
     }
 
     /// The header of [`Batch::merge`]; none if `parts` are none or differ in shape.
@@ -182,10 +234,13 @@ impl Batch {
         let mut merged = parts.first()?.header;
         let mut age_total = 0.0;
         (merged.rows, merged.tally, merged.held) = (0, Tally::default(), 0);
+        (merged.states_k, merged.states_n) = (0, 0);
         for BatchHeader {
             rows,
             positives,
             state_bytes,
+            states_k,
+            states_n,
             tally,
             held,
             mean_age,
@@ -196,6 +251,8 @@ impl Batch {
                 return None;
             }
             merged.rows += rows;
+            merged.states_k += states_k;
+            merged.states_n += states_n;
             merged.tally = merged.tally + tally;
             merged.held += held;
             age_total += mean_age * f64::from(rows);
@@ -230,12 +287,12 @@ impl Batch {
         self.column(Column::StatesT)
     }
 
-    /// s_{t+k} [P, B, state bytes]; rows without a positive hold zeros.
+    /// s_{t+k} of the positives that rows have, in the order of [P, B].
     pub fn states_k(&self) -> &[u8] {
         self.column(Column::StatesK)
     }
 
-    /// s_{t+n} [B, state bytes]; rows that do not bootstrap hold zeros.
+    /// s_{t+n} of the rows that bootstrap.
     pub fn states_n(&self) -> &[u8] {
         self.column(Column::StatesN)
     }
@@ -270,29 +327,9 @@ impl Batch {
         self.column(Column::K)
     }
 
-    /// Everything of one row, to be written in place.
-    pub fn rows_mut(&mut self) -> BatchRowsMut<'_> {
-        let layout = self.header.layout();
-        let mut rest = &mut self.payload[..];
-        // They lie in the order of their names here.
-        let mut take = |column| -> &mut [u8] {
-            let bytes = layout.column_bytes(column);
-            rest.split_off_mut(..bytes)
-                .expect("the columns fill the payload")
-        };
-        BatchRowsMut {
-            rows: layout.rows,
-            state_bytes: layout.state_bytes,
-            states_t: take(Column::StatesT),
-            states_k: take(Column::StatesK),
-            states_n: take(Column::StatesN),
-            n_step_return: take(Column::NStepReturn),
-            bootstrap_discount: take(Column::BootstrapDiscount),
-            action: take(Column::Action),
-            next_action: take(Column::NextAction),
-            positive_valid: take(Column::PositiveValid),
-            k: take(Column::K),
-        }
+    /// The places of all states that the rows have.
+    pub fn states_mut(&mut self) -> BatchStatesMut<'_> {
+        BatchStatesMut::new(self.header.layout(), &mut self.payload)
     }
 
     /// Header and payload, to travel as a [`BatchReply::Batch`].
@@ -300,74 +337,12 @@ impl Batch {
         (self.header, self.payload)
     }
 
-    /// Takes the payload of a decoded reply, checking that it is as long as its header says.
+    /// Takes the payload of a decoded reply, checking that it is as long as its header says, with the states that its rows say.
     ///
     /// # Errors
-    /// Buffer of another length.
+    /// Buffer of another length, or rows that say otherwise.
     pub fn from_payload(header: BatchHeader, payload: Buffer) -> Result<Self, CodecError> {
         header.check_payload(&payload)?;
         Ok(Self { header, payload })
-    }
-}
-
-/// The columns of a batch, borrowed for writing, row by row.
-#[derive(Debug)]
-pub struct BatchRowsMut<'a> {
-    rows: usize,
-    state_bytes: usize,
-    states_t: &'a mut [u8],
-    states_k: &'a mut [u8],
-    states_n: &'a mut [u8],
-    n_step_return: &'a mut [u8],
-    bootstrap_discount: &'a mut [u8],
-    action: &'a mut [u8],
-    next_action: &'a mut [u8],
-    positive_valid: &'a mut [u8],
-    k: &'a mut [u8],
-}
-
-impl BatchRowsMut<'_> {
-    /// Where s_t of `row` is written.
-    pub fn state_t(&mut self, row: usize) -> &mut [u8] {
-        &mut self.states_t[row * self.state_bytes..(row + 1) * self.state_bytes]
-    }
-
-    /// Where s_{t+n} of `row` is written; zeros if the row does not bootstrap.
-    pub fn state_n(&mut self, row: usize) -> &mut [u8] {
-        &mut self.states_n[row * self.state_bytes..(row + 1) * self.state_bytes]
-    }
-
-    /// Positives a row, P.
-    pub const fn positives(&self) -> usize {
-        self.positive_valid.len() / self.rows
-    }
-
-    /// Marks `row` as having no positive `p`.
-    pub fn no_positive(&mut self, p: usize, row: usize) {
-        self.positive(p, row, 0).fill(0);
-        self.positive_valid[p * self.rows + row] = 0;
-    }
-
-    /// Marks positive `p` of `row` as `k` steps ahead and gives where s_{t+k} is written.
-    pub fn positive(&mut self, p: usize, row: usize, k: u32) -> &mut [u8] {
-        let at = p * self.rows + row;
-        self.positive_valid[at] = 1;
-        self.k[at] = u8::try_from(k).unwrap_or(u8::MAX);
-        &mut self.states_k[at * self.state_bytes..(at + 1) * self.state_bytes]
-    }
-
-    /// Writes the scalars of `row`.
-    pub fn set(
-        &mut self,
-        row: usize,
-        action: u8,
-        next_action: u8,
-        n_step_return: f32,
-        discount: f32,
-    ) {
-        self.action[row] = action;
-        self.next_action[row] = next_action;
-        self.n_step_return[4 * row..4 * row + 4].copy_from_slice(&n_step_return.to_le_bytes());
-        self.bootstrap_discount[4 * row..4 * row + 4].copy_from_slice(&discount.to_le_bytes());
     }
 }

@@ -250,6 +250,11 @@ impl Chunk {
         ))
     }
 
+    /// The payload: all columns, one after the other.
+    pub fn payload(&self) -> &[u8] {
+        &self.payload
+    }
+
     /// The payload, to travel after a head from [`Chunk::seal`].
     pub fn into_payload(self) -> Buffer {
         self.payload

@@ -11,6 +11,8 @@ use crate::{
         hello::Hello,
         insert_reply::Claim,
         join::{ActorJoin, LearnerJoin},
+        parts::PartsStatus,
+        report::Report,
         status::{LearnerStatus, ReplayStatus},
         weights::{WeightsRequest, WeightsUpload, WeightsVersion},
     },
@@ -41,6 +43,7 @@ fn grant(keys: &Keys, role: Role) -> Grant {
                 keys.of_actor::<ChunkHeader>(actor),
                 keys.of_actor::<Claim>(actor),
                 keys.of_actor::<Goodbye>(actor),
+                keys.of_actor::<Report>(actor),
                 keys.of::<WeightsRequest>(),
             ]);
             hears.push(keys.of::<WeightsVersion>());
@@ -52,12 +55,17 @@ fn grant(keys: &Keys, role: Role) -> Grant {
                 keys.of::<BatchRequest>(),
                 keys.of::<AffinityUpdate>(),
                 keys.of::<WeightsUpload>(),
+                keys.of_learner::<Report>(),
             ]);
             answers.push(keys.of::<LearnerStatus>());
             lives.push(keys.lives_of_learner());
         }
         Role::Observer => {
-            asks.extend([keys.of::<ReplayStatus>(), keys.of::<LearnerStatus>()]);
+            asks.extend([
+                keys.of::<ReplayStatus>(),
+                keys.of::<PartsStatus>(),
+                keys.of::<LearnerStatus>(),
+            ]);
         }
         Role::ReplayServer => asks.clear(),
     }
@@ -177,6 +185,7 @@ mod tests {
                 "d/ingest/3",
                 "d/claim/3",
                 "d/goodbye/3",
+                "d/report/3",
                 "d/weights",
                 "d/weights-version",
                 "d/alive/actor/3/*",
@@ -190,6 +199,7 @@ mod tests {
                 "d/batch",
                 "d/affinity",
                 "d/weights-upload",
+                "d/report/learner",
                 "d/status/learner",
                 "d/alive/learner/*",
             ]

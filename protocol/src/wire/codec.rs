@@ -43,6 +43,39 @@ pub(crate) fn canonical_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecE
     encode_header(value)
 }
 
+/// Longest value of [`encode_value`], bytes.
+const VALUE_BYTES_MAX: usize = 1 << 28;
+
+/// The bytes of a value that travels in no message, for files.
+///
+/// # Errors
+/// A value over the limit, or one that serde cannot write.
+pub fn encode_value<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
+    let bytes = bincode::serde::encode_to_vec(value, bincode::config::standard())
+        .map_err(|e| CodecError::Header(e.to_string()))?;
+    if bytes.len() > VALUE_BYTES_MAX {
+        return Err(CodecError::TooLarge {
+            have: bytes.len(),
+            max: VALUE_BYTES_MAX,
+        });
+    }
+    Ok(bytes)
+}
+
+/// Reads what [`encode_value`] wrote. That the bytes are undamaged is the caller's to check.
+///
+/// # Errors
+/// Bytes that are no such value, or more than one.
+pub fn decode_value<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> {
+    let config = bincode::config::standard().with_limit::<VALUE_BYTES_MAX>();
+    let (value, used) = bincode::serde::decode_from_slice(bytes, config)
+        .map_err(|e| CodecError::Header(e.to_string()))?;
+    match bytes.len() - used {
+        0 => Ok(value),
+        over => Err(CodecError::Header(format!("{over} bytes after its end"))),
+    }
+}
+
 /// Prefix and header of a message; the wire carries these bytes followed by `payload`, which is not copied.
 ///
 /// # Errors

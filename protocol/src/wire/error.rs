@@ -49,11 +49,12 @@ pub enum CodecError {
     },
     /// A message of one actor at the key of another.
     #[error(
-        "the message speaks for actor {actor} at the key {key:?}: each actor speaks for itself alone"
+        "the message speaks for {} at the key {key:?}: each part speaks for itself alone",
+        .actor.map_or("the learner".into(), |actor| format!("actor {actor}"))
     )]
     Actor {
-        /// Whom the message speaks for.
-        actor: u32,
+        /// Whom the message speaks for; none is the learner.
+        actor: Option<u32>,
         /// Where it came.
         key: String,
     },

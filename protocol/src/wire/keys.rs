@@ -52,6 +52,15 @@ impl Keys {
         }
     }
 
+    /// Where the learner asks messages of type `M`, of which each actor may have a key of its own.
+    pub fn of_learner<M: Keyed>(&self) -> String {
+        if M::BY_ACTOR {
+            self.key(&format!("{}/learner", M::KEY))
+        } else {
+            self.key(M::KEY)
+        }
+    }
+
     /// The actor under whose number `key` stands; none where it stands under no single one.
     pub(crate) fn actor(key: &str) -> Option<u32> {
         key.rsplit('/').next()?.parse().ok()
@@ -136,7 +145,7 @@ fn mark(number: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::messages::{affinity::AffinityUpdate, goodbye::Goodbye};
+    use crate::messages::{affinity::AffinityUpdate, goodbye::Goodbye, report::Report};
 
     #[test]
     fn what_an_actor_says_stands_under_its_number() {
@@ -144,6 +153,9 @@ mod tests {
         assert_eq!(keys.of::<Goodbye>(), "a/7/goodbye/*");
         assert_eq!(keys.of_actor::<Goodbye>(7), "a/7/goodbye/7");
         assert_eq!(keys.of_actor::<AffinityUpdate>(7), "a/7/affinity");
+        assert_eq!(keys.of_learner::<AffinityUpdate>(), "a/7/affinity");
+        assert_eq!(keys.of_learner::<Report>(), "a/7/report/learner");
+        assert_eq!(Keys::actor("a/7/report/learner"), None);
         assert_eq!(Keys::actor("a/7/goodbye/7"), Some(7));
         for nobody_s in ["a/7/goodbye/*", "a/7/affinity", "", "a/4294967296", "a/-1"] {
             assert_eq!(Keys::actor(nobody_s), None, "{nobody_s}");

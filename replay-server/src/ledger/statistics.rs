@@ -4,9 +4,10 @@
 use std::collections::VecDeque;
 
 use driml_protocol::{RETURNS_OF, Returns};
+use serde::{Deserialize, Serialize};
 
 /// What the status reports beside the ring's and the limiter's own counts.
-#[derive(Default)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Statistics {
     pub(crate) transitions_lost: u64,
     pub(crate) transitions_duplicated: u64,
@@ -36,6 +37,13 @@ impl Statistics {
             action_histogram: vec![0; num_actions as usize],
             ..Self::default()
         }
+    }
+
+    /// Without what is counted of messages that change nothing, which no log knows of.
+    pub(crate) fn of_changes(mut self) -> Self {
+        (self.chunks_retried, self.messages_refused, self.actors) = (0, 0, 0);
+        (self.learner_waited_s, self.actors_waited_s) = (0.0, 0.0);
+        self
     }
 
     /// Counts rows served with these `ks`.

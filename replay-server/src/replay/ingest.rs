@@ -3,7 +3,7 @@
 
 use std::borrow::Cow;
 
-use driml_protocol::{ActorJoin, Chunk, Claim, Goodbye, InsertReply};
+use driml_protocol::{ActorJoin, Chunk, ChunkHeader, Claim, Goodbye, InsertReply};
 
 use super::Replay;
 use crate::{
@@ -26,6 +26,7 @@ impl Replay {
     pub fn packer(&self) -> Packer {
         Packer {
             compression: self.config.compression,
+            seal_for: None,
         }
     }
 
@@ -76,6 +77,7 @@ impl Replay {
             _ if self.limiter.all_in() => Some(InsertReply::Finished {
                 inserted_total: self.inserted_total(),
             }),
+            Verdict::OutOfOrder { .. } if self.actors.insists(&chunk.header) => None,
             Verdict::OutOfOrder { expected } => Some(InsertReply::OutOfOrder { expected }),
             Verdict::Next => None,
         }
@@ -84,19 +86,28 @@ impl Replay {
     /// Stores a chunk that [`Replay::settle`] has nothing to say of, if the limiter lets it pass or its actor leaves; else the
     /// answer is to wait.
     pub fn admit(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
-        let leaving = packed.chunk.header.leaving;
-        if self.limiter.may_insert() || self.starving || leaving {
+        if self.may_admit(&packed.chunk.header) {
             self.store(packed);
             self.stored()
         } else {
-            InsertReply::Wait {
-                inserted_total: self.inserted_total(),
-                kept: false,
-            }
+            self.wait()
         }
     }
 
-    fn stored(&self) -> InsertReply {
+    /// Whether the limiter lets a chunk pass now, or its actor leaves.
+    pub(crate) fn may_admit(&self, header: &ChunkHeader) -> bool {
+        self.limiter.may_insert() || self.starving || header.leaving
+    }
+
+    /// The answer to a chunk that is not stored yet.
+    pub(crate) const fn wait(&self) -> InsertReply {
+        InsertReply::Wait {
+            inserted_total: self.inserted_total(),
+            kept: false,
+        }
+    }
+
+    pub(crate) fn stored(&self) -> InsertReply {
         InsertReply::Stored {
             inserted_total: self.inserted_total(),
             actors: self.statistics.actors.saturating_mul(self.config.shards),
@@ -119,7 +130,7 @@ impl Replay {
         }
     }
 
-    fn unfit(&self, chunk: &Chunk) -> Option<String> {
+    pub(crate) fn unfit(&self, chunk: &Chunk) -> Option<String> {
         let header = &chunk.header;
         let frame_bytes = self.spec.frame_bytes();
         if header.frame_bytes as usize != frame_bytes {
@@ -168,7 +179,8 @@ impl Replay {
         ))
     }
 
-    fn store(&mut self, packed: &PackedChunk<'_>) {
+    /// Stores a chunk that is the next of its actor.
+    pub(crate) fn store(&mut self, packed: &PackedChunk<'_>) {
         let chunk = &*packed.chunk;
         let header = chunk.header;
         let (streams, difference) = self.actors.accept(&header);
@@ -204,7 +216,7 @@ impl Replay {
         }
         self.statistics.differences += 1;
         // Whoever sends nonsense could make the line come at any rate.
-        if self.statistics.differences.is_power_of_two() {
+        if self.statistics.differences.is_power_of_two() && !self.quiet {
             tracing::warn!(
                 "actor {actor}: {lost} transitions lost, {duplicated} stored twice, by its own count"
             );
@@ -240,9 +252,14 @@ impl Replay {
         }
     }
 
-    /// Makes room for an actor if a run's number of them is reached: forgets those that never sent a chunk and of which
-    /// `is_connected` says that their life is gone, as somebody who joins under one number after the other leaves behind.
-    pub fn forget_absent_actors(&mut self, is_connected: impl Fn(u32, u64) -> bool) {
-        self.actors.forget_absent(is_connected);
+    /// Who is to be forgotten so that an actor has room, if a run's number of them is reached: those that never sent a chunk and of
+    /// which `is_connected` says that their life is gone, as somebody who joins under one number after the other leaves behind.
+    pub(crate) fn absent_actors(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
+        self.actors.absent(is_connected)
+    }
+
+    /// Forgets these actors.
+    pub(crate) fn forget_actors(&mut self, actors: &[u32]) {
+        self.actors.forget(actors);
     }
 }

@@ -1,8 +1,10 @@
 //! The replay server's core: chunks in, batches out, and its account of itself.
 //! It does no I/O, keeps no time and starts no thread: the service around it does.
 
+pub(crate) mod events;
 mod ingest;
 mod sample;
+pub(crate) mod snapshot;
 mod status;
 
 use driml_protocol::{BatchReply, RunSpec, Tally, Waiting};
@@ -69,6 +71,8 @@ pub struct Replay {
     statistics: Statistics,
     /// The learner found no anchor: one chunk may pass the limiter, or both sides would wait for each other.
     starving: bool,
+    /// What happens has happened before, and was said then.
+    quiet: bool,
 }
 
 impl Replay {
@@ -138,6 +142,7 @@ impl Replay {
             rng,
             statistics: Statistics::new(spec.horizon.k_max(), spec.num_actions),
             starving: false,
+            quiet: false,
         })
     }
 

@@ -78,27 +78,21 @@ impl Replay {
             return Err(Unready::Wait(self.limiter.waiting(rows)));
         }
         let mut header = self.batch_header(rows);
-        let mut batch = Batch::in_memory(header, memory(header.payload_bytes()));
-        let pixel_bytes = self.spec.frame_channels as usize;
-        let mut packed = PackedStates::new(self.spec.frame_bytes(), pixel_bytes);
+        let mut drawn = Vec::with_capacity(rows as usize);
         let mut ks = Vec::with_capacity(rows as usize);
         let mut age_total = 0;
-        let mut rows_mut = batch.rows_mut();
-        for row in 0..rows as usize {
+        for _ in 0..rows {
             if !self
                 .anchors
                 .draw(&self.ring, &self.episodes, &mut self.rng, &mut self.window)
             {
                 return Err(self.no_anchor());
             }
-            let states = self.assembler.write_row(
-                &self.affinity,
-                &self.window,
-                &mut self.rng,
-                (&mut rows_mut, row),
-            );
-            packed.write_or_take_row(&self.ring, &self.episodes, states, &mut rows_mut, row);
-            ks.push(states.k());
+            let row = self
+                .assembler
+                .row(&self.affinity, &self.window, &mut self.rng);
+            ks.push(row.1.k());
+            drawn.push(row);
             age_total += self.ring.inserted() - 1 - self.window.index(0);
             let version = self.window.step(0).weights_version;
             let (newest, oldest) = header.weights_versions;
@@ -109,7 +103,14 @@ impl Replay {
         self.statistics.served(&ks);
         self.limiter.sampled(rows);
         header.tally = self.limiter.tally();
-        batch.header = header;
+        let (scalars, states): (Vec<_>, Vec<_>) = drawn.into_iter().unzip();
+        let mut batch = Batch::of_rows(header, &scalars, memory);
+        let pixel_bytes = self.spec.frame_channels as usize;
+        let mut packed = PackedStates::new(self.spec.frame_bytes(), pixel_bytes);
+        let mut places = batch.states_mut();
+        for (row, states) in states.into_iter().enumerate() {
+            packed.write_or_take_row(&self.ring, &self.episodes, states, &mut places, row);
+        }
         self.starving = false;
         Ok(PackedBatch { batch, packed, ks })
     }
@@ -125,19 +126,27 @@ impl Replay {
         rows: u32,
         memory: impl FnOnce(usize) -> Buffer,
     ) -> Result<PackedBatch, Unready> {
-        match self.requests.begin(id) {
-            Dedup::Superseded => return Err(Unready::Wait(self.limiter.waiting(rows))),
-            Dedup::Fresh(lost) => {
-                if !lost.is_empty() {
-                    tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
-                    self.limiter.refund(lost.len() as u64);
-                    self.statistics.refund(&lost);
-                }
-            }
+        if !self.begin_request(id) {
+            return Err(Unready::Wait(self.limiter.waiting(rows)));
         }
         let draft = self.draw_in(rows, memory)?;
         self.requests.complete(id.client_id, draft.ks.clone());
         Ok(draft)
+    }
+
+    /// Takes note of a request, and takes back what an earlier attempt at it was given; `false` if nobody waits for it any more.
+    pub(crate) fn begin_request(&mut self, id: RequestId) -> bool {
+        let Dedup::Fresh(lost) = self.requests.begin(id) else {
+            return false;
+        };
+        if !lost.is_empty() {
+            if !self.quiet {
+                tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
+            }
+            self.limiter.refund(lost.len() as u64);
+            self.statistics.refund(&lost);
+        }
+        true
     }
 
     /// What a batch of `rows` rows says of itself before any row is written.

@@ -31,6 +31,11 @@ impl Replay {
         self.limiter.inserted_total()
     }
 
+    /// Whether all transitions of the run are in.
+    pub fn all_in(&self) -> bool {
+        self.limiter.all_in()
+    }
+
     /// What was counted here since the start.
     pub const fn tally(&self) -> Tally {
         self.limiter.tally()

@@ -1,7 +1,9 @@
 //! Makes one row of a batch: a_t, a_{t+1}, the n-step return, and which transitions' states are s_t, s_{t+n} and s_{t+k}, with
 //! each k drawn here. It does not choose the anchor and reads no frame.
 
-use driml_protocol::{BatchRowsMut, End, Horizon, NO_ACTION, POSITIVES_MAX, RunSpec, TimeoutRule};
+use driml_protocol::{
+    BatchStatesMut, End, Horizon, NO_ACTION, POSITIVES_MAX, RowScalars, RunSpec, TimeoutRule,
+};
 use rand::Rng;
 
 use super::{
@@ -39,26 +41,23 @@ impl RowStates {
         first.chain(self.s_tpk.into_iter().take(self.positives))
     }
 
-    /// Calls `write` with the index and the place of each state, in the order of [`RowStates::indices`]; the places of the
-    /// states that the row does not have are filled with zeros.
+    /// Calls `write` with the index and the place of each state, in the order of [`RowStates::indices`].
+    ///
+    /// # Panics
+    /// If `places` are those of another row's scalars.
     pub(crate) fn write(
         &self,
-        rows: &mut BatchRowsMut<'_>,
+        places: &mut BatchStatesMut<'_>,
         row: usize,
         mut write: impl FnMut(u64, &mut [u8]),
     ) {
-        write(self.t, rows.state_t(row));
-        match self.n {
-            Some(index) => write(index, rows.state_n(row)),
-            None => rows.state_n(row).fill(0),
+        write(self.t, places.t(row));
+        if let Some(index) = self.n {
+            write(index, places.n(row).expect("a row that bootstraps"));
         }
-        for p in 0..rows.positives() {
-            if p < self.positives {
-                let place = rows.positive(p, row, self.k_first + p as u32);
-                write(self.s_tpk[p], place);
-            } else {
-                rows.no_positive(p, row);
-            }
+        for p in 0..self.positives {
+            let place = places.k(p, row).expect("a positive that the row has");
+            write(self.s_tpk[p], place);
         }
     }
 }
@@ -85,14 +84,13 @@ impl Assembler {
         }
     }
 
-    /// Writes all of the row of the window's anchor but its states, and gives those.
-    pub(crate) fn write_row(
+    /// The row of the window's anchor.
+    pub(crate) fn row(
         &mut self,
         affinity: &Affinity,
         window: &Window,
         rng: &mut impl Rng,
-        (rows, row): (&mut BatchRowsMut<'_>, usize),
-    ) -> RowStates {
+    ) -> (RowScalars, RowStates) {
         let anchor = window.step(0);
         let next_action = if anchor.end == End::Running {
             window.step(1).action
@@ -104,14 +102,8 @@ impl Assembler {
             None => follows.map(|i| (i, self.discounts[i])),
             Some(ReproducedBug::BootstrapFromNextState) => self.next_state(window),
         };
-        let discount = bootstrap.map_or(0.0, |(_, discount)| discount);
-        rows.set(
-            row,
-            anchor.action,
-            next_action,
-            return_f32(n_step_return),
-            discount as f32,
-        );
+        // A state that counts for nothing is none.
+        let bootstrap = bootstrap.filter(|&(_, discount)| discount as f32 != 0.0);
         let furthest = self.draw_k(affinity, window, rng).unwrap_or(0);
         let k_first = match self.horizon {
             Horizon::All { .. } => 1,
@@ -129,7 +121,15 @@ impl Assembler {
             states.s_tpk[states.positives] = window.index(k as usize);
             states.positives += 1;
         }
-        states
+        let scalars = RowScalars {
+            action: anchor.action,
+            next_action,
+            n_step_return: return_f32(n_step_return),
+            bootstrap_discount: bootstrap.map_or(0.0, |(_, discount)| discount as f32),
+            positives: states.positives as u32,
+            k_first,
+        };
+        (scalars, states)
     }
 
     /// s_{t+1} at gamma^n, unless step t ended its episode: the bug of [`ReproducedBug::BootstrapFromNextState`].

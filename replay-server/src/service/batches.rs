@@ -3,16 +3,13 @@
 
 use std::time::{Duration, Instant};
 
-use driml_protocol::{BatchReply, BatchRequest, Buffer, Incoming, Responder, fault};
+use driml_protocol::{Alive, BatchReply, BatchRequest, Buffer, Incoming, Responder, fault};
 
 use super::{
     parked::ParkedRequest,
     server::{Service, State},
 };
-use crate::{
-    replay::{Replay, Unready},
-    sampling::packed_batch::PackedBatch,
-};
+use crate::{durable::DurableReplay, replay::Unready, sampling::packed_batch::PackedBatch};
 
 /// How long a request waits before it is told to come back: far below every learner's time-out.
 const HOLD_MAX: Duration = Duration::from_secs(1);
@@ -33,7 +30,7 @@ impl Service {
             return responder.reply(&BatchReply::Refused { why });
         };
         let mut state = self.state();
-        let is_allowed = state.members.check_learner(request.learner);
+        let is_allowed = state.check_learner(request.learner);
         let is_allowed = is_allowed.and_then(|()| self.check_rows(request.rows));
         let heard = is_allowed.and_then(|()| self.hear_of_others(&mut state.replay, &request));
         if let Err(why) = heard {
@@ -49,6 +46,8 @@ impl Service {
             Some(_) => SHARD_HOLD_MAX,
             None => HOLD_MAX,
         };
+        let learner = Alive::learner(request.learner);
+        state.accounts.heard(learner, None, Instant::now());
         state.requests.park(ParkedRequest {
             request,
             question: responder,
@@ -70,7 +69,11 @@ impl Service {
     }
 
     /// Takes what the learner says of the other shards.
-    fn hear_of_others(&self, replay: &mut Replay, request: &BatchRequest) -> Result<(), String> {
+    fn hear_of_others(
+        &self,
+        replay: &mut DurableReplay,
+        request: &BatchRequest,
+    ) -> Result<(), String> {
         let (_, shards) = self.shard;
         match request.other_shards {
             None if shards > 1 => Err(format!(

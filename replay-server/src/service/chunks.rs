@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{Chunk, ChunkHeader, Claim, CodecError, Incoming, InsertReply, fault};
+use driml_protocol::{Alive, Chunk, ChunkHeader, Claim, CodecError, Incoming, InsertReply, fault};
 
 use super::{
     parked::ParkedChunk,
@@ -107,6 +107,9 @@ impl State {
     fn take_chunk(&mut self, packed: PackedChunk<'static>, question: Question) -> Answers {
         let header = packed.chunk.header;
         let Question { arrived, .. } = question;
+        let actor = Alive::actor(header.actor, header.incarnation);
+        self.accounts
+            .heard(actor, Some(header.weights_version), arrived);
         let Self {
             replay,
             chunks,

@@ -1,6 +1,8 @@
 //! Parts that join: what they are told of the run, and whether they are let in.
 //! Who is connected and who is served is kept in `members`.
 
+use std::time::Instant;
+
 use driml_protocol::{ActorJoin, Alive, Hello, Incoming, JoinReply, LearnerJoin, Responder};
 use zenoh::sample::SampleKind;
 
@@ -8,20 +10,28 @@ use super::server::{Service, State};
 
 impl Service {
     pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {
-        let mut state = self.state();
-        state.members.note(who, kind == SampleKind::Put);
+        let (mut state, is_connected) = (self.state(), kind == SampleKind::Put);
+        state.members.note(who, is_connected);
+        // A part that this server's predecessor took, whose replay it goes on with, does not join again.
+        if state.takes_part(who) {
+            state.open_account(who);
+        }
+        state
+            .accounts
+            .note_connected(who, is_connected, Instant::now());
         state.count_actors();
     }
 
     pub(super) fn hello(&self, responder: Responder<Hello>) {
         let state = self.state();
         let (inserted_total, tally) = (state.replay.inserted_total(), state.replay.tally());
+        let after_updates = state.replay.after_updates();
         drop(state);
         let hello = Hello {
             config_toml: self.config_toml.clone(),
             inserted_total,
             tally,
-            after_updates: self.after_updates,
+            after_updates,
             shard: self.shard,
             shared_memory: self.shared_memory,
         };
@@ -31,6 +41,9 @@ impl Service {
     pub(super) fn join_actor(&self, incoming: Incoming<ActorJoin>) {
         if let Some(join) = self.read(&incoming) {
             let reply = self.state().join_actor(join);
+            if !self.state().replay.is_ready() {
+                return;
+            }
             self.welcome(incoming.into_responder(), reply);
         }
     }
@@ -38,6 +51,9 @@ impl Service {
     pub(super) fn join_learner(&self, incoming: Incoming<LearnerJoin>) {
         if let Some(join) = self.read(&incoming) {
             let reply = self.state().join_learner(join);
+            if !self.state().replay.is_ready() {
+                return;
+            }
             self.changed.notify_all();
             self.welcome(incoming.into_responder(), reply);
         }
@@ -77,6 +93,35 @@ impl State {
         self.replay.set_actors(actors);
     }
 
+    /// Whether this life of a part is the one that takes part.
+    fn takes_part(&self, who: Alive) -> bool {
+        match who {
+            Alive::Actor { actor, .. } => {
+                let life = self.replay.actor_incarnation(actor);
+                life.is_some_and(|life| Alive::actor(actor, life) == who)
+            }
+            Alive::Learner { .. } => {
+                let learner = self.replay.learner();
+                learner.is_some_and(|learner| Alive::learner(learner) == who)
+            }
+        }
+    }
+
+    /// Whether `learner` is the one that is served.
+    ///
+    /// # Errors
+    /// It is not; what happened, for a person.
+    pub(super) fn check_learner(&self, learner: u64) -> Result<(), String> {
+        match self.replay.learner() {
+            Some(served) if served == learner => Ok(()),
+            Some(_) => Err("another learner has joined the run since this one did: a run has one learner".into()),
+            None => Err("this replay server does not know the learner: it was started anew since the learner joined, and what it \
+                         held is gone. To go on with the run, start it with --after-updates and the number of the newest checkpoint, \
+                         and then the learner and the actors again"
+                .into()),
+        }
+    }
+
     /// Takes an actor that may take part; gives the number of its earlier lives.
     fn join_actor(&mut self, join: ActorJoin) -> Result<u32, Rejection> {
         let ActorJoin { actor, incarnation } = join;
@@ -92,6 +137,7 @@ impl State {
         self.replay
             .forget_absent_actors(|actor, life| self.members.is_connected(actor, life));
         let earlier_incarnations = self.replay.join_actor(join).map_err(Rejection::Refused)?;
+        self.open_account(Alive::actor(actor, incarnation));
         self.count_actors();
         if other.is_some() {
             // A chunk that was left behind.
@@ -105,20 +151,25 @@ impl State {
             learner,
             rows_sampled,
         } = join;
-        let other = self.members.learner.filter(|&other| other != learner);
+        let other = self.replay.learner().filter(|&other| other != learner);
         let connected = |other| self.members.connected.contains(&Alive::learner(other));
         if other.is_some_and(connected) {
             let why = "another learner takes part in this run, which has one alone";
             return Err(Rejection::Taken(why.into()));
         }
         // The same one asks again when it has not heard the answer.
-        if self.members.learner != Some(learner) {
+        if self.replay.learner() != Some(learner) {
             self.replay
-                .learner_starts(rows_sampled)
+                .learner_starts(learner, rows_sampled)
                 .map_err(Rejection::Refused)?;
-            self.members.learner = Some(learner);
             self.requests.keep_only(learner);
+            self.open_account(Alive::learner(learner));
         }
         Ok(0)
+    }
+
+    fn open_account(&mut self, who: Alive) {
+        let is_connected = self.members.connected.contains(&who);
+        self.accounts.joined(who, is_connected, Instant::now());
     }
 }

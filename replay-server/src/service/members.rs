@@ -1,5 +1,5 @@
-//! Who takes part: which actors and which learner have joined, and who of them is connected.
-//! It keeps no counts of transitions or rows: those are the core's.
+//! Who is connected, and which actors have delivered.
+//! Who has joined, and all counts, are the core's.
 
 use std::collections::HashSet;
 
@@ -16,8 +16,6 @@ pub(super) struct Members {
     pub(super) connected: HashSet<Alive>,
     /// Actors of which a chunk has come.
     acting: HashSet<u32>,
-    /// The learner that is served.
-    pub(super) learner: Option<u64>,
 }
 
 impl Members {
@@ -48,6 +46,14 @@ impl Members {
         self.connected.iter().filter(takes_part).count() as u32
     }
 
+    /// Nobody is connected yet; chunks of these actors have come before.
+    pub(super) fn with_acting(actors: impl Iterator<Item = u32>) -> Self {
+        Self {
+            connected: HashSet::new(),
+            acting: actors.collect(),
+        }
+    }
+
     /// A chunk of an actor has come.
     pub(super) fn note_acting(&mut self, actor: u32) {
         self.acting.insert(actor);
@@ -56,20 +62,5 @@ impl Members {
     /// Actors of which a chunk has come, those that have ended too.
     pub(super) fn actors_acting(&self) -> u32 {
         self.acting.len() as u32
-    }
-
-    /// Whether `learner` is the one that is served.
-    ///
-    /// # Errors
-    /// It is not; what happened, for a person.
-    pub(super) fn check_learner(&self, learner: u64) -> Result<(), String> {
-        match self.learner {
-            Some(served) if served == learner => Ok(()),
-            Some(_) => Err("another learner has joined the run since this one did: a run has one learner".into()),
-            None => Err("this replay server does not know the learner: it was started anew since the learner joined, and what it \
-                         held is gone. To go on with the run, start it with --after-updates and the number of the newest checkpoint, \
-                         and then the learner and the actors again"
-                .into()),
-        }
     }
 }

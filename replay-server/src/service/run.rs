@@ -2,9 +2,10 @@
 //! What an answer is, is in the files named for the messages.
 
 use std::{
+    path::{Path, PathBuf},
     sync::{Arc, Condvar, Mutex},
     thread::JoinHandle,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use anyhow::Context;
@@ -20,13 +21,19 @@ use driml_protocol::{
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
 use super::{
+    accounts::Accounts,
     limits::Limits,
     members::Members,
     parked::{ParkedChunks, ParkedRequests},
     server::{Service, State},
     timings::Timings,
+    weights_store::WeightsStore,
 };
-use crate::{config::Config, replay::Replay};
+use crate::{
+    config::Config,
+    durable::{DurableArgs, DurableReplay, shard_dir},
+    replay::Replay,
+};
 
 /// Threads that make batches: one assembles while another's reply is being sent.
 const BATCH_THREADS: usize = 2;
@@ -59,6 +66,8 @@ pub struct RunArgs {
     pub after_updates: u64,
     /// Bytes of a version of the weights, of which the replay server itself knows nothing; longer uploads are refused.
     pub weights_bytes_max: usize,
+    /// The folder in which the replay is kept, if it is kept on disk; of several shards each has a folder of its own there.
+    pub dir: Option<PathBuf>,
     /// The run's resolved settings, which it hands to whoever joins.
     pub config_toml: String,
 }
@@ -74,10 +83,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let config: Config = settings.table("replay")?;
     let batch_size = number(&settings, "learner", "batch_size")?;
     let ack_timeout = Duration::from_millis(number(&settings, "actor", "ack_timeout_ms")?.into());
-    let mut replay = Replay::shard(&spec, &config, batch_size, args.shard)?;
-    if args.after_updates > 0 {
-        replay = replay.resumed_at(args.after_updates, args.shard);
-    }
+    let (replay, weights) = match &args.dir {
+        Some(dir) => open_durable(&args, dir, &spec, &config, batch_size)?,
+        None => {
+            let mut replay = Replay::shard(&spec, &config, batch_size, args.shard)?;
+            if args.after_updates > 0 {
+                replay = replay.resumed_at(args.after_updates, args.shard);
+            }
+            let replay = DurableReplay::in_memory(replay, args.after_updates);
+            (replay, WeightsStore::default())
+        }
+    };
     let transport: TransportConfig = settings.table("transport")?;
     let batch = BatchHeader::of(&spec, batch_size);
     let pool = if transport.shared_memory {
@@ -116,15 +132,15 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         num_actions: spec.num_actions,
         limits,
         shard: (args.shard, config.shards),
-        after_updates: args.after_updates,
         config_toml: args.config_toml,
         shared_memory: reads_shared_memory,
         hold_max: HOLD_MAX.min(ack_timeout / 4),
         pool,
         packer: replay.packer(),
         state: Mutex::new(State {
+            members: Members::with_acting(replay.actors_delivered()),
             replay,
-            members: Members::default(),
+            accounts: Accounts::new(Instant::now()),
             chunks: ParkedChunks::default(),
             requests: ParkedRequests::default(),
             timings: Timings::default(),
@@ -132,7 +148,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             said: SeldomEach::default(),
         }),
         changed: Condvar::new(),
-        weights: Mutex::default(),
+        weights: Mutex::new(weights),
         announcements: client.announce().map_err(declaring)?,
         shutdown: shutdown.clone(),
     });
@@ -162,7 +178,44 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     drop(queryables);
     let closed = client.session().close().wait();
     join_within(threads, THREADS_END_MAX);
+    service.state().replay.flush();
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+}
+
+/// The replay that is kept in `dir`, and the newest weights that were handed over.
+fn open_durable(
+    args: &RunArgs,
+    dir: &Path,
+    spec: &RunSpec,
+    config: &Config,
+    batch_size: u32,
+) -> anyhow::Result<(DurableReplay, WeightsStore)> {
+    let dir = shard_dir(dir, args.shard, config.shards);
+    let durable = DurableArgs {
+        dir: dir.clone(),
+        shard: args.shard,
+        after_updates: args.after_updates,
+        segment_bytes: None,
+    };
+    let (replay, recovery) = DurableReplay::open(&durable, spec, config, batch_size)?;
+    for warning in &recovery.warnings {
+        tracing::warn!("{}: {warning}", dir.display());
+    }
+    if recovery.found {
+        let status = replay.status();
+        tracing::info!(
+            "goes on with the replay in {}: {} transitions stored, {} held, {} rows served; {} MiB read in {:.1} s",
+            dir.display(),
+            status.transitions_inserted,
+            status.transitions_held,
+            status.rows_sampled,
+            recovery.bytes >> 20,
+            recovery.took.as_secs_f64()
+        );
+    } else {
+        tracing::info!("keeps the replay in {}", dir.display());
+    }
+    Ok((replay, WeightsStore::kept_in(&dir, spec.hash())))
 }
 
 /// One whole number of another part's settings.
@@ -224,7 +277,9 @@ impl<'a> Answers<'a> {
             limits.small,
             Service::give_weights,
         )?;
+        this.answer("report", 1, limits.small, Service::report)?;
         this.offer("status", 1, Service::status)?;
+        this.offer("parts", 1, Service::parts)?;
         Ok(this)
     }
 
@@ -295,7 +350,10 @@ impl Service {
                 .name(name.into())
                 .spawn(move || work(&service))
         };
-        let mut threads = vec![work("admit", Self::admit_parked)?];
+        let mut threads = vec![
+            work("admit", Self::admit_parked)?,
+            work("missing", Self::say_who_is_missing)?,
+        ];
         for i in 0..BATCH_THREADS {
             threads.push(work(&format!("sample-{i}"), Self::serve_parked)?);
         }

@@ -12,20 +12,20 @@ use driml_protocol::{
 };
 
 use super::{
+    accounts::Accounts,
     limits::Limits,
     members::Members,
     parked::{ParkedChunks, ParkedRequests},
     timings::Timings,
     weights_store::WeightsStore,
 };
-use crate::{replay::Replay, storage::frame_store::Packer};
+use crate::{durable::DurableReplay, storage::frame_store::Packer};
 
 /// What all threads share.
 pub(super) struct Service {
     pub(super) num_actions: u32,
     pub(super) limits: Limits,
     pub(super) shard: (u32, u32),
-    pub(super) after_updates: u64,
     pub(super) config_toml: String,
     /// Whether chunks may come through shared memory.
     pub(super) shared_memory: bool,
@@ -45,8 +45,9 @@ pub(super) struct Service {
 
 /// What changes, under one lock.
 pub(super) struct State {
-    pub(super) replay: Replay,
+    pub(super) replay: DurableReplay,
     pub(super) members: Members,
+    pub(super) accounts: Accounts,
     pub(super) chunks: ParkedChunks<Question>,
     pub(super) requests: ParkedRequests<Responder<BatchReply>>,
     pub(super) timings: Timings,
@@ -96,9 +97,11 @@ impl Service {
     /// Waits until something has changed, or for `wait_max`.
     pub(super) fn wait<'a>(
         &'a self,
-        state: MutexGuard<'a, State>,
+        mut state: MutexGuard<'a, State>,
         wait_max: Duration,
     ) -> MutexGuard<'a, State> {
+        let waiting = state.replay.waiting();
+        state.accounts.note_waiting(waiting, Instant::now());
         self.changed
             .wait_timeout(state, wait_max)
             .unwrap_or_else(PoisonError::into_inner)

@@ -1,9 +1,18 @@
-//! The small messages that need no file of their own: an actor's goodbye, the learner's affinity, and the status.
+//! The small messages that need no file of their own: an actor's goodbye, the learner's affinity, reports, and the status.
 //! None of them ever waits.
 
-use driml_protocol::{AffinityUpdate, Done, Goodbye, Incoming, ReplayStatus, Responder};
+use std::time::{Duration, Instant};
 
-use super::server::Service;
+use driml_protocol::{
+    AffinityUpdate, Done, Goodbye, Incoming, PartName, PartsStatus, ReplayStatus, Report, Responder,
+};
+
+use super::{accounts::own_warning, server::Service};
+
+/// How often it is looked whether somebody is missing.
+const LOOK: Duration = Duration::from_secs(1);
+/// How long somebody may be missing before it is said.
+const SILENT_MAX: Duration = Duration::from_secs(10);
 
 impl Service {
     pub(super) fn goodbye(&self, incoming: Incoming<Goodbye>) {
@@ -12,9 +21,12 @@ impl Service {
             if let Some(why) = state.replay.goodbye(&goodbye) {
                 state.say("goodbye", &format!("a goodbye was refused: {why}"));
             }
+            let is_ready = state.replay.is_ready();
             drop(state);
             // Whoever says goodbye has nothing to do any more, with whatever it has said.
-            incoming.into_responder().reply(&Done);
+            if is_ready {
+                incoming.into_responder().reply(&Done);
+            }
         }
     }
 
@@ -23,7 +35,7 @@ impl Service {
             return;
         };
         let mut state = self.state();
-        let set = match state.members.check_learner(update.learner) {
+        let set = match state.check_learner(update.learner) {
             Ok(()) => state
                 .replay
                 .set_affinity(&update)
@@ -34,14 +46,75 @@ impl Service {
             }
         };
         if let Err(why) = set {
-            state.say(
-                "affinity",
-                &format!("an affinity matrix was refused: {why}"),
-            );
+            let line = format!("an affinity matrix was refused: {why}");
+            state.say("affinity", &line);
             return;
+        }
+        let is_ready = state.replay.is_ready();
+        drop(state);
+        if is_ready {
+            incoming.into_responder().reply(&Done);
+        }
+    }
+
+    pub(super) fn report(&self, incoming: Incoming<Report>) {
+        let Some(report) = self.read(&incoming) else {
+            return;
+        };
+        let mut state = self.state();
+        // That of a part which has been replaced, or is about to join.
+        if !state.accounts.reported(report, Instant::now()) {
+            tracing::debug!("a report of a part that does not take part");
         }
         drop(state);
         incoming.into_responder().reply(&Done);
+    }
+
+    pub(super) fn parts(&self, responder: Responder<PartsStatus>) {
+        let weights_version = self.weights().version();
+        let (state, now) = (self.state(), Instant::now());
+        let (waiting, waiting_s) = state.accounts.waiting(now);
+        let (up_s, weights_age_s) = state.accounts.ages(now);
+        let held_since = |who| match who {
+            PartName::Actor(actor) => state.chunks.arrived(actor),
+            PartName::Learner => state.requests.oldest(),
+        };
+        let status = PartsStatus {
+            up_s,
+            waiting,
+            waiting_s,
+            requests_waiting: state.requests.len() as u32,
+            chunks_waiting: state.chunks.len() as u32,
+            chunk_bytes_waiting: state.chunks.bytes() as u64,
+            weights_version,
+            weights_age_s,
+            last_warning: own_warning(),
+            parts: state.accounts.parts(now, held_since),
+        };
+        drop(state);
+        responder.reply(&status);
+    }
+
+    /// Says whom the run waits for, where it could not go on without: after some seconds, then now and then. The thread's whole
+    /// work until the end of the process.
+    pub(super) fn say_who_is_missing(&self) {
+        // Who, since when, and after how long it is said next: ever more seldom.
+        let mut missing: Option<(&str, Instant, Duration)> = None;
+        while !self.shutdown.wait_timeout(LOOK) {
+            let state = self.state();
+            let now = state.accounts.missing(state.replay.all_in());
+            drop(state);
+            if now != missing.map(|(before, ..)| before) {
+                missing = now.map(|now| (now, Instant::now(), SILENT_MAX));
+            }
+            if let Some((missing, since, due)) = &mut missing
+                && since.elapsed() > *due
+            {
+                let since = since.elapsed().as_secs();
+                tracing::info!("{missing}, waiting since {since} s: `driml status` says more");
+                *due *= 2;
+            }
+        }
     }
 
     pub(super) fn status(&self, responder: Responder<ReplayStatus>) {

@@ -110,6 +110,8 @@ fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
+        disk_bytes_max: None,
+        fsync_ms: None,
         reproduced_bug: None,
         replay_ratio: 64.0,
         warmup_transitions: 0,

@@ -12,6 +12,8 @@ fn good() -> Config {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
+        disk_bytes_max: None,
+        fsync_ms: None,
         reproduced_bug: None,
         replay_ratio: 8.0,
         warmup_transitions: 1000,

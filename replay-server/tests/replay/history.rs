@@ -72,6 +72,8 @@ pub(crate) fn unlimited(capacity_transitions: u64) -> Config {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
+        disk_bytes_max: None,
+        fsync_ms: None,
         reproduced_bug: None,
         replay_ratio: 1e6,
         warmup_transitions: 0,

@@ -6,6 +6,8 @@ mod anchors;
 mod batches;
 mod compression;
 mod config;
+mod durable;
+mod durable_damage;
 mod exactly_once;
 mod history;
 mod horizon;

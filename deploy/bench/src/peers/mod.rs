@@ -129,7 +129,9 @@ pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
             }
         }
     }
-    let is_measured = |pair: &&Pair| sides.contains_key(&pair.component);
+    let precisions = args.flags.precisions(DeviceName::Cpu);
+    let is_measured =
+        |pair: &&Pair| sides.contains_key(&pair.component) && pair.is_asked(&precisions);
     let rows = PAIRS.iter().filter(is_measured).map(|pair| {
         let (_, sides) = &sides[&pair.component];
         row(pair, sides).with_context(|| format!("comparing {:?}", pair.ours))

@@ -1,6 +1,8 @@
 //! Which figure of ours is compared with which of theirs, and the ratio that is wanted.
 //! It measures nothing; names are those of the benches and of the scripts in `deploy/bench/peers/`.
 
+use driml_learner::Precision;
+
 use crate::flags::Component;
 
 /// A figure of ours and the figure of a peer that it is compared with.
@@ -14,6 +16,19 @@ pub(super) struct Pair {
     pub(super) theirs: Theirs,
     /// The least ratio of ours to theirs that is wanted; none where it is only of interest.
     pub(super) goal: Option<f64>,
+}
+
+impl Pair {
+    /// Whether our figure is of one of these precisions; figures of components that multiply nothing always are.
+    pub(super) fn is_asked(&self, precisions: &[Precision]) -> bool {
+        let bf16 = self.ours.ends_with(", bf16");
+        let own = if bf16 {
+            Precision::Bf16
+        } else {
+            Precision::F32
+        };
+        precisions.contains(&own) || !matches!(self.component, Learner | Policy)
+    }
 }
 
 /// What a figure is compared with.

@@ -1,5 +1,6 @@
 //! The comparison's arithmetic and its table, without any measurement.
 
+use driml_learner::Precision;
 use expect_test::expect;
 
 use super::*;
@@ -98,4 +99,19 @@ fn every_peer_s_figure_is_named_in_its_script() {
             assert!(scripts.iter().any(|text| text.contains(&quoted)), "{name}");
         }
     }
+}
+
+#[test]
+fn rows_of_a_precision_that_was_not_asked_for_are_left_out() {
+    let asked = |precisions: &[Precision]| {
+        let learners = PAIRS.iter().filter(|it| it.component == Component::Learner);
+        let asked = learners.filter(|pair| pair.is_asked(precisions));
+        asked.map(|pair| pair.ours).collect::<Vec<_>>()
+    };
+    let (f32, bf16) = (asked(&[Precision::F32]), asked(&[Precision::Bf16]));
+    assert!(bf16.iter().all(|name| name.ends_with(", bf16")));
+    assert!(!f32.iter().any(|name| name.contains("bf16")));
+    let all = asked(&[Precision::F32, Precision::Bf16]);
+    assert_eq!(f32.len() + bf16.len(), all.len());
+    assert!(!f32.is_empty() && !bf16.is_empty());
 }

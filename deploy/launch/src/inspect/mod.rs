@@ -11,6 +11,7 @@ mod update;
 pub mod worlds;
 
 use anyhow::Context;
+use driml_protocol::Batch;
 use driml_settings::config::RunConfig;
 use serde::Serialize;
 
@@ -65,6 +66,20 @@ impl Inspection {
     /// A world that cannot be had or fails.
     pub fn play(config: &RunConfig) -> anyhow::Result<RowShares> {
         play::play(config).with_context(|| format!("playing {}", config.run.world))
+    }
+
+    /// Plays as [`Inspection::play`] does, until there are `count` batches or the run ends.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn batches(config: &RunConfig, count: usize) -> anyhow::Result<Vec<Batch>> {
+        let mut batches = Vec::with_capacity(count);
+        play::each_batch(config, |batch| {
+            batches.push(batch);
+            batches.len() < count
+        })
+        .with_context(|| format!("playing {}", config.run.world))?;
+        Ok(batches)
     }
 
     /// As JSON.

@@ -2,7 +2,7 @@
 
 use driml_learner::{Compute, Learner, LearnerConfig};
 use driml_machine::resources::Machine;
-use driml_protocol::{Batch, BatchHeader};
+use driml_protocol::{Batch, BatchHeader, Buffer, RowScalars};
 use driml_settings::{
     presets::{AGENTS, PRESETS},
     resolve::{Flags, Source, resolve},
@@ -106,7 +106,18 @@ fn what_is_counted_is_what_is_built() {
 
             let weights = learner.next_weights().unwrap().safetensors.len();
             assert_eq!(find(&inspection.bytes, "a broadcast").is, weights as u64);
-            let batch = Batch::zeroed(BatchHeader::of(&config.run, config.learner.batch_size));
+            // Rows that have every state that a row may have.
+            let header = BatchHeader::of(&config.run, config.learner.batch_size);
+            let row = RowScalars {
+                action: 0,
+                next_action: 0,
+                n_step_return: 0.0,
+                bootstrap_discount: 1.0,
+                positives: header.positives,
+                k_first: 1,
+            };
+            let rows = vec![row; header.rows as usize];
+            let batch = Batch::of_rows(header, &rows, Buffer::zeroed);
             let states = [batch.states_t(), batch.states_n(), batch.states_k()].map(<[u8]>::len);
             let (_, payload) = batch.into_payload();
             let said = |what| find(&inspection.bytes, what).is as usize;
@@ -135,7 +146,7 @@ fn a_world_that_needs_nothing_is_played() {
     assert_eq!((shares.frames, shares.rows), (608, 400));
     // Episodes are a few steps long, and the corridor has eight frames.
     assert!(shares.without_bootstrap > 0.2 && shares.without_positive > 0.02);
-    assert!(shares.zero_bytes > 0.05 && shares.zero_bytes < 0.5);
+    assert!(shares.absent_bytes > 0.05 && shares.absent_bytes < 0.5);
     assert!(shares.repeated_online > 0.5 && shares.repeated_target > 0.0);
     let text = worlds::markdown(&[(config, Some(shares))]).unwrap();
     assert_eq!(text.lines().count(), 3);

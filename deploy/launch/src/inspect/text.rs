@@ -31,9 +31,11 @@ pub(super) fn played(shares: &RowShares) -> String {
         rows,
         without_bootstrap,
         without_positive,
-        zero_bytes,
+        absent_bytes,
         repeated_online,
         repeated_target,
+        computed_online,
+        computed_target,
     } = *shares;
     let heading = format!(
         "{} rows of batches, from {} frames played with the first weights",
@@ -42,14 +44,14 @@ pub(super) fn played(shares: &RowShares) -> String {
     );
     let lines = [
         (
-            "bootstrap from nothing: their s_{t+n} is zeros",
+            "bootstrap from nothing: they have no s_{t+n}",
             without_bootstrap,
         ),
+        ("positives that rows do not have", without_positive),
         (
-            "positives that rows do not have: zeros too",
-            without_positive,
+            "of a batch's bytes do not travel, as rows do not have these states",
+            absent_bytes,
         ),
-        ("of a batch's bytes are these zeros", zero_bytes),
         (
             "of s_t and s_{t+k} are equal to another of the batch",
             repeated_online,
@@ -57,6 +59,14 @@ pub(super) fn played(shares: &RowShares) -> String {
         (
             "of s_{t+n} are equal to another of the batch",
             repeated_target,
+        ),
+        (
+            "of places for s_t and s_{t+k} are computed: equal states once, where it pays (learner.equal_states)",
+            computed_online,
+        ),
+        (
+            "of places for s_{t+n} are computed: equal states once, and none of rows that bootstrap from nothing",
+            computed_target,
         ),
     ];
     let lines = lines.map(|(what, share)| format!("{:>6.2}%  {what}\n", 100.0 * share));

@@ -1,5 +1,5 @@
 //! What one agent costs in several worlds: a Markdown table with a line for each, and in brackets what it would be with whole frames,
-//! every action's distribution of s_t, and targets of all rows. It is the table of `deploy/experiments/results/inspect/README.md`.
+//! every action's distribution of s_t, targets of all rows, and each state computed and sent. It is the table of `deploy/experiments/results/inspect/README.md`.
 
 use std::collections::BTreeSet;
 
@@ -21,7 +21,7 @@ const HEADINGS: [&str; 7] = [
 const PLAYED: [&str; 6] = [
     "no bootstrap",
     "no positive",
-    "zeros in a batch",
+    "bytes of a batch that do not travel",
     "s_t, s_{t+k} that repeat",
     "s_{t+n} that repeat",
     "rows",
@@ -68,7 +68,9 @@ fn cells(config: &RunConfig, shares: Option<RowShares>) -> anyhow::Result<Vec<St
     let transition = |it| bytes(it, "a transition in a chunk").to_string();
     let batch = |it| format!("{:.2}", bytes(it, "a batch") as f64 / 1e6);
     let update = |flops: f64| format!("{:.2}", flops / 1e9);
-    let without_bootstrap = shares.map_or(0.0, |shares| shares.without_bootstrap);
+    let whole_batch = bytes(&is, "a batch") as f64;
+    let travels = 1.0 - shares.map_or(0.0, |shares| shares.absent_bytes);
+    let batch_is = format!("{:.2}", whole_batch * travels / 1e6);
     Ok(vec![
         run.world.clone(),
         beside(
@@ -76,24 +78,29 @@ fn cells(config: &RunConfig, shares: Option<RowShares>) -> anyhow::Result<Vec<St
             format!("{}x{}", frame.height, frame.width),
         ),
         beside(transition(&is), transition(&whole)),
-        beside(batch(&is), batch(&whole)),
+        beside(batch_is, batch(&whole)),
         beside(
-            update(flops(config, false, without_bootstrap)),
-            update(flops(&whole_frames, true, 0.0)),
+            update(flops(config, false, shares)),
+            update(flops(&whole_frames, true, None)),
         ),
         format!("{:.2}", bytes(&is, "a broadcast") as f64 / 1e6),
         format!("{} of {}", differ.len(), config.world.num_actions()),
     ])
 }
 
-/// FLOPs of an update, of which this share of rows does not bootstrap.
-fn flops(config: &RunConfig, every_action: bool, without_bootstrap: f64) -> f64 {
+/// FLOPs of an update, of whose states those are computed that `shares` has, or all.
+fn flops(config: &RunConfig, every_action: bool, shares: Option<RowShares>) -> f64 {
     let shape = UpdateShape {
         every_action,
         ..UpdateShape::of(&config.learner, config.run.horizon.positives())
     };
     let cost = UpdateCost::of(&config.model, &shape);
-    cost.total() as f64 - without_bootstrap * (cost.target + cost.double_dqn) as f64
+    let left_out = shares.map_or(0.0, |shares| {
+        let online = (1.0 - shares.computed_online) * (cost.online + cost.states) as f64;
+        let target = (1.0 - shares.computed_target) * (cost.target + cost.double_dqn) as f64;
+        online + target
+    });
+    cost.total() as f64 - left_out
 }
 
 fn played_cells(shares: RowShares) -> Vec<String> {
@@ -101,7 +108,7 @@ fn played_cells(shares: RowShares) -> Vec<String> {
         rows,
         without_bootstrap,
         without_positive,
-        zero_bytes,
+        absent_bytes,
         repeated_online,
         repeated_target,
         ..
@@ -109,7 +116,7 @@ fn played_cells(shares: RowShares) -> Vec<String> {
     let percents = [
         without_bootstrap,
         without_positive,
-        zero_bytes,
+        absent_bytes,
         repeated_online,
         repeated_target,
     ];

@@ -52,9 +52,19 @@ impl RunFolder {
         self.path.join("summary.json")
     }
 
+    /// The endpoints of the replay servers, a line each, while `driml local` runs here.
+    pub fn endpoints(&self) -> PathBuf {
+        self.path.join("endpoints")
+    }
+
     /// A folder for each checkpoint.
     pub fn checkpoints(&self) -> PathBuf {
         self.path.join(driml_learner::checkpoint::FOLDER)
+    }
+
+    /// The replay, where it is kept on disk.
+    pub fn replay(&self) -> PathBuf {
+        self.path.join("replay")
     }
 
     /// A file for each process.

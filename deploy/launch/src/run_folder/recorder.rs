@@ -3,7 +3,6 @@
 
 use std::{
     fs::{self, File},
-    path::PathBuf,
     time::Instant,
 };
 
@@ -40,7 +39,6 @@ pub struct RunRecorder {
     episodes_before: u64,
     /// Mean and standard deviation of k up to there.
     k_before: Option<(f64, f64)>,
-    folder: RunFolder,
     metrics: GrowingCsv,
     returns: TrainingReturns,
     losses: &'static [&'static str],
@@ -99,7 +97,8 @@ impl RunRecorder {
             0 => none(head),
             _ => rows_up_to(&folder.metrics(), head, resume_point, frames_max)?,
         };
-        let returns = TrainingReturns::go_on(folder, rows.last("frames").unwrap_or(0))?;
+        let is_known = resume_point.replay_is_kept;
+        let returns = TrainingReturns::go_on(folder, rows.last("frames").unwrap_or(0), is_known)?;
         Summary::remove(folder)?;
         folder.write_config(config_toml)?;
         Self::begin(folder, losses, processes, lock, rows, returns, resume_point)
@@ -114,14 +113,21 @@ impl RunRecorder {
         returns: TrainingReturns,
         resume_point: ResumePoint,
     ) -> anyhow::Result<Self> {
+        // A replay that was kept knows of all the run's episodes and k.
+        let before = |column| match resume_point.replay_is_kept {
+            true => None,
+            false => rows.last(column),
+        };
         let mut this = Self {
             _lock: lock,
             resume_point,
             seconds_before: rows.last("seconds").unwrap_or(0.0),
             frames_before: rows.last("frames").unwrap_or(0),
-            episodes_before: rows.last("episodes").unwrap_or(0),
-            k_before: rows.last("mean_k").zip(rows.last("sd_k")),
-            folder: folder.clone(),
+            episodes_before: rows
+                .last("episodes")
+                .filter(|_| !resume_point.replay_is_kept)
+                .unwrap_or(0),
+            k_before: before("mean_k").zip(before("sd_k")),
             metrics: GrowingCsv::create(&folder.metrics(), &rows.header, &rows.rows)?,
             returns,
             losses,
@@ -133,11 +139,6 @@ impl RunRecorder {
         this.rates
             .add(this.started, resume_point.frames, resume_point.updates);
         Ok(this)
-    }
-
-    /// The settings' file, for processes that read it.
-    pub(crate) fn config_path(&self) -> PathBuf {
-        self.folder.config()
     }
 
     /// Mean and standard deviation of k over all `updates` of the run, before it was resumed too.
@@ -255,6 +256,7 @@ impl RunRecorder {
             weights_sha256: learner.weights_sha256.clone(),
             chunks_retried: replay.chunks_retried,
             batches_retried: replay.batches_retried,
+            replay_servers_restarted: 0,
             replay_frame_mib: replay.frame_bytes_held.div_ceil(1 << 20),
             messages_refused: replay.messages_refused,
             insert_ms: replay.insert_ms,

@@ -125,6 +125,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     let resume_point = ResumePoint {
         updates: 31,
         frames: 2_000,
+        replay_is_kept: false,
     };
     let said = RunRecorder::go_on(&run, "", &LOSSES, &processes, resume_point, 9_999).unwrap_err();
     assert!(said.to_string().contains("is still going on"), "{said}");

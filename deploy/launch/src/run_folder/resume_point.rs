@@ -7,4 +7,6 @@ pub struct ResumePoint {
     pub updates: u64,
     /// Frames that these updates needed, the warm-up included.
     pub frames: u64,
+    /// The replay was kept, and counts all of the run.
+    pub replay_is_kept: bool,
 }

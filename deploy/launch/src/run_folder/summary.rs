@@ -84,6 +84,9 @@ pub struct Summary {
     /// Batches that did not reach the learner and were asked for again; older runs do not say.
     #[serde(default)]
     pub batches_retried: u64,
+    /// How often a replay server that had died was started again with what it had kept; older runs do not say.
+    #[serde(default)]
+    pub replay_servers_restarted: u32,
     /// Memory that the frames in the replay took at the end, MiB.
     pub replay_frame_mib: u64,
     /// Messages refused as malformed or foreign.

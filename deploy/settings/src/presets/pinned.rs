@@ -44,6 +44,7 @@ const PINNED: &[(&str, &[Pinned])] = &[
         ("transport.shared_memory", "true", "ours"),
         ("learner.batch_size", "256", "code"),
         ("learner.precision", r#""f32""#, "ours"),
+        ("learner.equal_states", r#""once""#, "ours"),
         ("learner.batches_in_flight", "2", "ours"),
         ("learner.publish_as", r#""f32""#, "ours"),
         ("learner.publish_period_updates", "8", "ours"),

@@ -201,7 +201,7 @@ fn what_nobody_uses_is_not_there() {
 fn settings_that_cannot_work_are_answered_with_what_to_do() {
     let said = |agent: &str, set: &str| with("procgen:bigfish", agent, &[set]).unwrap_err();
     expect![[r#"there is no setting "learner.update.adam.learning_rate"; [learner.update.adam] has beta1, beta2, eps, lr"#]].assert_eq(&said("driml-ada", "learner.update.adam.learning_rate=1"));
-    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, precision, publish_as, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
+    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, equal_states, precision, publish_as, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
     expect![[r#"there is no setting "world.num_level" (did you mean "world.num_levels"?); [world] has center_agent, distribution_mode, frame_side, grey, num_levels, paint_vel_info, restrict_themes, start_level, use_backgrounds, use_sequential_levels"#]].assert_eq(&said("driml-ada", "world.num_level=5"));
     expect![
         "model.height cannot be set by hand: it follows from input.height and what model.conv reads"

@@ -151,6 +151,7 @@ impl<U: Unit> CustomOp2 for ConvStack<U> {
             .par_chunks_mut(TASK_IMAGES * last.map_len())
             .enumerate();
         let saved = tasks
+            .with_max_len(1)
             .map(|(task, maps)| {
                 stack_forward(self.unit, &layers, self.task_images(images, task), maps)
             })
@@ -202,6 +203,7 @@ impl<U: Unit> CustomOp2 for ConvStack<U> {
             .zip(saved.par_iter())
             .zip(grad_parts)
             .enumerate()
+            .with_max_len(1)
             .map(|(task, (((maps, grad_maps), saved), grad_images))| {
                 let images = self.task_images(image_values, task);
                 stack_backward(

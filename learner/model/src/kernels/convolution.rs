@@ -7,7 +7,7 @@
 
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::images::Images;
+use crate::kernels::images::{Images, Room};
 use crate::kernels::linear::{relu_gradient, relu_of};
 use crate::kernels::panels::{Matrix, Panels, Threads};
 use crate::kernels::rounding::write_rows;
@@ -111,47 +111,48 @@ pub(crate) fn forward<U: Unit, M: Element>(
 ) {
     let shape = &layer.shape;
     let (out_width, out) = (shape.out_width(), shape.channels_out);
-    let mut row = Buffer::new(out_width * out);
-    let left = Left {
-        values: images.values,
-        start: 0,
-        row_stride: shape.shift(),
-        step: U::Element::DEPTH,
-        steps: shape.run().div_ceil(U::Element::DEPTH),
-        run_stride: shape.line(),
-        runs: shape.kernel,
-    };
-    for (index, maps) in maps.chunks_exact_mut(out_width * out).enumerate() {
-        let (image, y) = (index / shape.out_height(), index % shape.out_height());
-        let start = image * shape.image_len() + y * shape.stride * shape.line();
-        for (x, windows) in row_tiles::<U>(out_width, layer.forward.vecs()) {
-            let left = Left {
-                start: start + x * shape.shift(),
-                ..left
-            };
-            layer
-                .forward
-                .multiply(unit, windows, left, Mode::Replace, &mut row[x * out..]);
+    let (mut room, mut row) = (Room::new(), Buffer::new(out_width * out));
+    for (index, maps) in maps.chunks_exact_mut(shape.map_len()).enumerate() {
+        let left = Left {
+            values: images.image(unit, index, shape.image_len(), &mut room),
+            start: 0,
+            row_stride: shape.shift(),
+            step: U::Element::DEPTH,
+            steps: shape.run().div_ceil(U::Element::DEPTH),
+            run_stride: shape.line(),
+            runs: shape.kernel,
+        };
+        for (y, maps) in maps.chunks_exact_mut(out_width * out).enumerate() {
+            let start = y * shape.stride * shape.line();
+            for (x, windows) in row_tiles::<U>(out_width, layer.forward.vecs()) {
+                let left = Left {
+                    start: start + x * shape.shift(),
+                    ..left
+                };
+                layer
+                    .forward
+                    .multiply(unit, windows, left, Mode::Replace, &mut row[x * out..]);
+            }
+            finish_row(unit, &mut row, &layer.bias, images.scale(), maps);
         }
-        finish_row(unit, &row, &layer.bias, images.scale, maps);
     }
 }
 
 vectorized! {
-    /// relu(scale * row + bias) for each location of `row` [locations, out], into `maps`.
+    /// relu(scale * row + bias) for each location of `row` [locations, out], there and rounded into `maps`.
     fn finish_row<U, M>(
         unit,
-        row: &'a [f32],
+        row: &'a mut [f32],
         bias: &'a [f32],
         scale: f32,
         maps: &'a mut [M],
     ) {
-        let locations = row.chunks_exact(bias.len());
-        for (maps, row) in maps.chunks_exact_mut(bias.len()).zip(locations) {
-            for ((map, &value), &bias) in maps.iter_mut().zip(row).zip(bias) {
-                *map = M::of(relu_of(value * scale + bias));
+        for row in row.chunks_exact_mut(bias.len()) {
+            for (value, &bias) in row.iter_mut().zip(bias) {
+                *value = relu_of(*value * scale + bias);
             }
         }
+        M::store(unit, row, maps);
     }
 }
 
@@ -196,19 +197,20 @@ pub(crate) fn backward<U: Unit, M: Element>(
 ) {
     let shape = &layer.shape;
     let mut masked = Masked::new::<U>(shape);
+    let (len, mut rooms) = (shape.image_len(), [Room::new(), Room::new()]);
     for (image, (maps, grad_maps)) in maps
         .chunks_exact(shape.map_len())
         .zip(grad_maps.chunks_exact(shape.map_len()))
         .enumerate()
     {
-        let pixels = image * shape.image_len()..(image + 1) * shape.image_len();
         masked.mask(unit, maps, grad_maps, grads.bias);
         masked.write_panels(unit, shape);
-        let values = &images.values[pixels.clone()];
-        weight_gradient(unit, shape, values, &masked.panels, grads.packed);
+        let steps = images.steps(unit, image, (len, shape.shift()), &mut rooms);
+        weight_gradient(unit, shape, steps, &masked.panels, grads.packed);
         if let Some(grad_images) = &mut grads.images {
             masked.write_rows(unit, shape.channels_out);
-            image_gradient(unit, layer, &masked.rows, &mut grad_images[pixels]);
+            let pixels = &mut grad_images[image * len..(image + 1) * len];
+            image_gradient(unit, layer, &masked.rows, pixels);
         }
     }
 }
@@ -294,7 +296,7 @@ vectorized! {
                     let second = windows.get(out..).unwrap_or_default();
                     let second = second.get(cols.clone()).unwrap_or_default();
                     if let Some(step) = steps.next() {
-                        U::Element::join(&windows[cols.clone()], second, step);
+                        U::Element::join(unit, &windows[cols.clone()], second, step);
                     }
                 }
             }
@@ -308,7 +310,7 @@ fn panel_len<E: Element>(shape: &ConvShape, width: usize) -> usize {
     steps * width * E::DEPTH
 }
 
-/// Adds one image's part of the weight's gradient: windows, transposed, times masked gradients.
+/// Adds one image's part of the weight's gradient: windows, transposed, times masked gradients. `image` is from [`Images::steps`].
 fn weight_gradient<U: Unit>(
     unit: U,
     shape: &ConvShape,
@@ -319,18 +321,12 @@ fn weight_gradient<U: Unit>(
     let (depth, out) = (U::Element::DEPTH, shape.channels_out);
     let vecs = tile_vecs::<U>(out);
     let width = vecs * LANES;
-    let pairs = (depth == 2).then(|| {
-        let mut pairs = Buffer::new(image.len() * 2);
-        pair_neighbours(unit, image, shape.shift(), &mut pairs);
-        pairs
-    });
-    let values = pairs.as_deref().unwrap_or(image);
     let steps = shape.out_width().div_ceil(depth);
     for kernel_y in 0..shape.kernel {
         let rows = &mut packed[kernel_y * shape.run() * out..][..shape.run() * out];
         for (first, count) in row_tiles::<U>(shape.run(), vecs) {
             let left = Left {
-                values,
+                values: image,
                 start: (kernel_y * shape.line() + first) * depth,
                 row_stride: depth,
                 step: depth * depth * shape.shift(),
@@ -350,26 +346,6 @@ fn weight_gradient<U: Unit>(
                 };
                 multiply_tile(unit, count, left, panel, columns);
             }
-        }
-    }
-}
-
-vectorized! {
-    /// Pairs every scalar with the one `shift` further, or with 0 where the image ends before.
-    fn pair_neighbours<U>(
-        unit,
-        values: &'a [U::Element],
-        shift: usize,
-        pairs: &'a mut [U::Element],
-    ) {
-        let later = values.get(shift..).unwrap_or_default();
-        let (both, one) = pairs.split_at_mut(later.len() * 2);
-        let (begin, end) = values.split_at(later.len());
-        for ((pair, &value), &later) in both.chunks_exact_mut(2).zip(begin).zip(later) {
-            (pair[0], pair[1]) = (value, later);
-        }
-        for (pair, &value) in one.chunks_exact_mut(2).zip(end) {
-            (pair[0], pair[1]) = (value, U::Element::default());
         }
     }
 }

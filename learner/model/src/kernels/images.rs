@@ -1,7 +1,7 @@
-//! Images and maps as convolutions take them: as they are stored, and as operands of products.
+//! Images and maps as convolutions take them: as they are stored, and one by one as operands of products.
 
 use crate::kernels::buffer::Buffer;
-use crate::kernels::rounding::{store, store_bytes};
+use crate::kernels::rounding::{pair_neighbours, store, store_bytes, store_steps_of_bytes};
 use crate::kernels::units::{Element, Unit};
 
 /// Images [n, height, width, channels_in], as they are stored.
@@ -12,7 +12,7 @@ pub(crate) enum Pixels<'a> {
     Floats(&'a [f32]),
 }
 
-impl<'a> Pixels<'a> {
+impl Pixels<'_> {
     pub(crate) fn len(&self) -> usize {
         match self {
             Self::Bytes(bytes) => bytes.len(),
@@ -27,39 +27,88 @@ impl<'a> Pixels<'a> {
             Self::Floats(floats) => Self::Floats(&floats[range]),
         }
     }
-
-    /// The images and `PADDING` as operands, and what products with them are multiplied by.
-    pub(crate) fn operands<U: Unit>(&self, unit: U) -> (Buffer<U::Element>, f32) {
-        let mut values = Buffer::new(self.len() + PADDING);
-        values[self.len()..].fill(U::Element::default());
-        let scale = match *self {
-            Self::Bytes(bytes) => {
-                store_bytes(unit, bytes, &mut values);
-                U::Element::BYTE_SCALE
-            }
-            Self::Floats(floats) => {
-                store(unit, floats, &mut values);
-                1.0
-            }
-        };
-        (values, scale)
-    }
 }
 
 /// Scalars after the last image: where a run is odd, the last step of the last window reads one further, times 0.
 pub(crate) const PADDING: usize = 1;
 
-/// Images [n, height, width, channels_in] and `PADDING`, as operands of products.
+/// What a convolution reads.
 #[derive(Clone, Copy)]
-pub(crate) struct Images<'a, E> {
-    pub(crate) values: &'a [E],
-    /// What a product with them is multiplied by.
-    pub(crate) scale: f32,
+pub(crate) enum Images<'a, E> {
+    /// Images that are not operands yet: each becomes one when its turn comes, and stays in the first cache meanwhile.
+    Pixels(Pixels<'a>),
+    /// The maps of another layer, with `PADDING` after them.
+    Maps(&'a [E]),
 }
 
-impl<'a, E> Images<'a, E> {
-    /// The maps of another layer.
-    pub(crate) const fn of_maps(values: &'a [E]) -> Self {
-        Self { values, scale: 1.0 }
+impl<E: Element> Images<'_, E> {
+    /// What a product with them is multiplied by.
+    pub(crate) const fn scale(&self) -> f32 {
+        match self {
+            Self::Pixels(Pixels::Bytes(_)) => E::BYTE_SCALE,
+            Self::Pixels(Pixels::Floats(_)) | Self::Maps(_) => 1.0,
+        }
+    }
+
+    /// The image with this index, `len` scalars and `PADDING`, as an operand; `room` is for those that have to be made.
+    pub(crate) fn image<'r, U: Unit<Element = E>>(
+        &'r self,
+        unit: U,
+        index: usize,
+        len: usize,
+        room: &'r mut Room<E>,
+    ) -> &'r [E] {
+        let range = index * len..(index + 1) * len;
+        match self {
+            Self::Maps(maps) => &maps[range.start..range.end + PADDING],
+            Self::Pixels(pixels) => {
+                let operand = room.of(len + PADDING);
+                operand[len..].fill(E::default());
+                match pixels {
+                    Pixels::Bytes(bytes) => store_bytes(unit, &bytes[range], operand),
+                    Pixels::Floats(floats) => store(unit, &floats[range], &mut operand[..len]),
+                }
+                operand
+            }
+        }
+    }
+
+    /// The image with this index as the operand of a sum over windows: each of its `len` scalars with the one `shift` further if
+    /// steps are pairs, or with 0 where the image ends before.
+    pub(crate) fn steps<'r, U: Unit<Element = E>>(
+        &'r self,
+        unit: U,
+        index: usize,
+        (len, shift): (usize, usize),
+        [room, single]: &'r mut [Room<E>; 2],
+    ) -> &'r [E] {
+        let range = index * len..(index + 1) * len;
+        if let Self::Pixels(Pixels::Bytes(bytes)) = self {
+            let steps = room.of(len * E::DEPTH);
+            store_steps_of_bytes(unit, &bytes[range], shift, steps);
+            return steps;
+        }
+        let image = &self.image(unit, index, len, single)[..len];
+        if E::DEPTH == 1 {
+            return image;
+        }
+        let steps = room.of(len * E::DEPTH);
+        pair_neighbours(unit, image, shift, steps);
+        steps
+    }
+}
+
+/// Memory for one image at a time.
+pub(crate) struct Room<E: Element>(Option<Buffer<E>>);
+
+impl<E: Element> Room<E> {
+    /// Takes nothing yet.
+    pub(crate) const fn new() -> Self {
+        Self(None)
+    }
+
+    /// `len` scalars, with what was there before; the same number every time.
+    fn of(&mut self, len: usize) -> &mut [E] {
+        self.0.get_or_insert_with(|| Buffer::new(len))
     }
 }

@@ -83,6 +83,7 @@ impl<E: Element> Panels<E> {
             }
             Threads::Pool => values
                 .par_chunks_exact_mut(panel_len)
+                .with_max_len(1)
                 .enumerate()
                 .for_each(|(panel, values)| pack(panel, values)),
         }
@@ -200,7 +201,7 @@ vectorized! {
                 let row = rows.get(row * b.cols..).unwrap_or_default();
                 row.get(first..first + cols).unwrap_or_default()
             };
-            U::Element::join(part(0), part(1), step);
+            U::Element::join(unit, part(0), part(1), step);
         }
     }
 }
@@ -223,16 +224,7 @@ fn pack_transposed<U: Unit>(
             let mut block = [[0; LANES]; LANES];
             let block_columns = columns.chunks_exact(k).skip(col).take(LANES);
             for (block, column) in block.iter_mut().zip(block_columns) {
-                let run = &column[run.clone()];
-                if run.len() == LANES * depth {
-                    for (bits, values) in block.iter_mut().zip(run.chunks_exact(depth)) {
-                        *bits = U::Element::step(values);
-                    }
-                } else {
-                    for (bits, values) in block.iter_mut().zip(run.chunks(depth)) {
-                        *bits = U::Element::step(values);
-                    }
-                }
+                U::Element::steps(unit, &column[run.clone()], block);
             }
             unit.transpose(&mut block);
             for (at, block) in block.iter().enumerate().take(steps - step) {

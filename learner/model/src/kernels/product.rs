@@ -75,6 +75,7 @@ fn multiply_with<U: Unit>(
         Threads::Caller => task(0, out),
         Threads::Pool => out
             .par_chunks_mut(TASK_ROWS * n)
+            .with_max_len(1)
             .enumerate()
             .for_each(|(index, out)| task(index * TASK_ROWS, out)),
     }

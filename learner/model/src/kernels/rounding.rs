@@ -12,11 +12,21 @@ vectorized! {
 }
 
 vectorized! {
-    /// Rounds `floats` into the first of `values`.
+    /// Stores pixels as operands of a sum over windows, as [`Element::steps_of_bytes`].
+    pub(crate) fn store_steps_of_bytes<U>(
+        unit,
+        bytes: &'a [u8],
+        shift: usize,
+        steps: &'a mut [U::Element],
+    ) {
+        U::Element::steps_of_bytes(bytes, shift, steps);
+    }
+}
+
+vectorized! {
+    /// Rounds `floats` into `values`, which is as long.
     pub(crate) fn store<U>(unit, floats: &'a [f32], values: &'a mut [U::Element]) {
-        for (value, &float) in values.iter_mut().zip(floats) {
-            *value = U::Element::of(float);
-        }
+        U::Element::store(unit, floats, values);
     }
 }
 
@@ -26,10 +36,28 @@ vectorized! {
         let rows = rows.chunks_exact_mut(cols.next_multiple_of(U::Element::DEPTH));
         for (row, values) in rows.zip(values.chunks_exact(cols)) {
             let (begin, end) = row.split_at_mut(cols);
-            for (to, &value) in begin.iter_mut().zip(values) {
-                *to = U::Element::of(value);
-            }
+            U::Element::store(unit, values, begin);
             end.fill(U::Element::default());
+        }
+    }
+}
+
+vectorized! {
+    /// Pairs every scalar with the one `shift` further, or with 0 where the image ends before.
+    pub(crate) fn pair_neighbours<U>(
+        unit,
+        values: &'a [U::Element],
+        shift: usize,
+        pairs: &'a mut [U::Element],
+    ) {
+        let later = values.get(shift..).unwrap_or_default();
+        let (both, one) = pairs.split_at_mut(later.len() * 2);
+        let (begin, end) = values.split_at(later.len());
+        for ((pair, &value), &later) in both.chunks_exact_mut(2).zip(begin).zip(later) {
+            (pair[0], pair[1]) = (value, later);
+        }
+        for (pair, &value) in one.chunks_exact_mut(2).zip(end) {
+            (pair[0], pair[1]) = (value, U::Element::default());
         }
     }
 }

@@ -66,18 +66,14 @@ pub(crate) fn stack_forward<U: Unit>(
         .iter()
         .map(|layer| count * layer.shape.map_len() + PADDING);
     let mut saved = Buffer::new(saved_len.sum());
-    let (pixels, scale) = images.operands(unit);
-    let mut input = Images {
-        values: &pixels,
-        scale,
-    };
+    let mut input = Images::Pixels(images);
     let mut free = &mut saved[..];
     for layer in inner {
         let len = count * layer.shape.map_len();
         let (output, rest) = std::mem::take(&mut free).split_at_mut(len + PADDING);
         output[len..].fill(U::Element::default());
         forward(unit, layer, input, &mut output[..len]);
-        (input, free) = (Images::of_maps(output), rest);
+        (input, free) = (Images::Maps(output), rest);
     }
     forward(unit, last, input, maps);
     saved
@@ -113,7 +109,7 @@ pub(crate) fn stack_backward<U: Unit>(
         saved = earlier;
         let mut grad_input = Buffer::zeros(input_len);
         let grads = ConvGradients::cut(&mut sums_left, shape, Some(&mut grad_input));
-        let images = Images::of_maps(input);
+        let images = Images::Maps(input);
         match (output, &grad_output) {
             (Some(output), Some(grad)) => backward(unit, layer, images, output, grad, grads),
             _ => backward(unit, layer, images, maps, grad_maps, grads),
@@ -121,11 +117,8 @@ pub(crate) fn stack_backward<U: Unit>(
         output = Some(&input[..input_len]);
         grad_output = Some(grad_input);
     }
-    let (pixels, scale) = images.operands(unit);
-    let images = Images {
-        values: &pixels,
-        scale,
-    };
+    let images = Images::Pixels(images);
+    let scale = images.scale();
     let grads = ConvGradients::cut(&mut sums_left, &first.shape, grad_images.take());
     match (output, &grad_output) {
         (Some(output), Some(grad)) => backward(unit, first, images, output, grad, grads),

@@ -37,9 +37,15 @@ pub struct Float64 {
 /// Computes the losses of `batch` at the parameters of `agent` in float64.
 ///
 /// # Errors
-/// An agent with another auxiliary objective than DIM, a batch that does not fit.
+/// An agent with another auxiliary objective than DIM, a batch that does not fit or leaves states out.
 pub fn float64(agent: &Agent, batch: &Batch<'_>) -> Result<Float64, UpdateError> {
     agent.check(batch)?;
+    let len = agent.model().frame_len();
+    let whole = [batch.rows, batch.positive_valid.len()].map(|states| states * len);
+    if [batch.states_n.len(), batch.states_k.len()] != whole {
+        let what = "the float64 reference computes states that rows do not have too";
+        return Err(UpdateError::Batch(what.to_owned()));
+    }
     let settings = agent.settings();
     let objective = settings.objective;
     if objective != Objective::NONE && objective != Objective::of(&DIM) {

@@ -84,6 +84,14 @@ impl CompressedFrames {
         oldest
     }
 
+    /// Lets go of the blocks that end before `oldest`.
+    pub(crate) fn forget_before(&mut self, oldest: u64) {
+        while let Some(block) = self.blocks.front().filter(|it| it.end() <= oldest) {
+            self.log.release(self.place_end(block));
+            self.blocks.pop_front();
+        }
+    }
+
     /// The key of the block that holds `index`, and the part with its frame, unless that is the key.
     pub(crate) fn parts(&self, index: u64) -> (BlockPart, Option<BlockPart>) {
         let after = self.blocks.partition_point(|block| block.first <= index);

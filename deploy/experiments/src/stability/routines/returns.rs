@@ -42,6 +42,8 @@ pub(super) fn replay(spec: &RunSpec, rows: u32) -> anyhow::Result<Replay> {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
+        disk_bytes_max: None,
+        fsync_ms: None,
         replay_ratio: 8.0,
         warmup_transitions: 0,
         slack_transitions: 1 << 40,

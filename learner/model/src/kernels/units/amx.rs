@@ -8,6 +8,8 @@ use std::sync::OnceLock;
 
 use half::bf16;
 
+use super::avx512::Brain;
+use super::element::Rounding;
 use super::unit::{LANES, Loop, Mode, RawTile, Unit};
 
 /// Steps, which are pairs of bf16, in a row of a tile register: 64 bytes.
@@ -21,9 +23,8 @@ pub(super) const SUMS: usize = 4;
 /// registers.
 pub(super) fn available() -> bool {
     static AVAILABLE: OnceLock<bool> = OnceLock::new();
-    *AVAILABLE.get_or_init(|| {
-        has_amx_bf16() && super::avx512::available() && granted() && multiplies_right()
-    })
+    *AVAILABLE
+        .get_or_init(|| has_amx_bf16() && Brain::available() && granted() && multiplies_right())
 }
 
 /// Multiplies two small matrices whose product is exact in either order of the sum, in both ways that tiles are used, and looks at
@@ -229,19 +230,34 @@ impl Tiles for Hardware {
 
 /// bf16 operands in pairs, on tiles.
 #[derive(Clone, Copy)]
-pub(super) struct Amx(());
+pub(super) struct Amx(
+    /// For all that is not a product: a processor with AMX's bf16 has AVX-512's.
+    Brain,
+);
 
 impl Amx {
     /// # Panics
     /// If the processor or the kernel lacks it.
     pub(super) fn here() -> Self {
         assert!(available(), "no AMX");
-        Self(())
+        Self(Brain::here())
     }
 }
 
 /// Most rows of a tile as the products are cut: four registers of them.
 pub(super) const ROWS_MAX: usize = SUMS * ROWS;
+
+impl Rounding for Amx {
+    #[inline(always)]
+    fn round(self, values: &[f32], to: &mut [bf16]) {
+        self.0.round(values, to);
+    }
+
+    #[inline(always)]
+    fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
+        self.0.round_pairs(first, second, pairs);
+    }
+}
 
 impl Unit for Amx {
     type Element = bf16;
@@ -258,12 +274,12 @@ impl Unit for Amx {
 
     #[inline(always)]
     fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
-        super::avx512::Single::here().transpose(block);
+        self.0.transpose(block);
     }
 
     #[inline(always)]
     fn vectorize<W: Loop>(self, work: W) {
-        super::avx512::Single::here().vectorize(work)
+        self.0.vectorize(work)
     }
 }
 

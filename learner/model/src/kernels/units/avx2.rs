@@ -11,6 +11,7 @@ use std::arch::x86_64::{
 use half::bf16;
 
 use super::{
+    element::Rounding,
     unit::{LANES, Loop, RawTile, Unit},
     vector::{Vector, compute_sizes},
 };
@@ -43,6 +44,8 @@ macro_rules! unit {
                 compute_sizes!(Self, tile, rows, vecs; 1: 1 2 3 4 5 6;);
             }
         }
+
+        impl Rounding for $unit {}
 
         impl Unit for $unit {
             type Element = $element;

@@ -3,16 +3,19 @@
 #![cfg(target_arch = "x86_64")]
 
 use std::arch::x86_64::{
-    __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_dpbf16_ps, _mm512_fmadd_ps, _mm512_loadu_ps,
-    _mm512_loadu_si512, _mm512_mask_storeu_ps, _mm512_maskz_loadu_ps, _mm512_set1_epi32,
-    _mm512_set1_ps, _mm512_setzero_ps, _mm512_shuffle_i32x4, _mm512_storeu_si512,
-    _mm512_unpackhi_epi32, _mm512_unpackhi_epi64, _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
+    __m256bh, __m256i, __m512, __m512bh, __m512i, _mm256_mask_storeu_epi16, _mm512_add_ps,
+    _mm512_cvtne2ps_pbh, _mm512_cvtneps_pbh, _mm512_dpbf16_ps, _mm512_fmadd_ps, _mm512_loadu_ps,
+    _mm512_loadu_si512, _mm512_mask_storeu_epi16, _mm512_mask_storeu_ps, _mm512_maskz_loadu_ps,
+    _mm512_permutexvar_epi16, _mm512_set1_epi32, _mm512_set1_ps, _mm512_setzero_ps,
+    _mm512_shuffle_i32x4, _mm512_storeu_si512, _mm512_unpackhi_epi32, _mm512_unpackhi_epi64,
+    _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
 };
 use std::mem::transmute;
 
 use half::bf16;
 
 use super::{
+    element::Rounding,
     unit::{LANES, Loop, RawTile, Unit},
     vector::{Vector, compute_sizes},
 };
@@ -24,11 +27,6 @@ pub(super) fn available() -> bool {
         && is_x86_feature_detected!("avx512dq")
         && is_x86_feature_detected!("avx512vl")
         && is_x86_feature_detected!("fma")
-}
-
-/// Whether it has AVX512_BF16 too.
-pub(super) fn bf16_available() -> bool {
-    is_x86_feature_detected!("avx512bf16")
 }
 
 /// f32 operands.
@@ -49,10 +47,15 @@ impl Single {
 }
 
 impl Brain {
+    /// Whether this processor has AVX512_BF16 beside AVX-512.
+    pub(super) fn available() -> bool {
+        available() && is_x86_feature_detected!("avx512bf16")
+    }
+
     /// # Panics
     /// If the processor lacks it.
     pub(super) fn here() -> Self {
-        assert!(available() && bf16_available(), "no AVX512_BF16");
+        assert!(Self::available(), "no AVX512_BF16");
         Self(())
     }
 }
@@ -86,11 +89,16 @@ macro_rules! unit {
             #[inline(always)]
             fn vectorize<W: Loop>(self, work: W) {
                 // SAFETY: `here` found the instructions.
-                unsafe { vectorized(work) }
+                unsafe { Self::vectorized(work) }
             }
         }
 
         impl $unit {
+            #[target_feature(enable = $features)]
+            unsafe fn vectorized<W: Loop>(work: W) {
+                work.run();
+            }
+
             #[target_feature(enable = $features)]
             unsafe fn compute_sized(tile: &RawTile<$element>, rows: usize, vecs: usize) {
                 compute_sizes!(Self, tile, rows, vecs;
@@ -109,6 +117,108 @@ unit!(
     bf16,
     "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma"
 );
+
+impl Rounding for Single {}
+
+impl Rounding for Brain {
+    #[inline(always)]
+    fn round(self, values: &[f32], to: &mut [bf16]) {
+        // SAFETY: `here` found the instructions.
+        unsafe { rounded(values, to) }
+    }
+
+    #[inline(always)]
+    fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
+        // SAFETY: `here` found the instructions.
+        unsafe { rounded_pairs(first, second, pairs) }
+    }
+}
+
+/// `Rounding::round`, 32 values at a time.
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
+unsafe fn rounded(values: &[f32], to: &mut [bf16]) {
+    let to = &mut to[..values.len()];
+    let (blocks, tail) = values.as_chunks::<{ 2 * LANES }>();
+    let (to_blocks, to_tail) = to.as_chunks_mut::<{ 2 * LANES }>();
+    for (block, to) in blocks.iter().zip(to_blocks) {
+        // SAFETY: a block is two registers of f32, and what it is rounded to one of bf16.
+        unsafe {
+            let (low, high) = (
+                _mm512_loadu_ps(block.as_ptr()),
+                _mm512_loadu_ps(block[LANES..].as_ptr()),
+            );
+            let words = transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(high, low));
+            _mm512_storeu_si512(to.as_mut_ptr().cast(), words);
+        }
+    }
+    for (part, to) in tail.chunks(LANES).zip(to_tail.chunks_mut(LANES)) {
+        let mask = first_lanes(part.len());
+        // SAFETY: the mask leaves out what lies beyond the slices, which are as long as each other and at most a register.
+        unsafe {
+            let words = _mm512_cvtneps_pbh(_mm512_maskz_loadu_ps(mask, part.as_ptr()));
+            let words = transmute::<__m256bh, __m256i>(words);
+            _mm256_mask_storeu_epi16(to.as_mut_ptr().cast(), mask, words);
+        }
+    }
+}
+
+/// `Rounding::round_pairs`, 16 pairs at a time.
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
+unsafe fn rounded_pairs(first: &[f32], second: &[f32], pairs: &mut [bf16]) {
+    // Word i of a pair's register is i / 2 of the first row's words, 0 to 15, or of the second's, 16 to 31.
+    const ORDER: [u16; 2 * LANES] = {
+        let mut order = [0; 2 * LANES];
+        let mut at = 0;
+        while at < order.len() {
+            order[at] = (at / 2 + at % 2 * LANES) as u16;
+            at += 1;
+        }
+        order
+    };
+    // SAFETY: `ORDER` is the 64 bytes of a register.
+    let order = unsafe { _mm512_loadu_si512(ORDER.as_ptr().cast()) };
+    let interleaved = |first: __m512, second: __m512| {
+        // SAFETY: two names of one register of 32 bf16.
+        let words = unsafe { transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(second, first)) };
+        _mm512_permutexvar_epi16(order, words)
+    };
+    let columns = first.len().min(second.len());
+    let (first, second) = (&first[..columns], &second[..columns]);
+    let pairs = &mut pairs[..2 * columns];
+    let (first_blocks, first_tail) = first.as_chunks::<LANES>();
+    let (second_blocks, second_tail) = second.as_chunks::<LANES>();
+    let (pair_blocks, pair_tail) = pairs.as_chunks_mut::<{ 2 * LANES }>();
+    for ((pairs, first), second) in pair_blocks.iter_mut().zip(first_blocks).zip(second_blocks) {
+        // SAFETY: a block of either row is a register of f32, and its pairs one of bf16.
+        unsafe {
+            let words = interleaved(
+                _mm512_loadu_ps(first.as_ptr()),
+                _mm512_loadu_ps(second.as_ptr()),
+            );
+            _mm512_storeu_si512(pairs.as_mut_ptr().cast(), words);
+        }
+    }
+    if !first_tail.is_empty() {
+        let mask = first_lanes(first_tail.len());
+        let words_mask = ((1u64 << (2 * first_tail.len())) - 1) as u32;
+        // SAFETY: the masks leave out what lies beyond the slices, fewer than `LANES` columns of each row.
+        unsafe {
+            let words = interleaved(
+                _mm512_maskz_loadu_ps(mask, first_tail.as_ptr()),
+                _mm512_maskz_loadu_ps(mask, second_tail.as_ptr()),
+            );
+            _mm512_mask_storeu_epi16(pair_tail.as_mut_ptr().cast(), words_mask, words);
+        }
+    }
+}
+
+/// A mask of the first `count` of 16 lanes.
+#[inline(always)]
+const fn first_lanes(count: usize) -> u16 {
+    ((1u32 << count) - 1) as u16
+}
 
 /// Transposes 16 registers of 16: pairs of 32 bits, of 64 bits, then quarters of registers twice.
 #[inline]
@@ -160,16 +270,11 @@ unsafe fn transposed(block: &mut [[u32; LANES]; LANES]) {
     }
 }
 
-#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,fma")]
-unsafe fn vectorized<W: Loop>(work: W) {
-    work.run();
-}
-
 /// Writes the first `count` of 16 sums.
 #[inline(always)]
 unsafe fn write(sums: __m512, at: *mut f32, count: usize, add: bool) {
     debug_assert!(count <= LANES);
-    let mask = ((1u32 << count) - 1) as u16;
+    let mask = first_lanes(count);
     // SAFETY: the lanes that the mask leaves out are neither read nor written; the caller answers for the others.
     unsafe {
         let sums = if add {

@@ -24,7 +24,7 @@ fn instructions() -> Instructions {
             if amx::available() {
                 return Instructions::Amx;
             }
-            return if avx512::bf16_available() {
+            return if avx512::Brain::available() {
                 Instructions::Avx512Bf16
             } else {
                 Instructions::Avx512
@@ -107,6 +107,8 @@ pub(crate) fn with_every_unit<F: ForUnit + Copy>(precision: Precision, work: F) 
 
 #[cfg(test)]
 mod tests {
+    use half::bf16;
+
     use super::*;
     use crate::kernels::units::{Columns, Element, LANES, Left, Mode, Unit, multiply_tile};
 
@@ -253,6 +255,53 @@ mod tests {
         }
         for precision in Precision::ALL {
             assert!(!with_every_unit(precision, Transpose).is_empty());
+        }
+    }
+
+    /// Lengths that fill no register; values over the whole of the float space, subnormals and what is not finite included.
+    #[test]
+    fn every_unit_rounds_to_the_nearest() {
+        #[derive(Clone, Copy)]
+        struct Round<'a>(&'a [f32], &'a [f32]);
+        impl ForUnit for Round<'_> {
+            type Output = [Vec<bf16>; 2];
+            fn run<U: Unit>(self, unit: U) -> [Vec<bf16>; 2] {
+                let Self(first, second) = self;
+                // What lies beyond is left alone.
+                let mut rounded = vec![bf16::ONE; first.len() + 3];
+                unit.round(first, &mut rounded);
+                let mut pairs = vec![bf16::ONE; 2 * first.len() + 3];
+                unit.round_pairs(first, second, &mut pairs);
+                [rounded, pairs]
+            }
+        }
+        let mut bits = 1u32;
+        let mut draw = |_| {
+            bits = bits.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            f32::from_bits(bits)
+        };
+        let check = |got: bf16, value: f32| {
+            let (got, wanted) = (got.to_f32(), bf16::from_f32(value).to_f32());
+            let subnormal = value.abs() < f32::MIN_POSITIVE && got == 0.0;
+            assert!(
+                got.to_bits() == wanted.to_bits()
+                    || value.is_nan() && got.is_nan()
+                    || subnormal && got.is_sign_negative() == value.is_sign_negative(),
+                "{value:e}: {got:e}, wanted {wanted:e}"
+            );
+        };
+        for len in (0..70).chain([100_000]) {
+            let first: Vec<f32> = (0..len).map(&mut draw).collect();
+            let second: Vec<f32> = (0..len).map(&mut draw).collect();
+            for [rounded, pairs] in with_every_unit(Precision::Bf16, Round(&first, &second)) {
+                for (at, (&first, &second)) in first.iter().zip(&second).enumerate() {
+                    check(rounded[at], first);
+                    check(pairs[2 * at], first);
+                    check(pairs[2 * at + 1], second);
+                }
+                assert!(rounded[len..].iter().all(|&one| one == bf16::ONE));
+                assert!(pairs[2 * len..].iter().all(|&one| one == bf16::ONE));
+            }
         }
     }
 

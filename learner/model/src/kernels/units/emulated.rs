@@ -6,6 +6,7 @@ use half::bf16;
 
 use super::{
     amx::{ROWS, ROWS_MAX, STEPS, SUMS, Tiles, compute},
+    element::Rounding,
     unit::{LANES, Loop, RawTile, Unit},
 };
 
@@ -75,6 +76,8 @@ impl Tiles for Registers {
 /// `Amx` without AMX.
 #[derive(Clone, Copy)]
 pub(super) struct EmulatedAmx;
+
+impl Rounding for EmulatedAmx {}
 
 impl Unit for EmulatedAmx {
     type Element = bf16;

@@ -3,7 +3,7 @@
 use half::bf16;
 
 use super::{
-    element::Element,
+    element::{Element, Rounding},
     unit::{LANES, Loop, RawTile, Unit},
     vector::{Vector, compute_sizes},
 };
@@ -18,6 +18,8 @@ pub(super) struct Rounded;
 
 macro_rules! unit {
     ($unit:ident, $element:ty) => {
+        impl Rounding for $unit {}
+
         #[allow(unsafe_code, reason = "units work on pointers")]
         impl Unit for $unit {
             type Element = $element;

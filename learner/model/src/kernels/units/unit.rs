@@ -1,10 +1,8 @@
 //! What a unit is: an instruction set that computes one tile of a product in registers.
 //! It names none; the choice is in `choice`.
 
-use super::element::Element;
-
-/// Columns of one register, on every unit.
-pub(crate) const LANES: usize = 16;
+pub(crate) use super::element::LANES;
+use super::element::{Element, Rounding};
 
 /// What a product does to the output's old content.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -36,7 +34,7 @@ pub(crate) struct RawTile<E> {
 /// An instruction set, with the type that its operands are stored as. Sums are f32.
 ///
 /// A value of a unit exists only where the processor has its instructions: [`with_unit`] looks before it makes one.
-pub(crate) trait Unit: Copy + Send + Sync + 'static {
+pub(crate) trait Unit: Rounding + Send + Sync + 'static {
     /// What operands are stored as.
     type Element: Element;
 
