@@ -42,8 +42,8 @@ pub enum SessionError {
     },
     /// Nobody listens where the session was to connect.
     #[error(
-        "nobody listens on {}, after {} s: is the replay server running, and is the endpoint right? One that wants TLS is reached with \
-         tls/HOST:PORT and --tls-dir",
+        "nobody listens on {}, after {} s: is the replay server running, and is the endpoint right? One with --tls-dir is reached with \
+         quic/HOST:PORT, which is UDP, and --tls-dir",
         .connect.join(", "), CONNECT_MAX.as_secs()
     )]
     NobodyListens {
@@ -117,7 +117,7 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
     open_with(endpoints, MESSAGE_BYTES_MAX, &[])
 }
 
-/// As [`open`], with certificates where there are any: then endpoints are `tls/HOST:PORT` or unix sockets, and a replay server
+/// As [`open`], with certificates where there are any: then endpoints are `quic/HOST:PORT` or unix sockets, and a replay server
 /// gives each role of the run with these keys what it needs and no more. Messages of more than `message_bytes_max` bytes, which no
 /// peer of this run sends, are dropped while they come in.
 ///
@@ -133,7 +133,7 @@ pub fn open_as(
         return open_with(endpoints, message_bytes_max, &[]);
     };
     credentials.warn_if_it_expires_soon();
-    for endpoint in endpoints.connect.iter().filter(|it| is_tls(it)) {
+    for endpoint in endpoints.connect.iter().filter(|it| is_quic(it)) {
         if !tls::check(endpoint, credentials, CONNECT_MAX)? {
             let connect = vec![endpoint.clone()];
             return Err(SessionError::NobodyListens { connect });
@@ -143,7 +143,7 @@ pub fn open_as(
         ("transport/link/tls", credentials.zenoh_settings()),
         (
             "transport/link/protocols",
-            "[\"tls\", \"unixsock-stream\"]".into(),
+            "[\"quic\", \"unixsock-stream\"]".into(),
         ),
     ];
     if credentials.role() == Role::ReplayServer {
@@ -152,9 +152,9 @@ pub fn open_as(
     open_with(endpoints, message_bytes_max, &settings)
 }
 
-/// Whether an endpoint is reached over TLS.
-pub fn is_tls(endpoint: &str) -> bool {
-    endpoint.starts_with("tls/")
+/// Whether an endpoint is reached over QUIC, with certificates.
+pub fn is_quic(endpoint: &str) -> bool {
+    endpoint.starts_with("quic/")
 }
 
 fn open_with(
@@ -203,7 +203,7 @@ fn open_with(
         ("transport/unicast/open_timeout", "2000"),
         ("transport/unicast/accept_timeout", "5000"),
         // Long enough for a machine that is busy with much else: a part that got no processor for a while is not gone. One that
-        // died is known at once, as its connection closes.
+        // died is known at once, as its connection closes; over QUIC, which has no system to close it, after this long.
         ("transport/link/tx/lease", "30000"),
         ("transport/link/tx/queue/size/data", "16"),
         (

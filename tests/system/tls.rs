@@ -1,8 +1,8 @@
-//! Mutual TLS: a run over it, and everybody who is not let in, each refused with a sentence on the side that has `--tls-dir`.
+//! Mutual TLS in QUIC: a run over it, and everybody who is not let in, each refused with a sentence on the side that has `--tls-dir`.
 //! What each role may do is in `roles`.
 
 use std::{
-    net::TcpListener,
+    net::UdpSocket,
     time::{Duration, Instant},
 };
 
@@ -39,7 +39,7 @@ impl TlsSystem {
         Some(Self {
             system,
             good,
-            endpoint: format!("tls/127.0.0.1:{}", free_port()),
+            endpoint: format!("quic/127.0.0.1:{}", free_port()),
         })
     }
 
@@ -77,6 +77,20 @@ impl TlsSystem {
         Client::over(session)
     }
 
+    /// A stranger in the place of a replay server, once the port of the one before is free.
+    fn listen_raw(&self, certificates: &Certificates, role: &str) -> Session {
+        let listen = format!("[{:?}]", self.endpoint);
+        let own = raw_tls("listen", certificates, Some(role));
+        wait_for("a port that is free again", || {
+            let settings = [
+                ("mode", "\"router\"".into()),
+                ("listen/endpoints", listen.clone()),
+                ("transport/link/tls", own.clone()),
+            ];
+            open_raw(&settings).ok()
+        })
+    }
+
     /// A part that is refused says so within seconds, and ends with this code.
     fn refused(&self, part: &str, folder: &str, code: i32, words: &str) {
         let started = Instant::now();
@@ -89,8 +103,8 @@ impl TlsSystem {
 
 /// A port of this machine that nobody has.
 fn free_port() -> u16 {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    listener.local_addr().unwrap().port()
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    socket.local_addr().unwrap().port()
 }
 
 /// Opens a session with zenoh alone, without any check of ours; as a client it gives up soon.
@@ -255,18 +269,18 @@ fn own_files_that_cannot_be_used() {
     );
     assert!(!tls.system.path("run").exists(), "nothing was begun");
 
-    let server = "replay-server --listen tls/127.0.0.1:1 --tls-dir old --env chain --agent c51";
+    let server = "replay-server --listen quic/127.0.0.1:1 --tls-dir old --env chain --agent c51";
     std::fs::remove_file(tls.system.path("old/replay-server.pem")).unwrap();
     let ended = tls.system.run(server);
     ended
         .expect_code(64)
         .expect_said("old/replay-server.pem is not there");
-    let server = server.replace("tls/127.0.0.1", "tcp/127.0.0.1");
+    let server = server.replace("quic/127.0.0.1", "tcp/127.0.0.1");
     tls.system
         .run(&server)
         .expect_code(64)
-        .expect_said("it is tls/127.0.0.1:1");
-    let without = "actor --connect tls/127.0.0.1:1";
+        .expect_said("it is quic/127.0.0.1:1");
+    let without = "actor --connect quic/127.0.0.1:1";
     tls.system
         .run(without)
         .expect_code(64)
@@ -311,15 +325,14 @@ fn strangers_at_a_replay_server() {
         let counted = |it: &driml_protocol::ReplayStatus| it.connections_refused > before;
         observer.wait_for_replay(why, counted);
     }
-    // Without TLS.
-    let plain = tls.endpoint.replace("tls/", "tcp/");
+    // Without QUIC, at whose port nobody listens.
+    let plain = tls.endpoint.replace("quic/", "tcp/");
     let started = Instant::now();
     let actor = tls.system.run(&format!("actor --connect {plain}"));
     actor
         .expect_code(1)
-        .expect_said("One that wants TLS is reached with tls/HOST:PORT and --tls-dir");
+        .expect_said("One with --tls-dir is reached with quic/HOST:PORT");
     assert!(started.elapsed() < SECONDS);
-    server.wait_for_stderr("a connection was refused: it does not speak TLS");
 
     // Who is let in is not disturbed.
     let learner = tls.start("learner --run-dir run", "tls");
@@ -361,15 +374,7 @@ fn strangers_in_the_place_of_a_replay_server() {
         ),
         (&tls.good, "learner", "whoever listens on"),
     ] {
-        let listening = open_raw(&[
-            ("mode", "\"router\"".into()),
-            ("listen/endpoints", format!("[{:?}]", tls.endpoint)),
-            (
-                "transport/link/tls",
-                raw_tls("listen", certificates, Some(role)),
-            ),
-        ])
-        .unwrap();
+        let listening = tls.listen_raw(certificates, role);
         tls.refused("actor --id 0", "tls", 1, why);
         listening.close().wait().unwrap();
     }
@@ -384,15 +389,7 @@ fn strangers_in_the_place_of_a_replay_server() {
         foreign.path("replay-server.key"),
     )
     .unwrap();
-    let listening = open_raw(&[
-        ("mode", "\"router\"".into()),
-        ("listen/endpoints", format!("[{:?}]", tls.endpoint)),
-        (
-            "transport/link/tls",
-            raw_tls("listen", &foreign, Some("replay-server")),
-        ),
-    ])
-    .unwrap();
+    let listening = tls.listen_raw(&foreign, "replay-server");
     tls.refused(
         "learner --run-dir run",
         "tls",
@@ -401,13 +398,13 @@ fn strangers_in_the_place_of_a_replay_server() {
     );
     listening.close().wait().unwrap();
 
-    let plain = tls.endpoint.replace("tls/", "tcp/");
+    let plain = tls.endpoint.replace("quic/", "tcp/");
     let listening = open_raw(&[
         ("mode", "\"router\"".into()),
         ("listen/endpoints", format!("[{plain:?}]")),
     ])
     .unwrap();
-    tls.refused("actor --id 0", "tls", 1, "it does not speak TLS");
+    tls.refused("actor --id 0", "tls", 1, "it does not speak QUIC");
     listening.close().wait().unwrap();
     let nobody = wait_for("nobody who listens", || {
         let actor = tls.start("actor --id 0", "tls").wait();

@@ -65,11 +65,12 @@ pub fn describe(error: &anyhow::Error) -> String {
 ///
 /// zenoh warns of each try to reach a process that is not there yet or any more, which is ours to judge: so only its errors are
 /// logged, and of those neither what its session says of messages that come while it closes, as at the end of every run, nor
-/// that no answer is wanted any more.
+/// that no answer is wanted any more. Nor what it says of connections over QUIC that did not come about, and what quinn warns of.
 ///
 /// With `guarded`, what zenoh says of those whom it refuses is heard too: [`tls::overhear`].
 pub fn log_to_stderr(guarded: bool) {
-    let usual = "warn,driml=info,zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off";
+    let usual = "warn,driml=info,zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off,\
+                 zenoh_link_commons::quic=off,quinn=error";
     let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
     let filter = wanted.map_or_else(
         || EnvFilter::new(usual),

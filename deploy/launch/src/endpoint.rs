@@ -22,7 +22,15 @@ pub struct Guard {
 /// # Errors
 /// The first that cannot work, and what to do.
 pub fn check_endpoints(endpoints: &[String], tls: bool) -> Result<(), Usage> {
-    endpoints.iter().try_for_each(|it| check_endpoint(it, tls))
+    endpoints.iter().try_for_each(|it| {
+        check_endpoint(it, tls)?;
+        if it.starts_with("quic/[") {
+            return Err(usage!(
+                "{it}: zenoh looks for this address, with its brackets, in the certificate and does not find it: connect by a name"
+            ));
+        }
+        Ok(())
+    })
 }
 
 /// Refuses endpoints to listen on that zenoh could not open, and those that others can reach and nothing guards.
@@ -38,7 +46,7 @@ pub fn check_listening(endpoints: &[String], guard: Guard) -> Result<(), Usage> 
         if !guard.insecure_network {
             return Err(usage!(
                 "{endpoint} can be reached from other machines, and whoever reaches it can read the run, change what is learned, and \
-                 end it. Listen on tls/HOST:PORT with --tls-dir DIR (deploy/certs.sh makes the certificates); or, where every machine \
+                 end it. Listen on quic/HOST:PORT with --tls-dir DIR (deploy/certs.sh makes the certificates); or, where every machine \
                  that can connect is trusted, add --insecure-network"
             ));
         }
@@ -58,15 +66,19 @@ fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
     // Behind # zenoh takes settings of its own, which could undo ours.
     match endpoint.split_once('/') {
         Some(("tcp", address)) if tls && has_host(address) => Err(usage!(
-            "{endpoint} is not encrypted: with --tls-dir it is tls/{address}"
+            "{endpoint} is not encrypted: with --tls-dir it is quic/{address}"
         )),
-        Some(("tls", address)) if !tls && has_host(address) => Err(usage!(
+        Some(("tls", address)) if has_host(address) => Err(usage!(
+            "{endpoint}: TLS over TCP is not used, as zenoh's may break a connection or end the process \
+             (https://github.com/eclipse-zenoh/zenoh/issues/2557): with --tls-dir it is quic/{address}, the TLS of QUIC over UDP"
+        )),
+        Some(("quic", address)) if !tls && has_host(address) => Err(usage!(
             "{endpoint} needs certificates: add --tls-dir DIR, which deploy/certs.sh makes"
         )),
-        Some(("tcp" | "tls", address)) if has_host(address) => Ok(()),
+        Some(("tcp" | "quic", address)) if has_host(address) => Ok(()),
         Some(("unixsock-stream", path)) if !path.is_empty() => Ok(()),
         _ => Err(usage!(
-            "{endpoint:?} is no endpoint: take tcp/HOST:PORT, tls/HOST:PORT or unixsock-stream/PATH"
+            "{endpoint:?} is no endpoint: take tcp/HOST:PORT, quic/HOST:PORT or unixsock-stream/PATH"
         )),
     }
 }
@@ -125,11 +137,18 @@ mod tests {
             let checked = check_endpoints(&[endpoint.into()], tls);
             checked.unwrap_err().to_string()
         };
-        assert!(check_endpoints(&["tls/host:1".into()], true).is_ok());
+        assert!(check_endpoints(&["quic/host:1".into()], true).is_ok());
         assert!(check_endpoints(&["unixsock-stream//tmp/s".into()], true).is_ok());
-        assert!(refused("tls/host:1", false).contains("add --tls-dir DIR"));
-        assert!(refused("tcp/host:1", true).contains("it is tls/host:1"));
-        assert!(refused("tls/host:1#enable_mtls=false", true).contains("no endpoint"));
+        assert!(refused("quic/host:1", false).contains("add --tls-dir DIR"));
+        assert!(refused("quic/[::1]:1", true).contains("connect by a name"));
+        assert_eq!(listening("quic/[::]:1", TLS), Ok(()));
+        assert!(refused("tcp/host:1", true).contains("it is quic/host:1"));
+        assert!(refused("quic/host:1#enable_mtls=false", true).contains("no endpoint"));
+        for tls in [false, true] {
+            let said = refused("tls/host:1", tls);
+            assert!(said.contains("with --tls-dir it is quic/host:1"), "{said}");
+            assert!(said.contains("issues/2557"), "{said}");
+        }
     }
 
     #[test]
@@ -158,7 +177,7 @@ mod tests {
                 ..nothing
             };
             assert_eq!(listening(open, trusted), Ok(()), "{open}");
-            assert_eq!(listening(&open.replace("tcp", "tls"), TLS), Ok(()));
+            assert_eq!(listening(&open.replace("tcp", "quic"), TLS), Ok(()));
         }
     }
 }

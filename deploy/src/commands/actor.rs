@@ -8,7 +8,7 @@ use super::join::{JoinFlags, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct ActorArgs {
-    /// Endpoint of the replay server, such as tls/10.0.0.1:7447; may be given several times
+    /// Endpoint of the replay server, such as quic/10.0.0.1:7447; may be given several times
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) connect: Vec<String>,
     /// Which actor this is; unique in the run

@@ -28,9 +28,9 @@ pub(crate) struct JoinFlags {
 /// With which certificate a process takes part.
 #[derive(Debug, Args)]
 pub(crate) struct TlsFlags {
-    /// Talk over mutual TLS, with the certificates in DIR that deploy/certs.sh makes: ca.pem, and ROLE.pem and ROLE.key, where
-    /// ROLE is actor-N (N is its --id), learner, replay-server or, to only look, observer. Endpoints are then tls/HOST:PORT, or unix sockets, and the replay
-    /// server lets each role do what it needs and no more
+    /// Talk over mutual TLS (in QUIC, so over UDP), with the certificates in DIR that deploy/certs.sh makes: ca.pem, and ROLE.pem
+    /// and ROLE.key, where ROLE is actor-N (N is its --id), learner, replay-server or, to only look, observer. Endpoints are then
+    /// quic/HOST:PORT, or unix sockets, and the replay server lets each role do what it needs and no more
     #[arg(long, value_name = "DIR")]
     pub(crate) tls_dir: Option<PathBuf>,
 }

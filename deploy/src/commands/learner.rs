@@ -11,7 +11,7 @@ use super::join::{JoinFlags, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct LearnerArgs {
-    /// Endpoint of the replay server, such as tls/10.0.0.1:7447; once for each of the run's replay shards
+    /// Endpoint of the replay server, such as quic/10.0.0.1:7447; once for each of the run's replay shards
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) connect: Vec<String>,
     /// Where checkpoints go: DIR/checkpoints

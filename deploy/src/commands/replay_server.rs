@@ -13,7 +13,7 @@ use super::join::{JoinFlags, NetworkFlag, TlsFlags, clean_up_after, join};
 #[derive(Debug, Args)]
 pub(crate) struct ReplayServerArgs {
     /// Endpoint to listen on, such as tcp/127.0.0.1:7447; may be given several times. One that other machines reach is
-    /// tls/HOST:PORT, such as tls/0.0.0.0:7447, with --tls-dir
+    /// quic/HOST:PORT, such as quic/0.0.0.0:7447, with --tls-dir
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) listen: Vec<String>,
     /// Router to connect to as well; not with --tls-dir, as its rules would not be ours

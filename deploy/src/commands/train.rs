@@ -60,7 +60,7 @@ pub(crate) struct TrainArgs {
     #[arg(long, conflicts_with = "listen")]
     pub(crate) lockstep: bool,
     /// Endpoint on which the parts meet [default: a unix socket in a fresh folder]; or, with --tls-dir, on which the replay server
-    /// listens for parts of other machines, such as tls/0.0.0.0:7447, while those of this one meet at a unix socket
+    /// listens for parts of other machines, such as quic/0.0.0.0:7447, while those of this one meet at a unix socket
     #[arg(long, value_name = "ENDPOINT")]
     pub(crate) listen: Option<String>,
     #[command(flatten)]
@@ -100,9 +100,9 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
         }
     };
     check_listening(args.listen.as_slice(), args.network.guard(&args.tls))?;
-    if args.tls.is_set() && !args.listen.as_deref().is_some_and(session::is_tls) {
+    if args.tls.is_set() && !args.listen.as_deref().is_some_and(session::is_quic) {
         return Err(usage!(
-            "--tls-dir is for parts of other machines, which need somewhere to connect to: add --listen tls/HOST:PORT"
+            "--tls-dir is for parts of other machines, which need somewhere to connect to: add --listen quic/HOST:PORT"
         )
         .into());
     }

@@ -120,7 +120,7 @@ impl Lists {
             rules.push(id);
         }
         self.subjects.push(format!(
-            "{{ id: \"{name}\", cert_common_names: [\"{name}\"], link_protocols: [\"tls\"] }}"
+            "{{ id: \"{name}\", cert_common_names: [\"{name}\"], link_protocols: [\"quic\"] }}"
         ));
         self.policies.push(format!(
             "{{ rules: [{}], subjects: [\"{name}\"] }}",
@@ -206,7 +206,12 @@ mod tests {
         );
         assert_eq!(
             all(&of(Role::Observer)),
-            ["d/hello", "d/status/replay", "d/status/learner"]
+            [
+                "d/hello",
+                "d/status/replay",
+                "d/status/parts",
+                "d/status/learner",
+            ]
         );
         assert!(all(&of(Role::ReplayServer)).is_empty());
     }

@@ -2,30 +2,37 @@
 //! than that. It sends nothing but the handshake.
 
 use std::{
-    io::{self, ErrorKind, Read, Write},
-    net::{TcpStream, ToSocketAddrs},
+    net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpStream, ToSocketAddrs},
     sync::Arc,
     time::{Duration, Instant},
 };
 
-use rustls::{
-    AlertDescription, CertificateError, ClientConfig, ClientConnection, Error,
-    pki_types::ServerName, version::TLS13,
-};
+use quinn::{ConnectionError, Endpoint, TransportConfig, crypto::rustls::QuicClientConfig};
+use rustls::{AlertDescription, ClientConfig, version::TLS13};
+use tokio::time::{sleep, timeout};
 
 use super::{
     TlsError,
     credentials::{Credentials, provider},
 };
 
-/// How long the other side may take for one step of the handshake.
-const STEP_MAX: Duration = Duration::from_secs(3);
-/// How long its verdict on this part's certificate is waited for: it comes with the handshake's last message, or not at all.
-const VERDICT_MAX: Duration = Duration::from_millis(1500);
-/// Pause before somebody who does not listen yet is tried again.
-const PAUSE: Duration = Duration::from_millis(100);
+/// How long one try may take. Nobody is there who could say that nobody listens: a try gets an answer or none.
+const TRY_MAX: Duration = Duration::from_secs(3);
+/// How long the other side's verdict on this part's certificate is waited for: it comes with the handshake's last message.
+const VERDICT_MAX: Duration = Duration::from_secs(2);
+/// How often it is looked for.
+const TICK: Duration = Duration::from_millis(5);
+/// How long a connection stays before it is closed: the other side, which opens its streams at once, calls it an error if it
+/// cannot.
+const LINGER: Duration = Duration::from_millis(50);
+/// How long the last message may take to go out.
+const LAST_WORD_MAX: Duration = Duration::from_millis(200);
+/// The time of a message to the other side and back, before it is known: a lost one is sent again after three of them.
+const ROUND_TRIP: Duration = Duration::from_millis(50);
+/// The names by which zenoh calls what it speaks over QUIC, which the other side wants to hear.
+const PROTOCOLS: [&[u8]; 2] = [b"zenoh-ms", b"zenoh"];
 
-/// Checks that whoever listens on `endpoint`, `tls/HOST:PORT`, is a replay server of the same authority and takes this part's
+/// Checks that whoever listens on `endpoint`, `quic/HOST:PORT`, is a replay server of the same authority and takes this part's
 /// certificate. False if nobody listens there within `wait_max`.
 ///
 /// # Errors
@@ -35,36 +42,15 @@ pub(crate) fn check(
     credentials: &Credentials,
     wait_max: Duration,
 ) -> Result<bool, TlsError> {
-    let started = Instant::now();
-    let Some(tcp) = std::iter::repeat_with(|| connect(endpoint))
-        .inspect(|tried| {
-            if tried.is_none() {
-                std::thread::sleep(PAUSE);
-            }
-        })
-        .take_while(|tried| tried.is_some() || started.elapsed() < wait_max)
-        .flatten()
-        .next()
-    else {
-        return Ok(false);
-    };
     let handshake = Handshake {
         endpoint,
         credentials,
     };
-    handshake.run(tcp).map(|()| true)
-}
-
-/// The host and the port of an endpoint.
-fn address(endpoint: &str) -> Option<(&str, &str)> {
-    endpoint.split_once('/')?.1.rsplit_once(':')
-}
-
-fn connect(endpoint: &str) -> Option<TcpStream> {
-    let (_, address) = endpoint.split_once('/')?;
-    let addresses = address.to_socket_addrs().ok()?;
-    let mut streams = addresses.filter_map(|it| TcpStream::connect_timeout(&it, STEP_MAX).ok());
-    streams.next()
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .map_err(|e| handshake.server(e.to_string()))?;
+    runtime.block_on(handshake.run(wait_max))
 }
 
 struct Handshake<'a> {
@@ -73,120 +59,172 @@ struct Handshake<'a> {
 }
 
 impl Handshake<'_> {
-    fn run(&self, mut tcp: TcpStream) -> Result<(), TlsError> {
-        let mut tls = self.begin()?;
-        let began = set_timeout(&tcp, STEP_MAX).and_then(|()| {
-            while tls.is_handshaking() {
-                tls.complete_io(&mut tcp)?;
+    async fn run(&self, wait_max: Duration) -> Result<bool, TlsError> {
+        let (config, started) = (self.config()?, Instant::now());
+        loop {
+            let tried = match self.address() {
+                Some(address) => self.try_once(address, config.clone()).await?,
+                None => false,
+            };
+            if tried {
+                return Ok(true);
             }
-            tls.complete_io(&mut tcp).map(drop)
-        });
-        began.map_err(|e| self.their_fault(&e))?;
-        // The other side judges this part's certificate after the handshake has ended here: it sends tickets, or a refusal.
-        let judged = set_timeout(&tcp, VERDICT_MAX).and_then(|()| {
-            tls.read_tls(&mut tcp)?;
-            tls.process_new_packets().map_err(io::Error::other)?;
-            match tls.reader().read(&mut [0]) {
-                Ok(0) => Err(ErrorKind::UnexpectedEof.into()),
-                Err(e) if e.kind() != ErrorKind::WouldBlock => Err(e),
-                _ => Ok(()),
+            if started.elapsed() > wait_max {
+                break;
             }
-        });
-        match judged {
-            Err(e) if !is_timeout(&e) => Err(self.refused(&e)),
-            _ => {
-                tls.send_close_notify();
-                // It has said all that is asked here.
-                let _ = tls.write_tls(&mut tcp).and_then(|_| tcp.flush());
-                Ok(())
-            }
+            sleep(TICK).await;
+        }
+        let plain = self
+            .address()
+            .map(|it| TcpStream::connect_timeout(&it, TRY_MAX));
+        match plain {
+            Some(Ok(_)) => Err(self.server(no_quic())),
+            _ => Ok(false),
         }
     }
 
-    fn begin(&self) -> Result<ClientConnection, TlsError> {
-        let Credentials {
-            roots,
-            chain,
-            secret,
-            ..
-        } = self.credentials;
-        let server = |why: String| TlsError::Server {
-            endpoint: self.endpoint.into(),
-            why,
-        };
-        let config = ClientConfig::builder_with_provider(provider().into())
-            .with_protocol_versions(&[&TLS13])
-            .and_then(|builder| {
-                let builder = builder.with_root_certificates(roots.clone());
-                builder.with_client_auth_cert(chain.clone(), secret.clone_key())
-            })
-            .map_err(|e| server(e.to_string()))?;
-        let host = address(self.endpoint).map_or("", |(host, _)| host);
-        let host = host
-            .trim_start_matches('[')
-            .trim_end_matches(']')
-            .to_owned();
-        let name = ServerName::try_from(host).map_err(|e| server(e.to_string()))?;
-        ClientConnection::new(Arc::new(config), name).map_err(|e| server(e.to_string()))
+    /// The host and the port.
+    fn host_and_port(&self) -> Option<(&str, &str)> {
+        self.endpoint.split_once('/')?.1.rsplit_once(':')
     }
 
-    /// What is wrong with the other side, by an error before the handshake's end here.
-    fn their_fault(&self, e: &io::Error) -> TlsError {
-        let why = match tls_error(e) {
-            Some(Error::InvalidCertificate(fault)) => self.their_certificate(fault),
-            Some(Error::AlertReceived(_)) => return self.refused(e),
-            Some(Error::InvalidMessage(_)) => no_tls(),
-            Some(e) => format!("{e}: only TLS 1.3 is spoken here"),
-            None => no_tls(),
-        };
+    /// The address that zenoh takes too.
+    fn address(&self) -> Option<SocketAddr> {
+        let (_, address) = self.endpoint.split_once('/')?;
+        address.to_socket_addrs().ok()?.next()
+    }
+
+    fn server(&self, why: String) -> TlsError {
         TlsError::Server {
             endpoint: self.endpoint.into(),
             why,
         }
     }
 
-    fn their_certificate(&self, fault: &CertificateError) -> String {
-        use CertificateError as Fault;
+    fn config(&self) -> Result<quinn::ClientConfig, TlsError> {
+        let Credentials {
+            roots,
+            chain,
+            secret,
+            ..
+        } = self.credentials;
+        let mut tls = ClientConfig::builder_with_provider(provider().into())
+            .with_protocol_versions(&[&TLS13])
+            .and_then(|builder| {
+                let builder = builder.with_root_certificates(roots.clone());
+                builder.with_client_auth_cert(chain.clone(), secret.clone_key())
+            })
+            .map_err(|e| self.server(e.to_string()))?;
+        tls.alpn_protocols = PROTOCOLS.map(Vec::from).into();
+        let crypto = QuicClientConfig::try_from(tls).map_err(|e| self.server(e.to_string()))?;
+        let mut transport = TransportConfig::default();
+        transport.initial_rtt(ROUND_TRIP);
+        let mut config = quinn::ClientConfig::new(Arc::new(crypto));
+        config.transport_config(transport.into());
+        Ok(config)
+    }
+
+    /// True once the other side has taken this part's certificate; false if nobody answers.
+    async fn try_once(
+        &self,
+        address: SocketAddr,
+        config: quinn::ClientConfig,
+    ) -> Result<bool, TlsError> {
+        let any: IpAddr = match address {
+            SocketAddr::V4(_) => Ipv4Addr::UNSPECIFIED.into(),
+            SocketAddr::V6(_) => Ipv6Addr::UNSPECIFIED.into(),
+        };
+        let local = Endpoint::client((any, 0).into()).map_err(|e| self.server(e.to_string()))?;
+        let tried = self.shake_hands(&local, address, config).await;
+        // It has said all that is asked here.
+        local.close(0u8.into(), b"");
+        let _ = timeout(LAST_WORD_MAX, local.wait_idle()).await;
+        tried
+    }
+
+    async fn shake_hands(
+        &self,
+        local: &Endpoint,
+        address: SocketAddr,
+        config: quinn::ClientConfig,
+    ) -> Result<bool, TlsError> {
+        let host = self.host_and_port().map_or("", |(host, _)| host);
+        let connecting = local
+            .connect_with(config, address, host)
+            .map_err(|e| self.server(e.to_string()))?;
+        let connection = match timeout(TRY_MAX, connecting).await {
+            Err(_) | Ok(Err(ConnectionError::TimedOut)) => return Ok(false),
+            Ok(Err(e)) => return Err(self.their_fault(&e)),
+            Ok(Ok(connection)) => connection,
+        };
+        // The other side judges this part's certificate after the handshake has ended here.
+        let started = Instant::now();
+        while connection.stats().frame_rx.handshake_done == 0 && started.elapsed() < VERDICT_MAX {
+            if let Ok(e) = timeout(TICK, connection.closed()).await {
+                return Err(self.refused(&e));
+            }
+        }
+        sleep(LINGER).await;
+        Ok(true)
+    }
+
+    /// What is wrong with the other side, by an error before the handshake's end here.
+    fn their_fault(&self, e: &ConnectionError) -> TlsError {
+        match e {
+            ConnectionError::TransportError(e) if e.reason.contains(BAD_CERTIFICATE) => {
+                self.server(self.their_certificate(&e.reason))
+            }
+            ConnectionError::ConnectionClosed(_) | ConnectionError::ApplicationClosed(_) => {
+                self.refused(e)
+            }
+            e => self.server(format!("{e}: {}", no_quic())),
+        }
+    }
+
+    /// What is wrong with its certificate, by what rustls says of it.
+    fn their_certificate(&self, said: &str) -> String {
         let authority = self.credentials.authority_path().display();
-        match fault {
-            Fault::UnknownIssuer | Fault::BadSignature => format!(
+        if said.contains("UnknownIssuer") || said.contains("BadSignature") {
+            format!(
                 "its certificate is not from the authority of {authority}; if it is the right machine, copy ca.pem from where \
                  deploy/certs.sh made its certificate"
-            ),
-            Fault::Expired | Fault::ExpiredContext { .. } => "its certificate has expired: remove replay-server.pem and \
-                 replay-server.key, let deploy/certs.sh make new ones, and start it again; if it did not, this machine's clock is wrong"
-                .into(),
-            Fault::NotValidYet | Fault::NotValidYetContext { .. } => {
-                "its certificate is not valid yet: the clock of this machine is wrong, or of the one on which it was made".into()
-            }
-            Fault::NotValidForName | Fault::NotValidForNameContext { .. } => format!(
+            )
+        } else if said.contains("not valid yet") {
+            "its certificate is not valid yet: the clock of this machine is wrong, or of the one on which it was made".into()
+        } else if said.contains("expired") {
+            "its certificate has expired: remove replay-server.pem and replay-server.key, let deploy/certs.sh make new ones, and start \
+             it again; if it did not, this machine's clock is wrong"
+                .into()
+        } else if said.contains("not valid for name") {
+            format!(
                 "its certificate is not for {host}: connect by a name that it is for, or remove replay-server.pem and \
                  replay-server.key there and make them anew with `deploy/certs.sh DIR --host {host}`",
-                host = address(self.endpoint).map_or("", |(host, _)| host)
-            ),
-            Fault::InvalidPurpose | Fault::InvalidPurposeContext { .. } => {
-                "its certificate is that of an actor, a learner or an observer, not of a replay server".into()
-            }
-            other => other.to_string(),
+                host = self.host_and_port().map_or("", |(host, _)| host)
+            )
+        } else if said.contains("extended key usage") {
+            "its certificate is that of an actor, a learner or an observer, not of a replay server"
+                .into()
+        } else {
+            said.to_owned()
         }
     }
 
     /// That the other side refuses this part, by what it said.
-    fn refused(&self, e: &io::Error) -> TlsError {
-        let why = match tls_error(e) {
-            Some(Error::AlertReceived(alert)) => match alert {
-                AlertDescription::UnknownCA | AlertDescription::DecryptError => {
-                    "its ca.pem is of another authority; copy there the one with which this certificate was made, or make a \
-                     certificate with the authority that it has"
-                        .into()
-                }
-                AlertDescription::CertificateExpired => {
-                    "it holds it for expired or not valid yet, which it is not by the clock here: set both clocks".into()
-                }
-                AlertDescription::ProtocolVersion => "it does not speak TLS 1.3".into(),
-                other => format!("{other:?}; its own log says more"),
-            },
-            _ => format!("it closed the connection ({e}); its own log says more"),
+    fn refused(&self, e: &ConnectionError) -> TlsError {
+        let why = match alert(e) {
+            Some(AlertDescription::UnknownCA | AlertDescription::DecryptError) => {
+                "its ca.pem is of another authority; copy there the one with which this certificate was made, or make a \
+                 certificate with the authority that it has"
+                    .into()
+            }
+            Some(AlertDescription::CertificateExpired) => {
+                "it holds it for expired or not valid yet, which it is not by the clock here: set both clocks".into()
+            }
+            Some(AlertDescription::NoApplicationProtocol) => {
+                "it speaks QUIC and is no replay server of this program".into()
+            }
+            Some(other) => format!("{other:?}; its own log says more"),
+            None => format!("it closed the connection ({e}); its own log says more"),
         };
         TlsError::Refused {
             endpoint: self.endpoint.into(),
@@ -196,21 +234,25 @@ impl Handshake<'_> {
     }
 }
 
-fn no_tls() -> String {
-    "it does not speak TLS: start the replay server with --tls-dir and --listen tls/HOST:PORT, or connect with tcp/HOST:PORT and \
+/// How rustls begins what it says of a certificate.
+const BAD_CERTIFICATE: &str = "invalid peer certificate";
+
+/// The codes with which QUIC closes a connection for an alert of TLS, which is the low byte.
+const ALERTS: std::ops::Range<u64> = 0x100..0x200;
+
+/// What the other side's TLS says.
+fn alert(e: &ConnectionError) -> Option<AlertDescription> {
+    let ConnectionError::ConnectionClosed(close) = e else {
+        return None;
+    };
+    let code = u64::from(close.error_code);
+    ALERTS
+        .contains(&code)
+        .then(|| AlertDescription::from((code - ALERTS.start) as u8))
+}
+
+fn no_quic() -> String {
+    "it does not speak QUIC: start the replay server with --tls-dir and --listen quic/HOST:PORT, or connect with tcp/HOST:PORT and \
      without --tls-dir to one that does not have it"
         .into()
-}
-
-fn tls_error(e: &io::Error) -> Option<&Error> {
-    e.get_ref()?.downcast_ref()
-}
-
-fn is_timeout(e: &io::Error) -> bool {
-    matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut)
-}
-
-fn set_timeout(tcp: &TcpStream, timeout: Duration) -> io::Result<()> {
-    tcp.set_read_timeout(Some(timeout))?;
-    tcp.set_write_timeout(Some(timeout))
 }

@@ -8,7 +8,7 @@ use std::{
 };
 
 /// Where zenoh says that a handshake failed, in warnings.
-pub const HANDSHAKE_TARGET: &str = "zenoh_link_tls::unicast";
+pub const HANDSHAKE_TARGET: &str = "zenoh_link_commons::quic::unicast";
 /// Where zenoh says that a message was denied, in traces.
 pub const ACCESS_TARGET: &str = "zenoh::net::routing::interceptor::access_control";
 
@@ -51,7 +51,8 @@ pub fn overhear(target: &str, line: &str) {
 /// Why a handshake failed.
 fn connection(line: &str) -> Option<Report> {
     // Zenoh adds to whatever went wrong a guess of its own.
-    let (said, _) = line.split_once(". Hint: increase the system open file limit")?;
+    let (said, _) = line.split_once(" Hint: increase the system open file limit")?;
+    let said = said.strip_prefix("QUIC acceptor failed: ")?;
     let why = if said.contains("peer sent no certificates") {
         "it has no certificate: start that part with --tls-dir, and deploy/certs.sh makes what it needs".into()
     } else if said.contains("UnknownIssuer") || said.contains("BadSignature") {
@@ -68,12 +69,13 @@ fn connection(line: &str) -> Option<Report> {
     {
         "its certificate is a replay server's, which connects to nobody: each part has its own"
             .into()
-    } else if said.contains("corrupt message") {
-        "it does not speak TLS: start that part with --tls-dir, and --connect tls/HOST:PORT".into()
-    } else if said.contains("received fatal alert") {
-        format!("it refuses this replay server's certificate ({said}): its own log says why")
-    } else if said.contains("Timeout during TLS handshake") || said.contains("eof") {
-        "it connected and said nothing that TLS begins with".into()
+    } else if said.contains("ConnectionClosed") && said.contains("crypto") {
+        "it refuses this replay server's certificate: its own log says why".into()
+    } else if said.contains("Closed") {
+        // It gave up, as a part does that is told to end.
+        return None;
+    } else if said.contains("TimedOut") {
+        "it began to connect and did not go on".into()
     } else {
         said.to_owned()
     };
@@ -165,12 +167,21 @@ mod tests {
     #[test]
     fn only_what_was_refused_is_reported() {
         let said = |line: &str| connection(line).map(|it| format!("{it:?}"));
-        let hint = ". Hint: increase the system open file limit.";
-        let no_certificate = said(&format!("peer sent no certificates{hint}")).unwrap();
+        let failed = |why: &str| {
+            let hint = "Hint: increase the system open file limit.";
+            said(&format!("QUIC acceptor failed: {why} at /a/b.rs:1. {hint}"))
+        };
+        let no_certificate = failed("TransportError(\"peer sent no certificates\")").unwrap();
         assert!(no_certificate.contains("it has no certificate"));
-        assert_eq!(said("Error getting client cert common name: x"), None);
+        assert!(failed("TimedOut").unwrap().contains("did not go on"));
+        let gave_up = "ConnectionClosed(ConnectionClose { error_code: APPLICATION_ERROR })";
+        assert_eq!(failed(gave_up), None);
+        assert_eq!(
+            said("Can not accept QUIC connections: acceptor closed"),
+            None
+        );
 
-        let denied = "1f on Interface(lo)+CertCommonName(actor-1)+Transport(Tls) is unauthorized to Query (ingress) on d/batch";
+        let denied = "1f on Interface(lo)+CertCommonName(actor-1)+Transport(Quic) is unauthorized to Query (ingress) on d/batch";
         let Some(Report::Message(text)) = message(denied) else {
             panic!("{denied}");
         };

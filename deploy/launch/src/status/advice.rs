@@ -60,7 +60,7 @@ pub(super) fn to_go_on(snapshot: &Snapshot) -> Vec<String> {
         return needed;
     }
     let endpoint = &snapshot.servers[0].endpoint;
-    let certificates = |endpoint: &str| match session::is_tls(endpoint) {
+    let certificates = |endpoint: &str| match session::is_quic(endpoint) {
         true => " --tls-dir DIR",
         false => "",
     };
