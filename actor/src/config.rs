@@ -5,6 +5,7 @@ use driml_protocol::{
     BufferPool, RunSpec, RunSpecError, TRANSITION_BYTES,
     codec::PAYLOAD_BYTES_MAX,
     config::{Settings, TransportConfig},
+    transitions_max,
 };
 use serde::{Deserialize, Serialize};
 
@@ -108,6 +109,32 @@ impl ActorSettings {
         this.actor.validate()?;
         this.check_chunk()?;
         Ok(this)
+    }
+
+    /// Steps `envs` copies of the world instead of those that the settings say.
+    ///
+    /// # Errors
+    /// Too many, or chunks that are longer than those of this run may be; what to do.
+    pub fn set_envs(&mut self, envs: u32) -> Result<(), ConfigError> {
+        let Config {
+            steps_per_chunk,
+            round_transitions_max,
+            ..
+        } = self.actor;
+        let most = transitions_max(self.actor.envs, steps_per_chunk, round_transitions_max);
+        self.actor.envs = envs;
+        self.actor.validate()?;
+        self.check_chunk()?;
+        let longest = u64::from(envs) * u64::from(self.actor.chunk_steps(1));
+        if longest > most {
+            return Err(ConfigError {
+                key: "envs",
+                value: envs.to_string(),
+                why: "its chunks are longer than the replay server takes in this run, by the settings' actor.envs and \
+                      actor.steps_per_chunk: use fewer, or start the run with more (--envs at the replay server)",
+            });
+        }
+        Ok(())
     }
 
     /// Checks that the longest chunk fits a message.

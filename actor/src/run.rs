@@ -1,12 +1,13 @@
 //! One actor process: join, act, deliver, until told to stop or no longer needed.
 //! The acting itself is `collect`, which knows no network.
 
-use std::time::Duration;
+use std::{sync::Arc, time::Duration};
 
 use anyhow::Context;
 use driml_protocol::{
-    Activity, ActorJoin, Alive, Keys, RunClient, Shutdown, Weights, join, reporter,
+    Activity, ActorJoin, Keys, Life, RunClient, Shutdown, Weights, join, reporter,
     session::{self, Endpoints},
+    tls::Credentials,
 };
 use zenoh::Wait;
 
@@ -25,6 +26,8 @@ const WEIGHTS_WAIT_MAX: Duration = Duration::from_secs(120);
 pub struct RunArgs {
     /// Endpoints of the replay server.
     pub connect: Vec<String>,
+    /// With which certificate it takes part; none without TLS.
+    pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
     /// Which actor this is; unique in the run.
@@ -39,19 +42,23 @@ pub struct RunArgs {
 /// Nobody to join, settings or weights that do not fit, a world that fails, chunks that cannot be delivered.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let session = session::open(&Endpoints {
+    let endpoints = Endpoints {
         listen: Vec::new(),
         connect: args.connect,
-    })?;
+    };
+    let session = session::open_as(
+        &endpoints,
+        &keys,
+        args.credentials.as_deref(),
+        session::SMALL_MESSAGE_BYTES_MAX,
+    )?;
     let Some(hello) = join::hello(&session, &keys, shutdown)? else {
         return Ok(());
     };
     let mut settings = ActorSettings::from_toml(&hello.config_toml)
         .context("the settings that the replay server sent")?;
     if let Some(envs) = args.envs {
-        settings.actor.envs = envs;
-        settings.actor.validate()?;
-        settings.check_chunk()?;
+        settings.set_envs(envs)?;
     }
     if settings.transport.shared_memory && !hello.shared_memory {
         tracing::info!("chunks go through sockets: the replay server cannot read shared memory");
@@ -62,22 +69,19 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         actor: args.actor,
         incarnation: rand::random(),
     };
+    let who = Life::Actor {
+        actor: join.actor,
+        incarnation: join.incarnation,
+    };
     // Before it joins, so that no other process can take its place from then on.
     let client = RunClient::new(session, keys, spec_hash);
     let alive = client
-        .declare_alive(Alive::Actor {
-            actor: join.actor,
-            incarnation: join.incarnation,
-        })
+        .declare_alive(who.alive())
         .map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
     let Some(welcome) = join::as_actor(&client, join, shutdown)? else {
         return Ok(());
     };
     let activity = Activity::new("waits for the learner's first weights");
-    let who = Alive::Actor {
-        actor: join.actor,
-        incarnation: join.incarnation,
-    };
     reporter::start(
         vec![client.clone()],
         who,

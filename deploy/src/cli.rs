@@ -68,6 +68,14 @@ pub(crate) enum Command {
 }
 
 impl Command {
+    /// Whether it listens with certificates, and so is to say whom it refuses.
+    pub(crate) const fn is_guarded(&self) -> bool {
+        match self {
+            Self::ReplayServer(args) => args.tls.is_set(),
+            _ => false,
+        }
+    }
+
     /// Runs the command.
     pub(crate) fn run(self) -> anyhow::Result<()> {
         match self {

@@ -76,7 +76,7 @@ fn values_that_cannot_work() {
         error: 10 frames are no more than the warm-up of 500: ask for more --frames, or --set replay.warmup_transitions=1
     "#]].assert_eq(&usage(&["local", "--env", "chain", "--frames", "10"]));
     expect![[r#"
-        error: "localhost" is no endpoint: take tcp/HOST:PORT, tls/HOST:PORT or unixsock-stream/PATH
+        error: "localhost" is no endpoint: take tcp/HOST:PORT, quic/HOST:PORT or unixsock-stream/PATH
     "#]]
     .assert_eq(&usage(&["local", "--listen", "localhost"]));
     expect![[r#"

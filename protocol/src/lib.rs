@@ -27,6 +27,7 @@ mod client;
 pub mod config;
 pub mod join;
 pub mod session;
+pub mod tls;
 
 mod messages;
 mod process;
@@ -41,14 +42,14 @@ pub use messages::{
     batch::{Batch, BatchHeader, BatchReply, NO_ACTION, POOL_BATCHES},
     batch_request::{BatchRequest, RequestId},
     batch_rows::{BatchStatesMut, RowScalars},
-    chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES},
+    chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES, transitions_max},
     done::Done,
     goodbye::Goodbye,
     hello::Hello,
     insert_reply::{Claim, InsertReply},
     join::{ActorJoin, JoinReply, LearnerJoin},
     parts::{PartName, PartStatus, PartsStatus, WARNINGS_MAX},
-    report::{Report, Warning},
+    report::{Life, Report, Warning},
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
     tally::Tally,
     weights::{
@@ -59,7 +60,7 @@ pub use messages::{
 pub use process::{
     activity::Activity,
     end_signs, fault, last_warning, lock_file,
-    seldom::Seldom,
+    seldom::{Seldom, SeldomEach},
     shutdown::{Shutdown, join_within},
     whole_file,
 };

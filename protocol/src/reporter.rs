@@ -8,9 +8,8 @@ use std::{
 
 use crate::{
     client::RunClient,
-    messages::report::{Report, Warning},
+    messages::report::{Life, Report, Warning},
     process::{activity::Activity, last_warning, shutdown::Shutdown},
-    wire::keys::Alive,
 };
 
 /// How often a part reports although nothing has changed.
@@ -26,7 +25,7 @@ const TIMEOUT: Duration = Duration::from_secs(2);
 /// The operating system gave no thread.
 pub fn start(
     clients: Vec<RunClient>,
-    who: Alive,
+    who: Life,
     activity: Activity,
     shutdown: Shutdown,
 ) -> std::io::Result<JoinHandle<()>> {

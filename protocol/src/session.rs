@@ -12,7 +12,10 @@ use zenoh::{
     query::{ConsolidationMode, Query, QueryTarget, Reply},
 };
 
-use crate::wire::error::CodecError;
+use crate::{
+    tls::{self, Credentials, Role, TlsError},
+    wire::{error::CodecError, keys::Keys},
+};
 
 /// How a part reaches the others.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -39,13 +42,17 @@ pub enum SessionError {
     },
     /// Nobody listens where the session was to connect.
     #[error(
-        "nobody listens on {}, after {} s: is the replay server running, and is the endpoint right?",
+        "nobody listens on {}, after {} s: is the replay server running, and is the endpoint right? One with --tls-dir is reached with \
+         quic/HOST:PORT, which is UDP, and --tls-dir",
         .connect.join(", "), CONNECT_MAX.as_secs()
     )]
     NobodyListens {
         /// Endpoints to connect to.
         connect: Vec<String>,
     },
+    /// A certificate, or the other side's, is not good.
+    #[error(transparent)]
+    Tls(#[from] TlsError),
     /// Nobody is there who could answer.
     #[error("{key}: nobody is there to answer")]
     Nobody {
@@ -97,14 +104,64 @@ const NOBODY_LISTENS: &str = "Unable to connect to any of";
 const STALLED_MAX: Duration = Duration::from_secs(8);
 /// How long a client tries to connect.
 const CONNECT_MAX: Duration = Duration::from_secs(10);
-/// Longest message accepted from a peer, bytes.
-const MESSAGE_BYTES_MAX: usize = 1 << 29;
+/// Longest message accepted from a peer, bytes, where a part does not know its run's sizes yet.
+pub const MESSAGE_BYTES_MAX: usize = 1 << 29;
+/// The same for whoever receives settings, status and pieces of weights alone.
+pub const SMALL_MESSAGE_BYTES_MAX: usize = 1 << 22;
 
 /// Opens a session. A part that listens is the run's router; one that only connects is a client.
 ///
 /// # Errors
 /// An endpoint that cannot be listened on; a client whose endpoint nobody listens on after ten seconds.
 pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
+    open_with(endpoints, MESSAGE_BYTES_MAX, &[])
+}
+
+/// As [`open`], with certificates where there are any: then endpoints are `quic/HOST:PORT` or unix sockets, and a replay server
+/// gives each role of the run with these keys what it needs and no more. Messages of more than `message_bytes_max` bytes, which no
+/// peer of this run sends, are dropped while they come in.
+///
+/// # Errors
+/// As [`open`]; a certificate that either side refuses, and why.
+pub fn open_as(
+    endpoints: &Endpoints,
+    keys: &Keys,
+    credentials: Option<&Credentials>,
+    message_bytes_max: usize,
+) -> Result<Session, SessionError> {
+    let Some(credentials) = credentials else {
+        return open_with(endpoints, message_bytes_max, &[]);
+    };
+    credentials.warn_if_it_expires_soon();
+    for endpoint in endpoints.connect.iter().filter(|it| is_quic(it)) {
+        if !tls::check(endpoint, credentials, CONNECT_MAX)? {
+            let connect = vec![endpoint.clone()];
+            return Err(SessionError::NobodyListens { connect });
+        }
+    }
+    let mut settings = vec![
+        ("transport/link/tls", credentials.zenoh_settings()),
+        (
+            "transport/link/protocols",
+            "[\"quic\", \"unixsock-stream\"]".into(),
+        ),
+    ];
+    if credentials.role() == Role::ReplayServer {
+        settings.push(("access_control", tls::rules(keys)));
+    }
+    open_with(endpoints, message_bytes_max, &settings)
+}
+
+/// Whether an endpoint is reached over QUIC, with certificates.
+pub fn is_quic(endpoint: &str) -> bool {
+    endpoint.starts_with("quic/")
+}
+
+fn open_with(
+    endpoints: &Endpoints,
+    message_bytes_max: usize,
+    more: &[(&str, String)],
+) -> Result<Session, SessionError> {
     let fail = |why: String| SessionError::Open {
         listen: endpoints.listen.clone(),
         connect: endpoints.connect.clone(),
@@ -121,7 +178,7 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
         )
     };
     let router = !endpoints.listen.is_empty();
-    let max = MESSAGE_BYTES_MAX.to_string();
+    let max = message_bytes_max.to_string();
     let stalled_us = STALLED_MAX.as_micros().to_string();
     let connect_ms = CONNECT_MAX.as_millis().to_string();
     let settings: &[(&str, &str)] = &[
@@ -146,7 +203,7 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
         ("transport/unicast/open_timeout", "2000"),
         ("transport/unicast/accept_timeout", "5000"),
         // Long enough for a machine that is busy with much else: a part that got no processor for a while is not gone. One that
-        // died is known at once, as its connection closes.
+        // died is known at once, as its connection closes; over QUIC, which has no system to close it, after this long.
         ("transport/link/tx/lease", "30000"),
         ("transport/link/tx/queue/size/data", "16"),
         (
@@ -163,8 +220,9 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
     ];
     let open_with = |shared_memory: &str| {
         let mut config = zenoh::Config::default();
-        let last = ("transport/shared_memory/enabled", shared_memory);
-        for (key, value) in settings.iter().chain([&last]) {
+        let more = more.iter().map(|(key, value)| (*key, value.as_str()));
+        let last = [("transport/shared_memory/enabled", shared_memory)];
+        for (key, value) in settings.iter().copied().chain(more).chain(last) {
             config
                 .insert_json5(key, value)
                 .map_err(|e| format!("{key} = {value}: {e}"))?;

@@ -5,9 +5,9 @@
 use std::fmt::Debug;
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Alive, Batch, BatchHeader, BatchReply, BatchRequest, Buffer,
-    BufferPool, Chunk, ChunkHeader, Claim, CodecError, Done, End, Goodbye, Hello, Horizon,
-    InsertReply, JoinReply, Kind, LearnerJoin, LearnerStatus, Message, NO_ACTION, PROTOCOL_VERSION,
+    ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, BufferPool,
+    Chunk, ChunkHeader, Claim, CodecError, Done, End, Goodbye, Hello, Horizon, InsertReply,
+    JoinReply, Kind, LearnerJoin, LearnerStatus, Life, Message, NO_ACTION, PROTOCOL_VERSION,
     PartName, PartStatus, PartsStatus, ReplayStatus, Report, RequestId, Returns, RowScalars,
     RunSpec, Tally, TimeoutRule, Waiting, Warning, WeightsHeader, WeightsReply, WeightsRequest,
     WeightsUpload, WeightsVersion,
@@ -285,7 +285,7 @@ fn samples() -> Vec<Sample> {
         }),
         Sample::of(&Done),
         Sample::of(&Report::new(
-            Alive::Learner(5),
+            Life::Learner(5),
             "learns",
             1.5,
             Some(Warning::new("a chunk was refused", 3.0)),

@@ -56,6 +56,13 @@ impl RateLimiter {
             .saturating_add(self.other_shards.inserted)
     }
 
+    /// Rows sampled from all shards.
+    pub const fn rows_sampled_total(&self) -> u64 {
+        self.this_shard
+            .rows_sampled
+            .saturating_add(self.other_shards.rows_sampled)
+    }
+
     /// Takes what the other shards have counted; counts never fall.
     pub fn set_other_shards(&mut self, other_shards: Tally) {
         let Tally {

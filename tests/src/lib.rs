@@ -7,6 +7,7 @@
     reason = "a harness fails by panicking in the test that uses it, and says there what it knows"
 )]
 
+mod certificates;
 mod client;
 mod network;
 mod process;
@@ -14,6 +15,7 @@ mod run_folder;
 mod system;
 mod waiting;
 
+pub use certificates::{Certificates, Valid, skipped_without_openssl};
 pub use client::Client;
 pub use network::Network;
 pub use process::{Ended, Process};

@@ -16,6 +16,7 @@ mod durable;
 mod evaluate;
 mod failures;
 mod leftovers;
+mod lies;
 mod local;
 mod lockstep;
 mod lost_batches;
@@ -26,11 +27,13 @@ mod parity;
 mod procgen;
 mod repo_rules;
 mod resume;
+mod roles;
 mod several_machines;
 mod soak;
 mod status;
 mod successors;
 mod tiny_replay;
+mod tls;
 
 use driml_tests::{Process, TestSystem};
 

@@ -68,7 +68,7 @@ impl Run {
         let endpoint = self.endpoint();
         let args = match machine {
             0 => format!(
-                "replay-server --listen {endpoint} --replay-dir replay {}",
+                "replay-server --listen {endpoint} --insecure-network --replay-dir replay {}",
                 self.flags
             ),
             1 => format!("learner --connect {endpoint} --run-dir run"),

@@ -17,7 +17,7 @@ use crate::{
     flags::BenchReplayArgs,
     measurements::Measurement,
     recording::Recording,
-    replay::{ANSWER_MAX, CHUNKS, Run, touched},
+    replay::{ANSWER_MAX, CHUNKS, Run, Wire, touched},
     taking_part,
 };
 
@@ -35,6 +35,11 @@ pub(super) fn measure(args: &BenchReplayArgs, dir: &Path) -> anyhow::Result<Vec<
     let (effort, recording) = (Effort::new(&args.flags), Recording::play()?);
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
     let endpoint = format!("unixsock-stream/{}/s", folder.path().display());
+    let wire = Wire {
+        endpoint: &endpoint,
+        shared_memory: true,
+        tls_dir: None,
+    };
     let held = format!("replay.capacity_transitions={}", args.held);
     let in_memory = ["--set".to_owned(), held];
     let mut on_disk = in_memory.to_vec();
@@ -50,11 +55,11 @@ pub(super) fn measure(args: &BenchReplayArgs, dir: &Path) -> anyhow::Result<Vec<
             if is_on_disk && dir.exists() {
                 fs::remove_dir_all(dir).with_context(|| format!("emptying {}", dir.display()))?;
             }
-            let mut run = Run::start(&endpoint, true, folder.path(), flags)?;
+            let mut run = Run::start(wire, folder.path(), flags)?;
             of_server(&mut run, &recording, args.held, &effort, found)?;
             if is_on_disk {
                 of_restart(run, dir, &mut restarts, || {
-                    Run::start(&endpoint, true, folder.path(), flags)
+                    Run::start(wire, folder.path(), flags)
                 })?;
             } else {
                 run.end();
@@ -134,7 +139,7 @@ fn insert_one_by_one(
     chunk: (u32, u32),
     effort: &Effort,
 ) -> anyhow::Result<Vec<f64>> {
-    let (client, actor, pool) = run.next_actor();
+    let (client, actor, pool) = run.next_actor()?;
     let alive = taking_part::join_as_actor(&client, actor)?;
     let (mut seconds, first) = (Vec::new(), Instant::now());
     for chunk in recording.chunks(actor, chunk, pool) {
@@ -156,8 +161,8 @@ fn insert_one_by_one(
 }
 
 /// Seconds from each request for a batch to the batch.
-fn ask_one_by_one(run: &Run, effort: &Effort) -> anyhow::Result<Vec<f64>> {
-    let client = run.learner_client();
+fn ask_one_by_one(run: &mut Run, effort: &Effort) -> anyhow::Result<Vec<f64>> {
+    let client = run.learner_client()?;
     let _alive = taking_part::join_as_learner(&client)?;
     let (pool, mut id) = (BufferPool::new(2), RequestId::first(1));
     let (mut seconds, first) = (Vec::new(), Instant::now());

@@ -100,6 +100,9 @@ pub struct BenchReplayArgs {
     /// With it: rounds of both
     #[arg(long, value_name = "N", default_value_t = 3, requires = "replay_dir")]
     pub(crate) rounds: u32,
+    /// Instead: over TCP and over QUIC, with the certificates of replay-server, observer, learner and actors 1 to 5 in this folder
+    #[arg(long, value_name = "DIR", conflicts_with = "replay_dir")]
+    pub(crate) tls_dir: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) flags: BenchFlags,
 }

@@ -95,12 +95,16 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
             alone(Component::Learner, flags, device, instead)
         }
         BenchCommand::Policy(flags) => alone(Component::Policy, flags, cpu, Instead::No),
-        BenchCommand::Replay(args) => match &args.replay_dir {
-            Some(dir) => {
+        BenchCommand::Replay(args) => match (&args.replay_dir, &args.tls_dir) {
+            (Some(dir), _) => {
                 let figures = durable::measure(args, dir)?;
                 measurements::report("durable replay", &figures, machine, &args.flags)
             }
-            None => alone(Component::Replay, &args.flags, cpu, Instead::No),
+            (None, Some(dir)) => {
+                let figures = replay::measure_guarded(&Effort::new(&args.flags), dir)?;
+                measurements::report("guarded replay", &figures, machine, &args.flags)
+            }
+            (None, None) => alone(Component::Replay, &args.flags, cpu, Instead::No),
         },
         BenchCommand::Env(flags) => alone(Component::Env, flags, cpu, Instead::No),
         BenchCommand::System(args) => {

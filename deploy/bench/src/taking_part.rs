@@ -21,13 +21,7 @@ const UPLOAD_MAX: Duration = Duration::from_secs(10);
 /// # Errors
 /// The replay server does not answer or refuses.
 pub(super) fn join_as_actor(client: &RunClient, actor: u32) -> anyhow::Result<LivelinessToken> {
-    let alive = alive(
-        client,
-        Alive::Actor {
-            actor,
-            incarnation: INCARNATION,
-        },
-    )?;
+    let alive = alive(client, Alive::actor(actor, INCARNATION))?;
     let join = ActorJoin {
         actor,
         incarnation: INCARNATION,
@@ -42,7 +36,7 @@ pub(super) fn join_as_actor(client: &RunClient, actor: u32) -> anyhow::Result<Li
 /// # Errors
 /// As [`join_as_actor`].
 pub(super) fn join_as_learner(client: &RunClient) -> anyhow::Result<LivelinessToken> {
-    let alive = alive(client, Alive::Learner(LEARNER))?;
+    let alive = alive(client, Alive::learner(LEARNER))?;
     let join = LearnerJoin {
         learner: LEARNER,
         rows_sampled: 0,

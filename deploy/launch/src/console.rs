@@ -1,11 +1,14 @@
 //! Everything that this program writes to stdout and stderr: messages, the log, progress bars, results.
 //! A terminal or pipe that is gone takes nothing and is no error here; `driml_protocol::end_signs` notices it.
 
-use std::io::{self, ErrorKind, IsTerminal, Write, stderr};
+use std::{
+    fmt,
+    io::{self, ErrorKind, IsTerminal, Write, stderr},
+};
 
-use anyhow::Context;
+use anyhow::Context as _;
 use console::Term;
-use driml_protocol::last_warning;
+use driml_protocol::{last_warning, tls};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
 use tracing::{
     Event, Level, Subscriber,
@@ -13,6 +16,7 @@ use tracing::{
 };
 use tracing_subscriber::{
     EnvFilter, Layer,
+    filter::Targets,
     layer::{Context as LayerContext, SubscriberExt},
     util::SubscriberInitExt,
 };
@@ -61,9 +65,12 @@ pub fn describe(error: &anyhow::Error) -> String {
 ///
 /// zenoh warns of each try to reach a process that is not there yet or any more, which is ours to judge: so only its errors are
 /// logged, and of those neither what its session says of messages that come while it closes, as at the end of every run, nor
-/// that no answer is wanted any more.
-pub fn log_to_stderr() {
-    let usual = "warn,driml=info,zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off";
+/// that no answer is wanted any more. Nor what it says of connections over QUIC that did not come about, and what quinn warns of.
+///
+/// With `guarded`, what zenoh says of those whom it refuses is heard too: [`tls::overhear`].
+pub fn log_to_stderr(guarded: bool) {
+    let usual = "warn,driml=info,zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off,\
+                 zenoh_link_commons::quic=off,quinn=error";
     let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
     let filter = wanted.map_or_else(
         || EnvFilter::new(usual),
@@ -76,15 +83,32 @@ pub fn log_to_stderr() {
             })
         },
     );
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let log = tracing_subscriber::fmt::layer()
         .with_writer(stderr)
         // It would say with `eprintln!`, which panics, that stderr cannot be written to.
         .log_internal_errors(false)
         .with_ansi(stderr().is_terminal())
-        .finish()
-        .with(LastWarning)
+        .with_filter(filter.clone());
+    let refusals = guarded.then(|| {
+        let targets = Targets::new()
+            .with_target(tls::HANDSHAKE_TARGET, Level::WARN)
+            .with_target(tls::ACCESS_TARGET, Level::TRACE);
+        Refusals.with_filter(targets)
+    });
+    tracing_subscriber::registry()
+        .with(log)
+        .with(LastWarning.with_filter(filter))
+        .with(refusals)
         .init();
+}
+
+/// Hands on what zenoh says of those whom it refuses.
+struct Refusals;
+
+impl<S: Subscriber> Layer<S> for Refusals {
+    fn on_event(&self, event: &Event<'_>, _: LayerContext<'_, S>) {
+        tls::overhear(event.metadata().target(), &text(event));
+    }
 }
 
 /// Keeps the last warning or error of the log for those who ask this process how it is.
@@ -92,21 +116,25 @@ struct LastWarning;
 
 impl<S: Subscriber> Layer<S> for LastWarning {
     fn on_event(&self, event: &Event<'_>, _: LayerContext<'_, S>) {
-        if *event.metadata().level() > Level::WARN {
-            return;
+        if *event.metadata().level() <= Level::WARN {
+            last_warning::note(text(event));
         }
-        struct Message(String);
-        impl Visit for Message {
-            fn record_debug(&mut self, field: &Field, value: &dyn std::fmt::Debug) {
-                if field.name() == "message" {
-                    self.0 = format!("{value:?}");
-                }
+    }
+}
+
+/// The text of a line of the log.
+fn text(event: &Event<'_>) -> String {
+    struct Text(String);
+    impl Visit for Text {
+        fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+            if field.name() == "message" {
+                self.0 = format!("{value:?}");
             }
         }
-        let mut message = Message(String::new());
-        event.record(&mut message);
-        last_warning::note(message.0);
     }
+    let mut text = Text(String::new());
+    event.record(&mut text);
+    text.0
 }
 
 /// Where messages go: stderr, above a progress bar if stderr is a terminal. Clones share the bar.

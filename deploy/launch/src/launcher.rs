@@ -3,7 +3,7 @@
 //! Each is a `managed_process`; `status_client` asks how they are, `live_view` shows it and `run_folder` keeps it.
 
 use std::{
-    path::Path,
+    path::{Path, PathBuf},
     time::{Duration, Instant},
 };
 
@@ -52,6 +52,17 @@ const DRAIN_POLL: Duration = Duration::from_millis(100);
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
 const PROCESS_THREADS: u32 = 1;
 
+/// Where the replay server is reached from outside the run.
+#[derive(Clone, Debug, Default)]
+pub struct Outside {
+    /// Where the parts meet, if not at a unix socket of their own; with certificates, where it listens beside that.
+    pub listen: Option<String>,
+    /// The folder of certificates.
+    pub tls_dir: Option<PathBuf>,
+    /// Whether everybody is trusted who can connect.
+    pub insecure_network: bool,
+}
+
 /// Trains with a process for each replay server, the learner and each actor, and leaves `run_dir`; a run that is `resumed` has
 /// that folder already and goes on from the point given.
 ///
@@ -61,7 +72,7 @@ pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
     resumed: Option<ResumePoint>,
-    listen: Option<String>,
+    outside: Outside,
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
@@ -88,8 +99,8 @@ pub fn run(
     let resume_point = resumed.unwrap_or_default();
     let meeting = Meeting::create()?;
     let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
-    if let Some(listen) = listen {
-        endpoints[0] = listen;
+    if let (Some(listen), None) = (&outside.listen, &outside.tls_dir) {
+        endpoints[0].clone_from(listen);
     }
     write_whole(&run_dir.endpoints(), endpoints.join("\n").as_bytes())?;
     let screen = Screen::new(config.frames(), TEMPLATE);
@@ -105,6 +116,7 @@ pub fn run(
         resume_point,
         servers,
         endpoints,
+        outside,
         meeting,
         screen,
         display,
@@ -166,6 +178,7 @@ struct Launch<'a> {
     /// Names of the replay servers, one a shard, and where each listens.
     servers: Vec<String>,
     endpoints: Vec<String>,
+    outside: Outside,
     meeting: Meeting,
     screen: Screen,
     display: Display,
@@ -187,6 +200,21 @@ fn server_names(shards: u32) -> Vec<String> {
     match shards {
         1 => vec!["replay-server".into()],
         _ => (0..shards).map(|i| format!("replay-server-{i}")).collect(),
+    }
+}
+
+impl Outside {
+    /// What the first replay server is told of it, beside where the parts meet.
+    fn flags(&self) -> Vec<String> {
+        let mut flags = Vec::new();
+        if let (Some(listen), Some(folder)) = (&self.listen, &self.tls_dir) {
+            flags.extend(["--listen".into(), listen.clone()]);
+            flags.extend(["--tls-dir".into(), folder.display().to_string()]);
+        }
+        if self.insecure_network {
+            flags.push("--insecure-network".into());
+        }
+        flags
     }
 }
 
@@ -285,6 +313,9 @@ impl Launch<'_> {
             "--config",
             &config,
         ]);
+        if shard == 0 {
+            args.extend(self.outside.flags());
+        }
         if let Some(bug) = self.config.replay.reproduced_bug {
             args.extend(words(&["--reproduce-bug", bug.name()]));
         }

@@ -106,6 +106,15 @@ pub(crate) fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
 }
 
 impl RunConfig {
+    /// Bytes of a version of the weights as the learner publishes it.
+    ///
+    /// # Errors
+    /// A network that cannot be.
+    pub fn weights_bytes(&self) -> driml_model::Result<usize> {
+        let published = self.model.without_dim();
+        published.weights_bytes(self.learner.publish_as)
+    }
+
     pub(crate) fn from_table(table: &Table) -> Result<Self, Usage> {
         let mut config = parts_read(table)?;
         config.validate()?;

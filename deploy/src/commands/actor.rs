@@ -2,12 +2,13 @@
 
 use clap::Args;
 use driml_launch::endpoint::check_endpoints;
+use driml_protocol::tls::Role;
 
-use super::join::{JoinFlags, clean_up_after, join};
+use super::join::{JoinFlags, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct ActorArgs {
-    /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; may be given several times
+    /// Endpoint of the replay server, such as quic/10.0.0.1:7447; may be given several times
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) connect: Vec<String>,
     /// Which actor this is; unique in the run
@@ -17,6 +18,8 @@ pub(crate) struct ActorArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub(crate) envs: Option<u32>,
     #[command(flatten)]
+    pub(crate) tls: TlsFlags,
+    #[command(flatten)]
     pub(crate) join: JoinFlags,
 }
 
@@ -25,10 +28,12 @@ pub(crate) struct ActorArgs {
 /// # Errors
 /// A call that cannot work, or what the actor met.
 pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
-    check_endpoints(&args.connect)?;
+    check_endpoints(&args.connect, args.tls.is_set())?;
+    let credentials = args.tls.credentials(Role::Actor(args.id))?;
     let shutdown = join(&args.join)?;
     let run = driml_actor::RunArgs {
         connect: args.connect,
+        credentials,
         namespace: args.join.namespace,
         actor: args.id,
         envs: args.envs,

@@ -9,6 +9,9 @@ use driml_launch::{
     run_folder::RunFolder,
     status::{self, Connection, Live, endpoints_of},
 };
+use driml_protocol::tls::Role;
+
+use super::join::TlsFlags;
 
 #[derive(Debug, Args)]
 #[command(group = clap::ArgGroup::new("whose").required(true))]
@@ -28,6 +31,8 @@ pub(crate) struct StatusArgs {
     /// Prefix of the run's keys
     #[arg(long, value_name = "NS", default_value = NAMESPACE)]
     pub(crate) namespace: String,
+    #[command(flatten)]
+    pub(crate) tls: TlsFlags,
 }
 
 /// Asks, and prints the answers.
@@ -35,7 +40,8 @@ pub(crate) struct StatusArgs {
 /// # Errors
 /// A call that cannot work, or nobody there.
 pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<()> {
-    check_endpoints(&args.connect)?;
+    check_endpoints(&args.connect, args.tls.is_set())?;
+    let credentials = args.tls.credentials(Role::Observer)?;
     let endpoints = match &args.run {
         None => args.connect.clone(),
         Some(folder) => match endpoints_of(&RunFolder::new(folder))? {
@@ -43,6 +49,6 @@ pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<()> {
             Live::Over(how) => return console::print(&how),
         },
     };
-    let mut connection = Connection::open(&endpoints, &args.namespace)?;
+    let mut connection = Connection::open(&endpoints, &args.namespace, credentials.as_deref())?;
     status::run(&mut connection, args.watch, args.json)
 }

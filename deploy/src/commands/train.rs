@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use driml_launch::{
     console::{self, print},
-    endpoint::check_endpoints,
+    endpoint::check_listening,
     launcher, lockstep, plan, resume,
     run_folder::RunFolder,
 };
@@ -16,11 +16,13 @@ use driml_machine::{
     error::{Usage, usage},
     resources::Machine,
 };
-use driml_protocol::RunSpec;
+use driml_protocol::{RunSpec, session, tls::Role};
 use driml_settings::{
     config::RunConfig,
     flags::{RunFlags, resolve},
 };
+
+use super::join::{NetworkFlag, TlsFlags};
 
 /// What a resumed run has settled.
 const RESUMED: [&str; 11] = [
@@ -57,9 +59,14 @@ pub(crate) struct TrainArgs {
     /// All parts in one process in a fixed order: the same seed gives the same weights
     #[arg(long, conflicts_with = "listen")]
     pub(crate) lockstep: bool,
-    /// Endpoint on which the parts meet [default: a unix socket in a fresh folder]
+    /// Endpoint on which the parts meet [default: a unix socket in a fresh folder]; or, with --tls-dir, on which the replay server
+    /// listens for parts of other machines, such as quic/0.0.0.0:7447, while those of this one meet at a unix socket
     #[arg(long, value_name = "ENDPOINT")]
     pub(crate) listen: Option<String>,
+    #[command(flatten)]
+    pub(crate) tls: TlsFlags,
+    #[command(flatten)]
+    pub(crate) network: NetworkFlag,
     /// End as after Ctrl-C when the process that started this one, which has this number, ends
     #[arg(long, value_name = "PID", hide = true)]
     pub(crate) exit_with_parent: Option<u32>,
@@ -92,7 +99,15 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             (config, from, None)
         }
     };
-    check_endpoints(args.listen.as_slice())?;
+    check_listening(args.listen.as_slice(), args.network.guard(&args.tls))?;
+    if args.tls.is_set() && !args.listen.as_deref().is_some_and(session::is_quic) {
+        return Err(usage!(
+            "--tls-dir is for parts of other machines, which need somewhere to connect to: add --listen quic/HOST:PORT"
+        )
+        .into());
+    }
+    // What is wrong with them is said before anything is made.
+    args.tls.credentials(Role::ReplayServer)?;
     ready_for(config.local.learner_device)?;
     let (shards, actors) = (config.replay.shards, config.local.actors);
     if shards > actors {
@@ -139,7 +154,11 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             &config,
             &run_dir,
             resume_point,
-            args.listen,
+            launcher::Outside {
+                listen: args.listen,
+                tls_dir: args.tls.tls_dir,
+                insecure_network: args.network.insecure_network,
+            },
             args.exit_with_parent,
         )
     }

@@ -3,13 +3,15 @@
 
 use std::{
     path::{Path, PathBuf},
+    sync::Arc,
     time::{Duration, Instant},
 };
 
 use anyhow::Context;
 use driml_model::DeviceName;
 use driml_protocol::{
-    Activity, Alive, BatchHeader, Keys, Shutdown, reporter, shared_memory, whole_file,
+    Activity, BatchHeader, Keys, Life, Shutdown, reporter, shared_memory, tls::Credentials,
+    whole_file,
 };
 
 use super::{
@@ -35,6 +37,8 @@ const TICK: Duration = Duration::from_millis(200);
 pub struct RunArgs {
     /// Endpoints of the replay server; one for each shard.
     pub connect: Vec<String>,
+    /// With which certificate it takes part; none without TLS.
+    pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
     /// Where checkpoints go: `RUN_DIR/checkpoints`.
@@ -50,7 +54,8 @@ pub struct RunArgs {
 /// A device that is not there, no replay server to join, settings that cannot work, an update that failed, a disk that refuses.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let Some(shards) = Shards::join(&args.connect, &keys, shutdown)? else {
+    let credentials = args.credentials.as_deref();
+    let Some(shards) = Shards::join(&args.connect, &keys, credentials, shutdown)? else {
         return Ok(());
     };
     let config = LearnerConfig::from_toml(&shards.config_toml)
@@ -109,7 +114,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let activity = Activity::new("waits for its first batch");
     reporter::start(
         clients.clone(),
-        Alive::Learner(requests.learner),
+        Life::Learner(requests.learner),
         activity.clone(),
         shutdown.clone(),
     )?;

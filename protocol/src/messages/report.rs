@@ -15,11 +15,35 @@ const DOING_MAX: usize = 80;
 /// Bytes of a warning that is passed on.
 const WARNING_MAX: usize = 400;
 
+/// One life of a part, by the number that nobody knows but itself and the replay server.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Life {
+    /// Of an actor.
+    Actor {
+        /// The actor's number in the run.
+        actor: u32,
+        /// This life's.
+        incarnation: u64,
+    },
+    /// Of a learner.
+    Learner(u64),
+}
+
+impl Life {
+    /// How others see that it is connected.
+    pub fn alive(self) -> Alive {
+        match self {
+            Self::Actor { actor, incarnation } => Alive::actor(actor, incarnation),
+            Self::Learner(learner) => Alive::learner(learner),
+        }
+    }
+}
+
 /// A part's account of itself.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Report {
     /// Whose it is.
-    pub who: Alive,
+    pub who: Life,
     /// What it does, such as `plays`; at most 80 bytes.
     pub doing: String,
     /// For how long, seconds.
@@ -49,7 +73,7 @@ impl Warning {
 
 impl Report {
     /// Cut to what may be sent.
-    pub fn new(who: Alive, doing: &str, since_s: f64, last_warning: Option<Warning>) -> Self {
+    pub fn new(who: Life, doing: &str, since_s: f64, last_warning: Option<Warning>) -> Self {
         Self {
             who,
             doing: cut(doing, DOING_MAX),
@@ -88,10 +112,18 @@ impl Message for Report {
         }
         no_payload(payload)
     }
+
+    fn actor(&self) -> Option<u32> {
+        match self.who {
+            Life::Actor { actor, .. } => Some(actor),
+            Life::Learner(_) => None,
+        }
+    }
 }
 
 impl Keyed for Report {
     const KEY: &'static str = "report";
+    const BY_ACTOR: bool = true;
 }
 
 impl Request for Report {
@@ -112,7 +144,7 @@ mod tests {
     #[test]
     fn what_is_too_long_or_no_time_is_refused() {
         let report = |doing: &str, since_s, warning: Option<(&str, f64)>| Report {
-            who: Alive::Learner(1),
+            who: Life::Learner(1),
             doing: doing.into(),
             since_s,
             last_warning: warning.map(|(text, age_s)| Warning {
@@ -136,12 +168,7 @@ mod tests {
             assert!(bad.validate(&[]).is_err(), "{bad:?}");
         }
         assert!(report("plays", 1.0, None).validate(&[1]).is_err());
-        let cut = Report::new(
-            Alive::Learner(1),
-            &long,
-            0.0,
-            Some(Warning::new(&long, 0.0)),
-        );
+        let cut = Report::new(Life::Learner(1), &long, 0.0, Some(Warning::new(&long, 0.0)));
         assert!(cut.validate(&[]).is_ok());
     }
 }

@@ -101,8 +101,10 @@ pub struct ReplayStatus {
     pub chunks_retried: u64,
     /// Batches that did not reach the learner, which asked again; they do not count as served.
     pub batches_retried: u64,
-    /// Messages refused as malformed or foreign.
+    /// Messages refused as malformed or foreign, or because their sender's role may not send them.
     pub messages_refused: u64,
+    /// Connections refused, for want of a good certificate.
+    pub connections_refused: u64,
     /// Rows served since the start.
     pub rows_sampled: u64,
     /// Rows served to a learner that died before it saved what it learned from them; they do not count as sampled.
@@ -177,6 +179,7 @@ impl ReplayStatus {
                 chunks_retried,
                 batches_retried,
                 messages_refused,
+                connections_refused,
                 rows_sampled,
                 rows_unlearned,
                 // Every shard has the whole run's.
@@ -208,6 +211,7 @@ impl ReplayStatus {
             sum.chunks_retried += chunks_retried;
             sum.batches_retried += batches_retried;
             sum.messages_refused += messages_refused;
+            sum.connections_refused += connections_refused;
             sum.rows_sampled += rows_sampled;
             sum.rows_unlearned += rows_unlearned;
             sum.episodes += episodes;
@@ -338,6 +342,7 @@ mod tests {
             chunks_retried: 6 * n,
             batches_retried: 7 * n,
             messages_refused: 8 * n,
+            connections_refused: 9 * n,
             rows_sampled: 9 * n,
             rows_unlearned: 19 * n,
             warmup_transitions: 1_000,

@@ -297,10 +297,7 @@ impl Recovery<'_> {
     fn apply_event(&mut self, event: Event) -> Result<(), String> {
         match event {
             Event::ActorJoined(join) => self.replay.join_actor(join).map(drop),
-            Event::Goodbye(goodbye) => {
-                self.replay.goodbye(&goodbye);
-                Ok(())
-            }
+            Event::Goodbye(goodbye) => self.replay.goodbye(&goodbye).map_or(Ok(()), Err),
             Event::LearnerStarted {
                 learner,
                 rows_sampled,
@@ -325,6 +322,10 @@ impl Recovery<'_> {
             }
             Event::ServedBefore { rows } => {
                 self.replay.count_served_before(rows);
+                Ok(())
+            }
+            Event::ActorsForgotten(actors) => {
+                self.replay.forget_actors(&actors);
                 Ok(())
             }
         }

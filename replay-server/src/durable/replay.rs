@@ -246,10 +246,23 @@ impl DurableReplay {
         Some(reply)
     }
 
+    /// Makes room for an actor if a run's number of them is reached: forgets those that never sent a chunk and of which
+    /// `is_connected` says that their life is gone.
+    pub fn forget_absent_actors(&mut self, is_connected: impl Fn(u32, u64) -> bool) {
+        let absent = self.replay.absent_actors(is_connected);
+        if !absent.is_empty() {
+            self.replay.forget_actors(&absent);
+            self.log_event(|| Event::ActorsForgotten(absent));
+        }
+    }
+
     /// [`Replay::goodbye`].
-    pub fn goodbye(&mut self, goodbye: &Goodbye) {
-        self.replay.goodbye(goodbye);
-        self.log_event(|| Event::Goodbye(*goodbye));
+    pub fn goodbye(&mut self, goodbye: &Goodbye) -> Option<String> {
+        let refused = self.replay.goodbye(goodbye);
+        if refused.is_none() {
+            self.log_event(|| Event::Goodbye(*goodbye));
+        }
+        refused
     }
 
     /// [`Replay::learner_starts`] for `learner`, which is served from now on.

@@ -299,15 +299,39 @@ impl Actors {
         (&mut actor.streams, difference)
     }
 
-    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second goodbye,
-    /// and that of a life that never joined, reveal nothing.
-    pub(crate) fn goodbye(&mut self, goodbye: &Goodbye) -> Difference {
-        let Some(actor) = self.actors.get_mut(&goodbye.actor) else {
-            return Difference::default();
-        };
-        let mut lives = std::iter::once(&mut actor.current).chain(&mut actor.past);
+    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second goodbye
+    /// reveals nothing.
+    ///
+    /// # Errors
+    /// A life that never joined; the reason, for a person.
+    pub(crate) fn goodbye(&mut self, goodbye: &Goodbye) -> Result<Difference, String> {
+        let actor = self.actors.get_mut(&goodbye.actor);
+        let mut lives = actor
+            .into_iter()
+            .flat_map(|it| std::iter::once(&mut it.current).chain(&mut it.past));
         let life = lives.find(|life| life.incarnation == goodbye.incarnation);
-        life.map_or_else(Difference::default, |life| life.goodbye(goodbye.produced))
+        life.map(|life| life.goodbye(goodbye.produced))
+            .ok_or_else(|| format!("no such life of actor {} has joined", goodbye.actor))
+    }
+
+    /// Actors that never sent a chunk and are not connected, if there is no room for one more.
+    pub(crate) fn absent(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
+        if self.actors.len() < ACTORS_MAX {
+            return Vec::new();
+        }
+        let is_absent = |(number, actor): &(&u32, &Actor)| {
+            let has_sent = actor.expected > 0 || !actor.past.is_empty();
+            !has_sent && !is_connected(**number, actor.current.incarnation)
+        };
+        let absent = self.actors.iter().filter(is_absent);
+        absent.map(|(&number, _)| number).collect()
+    }
+
+    /// Forgets these actors.
+    pub(crate) fn forget(&mut self, actors: &[u32]) {
+        for actor in actors {
+            self.actors.remove(actor);
+        }
     }
 }
 

@@ -16,6 +16,8 @@ pub(crate) struct Statistics {
     /// Rows served to a learner that died before it saved what it learned from them.
     pub(crate) rows_unlearned: u64,
     pub(crate) messages_refused: u64,
+    /// Messages by which an actor's own count differed.
+    pub(crate) differences: u64,
     pub(crate) episodes: u64,
     returns_known: u64,
     returns: VecDeque<f64>,

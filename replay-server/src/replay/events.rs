@@ -37,6 +37,8 @@ pub(crate) enum Event {
         /// How many.
         rows: u64,
     },
+    /// [`Replay::forget_actors`].
+    ActorsForgotten(Vec<u32>),
 }
 
 /// What a request for a batch has changed. The draw itself is not repeated: it would need what the ring held then.

@@ -18,6 +18,9 @@ use crate::{
     },
 };
 
+/// Transitions that one life of an actor can have produced, by its own account: three years at three million a second.
+const TRANSITIONS_MAX: u64 = 1 << 48;
+
 impl Replay {
     /// Compresses chunks for this replay; it can do so while the replay is in use elsewhere.
     pub fn packer(&self) -> Packer {
@@ -64,7 +67,6 @@ impl Replay {
         };
         match verdict {
             Verdict::Refused(why) => {
-                tracing::warn!("refused a chunk of actor {}: {why}", chunk.header.actor);
                 self.statistics.messages_refused += 1;
                 Some(InsertReply::Refused { why })
             }
@@ -150,8 +152,8 @@ impl Replay {
                 "a chunk that may take {bytes} bytes; compressed_bytes_max is {max}"
             ));
         }
-        if header.sequence == u64::MAX || header.first_transition.checked_add(transitions).is_none()
-        {
+        let count = header.first_transition.checked_add(transitions);
+        if header.sequence == u64::MAX || count.is_none_or(|count| count > TRANSITIONS_MAX) {
             return Some(format!(
                 "counts that no run reaches: chunk {}, transition {}",
                 header.sequence, header.first_transition
@@ -209,7 +211,12 @@ impl Replay {
     }
 
     fn count(&mut self, actor: u32, Difference { lost, duplicated }: Difference) {
-        if (lost > 0 || duplicated > 0) && !self.quiet {
+        if lost == 0 && duplicated == 0 {
+            return;
+        }
+        self.statistics.differences += 1;
+        // Whoever sends nonsense could make the line come at any rate.
+        if self.statistics.differences.is_power_of_two() && !self.quiet {
             tracing::warn!(
                 "actor {actor}: {lost} transitions lost, {duplicated} stored twice, by its own count"
             );
@@ -223,9 +230,36 @@ impl Replay {
         *transitions_duplicated = transitions_duplicated.saturating_add(duplicated);
     }
 
-    /// Takes an actor's last word; what it produced and is not stored counts as lost, the reverse as stored twice.
-    pub fn goodbye(&mut self, goodbye: &Goodbye) {
-        let difference = self.actors.goodbye(goodbye);
-        self.count(goodbye.actor, difference);
+    /// Takes an actor's last word; what it produced and is not stored counts as lost, the reverse as stored twice. One of a life
+    /// that never joined, or with a count that no run reaches, is refused: gives the reason.
+    pub fn goodbye(&mut self, goodbye: &Goodbye) -> Option<String> {
+        let said = match goodbye.produced {
+            0..=TRANSITIONS_MAX => self.actors.goodbye(goodbye),
+            produced => Err(format!(
+                "actor {} says it produced {produced} transitions, a count that no run reaches",
+                goodbye.actor
+            )),
+        };
+        match said {
+            Ok(difference) => {
+                self.count(goodbye.actor, difference);
+                None
+            }
+            Err(why) => {
+                self.note_refused_message();
+                Some(why)
+            }
+        }
+    }
+
+    /// Who is to be forgotten so that an actor has room, if a run's number of them is reached: those that never sent a chunk and of
+    /// which `is_connected` says that their life is gone, as somebody who joins under one number after the other leaves behind.
+    pub(crate) fn absent_actors(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
+        self.actors.absent(is_connected)
+    }
+
+    /// Forgets these actors.
+    pub(crate) fn forget_actors(&mut self, actors: &[u32]) {
+        self.actors.forget(actors);
     }
 }

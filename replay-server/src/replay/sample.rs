@@ -12,6 +12,10 @@ use crate::{
     sampling::packed_batch::{PackedBatch, PackedStates},
 };
 
+/// How far the version of an affinity matrix may be ahead of the rows served, of which a replay that was started anew may not
+/// know all.
+const VERSION_AHEAD_MAX: u64 = 1 << 32;
+
 impl Replay {
     /// A learner takes over that has learned from `rows_sampled` rows of this replay. What was served beyond them, to one that
     /// died before it saved what it learned, does not count as sampled any more; nor do versions of that one's affinity.
@@ -171,9 +175,16 @@ impl Replay {
     /// # Errors
     /// A matrix of another size, or with an entry that is no probability; it counts as a refused message.
     pub fn set_affinity(&mut self, update: &AffinityUpdate) -> Result<(), CodecError> {
-        self.affinity
-            .update(update)
-            .inspect_err(|_| self.note_refused_message())
+        // A version is a count of updates, each of at least one row.
+        let rows = self.limiter.rows_sampled_total();
+        let set = match update.version.saturating_sub(rows) {
+            0..=VERSION_AHEAD_MAX => self.affinity.update(update),
+            _ => Err(CodecError::Header(format!(
+                "version {} of the affinity, in a run that has served {rows} rows",
+                update.version
+            ))),
+        };
+        set.inspect_err(|_| self.note_refused_message())
     }
 
     /// Takes what the replay's other shards have counted.

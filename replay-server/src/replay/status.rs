@@ -63,6 +63,8 @@ impl Replay {
             chunks_retried: statistics.chunks_retried,
             batches_retried: statistics.batches_retried,
             messages_refused: statistics.messages_refused,
+            // As are these, below.
+            connections_refused: 0,
             rows_sampled: self.limiter.tally().rows_sampled,
             rows_unlearned: statistics.rows_unlearned,
             warmup_transitions: self.config.warmup_transitions,

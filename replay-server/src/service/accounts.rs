@@ -36,7 +36,7 @@ struct Account {
 const fn name(who: Alive) -> PartName {
     match who {
         Alive::Actor { actor, .. } => PartName::Actor(actor),
-        Alive::Learner(_) => PartName::Learner,
+        Alive::Learner { .. } => PartName::Learner,
     }
 }
 
@@ -100,7 +100,7 @@ impl Accounts {
 
     /// A part says what it does; `false` if it does not take part.
     pub(super) fn reported(&mut self, report: Report, now: Instant) -> bool {
-        let account = self.of(report.who);
+        let account = self.of(report.who.alive());
         let known = account.is_some();
         if let Some(account) = account {
             account.report = Some((report, now));
@@ -210,13 +210,12 @@ fn seconds(now: Instant, since: Instant) -> f64 {
 mod tests {
     use std::time::Duration;
 
+    use driml_protocol::Life;
+
     use super::*;
 
-    const fn actor(incarnation: u64) -> Alive {
-        Alive::Actor {
-            actor: 3,
-            incarnation,
-        }
+    fn actor(incarnation: u64) -> Alive {
+        Alive::actor(3, incarnation)
     }
 
     #[test]
@@ -235,7 +234,11 @@ mod tests {
         accounts.heard(actor(9), Some(8), at(7));
         let report = |incarnation| {
             let warning = Some(Warning::new("late", 1.0));
-            Report::new(actor(incarnation), "plays", 2.0, warning)
+            let who = Life::Actor {
+                actor: 3,
+                incarnation,
+            };
+            Report::new(who, "plays", 2.0, warning)
         };
         assert!(accounts.reported(report(1), at(8)));
         assert!(!accounts.reported(report(9), at(8)));
@@ -255,7 +258,7 @@ mod tests {
         assert_eq!(accounts.parts(at(12), |_| Some(at(11))), [expected]);
 
         accounts.joined(actor(2), true, at(20));
-        accounts.joined(Alive::Learner(1), true, at(20));
+        accounts.joined(Alive::learner(1), true, at(20));
         assert_eq!(accounts.actor_lives(), 2);
         let again = &accounts.parts(at(21), |_| None)[1];
         assert_eq!(
@@ -269,7 +272,7 @@ mod tests {
         let now = Instant::now();
         let mut accounts = Accounts::new(now);
         assert_eq!(accounts.missing(false), Some("no learner has joined yet"));
-        let learner = Alive::Learner(5);
+        let learner = Alive::learner(5);
         accounts.joined(learner, true, now);
         assert_eq!(accounts.missing(false), Some("no actor has joined yet"));
         assert_eq!(accounts.missing(true), None);
@@ -302,11 +305,11 @@ mod tests {
         let now = Instant::now();
         let mut accounts = Accounts::new(now);
         for actor in 0..200 {
-            let who = Alive::Actor {
+            let who = Life::Actor {
                 actor,
                 incarnation: 1,
             };
-            accounts.joined(who, true, now);
+            accounts.joined(who.alive(), true, now);
             // The higher the number the newer, and many of one age.
             let age = f64::from((200 - actor) / 50);
             let report = Report::new(who, "plays", 0.0, Some(Warning::new("w", age)));

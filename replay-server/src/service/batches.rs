@@ -31,9 +31,14 @@ impl Service {
         };
         let mut state = self.state();
         let is_allowed = state.check_learner(request.learner);
+        let is_allowed = is_allowed.and_then(|()| self.check_rows(request.rows));
         let heard = is_allowed.and_then(|()| self.hear_of_others(&mut state.replay, &request));
         if let Err(why) = heard {
             state.replay.note_refused_message();
+            state.say(
+                "batch",
+                &format!("a request for a batch was refused: {why}"),
+            );
             drop(state);
             return responder.reply(&BatchReply::Refused { why });
         }
@@ -41,7 +46,7 @@ impl Service {
             Some(_) => SHARD_HOLD_MAX,
             None => HOLD_MAX,
         };
-        let learner = Alive::Learner(request.learner);
+        let learner = Alive::learner(request.learner);
         state.accounts.heard(learner, None, Instant::now());
         state.requests.park(ParkedRequest {
             request,
@@ -51,6 +56,16 @@ impl Service {
         });
         drop(state);
         self.changed.notify_all();
+    }
+
+    /// A batch is as long as the run's are, or a part of one.
+    fn check_rows(&self, rows: u32) -> Result<(), String> {
+        match self.limits.batch_rows {
+            most if (1..=most).contains(&rows) => Ok(()),
+            most => Err(format!(
+                "a batch of {rows} rows; those of this run have {most} (learner.batch_size)"
+            )),
+        }
     }
 
     /// Takes what the learner says of the other shards.

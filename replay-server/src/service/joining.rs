@@ -74,8 +74,9 @@ impl Service {
             },
             Err(Rejection::Taken(why)) => JoinReply::Taken { why },
             Err(Rejection::Refused(why)) => {
-                tracing::warn!("a part was not let in: {why}");
-                self.state().replay.note_refused_message();
+                let mut state = self.state();
+                state.replay.note_refused_message();
+                state.say("join", &format!("a part was not let in: {why}"));
                 JoinReply::Refused { why }
             }
         };
@@ -100,10 +101,14 @@ impl State {
     /// Whether this life of a part is the one that takes part.
     fn takes_part(&self, who: Alive) -> bool {
         match who {
-            Alive::Actor { actor, incarnation } => {
-                self.replay.actor_incarnation(actor) == Some(incarnation)
+            Alive::Actor { actor, .. } => {
+                let life = self.replay.actor_incarnation(actor);
+                life.is_some_and(|life| Alive::actor(actor, life) == who)
             }
-            Alive::Learner(learner) => self.replay.learner() == Some(learner),
+            Alive::Learner { .. } => {
+                let learner = self.replay.learner();
+                learner.is_some_and(|learner| Alive::learner(learner) == who)
+            }
         }
     }
 
@@ -129,18 +134,15 @@ impl State {
             .replay
             .actor_incarnation(actor)
             .filter(|&other| other != incarnation);
-        let connected = |incarnation| {
-            self.members
-                .connected
-                .contains(&Alive::Actor { actor, incarnation })
-        };
-        if other.is_some_and(connected) {
+        if other.is_some_and(|life| self.members.is_connected(actor, life)) {
             return Err(Rejection::Taken(format!(
                 "another process is actor {actor} of this run: give each actor a number of its own (--id)"
             )));
         }
+        self.replay
+            .forget_absent_actors(|actor, life| self.members.is_connected(actor, life));
         let earlier_incarnations = self.replay.join_actor(join).map_err(Rejection::Refused)?;
-        self.open_account(Alive::Actor { actor, incarnation });
+        self.open_account(Alive::actor(actor, incarnation));
         self.count_actors();
         if other.is_some() {
             // A chunk that was left behind.
@@ -155,7 +157,7 @@ impl State {
             rows_sampled,
         } = join;
         let other = self.replay.learner().filter(|&other| other != learner);
-        let connected = |other| self.members.connected.contains(&Alive::Learner(other));
+        let connected = |other| self.members.connected.contains(&Alive::learner(other));
         if other.is_some_and(connected) {
             let why = "another learner takes part in this run, which has one alone";
             return Err(Rejection::Taken(why.into()));
@@ -166,7 +168,7 @@ impl State {
                 .learner_starts(learner, rows_sampled)
                 .map_err(Rejection::Refused)?;
             self.requests.keep_only(learner);
-            self.open_account(Alive::Learner(learner));
+            self.open_account(Alive::learner(learner));
         }
         Ok(0)
     }

@@ -11,16 +11,18 @@ use std::{
 use anyhow::Context;
 use driml_protocol::{
     BatchHeader, BufferPool, Incoming, Keyed, Keys, POOL_BATCHES, QueryWorkers, Request, Responder,
-    RunClient, RunSpec, Shutdown, TRANSITION_BYTES,
+    RunClient, RunSpec, SeldomEach, Shutdown, TRANSITION_BYTES,
     config::{Settings, TransportConfig},
     join_within,
     session::{self, Endpoints},
     shared_memory,
+    tls::{self, Credentials},
 };
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
 use super::{
     accounts::Accounts,
+    limits::Limits,
     members::Members,
     parked::{ParkedChunks, ParkedRequests},
     server::{Service, State},
@@ -54,12 +56,16 @@ pub struct RunArgs {
     pub listen: Vec<String>,
     /// Routers to connect to, if any.
     pub connect: Vec<String>,
+    /// With which certificate it takes part; none without TLS.
+    pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
     /// Which of the replay's shards this is, from 0.
     pub shard: u32,
     /// Updates of the learner after which the run goes on; 0 starts it.
     pub after_updates: u64,
+    /// Bytes of a version of the weights, of which the replay server itself knows nothing; longer uploads are refused.
+    pub weights_bytes_max: usize,
     /// The folder in which the replay is kept, if it is kept on disk; of several shards each has a folder of its own there.
     pub dir: Option<PathBuf>,
     /// The run's resolved settings, which it hands to whoever joins.
@@ -105,16 +111,26 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
                 false
             }
         };
+    let limits = Limits::of(&settings, &spec, args.weights_bytes_max)?;
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let session = session::open(&Endpoints {
+    let endpoints = Endpoints {
         listen: args.listen.clone(),
         connect: args.connect,
-    })?;
+    };
+    // From the first connection on.
+    let reports = args.credentials.is_some().then(tls::listen);
+    let session = session::open_as(
+        &endpoints,
+        &keys,
+        args.credentials.as_deref(),
+        limits.largest(),
+    )?;
     let client = RunClient::new(session, keys, spec.hash());
     let declaring =
         |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
     let service = Arc::new(Service {
         num_actions: spec.num_actions,
+        limits,
         shard: (args.shard, config.shards),
         config_toml: args.config_toml,
         shared_memory: reads_shared_memory,
@@ -128,6 +144,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             chunks: ParkedChunks::default(),
             requests: ParkedRequests::default(),
             timings: Timings::default(),
+            connections_refused: 0,
+            said: SeldomEach::default(),
         }),
         changed: Condvar::new(),
         weights: Mutex::new(weights),
@@ -142,6 +160,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         ..
     } = Answers::declare(&client, &service).map_err(declaring)?;
     threads.extend(service.clone().start_working()?);
+    if let Some(reports) = reports {
+        threads.push(service.clone().start_hearing(reports)?);
+    }
     tracing::info!(
         "replay server listens on {:?}, run {:016x}",
         args.listen,
@@ -198,7 +219,7 @@ fn open_durable(
 }
 
 /// One whole number of another part's settings.
-fn number(settings: &Settings, table: &'static str, key: &str) -> anyhow::Result<u32> {
+pub(super) fn number(settings: &Settings, table: &'static str, key: &str) -> anyhow::Result<u32> {
     let values: toml::Table = settings.table(table)?;
     let value = values.get(key).and_then(toml::Value::as_integer);
     let value = value.with_context(|| format!("{table}.{key} is missing or not a whole number"))?;
@@ -240,48 +261,65 @@ impl<'a> Answers<'a> {
             queryables: Vec::new(),
             threads: Threads::new(),
         };
-        this.answer("insert", 1, Service::insert)?;
-        this.answer("claim", 1, Service::claim)?;
-        this.answer("request", 1, Service::request)?;
-        this.answer("affinity", 1, Service::affinity)?;
+        let limits = service.limits;
+        this.answer("insert", 1, limits.chunk, Service::insert)?;
+        this.answer("claim", 1, limits.small, Service::claim)?;
+        this.answer("request", 1, limits.small, Service::request)?;
+        this.answer("affinity", 1, limits.affinity, Service::affinity)?;
         this.offer("hello", 1, Service::hello)?;
-        this.answer("join-actor", 1, Service::join_actor)?;
-        this.answer("join-learner", 1, Service::join_learner)?;
-        this.answer("goodbye", 1, Service::goodbye)?;
-        this.answer("weights-upload", 1, Service::take_weights)?;
-        this.answer("weights", WEIGHTS_THREADS, Service::give_weights)?;
-        this.answer("report", 1, Service::report)?;
+        this.answer("join-actor", 1, limits.small, Service::join_actor)?;
+        this.answer("join-learner", 1, limits.small, Service::join_learner)?;
+        this.answer("goodbye", 1, limits.small, Service::goodbye)?;
+        this.answer("weights-upload", 1, limits.weights, Service::take_weights)?;
+        this.answer(
+            "weights",
+            WEIGHTS_THREADS,
+            limits.small,
+            Service::give_weights,
+        )?;
+        this.answer("report", 1, limits.small, Service::report)?;
         this.offer("status", 1, Service::status)?;
         this.offer("parts", 1, Service::parts)?;
         Ok(this)
     }
 
-    /// Answers requests `R` with `answer`, on so many threads of this name.
+    /// Answers requests `R` of at most `bytes_max` bytes with `answer`, on so many threads of this name.
     fn answer<R: Request + 'static>(
         &mut self,
-        name: &str,
+        name: &'static str,
         threads: usize,
+        bytes_max: usize,
         answer: fn(&Service, Incoming<R>),
     ) -> zenoh::Result<()> {
         let (service, spec_hash) = (self.service.clone(), self.client.spec_hash());
         let answer = move |incoming| answer(&service, incoming);
-        self.add(QueryWorkers::answer(name, threads, spec_hash, answer)?)
+        let workers = QueryWorkers::answer(name, threads, spec_hash, answer)?;
+        self.add(name, bytes_max, workers)
     }
 
     /// Gives an `M` to whoever fetches it, on so many threads of this name.
     fn offer<M: Keyed + 'static>(
         &mut self,
-        name: &str,
+        name: &'static str,
         threads: usize,
         give: fn(&Service, Responder<M>),
     ) -> zenoh::Result<()> {
         let (service, spec_hash) = (self.service.clone(), self.client.spec_hash());
         let give = move |responder| give(&service, responder);
-        self.add(QueryWorkers::offer(name, threads, spec_hash, give)?)
+        let workers = QueryWorkers::offer(name, threads, spec_hash, give)?;
+        self.add(name, self.service.limits.small, workers)
     }
 
-    fn add<M: Keyed + 'static>(&mut self, workers: QueryWorkers<M>) -> zenoh::Result<()> {
-        self.queryables.push(workers.declare(self.client)?);
+    fn add<M: Keyed + 'static>(
+        &mut self,
+        name: &'static str,
+        bytes_max: usize,
+        workers: QueryWorkers<M>,
+    ) -> zenoh::Result<()> {
+        let service = self.service.clone();
+        let refused = move |bytes| service.refuse_long(name, bytes, bytes_max);
+        let queryable = workers.declare_limited(self.client, bytes_max, refused)?;
+        self.queryables.push(queryable);
         self.threads.extend(workers.into_threads());
         Ok(())
     }

@@ -18,9 +18,12 @@ impl Service {
     pub(super) fn goodbye(&self, incoming: Incoming<Goodbye>) {
         if let Some(goodbye) = self.read(&incoming) {
             let mut state = self.state();
-            state.replay.goodbye(&goodbye);
+            if let Some(why) = state.replay.goodbye(&goodbye) {
+                state.say("goodbye", &format!("a goodbye was refused: {why}"));
+            }
             let is_ready = state.replay.is_ready();
             drop(state);
+            // Whoever says goodbye has nothing to do any more, with whatever it has said.
             if is_ready {
                 incoming.into_responder().reply(&Done);
             }
@@ -42,12 +45,15 @@ impl Service {
                 Err(why)
             }
         };
+        if let Err(why) = set {
+            let line = format!("an affinity matrix was refused: {why}");
+            state.say("affinity", &line);
+            return;
+        }
         let is_ready = state.replay.is_ready();
         drop(state);
-        match set {
-            Ok(()) if !is_ready => {}
-            Ok(()) => incoming.into_responder().reply(&Done),
-            Err(why) => tracing::warn!("an affinity matrix was refused: {why}"),
+        if is_ready {
+            incoming.into_responder().reply(&Done);
         }
     }
 
@@ -114,6 +120,7 @@ impl Service {
     pub(super) fn status(&self, responder: Responder<ReplayStatus>) {
         let state = self.state();
         let mut status = state.replay.status();
+        status.connections_refused = state.connections_refused;
         status.actors_acting = state.members.actors_acting();
         status.actors_waiting = state.chunks.len() as u32;
         status.answer_ms = state.timings.answer_ms();

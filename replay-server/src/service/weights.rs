@@ -44,8 +44,9 @@ impl Service {
                 incoming.into_responder().reply(&Done);
             }
             Err(why) => {
-                tracing::warn!("weights were refused: {why}");
-                self.state().replay.note_refused_message();
+                let mut state = self.state();
+                state.replay.note_refused_message();
+                state.say("weights", &format!("weights were refused: {why}"));
             }
         }
     }

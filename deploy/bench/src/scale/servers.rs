@@ -83,7 +83,11 @@ impl Servers {
                 meeting: None,
             };
             let mut process = ManagedProcess::start(&name, &args, 1, surroundings)?;
-            let session = reach(&endpoint, &mut process)?;
+            let at = Endpoints {
+                listen: Vec::new(),
+                connect: vec![endpoint.clone()],
+            };
+            let session = reach(&mut process, || session::open(&at))?;
             if let Err(e) = session.close().wait() {
                 tracing::debug!("closing a session: {e}");
             }

@@ -36,7 +36,7 @@ pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Resu
         stack => format!("{stack} frames each"),
     };
     let published = config.learner.publish_as;
-    let weights = config.model.without_dim().weights_bytes(published)?;
+    let weights = config.weights_bytes()?;
     let every_weights = every.model.weights_bytes(StoredAs::F32)?;
     let scalars = batch(run) - states(run, 2 + positives);
     let every_scalars = batch(&every.run) - states(&every.run, 2 + every_positives);

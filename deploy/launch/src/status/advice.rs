@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use driml_machine::units::duration;
-use driml_protocol::{PartName, PartStatus, PartsStatus, Waiting};
+use driml_protocol::{PartName, PartStatus, PartsStatus, Waiting, session};
 
 use super::snapshot::{ServerAnswer, Snapshot};
 
@@ -60,10 +60,15 @@ pub(super) fn to_go_on(snapshot: &Snapshot) -> Vec<String> {
         return needed;
     }
     let endpoint = &snapshot.servers[0].endpoint;
+    let certificates = |endpoint: &str| match session::is_quic(endpoint) {
+        true => " --tls-dir DIR",
+        false => "",
+    };
     let connects = snapshot.servers.iter();
-    let connects: String = connects
+    let mut connects: String = connects
         .map(|it| format!(" --connect {}", it.endpoint))
         .collect();
+    connects.push_str(certificates(endpoint));
     match parts(snapshot).find(|(_, part)| part.who == PartName::Learner) {
         None => needed.push(format!(
             "no learner has joined: start `driml learner{connects} --run-dir DIR`"
@@ -88,7 +93,8 @@ pub(super) fn to_go_on(snapshot: &Snapshot) -> Vec<String> {
             Some(_) => "all actors are gone".to_owned(),
         };
         needed.push(format!(
-            "{first}: start `driml actor --connect {endpoint} --id N`, each with a number of its own"
+            "{first}: start `driml actor --connect {endpoint}{} --id N`, each with a number of its own",
+            certificates(endpoint)
         ));
         return needed;
     }
@@ -103,8 +109,9 @@ pub(super) fn to_go_on(snapshot: &Snapshot) -> Vec<String> {
             .map_or(f64::INFINITY, |(_, _, said)| *said);
         if !actor.connected {
             needed.push(format!(
-                "actor-{id} is gone since {}; the others go on. To have it again: `driml actor --connect {endpoint} --id {id}`",
-                seconds(actor.since_s)
+                "actor-{id} is gone since {}; the others go on. To have it again: `driml actor --connect {endpoint}{} --id {id}`",
+                seconds(actor.since_s),
+                certificates(endpoint)
             ));
         } else if silent > SILENT && says > SILENT && actor.held_s.is_none() {
             needed.push(format!(

@@ -6,7 +6,8 @@ use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{
     Hello, Keyed, Keys, LearnerStatus, PartsStatus, ReplayStatus, RunClient, codec,
-    session::{self, Endpoints, SessionError},
+    session::{self, Endpoints, SMALL_MESSAGE_BYTES_MAX, SessionError},
+    tls::Credentials,
 };
 use driml_settings::config::RunConfig;
 use zenoh::bytes::ZBytes;
@@ -29,19 +30,24 @@ pub struct Connection {
 }
 
 impl Connection {
-    /// Connects to the replay servers at `endpoints`.
+    /// Connects to the replay servers at `endpoints`, with an observer's certificate where they want one.
     ///
     /// # Errors
     /// Nobody listens there, or somebody who is no replay server of this program and namespace.
-    pub fn open(endpoints: &[String], namespace: &str) -> anyhow::Result<Self> {
+    pub fn open(
+        endpoints: &[String],
+        namespace: &str,
+        credentials: Option<&Credentials>,
+    ) -> anyhow::Result<Self> {
         let keys = Keys::new(namespace).map_err(driml_machine::error::Usage)?;
         let mut servers = Vec::new();
         let mut config = None;
         for endpoint in endpoints {
-            let session = session::open(&Endpoints {
+            let reached = Endpoints {
                 listen: Vec::new(),
                 connect: vec![endpoint.clone()],
-            })?;
+            };
+            let session = session::open_as(&reached, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
             let nothing = ZBytes::new();
             let hello = session::ask(
                 &session,
