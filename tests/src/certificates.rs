@@ -7,6 +7,8 @@ use std::{
     process::Command,
 };
 
+use crate::skipped::skip;
+
 /// A folder for `--tls-dir`, with everything in it.
 #[derive(Debug)]
 pub struct Certificates {
@@ -26,7 +28,7 @@ pub enum Valid {
 pub fn skipped_without_openssl(test: &str) -> bool {
     let is_there = Command::new("openssl").arg("version").output().is_ok();
     if !is_there {
-        crate::skip(test, "openssl is not there");
+        skip(test, "openssl is not there");
     }
     !is_there
 }

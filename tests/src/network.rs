@@ -6,7 +6,7 @@ use std::{
     sync::atomic::{AtomicU32, Ordering},
 };
 
-use crate::skip;
+use crate::skipped::skip;
 
 /// Namespaces joined by a router. Dropping it removes them; what runs in one is to have ended before.
 #[derive(Debug)]

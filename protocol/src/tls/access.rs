@@ -1,7 +1,7 @@
 //! What each role may do, as rules for zenoh's access control at the replay server: everything else is denied.
 //! A message is let in by its sender's common name and its key alone; what it says is checked by whoever answers it.
 
-use super::{ACTORS_MAX, Role};
+use super::role::{ACTORS_MAX, Role};
 use crate::{
     messages::{
         affinity::AffinityUpdate,

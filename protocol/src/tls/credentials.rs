@@ -18,7 +18,10 @@ use rustls::{
 };
 use x509_parser::prelude::{FromDer, X509Certificate};
 
-use super::{ACTORS_MAX, Role, TlsError};
+use super::{
+    role::{ACTORS_MAX, Role},
+    sentences::TlsError,
+};
 
 /// A certificate that expires sooner is warned of at the start.
 const EXPIRES_SOON: Duration = Duration::from_secs(14 * 24 * 3600);

@@ -12,8 +12,8 @@ use rustls::{AlertDescription, ClientConfig, version::TLS13};
 use tokio::time::{sleep, timeout};
 
 use super::{
-    TlsError,
     credentials::{Credentials, provider},
+    sentences::TlsError,
 };
 
 /// How long one try may take. Nobody is there who could say that nobody listens: a try gets an answer or none.

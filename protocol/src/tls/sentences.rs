@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 
-use super::{ACTORS_MAX, Role};
+use super::role::{ACTORS_MAX, Role};
 
 /// Why a part cannot take part with its certificate.
 #[derive(Debug, thiserror::Error)]

@@ -1,9 +1,8 @@
 //! How long a message of each kind can be in this run, from its own settings: longer ones are no part's.
 //! It refuses nothing.
 
+use anyhow::Context;
 use driml_protocol::{RunSpec, TRANSITION_BYTES, config::Settings, transitions_max};
-
-use super::run::number;
 
 /// What stands before a payload: the prefix and the header.
 const HEAD_BYTES_MAX: usize = 1 << 12;
@@ -56,4 +55,12 @@ impl Limits {
     pub(super) fn largest(&self) -> usize {
         self.chunk.max(self.weights).max(self.affinity)
     }
+}
+
+/// One whole number of another part's settings.
+pub(super) fn number(settings: &Settings, table: &'static str, key: &str) -> anyhow::Result<u32> {
+    let values: toml::Table = settings.table(table)?;
+    let value = values.get(key).and_then(toml::Value::as_integer);
+    let value = value.with_context(|| format!("{table}.{key} is missing or not a whole number"))?;
+    u32::try_from(value).with_context(|| format!("{table}.{key} = {value} cannot work"))
 }

@@ -8,7 +8,6 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::Context;
 use driml_protocol::{
     BatchHeader, BufferPool, Incoming, Keyed, Keys, POOL_BATCHES, QueryWorkers, Request, Responder,
     RunClient, RunSpec, SeldomEach, Shutdown, TRANSITION_BYTES,
@@ -22,7 +21,7 @@ use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
 use super::{
     accounts::Accounts,
-    limits::Limits,
+    limits::{Limits, number},
     members::Members,
     parked::{ParkedChunks, ParkedRequests},
     server::{Service, State},
@@ -216,14 +215,6 @@ fn open_durable(
         tracing::info!("keeps the replay in {}", dir.display());
     }
     Ok((replay, WeightsStore::kept_in(&dir, spec.hash())))
-}
-
-/// One whole number of another part's settings.
-pub(super) fn number(settings: &Settings, table: &'static str, key: &str) -> anyhow::Result<u32> {
-    let values: toml::Table = settings.table(table)?;
-    let value = values.get(key).and_then(toml::Value::as_integer);
-    let value = value.with_context(|| format!("{table}.{key} is missing or not a whole number"))?;
-    u32::try_from(value).with_context(|| format!("{table}.{key} = {value} cannot work"))
 }
 
 /// Bytes of shared memory that all actors of the run make for their chunks together, as far as the settings know of them.
