@@ -110,6 +110,17 @@ const ARROWS: &[(&str, &str, &[&str])] = &[
     ),
     ("driml", "deploy", ALL),
     ("driml-tests", "tests", ALL),
+    (
+        "driml-decoders",
+        "tests/decoders",
+        &[
+            "driml-protocol",
+            "driml-actor",
+            "driml-replay-server",
+            "driml-learner",
+            "driml-settings",
+        ],
+    ),
 ];
 
 pub(crate) fn root() -> PathBuf {

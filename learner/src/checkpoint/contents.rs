@@ -40,9 +40,28 @@ pub(super) struct StateFile {
     pub(super) sha256: BTreeMap<String, String>,
 }
 
+/// Reads a `state.json` and throws it away: for whoever tries what such a file may hold.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn check_state(text: &[u8]) -> Result<(), String> {
+    StateFile::read(text).map(drop)
+}
+
 impl StateFile {
+    /// Reads the file's text and checks what it holds.
+    pub(super) fn read(text: &[u8]) -> Result<Self, String> {
+        let state: Self = serde_json::from_slice(text).map_err(|e| e.to_string())?;
+        if !(1..=FORMAT).contains(&state.format) {
+            let format = state.format;
+            return Err(format!("its format is {format}, not 1 to {FORMAT}"));
+        }
+        state.check_valid()?;
+        Ok(state)
+    }
+
     /// Checks what its types do not hold: a file may be right by its sum and still not be one that a learner wrote.
-    pub(super) fn check_valid(&self) -> Result<(), String> {
+    fn check_valid(&self) -> Result<(), String> {
         for (name, count) in [
             ("updates", self.updates),
             ("adam_step", self.adam_step),

@@ -7,9 +7,7 @@ use driml_model::{Compute, Encoder, ModelConfig, Parameters};
 use rand_chacha::ChaCha8Rng;
 
 use super::{
-    contents::{
-        FORMAT, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of, sha256_of,
-    },
+    contents::{KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of, sha256_of},
     error::{CheckpointError, damaged},
     folder::{list, read},
 };
@@ -69,15 +67,7 @@ pub fn load(
             format!("its SHA-256 is not the one in {STATE_SUM}"),
         ));
     }
-    let state: StateFile =
-        serde_json::from_slice(&text).map_err(|why| damaged(path, STATE, why.to_string()))?;
-    if !(1..=FORMAT).contains(&state.format) {
-        return Err(damaged(
-            path,
-            STATE,
-            format!("its format is {}, not 1 to {FORMAT}", state.format),
-        ));
-    }
+    let state = StateFile::read(&text).map_err(|why| damaged(path, STATE, why))?;
     let expected = hex_of(run_spec_hash);
     if state.run_spec_hash != expected {
         let (folder, found) = (path.to_owned(), state.run_spec_hash);
@@ -91,9 +81,6 @@ pub fn load(
     if state.format == 1 && has_key {
         return Err(CheckpointError::WithoutKeyEncoder(path.to_owned()));
     }
-    state
-        .check_valid()
-        .map_err(|why| damaged(path, STATE, why))?;
     let tensors = |name: &str| {
         let bytes = read(&path.join(name))?;
         if state.sha256.get(name) == Some(&sha256_of(&bytes)) {

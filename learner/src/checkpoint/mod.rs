@@ -7,6 +7,7 @@ mod folder;
 mod load;
 mod save;
 
+pub use contents::check_state;
 pub use error::CheckpointError;
 pub use folder::{FOLDER, list, lock};
 pub use load::{Restored, load, load_latest};
