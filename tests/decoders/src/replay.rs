@@ -65,6 +65,8 @@ fn config(shards: u32) -> Config {
         shards,
         compression: Compression::None,
         compressed_bytes_max: None,
+        disk_bytes_max: None,
+        fsync_ms: None,
         replay_ratio: 2.0,
         warmup_transitions: 8,
         slack_transitions: 16,
