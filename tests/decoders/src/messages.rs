@@ -137,7 +137,7 @@ fn sealed(bytes: &[u8]) -> Option<(Vec<u8>, Read)> {
     Some((message, read))
 }
 
-/// What [`messages`] takes, of a message's bytes.
+/// What the decoder `messages` takes, of a message's bytes.
 pub fn forged(message: &[u8]) -> Vec<u8> {
     let kind = u16::from_le_bytes([message[6], message[7]]);
     let at = KINDS.iter().position(|(known, _)| *known as u16 == kind);
