@@ -152,6 +152,14 @@ pub enum InstallError {
         /// What is wrong with it.
         reason: String,
     },
+    /// Another build of the library, without the pictures that it reads.
+    #[error(
+        "the library {} is no engine without its pictures: put Procgen's folder `assets` beside it or beside its folder", library.display()
+    )]
+    NoAssets {
+        /// The library's file.
+        library: PathBuf,
+    },
     /// The file system refused something.
     #[error("installing procgen's engine: {doing} {path}: {source} {WITHOUT_ENGINE}")]
     Io {
