@@ -1,6 +1,6 @@
 //! Why a world could not be made or stepped.
 
-use crate::worlds::exec::ExecError;
+use crate::worlds::exec::error::ExecError;
 
 /// Why a world could not be made or stepped.
 #[derive(Debug, thiserror::Error)]

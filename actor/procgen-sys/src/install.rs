@@ -81,8 +81,10 @@ impl Engine {
     pub fn other(library: &Path) -> Result<Engine, InstallError> {
         library::check_machine()?;
         // The loader takes a name without a folder for one of the system's.
-        let library = fs::canonicalize(library)
-            .map_err(|error| InstallError::io("finding another build of it,", library, error))?;
+        let library = fs::canonicalize(library).map_err(|error| InstallError::NoLibrary {
+            library: library.to_owned(),
+            reason: error.to_string(),
+        })?;
         let folders = library.ancestors().skip(1).take(2);
         let assets = folders
             .map(|folder| folder.join("assets"))

@@ -140,6 +140,10 @@ const PINNED: &[(&str, &[Pinned])] = &[
         ("run.frame_stack", "4", "Mnih et al. 2015"),
         ("world.start_timeout_ms", "120000", "ours"),
         ("world.step_timeout_ms", "60000", "ours"),
+        ("learner.update.lambda.3t3", "0.0", "paper"),
+        ("learner.update.lambda.3t4", "0.0", ""),
+        ("learner.update.lambda.4t3", "0.0", ""),
+        ("learner.update.lambda.4t4", "1.0", "paper"),
     ]),
     ("agent/c51", &[
         ("run.horizon.rule", r#""none""#, ""),

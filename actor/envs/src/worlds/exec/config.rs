@@ -4,15 +4,14 @@ use std::time::Duration;
 
 use rand::Rng;
 use serde::{Deserialize, Serialize};
+use tracing::Level;
 
 use super::error::ExecError;
 use super::messages::{Declaration, Request};
 use super::process::{Patience, WorldProcess};
-use super::world::ExecWorld;
 use crate::copies::{RngUse, copy_rng};
-use crate::environment::{Environment, FrameShape};
+use crate::environment::FrameShape;
 use crate::error::EnvError;
-use crate::settings::{Variants, WorldSettings};
 
 /// Longest side of a frame, in pixels.
 const SIDE_MAX: usize = 4096;
@@ -131,16 +130,16 @@ const fn start_patience(timeout_ms: u64) -> Patience {
     }
 }
 
-/// Starts a world's process, asks it for `copies`, and hears what it declares.
+/// Starts a world's process, asks it for a copy for each of `seeds`, and hears what it declares. Its stderr is logged at `level`.
 pub(super) fn introduce(
     command: &str,
     patience: Patience,
     seeds: Vec<u32>,
+    level: Level,
 ) -> Result<(WorldProcess, Declaration), ExecError> {
-    let mut process = WorldProcess::start(command)?;
+    let mut process = WorldProcess::start(command, level)?;
     let mut request = serde_json::to_vec(&Request::new(seeds)).expect("plain numbers are JSON");
     request.push(b'\n');
-    // One that ended before it was asked says more by how it ended.
     let doing = "before it declared itself";
     process.say(&request, doing)?;
     let line = process.line(patience, doing)?;
@@ -157,7 +156,12 @@ pub fn declaration(
     start_timeout_ms: u64,
     step_timeout_ms: u64,
 ) -> Result<ExecConfig, EnvError> {
-    let (process, declared) = introduce(command, start_patience(start_timeout_ms), vec![0])?;
+    let (process, declared) = introduce(
+        command,
+        start_patience(start_timeout_ms),
+        vec![0],
+        Level::DEBUG,
+    )?;
     drop(process);
     let config = ExecConfig {
         command: command.into(),
@@ -177,39 +181,4 @@ pub(super) fn seeds(seed: u64, copies: usize) -> Vec<u32> {
     (0..copies)
         .map(|copy| copy_rng(seed, copy, RngUse::Game).random::<u32>() >> 1)
         .collect()
-}
-
-impl WorldSettings for ExecConfig {
-    fn validate(&self) -> Result<(), EnvError> {
-        ExecConfig::validate(self)
-    }
-
-    fn frame_shape(&self) -> FrameShape {
-        ExecConfig::frame_shape(self)
-    }
-
-    fn action_names(&self) -> Vec<&str> {
-        self.actions.iter().map(String::as_str).collect()
-    }
-
-    fn build(
-        &self,
-        num_envs: usize,
-        seed: u64,
-        _threads: usize,
-    ) -> Result<Box<dyn Environment>, EnvError> {
-        Ok(Box::new(ExecWorld::new(self, num_envs, seed)?))
-    }
-
-    fn variants() -> Variants {
-        Variants {
-            key: "command",
-            names: &[],
-            is_open: true,
-        }
-    }
-
-    fn variant(&self) -> Option<&str> {
-        Some(&self.command)
-    }
 }

@@ -23,7 +23,7 @@
 
 mod block;
 mod config;
-mod error;
+pub(crate) mod error;
 mod messages;
 mod process;
 #[cfg(test)]

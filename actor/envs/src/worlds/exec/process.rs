@@ -14,6 +14,7 @@ use std::time::{Duration, Instant};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::{Signal, killpg};
 use nix::unistd::Pid;
+use tracing::Level;
 
 use super::error::{ExecError, Fault, LastWords};
 
@@ -63,12 +64,12 @@ pub(super) struct WorldProcess {
 }
 
 impl WorldProcess {
-    /// Starts the command.
+    /// Starts the command; what it writes to stderr is logged at `level`.
     ///
     /// # Errors
     /// The operating system refuses.
-    pub(super) fn start(command: &str) -> Result<Self, ExecError> {
-        Self::try_start(command).map_err(|source| ExecError {
+    pub(super) fn start(command: &str, level: Level) -> Result<Self, ExecError> {
+        Self::try_start(command, level).map_err(|source| ExecError {
             command: command.into(),
             fault: Fault::System {
                 doing: "starting it",
@@ -78,7 +79,7 @@ impl WorldProcess {
         })
     }
 
-    fn try_start(command: &str) -> io::Result<Self> {
+    fn try_start(command: &str, level: Level) -> io::Result<Self> {
         let mut guard = Command::new(SHELL)
             .args(["-c", GUARD])
             .stdin(Stdio::piped())
@@ -109,6 +110,7 @@ impl WorldProcess {
         let log = Log {
             stderr: child.stderr.take().expect(pipe),
             words: Arc::clone(&words),
+            level,
             _speaks: speaks,
         };
         thread::Builder::new()
@@ -125,18 +127,18 @@ impl WorldProcess {
         })
     }
 
-    /// Says something to it.
+    /// Says something to it. Whether it has ended is found out when its answer is read: what it said before that counts.
     ///
     /// # Errors
-    /// It has ended.
+    /// The operating system refuses.
     pub(super) fn say(&mut self, bytes: &[u8], doing: &'static str) -> Result<(), ExecError> {
         let said = match &mut self.to {
             Some(to) => to.write_all(bytes).and_then(|()| to.flush()),
-            None => Err(ErrorKind::BrokenPipe.into()),
+            None => Ok(()),
         };
         match said {
             Ok(()) => Ok(()),
-            Err(e) if e.kind() == ErrorKind::BrokenPipe => Err(self.ended(doing)),
+            Err(e) if e.kind() == ErrorKind::BrokenPipe => Ok(()),
             Err(source) => Err(self.fail(Fault::System { doing, source })),
         }
     }
@@ -290,6 +292,7 @@ fn in_words(status: ExitStatus) -> String {
 struct Log {
     stderr: ChildStderr,
     words: Arc<Mutex<VecDeque<String>>>,
+    level: Level,
     /// Dropped when there is nothing more to say.
     _speaks: Sender<()>,
 }
@@ -311,7 +314,10 @@ impl Log {
             if text.is_empty() {
                 continue;
             }
-            tracing::info!("world: {text}");
+            match self.level {
+                Level::INFO => tracing::info!("world: {text}"),
+                _ => tracing::debug!("world: {text}"),
+            }
             let mut words = self.words.lock().unwrap_or_else(PoisonError::into_inner);
             if words.len() == WORDS_MAX {
                 words.pop_front();

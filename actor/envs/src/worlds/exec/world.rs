@@ -1,5 +1,7 @@
 //! Copies of a game in a process of their own, as the trait has them: a byte to the process and one back for each step.
 
+use tracing::Level;
+
 use super::block::Block;
 use super::config::{ExecConfig, in_words, introduce, seeds};
 use super::error::{ExecError, Fault};
@@ -8,6 +10,7 @@ use super::process::{Patience, WorldProcess};
 use crate::copies::{check_num_envs, check_step};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
+use crate::settings::{Variants, WorldSettings};
 
 /// Says that the actions lie in the block.
 const STEP: u8 = b's';
@@ -34,7 +37,12 @@ impl ExecWorld {
         config.validate()?;
         check_num_envs(num_envs)?;
         let patience = config.start_patience();
-        let (mut process, declared) = introduce(&config.command, patience, seeds(seed, num_envs))?;
+        let (mut process, declared) = introduce(
+            &config.command,
+            patience,
+            seeds(seed, num_envs),
+            Level::INFO,
+        )?;
         let shape = FrameShape {
             height: declared.height,
             width: declared.width,
@@ -84,6 +92,41 @@ impl ExecWorld {
             DONE => Ok(()),
             byte => Err(self.process.fail(Fault::OtherByte { byte })),
         }
+    }
+}
+
+impl WorldSettings for ExecConfig {
+    fn validate(&self) -> Result<(), EnvError> {
+        ExecConfig::validate(self)
+    }
+
+    fn frame_shape(&self) -> FrameShape {
+        ExecConfig::frame_shape(self)
+    }
+
+    fn action_names(&self) -> Vec<&str> {
+        self.actions.iter().map(String::as_str).collect()
+    }
+
+    fn build(
+        &self,
+        num_envs: usize,
+        seed: u64,
+        _threads: usize,
+    ) -> Result<Box<dyn Environment>, EnvError> {
+        Ok(Box::new(ExecWorld::new(self, num_envs, seed)?))
+    }
+
+    fn variants() -> Variants {
+        Variants {
+            key: "command",
+            names: &[],
+            is_open: true,
+        }
+    }
+
+    fn variant(&self) -> Option<&str> {
+        Some(&self.command)
     }
 }
 
