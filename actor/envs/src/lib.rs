@@ -54,6 +54,7 @@ mod error;
 mod frame_stack;
 mod own;
 mod registry;
+mod saved;
 mod settings;
 mod worlds;
 

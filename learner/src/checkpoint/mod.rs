@@ -10,5 +10,5 @@ mod save;
 pub use contents::check_state;
 pub use error::CheckpointError;
 pub use folder::{FOLDER, list, lock};
-pub use load::{Restored, load, load_latest};
+pub use load::{Restored, companion, load, load_latest};
 pub use save::{RunState, save};

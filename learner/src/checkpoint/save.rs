@@ -11,7 +11,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{
     contents::{
-        FORMAT, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of, sha256_of,
+        COMPANION, FORMAT, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of,
+        sha256_of,
     },
     error::{CheckpointError, io_error},
     folder::{PREFIX, list, put_in_place, remove_if_there, sync, tidy, write_durably},
@@ -31,6 +32,8 @@ pub struct RunState<'a> {
     pub weights_version: u64,
     /// Hash of the run's specification.
     pub run_spec_hash: u64,
+    /// What whoever drives the learner keeps with it.
+    pub companion: Option<&'a [u8]>,
 }
 
 /// Writes `folder/checkpoint-<updates>` and removes all but the newest `keep` checkpoints.
@@ -67,7 +70,8 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
 /// Writes a checkpoint's files into the folder `aside`, which is made.
 fn write(aside: &Path, state: &RunState<'_>) -> Result<(), CheckpointError> {
     let agent = state.agent;
-    let files = tensor_files(agent).map_err(CheckpointError::Unsound)?;
+    let mut files = tensor_files(agent).map_err(CheckpointError::Unsound)?;
+    files.extend(state.companion.map(|bytes| (COMPANION, bytes.to_vec())));
     fs::create_dir(aside).map_err(io_error("create", aside))?;
     let mut sha256 = BTreeMap::new();
     for (name, bytes) in files {

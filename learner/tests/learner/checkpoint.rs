@@ -90,6 +90,7 @@ impl Run {
             rng,
             weights_version: 7,
             run_spec_hash: SPEC,
+            companion: None,
         };
         save(folder, &state, keep).unwrap()
     }
@@ -357,6 +358,7 @@ fn a_state_that_is_not_finite_is_not_saved() {
                 rng: &run.rng,
                 weights_version: 8,
                 run_spec_hash: SPEC,
+                companion: None,
             };
             let said = save(&folder.0, &state, 1).unwrap_err().to_string();
             assert!(
