@@ -17,8 +17,8 @@ pub enum BenchCommand {
     Policy(BenchFlags),
     /// Transitions into a replay server and batches out of it, over the wire; and its batches without the wire
     Replay(BenchReplayArgs),
-    /// Procgen's steps through our wrapper
-    Env(BenchFlags),
+    /// Procgen's steps through our wrapper, or those of other worlds
+    Env(BenchEnvArgs),
     /// A short run with real processes: its speed, how long the learner computes and waits, its memory
     System(BenchSystemArgs),
     /// More and more actors, synthetic and real: what is stored and served, how long each waits, how old the weights are
@@ -78,6 +78,16 @@ pub struct BenchLearnerArgs {
     pub(crate) played: Vec<WorldName>,
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
+    #[command(flatten)]
+    pub(crate) flags: BenchFlags,
+}
+
+/// What `driml bench env` takes.
+#[derive(Clone, Debug, Args)]
+pub struct BenchEnvArgs {
+    /// Instead: this world, such as "exec:COMMAND"; may be given several times
+    #[arg(long, value_name = "WORLD")]
+    pub(crate) env: Vec<String>,
     #[command(flatten)]
     pub(crate) flags: BenchFlags,
 }

@@ -266,13 +266,16 @@ impl Launch<'_> {
     }
 
     fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
-        let args = words(&[
+        let mut args = words(&[
             "actor",
             "--connect",
             &self.endpoints[id as usize % self.endpoints.len()],
             "--id",
             &id.to_string(),
         ]);
+        if self.config.world.name().foreign_code().is_some() {
+            args.extend(words(&["--env", &self.config.run.world]));
+        }
         let logs = self.run_dir.logs();
         let name = format!("actor-{id}");
         ManagedProcess::start(&name, &args, PROCESS_THREADS, self.surroundings(&logs))

@@ -86,6 +86,16 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
             let mut table = presets::layers(preset, *world, presets::agent(agent)?)?;
             derived::name(&mut table, &world.to_string(), agent);
             derived::cut_frames(&mut table);
+            if let Some(command) = world.command() {
+                // How long it is waited for is needed at once.
+                for text in &flags.sets {
+                    let one = Override::parse(text)?;
+                    if one.path.starts_with("world.") {
+                        one.apply(&mut table)?;
+                    }
+                }
+                derived::declare(&mut table, command)?;
+            }
             table
         }
         Source::File(name, text) => {
