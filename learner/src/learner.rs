@@ -288,7 +288,11 @@ impl Learner {
     /// # Errors
     /// The file system refused; older checkpoints are untouched.
     pub fn save(&self, folder: &Path) -> Result<(), LearnerError> {
+        let LearnerConfig {
+            spec, model, input, ..
+        } = &self.config;
         let state = RunState {
+            description: &checkpoint::describe(spec, model, input),
             agent: &self.agent,
             affinity: self.affinity.as_ref(),
             rng: &self.rng,

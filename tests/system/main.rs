@@ -25,6 +25,7 @@ mod pages;
 mod panics;
 mod parity;
 mod procgen;
+mod python;
 mod repo_rules;
 mod resume;
 mod roles;
