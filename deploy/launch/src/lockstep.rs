@@ -42,6 +42,9 @@ pub fn run(
         config.learner.update.objective.losses(),
         &[],
     )?;
+    if config.local.tensorboard {
+        recorder.write_events(run_dir)?;
+    }
     let screen = Screen::new(config.frames(), TEMPLATE);
     let mut lockstep = Lockstep::new(config)?;
     let mut display = Display::new(
