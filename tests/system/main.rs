@@ -26,6 +26,7 @@ mod pages;
 mod panics;
 mod parity;
 mod procgen;
+mod python;
 mod repo_rules;
 mod resume;
 mod roles;

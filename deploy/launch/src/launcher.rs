@@ -96,6 +96,9 @@ pub fn run(
         )?,
         None => RunRecorder::create(run_dir, &text, losses, &names)?,
     };
+    if config.local.tensorboard {
+        recorder.write_events(run_dir)?;
+    }
     let resume_point = resumed.unwrap_or_default();
     let meeting = Meeting::create()?;
     let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();

@@ -42,6 +42,9 @@ pub fn run(
         Some(point) => RunRecorder::go_on(run_dir, &text, losses, &[], point, config.frames())?,
         None => RunRecorder::create(run_dir, &text, losses, &[])?,
     };
+    if config.local.tensorboard {
+        recorder.write_events(run_dir)?;
+    }
     let screen = Screen::new(config.frames(), TEMPLATE);
     let mut lockstep = match resumed {
         Some(_) => Lockstep::resume(config, run_dir)?,
