@@ -94,6 +94,21 @@ fn values_that_cannot_work() {
     .assert_eq(&usage(&["local", "--config", "no-such.toml"]));
 }
 
+/// It would have to forget what going on exactly needs.
+#[test]
+fn lockstep_keeps_its_replay_whole_or_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = "replay.disk_bytes_max=100000000";
+    let args = ["local", "--lockstep", "--env", "chain", "--set", set];
+    let output = driml_in(folder.path(), &args);
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(64), "{text}");
+    assert!(
+        text.contains("cannot keep it within replay.disk_bytes_max"),
+        "{text}"
+    );
+}
+
 #[test]
 fn clap_s_own_refusals_are_usage_too() {
     for args in [

@@ -288,6 +288,14 @@ impl Learner {
     /// # Errors
     /// The file system refused; older checkpoints are untouched.
     pub fn save(&self, folder: &Path) -> Result<(), LearnerError> {
+        self.save_with(folder, None)
+    }
+
+    /// Writes a checkpoint into `folder` and, in it, what its caller keeps with it: [`checkpoint::companion`] reads that.
+    ///
+    /// # Errors
+    /// As [`Learner::save`].
+    pub fn save_with(&self, folder: &Path, companion: Option<&[u8]>) -> Result<(), LearnerError> {
         let LearnerConfig {
             spec, model, input, ..
         } = &self.config;
@@ -298,6 +306,7 @@ impl Learner {
             rng: &self.rng,
             weights_version: self.weights_version,
             run_spec_hash: self.spec_hash,
+            companion,
         };
         let path = checkpoint::save(
             folder,

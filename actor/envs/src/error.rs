@@ -19,6 +19,12 @@ pub enum EnvError {
         /// The world's number of actions; valid ones are below it.
         num_actions: usize,
     },
+    /// This world cannot say how it stands.
+    #[error("this world's state cannot be saved")]
+    NotSaved,
+    /// Bytes that are no saved state of this world.
+    #[error("no state of this world: {0}")]
+    State(String),
     /// A step was asked for with a buffer of the wrong length.
     #[error("{name} has {got} entries, but the world has {num_envs} copies")]
     BufferLength {

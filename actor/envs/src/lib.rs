@@ -50,6 +50,7 @@ mod environment;
 mod error;
 mod frame_stack;
 mod registry;
+mod saved;
 mod settings;
 mod worlds;
 

@@ -161,12 +161,7 @@ pub fn run(
         )
     })?;
     if outcome == Outcome::Interrupted {
-        if resume::is_resumable(&config.world, run_dir) {
-            console::line(&format!(
-                "`driml local --resume {}` goes on with it",
-                run_dir.display()
-            ));
-        }
+        resume::say_how(&config.world, run_dir);
         Err(Interrupted.into())
     } else {
         Ok(())

@@ -11,7 +11,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{
     contents::{
-        FORMAT, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of, sha256_of,
+        COMPANION, FORMAT, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of,
+        sha256_of,
     },
     description,
     error::{CheckpointError, io_error},
@@ -34,6 +35,8 @@ pub struct RunState<'a> {
     pub run_spec_hash: u64,
     /// What [`describe`](super::describe) says, for the networks' metadata.
     pub description: &'a str,
+    /// What whoever drives the learner keeps with it.
+    pub companion: Option<&'a [u8]>,
 }
 
 /// Writes `folder/checkpoint-<updates>` and removes all but the newest `keep` checkpoints.
@@ -70,7 +73,8 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
 /// Writes a checkpoint's files into the folder `aside`, which is made.
 fn write(aside: &Path, state: &RunState<'_>) -> Result<(), CheckpointError> {
     let agent = state.agent;
-    let files = tensor_files(agent, state.description).map_err(CheckpointError::Unsound)?;
+    let mut files = tensor_files(agent, state.description).map_err(CheckpointError::Unsound)?;
+    files.extend(state.companion.map(|bytes| (COMPANION, bytes.to_vec())));
     fs::create_dir(aside).map_err(io_error("create", aside))?;
     let mut sha256 = BTreeMap::new();
     for (name, bytes) in files {

@@ -91,6 +91,7 @@ impl Run {
             weights_version: 7,
             run_spec_hash: SPEC,
             description: DESCRIPTION,
+            companion: None,
         };
         save(folder, &state, keep).unwrap()
     }
@@ -362,6 +363,7 @@ fn a_state_that_is_not_finite_is_not_saved() {
                 weights_version: 8,
                 run_spec_hash: SPEC,
                 description: DESCRIPTION,
+                companion: None,
             };
             let said = save(&folder.0, &state, 1).unwrap_err().to_string();
             assert!(

@@ -195,6 +195,7 @@ fn open_durable(
         shard: args.shard,
         after_updates: args.after_updates,
         segment_bytes: None,
+        mark: None,
     };
     let (replay, recovery) = DurableReplay::open(&durable, spec, config, batch_size)?;
     for warning in &recovery.warnings {

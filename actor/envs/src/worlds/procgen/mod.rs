@@ -33,11 +33,12 @@ mod shrink;
 mod tests;
 mod visible_actions;
 
-use procgen_sys::{Engine, Game, NUM_ACTIONS, ProcgenError, RESET, VecGame};
+use procgen_sys::{Engine, Game, NUM_ACTIONS, ProcgenError, RESET, State, VecGame};
 
 use crate::copies::check_step;
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
+use crate::saved;
 use crate::settings::{Levels, Variants, WorldSettings};
 use shrink::Shrink;
 
@@ -303,6 +304,22 @@ impl Environment for ProcgenWorld {
             {
                 levels.redraw(&mut self.game, env)?;
             }
+        }
+        Ok(())
+    }
+
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        let game = &mut self.game;
+        let copies = self.steps_taken.iter().enumerate();
+        let copies = copies.map(|(env, &steps)| Ok((steps, game.state(env)?.sealed())));
+        saved::encode(&copies.collect::<Result<Vec<_>, ProcgenError>>()?)
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        let copies: Vec<(u32, Vec<u8>)> = saved::decode(state, self.num_envs())?;
+        for (env, (steps, sealed)) in copies.into_iter().enumerate() {
+            self.game.set_state(env, &State::unsealed(&sealed)?)?;
+            self.steps_taken[env] = steps;
         }
         Ok(())
     }

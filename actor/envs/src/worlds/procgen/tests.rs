@@ -521,3 +521,20 @@ fn visible_actions_are_what_the_engine_does() {
         }
     }
 }
+
+#[test]
+fn every_game_goes_on_where_it_was_saved() {
+    use crate::saved::tests::goes_on;
+
+    let Some(engine) = engine("every_game_goes_on_where_it_was_saved") else {
+        return;
+    };
+    let mut ended = 0;
+    for game in Game::ALL {
+        let config = config(game);
+        ended += goes_on(game.name(), 200, || {
+            Box::new(ProcgenWorld::with_engine(engine, &config, 2, 5, 0).unwrap())
+        });
+    }
+    assert!(ended > 16, "{ended} ends in all games");
+}
