@@ -21,6 +21,7 @@ mod local;
 mod lockstep;
 mod lost_batches;
 mod lost_chunks;
+mod own_worlds;
 mod pages;
 mod panics;
 mod parity;

@@ -110,6 +110,18 @@ const ARROWS: &[(&str, &str, &[&str])] = &[
         ],
     ),
     ("driml", "deploy", ALL),
+    // As a user's own package: the program, and the registries that it adds to.
+    (
+        "driml-examples",
+        "examples",
+        &[
+            "driml",
+            "driml-envs",
+            "driml-learner",
+            "driml-model",
+            "driml-settings",
+        ],
+    ),
     ("driml-tests", "tests", ALL),
     (
         "driml-decoders",

@@ -1,5 +1,7 @@
 //! Why a world could not be made or stepped.
 
+use crate::worlds::exec::error::ExecError;
+
 /// Why a world could not be made or stepped.
 #[derive(Debug, thiserror::Error)]
 pub enum EnvError {
@@ -9,6 +11,9 @@ pub enum EnvError {
     /// Procgen's engine could not be had, or refused something.
     #[error(transparent)]
     Procgen(#[from] procgen_sys::ProcgenError),
+    /// The process that is the world could not be started, or failed.
+    #[error(transparent)]
+    Exec(Box<ExecError>),
     /// A step was asked for with an action that the world does not have.
     #[error("action {action} of copy {env} is out of range: this world has {num_actions} actions")]
     ActionOutOfRange {
@@ -35,4 +40,10 @@ pub enum EnvError {
         /// The world's copies.
         num_envs: usize,
     },
+}
+
+impl From<ExecError> for EnvError {
+    fn from(error: ExecError) -> Self {
+        Self::Exec(Box::new(error))
+    }
 }

@@ -164,7 +164,7 @@ pub fn run(
         resume::say_how(&config.world, run_dir);
         Err(Interrupted.into())
     } else {
-        Ok(())
+        print(&summary.next_steps(run_dir))
     }
 }
 
@@ -244,7 +244,14 @@ impl Launch<'_> {
 
         let folder = self.run_dir.display().to_string();
         let device = self.config.local.learner_device.to_string();
-        let mut args = words(&["learner", "--run-dir", &folder, "--device", &device]);
+        let mut args = words(&[
+            "learner",
+            "--stay",
+            "--run-dir",
+            &folder,
+            "--device",
+            &device,
+        ]);
         for endpoint in &self.endpoints {
             args.extend(words(&["--connect", endpoint]));
         }
@@ -262,13 +269,16 @@ impl Launch<'_> {
     }
 
     fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
-        let args = words(&[
+        let mut args = words(&[
             "actor",
             "--connect",
             &self.endpoints[id as usize % self.endpoints.len()],
             "--id",
             &id.to_string(),
         ]);
+        if self.config.world.name().foreign_code().is_some() {
+            args.extend(words(&["--env", &self.config.run.world]));
+        }
         let logs = self.run_dir.logs();
         let name = format!("actor-{id}");
         ManagedProcess::start(&name, &args, PROCESS_THREADS, self.surroundings(&logs))
@@ -302,6 +312,7 @@ impl Launch<'_> {
         let (number, after) = (shard.to_string(), after_updates.to_string());
         let mut args = words(&[
             "replay-server",
+            "--stay",
             "--listen",
             &self.endpoints[shard],
             "--shard",

@@ -127,8 +127,8 @@ impl WorldSettings for CorridorConfig {
         CorridorConfig::frame_shape(self)
     }
 
-    fn action_names(&self) -> &'static [&'static str] {
-        &CorridorWorld::ACTION_NAMES
+    fn action_names(&self) -> Vec<&str> {
+        CorridorWorld::ACTION_NAMES.to_vec()
     }
 
     fn build(

@@ -97,6 +97,6 @@ pub fn run(
         resume::say_how(&config.world, run_dir);
         Err(Interrupted.into())
     } else {
-        Ok(())
+        print(&summary.next_steps(run_dir))
     }
 }

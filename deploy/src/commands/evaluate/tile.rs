@@ -51,7 +51,7 @@ pub(super) struct Layout {
     copies: usize,
     has_panel: bool,
     local: Option<Local>,
-    action_names: Vec<&'static str>,
+    action_names: Vec<String>,
     support: Vec<f32>,
 }
 
@@ -189,7 +189,7 @@ impl Layout {
 
     fn draw_panel(&self, picture: &mut Picture, area: Area, shot: &Shot, look: Look<'_>) {
         let action = usize::from(shot.action);
-        let name = self.action_names[action];
+        let name = &self.action_names[action];
         let best = look
             .q_values
             .iter()

@@ -142,8 +142,8 @@ impl WorldSettings for IsingConfig {
         IsingConfig::frame_shape(self)
     }
 
-    fn action_names(&self) -> &'static [&'static str] {
-        &IsingWorld::ACTION_NAMES
+    fn action_names(&self) -> Vec<&str> {
+        IsingWorld::ACTION_NAMES.to_vec()
     }
 
     fn build(

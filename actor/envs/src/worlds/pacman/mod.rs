@@ -106,8 +106,8 @@ impl WorldSettings for PacmanConfig {
         PacmanConfig::frame_shape(self)
     }
 
-    fn action_names(&self) -> &'static [&'static str] {
-        &PacmanWorld::ACTION_NAMES
+    fn action_names(&self) -> Vec<&str> {
+        PacmanWorld::ACTION_NAMES.to_vec()
     }
 
     fn build(

@@ -109,7 +109,7 @@ impl ProcgenWorld {
         threads: usize,
     ) -> Result<ProcgenWorld, EnvError> {
         config.options(num_envs, seed, threads)?;
-        let engine = Engine::install(&mut |_| {}).map_err(ProcgenError::from)?;
+        let engine = config.engine(&mut |_| {})?;
         ProcgenWorld::with_engine(&engine, config, num_envs, seed, threads)
     }
 
@@ -203,8 +203,8 @@ impl WorldSettings for ProcgenConfig {
         15.0
     }
 
-    fn action_names(&self) -> &'static [&'static str] {
-        &ProcgenWorld::ACTION_NAMES
+    fn action_names(&self) -> Vec<&str> {
+        ProcgenWorld::ACTION_NAMES.to_vec()
     }
 
     fn build(
@@ -220,11 +220,16 @@ impl WorldSettings for ProcgenConfig {
         Variants {
             key: "game",
             names: &Game::NAMES,
+            is_open: false,
         }
     }
 
-    fn variant(&self) -> Option<&'static str> {
+    fn variant(&self) -> Option<&str> {
         Some(self.game.name())
+    }
+
+    fn library(&self) -> Option<&str> {
+        self.library.as_deref()
     }
 
     fn visible_actions(&self) -> Vec<u8> {
@@ -251,7 +256,7 @@ impl WorldSettings for ProcgenConfig {
     }
 
     fn install(&self, progress: &mut dyn FnMut(&str)) -> Result<(), EnvError> {
-        Engine::install(progress).map_err(ProcgenError::from)?;
+        self.engine(progress)?;
         Ok(())
     }
 }
