@@ -34,6 +34,7 @@ mod several_machines;
 mod soak;
 mod status;
 mod successors;
+mod tensorboard;
 mod tiny_replay;
 mod tls;
 

@@ -150,7 +150,7 @@ fn onnx_runtime_computes_what_driml_does() {
 
 #[test]
 fn the_page_has_the_actions_in_their_order() {
-    let page = fs::read_to_string(root().join("deploy/python/README.md")).unwrap();
+    let page = fs::read_to_string(root().join("deploy/python/weights.md")).unwrap();
     for (world, names) in [
         ("chain", &CorridorWorld::ACTION_NAMES[..]),
         ("mspacman", &PacmanWorld::ACTION_NAMES),

@@ -33,10 +33,10 @@ pub struct RunState<'a> {
     pub weights_version: u64,
     /// Hash of the run's specification.
     pub run_spec_hash: u64,
-    /// What whoever drives the learner keeps with it.
-    pub companion: Option<&'a [u8]>,
     /// What [`describe`](super::describe) says, for the networks' metadata.
     pub description: &'a str,
+    /// What whoever drives the learner keeps with it.
+    pub companion: Option<&'a [u8]>,
 }
 
 /// Writes `folder/checkpoint-<updates>` and removes all but the newest `keep` checkpoints.

@@ -90,8 +90,8 @@ impl Run {
             rng,
             weights_version: 7,
             run_spec_hash: SPEC,
-            companion: None,
             description: DESCRIPTION,
+            companion: None,
         };
         save(folder, &state, keep).unwrap()
     }
@@ -362,8 +362,8 @@ fn a_state_that_is_not_finite_is_not_saved() {
                 rng: &run.rng,
                 weights_version: 8,
                 run_spec_hash: SPEC,
-                companion: None,
                 description: DESCRIPTION,
+                companion: None,
             };
             let said = save(&folder.0, &state, 1).unwrap_err().to_string();
             assert!(

@@ -214,7 +214,7 @@ impl RunRecorder {
         };
         let row = moment.row();
         let events = self.events.as_mut();
-        let drawn = events.and_then(|events| events.add(&row, replay));
+        let drawn = events.and_then(|events| events.add(&row, replay, learner.finished));
         let written = self.metrics.add(row);
         said.into_iter().chain(written).chain(drawn).collect()
     }

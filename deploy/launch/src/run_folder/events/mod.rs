@@ -75,8 +75,14 @@ impl Events {
         })
     }
 
-    /// Adds a row of metrics, and from time to time what is not in it. A warning is returned as by [`GrowingFile::add`].
-    pub(super) fn add(&mut self, row: &[String], replay: &ReplayStatus) -> Option<String> {
+    /// Adds a row of metrics, and from time to time and at the run's end what is not in it. A warning is returned as by
+    /// [`GrowingFile::add`].
+    pub(super) fn add(
+        &mut self,
+        row: &[String],
+        replay: &ReplayStatus,
+        is_last: bool,
+    ) -> Option<String> {
         let at = At {
             seconds: now(),
             step: replay.transitions_inserted,
@@ -90,10 +96,8 @@ impl Events {
         let said = self
             .file
             .add(encode::summary(at, &points.collect::<Vec<_>>()));
-        if self
-            .slow_at
-            .is_some_and(|last| last.elapsed() < SLOW_PERIOD)
-        {
+        let was = self.slow_at;
+        if !is_last && was.is_some_and(|last| last.elapsed() < SLOW_PERIOD) {
             return said;
         }
         self.slow_at = Some(Instant::now());
@@ -252,7 +256,7 @@ mod tests {
             ..ReplayStatus::default()
         };
         let row = ["70", "1.5", "nobody waits"].map(String::from);
-        assert_eq!(events.add(&row, &replay), None);
+        assert_eq!(events.add(&row, &replay, false), None);
         let again = Events::create(&folder, columns, Some(70)).unwrap();
         assert_eq!(again.missing(), None);
         let mut counts = Vec::new();
