@@ -51,6 +51,62 @@ fn it_prints_the_agent_beside_a_random_policy() {
 }
 
 #[test]
+fn it_tells_programs_what_it_tells_people() {
+    let system = with_run();
+    let flags = "evaluate run --episodes 7 --seed 2";
+    let lines = system.run(flags).expect_code(0).stdout;
+    let ended = system
+        .run(&format!("{flags} --json --returns returns.csv"))
+        .expect_code(0);
+    let told: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
+    assert_eq!(
+        (&told["world"], &told["updates"]),
+        (&"chain".into(), &540.into())
+    );
+    let table = fs::read_to_string(system.path("returns.csv")).unwrap();
+    for policy in ["driml-fix", "random"] {
+        let mean = told["policies"][policy]["mean_return"].as_f64().unwrap();
+        assert!(
+            lines.contains(&format!("{policy:12} mean return {mean:8.3}")),
+            "{lines}"
+        );
+        let rows = table
+            .lines()
+            .filter_map(|row| row.strip_prefix(&format!("{policy},")));
+        let returns: Vec<f64> = rows
+            .map(|row| row.split_once(',').unwrap().1.parse().unwrap())
+            .collect();
+        assert_eq!(returns.len(), 7);
+        assert!((returns.iter().sum::<f64>() / 7.0 - mean).abs() < 1e-9);
+    }
+    system
+        .run("evaluate run --returns none/returns.csv")
+        .expect_code(1)
+        .expect_said("--returns none/returns.csv");
+}
+
+#[test]
+fn it_plays_any_checkpoint_that_is_there() {
+    let system = with_run();
+    let kept = system.run_folder("run").checkpoints();
+    let updates = |path: &std::path::Path| -> u64 {
+        let name = path.file_name().unwrap().to_str().unwrap();
+        name.strip_prefix("checkpoint-").unwrap().parse().unwrap()
+    };
+    let oldest = updates(&kept[0]);
+    assert!(oldest < 540);
+    let ended = system
+        .run(&format!("evaluate run --episodes 2 --checkpoint {oldest}"))
+        .expect_code(0);
+    let said = format!("weights after {oldest} updates");
+    assert!(ended.stdout.contains(&said), "{}", ended.stdout);
+    system
+        .run("evaluate run --checkpoint 7")
+        .expect_code(64)
+        .expect_said("no checkpoint after 7 updates; it has those after");
+}
+
+#[test]
 fn a_folder_that_is_no_run_s() {
     let system = system();
     fs::create_dir(system.path("empty")).unwrap();

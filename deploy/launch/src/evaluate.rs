@@ -1,6 +1,8 @@
 //! Whole episodes with a run's newest checkpoint, and a random policy's beside them.
 //! It trains nothing and changes nothing in the run folder.
 
+use std::path::PathBuf;
+
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_actor::{Evaluation, NetworkPolicy, Policy, RandomPolicy, Step, episode_returns};
@@ -63,6 +65,14 @@ impl Player {
     /// # Errors
     /// A folder that is no run's or has no checkpoint, a damaged checkpoint.
     pub fn load(folder: &RunFolder) -> anyhow::Result<Self> {
+        Self::load_at(folder, None)
+    }
+
+    /// Reads the checkpoint after so many updates in a run's folder; the newest if it is not said.
+    ///
+    /// # Errors
+    /// A folder that is no run's or does not have that checkpoint, a damaged checkpoint.
+    pub fn load_at(folder: &RunFolder, updates: Option<u64>) -> anyhow::Result<Self> {
         let path = folder.config();
         let text = std::fs::read_to_string(&path).map_err(|e| {
             usage!(
@@ -72,19 +82,13 @@ impl Player {
             )
         })?;
         let config = RunConfig::parse(&path.display().to_string(), &text)?;
-        let restored = checkpoint::load_latest(
-            &folder.checkpoints(),
+        let restored = checkpoint::load(
+            &checkpoint_at(folder, updates)?,
             &config.model,
             &config.learner.update,
             &Compute::CPU,
             config.run.hash(),
-        )?
-        .ok_or_else(|| {
-            usage!(
-                "{} has no checkpoint yet: let the run go on",
-                folder.display()
-            )
-        })?;
+        )?;
         let weights = restored.agent.weights()?;
         let updates = restored.agent.updates();
         Ok(Self {
@@ -190,6 +194,29 @@ impl Player {
         let config = &self.config;
         Ok(config.input.enlarge(self.sent(), &config.model)?)
     }
+}
+
+/// The folder of the checkpoint after so many updates, or of the newest.
+fn checkpoint_at(folder: &RunFolder, updates: Option<u64>) -> anyhow::Result<PathBuf> {
+    let mut all = checkpoint::list(&folder.checkpoints())?;
+    let Some((newest, _)) = all.last() else {
+        return Err(usage!(
+            "{} has no checkpoint yet: let the run go on",
+            folder.display()
+        )
+        .into());
+    };
+    let wanted = updates.unwrap_or(*newest);
+    let known: Vec<String> = all.iter().map(|(updates, _)| updates.to_string()).collect();
+    let found = all.iter().position(|(updates, _)| *updates == wanted);
+    let at = found.ok_or_else(|| {
+        usage!(
+            "{} has no checkpoint after {wanted} updates; it has those after {}. learner.checkpoints_kept says how many stay",
+            folder.display(),
+            known.join(", ")
+        )
+    })?;
+    Ok(all.swap_remove(at).1)
 }
 
 /// Sees what the policy sees.

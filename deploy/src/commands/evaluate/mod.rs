@@ -1,6 +1,7 @@
 //! `driml evaluate`: whole episodes with a run's newest checkpoint, and a random policy's beside them; a film of them on request.
 
 mod recording;
+mod report;
 mod tile;
 
 use std::path::PathBuf;
@@ -33,6 +34,15 @@ pub(crate) struct EvaluateArgs {
     /// Seed of the worlds and of exploration
     #[arg(long, value_name = "S", default_value_t = 0)]
     pub(crate) seed: u64,
+    /// Play with the checkpoint after so many updates [default: the newest]
+    #[arg(long, value_name = "UPDATES")]
+    pub(crate) checkpoint: Option<u64>,
+    /// Write every episode's return into this file, as CSV: who played, number of the episode, return
+    #[arg(long, value_name = "FILE")]
+    pub(crate) returns: Option<PathBuf>,
+    /// Print one JSON object instead of lines for people
+    #[arg(long)]
+    pub(crate) json: bool,
     #[command(flatten)]
     pub(crate) film: RecordArgs,
 }
@@ -47,7 +57,10 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     }
     let folder = args.folder.as_ref().or(args.run.as_ref());
     let folder = folder.expect("clap asks for one of the two");
-    let player = Player::load(&RunFolder::new(folder))?;
+    let player = Player::load_at(&RunFolder::new(folder), args.checkpoint)?;
+    // Before an hour of playing.
+    let table = args.returns.as_deref().map(report::Table::begin);
+    let mut table = table.transpose()?;
     let world = levels(&player.config.world, args.levels)?;
     let mut film = Recording::begin(&args.film, &player, args.episodes)?;
     let spec = &player.config.run;
@@ -56,7 +69,8 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         Levels::TrainSingle => "on the levels trained on, one an episode",
         Levels::Unseen => "on unseen levels",
     };
-    print(&format!(
+    let said = |text: &str| if args.json { Ok(()) } else { print(text) };
+    said(&format!(
         "{} {which}, {} episodes each, weights after {} updates, seed {}\n",
         spec.world, args.episodes, player.updates, args.seed
     ))?;
@@ -74,7 +88,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     let returns = match (returns, film) {
         (Ok(returns), None) => returns,
         (Ok(returns), Some(film)) => {
-            print(&film.finish()?)?;
+            said(&film.finish()?)?;
             returns
         }
         (Err(e), film) => {
@@ -84,14 +98,20 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
             return Err(e);
         }
     };
-    describe(&spec.agent, &returns)?;
-    let returns = player.play(Who::Random, &world, args.episodes as usize, args.seed)?;
-    describe("random", &returns)
+    said(&describe(&spec.agent, &returns))?;
+    let random = player.play(Who::Random, &world, args.episodes as usize, args.seed)?;
+    said(&describe("random", &random))?;
+    let played = [(spec.agent.as_str(), returns), ("random", random)];
+    if let Some(table) = &mut table {
+        table.finish(&played)?;
+    }
+    if args.json {
+        print(&report::json(&player, args, &played)?)?;
+    }
+    Ok(())
 }
 
-fn describe(name: &str, returns: &[f64]) -> anyhow::Result<()> {
+fn describe(name: &str, returns: &[f64]) -> String {
     let (mean, deviation) = mean_and_deviation(returns);
-    print(&format!(
-        "{name:12} mean return {mean:8.3}, standard deviation {deviation:.3}\n"
-    ))
+    format!("{name:12} mean return {mean:8.3}, standard deviation {deviation:.3}\n")
 }
