@@ -106,7 +106,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         table.finish(&played)?;
     }
     if args.json {
-        print(&report::json(&player, args, &played)?)?;
+        print(&report::json(&player, args.levels, args.seed, &played)?)?;
     }
     Ok(())
 }

@@ -8,10 +8,9 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_launch::evaluate::{Player, mean_and_deviation};
+use clap::ValueEnum;
+use driml_launch::evaluate::{Levels, Player, mean_and_deviation};
 use serde_json::json;
-
-use super::EvaluateArgs;
 
 /// Who played, and the returns of the episodes.
 type Played<'a> = (&'a str, Vec<f64>);
@@ -61,7 +60,8 @@ impl Table {
 /// It cannot be written as JSON.
 pub(super) fn json(
     player: &Player,
-    args: &EvaluateArgs,
+    levels: Levels,
+    seed: u64,
     played: &[Played<'_>],
 ) -> anyhow::Result<String> {
     let spec = &player.config.run;
@@ -73,13 +73,13 @@ pub(super) fn json(
             ((*name).to_owned(), of)
         })
         .collect();
-    let levels = clap::ValueEnum::to_possible_value(&args.levels);
+    let levels = levels.to_possible_value();
     let object = json!({
         "world": spec.world,
         "agent": spec.agent,
         "updates": player.updates,
         "levels": levels.map(|it| it.get_name().to_owned()),
-        "seed": args.seed,
+        "seed": seed,
         "policies": policies,
     });
     Ok(serde_json::to_string(&object)? + "\n")
