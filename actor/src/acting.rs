@@ -12,6 +12,8 @@ use crate::{error::ActError, policy::Policy};
 pub struct Step<'a> {
     /// Frames [N, frame bytes] in which the actions were taken, unstacked.
     pub frames: &'a [u8],
+    /// The same with the frames before them [N, state bytes], as the policy saw them.
+    pub states: &'a [u8],
     /// Actions [N].
     pub actions: &'a [u8],
     /// Rewards [N] that they earned.
@@ -83,6 +85,7 @@ impl Acting {
         }
         Ok(Step {
             frames: &self.frames,
+            states: &self.states,
             actions: &self.actions,
             rewards: &self.rewards,
             ends: &self.ends,

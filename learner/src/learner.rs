@@ -296,7 +296,11 @@ impl Learner {
     /// # Errors
     /// As [`Learner::save`].
     pub fn save_with(&self, folder: &Path, companion: Option<&[u8]>) -> Result<(), LearnerError> {
+        let LearnerConfig {
+            spec, model, input, ..
+        } = &self.config;
         let state = RunState {
+            description: &checkpoint::describe(spec, model, input),
             agent: &self.agent,
             affinity: self.affinity.as_ref(),
             rng: &self.rng,

@@ -26,6 +26,7 @@ mod pages;
 mod panics;
 mod parity;
 mod procgen;
+mod python;
 mod repo_rules;
 mod resume;
 mod roles;
@@ -33,6 +34,7 @@ mod several_machines;
 mod soak;
 mod status;
 mod successors;
+mod tensorboard;
 mod tiny_replay;
 mod tls;
 

@@ -67,6 +67,7 @@ const ARROWS: &[(&str, &str, &[&str])] = &[
         &[
             "driml-protocol",
             "driml-envs",
+            "driml-figure",
             "driml-model",
             "driml-actor",
             "driml-replay-server",

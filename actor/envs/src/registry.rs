@@ -138,6 +138,11 @@ impl WorldConfig {
         self.settings().1.action_names()
     }
 
+    /// Steps a second at which a person plays the game, or can follow it.
+    pub fn steps_per_second(&self) -> f64 {
+        self.settings().1.steps_per_second()
+    }
+
     /// Number of the world's actions; valid ones are below it.
     pub fn num_actions(&self) -> usize {
         self.action_names().len()

@@ -30,6 +30,11 @@ pub trait WorldSettings {
     /// The names of the actions; an action is a place in this list, so there are at most 256.
     fn action_names(&self) -> Vec<&str>;
 
+    /// Steps a second at which a person plays the game, or can follow it.
+    fn steps_per_second(&self) -> f64 {
+        10.0
+    }
+
     /// Builds `num_envs` copies. Copy i depends on (`seed`, i) and its actions only. `threads` is how many threads of its own
     /// the world may start, 0 for none.
     ///

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand, ValueEnum};
 use driml_envs::WorldName;
 use driml_learner::{DeviceName, Precision};
-use driml_machine::device::DeviceFlag;
+use driml_machine::{device::DeviceFlag, whole_number};
 
 /// What to measure.
 #[derive(Debug, Subcommand)]
@@ -121,7 +121,7 @@ pub struct BenchReplayArgs {
 #[derive(Debug, Args)]
 pub struct BenchSystemArgs {
     /// Frames of the run [default: 12000, or 2500 with --quick]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(2_000..=100_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(2_000..=100_000_000))]
     pub(crate) frames: Option<u64>,
     #[command(flatten)]
     pub(crate) flags: BenchFlags,

@@ -96,6 +96,9 @@ pub fn run(
         )?,
         None => RunRecorder::create(run_dir, &text, losses, &names)?,
     };
+    if config.local.tensorboard {
+        recorder.write_events(run_dir)?;
+    }
     let resume_point = resumed.unwrap_or_default();
     let meeting = Meeting::create()?;
     let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
@@ -161,7 +164,7 @@ pub fn run(
         resume::say_how(&config.world, run_dir);
         Err(Interrupted.into())
     } else {
-        Ok(())
+        print(&summary.next_steps(run_dir))
     }
 }
 
@@ -241,7 +244,14 @@ impl Launch<'_> {
 
         let folder = self.run_dir.display().to_string();
         let device = self.config.local.learner_device.to_string();
-        let mut args = words(&["learner", "--run-dir", &folder, "--device", &device]);
+        let mut args = words(&[
+            "learner",
+            "--stay",
+            "--run-dir",
+            &folder,
+            "--device",
+            &device,
+        ]);
         for endpoint in &self.endpoints {
             args.extend(words(&["--connect", endpoint]));
         }
@@ -302,6 +312,7 @@ impl Launch<'_> {
         let (number, after) = (shard.to_string(), after_updates.to_string());
         let mut args = words(&[
             "replay-server",
+            "--stay",
             "--listen",
             &self.endpoints[shard],
             "--shard",

@@ -30,6 +30,9 @@ pub struct LocalConfig {
     /// run goes on with it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub durable: bool,
+    /// Whether events for TensorBoard are written beside the metrics, about a kilobyte a second.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub tensorboard: bool,
 }
 
 /// The resolved settings of a run. TOML is what they come from and travel as; between, there is this form alone.

@@ -56,6 +56,9 @@ pub(crate) struct TrainArgs {
     /// Keep the replay on disk too, in the run folder: a replay server that dies goes on with it, and so does --resume
     #[arg(long)]
     pub(crate) durable: bool,
+    /// Write events for TensorBoard too, in the run folder: `tensorboard --logdir RUN`
+    #[arg(long)]
+    pub(crate) tensorboard: bool,
     /// All parts in one process in a fixed order: the same seed gives the same weights, also if the run is interrupted and resumed
     #[arg(long, conflicts_with = "listen")]
     pub(crate) lockstep: bool,
@@ -86,6 +89,9 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     }
     if args.durable {
         args.run.over.sets.push("local.durable=true".into());
+    }
+    if args.tensorboard {
+        args.run.over.sets.push("local.tensorboard=true".into());
     }
     let (config, from, resume_point) = match &args.resume {
         Some(folder) => {

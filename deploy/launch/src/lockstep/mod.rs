@@ -42,6 +42,9 @@ pub fn run(
         Some(point) => RunRecorder::go_on(run_dir, &text, losses, &[], point, config.frames())?,
         None => RunRecorder::create(run_dir, &text, losses, &[])?,
     };
+    if config.local.tensorboard {
+        recorder.write_events(run_dir)?;
+    }
     let screen = Screen::new(config.frames(), TEMPLATE);
     let mut lockstep = match resumed {
         Some(_) => Lockstep::resume(config, run_dir)?,
@@ -94,6 +97,6 @@ pub fn run(
         resume::say_how(&config.world, run_dir);
         Err(Interrupted.into())
     } else {
-        Ok(())
+        print(&summary.next_steps(run_dir))
     }
 }

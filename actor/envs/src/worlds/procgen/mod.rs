@@ -198,6 +198,11 @@ impl WorldSettings for ProcgenConfig {
         ProcgenConfig::frame_shape(self)
     }
 
+    /// Source: the `tps` of Procgen's own `interactive.py`.
+    fn steps_per_second(&self) -> f64 {
+        15.0
+    }
+
     fn action_names(&self) -> Vec<&str> {
         ProcgenWorld::ACTION_NAMES.to_vec()
     }
