@@ -36,7 +36,7 @@
 //! ```
 
 // The engine is a C library: calling it and owning the memory it writes to cannot be done in safe Rust. The other `unsafe` of the
-// workspace is in `learner/model/src/kernels/gemm.rs`.
+// workspace is in `learner/model/src/kernels/`.
 #![allow(unsafe_code)]
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
@@ -47,6 +47,7 @@ mod ffi;
 mod game;
 mod install;
 mod library;
+mod nap;
 mod options;
 mod pinned;
 mod release;

@@ -2,12 +2,14 @@
 //! It passes the engine's flags on as they are and does not say what they mean for episodes.
 
 use std::ffi::c_void;
+use std::time::Instant;
 
 use crate::error::{InstallError, ProcgenError};
 use crate::ffi::{self, DTYPE_INT32, DTYPE_UINT8, Handle, LibenvBuffers, LibenvTensortype};
 use crate::game::Game;
 use crate::install::Engine;
 use crate::library::{self, Api};
+use crate::nap::Nap;
 use crate::options::{NUM_ACTIONS, Options, RawOptions};
 use crate::pinned::Pinned;
 use crate::state::State;
@@ -32,6 +34,8 @@ pub struct VecGame {
     game: Game,
     num_envs: usize,
     state_bytes: usize,
+    /// How long to leave the engine's own threads alone; `None` where the calling thread steps.
+    nap: Option<Nap>,
     // The engine keeps the addresses of all of these until `close`, which `Drop` calls before they go.
     frames: Pinned<u8>,
     rewards: Pinned<f32>,
@@ -88,6 +92,7 @@ impl VecGame {
             game: options.game,
             num_envs: n,
             state_bytes: STATE_BYTES,
+            nap: (options.num_threads > 0).then(Nap::default),
             frames: Pinned::new(0, n * FRAME_BYTES),
             rewards: Pinned::new(0.0, n),
             first: Pinned::new(0, n),
@@ -171,11 +176,16 @@ impl VecGame {
         }
         // SAFETY: `act` below is the only call during which the engine reads the actions.
         unsafe { self.actions.as_mut_slice() }.copy_from_slice(actions);
+        let started = Instant::now();
         // SAFETY: the handle is open, the buffers are set, and no reference into them is alive thanks to `&mut self`.
-        // `observe` returns once every copy is stepped, so that nothing is written after this.
-        unsafe {
-            (self.api.act)(self.handle);
-            (self.api.observe)(self.handle);
+        unsafe { (self.api.act)(self.handle) };
+        if let Some(nap) = &self.nap {
+            nap.take();
+        }
+        // SAFETY: as for `act`. It returns once every copy is stepped, so that nothing is written after this.
+        unsafe { (self.api.observe)(self.handle) };
+        if let Some(nap) = &mut self.nap {
+            nap.learn(started.elapsed());
         }
         Ok(())
     }

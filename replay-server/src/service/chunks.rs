@@ -40,8 +40,13 @@ impl Service {
         };
         let packed = self.packer.pack(Cow::Owned(chunk));
         let question = Question { responder, arrived };
-        let answers = self.state().take_chunk(packed, question);
-        self.changed.notify_all();
+        let mut state = self.state();
+        let answers = state.take_chunk(packed, question);
+        let is_awaited = state.is_awaited(Instant::now());
+        drop(state);
+        if is_awaited {
+            self.changed.notify_all();
+        }
         self.answer_all(answers);
     }
 

@@ -100,8 +100,7 @@ impl Service {
         mut state: MutexGuard<'a, State>,
         wait_max: Duration,
     ) -> MutexGuard<'a, State> {
-        let waiting = state.replay.waiting();
-        state.accounts.note_waiting(waiting, Instant::now());
+        state.note_waiting(Instant::now());
         self.changed
             .wait_timeout(state, wait_max)
             .unwrap_or_else(PoisonError::into_inner)
@@ -110,6 +109,19 @@ impl Service {
 }
 
 impl State {
+    /// Notes which side waits now.
+    fn note_waiting(&mut self, now: Instant) {
+        let waiting = self.replay.waiting();
+        self.accounts.note_waiting(waiting, now);
+    }
+
+    /// Whether a chunk or a request waits for what the replay holds; if not, the threads that serve them have nothing to look at, and
+    /// what they would note is noted here. Waking them costs six changes of threads a chunk.
+    pub(super) fn is_awaited(&mut self, now: Instant) -> bool {
+        self.note_waiting(now);
+        !self.chunks.is_empty() || self.requests.len() > 0
+    }
+
     /// Logs a line of this kind, or counts it where one was logged a short while ago.
     pub(super) fn say(&mut self, kind: &str, line: &str) {
         if let Some(more) = self.said.due(kind) {
