@@ -37,6 +37,8 @@ pub fn run(python: &str, script: &[&str], args: &[&str]) -> String {
     let output = Command::new(python)
         .args(script)
         .args(args)
+        // Nothing is left beside the scripts.
+        .env("PYTHONDONTWRITEBYTECODE", "1")
         .output()
         .unwrap();
     let said = String::from_utf8_lossy(&output.stderr);

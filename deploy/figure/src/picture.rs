@@ -1,5 +1,5 @@
 //! A picture of pixels, one of many: images enlarged, text, bars and cells of heat.
-//! Unlike a [`Figure`](crate::figure::Figure) it is drawn at once, and exists as pixels alone.
+//! Unlike a [`Figure`](crate::Figure) it is drawn at once, and exists as pixels alone.
 
 use tiny_skia::{Pixmap, PremultipliedColorU8, Transform};
 

@@ -80,7 +80,8 @@ pub(super) fn summary(at: At, values: &[(String, Value<'_>)]) -> Vec<u8> {
     record(&event)
 }
 
-/// A `HistogramProto` in which each number has a bucket of its own, from half below it to half above.
+/// A `HistogramProto` in which each number has a bucket of its own, from half below it to half above. Its least and largest value are
+/// those buckets' ends, as TensorBoard draws nothing beyond them.
 fn histogram(counts: &[u64]) -> Vec<u8> {
     let total = counts.iter().map(|&n| n as f64).sum::<f64>();
     let (mut sum, mut squares) = (0.0, 0.0);
@@ -91,7 +92,8 @@ fn histogram(counts: &[u64]) -> Vec<u8> {
     let counted = |(_, n): &(usize, &u64)| **n > 0;
     let least = counts.iter().enumerate().find(counted);
     let most = counts.iter().enumerate().rfind(counted);
-    let [least, most] = [least, most].map(|found| found.map_or(0.0, |(value, _)| value as f64));
+    let [least, most] = [(least, -0.5), (most, 0.5)]
+        .map(|(found, half)| found.map_or(0.0, |(value, _)| value as f64 + half));
     let mut histogram = Vec::new();
     for (field, value) in [(1, least), (2, most), (3, total), (4, sum), (5, squares)] {
         key(&mut histogram, field, FIXED64);
