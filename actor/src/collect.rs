@@ -5,10 +5,15 @@ use driml_envs::{CutFrames, FewerActions};
 use driml_protocol::{BufferPool, Chunk, RunSpec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
 
 use crate::{
-    acting::Acting, config::ActorSettings, error::ActError, policy::NetworkPolicy,
-    recorder::ChunkRecorder, schedule::Schedule,
+    acting::{Acting, ActingState},
+    config::ActorSettings,
+    error::ActError,
+    policy::NetworkPolicy,
+    recorder::{ChunkNumbers, ChunkRecorder},
+    schedule::Schedule,
 };
 
 /// One life of an actor, from its start to its end; a restarted actor is another incarnation.
@@ -49,6 +54,13 @@ pub struct Collector {
     recorder: ChunkRecorder,
     policy: NetworkPolicy,
     weights_version: u64,
+}
+
+/// How a collector stands between two chunks; the weights it acts with are not in it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CollectorState {
+    acting: ActingState,
+    next_chunk: ChunkNumbers,
 }
 
 impl Collector {
@@ -161,6 +173,27 @@ impl Collector {
                 return Ok(chunk);
             }
         }
+    }
+
+    /// How it stands between two chunks.
+    ///
+    /// # Errors
+    /// A world whose state cannot be saved; a fault of the engine.
+    pub fn state(&mut self) -> Result<CollectorState, ActError> {
+        Ok(CollectorState {
+            acting: self.acting.state()?,
+            next_chunk: self.recorder.next_chunk(),
+        })
+    }
+
+    /// Goes on where another one of the same settings stood: with the same weights it gives the same chunks.
+    ///
+    /// # Errors
+    /// A state of other settings.
+    pub fn go_on_from(&mut self, state: CollectorState) -> Result<(), ActError> {
+        self.acting.go_on_from(state.acting)?;
+        self.recorder.go_on_at(state.next_chunk);
+        Ok(())
     }
 }
 

@@ -1,6 +1,7 @@
 //! The actor's settings, and what it takes from the run's other tables.
 //! It fills in no number: presets do, with their sources.
 
+use driml_envs::{EnvError, WorldName};
 use driml_protocol::{
     BufferPool, RunSpec, RunSpecError, TRANSITION_BYTES,
     codec::PAYLOAD_BYTES_MAX,
@@ -133,6 +134,26 @@ impl ActorSettings {
                 why: "its chunks are longer than the replay server takes in this run, by the settings' actor.envs and \
                       actor.steps_per_chunk: use fewer, or start the run with more (--envs at the replay server)",
             });
+        }
+        Ok(())
+    }
+
+    /// Takes the world's code from `world`, which a person on this machine has named, and not from the run's settings.
+    ///
+    /// # Errors
+    /// A world with code that nobody here has named, or the name of another world.
+    pub fn set_world(&mut self, world: Option<WorldName>) -> Result<(), EnvError> {
+        let name = self.world.name();
+        match world {
+            Some(world) => self.world = self.world.with_code_of(world)?,
+            None if name.foreign_code().is_some() => {
+                return Err(EnvError::Config(format!(
+                    "the run's world is code on this actor's machine, {name}, and an actor starts none because a replay server says so: \
+                     if you trust it, name it with --env {:?}, or as this machine has it",
+                    name.to_string()
+                )));
+            }
+            None => {}
         }
         Ok(())
     }

@@ -74,14 +74,14 @@ mod run;
 mod schedule;
 mod weights;
 
-pub use acting::{Acting, Step};
-pub use collect::{Collector, Incarnation};
+pub use acting::{Acting, ActingState, Step};
+pub use collect::{Collector, CollectorState, Incarnation};
 pub use config::{ActorSettings, Config, ConfigError, EpsilonLadder, SettingsError};
 pub use delivery::{Delivery, DeliveryError, DeliveryLimits};
 pub use error::ActError;
-pub use evaluate::episode_returns;
+pub use evaluate::{Evaluation, episode_returns};
 pub use policy::{NetworkPolicy, Policy, RandomPolicy};
-pub use recorder::ChunkRecorder;
+pub use recorder::{ChunkNumbers, ChunkRecorder};
 pub use run::{RunArgs, run};
 pub use schedule::{BeyondLadder, Schedule};
 pub use weights::{NewestWeights, WeightsError, WeightsSource};

@@ -3,6 +3,7 @@
 
 use driml_envs::StepEnd;
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
+use serde::{Deserialize, Serialize};
 
 /// What a world ended, in the words of the wire.
 const fn end_on_the_wire(end: StepEnd) -> End {
@@ -12,6 +13,13 @@ const fn end_on_the_wire(end: StepEnd) -> End {
         StepEnd::TimedOut => End::TimedOut,
         StepEnd::Terminal => End::Terminal,
     }
+}
+
+/// Which chunk of an actor's life it is, and how many transitions were before it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ChunkNumbers {
+    sequence: u64,
+    first_transition: u64,
 }
 
 /// Fills chunk after chunk.
@@ -69,6 +77,24 @@ impl ChunkRecorder {
     /// Transitions recorded so far, including those of the chunk being filled.
     pub const fn produced(&self) -> u64 {
         self.header.first_transition + self.filled_steps as u64 * self.header.streams as u64
+    }
+
+    /// The numbers of the next chunk, between two of them.
+    ///
+    /// # Panics
+    /// If a chunk is being filled.
+    pub fn next_chunk(&self) -> ChunkNumbers {
+        assert!(self.chunk.is_none(), "a chunk is kept whole or not at all");
+        ChunkNumbers {
+            sequence: self.header.sequence,
+            first_transition: self.header.first_transition,
+        }
+    }
+
+    /// Goes on with the numbers of another recorder of the same life.
+    pub fn go_on_at(&mut self, next: ChunkNumbers) {
+        self.header.sequence = next.sequence;
+        self.header.first_transition = next.first_transition;
     }
 
     /// Records one step of every copy: frames [N, frame bytes] in which `actions` [N] were taken, and what came of it.

@@ -4,6 +4,7 @@
 use std::{sync::Arc, time::Duration};
 
 use anyhow::Context;
+use driml_envs::WorldName;
 use driml_protocol::{
     Activity, ActorJoin, Keys, Life, RunClient, Shutdown, Weights, join, reporter,
     session::{self, Endpoints},
@@ -34,6 +35,9 @@ pub struct RunArgs {
     pub actor: u32,
     /// Copies of the world, if not as many as the settings say.
     pub envs: Option<u32>,
+    /// The world as this machine has it, where it is code that is no part of this program: nothing else of that kind is started
+    /// or loaded, whatever the replay server says.
+    pub world: Option<WorldName>,
 }
 
 /// Runs one actor until `shutdown`, or until the run has its transitions.
@@ -60,6 +64,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     if let Some(envs) = args.envs {
         settings.set_envs(envs)?;
     }
+    settings.set_world(args.world)?;
     if settings.transport.shared_memory && !hello.shared_memory {
         tracing::info!("chunks go through sockets: the replay server cannot read shared memory");
         settings.transport.shared_memory = false;

@@ -41,10 +41,10 @@ fn usage(args: &[&str]) -> String {
 #[test]
 fn names_that_nothing_has() {
     expect![[r#"
-        error: --env: no world is named "procgen:bigfihs"; did you mean "procgen:bigfish"? (the worlds: procgen:GAME, mspacman, ising, chain; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
+        error: --env: no world is named "procgen:bigfihs"; did you mean "procgen:bigfish"? (the worlds: procgen:GAME, mspacman, ising, chain, exec:COMMAND, libenv:PATH:GAME; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
     "#]].assert_eq(&usage(&["local", "--env", "procgen:bigfihs"]));
     expect![[r#"
-        error: --env: no world is named "pong"; did you mean "ising"? (the worlds: procgen:GAME, mspacman, ising, chain; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
+        error: --env: no world is named "pong"; did you mean "ising"? (the worlds: procgen:GAME, mspacman, ising, chain, exec:COMMAND, libenv:PATH:GAME; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
     "#]].assert_eq(&usage(&["local", "--env", "pong"]));
     expect![[r#"
         error: there is no agent "driml"; --agent takes c51, driml-fix, driml-ada, driml-randk, driml-noact, cpc, curl
@@ -92,6 +92,21 @@ fn values_that_cannot_work() {
         error: reading the settings no-such.toml: No such file or directory (os error 2)
     "#]]
     .assert_eq(&usage(&["local", "--config", "no-such.toml"]));
+}
+
+/// It would have to forget what going on exactly needs.
+#[test]
+fn lockstep_keeps_its_replay_whole_or_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = "replay.disk_bytes_max=100000000";
+    let args = ["local", "--lockstep", "--env", "chain", "--set", set];
+    let output = driml_in(folder.path(), &args);
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(64), "{text}");
+    assert!(
+        text.contains("cannot keep it within replay.disk_bytes_max"),
+        "{text}"
+    );
 }
 
 #[test]

@@ -124,7 +124,7 @@ impl<'a> Batch<'a> {
     }
 
     /// s_{t+k} [P, B] of a batch that is valid with states of this length; none where a row has no such positive.
-    pub(crate) fn positive_states(&self, state_bytes: usize) -> Vec<Option<&'a [u8]>> {
+    pub fn positive_states(&self, state_bytes: usize) -> Vec<Option<&'a [u8]>> {
         let whole = self.states_k.len() == self.positive_valid.len() * state_bytes;
         let mut states = self.states_k.chunks_exact(state_bytes);
         let positives = self.positive_valid.iter().map(|&valid| {

@@ -288,12 +288,25 @@ impl Learner {
     /// # Errors
     /// The file system refused; older checkpoints are untouched.
     pub fn save(&self, folder: &Path) -> Result<(), LearnerError> {
+        self.save_with(folder, None)
+    }
+
+    /// Writes a checkpoint into `folder` and, in it, what its caller keeps with it: [`checkpoint::companion`] reads that.
+    ///
+    /// # Errors
+    /// As [`Learner::save`].
+    pub fn save_with(&self, folder: &Path, companion: Option<&[u8]>) -> Result<(), LearnerError> {
+        let LearnerConfig {
+            spec, model, input, ..
+        } = &self.config;
         let state = RunState {
+            description: &checkpoint::describe(spec, model, input),
             agent: &self.agent,
             affinity: self.affinity.as_ref(),
             rng: &self.rng,
             weights_version: self.weights_version,
             run_spec_hash: self.spec_hash,
+            companion,
         };
         let path = checkpoint::save(
             folder,

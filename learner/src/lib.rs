@@ -57,6 +57,7 @@ pub mod cost;
 #[cfg(test)]
 mod edges;
 mod error;
+pub mod insight;
 mod learner;
 pub mod losses;
 pub mod optimiser;

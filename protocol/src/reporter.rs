@@ -19,6 +19,30 @@ const TICK: Duration = Duration::from_millis(250);
 /// How long one report may take.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
+/// Tells the replay servers of `clients` once that the part of `who` in the run is done, whatever comes of it.
+pub fn say_finished(clients: &[RunClient], who: Life) {
+    let finished = Report {
+        finished: true,
+        ..report(who, "has finished", Duration::ZERO)
+    };
+    send(clients, &finished);
+}
+
+/// What `who` says of itself, and the last warning in the log of this process.
+fn report(who: Life, doing: &str, since: Duration) -> Report {
+    let warning = last_warning::get();
+    let warning = warning.map(|(text, age)| Warning::new(&text, age.as_secs_f64()));
+    Report::new(who, doing, since.as_secs_f64(), warning)
+}
+
+fn send(clients: &[RunClient], report: &Report) {
+    for client in clients {
+        if let Err(e) = client.ask(report, TIMEOUT) {
+            tracing::debug!("a report did not arrive: {e}");
+        }
+    }
+}
+
 /// Reports what `who` does to the replay servers of `clients`, until `shutdown` or the end of their sessions.
 ///
 /// # Errors
@@ -35,14 +59,7 @@ pub fn start(
             let (doing, since) = activity.get();
             let is_old = |(said, at): &(String, Instant)| *said != doing || at.elapsed() > PERIOD;
             if said.as_ref().is_none_or(is_old) {
-                let warning = last_warning::get();
-                let warning = warning.map(|(text, age)| Warning::new(&text, age.as_secs_f64()));
-                let report = Report::new(who, &doing, since.as_secs_f64(), warning);
-                for client in &clients {
-                    if let Err(e) = client.ask(&report, TIMEOUT) {
-                        tracing::debug!("a report did not arrive: {e}");
-                    }
-                }
+                send(&clients, &report(who, &doing, since));
                 said = Some((doing, Instant::now()));
             }
             if shutdown.wait_timeout(TICK) || clients.iter().all(|it| it.session().is_closed()) {

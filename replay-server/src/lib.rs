@@ -77,7 +77,7 @@ mod service;
 mod storage;
 
 pub use config::{Compression, Config, ConfigError, ReproducedBug};
-pub use durable::{DurableArgs, DurableError, DurableReplay, Recovery};
+pub use durable::{DurableArgs, DurableError, DurableReplay, Mark, Recovery};
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use rate_limiter::RateLimiter;
 pub use replay::{Replay, Unready};

@@ -87,6 +87,7 @@ fn chunks(engine: &ProcgenEngine, game: Game, runs_right: bool) -> Vec<Chunk> {
         restrict_themes: false,
         frame_side: 64,
         grey: false,
+        library: None,
     };
     let mut world = ProcgenWorld::with_engine(engine, &config, COPIES, 1, 0).unwrap();
     let frame_bytes = world.frame_shape().bytes();

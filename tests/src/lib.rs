@@ -11,6 +11,7 @@ mod certificates;
 mod client;
 mod network;
 mod process;
+pub mod python;
 mod run_folder;
 mod skipped;
 mod system;

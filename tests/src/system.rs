@@ -128,10 +128,11 @@ impl TestSystem {
         Process::start(args.to_owned(), self.command_after(words, args)).wait()
     }
 
-    /// Starts a replay server on this system's endpoint, with the settings that `flags` ask for.
+    /// Starts a replay server on this system's endpoint, with the settings that `flags` ask for. When the run is over it stays to be
+    /// asked, as the learner does.
     pub fn start_replay_server(&self, flags: &str) -> Process {
         self.start_part(&format!(
-            "replay-server --listen {} {flags}",
+            "replay-server --stay --listen {} {flags}",
             self.endpoint()
         ))
     }
@@ -139,7 +140,7 @@ impl TestSystem {
     /// Starts a learner whose checkpoints go into the run folder `run_dir`.
     pub fn start_learner(&self, run_dir: &str) -> Process {
         self.start_part(&format!(
-            "learner --connect {} --run-dir {run_dir}",
+            "learner --stay --connect {} --run-dir {run_dir}",
             self.endpoint()
         ))
     }

@@ -125,6 +125,7 @@ fn numbers_in(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSe
         shard: 0,
         after_updates: 0,
         segment_bytes: None,
+        mark: None,
     };
     let (mut replay, recovery) = DurableReplay::open(&args, spec, &config, ROWS).unwrap();
     assert!(

@@ -35,6 +35,7 @@ fn steps(criterion: &mut Criterion) {
                 restrict_themes: false,
                 frame_side: 64,
                 grey: false,
+                library: None,
             };
             let mut world =
                 ProcgenWorld::with_engine(&engine, &config, NUM_ENVS, 1, threads).unwrap();

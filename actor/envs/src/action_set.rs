@@ -86,6 +86,14 @@ impl Environment for FewerActions {
         }
         self.world.step(&self.step, rewards, ends)
     }
+
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        self.world.save()
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        self.world.load(state)
+    }
 }
 
 #[cfg(test)]

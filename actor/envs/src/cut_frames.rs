@@ -84,6 +84,14 @@ impl Environment for CutFrames {
     ) -> Result<(), EnvError> {
         self.world.step(actions, rewards, ends)
     }
+
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        self.world.save()
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        self.world.load(state)
+    }
 }
 
 #[cfg(test)]

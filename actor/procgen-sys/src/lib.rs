@@ -51,6 +51,7 @@ mod nap;
 mod options;
 mod pinned;
 mod release;
+mod state;
 mod vec_game;
 mod wheel;
 
@@ -60,4 +61,5 @@ pub use game::{DistributionMode, Game, ParseGameError, ParseModeError};
 pub use install::Engine;
 pub use options::{NUM_ACTIONS, NUM_ENVS_MAX, NUM_THREADS_MAX, Options, OptionsError};
 pub use release::{LIBENV_SHA256, VERSION, WHEEL_NAME, WHEEL_SHA256, download_command};
-pub use vec_game::{FRAME_BYTES, FRAME_SIDE, RESET, State, VecGame};
+pub use state::State;
+pub use vec_game::{FRAME_BYTES, FRAME_SIDE, RESET, VecGame};

@@ -12,6 +12,7 @@ use crate::library::{self, Api};
 use crate::nap::Nap;
 use crate::options::{NUM_ACTIONS, Options, RawOptions};
 use crate::pinned::Pinned;
+use crate::state::State;
 
 /// Rows and columns of a frame.
 pub const FRAME_SIDE: usize = 64;
@@ -25,20 +26,6 @@ pub const RESET: i32 = -1;
 /// Bytes set aside for a state at first; grown when states come near it. The engine ends the process if one does not
 /// fit; states seen are below 100 kB.
 const STATE_BYTES: usize = 1 << 20;
-
-/// A copy's complete state, as the engine wrote it. Only the engine makes one, because it trusts what it reads back.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct State {
-    game: Game,
-    bytes: Vec<u8>,
-}
-
-impl State {
-    /// The engine's bytes.
-    pub fn bytes(&self) -> &[u8] {
-        &self.bytes
-    }
-}
 
 /// N copies of one game. One thread at a time may use it; different ones may be used by different threads.
 pub struct VecGame {
@@ -227,10 +214,7 @@ impl VecGame {
         }
         bytes.truncate(used);
         bytes.shrink_to_fit();
-        Ok(State {
-            game: self.game,
-            bytes,
-        })
+        Ok(State::written_by_engine(self.game, bytes))
     }
 
     /// Puts copy `env` into a state of the same game; its frame, reward and flags become those of that state.
@@ -239,20 +223,21 @@ impl VecGame {
     /// No such copy, or a state of another game.
     pub fn set_state(&mut self, env: usize, state: &State) -> Result<(), ProcgenError> {
         let index = self.index(env)?;
-        if state.game != self.game {
+        if state.game() != self.game {
             return Err(ProcgenError::State(format!(
                 "a state of {} for a copy of {}",
-                state.game, self.game
+                state.game(),
+                self.game
             )));
         }
-        let len = i32::try_from(state.bytes.len()).expect("the engine gave its length as an i32");
+        let len = i32::try_from(state.bytes().len()).expect("the engine gave its length as an i32");
         // SAFETY: the handle is open, its buffers are set, `index` is one of its copies, and the bytes are what the
         // engine wrote for this game. It only reads them; the pointer is `*mut` for want of `const` in its header.
         unsafe {
             (self.api.set_state)(
                 self.handle,
                 index,
-                state.bytes.as_ptr().cast_mut().cast(),
+                state.bytes().as_ptr().cast_mut().cast(),
                 len,
             )
         };

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand, ValueEnum};
 use driml_envs::WorldName;
 use driml_learner::{DeviceName, Precision};
-use driml_machine::device::DeviceFlag;
+use driml_machine::{device::DeviceFlag, whole_number};
 
 /// What to measure.
 #[derive(Debug, Subcommand)]
@@ -17,8 +17,8 @@ pub enum BenchCommand {
     Policy(BenchFlags),
     /// Transitions into a replay server and batches out of it, over the wire; and its batches without the wire
     Replay(BenchReplayArgs),
-    /// Procgen's steps through our wrapper
-    Env(BenchFlags),
+    /// Procgen's steps through our wrapper, or those of other worlds
+    Env(BenchEnvArgs),
     /// A short run with real processes: its speed, how long the learner computes and waits, its memory
     System(BenchSystemArgs),
     /// More and more actors, synthetic and real: what is stored and served, how long each waits, how old the weights are
@@ -82,6 +82,16 @@ pub struct BenchLearnerArgs {
     pub(crate) flags: BenchFlags,
 }
 
+/// What `driml bench env` takes.
+#[derive(Clone, Debug, Args)]
+pub struct BenchEnvArgs {
+    /// Instead: this world, such as "exec:COMMAND"; may be given several times
+    #[arg(long, value_name = "WORLD")]
+    pub(crate) env: Vec<String>,
+    #[command(flatten)]
+    pub(crate) flags: BenchFlags,
+}
+
 /// What `driml bench replay` takes.
 #[derive(Clone, Debug, Args)]
 pub struct BenchReplayArgs {
@@ -111,7 +121,7 @@ pub struct BenchReplayArgs {
 #[derive(Debug, Args)]
 pub struct BenchSystemArgs {
     /// Frames of the run [default: 12000, or 2500 with --quick]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(2_000..=100_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(2_000..=100_000_000))]
     pub(crate) frames: Option<u64>,
     #[command(flatten)]
     pub(crate) flags: BenchFlags,

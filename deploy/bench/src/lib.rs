@@ -68,6 +68,7 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
         } else {
             match instead {
                 Instead::No => measure(component, flags, device)?,
+                Instead::Worlds(worlds) => env::measure_worlds(effort, worlds)?,
                 Instead::Growth => {
                     by_precision(flags, device, &|it| growth::measure(effort, device, it))?
                 }
@@ -106,7 +107,13 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
             }
             (None, None) => alone(Component::Replay, &args.flags, cpu, Instead::No),
         },
-        BenchCommand::Env(flags) => alone(Component::Env, flags, cpu, Instead::No),
+        BenchCommand::Env(args) => {
+            let instead = match &args.env[..] {
+                [] => Instead::No,
+                worlds => Instead::Worlds(worlds),
+            };
+            alone(Component::Env, &args.flags, cpu, instead)
+        }
         BenchCommand::System(args) => {
             measurements::report("system", &system::measure(args)?, machine, &args.flags)
         }
@@ -115,12 +122,13 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
     }
 }
 
-/// What is measured of the learner instead of its updates at the paper's sizes.
+/// What is measured instead of the learner's updates at the paper's sizes, or of Procgen's steps.
 #[derive(Clone, Copy)]
 enum Instead<'a> {
     No,
     Growth,
     Played(&'a [WorldName]),
+    Worlds(&'a [String]),
 }
 
 impl Instead<'_> {
@@ -133,6 +141,10 @@ impl Instead<'_> {
                 let worlds: Vec<_> = worlds.iter().map(ToString::to_string).collect();
                 vec!["--played".into(), worlds.join(",")]
             }
+            Self::Worlds(worlds) => worlds
+                .iter()
+                .flat_map(|world| ["--env".to_owned(), world.clone()])
+                .collect(),
         }
     }
 }

@@ -153,7 +153,7 @@ impl Run {
             shared_memory,
             tls_dir,
         } = wire;
-        let words = ["replay-server", "--listen", endpoint];
+        let words = ["replay-server", "--stay", "--listen", endpoint];
         let run = ["--env", settings::WORLD, "--agent", settings::AGENT];
         let transport = format!("transport.shared_memory={shared_memory}");
         let sets = settings::REPLAY.into_iter().chain([transport.as_str()]);

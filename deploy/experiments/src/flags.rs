@@ -4,6 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
+use driml_machine::whole_number;
 use serde::de::DeserializeOwned;
 
 /// The paper's experiments.
@@ -60,10 +61,10 @@ pub struct PacmanArgs {
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) agents: Vec<String>,
     /// Frames of each run with ghosts that move at random (a)
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1_000..=1_000_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(1_000..=1_000_000_000))]
     pub(crate) frames: Option<u64>,
     /// Episodes until the next ghost is the lethal one (b, c); the paper's are 5000
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(1..=10_000_000))]
     pub(crate) episodes_per_task: Option<u64>,
 }
 
@@ -81,7 +82,7 @@ pub struct ProcgenArgs {
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) agents: Vec<String>,
     /// Frames of each run; the paper's are 50000000
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(500..=1_000_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(500..=1_000_000_000))]
     pub(crate) frames: Option<u64>,
     /// Episodes played with each run's weights on each kind of levels
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
@@ -110,7 +111,7 @@ pub struct TradeoffArgs {
     #[arg(long)]
     pub(crate) plan: bool,
     /// Frames of each run [default: as the world's settings say, fewer where the budget is small]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1_000..=1_000_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(1_000..=1_000_000_000))]
     pub(crate) frames: Option<u64>,
     /// Episodes played with each run's weights [default: 100]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]

@@ -16,6 +16,12 @@ impl Colour {
         }
     }
 
+    /// The colour without its alpha.
+    pub(super) fn solid(self) -> tiny_skia::Color {
+        let [r, g, b] = self.rgb;
+        tiny_skia::Color::from_rgba8(r, g, b, u8::MAX)
+    }
+
     pub(super) const fn with_alpha(self, alpha: f32) -> Self {
         Self { alpha, ..self }
     }

@@ -60,6 +60,20 @@ pub enum FigureError {
         /// What is wrong with it.
         why: String,
     },
+    /// The name is no film's.
+    #[error("{} is no name of a film: take one that ends in .gif", .0.display())]
+    NoFilm(PathBuf),
+    /// A picture or film of no area, or too large.
+    #[error("a picture of {width} x {height} pixels cannot be made")]
+    Size {
+        /// Pixels across.
+        width: usize,
+        /// Pixels down.
+        height: usize,
+    },
+    /// A picture cannot be encoded.
+    #[error("encoding a picture: {0}")]
+    Encode(String),
     /// The file system refused.
     #[error("writing {}", .path.display())]
     Write {

@@ -3,10 +3,14 @@
 
 use anyhow::Context;
 use clap::ValueEnum;
-use driml_actor::{NetworkPolicy, Policy, RandomPolicy, episode_returns};
+use driml_actor::{Evaluation, NetworkPolicy, Policy, RandomPolicy, Step, episode_returns};
 use driml_envs::{CutFrames, FewerActions, WorldConfig};
-use driml_learner::{Compute, checkpoint};
+use driml_learner::{
+    Agent, Compute, UpdateError, checkpoint,
+    insight::{Insight, Seen},
+};
 use driml_machine::error::{Usage, usage};
+use driml_model::Enlarge;
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -48,6 +52,7 @@ pub struct Player {
     pub config: RunConfig,
     /// The network's parameters, a safetensors file.
     weights: Vec<u8>,
+    agent: Agent,
     /// Updates behind its weights.
     pub updates: u64,
 }
@@ -86,6 +91,7 @@ impl Player {
             config,
             weights,
             updates,
+            agent: restored.agent,
         })
     }
 
@@ -117,31 +123,98 @@ impl Player {
         episodes: usize,
         seed: u64,
     ) -> anyhow::Result<Vec<f64>> {
+        self.play_watched(who, world, episodes, seed, &mut |_| ())
+    }
+
+    /// [`Player::play`], with every step shown to `watch`, which changes nothing.
+    ///
+    /// # Errors
+    /// As [`Player::play`].
+    pub fn play_watched(
+        &self,
+        who: Who,
+        world: &WorldConfig,
+        episodes: usize,
+        seed: u64,
+        watch: &mut dyn FnMut(&Step<'_>),
+    ) -> anyhow::Result<Vec<f64>> {
         let spec = &self.config.run;
-        let sent = (spec.frame_height as usize, spec.frame_width as usize);
         let mut policy: Box<dyn Policy> = match who {
             Who::Agent => Box::new(NetworkPolicy::new(
                 &self.config.model,
-                self.config.input.enlarge(sent, &self.config.model)?,
+                self.enlarge()?,
                 &self.weights,
                 self.config.actor.precision,
             )?),
             Who::Random => Box::new(RandomPolicy::new(u8::try_from(spec.num_actions)?)),
         };
-        let copies = episodes.min(COPIES_MAX);
+        let copies = Self::copies(episodes);
         let actions = world.actions(self.config.actor.actions);
         let fewer = FewerActions::of(world.build(copies, seed, 0)?, actions)?;
         let rounds = episodes.div_ceil(copies) as u64;
-        episode_returns(
-            CutFrames::of(fewer, sent)?,
-            spec.frame_stack as usize,
-            policy.as_mut(),
-            EPSILON,
+        let evaluation = Evaluation {
+            frame_stack: spec.frame_stack as usize,
+            epsilon: EPSILON,
             episodes,
-            rounds * STEPS_A_ROUND_MAX,
-            policy_rng(seed),
-        )
-        .with_context(|| format!("playing {}", spec.world))
+            steps_max: rounds * STEPS_A_ROUND_MAX,
+        };
+        let (world, rng) = (CutFrames::of(fewer, self.sent())?, policy_rng(seed));
+        episode_returns(world, policy.as_mut(), evaluation, rng, watch)
+            .with_context(|| format!("playing {}", spec.world))
+    }
+
+    /// Copies of the world that play so many episodes.
+    pub fn copies(episodes: usize) -> usize {
+        episodes.min(COPIES_MAX)
+    }
+
+    /// What the network that plays makes of the states it sees.
+    ///
+    /// # Errors
+    /// Settings that do not fit each other.
+    pub fn viewer(&self) -> anyhow::Result<Viewer> {
+        Ok(Viewer {
+            insight: Insight::of(&self.agent, Compute::cpu(self.config.actor.precision))?,
+            enlarge: self.enlarge()?,
+            enlarged: Vec::new(),
+        })
+    }
+
+    /// Rows and columns of a frame as it travels.
+    fn sent(&self) -> (usize, usize) {
+        let spec = &self.config.run;
+        (spec.frame_height as usize, spec.frame_width as usize)
+    }
+
+    fn enlarge(&self) -> anyhow::Result<Option<Enlarge>> {
+        let config = &self.config;
+        Ok(config.input.enlarge(self.sent(), &config.model)?)
+    }
+}
+
+/// Sees what the policy sees.
+#[derive(Debug)]
+pub struct Viewer {
+    /// The network.
+    pub insight: Insight,
+    enlarge: Option<Enlarge>,
+    enlarged: Vec<u8>,
+}
+
+impl Viewer {
+    /// What the network makes of a step's states.
+    ///
+    /// # Errors
+    /// Bytes that are not whole states.
+    pub fn look(&mut self, states: &[u8]) -> Result<Seen, UpdateError> {
+        let Some(enlarge) = &self.enlarge else {
+            return self.insight.look(states);
+        };
+        // An input has as many states as there were, whatever their sizes.
+        let count = states.len() / enlarge.input_bytes();
+        self.enlarged.resize(count * enlarge.output_bytes(), 0);
+        enlarge.apply(states, &mut self.enlarged);
+        self.insight.look(&self.enlarged)
     }
 }
 

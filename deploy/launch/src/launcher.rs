@@ -96,6 +96,9 @@ pub fn run(
         )?,
         None => RunRecorder::create(run_dir, &text, losses, &names)?,
     };
+    if config.local.tensorboard {
+        recorder.write_events(run_dir)?;
+    }
     let resume_point = resumed.unwrap_or_default();
     let meeting = Meeting::create()?;
     let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
@@ -158,15 +161,10 @@ pub fn run(
         )
     })?;
     if outcome == Outcome::Interrupted {
-        if resume::is_resumable(&config.world, run_dir) {
-            console::line(&format!(
-                "`driml local --resume {}` goes on with it",
-                run_dir.display()
-            ));
-        }
+        resume::say_how(&config.world, run_dir);
         Err(Interrupted.into())
     } else {
-        Ok(())
+        print(&summary.next_steps(run_dir))
     }
 }
 
@@ -246,7 +244,14 @@ impl Launch<'_> {
 
         let folder = self.run_dir.display().to_string();
         let device = self.config.local.learner_device.to_string();
-        let mut args = words(&["learner", "--run-dir", &folder, "--device", &device]);
+        let mut args = words(&[
+            "learner",
+            "--stay",
+            "--run-dir",
+            &folder,
+            "--device",
+            &device,
+        ]);
         for endpoint in &self.endpoints {
             args.extend(words(&["--connect", endpoint]));
         }
@@ -264,13 +269,16 @@ impl Launch<'_> {
     }
 
     fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
-        let args = words(&[
+        let mut args = words(&[
             "actor",
             "--connect",
             &self.endpoints[id as usize % self.endpoints.len()],
             "--id",
             &id.to_string(),
         ]);
+        if self.config.world.name().foreign_code().is_some() {
+            args.extend(words(&["--env", &self.config.run.world]));
+        }
         let logs = self.run_dir.logs();
         let name = format!("actor-{id}");
         ManagedProcess::start(&name, &args, PROCESS_THREADS, self.surroundings(&logs))
@@ -304,6 +312,7 @@ impl Launch<'_> {
         let (number, after) = (shard.to_string(), after_updates.to_string());
         let mut args = words(&[
             "replay-server",
+            "--stay",
             "--listen",
             &self.endpoints[shard],
             "--shard",

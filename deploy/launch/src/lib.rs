@@ -16,7 +16,7 @@
 //! # Ok::<(), anyhow::Error>(())
 //! ```
 //!
-//! It draws nothing and compares no runs: that is for `driml-experiments`.
+//! It compares no runs, and draws nothing but the pictures among a run's events: figures are for `driml-experiments`.
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 

@@ -103,7 +103,7 @@ pub fn describe(
             format!(
                 "the newest {held} transitions, up to {} of memory{}",
                 size(bytes),
-                match local.durable && !lockstep {
+                match local.durable || lockstep {
                     true => " and about as much of disk, in the run folder",
                     false => "",
                 }

@@ -30,6 +30,9 @@ pub struct LocalConfig {
     /// run goes on with it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub durable: bool,
+    /// Whether events for TensorBoard are written beside the metrics, about a kilobyte a second.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub tensorboard: bool,
 }
 
 /// The resolved settings of a run. TOML is what they come from and travel as; between, there is this form alone.
@@ -163,12 +166,12 @@ impl RunConfig {
     }
 
     /// The names of the run's actions; an action is a place in this list.
-    pub fn action_names(&self) -> Vec<&'static str> {
+    pub fn action_names(&self) -> Vec<String> {
         let actions = self.world.actions(self.actor.actions);
         let names = self.world.action_names();
         actions
             .into_iter()
-            .map(|it| names[usize::from(it)])
+            .map(|it| names[usize::from(it)].to_owned())
             .collect()
     }
 
@@ -189,6 +192,13 @@ impl RunConfig {
         let said = |e: &dyn std::fmt::Display| Usage(e.to_string());
         self.run.validate().map_err(|e| said(&e))?;
         self.world.validate().map_err(|e| said(&e))?;
+        let name = self.world.name().to_string();
+        if name != self.run.world {
+            return Err(usage!(
+                "run.world = {:?}, but the table [world] is of {name:?}: correct the one or the other",
+                self.run.world
+            ));
+        }
         self.actor.validate().map_err(|e| said(&e))?;
         if self.replay.transitions_max.is_none() {
             return Err(usage!(

@@ -11,7 +11,7 @@ use toml::{Table, Value};
 use crate::overrides::inline;
 
 /// What follows, and from what.
-const FOLLOWS: [(&str, &str); 15] = [
+const FOLLOWS: [(&str, &str); 17] = [
     ("run.world", "is chosen by --env"),
     ("run.agent", "is chosen by --agent"),
     (
@@ -29,6 +29,8 @@ const FOLLOWS: [(&str, &str); 15] = [
     ),
     ("world.kind", "is chosen by --env"),
     ("world.game", "is chosen by --env"),
+    ("world.command", "is chosen by --env"),
+    ("world.library", "is chosen by --env"),
     ("input.frame", "follows from the world"),
     (
         "model.height",
@@ -60,6 +62,30 @@ const FRAME: &str = "input.frame";
 pub(crate) fn name(table: &mut Table, world: &str, agent: &str) {
     put(table, "run.world", Value::String(world.into()));
     put(table, "run.agent", Value::String(agent.into()));
+}
+
+/// The limits of a world that is a process of its own, in `[world]`.
+const LIMITS: [&str; 2] = ["start_timeout_ms", "step_timeout_ms"];
+
+/// Asks a world that is a process of its own what it is, and fills that in: shapes, actions, and the size at which its frames are seen.
+///
+/// # Errors
+/// A command that declares no world.
+pub(crate) fn declare(table: &mut Table, command: &str) -> Result<(), Usage> {
+    let [start, step] = LIMITS.map(|limit| whole_size(table, &format!("world.{limit}")));
+    let declared = driml_envs::exec_declaration(command, start? as u64, step? as u64)
+        .map_err(|e| usage!("--env: {e}"))?;
+    for (path, side) in [
+        ("input.height", declared.height),
+        ("input.width", declared.width),
+    ] {
+        if find(table, path).is_none() {
+            put(table, path, Value::Integer(side as i64));
+        }
+    }
+    let declared = Value::try_from(declared).map_err(|e| usage!("a world as TOML: {e}"))?;
+    put(table, "world", declared);
+    Ok(())
 }
 
 /// Lets frames be cut to what the network reads. Settings of earlier versions do not: what they say of a run stays true of it.
@@ -108,12 +134,8 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         .parse()
         .map_err(|e| usage!("run.world: {e}"))?;
     put(table, "world.kind", Value::String(world.kind().into()));
-    if let Some((key, variant)) = world.variant() {
-        put(
-            table,
-            &format!("world.{key}"),
-            Value::String(variant.into()),
-        );
+    for (key, value) in world.settings() {
+        put(table, &format!("world.{key}"), Value::String(value.into()));
     }
     let config: WorldConfig = table_at(table, "world")?;
     let update: LearnerSettings = table_at(table, "learner.update")?;

@@ -16,13 +16,15 @@ use crate::{
     resolve::{self, Flags, Source},
 };
 
-const ENV: &str = "procgen:bigfish";
+const ENV: &str = "procgen:coinrun";
 const AGENT: &str = "driml-ada";
 
 /// What to train, and with which settings.
 #[derive(Clone, Debug, Args)]
 pub struct RunFlags {
-    /// World, such as procgen:coinrun or mspacman; `driml presets` lists them [default: procgen:bigfish]
+    /// World, such as procgen:coinrun or mspacman; `driml presets` lists them. Your own: "exec:COMMAND", a process that declares
+    /// itself, such as driml_env.py around a Gymnasium environment [default: procgen:coinrun, on which agents
+    /// learn within minutes]
     #[arg(long, value_name = "WORLD")]
     pub env: Option<String>,
     /// Agent: c51, driml-fix, driml-ada, driml-randk, driml-noact, cpc or curl [default: driml-ada]

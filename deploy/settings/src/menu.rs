@@ -12,7 +12,7 @@ use toml::{Table, Value};
 
 use crate::{
     derived,
-    presets::{AGENTS, Agent, Layer, Only, PRESETS, Preset, agent, layers, stack},
+    presets::{Agent, Layer, Only, PRESETS, Preset, agent, agents, layers, stack},
     resolve::{Flags, Source, resolve},
 };
 
@@ -27,10 +27,21 @@ const BY_MACHINE: [&str; 5] = [
     "actor.world_threads",
 ];
 
+/// What a world that is a process of its own says of itself.
+const DECLARED: [&str; 6] = [
+    "world.height",
+    "world.width",
+    "world.channels",
+    "world.actions",
+    "input.height",
+    "input.width",
+];
+
 /// Presets, agents, and what differs by game.
 pub fn menu() -> Result<String, Usage> {
     let presets = PRESETS.iter().map(|preset| (preset.name, preset.about));
-    let agents = AGENTS.iter().map(|agent| (agent.name, agent.about));
+    let agents = agents();
+    let agents = agents.iter().map(|agent| (agent.name, agent.about));
     let width = presets
         .clone()
         .chain(agents.clone())
@@ -108,7 +119,7 @@ pub fn sourced(preset: &'static Preset, world: WorldName, agent: &Agent) -> Resu
         .map_err(|e: toml::de::Error| usage!("the settings as TOML: {}", e.message()))?;
     let mut sources = BTreeMap::new();
     for layer in stack(preset, world, agent) {
-        note_sources(&layer, &world.to_string(), &mut sources);
+        note_sources(&layer, &world.with_own_library().to_string(), &mut sources);
     }
     let mut text = format!(
         "# {} in {world}, preset {}: every setting and its source. `driml local --config` takes this file.\n",
@@ -135,7 +146,9 @@ fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, ou
     }
     for (key, value) in lines {
         let setting = format!("{} = {value}", quoted(key));
-        let source = source_of(&inner(key), sources);
+        // Nothing else has one.
+        let is_process = sources.contains_key("world.start_timeout_ms");
+        let source = source_of(&inner(key), sources, is_process);
         out.push_str(&format!("{setting:SOURCE_COLUMN$} # {source}\n"));
     }
     for (key, value) in tables {
@@ -155,12 +168,15 @@ fn quoted(key: &str) -> String {
     }
 }
 
-fn source_of(path: &str, sources: &BTreeMap<String, String>) -> String {
+fn source_of(path: &str, sources: &BTreeMap<String, String>, is_process: bool) -> String {
     if let Some(source) = sources.get(path) {
         return source.clone();
     }
     if BY_MACHINE.contains(&path) {
         return "this machine".into();
+    }
+    if is_process && DECLARED.contains(&path) {
+        return "the world declares it".into();
     }
     derived::follows(path).unwrap_or("not said").to_owned()
 }
@@ -219,7 +235,7 @@ pub(crate) fn comments(text: &str) -> Vec<(String, String)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::RunConfig;
+    use crate::{config::RunConfig, presets::AGENTS};
 
     #[test]
     fn every_setting_of_every_game_and_agent_has_a_source_and_reads_back() {

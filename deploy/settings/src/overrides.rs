@@ -4,6 +4,9 @@
 use driml_machine::error::{Usage, nearest, usage};
 use toml::{Table, Value};
 
+/// Up to here a float is exactly the whole number that was written.
+const WHOLE_MAX: f64 = (1u64 << 53) as f64;
+
 /// A parsed `--set`.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Override {
@@ -73,6 +76,12 @@ impl Override {
     fn as_type_of(&self, old: &Value) -> Result<Value, Usage> {
         match (old, &self.value) {
             (Value::Float(_), Value::Integer(whole)) => Ok(Value::Float(*whole as f64)),
+            // 1e6 is a number of frames, too. Floats are whole numbers up to 2^53.
+            (Value::Integer(_), Value::Float(number))
+                if number.fract() == 0.0 && number.abs() <= WHOLE_MAX =>
+            {
+                Ok(Value::Integer(*number as i64))
+            }
             (old, new) if old.same_type(new) => Ok(new.clone()),
             (old, new) => Err(usage!(
                 "--set {}={}: the value is {}, and {new} is {}",

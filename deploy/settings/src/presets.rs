@@ -5,6 +5,8 @@
 mod pinned;
 pub(crate) mod prices;
 
+use std::sync::{Mutex, PoisonError};
+
 use driml_envs::WorldName;
 use driml_machine::error::{Usage, nearest, usage};
 use serde::Deserialize;
@@ -128,18 +130,45 @@ agents! {
     "curl": "two augmentations of the same state, the second one seen by a moving average of the network";
 }
 
+/// Those that the program added.
+static OWN_AGENTS: Mutex<Vec<&'static Agent>> = Mutex::new(Vec::new());
+
+/// Makes an agent known, before anything else is done: `--agent NAME` takes it from then on. `layer` is its settings, TOML as in
+/// `presets/agent/`. A name that is known already keeps its agent.
+pub fn register_agent(name: &'static str, about: &'static str, layer: &'static str) {
+    let agent = Agent {
+        name,
+        about,
+        layer: Layer { name, text: layer },
+    };
+    let mut own = OWN_AGENTS.lock().unwrap_or_else(PoisonError::into_inner);
+    own.push(Box::leak(Box::new(agent)));
+}
+
+/// Every agent, with those that the program added.
+pub(crate) fn agents() -> Vec<&'static Agent> {
+    let own = OWN_AGENTS.lock().unwrap_or_else(PoisonError::into_inner);
+    AGENTS.iter().chain(own.iter().copied()).collect()
+}
+
 /// One for each kind of world in the registry of worlds.
 const WORLDS: &[Layer] = &[
     layer!("world/procgen"),
     layer!("world/mspacman"),
     layer!("world/chain"),
     layer!("world/ising"),
+    layer!("world/exec"),
 ];
 
 fn world_layer(world: WorldName) -> Layer {
     let name = format!("world/{}", world.kind());
-    let found = WORLDS.iter().find(|layer| layer.name == name);
-    *found.expect("a test looks for a layer of each kind")
+    let found = WORLDS.iter().find(|layer| layer.name == name).copied();
+    let own = driml_envs::own_preset(world.kind()).map(|text| Layer {
+        name: world.kind(),
+        text,
+    });
+    let layer = found.or(own);
+    layer.expect("a test looks for a layer of each kind, and whoever adds one brings it along")
 }
 
 /// A world by its name, or by its game's.
@@ -156,11 +185,13 @@ pub fn world(name: &str) -> Result<WorldName, Usage> {
 /// # Errors
 /// Says which agents there are.
 pub fn agent(name: &str) -> Result<&'static Agent, Usage> {
-    AGENTS
+    let agents = agents();
+    agents
         .iter()
+        .copied()
         .find(|agent| agent.name == name)
         .ok_or_else(|| {
-            let names: Vec<_> = AGENTS.iter().map(|agent| agent.name).collect();
+            let names: Vec<_> = agents.iter().map(|agent| agent.name).collect();
             usage!(
                 "there is no agent {name:?}{}; --agent takes {}",
                 nearest(name, names.iter().copied()),
@@ -201,7 +232,7 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
     }
     let mut table = Table::new();
     for layer in stack(preset, world, agent) {
-        lay(&mut table, &layer, &world.to_string());
+        lay(&mut table, &layer, &world.with_own_library().to_string());
     }
     Ok(table)
 }
@@ -256,7 +287,7 @@ impl Layer {
     fn read(&self) -> (Table, Vec<Only>) {
         let bad = |e| -> ! {
             panic!(
-                "presets/{}.toml is built in, and a test reads it: {e}",
+                "presets/{}.toml, or what a program has registered by that name, is no layer of settings: {e}",
                 self.name
             )
         };

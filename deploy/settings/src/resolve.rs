@@ -9,6 +9,7 @@ use driml_envs::WorldName;
 use driml_machine::{
     error::{Usage, usage},
     resources::Machine,
+    whole_number,
 };
 use driml_replay_server::ReproducedBug;
 use toml::{Table, Value};
@@ -44,10 +45,10 @@ pub struct Flags {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub envs: Option<u32>,
     /// Frames of the whole run; it ends when they are in and their updates done
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=i64::MAX as u64))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(1..=i64::MAX as u64))]
     pub frames: Option<u64>,
     /// Seed of every generator of the run
-    #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=i64::MAX as u64))]
+    #[arg(long, value_name = "S", value_parser = whole_number::within(0..=i64::MAX as u64))]
     pub seed: Option<u64>,
     /// Train with a known bug of the paper's published code, to see what it does
     #[arg(long, value_name = "BUG", value_parser = reproduced_bugs())]
@@ -85,6 +86,16 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
             let mut table = presets::layers(preset, *world, presets::agent(agent)?)?;
             derived::name(&mut table, &world.to_string(), agent);
             derived::cut_frames(&mut table);
+            if let Some(command) = world.command() {
+                // How long it is waited for is needed at once.
+                for text in &flags.sets {
+                    let one = Override::parse(text)?;
+                    if one.path.starts_with("world.") {
+                        one.apply(&mut table)?;
+                    }
+                }
+                derived::declare(&mut table, command)?;
+            }
             table
         }
         Source::File(name, text) => {

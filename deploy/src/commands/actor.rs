@@ -2,7 +2,9 @@
 
 use clap::Args;
 use driml_launch::endpoint::check_endpoints;
+use driml_machine::error::usage;
 use driml_protocol::tls::Role;
+use driml_settings::presets;
 
 use super::join::{JoinFlags, TlsFlags, clean_up_after, join};
 
@@ -17,6 +19,10 @@ pub(crate) struct ActorArgs {
     /// Copies of the world [default: as the run's settings say]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub(crate) envs: Option<u32>,
+    /// The run's world, where it is code of your own: exec:COMMAND or libenv:PATH:GAME as this machine has it. An actor
+    /// starts or loads no code because a replay server says so
+    #[arg(long, value_name = "WORLD")]
+    pub(crate) env: Option<String>,
     #[command(flatten)]
     pub(crate) tls: TlsFlags,
     #[command(flatten)]
@@ -30,6 +36,10 @@ pub(crate) struct ActorArgs {
 pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::Actor(args.id))?;
+    let world = match &args.env {
+        Some(name) => Some(presets::world(name).map_err(|e| usage!("--env: {e}"))?),
+        None => None,
+    };
     let shutdown = join(&args.join)?;
     let run = driml_actor::RunArgs {
         connect: args.connect,
@@ -37,6 +47,7 @@ pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
         namespace: args.join.namespace,
         actor: args.id,
         envs: args.envs,
+        world,
     };
     clean_up_after(driml_actor::run(run, &shutdown))
 }

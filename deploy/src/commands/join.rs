@@ -25,6 +25,14 @@ pub(crate) struct JoinFlags {
     pub(crate) exit_with_parent: Option<u32>,
 }
 
+/// When a replay server or a learner ends.
+#[derive(Debug, Args)]
+pub(crate) struct StayFlag {
+    /// Stay when the run is over, to be asked, until this is ended by Ctrl-C or a signal
+    #[arg(long)]
+    pub(super) stay: bool,
+}
+
 /// With which certificate a process takes part.
 #[derive(Debug, Args)]
 pub(crate) struct TlsFlags {

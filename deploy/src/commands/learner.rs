@@ -7,7 +7,7 @@ use driml_launch::endpoint::check_endpoints;
 use driml_machine::device::{DeviceFlag, ready_for};
 use driml_protocol::tls::Role;
 
-use super::join::{JoinFlags, TlsFlags, clean_up_after, join};
+use super::join::{JoinFlags, StayFlag, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct LearnerArgs {
@@ -19,6 +19,8 @@ pub(crate) struct LearnerArgs {
     pub(crate) run_dir: PathBuf,
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
+    #[command(flatten)]
+    pub(crate) until: StayFlag,
     #[command(flatten)]
     pub(crate) tls: TlsFlags,
     #[command(flatten)]
@@ -40,6 +42,7 @@ pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
         namespace: args.join.namespace,
         run_dir: args.run_dir,
         device: args.on.device,
+        stay: args.until.stay,
     };
     clean_up_after(driml_learner::run(run, &shutdown))
 }

@@ -8,7 +8,7 @@ use driml_machine::resources::Machine;
 use driml_protocol::tls::Role;
 use driml_settings::flags::{self, RunFlags};
 
-use super::join::{JoinFlags, NetworkFlag, TlsFlags, clean_up_after, join};
+use super::join::{JoinFlags, NetworkFlag, StayFlag, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct ReplayServerArgs {
@@ -31,6 +31,8 @@ pub(crate) struct ReplayServerArgs {
     pub(crate) replay_dir: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) run: RunFlags,
+    #[command(flatten)]
+    pub(crate) until: StayFlag,
     #[command(flatten)]
     pub(crate) tls: TlsFlags,
     #[command(flatten)]
@@ -61,6 +63,7 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
         after_updates: args.after_updates,
         weights_bytes_max: config.weights_bytes()?,
         dir: args.replay_dir,
+        stay: args.until.stay,
         config_toml: config.to_toml(),
     };
     clean_up_after(driml_replay_server::run(run, &shutdown))

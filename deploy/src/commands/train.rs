@@ -54,9 +54,12 @@ pub(crate) struct TrainArgs {
     #[arg(long, value_name = "DEVICE")]
     pub(crate) device: Option<DeviceName>,
     /// Keep the replay on disk too, in the run folder: a replay server that dies goes on with it, and so does --resume
-    #[arg(long, conflicts_with = "lockstep")]
+    #[arg(long)]
     pub(crate) durable: bool,
-    /// All parts in one process in a fixed order: the same seed gives the same weights
+    /// Write events for TensorBoard too, in the run folder: `tensorboard --logdir RUN`
+    #[arg(long)]
+    pub(crate) tensorboard: bool,
+    /// All parts in one process in a fixed order: the same seed gives the same weights, also if the run is interrupted and resumed
     #[arg(long, conflicts_with = "listen")]
     pub(crate) lockstep: bool,
     /// Endpoint on which the parts meet [default: a unix socket in a fresh folder]; or, with --tls-dir, on which the replay server
@@ -87,12 +90,15 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     if args.durable {
         args.run.over.sets.push("local.durable=true".into());
     }
+    if args.tensorboard {
+        args.run.over.sets.push("local.tensorboard=true".into());
+    }
     let (config, from, resume_point) = match &args.resume {
         Some(folder) => {
-            let (config, resume_point) =
-                resume::find(&RunFolder::new(folder), &args.run.over, &machine)?;
-            let from = format!("its checkpoint after {} updates", resume_point.updates);
-            (config, from, Some(resume_point))
+            let found = resume::find(&RunFolder::new(folder), &args.run.over, &machine)?;
+            args.lockstep = found.lockstep;
+            let from = format!("its checkpoint after {} updates", found.point.updates);
+            (found.config, from, Some(found.point))
         }
         None => {
             let (config, from) = resolve(&args.run, &machine)?;
@@ -136,19 +142,20 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     ))?;
     config.world.install(&mut console::line)?;
     if args.lockstep {
-        if config.local.durable {
-            return Err(usage!(
-                "--lockstep runs everything in one process, which keeps no replay on disk: leave --durable out"
-            )
-            .into());
-        }
         if shards > 1 {
             return Err(usage!(
                 "--lockstep runs everything in one process, with one replay: leave --replay-shards out"
             )
             .into());
         }
-        lockstep::run(&config, &run_dir, args.exit_with_parent)
+        if let Some(max) = config.replay.disk_bytes_max {
+            return Err(usage!(
+                "--lockstep keeps the whole replay in the run folder, so that the run can be resumed exactly, and cannot keep it within \
+                 replay.disk_bytes_max = {max}: leave that out, or lower replay.capacity_transitions"
+            )
+            .into());
+        }
+        lockstep::run(&config, &run_dir, resume_point, args.exit_with_parent)
     } else {
         launcher::run(
             &config,

@@ -129,6 +129,25 @@ impl Parameters {
         stored: StoredAs,
         filter: impl Fn(&str) -> bool,
     ) -> Result<Vec<u8>> {
+        self.serialized(stored, filter, None)
+    }
+
+    /// All parameters as a safetensors file whose metadata has `value` under `key`: for readers that know nothing else of the
+    /// network. One entry, as more would be written in an order of their own each time.
+    ///
+    /// # Errors
+    /// As [`Parameters::to_safetensors`].
+    pub fn to_described_safetensors(&self, key: &str, value: &str) -> Result<Vec<u8>> {
+        let entry = HashMap::from([(key.to_owned(), value.to_owned())]);
+        self.serialized(StoredAs::F32, |_| true, Some(entry))
+    }
+
+    fn serialized(
+        &self,
+        stored: StoredAs,
+        filter: impl Fn(&str) -> bool,
+        metadata: Option<HashMap<String, String>>,
+    ) -> Result<Vec<u8>> {
         let mut tensors = Vec::new();
         for (name, var) in self.iter().filter(|(name, _)| filter(name)) {
             let values = var.flatten_all()?.to_vec1::<f32>()?;
@@ -146,7 +165,7 @@ impl Parameters {
                 TensorView::new(stored.dtype(), shape.clone(), bytes)?,
             ));
         }
-        Ok(safetensors::serialize(views, None)?)
+        Ok(safetensors::serialize(views, metadata)?)
     }
 
     /// The parameter of this name, for example `torso.conv1.weight`.

@@ -18,6 +18,8 @@ pub(super) const TARGET: &str = "target.safetensors";
 pub(super) const KEY: &str = "key.safetensors";
 /// Adam's moments.
 pub(super) const OPTIMIZER: &str = "optimizer.safetensors";
+/// What whoever drives the learner keeps with it; there if it keeps something.
+pub(super) const COMPANION: &str = "companion.bin";
 /// A [`StateFile`].
 pub(super) const STATE: &str = "state.json";
 /// The SHA-256 of [`STATE`], which has those of the other files.
@@ -36,7 +38,7 @@ pub(super) struct StateFile {
     pub(super) weights_version: u64,
     pub(super) rng: ChaCha8Rng,
     pub(super) affinity: Option<AffinityEstimator>,
-    /// SHA-256 of the tensor files, by name.
+    /// SHA-256 of the other files, by name.
     pub(super) sha256: BTreeMap<String, String>,
 }
 

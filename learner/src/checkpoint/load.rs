@@ -7,7 +7,9 @@ use driml_model::{Compute, Encoder, ModelConfig, Parameters};
 use rand_chacha::ChaCha8Rng;
 
 use super::{
-    contents::{KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of, sha256_of},
+    contents::{
+        COMPANION, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of, sha256_of,
+    },
     error::{CheckpointError, damaged},
     folder::{list, read},
 };
@@ -58,16 +60,7 @@ pub fn load(
     compute: &Compute,
     run_spec_hash: u64,
 ) -> Result<Restored, CheckpointError> {
-    let text = read(&path.join(STATE))?;
-    let sum = read(&path.join(STATE_SUM))?;
-    if !sum.starts_with(sha256_of(&text).as_bytes()) {
-        return Err(damaged(
-            path,
-            STATE,
-            format!("its SHA-256 is not the one in {STATE_SUM}"),
-        ));
-    }
-    let state = StateFile::read(&text).map_err(|why| damaged(path, STATE, why))?;
+    let state = read_state(path)?;
     let expected = hex_of(run_spec_hash);
     if state.run_spec_hash != expected {
         let (folder, found) = (path.to_owned(), state.run_spec_hash);
@@ -81,19 +74,7 @@ pub fn load(
     if state.format == 1 && has_key {
         return Err(CheckpointError::WithoutKeyEncoder(path.to_owned()));
     }
-    let tensors = |name: &str| {
-        let bytes = read(&path.join(name))?;
-        if state.sha256.get(name) == Some(&sha256_of(&bytes)) {
-            Ok(bytes)
-        } else {
-            let length = bytes.len();
-            Err(damaged(
-                path,
-                name,
-                format!("the SHA-256 of its {length} bytes is not the one in {STATE}"),
-            ))
-        }
-    };
+    let tensors = |name: &str| read_file(path, &state, name);
     let parameters = |model: &ModelConfig, part: fn(&str) -> bool, name: &str| {
         let loaded = Parameters::load_part(model, part, &tensors(name)?, &compute.device);
         loaded.map_err(|why| damaged(path, name, why.to_string()))
@@ -117,4 +98,43 @@ pub fn load(
         rng: state.rng,
         weights_version: state.weights_version,
     })
+}
+
+/// What whoever drove the learner kept with the checkpoint at `path`; none if it kept nothing.
+///
+/// # Errors
+/// A file that is missing or is not what was written.
+pub fn companion(path: &Path) -> Result<Option<Vec<u8>>, CheckpointError> {
+    let state = read_state(path)?;
+    let there = state.sha256.contains_key(COMPANION);
+    there
+        .then(|| read_file(path, &state, COMPANION))
+        .transpose()
+}
+
+fn read_state(path: &Path) -> Result<StateFile, CheckpointError> {
+    let text = read(&path.join(STATE))?;
+    let sum = read(&path.join(STATE_SUM))?;
+    if !sum.starts_with(sha256_of(&text).as_bytes()) {
+        return Err(damaged(
+            path,
+            STATE,
+            format!("its SHA-256 is not the one in {STATE_SUM}"),
+        ));
+    }
+    StateFile::read(&text).map_err(|why| damaged(path, STATE, why))
+}
+
+/// The bytes of one of its other files.
+fn read_file(path: &Path, state: &StateFile, name: &str) -> Result<Vec<u8>, CheckpointError> {
+    let bytes = read(&path.join(name))?;
+    if state.sha256.get(name) == Some(&sha256_of(&bytes)) {
+        return Ok(bytes);
+    }
+    let length = bytes.len();
+    Err(damaged(
+        path,
+        name,
+        format!("the SHA-256 of its {length} bytes is not the one in {STATE}"),
+    ))
 }

@@ -2,13 +2,15 @@
 //! It does not decide when to save, and never falls back to an older checkpoint by itself.
 
 mod contents;
+mod description;
 mod error;
 mod folder;
 mod load;
 mod save;
 
 pub use contents::check_state;
+pub use description::describe;
 pub use error::CheckpointError;
 pub use folder::{FOLDER, list, lock};
-pub use load::{Restored, load, load_latest};
+pub use load::{Restored, companion, load, load_latest};
 pub use save::{RunState, save};

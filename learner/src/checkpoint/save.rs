@@ -11,8 +11,10 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{
     contents::{
-        FORMAT, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of, sha256_of,
+        COMPANION, FORMAT, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of,
+        sha256_of,
     },
+    description,
     error::{CheckpointError, io_error},
     folder::{PREFIX, list, put_in_place, remove_if_there, sync, tidy, write_durably},
 };
@@ -31,6 +33,10 @@ pub struct RunState<'a> {
     pub weights_version: u64,
     /// Hash of the run's specification.
     pub run_spec_hash: u64,
+    /// What [`describe`](super::describe) says, for the networks' metadata.
+    pub description: &'a str,
+    /// What whoever drives the learner keeps with it.
+    pub companion: Option<&'a [u8]>,
 }
 
 /// Writes `folder/checkpoint-<updates>` and removes all but the newest `keep` checkpoints.
@@ -67,7 +73,8 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
 /// Writes a checkpoint's files into the folder `aside`, which is made.
 fn write(aside: &Path, state: &RunState<'_>) -> Result<(), CheckpointError> {
     let agent = state.agent;
-    let files = tensor_files(agent).map_err(CheckpointError::Unsound)?;
+    let mut files = tensor_files(agent, state.description).map_err(CheckpointError::Unsound)?;
+    files.extend(state.companion.map(|bytes| (COMPANION, bytes.to_vec())));
     fs::create_dir(aside).map_err(io_error("create", aside))?;
     let mut sha256 = BTreeMap::new();
     for (name, bytes) in files {
@@ -99,8 +106,13 @@ fn write(aside: &Path, state: &RunState<'_>) -> Result<(), CheckpointError> {
 }
 
 /// The files of tensors and their names, all finite.
-fn tensor_files(agent: &Agent) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
-    let everything = |parameters: &Parameters| parameters.to_safetensors(|_| true);
+fn tensor_files(
+    agent: &Agent,
+    description: &str,
+) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
+    let everything = |parameters: &Parameters| {
+        parameters.to_described_safetensors(description::KEY, description)
+    };
     let moments = agent.adam.to_tensors()?;
     let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from)?;
     let mut files = vec![

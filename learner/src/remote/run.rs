@@ -45,10 +45,11 @@ pub struct RunArgs {
     pub run_dir: PathBuf,
     /// The device on which updates are computed.
     pub device: DeviceName,
+    /// Stay when the run is over, to be asked, until `shutdown`.
+    pub stay: bool,
 }
 
-/// Runs the learner until `shutdown`. When the run has no more batches it saves, and stays to answer questions. Whatever ends it
-/// before, it saves what it has learned.
+/// Runs the learner until the run has no more batches, or `shutdown`. Whatever ends it, it saves what it has learned.
 ///
 /// # Errors
 /// A device that is not there, no replay server to join, settings that cannot work, an update that failed, a disk that refuses.
@@ -143,10 +144,15 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     }
     learned.and(saved.map_err(Into::into))?;
     outlets.with_status(|status| status.finished = true);
-    activity.begin("has finished and stays to be asked");
     tracing::info!("finished after {} updates", learner.updates());
-    shutdown.wait();
+    if args.stay {
+        activity.begin("has finished and stays to be asked");
+        shutdown.wait();
+    }
     outlets.wait_until_heard(LAST_WORD_MAX);
+    if !shutdown.is_set() {
+        reporter::say_finished(&clients, Life::Learner(requests.learner));
+    }
     drop(membership);
     let closed = shards.close();
     batches.end();

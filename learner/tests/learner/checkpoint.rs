@@ -90,6 +90,8 @@ impl Run {
             rng,
             weights_version: 7,
             run_spec_hash: SPEC,
+            description: DESCRIPTION,
+            companion: None,
         };
         save(folder, &state, keep).unwrap()
     }
@@ -110,6 +112,9 @@ impl Run {
         [all(self.agent.online()), all(self.agent.target())]
     }
 }
+
+/// What the metadata says is for others: here it is any text.
+const DESCRIPTION: &str = r#"{"format":1}"#;
 
 fn load(folder: &Path) -> Result<Option<driml_learner::checkpoint::Restored>, CheckpointError> {
     load_latest(
@@ -357,6 +362,8 @@ fn a_state_that_is_not_finite_is_not_saved() {
                 rng: &run.rng,
                 weights_version: 8,
                 run_spec_hash: SPEC,
+                description: DESCRIPTION,
+                companion: None,
             };
             let said = save(&folder.0, &state, 1).unwrap_err().to_string();
             assert!(
@@ -529,4 +536,25 @@ fn one_learner_saves_in_a_folder() {
     assert_eq!(list(&folder.0).unwrap(), []);
     drop(held);
     lock(&folder.0).unwrap();
+}
+
+/// Checkpoints of earlier versions say nothing of themselves, and load all the same.
+#[test]
+fn the_networks_say_what_they_are_and_need_not() {
+    let folder = Folder::new("described");
+    let run = Run::new();
+    let path = run.save(&folder.0, 1);
+    for name in ["online.safetensors", "target.safetensors"] {
+        let file = fs::read(path.join(name)).unwrap();
+        let (_, header) = safetensors::SafeTensors::read_metadata(&file).unwrap();
+        let entries = header.metadata().as_ref().unwrap();
+        assert_eq!(entries.len(), 1);
+        assert_eq!(entries["driml"], DESCRIPTION);
+    }
+    let bare = run.agent.online().to_safetensors(|_| true).unwrap();
+    fs::write(path.join("online.safetensors"), &bare).unwrap();
+    change_state(&path, |state| {
+        state["sha256"]["online.safetensors"] = sha256(&bare).into()
+    });
+    assert_eq!(Run::resume(&folder.0).bytes(), run.bytes());
 }

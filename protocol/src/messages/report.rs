@@ -50,6 +50,8 @@ pub struct Report {
     pub since_s: f64,
     /// The last warning or error in its log.
     pub last_warning: Option<Warning>,
+    /// Its part in the run is done: the learner has learned from every batch, and has saved.
+    pub finished: bool,
 }
 
 /// A line of a part's log.
@@ -79,6 +81,7 @@ impl Report {
             doing: cut(doing, DOING_MAX),
             since_s,
             last_warning,
+            finished: false,
         }
     }
 }
@@ -151,6 +154,7 @@ mod tests {
                 text: text.into(),
                 age_s,
             }),
+            finished: false,
         };
         let long = "x".repeat(401);
         assert!(

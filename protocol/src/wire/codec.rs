@@ -1,5 +1,5 @@
 //! The bytes of a message: a fixed prefix, a bincode header, then a raw payload that serde never touches.
-//! It does not know what a message means, and it is the only file that calls bincode.
+//! It does not know what a message means, and it is the only file of what travels that calls bincode.
 //!
 //! The prefix's fields are in `prefix`.
 

@@ -51,6 +51,9 @@ pub enum DurableError {
         /// What is wrong.
         why: String,
     },
+    /// The log does not reach back to a mark.
+    #[error("{} is missing or damaged: the replay cannot go back to where the checkpoint was made", .0.display())]
+    NoMark(PathBuf),
     /// A value that cannot be written.
     #[error(transparent)]
     Codec(#[from] CodecError),

@@ -17,7 +17,7 @@ use super::{
     error::DurableError,
     folder::io_error,
     record::{self, RecordKind},
-    segment::{self, DurableState, LogId, SegmentHeader},
+    segment::{self, DurableState, LogId, Mark, SegmentHeader},
     sync::Syncer,
 };
 use crate::replay::events::Event;
@@ -192,6 +192,11 @@ impl Journal {
         }
     }
 
+    /// Whether the disk has refused what was to be written last.
+    pub(super) const fn is_failing(&self) -> bool {
+        self.failing.is_some()
+    }
+
     fn newest(&mut self) -> &mut Segment {
         self.segments
             .back_mut()
@@ -294,9 +299,32 @@ impl Journal {
         Ok(())
     }
 
-    /// Removes the oldest segments, whose transitions are all before `oldest_row`.
-    pub(super) fn prune(&mut self, oldest_row: u64) {
-        while self.segments.len() > 1 && self.segments[1].first_row <= oldest_row {
+    /// Begins another segment with `state`, which is on the disk when this returns.
+    ///
+    /// # Errors
+    /// A disk that refuses.
+    pub(super) fn mark(&mut self, state: DurableState) -> Result<Mark, DurableError> {
+        let before = self.newest().number;
+        if self.is_ready() {
+            self.rotate(state)?;
+        }
+        let number = self.newest().number;
+        if number == before {
+            let full = io::Error::other("it refuses to be written, as the log says");
+            return Err(io_error("marking", &self.folder)(full));
+        }
+        self.syncer
+            .flushed()
+            .map_err(io_error("flushing", &self.folder))?;
+        Ok(Mark::at(number))
+    }
+
+    /// Removes the oldest segments, whose transitions are all before `oldest_row`, as far as they come before segment `keep`.
+    pub(super) fn prune(&mut self, oldest_row: u64, keep: u64) {
+        while self.segments.len() > 1
+            && self.segments[1].first_row <= oldest_row
+            && self.segments[0].number < keep
+        {
             let number = self.segments[0].number;
             let path = segment::path(&self.folder, number);
             self.syncer.removed(number);

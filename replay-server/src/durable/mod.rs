@@ -23,3 +23,4 @@ pub use error::DurableError;
 pub(crate) use opening::shard_dir;
 pub use opening::{DurableArgs, Recovery};
 pub use replay::DurableReplay;
+pub use segment::Mark;

@@ -12,9 +12,9 @@ use super::{
     error::DurableError,
     folder::LogFolder,
     journal::{Journal, Limits, Place},
-    recovery::{Recovered, find_id, recover},
-    replay::{DurableReplay, Log},
-    segment::{DurableState, FORMAT, LogId},
+    recovery::{Recovered, find_id, go_back, recover},
+    replay::{DurableReplay, Log, Marked},
+    segment::{DurableState, FORMAT, LogId, Mark},
 };
 use crate::{
     config::{Config, SEGMENT_BYTES_MIN},
@@ -39,6 +39,8 @@ pub struct DurableArgs {
     pub after_updates: u64,
     /// Size from which a segment is followed by another, if not what suits the ring.
     pub segment_bytes: Option<u64>,
+    /// Go back to this mark: what the log says after it is removed.
+    pub mark: Option<Mark>,
 }
 
 /// What was found in the folder.
@@ -81,8 +83,11 @@ impl DurableReplay {
         };
         let id = known.unwrap_or(ours);
         folder.check(&id, &ours)?;
+        if let Some(mark) = args.mark {
+            go_back(&folder, mark)?;
+        }
         let found = match known {
-            Some(id) => recover(&folder, id, spec.num_actions, &mut replay)?,
+            Some(id) => recover(&folder, id, spec.num_actions, &mut replay, args.mark)?,
             None => None,
         };
         let mut recovery = Recovery::default();
@@ -120,7 +125,9 @@ impl DurableReplay {
             fsync,
             state,
         )?;
-        let log = Log::new(journal, id.spec_hash, folder);
+        let oldest_row = replay.oldest_row();
+        let marked = args.mark.map(|mark| Marked { mark, oldest_row });
+        let log = Log::new(journal, id.spec_hash, folder).marked(marked);
         let mut this = Self::with_log(replay, log, found.learner, found.after_updates);
         this.catch_up(args.after_updates, batch_size, config.shards);
         this.tidy();

@@ -9,7 +9,7 @@ use super::{
     error::DurableError,
     folder::{LogFolder, io_error},
     record::{self, Broken, Record, RecordKind, RecordReader},
-    segment::{self, LogId, SegmentFile, SegmentHeader},
+    segment::{self, LogId, Mark, SegmentFile, SegmentHeader},
 };
 use crate::{
     replay::{Replay, events::Event},
@@ -71,14 +71,54 @@ struct Recovery<'a> {
     oldest: u64,
     /// Whether which transitions are held follows from their number, as it did before.
     same_capacity: bool,
+    /// The last that the log says, if it is a mark.
+    mark: Option<Mark>,
 }
 
-/// Rebuilds `replay`, which is empty, from the segments in `folder`; `None` if there are none of log `id`.
+/// Removes what the log in `folder` says after `mark`.
+pub(super) fn go_back(folder: &LogFolder, mark: Mark) -> Result<(), DurableError> {
+    let files = segment::list(&folder.path).map_err(io_error("listing", &folder.path))?;
+    let Some(marked) = files.iter().find(|it| it.number == mark.segment()) else {
+        return Err(DurableError::NoMark(segment::path(
+            &folder.path,
+            mark.segment(),
+        )));
+    };
+    let reading = || io_error("reading", &marked.path);
+    let mut reader = RecordReader::open(&marked.path).map_err(reading())?;
+    let begins = matches!(
+        reader.next().map_err(reading())?,
+        Some(Ok(record)) if record.kind == RecordKind::Segment
+    );
+    if !begins {
+        return Err(DurableError::NoMark(marked.path.clone()));
+    }
+    // The newest first: whatever is left then is a log that ends earlier.
+    for later in files.iter().rev() {
+        if later.number > mark.segment() {
+            fs::remove_file(&later.path).map_err(io_error("removing", &later.path))?;
+        }
+    }
+    cut_off(marked, reader.at())
+}
+
+/// Ends a segment's file at byte `at`.
+fn cut_off(file: &SegmentFile, at: u64) -> Result<(), DurableError> {
+    fs::File::options()
+        .write(true)
+        .open(&file.path)
+        .and_then(|opened| opened.set_len(at))
+        .map_err(io_error("cutting off the end of", &file.path))
+}
+
+/// Rebuilds `replay`, which is empty, from the segments in `folder`; `None` if there are none of log `id`. With a `mark`, which is
+/// the last that the log says, all of the replay's state is taken from there.
 pub(super) fn recover(
     folder: &LogFolder,
     id: LogId,
     num_actions: u32,
     replay: &mut Replay,
+    mark: Option<Mark>,
 ) -> Result<Option<Recovered>, DurableError> {
     let files = segment::list(&folder.path).map_err(io_error("listing", &folder.path))?;
     let number = files.last().map_or(0, |it| it.number + 1);
@@ -103,6 +143,7 @@ pub(super) fn recover(
         are_listed: false,
         oldest: 0,
         same_capacity: false,
+        mark,
     };
     let last = files.len().saturating_sub(1);
     for (at, file) in files.iter().enumerate() {
@@ -159,10 +200,11 @@ impl Recovery<'_> {
             self.set_aside(file, "it is not the segment that belongs here");
             return Ok(());
         }
+        let is_mark = self.mark.is_some_and(|mark| mark.segment() == file.number);
         let stored = self.replay.next_row();
         let first_row = state.replay.inserted;
         match self.expected {
-            Some(expected) if expected == ordinal => {}
+            Some(expected) if expected == ordinal && !is_mark => {}
             expected => {
                 self.oldest = state.replay.oldest;
                 self.same_capacity = state.replay.capacity == self.replay.capacity()
@@ -225,11 +267,7 @@ impl Recovery<'_> {
                  and served then is lost"
             )),
         }
-        fs::File::options()
-            .write(true)
-            .open(&file.path)
-            .and_then(|opened| opened.set_len(at))
-            .map_err(io_error("cutting off the end of", &file.path))
+        cut_off(file, at)
     }
 
     /// Gives a segment that cannot be used another name.

@@ -1,14 +1,19 @@
 //! The replay and its log: every change goes to both, and nobody hears of one that is not on disk.
 //! What a change is, is the replay's business; how it is written, the journal's.
 
-use std::ops::Deref;
+use std::{borrow::Cow, collections::VecDeque, ops::Deref};
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Buffer, Claim, CodecError, Goodbye, InsertReply, RequestId, Tally,
-    codec,
+    ActorJoin, AffinityUpdate, Batch, Buffer, Chunk, Claim, CodecError, Goodbye, InsertReply,
+    RequestId, Tally, codec,
 };
 
-use super::{folder::LogFolder, journal::Journal, segment::DurableState};
+use super::{
+    error::DurableError,
+    folder::LogFolder,
+    journal::Journal,
+    segment::{DurableState, Mark},
+};
 use crate::{
     replay::{
         Replay, Unready,
@@ -17,6 +22,9 @@ use crate::{
     sampling::packed_batch::PackedBatch,
     storage::frame_store::{PackedChunk, Packer},
 };
+
+/// Marks that hold: if the newest is of a checkpoint that was not written whole, the one before it is wanted.
+const MARKS: usize = 2;
 
 /// A replay and, if it is kept on disk, its log. Whatever changes the replay goes through this.
 pub struct DurableReplay {
@@ -31,7 +39,17 @@ pub struct DurableReplay {
 pub(super) struct Log {
     journal: Journal,
     spec_hash: u64,
+    /// The last two marks, the newest last.
+    marks: VecDeque<Marked>,
     _folder: LogFolder,
+}
+
+/// A moment to which a replay can go back: what it needs stays in the log.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Marked {
+    pub(super) mark: Mark,
+    /// The oldest transition that was held.
+    pub(super) oldest_row: u64,
 }
 
 impl Deref for DurableReplay {
@@ -48,8 +66,24 @@ impl Log {
         Self {
             journal,
             spec_hash,
+            marks: VecDeque::new(),
             _folder: folder,
         }
+    }
+
+    /// The same, to whose beginning `marked` belongs.
+    pub(super) fn marked(mut self, marked: Option<Marked>) -> Self {
+        self.marks.extend(marked);
+        self
+    }
+
+    /// Removes the segments that neither the ring nor a mark needs.
+    fn prune(&mut self, oldest_row: u64) {
+        let Some(first) = self.marks.front() else {
+            return self.journal.prune(oldest_row, u64::MAX);
+        };
+        self.journal
+            .prune(oldest_row.min(first.oldest_row), first.mark.segment());
     }
 }
 
@@ -125,6 +159,13 @@ impl DurableReplay {
         self.log.as_mut().is_none_or(|log| log.journal.is_ready())
     }
 
+    /// Whether a chunk or an event could not be written the last time.
+    pub fn is_refused_by_disk(&self) -> bool {
+        self.log
+            .as_ref()
+            .is_some_and(|log| log.journal.is_failing())
+    }
+
     /// All that a restart brings back beside the transitions, as bytes that are the same where it is. For tests.
     ///
     /// # Errors
@@ -166,18 +207,47 @@ impl DurableReplay {
                 if let Err(e) = log.journal.append_event(&Event::Forgotten { oldest }) {
                     tracing::error!("an event cannot be written to the replay's log: {e}");
                 }
-                log.journal.prune(self.replay.oldest_row());
+                log.prune(self.replay.oldest_row());
             }
-            let state = DurableState {
-                replay: self.replay.snapshot(),
-                learner: self.learner,
-                after_updates: self.after_updates,
-            };
+            let state = state_of(&self.replay, self.learner, self.after_updates);
             if let Err(e) = log.journal.rotate(state) {
                 tracing::error!("a segment of the replay's log cannot be begun: {e}");
             }
         }
-        log.journal.prune(self.replay.oldest_row());
+        log.prune(self.replay.oldest_row());
+    }
+
+    /// Marks this moment in the log, on the disk. The log can be opened there again, also after it went on: then all of the
+    /// replay is as it is now, to the last bit. The last two marks hold.
+    ///
+    /// # Errors
+    /// A disk that refuses.
+    pub fn mark(&mut self) -> Result<Option<Mark>, DurableError> {
+        let Some(log) = &mut self.log else {
+            return Ok(None);
+        };
+        let state = state_of(&self.replay, self.learner, self.after_updates);
+        let oldest_row = state.replay.oldest;
+        let mark = log.journal.mark(state)?;
+        if log.marks.len() == MARKS {
+            log.marks.pop_front();
+        }
+        log.marks.push_back(Marked { mark, oldest_row });
+        log.prune(self.replay.oldest_row());
+        Ok(Some(mark))
+    }
+
+    /// [`Replay::sample`], of which the log learns with the next mark: for whoever goes back to marks alone.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn sample_between_marks(&mut self, rows: u32) -> Result<Batch, Unready> {
+        self.replay.sample(rows)
+    }
+
+    /// [`Replay::insert`].
+    pub fn insert(&mut self, chunk: &Chunk) -> InsertReply {
+        self.insert_packed(&self.packer().pack(Cow::Borrowed(chunk)))
     }
 
     /// [`Replay::join_actor`].
@@ -358,5 +428,14 @@ impl DurableReplay {
     /// [`Replay::set_actors`].
     pub fn set_actors(&mut self, actors: u32) {
         self.replay.set_actors(actors);
+    }
+}
+
+/// All of a replay but its transitions.
+fn state_of(replay: &Replay, learner: Option<u64>, after_updates: u64) -> DurableState {
+    DurableState {
+        replay: replay.snapshot(),
+        learner,
+        after_updates,
     }
 }

@@ -25,6 +25,20 @@ pub(super) struct SegmentHeader {
     pub(super) state: DurableState,
 }
 
+/// A moment in the life of a replay that is kept on disk: the segment that begins there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Mark(u64);
+
+impl Mark {
+    pub(super) const fn at(segment: u64) -> Self {
+        Self(segment)
+    }
+
+    pub(super) const fn segment(self) -> u64 {
+        self.0
+    }
+}
+
 /// Which log it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct LogId {

@@ -101,8 +101,16 @@ impl Syncer {
 
 impl Syncer {
     /// Flushes now.
+    ///
+    /// # Errors
+    /// The disk refuses.
+    pub(super) fn flushed(&self) -> io::Result<()> {
+        flush(&self.shared)
+    }
+
+    /// Flushes now; a disk that refuses is a warning.
     pub(super) fn flush(&self) {
-        if let Err(e) = flush(&self.shared) {
+        if let Err(e) = self.flushed() {
             tracing::warn!("the replay's log was not flushed at the end: {e}");
         }
     }

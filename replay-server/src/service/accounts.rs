@@ -99,13 +99,14 @@ impl Accounts {
     }
 
     /// A part says what it does; `false` if it does not take part.
-    pub(super) fn reported(&mut self, report: Report, now: Instant) -> bool {
-        let account = self.of(report.who.alive());
-        let known = account.is_some();
-        if let Some(account) = account {
-            account.report = Some((report, now));
-        }
-        known
+    pub(super) fn reported(&mut self, mut report: Report, now: Instant) -> bool {
+        let Some(account) = self.of(report.who.alive()) else {
+            return false;
+        };
+        // One that was under way meanwhile does not undo it.
+        report.finished |= account.report.as_ref().is_some_and(|(it, _)| it.finished);
+        account.report = Some((report, now));
+        true
     }
 
     /// Who waits at the limiter now.
@@ -129,6 +130,19 @@ impl Accounts {
     pub(super) fn ages(&self, now: Instant) -> (f64, Option<f64>) {
         let weights = self.weights_at.map(|at| seconds(now, at));
         (seconds(now, self.started), weights)
+    }
+
+    /// Whether the learner said that it has learned from every batch, and has saved.
+    pub(super) fn is_over(&self) -> bool {
+        let learner = self.parts.get(&PartName::Learner);
+        let report = learner.and_then(|account| account.report.as_ref());
+        report.is_some_and(|(report, _)| report.finished)
+    }
+
+    /// Parts that are connected.
+    pub(super) fn connected(&self) -> usize {
+        let accounts = self.parts.values();
+        accounts.filter(|account| account.is_connected).count()
     }
 
     /// Which part the run cannot go on without and does not have, for a person; `finished` says whether all transitions are in.

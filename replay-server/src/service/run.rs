@@ -67,6 +67,8 @@ pub struct RunArgs {
     pub weights_bytes_max: usize,
     /// The folder in which the replay is kept, if it is kept on disk; of several shards each has a folder of its own there.
     pub dir: Option<PathBuf>,
+    /// Stay when the run is over, to be asked, until `shutdown`.
+    pub stay: bool,
     /// The run's resolved settings, which it hands to whoever joins.
     pub config_toml: String,
 }
@@ -167,7 +169,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         args.listen,
         client.spec_hash()
     );
-    shutdown.wait();
+    service.wait_until_over(args.stay);
+    // Threads of its own wait for that.
+    shutdown.set();
     service.changed.notify_all();
     tracing::info!(
         "replay server stops with {} transitions stored",
@@ -195,6 +199,7 @@ fn open_durable(
         shard: args.shard,
         after_updates: args.after_updates,
         segment_bytes: None,
+        mark: None,
     };
     let (replay, recovery) = DurableReplay::open(&durable, spec, config, batch_size)?;
     for warning in &recovery.warnings {

@@ -11,6 +11,8 @@ use super::{accounts::own_warning, server::Service};
 
 /// How often it is looked whether somebody is missing.
 const LOOK: Duration = Duration::from_secs(1);
+/// How long a replay server stays for parts that do not leave when the run is over.
+const FAREWELL_MAX: Duration = Duration::from_secs(30);
 /// How long somebody may be missing before it is said.
 const SILENT_MAX: Duration = Duration::from_secs(10);
 
@@ -113,6 +115,27 @@ impl Service {
                 let since = since.elapsed().as_secs();
                 tracing::info!("{missing}, waiting since {since} s: `driml status` says more");
                 *due *= 2;
+            }
+        }
+    }
+
+    /// Waits until the run is over and nobody is left who would ask, or for the end from outside; with `stay` for that alone.
+    pub(super) fn wait_until_over(&self, stay: bool) {
+        if stay {
+            return self.shutdown.wait();
+        }
+        let mut over_since: Option<Instant> = None;
+        while !self.shutdown.wait_timeout(LOOK) {
+            let state = self.state();
+            let (is_over, connected) = (state.accounts.is_over(), state.accounts.connected());
+            drop(state);
+            if !is_over {
+                over_since = None;
+                continue;
+            }
+            let since = over_since.get_or_insert_with(Instant::now);
+            if connected == 0 || since.elapsed() > FAREWELL_MAX {
+                return tracing::info!("the run is over, and {connected} parts are left");
             }
         }
     }

@@ -60,6 +60,7 @@ pub(crate) fn args(dir: &Path, segment_bytes: u64) -> DurableArgs {
         shard: 0,
         after_updates: 0,
         segment_bytes: Some(segment_bytes),
+        mark: None,
     }
 }
 
@@ -150,7 +151,7 @@ impl Life {
     }
 
     /// Something happens.
-    fn act(&mut self) {
+    pub(crate) fn act(&mut self) {
         match self.rng.random_range(0..20) {
             0..9 => {
                 let actor = self.rng.random_range(0..2);

@@ -8,6 +8,7 @@ mod compression;
 mod config;
 mod durable;
 mod durable_damage;
+mod durable_marks;
 mod exactly_once;
 mod history;
 mod horizon;

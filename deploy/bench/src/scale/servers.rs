@@ -62,7 +62,7 @@ impl Servers {
             let socket = folder.join(format!("{shard}.sock"));
             let endpoint = format!("unixsock-stream/{}", socket.display());
             let shard = shard.to_string();
-            let words = ["replay-server", "--listen", &endpoint];
+            let words = ["replay-server", "--stay", "--listen", &endpoint];
             let run = [
                 "--shard",
                 &shard,

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
+use driml_machine::whole_number;
 
 /// What `driml plot` takes.
 #[derive(Debug, Args)]
@@ -14,7 +15,7 @@ pub struct PlotArgs {
     #[arg(long, value_name = "COLUMN")]
     pub(crate) column: Vec<String>,
     /// Draw the mean over this many frames before each point
-    #[arg(long, value_name = "FRAMES", value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, value_name = "FRAMES", value_parser = whole_number::within(1..=u64::MAX))]
     pub(crate) smooth: Option<u64>,
     /// What the band over several seeds shows
     #[arg(long, value_enum, default_value_t = Band::Range)]

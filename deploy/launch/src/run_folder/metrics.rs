@@ -140,7 +140,7 @@ pub(super) fn rows_up_to(
     if !found.header.is_empty() && found.header != header {
         return Err(usage!(
             "{} has other columns than a run of several processes by this version of driml: go on with the version that began it; a \
-             run in --lockstep is repeated, not resumed",
+             run in --lockstep whose world cannot be saved is repeated, not resumed",
             path.display()
         )
         .into());

@@ -1,8 +1,10 @@
 //! A run's folder: the names of its files, what is written there while a run goes on, and reading it again.
 
 mod columns;
+mod events;
 mod folder;
 mod growing_csv;
+mod growing_file;
 mod metrics;
 mod recorder;
 mod resume_point;

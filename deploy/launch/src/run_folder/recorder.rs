@@ -1,4 +1,4 @@
-//! What is written into the run folder while a run goes on: settings, metrics, returns, and the summary at its end.
+//! What is written into the run folder while a run goes on: settings, metrics, returns, events on request, and the summary at its end.
 //! It reads no status from anywhere: its caller hands them over.
 
 use std::{
@@ -11,6 +11,7 @@ use driml_protocol::{LearnerStatus, ReplayStatus, RunSpec};
 
 use super::{
     columns::Columns,
+    events::Events,
     folder::RunFolder,
     growing_csv::GrowingCsv,
     metrics::{Moment, header, rows_up_to},
@@ -40,6 +41,8 @@ pub struct RunRecorder {
     /// Mean and standard deviation of k up to there.
     k_before: Option<(f64, f64)>,
     metrics: GrowingCsv,
+    header: Vec<String>,
+    events: Option<Events>,
     returns: TrainingReturns,
     losses: &'static [&'static str],
     processes: Vec<String>,
@@ -129,6 +132,8 @@ impl RunRecorder {
                 .unwrap_or(0),
             k_before: before("mean_k").zip(before("sd_k")),
             metrics: GrowingCsv::create(&folder.metrics(), &rows.header, &rows.rows)?,
+            header: rows.header,
+            events: None,
             returns,
             losses,
             processes: processes.to_vec(),
@@ -139,6 +144,16 @@ impl RunRecorder {
         this.rates
             .add(this.started, resume_point.frames, resume_point.updates);
         Ok(this)
+    }
+
+    /// Writes TensorBoard's events from now on, too.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(crate) fn write_events(&mut self, folder: &RunFolder) -> anyhow::Result<()> {
+        let kept = (self.resume_point.updates > 0).then_some(self.frames_before);
+        self.events = Some(Events::create(folder, self.header.clone(), kept)?);
+        Ok(())
     }
 
     /// Mean and standard deviation of k over all `updates` of the run, before it was resumed too.
@@ -198,12 +213,16 @@ impl RunRecorder {
                 .collect(),
         };
         let row = moment.row();
-        said.into_iter().chain(self.metrics.add(row)).collect()
+        let events = self.events.as_mut();
+        let drawn = events.and_then(|events| events.add(&row, replay, learner.finished));
+        let written = self.metrics.add(row);
+        said.into_iter().chain(written).chain(drawn).collect()
     }
 
     /// What to say about rows that could not be written up to now.
     pub fn missing(&self) -> Vec<String> {
-        let missing = [self.metrics.missing(), self.returns.missing()];
+        let events = self.events.as_ref().and_then(Events::missing);
+        let missing = [self.metrics.missing(), self.returns.missing(), events];
         missing.into_iter().flatten().collect()
     }
 

@@ -151,6 +151,17 @@ impl Summary {
         Self::read(folder).is_ok_and(|it| it.outcome == Outcome::Finished)
     }
 
+    /// What a person may do with a finished run, a command a line.
+    pub fn next_steps(&self, run_dir: &RunFolder) -> String {
+        let run = run_dir.display();
+        let more = self.frames.saturating_mul(2);
+        format!(
+            "  driml plot {run} --out plot.png              return, losses, k and speed\n  \
+               driml evaluate --run {run}             beside a random policy\n  \
+               driml local --resume {run} --frames {more}   goes on\n"
+        )
+    }
+
     /// What is printed at the end.
     pub fn describe(&self, run_dir: &RunFolder) -> String {
         let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));

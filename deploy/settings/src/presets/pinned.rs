@@ -136,6 +136,15 @@ const PINNED: &[(&str, &[Pinned])] = &[
         ("learner.update.lambda.4t3", "0.0", "paper"),
         ("learner.update.lambda.4t4", "0.0", "paper"),
     ]),
+    ("world/exec", &[
+        ("run.frame_stack", "4", "Mnih et al. 2015"),
+        ("world.start_timeout_ms", "120000", "ours"),
+        ("world.step_timeout_ms", "60000", "ours"),
+        ("learner.update.lambda.3t3", "0.0", "paper"),
+        ("learner.update.lambda.3t4", "0.0", ""),
+        ("learner.update.lambda.4t3", "0.0", ""),
+        ("learner.update.lambda.4t4", "1.0", "paper"),
+    ]),
     ("agent/c51", &[
         ("run.horizon.rule", r#""none""#, ""),
         ("learner.update.objective", r#""none""#, ""),
@@ -233,7 +242,9 @@ const OWN: [&str; 2] = ["world/chain", "variant/smoke"];
 
 fn all_layers() -> BTreeMap<&'static str, Layer> {
     let agents = AGENTS.iter().map(|agent| agent.layer);
-    let worlds = WorldName::all().map(world_layer);
+    // A command is no world's name; any one stands for all.
+    let exec = "exec:true".parse().unwrap();
+    let worlds = WorldName::all().chain([exec]).map(world_layer);
     let variants = PRESETS
         .iter()
         .flat_map(|preset| preset.layers.iter().copied());

@@ -1,7 +1,9 @@
 //! The settings of the Procgen world, as a preset or a command line gives them.
 //! There are no defaults: every field affects what is learned, so a preset says each with its source.
 
-use procgen_sys::{DistributionMode, FRAME_SIDE, Game, Options, ProcgenError};
+use std::path::Path;
+
+use procgen_sys::{DistributionMode, Engine, FRAME_SIDE, Game, Options, ProcgenError};
 
 use super::shrink::Shrink;
 use crate::environment::FrameShape;
@@ -42,6 +44,10 @@ pub struct ProcgenConfig {
     /// Whether frames are grey, one byte a pixel, rather than of three colours. Settings of earlier versions do not have it: not.
     #[serde(default)]
     pub grey: bool,
+    /// Another build of the engine's library, by the path of `libenv.so`, with its pictures in `assets` beside it or beside its
+    /// folder; none: the published one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub library: Option<String>,
 }
 
 const fn whole_side() -> u32 {
@@ -66,6 +72,18 @@ impl ProcgenConfig {
             )));
         }
         self.options(1, 0, 0).map(drop)
+    }
+
+    /// The engine that plays: the build that is named, or the published one, which is fetched if it is not there.
+    ///
+    /// # Errors
+    /// An engine that cannot be had.
+    pub(super) fn engine(&self, progress: &mut dyn FnMut(&str)) -> Result<Engine, EnvError> {
+        let engine = match &self.library {
+            Some(library) => Engine::other(Path::new(library)),
+            None => Engine::install(progress),
+        };
+        Ok(engine.map_err(ProcgenError::from)?)
     }
 
     /// The shape of a frame as it leaves the world.

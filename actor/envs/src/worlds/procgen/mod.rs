@@ -33,11 +33,12 @@ mod shrink;
 mod tests;
 mod visible_actions;
 
-use procgen_sys::{Engine, Game, NUM_ACTIONS, ProcgenError, RESET, VecGame};
+use procgen_sys::{Engine, Game, NUM_ACTIONS, ProcgenError, RESET, State, VecGame};
 
 use crate::copies::check_step;
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
+use crate::saved;
 use crate::settings::{Levels, Variants, WorldSettings};
 use shrink::Shrink;
 
@@ -108,7 +109,7 @@ impl ProcgenWorld {
         threads: usize,
     ) -> Result<ProcgenWorld, EnvError> {
         config.options(num_envs, seed, threads)?;
-        let engine = Engine::install(&mut |_| {}).map_err(ProcgenError::from)?;
+        let engine = config.engine(&mut |_| {})?;
         ProcgenWorld::with_engine(&engine, config, num_envs, seed, threads)
     }
 
@@ -197,8 +198,13 @@ impl WorldSettings for ProcgenConfig {
         ProcgenConfig::frame_shape(self)
     }
 
-    fn action_names(&self) -> &'static [&'static str] {
-        &ProcgenWorld::ACTION_NAMES
+    /// Source: the `tps` of Procgen's own `interactive.py`.
+    fn steps_per_second(&self) -> f64 {
+        15.0
+    }
+
+    fn action_names(&self) -> Vec<&str> {
+        ProcgenWorld::ACTION_NAMES.to_vec()
     }
 
     fn build(
@@ -214,11 +220,16 @@ impl WorldSettings for ProcgenConfig {
         Variants {
             key: "game",
             names: &Game::NAMES,
+            is_open: false,
         }
     }
 
-    fn variant(&self) -> Option<&'static str> {
+    fn variant(&self) -> Option<&str> {
         Some(self.game.name())
+    }
+
+    fn library(&self) -> Option<&str> {
+        self.library.as_deref()
     }
 
     fn visible_actions(&self) -> Vec<u8> {
@@ -245,7 +256,7 @@ impl WorldSettings for ProcgenConfig {
     }
 
     fn install(&self, progress: &mut dyn FnMut(&str)) -> Result<(), EnvError> {
-        Engine::install(progress).map_err(ProcgenError::from)?;
+        self.engine(progress)?;
         Ok(())
     }
 }
@@ -298,6 +309,22 @@ impl Environment for ProcgenWorld {
             {
                 levels.redraw(&mut self.game, env)?;
             }
+        }
+        Ok(())
+    }
+
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        let game = &mut self.game;
+        let copies = self.steps_taken.iter().enumerate();
+        let copies = copies.map(|(env, &steps)| Ok((steps, game.state(env)?.sealed())));
+        saved::encode(&copies.collect::<Result<Vec<_>, ProcgenError>>()?)
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        let copies: Vec<(u32, Vec<u8>)> = saved::decode(state, self.num_envs())?;
+        for (env, (steps, sealed)) in copies.into_iter().enumerate() {
+            self.game.set_state(env, &State::unsealed(&sealed)?)?;
+            self.steps_taken[env] = steps;
         }
         Ok(())
     }

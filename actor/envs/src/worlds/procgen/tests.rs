@@ -33,6 +33,7 @@ fn config(game: Game) -> ProcgenConfig {
         restrict_themes: false,
         frame_side: 64,
         grey: false,
+        library: None,
     }
 }
 
@@ -66,6 +67,42 @@ fn alone(engine: &Engine, config: &ProcgenConfig, level: i32, last_move: u8) -> 
     game.act(&[i32::from(last_move)]).unwrap();
     game.act(&[RESET]).unwrap();
     game
+}
+
+#[test]
+fn another_build_of_the_library_is_played_by_its_path() {
+    let Some(engine) = engine("another_build_of_the_library_is_played_by_its_path") else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    // As in Procgen's own tree: the pictures are beside the library's folder.
+    let library = folder.path().join("prebuilt/libenv.so");
+    std::fs::create_dir(folder.path().join("prebuilt")).unwrap();
+    std::fs::copy(engine.library(), &library).unwrap();
+    let other = |library: &std::path::Path| ProcgenConfig {
+        library: Some(library.display().to_string()),
+        ..config(Game::Coinrun)
+    };
+    let said = |library: &std::path::Path| {
+        let made = ProcgenWorld::new(&other(library), 1, 1, 0);
+        made.map(drop).unwrap_err().to_string()
+    };
+    assert!(said(&library).contains("put Procgen's folder `assets` beside it"));
+    let nowhere = folder.path().join("nowhere.so");
+    assert!(
+        said(&nowhere).contains("No such file"),
+        "{}",
+        said(&nowhere)
+    );
+    std::os::unix::fs::symlink(engine.assets(), folder.path().join("assets")).unwrap();
+
+    let mut published = ProcgenWorld::new(&config(Game::Coinrun), 2, 3, 0).unwrap();
+    let mut other = ProcgenWorld::new(&other(&library), 2, 3, 0).unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    for _ in 0..50 {
+        let actions = draw(&mut rng, 2);
+        assert_eq!(step(&mut published, &actions), step(&mut other, &actions));
+    }
 }
 
 #[test]
@@ -520,4 +557,21 @@ fn visible_actions_are_what_the_engine_does() {
             assert!(!contradicted || !differs[a][9], "{game}: {a} and 9");
         }
     }
+}
+
+#[test]
+fn every_game_goes_on_where_it_was_saved() {
+    use crate::saved::tests::goes_on;
+
+    let Some(engine) = engine("every_game_goes_on_where_it_was_saved") else {
+        return;
+    };
+    let mut ended = 0;
+    for game in Game::ALL {
+        let config = config(game);
+        ended += goes_on(game.name(), 200, || {
+            Box::new(ProcgenWorld::with_engine(engine, &config, 2, 5, 0).unwrap())
+        });
+    }
+    assert!(ended > 16, "{ended} ends in all games");
 }
