@@ -3,7 +3,7 @@
 use clap::{Parser, Subcommand};
 use driml_bench::flags::BenchCommand;
 use driml_experiments::{
-    flags::{ExperimentCommand, TradeoffArgs},
+    flags::{ExperimentCommand, GridArgs, TradeoffArgs},
     plot::{self, flags::PlotArgs},
 };
 
@@ -50,6 +50,8 @@ pub(crate) enum Command {
     Parity(ParityArgs),
     /// Draw what runs recorded over their frames: return, losses, k, speed; or their action affinity
     Plot(PlotArgs),
+    /// Train with every combination of settings, several seeds each: a table and a plot
+    Grid(GridArgs),
     /// Run one of the paper's experiments: figures, data and a page
     #[command(subcommand)]
     Experiment(ExperimentCommand),
@@ -88,6 +90,7 @@ impl Command {
             Self::Inspect(args) => inspect::run(&args),
             Self::Parity(args) => parity::run(&args),
             Self::Plot(args) => plot::run(&args),
+            Self::Grid(args) => driml_experiments::grid(&args),
             Self::Experiment(command) => driml_experiments::run(&command),
             Self::Tradeoff(args) => driml_experiments::tradeoff(&args),
             Self::Bench(command) => driml_bench::run(&command),

@@ -436,3 +436,101 @@ fn an_experiment_that_is_not_there() {
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("making file/pieces"), "{said}");
 }
+
+#[test]
+fn a_grid_makes_every_combination_once() {
+    let root = tempfile::tempdir().unwrap();
+    let fixed = [
+        "grid",
+        "--env",
+        "chain",
+        "--agent",
+        "c51,driml-ada",
+        "--preset",
+        "smoke",
+    ];
+    let sets = [
+        "--frames",
+        "320",
+        "--set",
+        "learner.update.adam.lr=1e-4,1e-3",
+    ];
+    fn call<'a>(parts: [&[&'a str]; 3]) -> Vec<&'a str> {
+        parts.concat()
+    }
+    let said = |args: &[&str]| {
+        let output = driml(root.path(), args);
+        (
+            output.status.code(),
+            String::from_utf8(output.stderr).unwrap(),
+        )
+    };
+    // What cannot work is said before anything starts.
+    let (code, text) = said(&[&fixed[..], &["--set", "learner.update.adam.lr=1e-4,fast"]].concat());
+    assert_eq!(code, Some(64));
+    assert!(
+        text.contains("agent=c51") && text.contains("lr=fast"),
+        "{text}"
+    );
+    let (code, text) = said(&call([
+        &fixed,
+        &sets,
+        &["--set", "learner.update.adam.lr=1"],
+    ]));
+    assert!(code == Some(64) && text.contains("is set twice"), "{text}");
+    let (code, text) = said(&call([&fixed, &sets, &["--report"]]));
+    assert!(
+        code == Some(64) && text.contains("there is nothing to report"),
+        "{text}"
+    );
+
+    let printed = run(root.path(), &call([&fixed, &sets, &["--jobs", "2"]]));
+    let folder = root.path().join("experiments/grid");
+    assert!(printed.ends_with("grid.svg\n"), "{printed}");
+    let table = fs::read_to_string(folder.join("grid.csv")).unwrap();
+    let rows: Vec<Vec<&str>> = table.lines().map(|row| row.split(',').collect()).collect();
+    assert_eq!(
+        rows[0][..4],
+        ["env", "agent", "learner.update.adam.lr", "seeds"]
+    );
+    let cells: Vec<&[&str]> = rows[1..].iter().map(|row| &row[1..4]).collect();
+    let expected = [
+        ["c51", "1e-4", "1"],
+        ["c51", "1e-3", "1"],
+        ["driml-ada", "1e-4", "1"],
+        ["driml-ada", "1e-3", "1"],
+    ];
+    assert_eq!(cells, expected);
+    assert!(
+        folder
+            .join("runs/1-c51-lr=1e-4-seed1/summary.json")
+            .is_file()
+    );
+    // One seed more makes what is missing alone.
+    let made = |name: &str| {
+        fs::metadata(folder.join("runs").join(name))
+            .unwrap()
+            .modified()
+            .unwrap()
+    };
+    let before = made("1-c51-lr=1e-4-seed1/summary.json");
+    run(
+        root.path(),
+        &call([&fixed, &sets, &["--seeds", "2", "--jobs", "2"]]),
+    );
+    assert_eq!(made("1-c51-lr=1e-4-seed1/summary.json"), before);
+    let table = fs::read_to_string(folder.join("grid.csv")).unwrap();
+    assert!(
+        table
+            .lines()
+            .skip(1)
+            .all(|row| row.split(',').nth(3) == Some("2")),
+        "{table}"
+    );
+    // Another grid does not mix with it.
+    let (code, text) = said(&[&fixed[..], &["--frames", "352"]].concat());
+    assert!(
+        code == Some(64) && text.contains("other settings"),
+        "{text}"
+    );
+}

@@ -122,6 +122,50 @@ pub struct TradeoffArgs {
     pub(crate) queue: QueueFlags,
 }
 
+/// What `driml grid` takes.
+#[derive(Clone, Debug, Args)]
+pub struct GridArgs {
+    /// Worlds, such as coinrun,maze or mspacman [default: as `driml local`]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) env: Vec<String>,
+    /// Agents, such as c51,driml-ada [default: as `driml local`]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) agent: Vec<String>,
+    /// Named settings of every run; `driml presets` lists them
+    #[arg(long, value_name = "NAME")]
+    pub(crate) preset: Option<String>,
+    /// Frames of each run
+    #[arg(long, value_name = "N", value_parser = whole_number::within(1..=i64::MAX as u64))]
+    pub(crate) frames: Option<u64>,
+    /// A setting by its dotted path and the values that it is to have, such as learner.batch_size=64,256; may be given several times:
+    /// every combination is made
+    #[arg(long = "set", value_name = "KEY=VALUE,..")]
+    pub(crate) sets: Vec<String>,
+    /// Seeds 1 to N of every combination
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub(crate) seeds: u32,
+    /// Runs at once, which share the cores
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub(crate) jobs: u32,
+    /// Start nothing: table and plot of the runs that are finished
+    #[arg(long)]
+    pub(crate) report: bool,
+    /// Where runs, table and plot go; a grid that was stopped goes on there [default: experiments/grid]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+}
+
+impl GridArgs {
+    /// Where it works, as experiments say it.
+    pub(crate) fn folder(&self) -> ExperimentFlags {
+        ExperimentFlags {
+            smoke: false,
+            out: self.out.clone(),
+            seeds: None,
+        }
+    }
+}
+
 #[cfg(test)]
 impl TradeoffArgs {
     /// A call that names the world alone.

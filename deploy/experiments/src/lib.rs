@@ -28,6 +28,7 @@
 
 mod aggregate;
 pub mod flags;
+mod grid;
 mod ising;
 #[cfg(test)]
 mod made_up;
@@ -45,7 +46,7 @@ mod statistics;
 mod template;
 mod tradeoff;
 
-use crate::flags::{ExperimentCommand, TradeoffArgs};
+use crate::flags::{ExperimentCommand, GridArgs, TradeoffArgs};
 
 /// Runs the experiment that the command names.
 ///
@@ -67,4 +68,12 @@ pub fn run(command: &ExperimentCommand) -> anyhow::Result<()> {
 /// As [`run`].
 pub fn tradeoff(args: &TradeoffArgs) -> anyhow::Result<()> {
     tradeoff::run(args)
+}
+
+/// Makes a run for each combination of settings and each seed.
+///
+/// # Errors
+/// As [`run`].
+pub fn grid(args: &GridArgs) -> anyhow::Result<()> {
+    grid::run(args)
 }

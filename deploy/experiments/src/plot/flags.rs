@@ -31,6 +31,21 @@ pub struct PlotArgs {
     pub(crate) out: PathBuf,
 }
 
+impl PlotArgs {
+    /// A call that names runs and a picture alone.
+    pub(crate) const fn overview(runs: Vec<PathBuf>, out: PathBuf) -> Self {
+        Self {
+            runs,
+            column: Vec::new(),
+            smooth: None,
+            band: Band::Range,
+            separate: false,
+            affinity: false,
+            out,
+        }
+    }
+}
+
 /// What the band over several seeds shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Band {
