@@ -35,7 +35,7 @@ impl Guarded {
         let tls = TlsSystem::new(test)?;
         let server = tls.start_server(&format!("--agent driml-ada {LONG}"));
         let parts = [
-            tls.start("learner --run-dir run", "tls"),
+            tls.start("learner --stay --run-dir run", "tls"),
             tls.start("actor --id 0", "tls"),
         ];
         let observer = tls.client(Role::Observer);

@@ -68,10 +68,10 @@ impl Run {
         let endpoint = self.endpoint();
         let args = match machine {
             0 => format!(
-                "replay-server --listen {endpoint} --insecure-network --replay-dir replay {}",
+                "replay-server --stay --listen {endpoint} --insecure-network --replay-dir replay {}",
                 self.flags
             ),
-            1 => format!("learner --connect {endpoint} --run-dir run"),
+            1 => format!("learner --stay --connect {endpoint} --run-dir run"),
             _ => format!("actor --connect {endpoint} --id {}", machine - 2),
         };
         let words = self.network.on(MACHINES[machine]);

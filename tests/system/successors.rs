@@ -114,7 +114,7 @@ fn a_learner_whose_replay_server_was_started_anew_saves_and_says_so() {
     // Its successor would count the updates twice, and says what to do.
     system
         .run(&format!(
-            "learner --connect {} --run-dir run",
+            "learner --stay --connect {} --run-dir run",
             system.endpoint()
         ))
         .expect_code(1)

@@ -45,7 +45,7 @@ impl TlsSystem {
 
     pub(crate) fn start_server(&self, flags: &str) -> Process {
         let mut server = self.system.start_part(&format!(
-            "replay-server --listen {} --tls-dir tls {flags}",
+            "replay-server --stay --listen {} --tls-dir tls {flags}",
             self.endpoint
         ));
         server.wait_for_stderr("replay server listens");
@@ -144,7 +144,7 @@ fn a_run_over_tls() {
     };
     let server = tls.start_server(&format!("--agent driml-ada {SHORT}"));
     let observer = tls.client(Role::Observer);
-    let learner = tls.start("learner --run-dir run", "tls");
+    let learner = tls.start("learner --stay --run-dir run", "tls");
     let actors = [
         tls.start("actor --id 0", "tls"),
         tls.start("actor --id 2", "tls"),
@@ -335,7 +335,7 @@ fn strangers_at_a_replay_server() {
     assert!(started.elapsed() < SECONDS);
 
     // Who is let in is not disturbed.
-    let learner = tls.start("learner --run-dir run", "tls");
+    let learner = tls.start("learner --stay --run-dir run", "tls");
     let actor = tls.start("actor --id 1", "tls");
     observer.wait_for_learner("some updates", |learner| learner.updates > 10);
     actor.stop().expect_code(0);
