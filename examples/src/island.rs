@@ -63,7 +63,7 @@ impl WorldSettings for IslandConfig {
     }
 }
 
-/// One copy.
+/// One copy: where its agent and its treasure are.
 struct Island {
     rng: ChaCha8Rng,
     agent: (usize, usize),

@@ -24,7 +24,7 @@ pub enum TlsError {
         .path.display(), how(.path, *.role)
     )]
     Missing {
-        /// The file.
+        /// The file of the certificate or key.
         path: PathBuf,
         /// Whose it is.
         role: Role,
@@ -32,7 +32,7 @@ pub enum TlsError {
     /// A file that cannot be read.
     #[error("{} cannot be read: {why}; it belongs to the user who starts this part", .path.display())]
     Unreadable {
-        /// The file.
+        /// The file of the certificate or key.
         path: PathBuf,
         /// What the system said.
         why: std::io::Error,
@@ -43,7 +43,7 @@ pub enum TlsError {
         .path.display()
     )]
     NotPem {
-        /// The file.
+        /// The file of the certificate or key.
         path: PathBuf,
         /// What was expected.
         what: &'static str,
@@ -114,7 +114,7 @@ pub enum TlsError {
     /// The other side's certificate is not good.
     #[error("whoever listens on {endpoint} is refused: {why}")]
     Server {
-        /// Where.
+        /// The endpoint that was to be reached.
         endpoint: String,
         /// What is wrong with it and what to do.
         why: String,
@@ -122,7 +122,7 @@ pub enum TlsError {
     /// The other side does not take this part's certificate.
     #[error("the replay server on {endpoint} refuses {}: {why}", .path.display())]
     Refused {
-        /// Where.
+        /// The endpoint that was to be reached.
         endpoint: String,
         /// This part's certificate.
         path: PathBuf,

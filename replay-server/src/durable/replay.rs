@@ -240,7 +240,7 @@ impl DurableReplay {
     /// [`Replay::sample`], of which the log learns with the next mark: for whoever goes back to marks alone.
     ///
     /// # Errors
-    /// As there.
+    /// Those of the replay's own function.
     pub fn sample_between_marks(&mut self, rows: u32) -> Result<Batch, Unready> {
         self.replay.sample(rows)
     }
@@ -253,7 +253,7 @@ impl DurableReplay {
     /// [`Replay::join_actor`].
     ///
     /// # Errors
-    /// As there.
+    /// Those of the replay's own function.
     pub fn join_actor(&mut self, join: ActorJoin) -> Result<u32, String> {
         let before = self.replay.actor_incarnation(join.actor);
         let joined = self.replay.join_actor(join)?;
@@ -338,7 +338,7 @@ impl DurableReplay {
     /// [`Replay::learner_starts`] for `learner`, which is served from now on.
     ///
     /// # Errors
-    /// As there.
+    /// Those of the replay's own function.
     pub fn learner_starts(&mut self, learner: u64, rows_sampled: u64) -> Result<(), String> {
         self.replay.learner_starts(rows_sampled)?;
         self.learner = Some(learner);
@@ -352,7 +352,7 @@ impl DurableReplay {
     /// [`Replay::draw_for`]. While the disk refuses, the answer is to wait.
     ///
     /// # Errors
-    /// As there.
+    /// Those of the replay's own function.
     pub fn draw_for(
         &mut self,
         id: RequestId,
@@ -389,7 +389,7 @@ impl DurableReplay {
     /// [`Replay::set_affinity`].
     ///
     /// # Errors
-    /// As there.
+    /// Those of the replay's own function.
     pub fn set_affinity(&mut self, update: &AffinityUpdate) -> Result<(), CodecError> {
         self.replay.set_affinity(update)?;
         self.log_event(|| Event::Affinity(update.clone()));
@@ -399,7 +399,7 @@ impl DurableReplay {
     /// [`Replay::set_other_shards`].
     ///
     /// # Errors
-    /// As there.
+    /// Those of the replay's own function.
     pub fn set_other_shards(&mut self, other_shards: Tally) -> Result<(), String> {
         let before = self.replay.other_shards();
         self.replay.set_other_shards(other_shards)?;

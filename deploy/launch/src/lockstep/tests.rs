@@ -101,7 +101,7 @@ fn resumed_weights(config: &RunConfig, rounds: usize, lost: usize) -> String {
     sha256(&lockstep)
 }
 
-/// Before the first update, between two publications, and late; a ring that is full by then, and one that is compressed.
+/// Before the first update, and late; a ring that is full by then, and one that is compressed.
 #[test]
 fn a_run_that_was_interrupted_computes_what_it_would_have() {
     let small = ["replay.capacity_transitions=320"];

@@ -19,7 +19,7 @@ const SIDE_MAX: usize = 4096;
 /// Most bytes a pixel.
 const CHANNELS_MAX: usize = 16;
 
-/// Most actions.
+/// Most actions of a world: the wire numbers them with a byte.
 const ACTIONS_MAX: usize = 255;
 
 /// Bounds of a time limit, in milliseconds: a day at most.
