@@ -36,6 +36,7 @@ const PINNED: &[(&str, &[Pinned])] = &[
         ("actor.unreachable_max_ms", "300000", "ours"),
         ("replay.capacity_transitions", "1000000", "paper"),
         ("replay.shards", "1", "ours"),
+        ("replay.sampling.rule", r#""uniform""#, "paper"),
         ("replay.compression", r#""none""#, "ours"),
         ("replay.replay_ratio", "8.0", "code"),
         ("replay.warmup_transitions", "1000", "paper"),
