@@ -142,7 +142,6 @@ impl Player {
         seed: u64,
         watch: &mut dyn FnMut(&Step<'_>),
     ) -> anyhow::Result<Vec<f64>> {
-        let spec = &self.config.run;
         let mut policy: Box<dyn Policy> = match who {
             Who::Agent => Box::new(NetworkPolicy::new(
                 &self.config.model,
@@ -150,21 +149,9 @@ impl Player {
                 &self.weights,
                 self.config.actor.precision,
             )?),
-            Who::Random => Box::new(RandomPolicy::new(u8::try_from(spec.num_actions)?)),
+            Who::Random => Box::new(random_policy(&self.config)?),
         };
-        let copies = Self::copies(episodes);
-        let actions = world.actions(self.config.actor.actions);
-        let fewer = FewerActions::of(world.build(copies, seed, 0)?, actions)?;
-        let rounds = episodes.div_ceil(copies) as u64;
-        let evaluation = Evaluation {
-            frame_stack: spec.frame_stack as usize,
-            epsilon: EPSILON,
-            episodes,
-            steps_max: rounds * STEPS_A_ROUND_MAX,
-        };
-        let (world, rng) = (CutFrames::of(fewer, self.sent())?, policy_rng(seed));
-        episode_returns(world, policy.as_mut(), evaluation, rng, watch)
-            .with_context(|| format!("playing {}", spec.world))
+        play_with(&self.config, policy.as_mut(), world, episodes, seed, watch)
     }
 
     /// Copies of the world that play so many episodes.
@@ -184,16 +171,54 @@ impl Player {
         })
     }
 
-    /// Rows and columns of a frame as it travels.
-    fn sent(&self) -> (usize, usize) {
-        let spec = &self.config.run;
-        (spec.frame_height as usize, spec.frame_width as usize)
-    }
-
     fn enlarge(&self) -> anyhow::Result<Option<Enlarge>> {
         let config = &self.config;
-        Ok(config.input.enlarge(self.sent(), &config.model)?)
+        Ok(config.input.enlarge(sent(config), &config.model)?)
     }
+}
+
+/// Returns of whole episodes of a random policy in a run's world, on the levels trained on. It needs no checkpoint.
+///
+/// # Errors
+/// The world failed, or episodes do not end.
+pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow::Result<Vec<f64>> {
+    let world = levels(&config.world, Levels::Train)?;
+    let mut policy = random_policy(config)?;
+    play_with(config, &mut policy, &world, episodes, seed, &mut |_| ())
+}
+
+fn random_policy(config: &RunConfig) -> anyhow::Result<RandomPolicy> {
+    Ok(RandomPolicy::new(u8::try_from(config.run.num_actions)?))
+}
+
+fn play_with(
+    config: &RunConfig,
+    policy: &mut dyn Policy,
+    world: &WorldConfig,
+    episodes: usize,
+    seed: u64,
+    watch: &mut dyn FnMut(&Step<'_>),
+) -> anyhow::Result<Vec<f64>> {
+    let spec = &config.run;
+    let copies = Player::copies(episodes);
+    let actions = world.actions(config.actor.actions);
+    let fewer = FewerActions::of(world.build(copies, seed, 0)?, actions)?;
+    let rounds = episodes.div_ceil(copies) as u64;
+    let evaluation = Evaluation {
+        frame_stack: spec.frame_stack as usize,
+        epsilon: EPSILON,
+        episodes,
+        steps_max: rounds * STEPS_A_ROUND_MAX,
+    };
+    let (world, rng) = (CutFrames::of(fewer, sent(config))?, policy_rng(seed));
+    episode_returns(world, policy, evaluation, rng, watch)
+        .with_context(|| format!("playing {}", spec.world))
+}
+
+/// Rows and columns of a frame as it travels.
+const fn sent(config: &RunConfig) -> (usize, usize) {
+    let spec = &config.run;
+    (spec.frame_height as usize, spec.frame_width as usize)
 }
 
 /// The folder of the checkpoint after so many updates, or of the newest.

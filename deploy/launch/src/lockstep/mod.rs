@@ -25,6 +25,8 @@ use parts::Lockstep;
 
 /// How often progress is shown and recorded.
 const POLL: Duration = Duration::from_secs(1);
+/// Rows of metrics that even the shortest run has, evenly over its frames: it may last no second.
+const ROWS_MIN: u64 = 200;
 
 /// Trains in this process, and leaves `run_dir`; with a resume point it goes on with the run that is there.
 ///
@@ -57,6 +59,8 @@ pub fn run(
         resumed.unwrap_or_default(),
     );
     let mut shown = Instant::now();
+    let row_frames = (config.frames() / ROWS_MIN).max(1);
+    let mut row = lockstep.frames() / row_frames;
     let folder = run_dir.checkpoints();
 
     let mut outcome = Outcome::Finished;
@@ -68,12 +72,16 @@ pub fn run(
             saved = Some(lockstep.updates());
             lockstep.save(&folder)?;
         }
-        if shown.elapsed() >= POLL {
-            shown = Instant::now();
+        let show = shown.elapsed() >= POLL;
+        if show || lockstep.frames() / row_frames > row {
+            row = lockstep.frames() / row_frames;
             let (replay, status) = lockstep.status();
             let said = recorder.record(std::slice::from_ref(&replay), status, &[]);
             said.iter().for_each(|line| screen.line(line));
-            display.show(&replay, status, recorder.episodes(&replay));
+            if show {
+                shown = Instant::now();
+                display.show(&replay, status, recorder.episodes(&replay));
+            }
         }
         if shutdown.is_set() {
             outcome = Outcome::Interrupted;
