@@ -53,7 +53,11 @@ pub(super) fn of(runs: &[Run], together: bool) -> Vec<Group<'_>> {
             }),
         }
     }
-    names::name(&mut groups);
+    let runs: Vec<_> = groups.iter().map(|group| &group.runs[..]).collect();
+    let names = names::of(&runs);
+    for (group, name) in groups.iter_mut().zip(names) {
+        group.name = name;
+    }
     groups
 }
 

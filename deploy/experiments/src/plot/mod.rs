@@ -33,9 +33,12 @@ use crate::plot::flags::{Band, PlotArgs};
 const CHART_SIZE: (f64, f64) = (460.0, 310.0);
 /// The column over which a random policy is a line.
 const RETURN: &str = "mean_return";
+/// The column of what checkpoints earned when they were played.
+const EVALUATED: &str = "evaluated_return";
 /// Columns that are drawn if none is asked for, those that the runs have values of; auxiliary losses follow [`C51_LOSS`].
-const OVERVIEW: [&str; 6] = [
+const OVERVIEW: [&str; 7] = [
     RETURN,
+    EVALUATED,
     C51_LOSS,
     "mean_k",
     "replay_ratio",
@@ -125,7 +128,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         band: args.band,
     };
     let random = match args.random {
-        Some(episodes) if columns.iter().any(|column| column == RETURN) => {
+        Some(episodes) if columns.iter().any(|it| it == RETURN || it == EVALUATED) => {
             at_random(&runs, episodes as usize)?
         }
         Some(_) => {
@@ -151,7 +154,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
             return Err(usage!("none of these runs has a value of {column:?} yet").into());
         }
         let mut series = series(&groups, drawn);
-        if column == RETURN {
+        if column == RETURN || column == EVALUATED {
             series.extend(lines(&random, &series));
         }
         panels.push(Panel::Chart(chart(column, is_loss, args.x, series)));
@@ -226,6 +229,10 @@ fn lines(random: &[(String, f64)], curves: &[Series]) -> Vec<Series> {
 fn words(column: &str) -> (String, String) {
     let (title, label) = match column {
         "mean_return" => ("Return", "mean of the last 100 episodes"),
+        EVALUATED => (
+            "Return of checkpoints, played greedily",
+            "mean over episodes",
+        ),
         "c51_kl" => ("C51 loss", "KL divergence [nats]"),
         "total_loss" => ("Total loss", "[nats]"),
         "mean_k" => (

@@ -5,46 +5,35 @@ use std::collections::BTreeMap;
 
 use toml::Value;
 
-use super::{groups::Group, runs::Run};
+use super::runs::Run;
 
 /// Settings that a name tells at most; of more it tells how many.
 const TOLD_MAX: usize = 3;
 
-/// Names the groups so that no two are alike.
-pub(super) fn name(groups: &mut [Group<'_>]) {
-    let mut names: Vec<String> = (0..groups.len())
-        .map(|at| {
-            let group = &groups[at];
-            let Some(what) = &group.runs[0].what else {
-                return group.runs[0].name.clone();
-            };
-            let peers = groups
-                .iter()
-                .filter(|other| other.runs[0].what.as_ref() == Some(what));
-            let peers: Vec<_> = peers.map(|other| settings(other.runs[0])).collect();
-            let mut parts = vec![what.clone()];
-            parts.extend(differences(&settings(group.runs[0]), &peers));
-            parts.push(seeds(&group.runs));
-            parts.join(", ")
-        })
-        .collect();
-    for at in 0..names.len() {
-        if names.iter().filter(|other| **other == names[at]).count() > 1 {
-            // All of them, the first included, so that none looks like the plain one.
-            let alike: Vec<_> = (0..names.len())
-                .filter(|&other| names[other] == names[at])
-                .collect();
-            for other in alike {
-                let run = &groups[other].runs[0].name;
-                if names[other] != *run {
-                    names[other] = format!("{} ({run})", names[other]);
-                }
-            }
-        }
-    }
-    for (group, name) in groups.iter_mut().zip(names) {
-        group.name = name;
-    }
+/// A name for each of these lists of runs, which differ in their seeds alone; no two are alike.
+pub(super) fn of(groups: &[&[&Run]]) -> Vec<String> {
+    let name = |runs: &&[&Run]| {
+        let Some(what) = &runs[0].what else {
+            return runs[0].name.clone();
+        };
+        let peers = groups.iter().map(|other| other[0]);
+        let peers = peers.filter(|other| other.what.as_ref() == Some(what));
+        let peers: Vec<_> = peers.map(settings).collect();
+        let mut parts = vec![what.clone()];
+        parts.extend(differences(&settings(runs[0]), &peers));
+        parts.push(seeds(runs));
+        parts.join(", ")
+    };
+    let names: Vec<String> = groups.iter().map(name).collect();
+    let alike = |name: &String| names.iter().filter(|other| *other == name).count() > 1;
+    let told_apart = names
+        .iter()
+        .zip(groups)
+        .map(|(name, runs)| match alike(name) {
+            true if *name != runs[0].name => format!("{name} ({})", runs[0].name),
+            _ => name.clone(),
+        });
+    told_apart.collect()
 }
 
 /// How many seeds there are, and that some were run again where that is so: runs of one seed are no independent samples.

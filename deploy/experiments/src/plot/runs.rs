@@ -1,7 +1,7 @@
 //! A run's folder as a plot needs it: the columns of `metrics.csv`, and the settings without the seed.
 //! It judges no value.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::ValueEnum;
@@ -30,6 +30,8 @@ pub(crate) struct Run {
     /// The settings without seed and without what the machine decides; none if there are none.
     pub(super) settings: Option<toml::Table>,
     columns: Columns,
+    /// What its checkpoints earned when they were played; it has columns of `frames`, `updates` and `seconds` too.
+    evaluations: Columns,
 }
 
 /// What a curve is drawn over: columns that only grow.
@@ -73,6 +75,11 @@ impl Run {
             )
             .into());
         }
+        let evaluations = match std::fs::read(folder.evaluations()) {
+            Ok(text) => Columns::parse(&text)
+                .with_context(|| format!("reading {}", folder.evaluations().display()))?,
+            Err(_) => Columns::default(),
+        };
         let (settings, seed) = settings(&folder.config()).unzip();
         let run = settings.as_ref().and_then(|table| table.get("run"));
         let word = |key: &str| run.and_then(|run| run.get(key)?.as_str());
@@ -85,6 +92,7 @@ impl Run {
             seed: seed.flatten(),
             folder: folder.clone(),
             columns,
+            evaluations,
         })
     }
 
@@ -103,11 +111,11 @@ impl Run {
     /// # Errors
     /// As for [`Run::values`], and metrics without the column that it goes over.
     pub(crate) fn values_over(&self, over: Over, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
-        let path = self.folder.metrics();
-        let x = self.place(over.column())?;
-        let place = self.place(column)?;
+        let (table, path) = self.table(column);
+        let x = self.place(table, over.column())?;
+        let place = self.place(table, column)?;
         let mut values = Vec::new();
-        for (line, row) in self.columns.rows.iter().enumerate() {
+        for (line, row) in table.rows.iter().enumerate() {
             let number = |text: &str| {
                 text.parse::<f64>().map_err(|_| {
                     usage!(
@@ -132,13 +140,25 @@ impl Run {
             .collect())
     }
 
+    /// The table that has the column, and its file; the metrics if neither has.
+    fn table(&self, column: &str) -> (&Columns, PathBuf) {
+        let in_metrics = self.columns.place(column).is_some();
+        if !in_metrics && self.evaluations.place(column).is_some() {
+            (&self.evaluations, self.folder.evaluations())
+        } else {
+            (&self.columns, self.folder.metrics())
+        }
+    }
+
     /// The place of a column of numbers.
-    fn place(&self, column: &str) -> Result<usize, Usage> {
-        let place = self.columns.place(column);
+    fn place(&self, table: &Columns, column: &str) -> Result<usize, Usage> {
+        let place = table.place(column);
         place.filter(|_| !WORDS.contains(&column)).ok_or_else(|| {
             let numbers = || {
-                let all = self.columns.header.iter().map(String::as_str);
-                all.filter(|name| !WORDS.contains(name))
+                let more = self.evaluations.header.iter();
+                let more = more.filter(|name| self.columns.place(name).is_none());
+                let all = self.columns.header.iter().chain(more);
+                all.map(String::as_str).filter(|name| !WORDS.contains(name))
             };
             usage!(
                 "{} has no column {column:?}{}; it has {}",
@@ -171,8 +191,9 @@ impl Run {
 
     /// Whether the column is there and not empty.
     pub(crate) fn has_values(&self, column: &str) -> bool {
-        let place = self.columns.place(column);
-        place.is_some_and(|place| self.columns.rows.iter().any(|row| !row[place].is_empty()))
+        let (table, _) = self.table(column);
+        let place = table.place(column);
+        place.is_some_and(|place| table.rows.iter().any(|row| !row[place].is_empty()))
     }
 }
 
@@ -195,6 +216,11 @@ fn settings(path: &Path) -> Option<(toml::Table, Option<i64>)> {
     table.extend(actors.map(|actors| ("actors".to_owned(), actors)));
     table.remove("transport");
     let seed = table.get_mut("run")?.as_table_mut()?.remove("seed");
+    // How often it is saved and played changes nothing that is learned.
+    if let Some(learner) = table.get_mut("learner").and_then(toml::Value::as_table_mut) {
+        learner.remove("checkpoint_period_updates");
+        learner.remove("checkpoints_kept");
+    }
     if let Some(actor) = table.get_mut("actor").and_then(toml::Value::as_table_mut) {
         actor.remove("world_threads");
     }
