@@ -37,6 +37,7 @@ mod successors;
 mod tensorboard;
 mod tiny_replay;
 mod tls;
+mod watch;
 
 use driml_tests::{Process, TestSystem};
 

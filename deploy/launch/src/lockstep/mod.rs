@@ -73,7 +73,7 @@ pub fn run(
             let (replay, status) = lockstep.status();
             let said = recorder.record(std::slice::from_ref(&replay), status, &[]);
             said.iter().for_each(|line| screen.line(line));
-            display.show(&replay, status, recorder.episodes(&replay));
+            display.show(&replay, status, recorder.episodes(&replay), &[]);
         }
         if shutdown.is_set() {
             outcome = Outcome::Interrupted;
