@@ -38,6 +38,7 @@ mod tensorboard;
 mod tiny_replay;
 mod tls;
 mod watch;
+mod wrong_place;
 
 use driml_tests::{Process, TestSystem};
 

@@ -52,6 +52,8 @@ impl Connection {
                 listen: Vec::new(),
                 connect: vec![endpoint.clone()],
             };
+            // Whoever only looks does not wait for somebody to come.
+            reach::look(endpoint)?;
             let session = session::open_as(&reached, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
             let nothing = ZBytes::new();
             let hello = session::ask(
