@@ -1,6 +1,6 @@
 //! The list of commands. Each has its flags and its code in a file of `commands`, or in the crate that it is named for.
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use driml_bench::flags::BenchCommand;
 use driml_experiments::{
     flags::{ExperimentCommand, GridArgs, TradeoffArgs},
@@ -9,6 +9,7 @@ use driml_experiments::{
 
 use crate::commands::{
     actor::{self, ActorArgs},
+    completions::{self, CompletionsArgs, ManArgs},
     doctor::{self, DoctorArgs},
     evaluate::{self, EvaluateArgs},
     inspect::{self, InspectArgs},
@@ -70,6 +71,10 @@ pub(crate) enum Command {
     /// Procgen's engine
     #[command(subcommand)]
     Procgen(ProcgenCommand),
+    /// Print what a shell needs to complete driml's commands, such as `driml completions bash > driml.bash`
+    Completions(CompletionsArgs),
+    /// Write driml's manual pages, such as `driml man share/man/man1`
+    Man(ManArgs),
 }
 
 impl Command {
@@ -101,14 +106,14 @@ impl Command {
             Self::Presets(args) => presets::run(&args),
             Self::Doctor(args) => doctor::run(&args),
             Self::Procgen(command) => procgen::run(&command),
+            Self::Completions(args) => completions::completions(&args, Cli::command()),
+            Self::Man(args) => completions::man(&args, Cli::command()),
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
-
     use super::*;
 
     #[test]

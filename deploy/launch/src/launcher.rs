@@ -19,6 +19,7 @@ use crate::{
     connect::connect,
     console::{self, Screen, print},
     endpoint::NAMESPACE,
+    evaluator::Evaluator,
     interrupts::Interrupts,
     live_view::{Display, TEMPLATE, silence},
     managed_process::{ManagedProcess, Surroundings},
@@ -94,6 +95,10 @@ pub fn run(
         recorder.write_events(run_dir)?;
     }
     let resume_point = resumed.unwrap_or_default();
+    let evaluator = config.local.evaluation;
+    let evaluator = evaluator
+        .map(|it| Evaluator::new(it, run_dir))
+        .transpose()?;
     let meeting = Meeting::create()?;
     let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
     if let (Some(listen), None) = (&outside.listen, &outside.tls_dir) {
@@ -119,6 +124,7 @@ pub fn run(
         display,
         interrupts,
         processes: Processes::default(),
+        evaluator,
         restarts: 0,
         actor_restarts: 0,
         statuses: None,
@@ -135,6 +141,12 @@ pub fn run(
         _ => Outcome::Failed,
     };
     let (summary, written) = launch.conclude(&mut recorder, outcome);
+    // Whoever interrupts a run, or whose run failed, does not wait for it.
+    if let Some(mut evaluator) = launch.evaluator.take()
+        && outcome == Outcome::Finished
+    {
+        evaluator.finish(&launch.screen, &|| launch.interrupts.count() > 0);
+    }
     // Nobody is there any more who could be asked; where this file is left, the lock tells.
     if let Err(e) = std::fs::remove_file(run_dir.endpoints()) {
         tracing::debug!("removing {}: {e}", run_dir.endpoints().display());
@@ -176,6 +188,8 @@ struct Launch<'a> {
     display: Display,
     interrupts: Interrupts,
     processes: Processes,
+    /// Plays the checkpoints, if they are to be.
+    evaluator: Option<Evaluator>,
     /// How often a replay server that had died was started again.
     restarts: u32,
     /// How often an actor was.
@@ -411,6 +425,9 @@ impl Launch<'_> {
                 .collect();
             self.display
                 .show(&replay, &learner, recorder.episodes(&replay), &notes);
+            if let Some(evaluator) = &mut self.evaluator {
+                evaluator.look(&self.screen);
+            }
             if replay.finished && learner.finished {
                 return Ok(Outcome::Finished);
             }

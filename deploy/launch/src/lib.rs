@@ -24,6 +24,7 @@ mod connect;
 pub mod console;
 pub mod endpoint;
 pub mod evaluate;
+mod evaluator;
 pub mod inspect;
 pub mod interrupts;
 pub mod launcher;
