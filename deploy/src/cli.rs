@@ -20,6 +20,7 @@ use crate::commands::{
     replay_server::{self, ReplayServerArgs},
     status::{self, StatusArgs},
     train::{self, TrainArgs},
+    watch::{self, WatchArgs},
 };
 
 /// Deep Reinforcement and InfoMax Learning: actors, a replay server and a learner.
@@ -43,6 +44,8 @@ pub(crate) enum Command {
     Learner(LearnerArgs),
     /// Who takes part in a run, who waits for whom and since when, and what it would take to go on
     Status(StatusArgs),
+    /// Show how a run goes, wherever its parts are and whoever started them, and record it in a folder
+    Watch(WatchArgs),
     /// Play whole episodes with a run's newest weights, beside a random policy
     Evaluate(EvaluateArgs),
     /// What a world and an agent build, compute and send, what it would be if everything were on, and why
@@ -91,6 +94,7 @@ impl Command {
             Self::ReplayServer(args) => replay_server::run(args),
             Self::Learner(args) => learner::run(args),
             Self::Status(args) => status::run(&args),
+            Self::Watch(args) => watch::run(&args),
             Self::Evaluate(args) => evaluate::run(&args),
             Self::Inspect(args) => inspect::run(&args),
             Self::Parity(args) => parity::run(&args),

@@ -21,7 +21,7 @@ use crate::{
     endpoint::NAMESPACE,
     evaluator::Evaluator,
     interrupts::Interrupts,
-    live_view::{Display, TEMPLATE},
+    live_view::{Display, TEMPLATE, silence},
     managed_process::{ManagedProcess, Surroundings},
     meeting::Meeting,
     processes::{Processes, stop},
@@ -78,13 +78,7 @@ pub fn run(
 ) -> anyhow::Result<()> {
     let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
     let servers = server_names(config.replay.shards);
-    let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
-    let names: Vec<_> = servers
-        .iter()
-        .cloned()
-        .chain(["learner".into()])
-        .chain(actors)
-        .collect();
+    let names = process_names(config);
     let (text, losses) = (config.to_toml(), config.learner.update.objective.losses());
     let mut recorder = match resumed {
         Some(resume_point) => RunRecorder::go_on(
@@ -205,6 +199,15 @@ struct Launch<'a> {
 
 fn words(args: &[&str]) -> Vec<String> {
     args.iter().map(|&arg| arg.to_owned()).collect()
+}
+
+/// The processes of a run that is started on one machine: replay servers, learner, actors.
+pub(crate) fn process_names(config: &RunConfig) -> Vec<String> {
+    let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
+    let others = ["learner".into()].into_iter().chain(actors);
+    let mut names = server_names(config.replay.shards);
+    names.extend(others);
+    names
 }
 
 /// `replay-server`, or one for each of several shards.
@@ -415,8 +418,13 @@ impl Launch<'_> {
             for line in recorder.record(&statuses.shards, &learner, &rss) {
                 self.screen.line(&line);
             }
+            let notes: Vec<_> = ["replay server", "learner"]
+                .into_iter()
+                .zip(heard)
+                .filter_map(|(part, heard)| silence(part, heard))
+                .collect();
             self.display
-                .show(&replay, &learner, recorder.episodes(&replay));
+                .show(&replay, &learner, recorder.episodes(&replay), &notes);
             if let Some(evaluator) = &mut self.evaluator {
                 evaluator.look(&self.screen);
             }

@@ -42,3 +42,4 @@ pub mod run_folder;
 pub mod shared_memory;
 pub mod status;
 pub mod status_client;
+pub mod watch;

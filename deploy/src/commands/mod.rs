@@ -12,5 +12,6 @@ pub(crate) mod procgen;
 pub(crate) mod replay_server;
 pub(crate) mod status;
 pub(crate) mod train;
+pub(crate) mod watch;
 
 mod join;

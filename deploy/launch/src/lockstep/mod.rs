@@ -83,7 +83,7 @@ pub fn run(
             said.iter().for_each(|line| screen.line(line));
             if show {
                 shown = Instant::now();
-                display.show(&replay, status, recorder.episodes(&replay));
+                display.show(&replay, status, recorder.episodes(&replay), &[]);
             }
         }
         if shutdown.is_set() {
