@@ -32,6 +32,7 @@ pub mod tls;
 mod messages;
 mod process;
 mod query_workers;
+pub mod reach;
 pub mod reporter;
 mod run_spec;
 mod sampling;

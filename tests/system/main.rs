@@ -38,6 +38,8 @@ mod successors;
 mod tensorboard;
 mod tiny_replay;
 mod tls;
+mod watch;
+mod wrong_place;
 
 use driml_tests::{Process, TestSystem};
 

@@ -202,6 +202,11 @@ impl Lockstep {
         self.learner.updates()
     }
 
+    /// Transitions stored so far.
+    pub(super) fn frames(&self) -> u64 {
+        self.replay.inserted_total()
+    }
+
     /// What replay and learner say of themselves.
     pub(super) fn status(&self) -> (ReplayStatus, &LearnerStatus) {
         (self.replay.status(), &self.status)

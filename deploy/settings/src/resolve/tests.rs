@@ -522,5 +522,6 @@ fn rows_are_drawn_by_the_rule_that_is_set() {
     expect!["in the settings' [replay] table: unknown variant `greedy`, expected `uniform` or `prioritised`, in `sampling.rule`"].assert_eq(&said(&["replay.sampling={rule=\"greedy\"}"]));
     expect![[r#"there is no setting "replay.sampling.alpha" (did you mean "replay.sampling.rule"?); [replay.sampling] has rule"#]].assert_eq(&said(&["replay.sampling.alpha=0.5"]));
     let none = all.replace("}", ",beta_updates=0}");
-    expect!["replay.sampling.beta_updates = 0 cannot work: beta rises over at least one update"].assert_eq(&said(&[&none]));
+    expect!["replay.sampling.beta_updates = 0 cannot work: beta rises over at least one update"]
+        .assert_eq(&said(&[&none]));
 }
