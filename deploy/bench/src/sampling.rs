@@ -38,8 +38,8 @@ pub(super) fn measure(effort: &Effort, held: u64) -> anyhow::Result<Vec<Measurem
     let mut uniform = Filled::new(held, Sampling::Uniform)?;
     let mut prioritised = Filled::new(held, PRIORITISED)?;
     let mut learned_from = Filled::new(held, PRIORITISED)?;
-    // Every transition has a priority of its own, as after a while of learning.
-    for _ in 0..8 * held / u64::from(learned_from.rows) {
+    // Most transitions have a priority of their own, as after a while of learning.
+    for _ in 0..2 * held / u64::from(learned_from.rows) {
         prioritised.learn()?;
         learned_from.learn()?;
     }

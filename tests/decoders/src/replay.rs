@@ -2,9 +2,17 @@
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon, InsertReply,
-    RequestId, RunSpec, Sampling, Tally, TimeoutRule,
+    Origin, PriorityPart, PriorityUpdate, RequestId, RunSpec, Sampling, Tally, TimeoutRule,
 };
 use driml_replay_server::{Compression, Config, Replay};
+
+/// Rows drawn by priority.
+const PRIORITISED: Sampling = Sampling::Prioritised {
+    alpha: 0.5,
+    beta_start: 0.4,
+    beta_end: 1.0,
+    beta_updates: 1,
+};
 
 /// Messages of one try.
 const MESSAGES_MAX: usize = 64;
@@ -59,13 +67,13 @@ fn spec() -> RunSpec {
     }
 }
 
-fn config(shards: u32) -> Config {
+fn config(shards: u32, sampling: Sampling) -> Config {
     Config {
         capacity_transitions: 64 * u64::from(shards),
         shards,
         compression: Compression::None,
         compressed_bytes_max: None,
-        sampling: Sampling::Uniform,
+        sampling,
         disk_bytes_max: None,
         fsync_ms: None,
         replay_ratio: 2.0,
@@ -79,10 +87,15 @@ fn config(shards: u32) -> Config {
 /// Sends the messages that the bytes say, one after the other.
 pub(crate) fn replay(bytes: &[u8]) {
     let mut numbers = Numbers(bytes);
-    let Some(shards) = numbers.byte().map(|byte| 1 + u32::from(byte % 2)) else {
+    let Some(byte) = numbers.byte() else {
         return;
     };
-    let mut replay = Replay::new(&spec(), &config(shards), 4).unwrap();
+    let shards = 1 + u32::from(byte % 2);
+    let sampling = match byte / 2 % 2 {
+        0 => Sampling::Uniform,
+        _ => PRIORITISED,
+    };
+    let mut replay = Replay::new(&spec(), &config(shards, sampling), 4).unwrap();
     for _ in 0..MESSAGES_MAX {
         if message(&mut replay, &mut numbers).is_none() {
             break;
@@ -149,8 +162,25 @@ fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
             let _ = replay.set_affinity(&affinity);
         }
         _ => {
-            if numbers.byte()? % 2 == 0 {
+            let byte = numbers.byte()?;
+            if byte % 2 == 0 {
                 let _ = replay.learner_starts(numbers.count()?);
+            } else if byte % 4 == 1 {
+                let origin = Origin {
+                    shard: u32::from(byte / 4 % 2),
+                    incarnation: u64::from(byte / 8 % 2),
+                };
+                let (transition, priority) = (numbers.count()?, numbers.byte()?);
+                let update = PriorityUpdate {
+                    learner: 1,
+                    number: numbers.count()?,
+                    parts: vec![PriorityPart {
+                        origin,
+                        transitions: vec![transition; 2],
+                        priorities: vec![f32::from(priority), f32::MAX * f32::from(priority % 2)],
+                    }],
+                };
+                let _ = replay.set_priorities(&update);
             } else {
                 let tally = Tally {
                     inserted: numbers.count()?,

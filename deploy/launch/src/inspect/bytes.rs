@@ -14,7 +14,10 @@ use super::{everything::Everything, line::Line};
 pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Result<Vec<Line>> {
     let run = &config.run;
     let rows = config.learner.batch_size;
-    let batch = |run: &RunSpec| BatchHeader::of(run, rows).payload_bytes() as u64;
+    let batch = |run: &RunSpec| {
+        let header = BatchHeader::of(run, rows).sampled_by(&config.replay.sampling);
+        header.payload_bytes() as u64
+    };
     let states = |run: &RunSpec, states: usize| rows as u64 * (states * run.state_bytes()) as u64;
     let transition = |run: &RunSpec| (run.frame_bytes() + TRANSITION_BYTES) as u64;
     let (positives, every_positives) = (run.horizon.positives(), every.run.horizon.positives());
