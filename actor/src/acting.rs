@@ -3,6 +3,7 @@
 
 use driml_envs::{EnvError, Environment, FrameStack, StepEnd};
 use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
 
 use crate::{error::ActError, policy::Policy};
 
@@ -11,6 +12,8 @@ use crate::{error::ActError, policy::Policy};
 pub struct Step<'a> {
     /// Frames [N, frame bytes] in which the actions were taken, unstacked.
     pub frames: &'a [u8],
+    /// The same with the frames before them [N, state bytes], as the policy saw them.
+    pub states: &'a [u8],
     /// Actions [N].
     pub actions: &'a [u8],
     /// Rewards [N] that they earned.
@@ -30,6 +33,16 @@ pub struct Acting {
     rewards: Vec<f32>,
     ends: Vec<StepEnd>,
     first: Vec<bool>,
+}
+
+/// How a world in motion stands between two steps.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ActingState {
+    world: Vec<u8>,
+    stacked: Vec<u8>,
+    /// Of each copy, whether its next frame is the first of an episode or level.
+    first: Vec<bool>,
+    rng: ChaCha8Rng,
 }
 
 impl Acting {
@@ -72,9 +85,38 @@ impl Acting {
         }
         Ok(Step {
             frames: &self.frames,
+            states: &self.states,
             actions: &self.actions,
             rewards: &self.rewards,
             ends: &self.ends,
         })
+    }
+
+    /// How it stands.
+    ///
+    /// # Errors
+    /// [`EnvError::NotSaved`]: a world whose state cannot be saved; a fault of the engine.
+    pub fn state(&mut self) -> Result<ActingState, EnvError> {
+        Ok(ActingState {
+            world: self.world.save()?,
+            stacked: self.stack.stacked().to_vec(),
+            first: self.first.clone(),
+            rng: self.rng.clone(),
+        })
+    }
+
+    /// Goes on where another one with the same world stood.
+    ///
+    /// # Errors
+    /// A state of another world.
+    pub fn go_on_from(&mut self, state: ActingState) -> Result<(), EnvError> {
+        if state.first.len() != self.first.len() {
+            let (found, own) = (state.first.len(), self.first.len());
+            return Err(EnvError::State(format!("{found} copies, not {own}")));
+        }
+        self.world.load(&state.world)?;
+        self.stack.load(&state.stacked)?;
+        (self.first, self.rng) = (state.first, state.rng);
+        Ok(())
     }
 }

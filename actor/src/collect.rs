@@ -1,13 +1,19 @@
 //! One actor's work without its network connections: act with the newest weights, give chunk after chunk.
 //! The processes and the lockstep mode run this same code; it neither sends nor waits.
 
+use driml_envs::{CutFrames, FewerActions};
 use driml_protocol::{BufferPool, Chunk, RunSpec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
 
 use crate::{
-    acting::Acting, config::ActorSettings, error::ActError, policy::NetworkPolicy,
-    recorder::Recorder, schedule::Schedule,
+    acting::{Acting, ActingState},
+    config::ActorSettings,
+    error::ActError,
+    policy::NetworkPolicy,
+    recorder::{ChunkNumbers, ChunkRecorder},
+    schedule::Schedule,
 };
 
 /// One life of an actor, from its start to its end; a restarted actor is another incarnation.
@@ -24,13 +30,20 @@ pub struct Incarnation {
 }
 
 impl Incarnation {
-    /// The seed of one of its generators. Lives that differ in `actor`, `after_updates` or `earlier_incarnations` have others.
-    fn seed(&self, spec: &RunSpec, used_for: &str) -> [u8; 32] {
+    /// The seed of one of its generators. Lives that differ in `actor`, `after_updates` or `earlier_incarnations` have others,
+    /// whatever these counts are.
+    pub fn seed(&self, spec: &RunSpec, used_for: &str) -> [u8; 32] {
         let index = u64::from(self.actor) | self.after_updates << u32::BITS;
-        match self.earlier_incarnations {
-            0 => spec.seed_for(used_for, index),
-            lives => spec.seed_for(&format!("{used_for} after {lives} lives"), index),
+        let mut used_for = used_for.to_owned();
+        if self.earlier_incarnations > 0 {
+            used_for += &format!(" after {} lives", self.earlier_incarnations);
         }
+        // What the index has no room for.
+        let beyond = self.after_updates >> u32::BITS;
+        if beyond > 0 {
+            used_for += &format!(" after {beyond} times 2^32 updates");
+        }
+        spec.seed_for(&used_for, index)
     }
 }
 
@@ -38,9 +51,16 @@ impl Incarnation {
 pub struct Collector {
     schedule: Schedule,
     acting: Acting,
-    recorder: Recorder,
+    recorder: ChunkRecorder,
     policy: NetworkPolicy,
     weights_version: u64,
+}
+
+/// How a collector stands between two chunks; the weights it acts with are not in it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CollectorState {
+    acting: ActingState,
+    next_chunk: ChunkNumbers,
 }
 
 impl Collector {
@@ -71,10 +91,18 @@ impl Collector {
                 world: spec.world.clone(),
                 source,
             })?;
+        let no_world = |source| ActError::NoWorld {
+            world: spec.world.clone(),
+            source,
+        };
+        let world =
+            FewerActions::of(world, settings.world.actions(config.actions)).map_err(no_world)?;
         let shape = world.frame_shape();
+        let sent = (spec.frame_height as usize, spec.frame_width as usize);
+        let (whole_height, whole_width) = settings.input.whole_frame(sent);
         let promised = (
-            spec.frame_height,
-            spec.frame_width,
+            whole_height as u32,
+            whole_width as u32,
             spec.frame_channels,
             spec.num_actions,
         );
@@ -92,15 +120,16 @@ impl Collector {
             });
         }
         let rng = ChaCha8Rng::from_seed(life.seed(spec, "exploration"));
+        let world = CutFrames::of(world, sent).map_err(no_world)?;
         let policy = NetworkPolicy::new(
             &settings.model,
-            (shape.height, shape.width),
+            settings.input.enlarge(sent, &settings.model)?,
             safetensors,
             settings.actor.precision,
         )?;
         Ok(Self {
             acting: Acting::new(world, spec.frame_stack as usize, rng)?,
-            recorder: Recorder::new(
+            recorder: ChunkRecorder::new(
                 pool,
                 life.actor,
                 life.id,
@@ -145,16 +174,37 @@ impl Collector {
             }
         }
     }
+
+    /// How it stands between two chunks.
+    ///
+    /// # Errors
+    /// A world whose state cannot be saved; a fault of the engine.
+    pub fn state(&mut self) -> Result<CollectorState, ActError> {
+        Ok(CollectorState {
+            acting: self.acting.state()?,
+            next_chunk: self.recorder.next_chunk(),
+        })
+    }
+
+    /// Goes on where another one of the same settings stood: with the same weights it gives the same chunks.
+    ///
+    /// # Errors
+    /// A state of other settings.
+    pub fn go_on_from(&mut self, state: CollectorState) -> Result<(), ActError> {
+        self.acting.go_on_from(state.acting)?;
+        self.recorder.go_on_at(state.next_chunk);
+        Ok(())
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use driml_envs::{CorridorConfig, WorldConfig};
-    use driml_model::{Compute, ConvLayer, DimHeads, ModelConfig, Parameters};
+    use driml_model::{Compute, ConvLayer, DimHeads, InputSize, ModelConfig, Parameters};
     use driml_protocol::{Horizon, TimeoutRule, config::TransportConfig};
 
     use super::*;
-    use crate::config::{Config, EpsilonLadder, InputSize};
+    use crate::config::{Config, EpsilonLadder};
 
     const ENVS: u32 = 32;
     const STEPS: u32 = 32;
@@ -192,6 +242,7 @@ mod tests {
             input: InputSize {
                 height: 12,
                 width: 12,
+                frame: None,
             },
             model: ModelConfig {
                 height: 12,
@@ -212,6 +263,7 @@ mod tests {
                 dim: DimHeads::NONE,
             },
             actor: Config {
+                actions: driml_envs::ActionSet::All,
                 precision: driml_model::Precision::F32,
                 envs: ENVS,
                 steps_per_chunk: STEPS,
@@ -269,6 +321,14 @@ mod tests {
             },
             Incarnation {
                 after_updates: 7,
+                ..at(1)
+            },
+            Incarnation {
+                after_updates: (1 << 32) + 7,
+                ..FIRST
+            },
+            Incarnation {
+                after_updates: 1 << 32,
                 ..at(1)
             },
         ];

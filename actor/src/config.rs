@@ -1,10 +1,12 @@
 //! The actor's settings, and what it takes from the run's other tables.
 //! It fills in no number: presets do, with their sources.
 
+use driml_envs::{EnvError, WorldName};
 use driml_protocol::{
     BufferPool, RunSpec, RunSpecError, TRANSITION_BYTES,
     codec::PAYLOAD_BYTES_MAX,
     config::{Settings, TransportConfig},
+    transitions_max,
 };
 use serde::{Deserialize, Serialize};
 
@@ -29,6 +31,9 @@ pub struct Config {
     /// In which numbers the network's products are computed. Settings of earlier versions do not have it: f32.
     #[serde(default)]
     pub precision: driml_model::Precision,
+    /// Which of the world's actions are chosen among. Settings of earlier versions do not have it: all.
+    #[serde(default)]
+    pub actions: driml_envs::ActionSet,
     /// Threads that step the copies; 0 steps them in the acting thread.
     pub world_threads: u32,
     /// Probability of a random action at the run's first frame.
@@ -59,16 +64,6 @@ pub struct EpsilonLadder {
     pub actors: u32,
 }
 
-/// The `[input]` table: the size at which the network sees a frame.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct InputSize {
-    /// Rows after enlargement.
-    pub height: u32,
-    /// Columns after enlargement.
-    pub width: u32,
-}
-
 /// Everything an actor needs to know of a run.
 #[derive(Clone, Debug)]
 pub struct ActorSettings {
@@ -77,7 +72,7 @@ pub struct ActorSettings {
     /// The world that its copies are of.
     pub world: driml_envs::WorldConfig,
     /// The size at which the network sees it.
-    pub input: InputSize,
+    pub input: driml_model::InputSize,
     /// The network that chooses actions.
     pub model: driml_model::ModelConfig,
     /// The actor's own.
@@ -115,6 +110,52 @@ impl ActorSettings {
         this.actor.validate()?;
         this.check_chunk()?;
         Ok(this)
+    }
+
+    /// Steps `envs` copies of the world instead of those that the settings say.
+    ///
+    /// # Errors
+    /// Too many, or chunks that are longer than those of this run may be; what to do.
+    pub fn set_envs(&mut self, envs: u32) -> Result<(), ConfigError> {
+        let Config {
+            steps_per_chunk,
+            round_transitions_max,
+            ..
+        } = self.actor;
+        let most = transitions_max(self.actor.envs, steps_per_chunk, round_transitions_max);
+        self.actor.envs = envs;
+        self.actor.validate()?;
+        self.check_chunk()?;
+        let longest = u64::from(envs) * u64::from(self.actor.chunk_steps(1));
+        if longest > most {
+            return Err(ConfigError {
+                key: "envs",
+                value: envs.to_string(),
+                why: "its chunks are longer than the replay server takes in this run, by the settings' actor.envs and \
+                      actor.steps_per_chunk: use fewer, or start the run with more (--envs at the replay server)",
+            });
+        }
+        Ok(())
+    }
+
+    /// Takes the world's code from `world`, which a person on this machine has named, and not from the run's settings.
+    ///
+    /// # Errors
+    /// A world with code that nobody here has named, or the name of another world.
+    pub fn set_world(&mut self, world: Option<WorldName>) -> Result<(), EnvError> {
+        let name = self.world.name();
+        match world {
+            Some(world) => self.world = self.world.with_code_of(world)?,
+            None if name.foreign_code().is_some() => {
+                return Err(EnvError::Config(format!(
+                    "the run's world is code on this actor's machine, {name}, and an actor starts none because a replay server says so: \
+                     if you trust it, name it with --env {:?}, or as this machine has it",
+                    name.to_string()
+                )));
+            }
+            None => {}
+        }
+        Ok(())
     }
 
     /// Checks that the longest chunk fits a message.
@@ -290,6 +331,7 @@ mod tests {
     #[test]
     fn chunks_get_shorter_as_actors_get_many() {
         let config = |envs, steps_per_chunk, round_transitions_max| Config {
+            actions: driml_envs::ActionSet::All,
             precision: driml_model::Precision::F32,
             envs,
             steps_per_chunk,

@@ -4,9 +4,27 @@
 use driml_envs::{Environment, StepEnd};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{acting::Acting, error::ActError, policy::Policy};
+use crate::{
+    acting::{Acting, Step},
+    error::ActError,
+    policy::Policy,
+};
 
-/// Returns of `episodes` whole episodes of `policy` in `world`, in the order in which they ended.
+/// How much is played, and how.
+#[derive(Clone, Copy, Debug)]
+pub struct Evaluation {
+    /// Frames that a state is made of.
+    pub frame_stack: usize,
+    /// Probability of a random action.
+    pub epsilon: f64,
+    /// Whole episodes of all copies together.
+    pub episodes: usize,
+    /// Steps of each copy after which it is given up.
+    pub steps_max: u64,
+}
+
+/// Returns of whole episodes of `policy` in `world`, in the order in which they ended; `rng` is for exploration alone. `watch` is
+/// shown every step and changes nothing.
 ///
 /// Each copy contributes the same number of episodes (the last round's surplus is dropped by copy order), so that short
 /// episodes are not favoured by being over first.
@@ -15,13 +33,17 @@ use crate::{acting::Acting, error::ActError, policy::Policy};
 /// The policy or the world failed, or episodes have not ended after `steps_max` steps a copy.
 pub fn episode_returns(
     world: Box<dyn Environment>,
-    frame_stack: usize,
     policy: &mut dyn Policy,
-    epsilon: f64,
-    episodes: usize,
-    steps_max: u64,
+    evaluation: Evaluation,
     rng: ChaCha8Rng,
+    watch: &mut dyn FnMut(&Step<'_>),
 ) -> Result<Vec<f64>, ActError> {
+    let Evaluation {
+        frame_stack,
+        epsilon,
+        episodes,
+        steps_max,
+    } = evaluation;
     let envs = world.num_envs();
     let quota = |copy: usize| episodes / envs + usize::from(copy < episodes % envs);
     let mut acting = Acting::new(world, frame_stack, rng)?;
@@ -33,6 +55,7 @@ pub fn episode_returns(
             return Ok(returns);
         }
         let step = acting.step(policy, epsilon)?;
+        watch(&step);
         for copy in 0..envs {
             running[copy] += f64::from(step.rewards[copy]);
             if matches!(step.ends[copy], StepEnd::Terminal | StepEnd::TimedOut) {
@@ -128,7 +151,15 @@ mod tests {
         let scripts = scripts.iter().map(|script| script.to_vec()).collect();
         let world = Box::new(Scripted { scripts, step: 0 });
         let (mut policy, rng) = (Tape::default(), ChaCha8Rng::seed_from_u64(1));
-        let returns = episode_returns(world, 1, &mut policy, 0.25, episodes, steps_max, rng);
+        let evaluation = Evaluation {
+            frame_stack: 1,
+            epsilon: 0.25,
+            episodes,
+            steps_max,
+        };
+        let mut seen = 0;
+        let returns = episode_returns(world, &mut policy, evaluation, rng, &mut |_| seen += 1);
+        assert_eq!(seen, policy.0.len(), "every step is shown");
         assert!(policy.0.iter().all(|&epsilon| epsilon == 0.25));
         returns
     }

@@ -2,10 +2,10 @@
 //! It never sees a batch and never learns; weights come from the learner.
 //!
 //! Start at [`run`], a whole actor process, or at [`Collector`], the same without a network connection. Below them [`Acting`]
-//! steps a world with a [`Policy`], [`Recorder`] makes chunks of the steps, and [`Delivery`] brings them to the replay server.
+//! steps a world with a [`Policy`], [`ChunkRecorder`] makes chunks of the steps, and [`Delivery`] brings them to the replay server.
 //!
 //! ```
-//! use driml_actor::{ActError, Acting, Policy, Recorder};
+//! use driml_actor::{ActError, Acting, Policy, ChunkRecorder};
 //! use driml_envs::{EnvError, Environment, FrameShape, StepEnd};
 //! use driml_protocol::BufferPool;
 //! use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
@@ -46,7 +46,7 @@
 //!
 //! let mut acting = Acting::new(Box::new(Counter(0)), 1, ChaCha8Rng::seed_from_u64(1))?;
 //! // Chunks of actor 7's incarnation 1, from two copies with frames of one byte.
-//! let mut recorder = Recorder::new(BufferPool::new(1), 7, 1, 2, 1);
+//! let mut recorder = ChunkRecorder::new(BufferPool::new(1), 7, 1, 2, 1);
 //! recorder.begin(0, 3);
 //! let chunk = loop {
 //!     let step = acting.step(&mut Always(2), 0.0)?;
@@ -74,14 +74,14 @@ mod run;
 mod schedule;
 mod weights;
 
-pub use acting::{Acting, Step};
-pub use collect::{Collector, Incarnation};
-pub use config::{ActorSettings, Config, ConfigError, EpsilonLadder, InputSize, SettingsError};
+pub use acting::{Acting, ActingState, Step};
+pub use collect::{Collector, CollectorState, Incarnation};
+pub use config::{ActorSettings, Config, ConfigError, EpsilonLadder, SettingsError};
 pub use delivery::{Delivery, DeliveryError, DeliveryLimits};
 pub use error::ActError;
-pub use evaluate::episode_returns;
+pub use evaluate::{Evaluation, episode_returns};
 pub use policy::{NetworkPolicy, Policy, RandomPolicy};
-pub use recorder::Recorder;
+pub use recorder::{ChunkNumbers, ChunkRecorder};
 pub use run::{RunArgs, run};
 pub use schedule::{BeyondLadder, Schedule};
-pub use weights::{NewestWeights, Weights, WeightsSource};
+pub use weights::{NewestWeights, WeightsError, WeightsSource};

@@ -49,36 +49,42 @@ impl Policy for RandomPolicy {
 }
 
 /// Greedy in the expected return of the C51 network, but for epsilon.
+///
+/// Which actions are random is drawn first: states in which chance decides do not pass through the network.
 pub struct NetworkPolicy {
     network: PolicyNetwork,
     enlarge: Option<Enlarge>,
-    enlarged: Vec<u8>,
     num_actions: u8,
+    /// The copies in which the network decides, their states if these are not all, at the network's size if that is another,
+    /// and their actions: memory to use again.
+    deciding: Vec<usize>,
+    states: Vec<u8>,
+    enlarged: Vec<u8>,
+    greedy: Vec<u8>,
 }
 
 impl NetworkPolicy {
-    /// A policy with the weights of a safetensors file; `frame` is (height, width) of a state as it comes. Its products are
-    /// computed in `precision`.
+    /// A policy with the weights of a safetensors file; `enlarge` makes the network's input of a state, if that is not it. Its
+    /// products are computed in `precision`.
     ///
     /// # Errors
     /// Weights that do not fit the model.
     pub fn new(
         model: &ModelConfig,
-        frame: (usize, usize),
+        enlarge: Option<Enlarge>,
         safetensors: &[u8],
         precision: Precision,
     ) -> Result<Self, ActError> {
-        let input = (model.height, model.width);
-        let enlarge = (frame != input)
-            .then(|| Enlarge::new(frame, input, model.channels))
-            .transpose()?;
         Ok(Self {
             network: PolicyNetwork::new(model, safetensors, precision)?,
             enlarge,
-            enlarged: Vec::new(),
             num_actions: u8::try_from(model.num_actions).map_err(|_| ActError::TooManyActions {
                 actions: model.num_actions,
             })?,
+            deciding: Vec::new(),
+            states: Vec::new(),
+            enlarged: Vec::new(),
+            greedy: Vec::new(),
         })
     }
 
@@ -99,20 +105,34 @@ impl Policy for NetworkPolicy {
         rng: &mut ChaCha8Rng,
         actions: &mut [u8],
     ) -> Result<(), ActError> {
-        let input = match &self.enlarge {
-            None => states,
-            Some(enlarge) => {
-                self.enlarged
-                    .resize(actions.len() * enlarge.output_bytes(), 0);
-                enlarge.apply(states, &mut self.enlarged);
-                &self.enlarged
-            }
-        };
-        self.network.greedy_actions(input, actions)?;
-        for action in actions {
+        self.deciding.clear();
+        for (copy, action) in actions.iter_mut().enumerate() {
             if rng.random_bool(epsilon) {
                 *action = rng.random_range(0..self.num_actions);
+            } else {
+                self.deciding.push(copy);
             }
+        }
+        let count = self.deciding.len();
+        let mut input = states;
+        if count < actions.len() {
+            let state_bytes = states.len() / actions.len();
+            self.states.clear();
+            for &copy in &self.deciding {
+                let state = &states[copy * state_bytes..][..state_bytes];
+                self.states.extend_from_slice(state);
+            }
+            input = &self.states;
+        }
+        if let Some(enlarge) = &self.enlarge {
+            self.enlarged.resize(count * enlarge.output_bytes(), 0);
+            enlarge.apply(input, &mut self.enlarged);
+            input = &self.enlarged;
+        }
+        self.greedy.resize(count, 0);
+        self.network.greedy_actions(input, &mut self.greedy)?;
+        for (&copy, &action) in self.deciding.iter().zip(&self.greedy) {
+            actions[copy] = action;
         }
         Ok(())
     }
@@ -129,6 +149,10 @@ mod tests {
     const STATES: usize = 4000;
 
     fn policy() -> NetworkPolicy {
+        policy_of(1)
+    }
+
+    fn policy_of(seed: u64) -> NetworkPolicy {
         let model = ModelConfig {
             height: 4,
             width: 4,
@@ -147,10 +171,10 @@ mod tests {
             action_embed: 4,
             dim: DimHeads::NONE,
         };
-        let rng = &mut ChaCha8Rng::seed_from_u64(1);
+        let rng = &mut ChaCha8Rng::seed_from_u64(seed);
         let weights = Parameters::init(&model, rng, &Compute::CPU.device).unwrap();
         let weights = weights.to_safetensors(|_| true).unwrap();
-        NetworkPolicy::new(&model, (4, 4), &weights, Precision::F32).unwrap()
+        NetworkPolicy::new(&model, None, &weights, Precision::F32).unwrap()
     }
 
     /// How often each action is chosen in `STATES` equal states.
@@ -188,6 +212,38 @@ mod tests {
             let mut shares = [epsilon / ACTIONS as f64; ACTIONS];
             shares[best] += 1.0 - epsilon;
             check_shares(counts(&mut policy, epsilon), shares);
+        }
+    }
+
+    /// As if the network had decided in every state and chance had then overruled it: the same numbers drawn, the same actions.
+    #[test]
+    fn states_in_which_chance_decides_need_no_network() {
+        let rng = &mut ChaCha8Rng::seed_from_u64(3);
+        let states: Vec<u8> = (0..16 * STATES).map(|_| rng.random()).collect();
+        // Weights that do not prefer one action in every state.
+        let decides = |seed| {
+            let mut policy = policy_of(seed);
+            let mut greedy = vec![0; STATES];
+            policy.network.greedy_actions(&states, &mut greedy).unwrap();
+            let differ = greedy.iter().any(|&action| action != greedy[0]);
+            differ.then_some((policy, greedy))
+        };
+        let (mut policy, greedy) = (1..100).find_map(decides).unwrap();
+        for epsilon in [0.0, 0.01, 0.5, 1.0] {
+            let mut overruled = greedy.clone();
+            let mut separate = rng.clone();
+            for action in &mut overruled {
+                if separate.random_bool(epsilon) {
+                    *action = separate.random_range(0..ACTIONS as u8);
+                }
+            }
+            let mut actions = vec![0; STATES];
+            policy.act(&states, epsilon, rng, &mut actions).unwrap();
+            assert_eq!(actions, overruled);
+            assert_eq!(rng.random::<u64>(), separate.random::<u64>());
+            assert_eq!(policy.greedy.len(), policy.deciding.len());
+            let share = policy.greedy.len() as f64 / STATES as f64;
+            assert!((share - (1.0 - epsilon)).abs() < 0.03, "{share}");
         }
     }
 

@@ -3,6 +3,7 @@
 
 use driml_envs::StepEnd;
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
+use serde::{Deserialize, Serialize};
 
 /// What a world ended, in the words of the wire.
 const fn end_on_the_wire(end: StepEnd) -> End {
@@ -14,9 +15,16 @@ const fn end_on_the_wire(end: StepEnd) -> End {
     }
 }
 
+/// Which chunk of an actor's life it is, and how many transitions were before it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ChunkNumbers {
+    sequence: u64,
+    first_transition: u64,
+}
+
 /// Fills chunk after chunk.
 #[derive(Debug)]
-pub struct Recorder {
+pub struct ChunkRecorder {
     pool: BufferPool,
     /// Of the chunk being filled, or of the next one.
     header: ChunkHeader,
@@ -25,8 +33,8 @@ pub struct Recorder {
     filled_steps: u32,
 }
 
-impl Recorder {
-    /// A recorder for `streams` copies; how long its chunks are is for [`Recorder::begin`].
+impl ChunkRecorder {
+    /// A recorder for `streams` copies; how long its chunks are is for [`ChunkRecorder::begin`].
     pub fn new(
         pool: BufferPool,
         actor: u32,
@@ -69,6 +77,24 @@ impl Recorder {
     /// Transitions recorded so far, including those of the chunk being filled.
     pub const fn produced(&self) -> u64 {
         self.header.first_transition + self.filled_steps as u64 * self.header.streams as u64
+    }
+
+    /// The numbers of the next chunk, between two of them.
+    ///
+    /// # Panics
+    /// If a chunk is being filled.
+    pub fn next_chunk(&self) -> ChunkNumbers {
+        assert!(self.chunk.is_none(), "a chunk is kept whole or not at all");
+        ChunkNumbers {
+            sequence: self.header.sequence,
+            first_transition: self.header.first_transition,
+        }
+    }
+
+    /// Goes on with the numbers of another recorder of the same life.
+    pub fn go_on_at(&mut self, next: ChunkNumbers) {
+        self.header.sequence = next.sequence;
+        self.header.first_transition = next.first_transition;
     }
 
     /// Records one step of every copy: frames [N, frame bytes] in which `actions` [N] were taken, and what came of it.
@@ -118,7 +144,7 @@ mod tests {
 
     #[test]
     fn chunks_are_numbered_and_stream_major() {
-        let mut recorder = Recorder::new(BufferPool::new(1), 7, 9, 2, 1);
+        let mut recorder = ChunkRecorder::new(BufferPool::new(1), 7, 9, 2, 1);
         let ends = [StepEnd::Running, StepEnd::Terminal];
         let mut chunks = Vec::new();
         for step in 0..7_u8 {

@@ -1,12 +1,14 @@
 //! One actor process: join, act, deliver, until told to stop or no longer needed.
 //! The acting itself is `collect`, which knows no network.
 
-use std::time::Duration;
+use std::{sync::Arc, time::Duration};
 
 use anyhow::Context;
+use driml_envs::WorldName;
 use driml_protocol::{
-    ActorJoin, Alive, Keys, RunClient, Shutdown, join,
+    Activity, ActorJoin, Keys, Life, RunClient, Shutdown, Weights, join, reporter,
     session::{self, Endpoints},
+    tls::Credentials,
 };
 use zenoh::Wait;
 
@@ -25,12 +27,17 @@ const WEIGHTS_WAIT_MAX: Duration = Duration::from_secs(120);
 pub struct RunArgs {
     /// Endpoints of the replay server.
     pub connect: Vec<String>,
+    /// With which certificate it takes part; none without TLS.
+    pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
     /// Which actor this is; unique in the run.
     pub actor: u32,
     /// Copies of the world, if not as many as the settings say.
     pub envs: Option<u32>,
+    /// The world as this machine has it, where it is code that is no part of this program: nothing else of that kind is started
+    /// or loaded, whatever the replay server says.
+    pub world: Option<WorldName>,
 }
 
 /// Runs one actor until `shutdown`, or until the run has its transitions.
@@ -39,20 +46,25 @@ pub struct RunArgs {
 /// Nobody to join, settings or weights that do not fit, a world that fails, chunks that cannot be delivered.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let session = session::open(&Endpoints {
+    let endpoints = Endpoints {
         listen: Vec::new(),
         connect: args.connect,
-    })?;
+    };
+    let session = session::open_as(
+        &endpoints,
+        &keys,
+        args.credentials.as_deref(),
+        session::SMALL_MESSAGE_BYTES_MAX,
+    )?;
     let Some(hello) = join::hello(&session, &keys, shutdown)? else {
         return Ok(());
     };
     let mut settings = ActorSettings::from_toml(&hello.config_toml)
         .context("the settings that the replay server sent")?;
     if let Some(envs) = args.envs {
-        settings.actor.envs = envs;
-        settings.actor.validate()?;
-        settings.check_chunk()?;
+        settings.set_envs(envs)?;
     }
+    settings.set_world(args.world)?;
     if settings.transport.shared_memory && !hello.shared_memory {
         tracing::info!("chunks go through sockets: the replay server cannot read shared memory");
         settings.transport.shared_memory = false;
@@ -62,21 +74,29 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         actor: args.actor,
         incarnation: rand::random(),
     };
+    let who = Life::Actor {
+        actor: join.actor,
+        incarnation: join.incarnation,
+    };
     // Before it joins, so that no other process can take its place from then on.
     let client = RunClient::new(session, keys, spec_hash);
     let alive = client
-        .declare_alive(Alive::Actor {
-            actor: join.actor,
-            incarnation: join.incarnation,
-        })
+        .declare_alive(who.alive())
         .map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
     let Some(welcome) = join::as_actor(&client, join, shutdown)? else {
         return Ok(());
     };
+    let activity = Activity::new("waits for the learner's first weights");
+    reporter::start(
+        vec![client.clone()],
+        who,
+        activity.clone(),
+        shutdown.clone(),
+    )?;
     let source = WeightsSource {
         client: client.clone(),
     };
-    let Some((header, weights)) = source.first(WEIGHTS_WAIT_MAX, shutdown)? else {
+    let Some(first) = source.first(WEIGHTS_WAIT_MAX, shutdown)? else {
         return Ok(());
     };
     let limits = DeliveryLimits::of(&settings.actor);
@@ -92,10 +112,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             after_updates: hello.after_updates,
             earlier_incarnations: welcome.earlier_incarnations,
         },
-        header.version,
-        &weights,
+        first.header.version,
+        &first.safetensors,
     )?;
-    let newest = source.watch(header.version, shutdown.clone())?;
+    let newest = source.watch(first.header.version, shutdown.clone())?;
     let delivery = Delivery::start(
         client.clone(),
         welcome.inserted_total,
@@ -110,8 +130,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     );
     while !shutdown.is_set() && !delivery.is_finished() {
         let newer = newest.take_within(delivery.fresh_weights_max());
-        if let Some((header, weights)) = newer
-            && let Err(e) = collector.set_weights(header.version, &weights)
+        if let Some(Weights {
+            header,
+            safetensors,
+        }) = newer
+            && let Err(e) = collector.set_weights(header.version, &safetensors)
         {
             tracing::warn!(
                 "weights {} were refused, the old ones stay: {e:#}",
@@ -120,12 +143,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         }
         // At the start not all are connected yet.
         let steps = config.chunk_steps(delivery.actors().max(actors_planned));
+        activity.begin("plays");
         let chunk = collector.collect(delivery.inserted_total(), steps)?;
+        if let Some(waits) = delivery.waits_in_words() {
+            activity.begin(waits);
+        }
         if !delivery.send(chunk) {
             break;
         }
     }
     let produced = collector.produced();
+    activity.begin("delivers its last chunks");
     let unwanted = delivery.finish()?;
     tracing::info!(
         "actor {} leaves: {} transitions delivered",

@@ -31,6 +31,9 @@ pub struct BeyondLadder {
 }
 
 impl Schedule {
+    /// Largest error of an epsilon, a probability, for any counts of frames.
+    pub const ERROR: f64 = 1e-15;
+
     /// The schedule of actor number `actor`.
     ///
     /// # Errors
@@ -46,7 +49,8 @@ impl Schedule {
         }
     }
 
-    /// Epsilon after `frames` frames of the run.
+    /// Epsilon after `frames` frames of the run, right to [`Schedule::ERROR`]; it never leaves the range from start to end, and never
+    /// goes back.
     pub fn epsilon(&self, frames: u64) -> f64 {
         match *self {
             Self::Fixed(epsilon) => epsilon,
@@ -57,7 +61,11 @@ impl Schedule {
                 start,
                 end,
                 decay_frames,
-            } => start + (end - start) * (frames as f64 / decay_frames as f64),
+            } => {
+                let epsilon = start + (end - start) * (frames as f64 / decay_frames as f64);
+                // Just before the end rounding may take it past it.
+                epsilon.clamp(start.min(end), start.max(end))
+            }
         }
     }
 }
@@ -81,6 +89,7 @@ mod tests {
     use super::*;
 
     const CONFIG: Config = Config {
+        actions: driml_envs::ActionSet::All,
         precision: driml_model::Precision::F32,
         envs: 1,
         steps_per_chunk: 1,
@@ -185,6 +194,39 @@ mod tests {
                 said.starts_with(&format!("actor.epsilon_ladder.{key}")),
                 "{said}"
             );
+        }
+    }
+
+    /// Counts of frames beyond 2^32 and 2^53, where a step of one is less than an f64 tells apart.
+    #[test]
+    fn epsilon_of_the_longest_run_falls_and_stays_in_its_range() {
+        for decay_frames in [10_000_000_000, 1 << 53, u64::MAX] {
+            for (start, end) in [(1.0, 0.0), (0.1, 0.01), (1.0, 0.999_999_9), (0.05, 0.05)] {
+                let schedule = Schedule::Falling {
+                    start,
+                    end,
+                    decay_frames,
+                };
+                let mut before = start;
+                for share in 0..=1000u64 {
+                    let frames = (u128::from(decay_frames) * u128::from(share) / 1000) as u64;
+                    for frames in [frames.saturating_sub(1), frames, frames.saturating_add(1)] {
+                        let epsilon = schedule.epsilon(frames);
+                        let exactly = start + (end - start) * (share as f64 / 1000.0);
+                        assert!(
+                            (epsilon - exactly).abs() < 1e-9,
+                            "{frames} of {decay_frames}"
+                        );
+                        assert!(
+                            (end..=before).contains(&epsilon),
+                            "{frames} of {decay_frames}: {epsilon} after {before}"
+                        );
+                        before = epsilon;
+                    }
+                }
+                assert_eq!(schedule.epsilon(decay_frames), end);
+                assert_eq!(schedule.epsilon(u64::MAX), end);
+            }
         }
     }
 }

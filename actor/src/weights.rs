@@ -7,10 +7,9 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, bail};
 use driml_protocol::{
     Assembly, BufferPool, CodecError, PIECE_BYTES, PendingReply, RunClient, Seldom, Shutdown,
-    WeightsHeader, WeightsReply, WeightsRequest, WeightsVersion, fault,
+    Weights, WeightsReply, WeightsRequest, WeightsVersion, fault, session::SessionError,
 };
 
 /// How long one piece may take to come.
@@ -26,8 +25,47 @@ const PAUSE: Duration = Duration::from_millis(200);
 /// How long the first weights may take before a person hears that they are waited for.
 const SILENT_MAX: Duration = Duration::from_secs(5);
 
-/// Weights as they came: what they say of themselves, and a safetensors file.
-pub type Weights = (WeightsHeader, Vec<u8>);
+/// Why there are no weights, or no newer ones.
+#[derive(Debug, thiserror::Error)]
+pub enum WeightsError {
+    /// The learner has sent none yet, or they could not be pulled in the time given.
+    #[error(
+        "no weights within {wait_max:?}: is the learner running and connected to the same replay server?"
+    )]
+    NoneInTime {
+        /// How long they were waited for.
+        wait_max: Duration,
+        /// Why the last pull failed, if it did.
+        source: Option<Box<Self>>,
+    },
+    /// The replay server cannot be asked.
+    #[error("asking for weights: {0}")]
+    Asking(SessionError),
+    /// A request that cannot be sent, or an answer that did not come.
+    #[error(transparent)]
+    Session(#[from] SessionError),
+    /// A piece that is damaged or not the next one, or a whole that is not what its header says.
+    #[error(transparent)]
+    Damaged(#[from] CodecError),
+    /// The pieces are fewer than their size says.
+    #[error("weights {version} have no last piece")]
+    Incomplete {
+        /// The version that was pulled.
+        version: u64,
+    },
+    /// Newer versions came so often that the replay server dropped this one before it was pulled.
+    #[error("weights {version} were replaced too often while they were pulled")]
+    Replaced {
+        /// The version that was pulled.
+        version: u64,
+    },
+    /// Announcements of new weights cannot be subscribed to.
+    #[error("listening for new weights: {0}")]
+    Listening(zenoh::Error),
+    /// The system starts no thread.
+    #[error(transparent)]
+    NoThread(#[from] std::io::Error),
+}
 
 /// The newest weights, taken at most once. They are pulled at most once for each time that they are asked for.
 #[derive(Clone, Debug)]
@@ -105,7 +143,7 @@ impl NewestWeights {
         let mut state = self.state();
         match weights {
             Some(weights) => {
-                state.pulled = weights.0.version;
+                state.pulled = weights.header.version;
                 state.slot = Some(weights);
             }
             // Whoever announced them did not have them.
@@ -131,7 +169,7 @@ impl WeightsSource {
         &self,
         wait_max: Duration,
         shutdown: &Shutdown,
-    ) -> anyhow::Result<Option<Weights>> {
+    ) -> Result<Option<Weights>, WeightsError> {
         let started = Instant::now();
         let mut said = Seldom::default();
         loop {
@@ -139,15 +177,10 @@ impl WeightsSource {
             match pulled {
                 Ok(Some(weights)) => return Ok(Some(weights)),
                 pulled if started.elapsed() > wait_max => {
-                    let advice = format!(
-                        "no weights within {wait_max:?}: is the learner running and connected to the same replay server?"
-                    );
-                    return match pulled {
-                        Err(e) => Err(e.context(advice)),
-                        Ok(_) => bail!(advice),
-                    };
+                    let source = pulled.err().map(Box::new);
+                    return Err(WeightsError::NoneInTime { wait_max, source });
                 }
-                Err(e) => tracing::debug!("no weights yet: {e:#}"),
+                Err(e) => tracing::debug!("no weights yet: {e}"),
                 Ok(None) => {}
             }
             if started.elapsed() > SILENT_MAX && said.due().is_some() {
@@ -163,7 +196,7 @@ impl WeightsSource {
     ///
     /// # Errors
     /// No subscription, or no thread.
-    pub fn watch(self, version: u64, shutdown: Shutdown) -> anyhow::Result<NewestWeights> {
+    pub fn watch(self, version: u64, shutdown: Shutdown) -> Result<NewestWeights, WeightsError> {
         let newest = NewestWeights::after(version);
         let slot = newest.clone();
         let hear = move |announced: Result<WeightsVersion, CodecError>| match announced {
@@ -173,7 +206,7 @@ impl WeightsSource {
         let announcements = self
             .client
             .subscribe(hear)
-            .map_err(|e| anyhow::anyhow!("listening for new weights: {e}"))?;
+            .map_err(WeightsError::Listening)?;
         let slot = newest.clone();
         let work = move || {
             // For as long as the thread lives.
@@ -195,7 +228,7 @@ impl WeightsSource {
                     // The actor leaves: its session closes under this thread.
                     Err(_) if self.client.session().is_closed() => return,
                     Err(e) => {
-                        tracing::warn!("keeping weights {version}, newer ones did not come: {e:#}");
+                        tracing::warn!("keeping weights {version}, newer ones did not come: {e}");
                         slot.put(None);
                     }
                 }
@@ -208,7 +241,7 @@ impl WeightsSource {
     }
 
     /// The newest weights, piece by piece; none if they are not newer than `version`.
-    fn pull(&self, version: u64) -> anyhow::Result<Option<Weights>> {
+    fn pull(&self, version: u64) -> Result<Option<Weights>, WeightsError> {
         let pool = BufferPool::new(PIECES_IN_FLIGHT);
         let first = self.ask(WeightsRequest::NewerThan(version))?;
         let (reply, piece) = first.receive(&pool)?;
@@ -235,7 +268,9 @@ impl WeightsSource {
                 asked.push_back(self.ask(request)?);
             }
             let Some(next) = asked.pop_front() else {
-                bail!("weights {} have no last piece", weights.version);
+                return Err(WeightsError::Incomplete {
+                    version: weights.version,
+                });
             };
             match next.receive(&pool)? {
                 (
@@ -244,29 +279,35 @@ impl WeightsSource {
                     },
                     piece,
                 ) => assembly.take(weights, offset, &piece)?,
-                _ => bail!(
-                    "weights {} were replaced too often while they were pulled",
-                    weights.version
-                ),
+                _ => {
+                    return Err(WeightsError::Replaced {
+                        version: weights.version,
+                    });
+                }
             }
         }
         Ok(Some(assembly.finish()?))
     }
 
-    fn ask(&self, request: WeightsRequest) -> anyhow::Result<PendingReply<WeightsReply>> {
+    fn ask(&self, request: WeightsRequest) -> Result<PendingReply<WeightsReply>, WeightsError> {
         let request = self.client.seal(&request)?;
         self.client
             .send(request, PIECE_TIMEOUT)
-            .context("asking for weights")
+            .map_err(WeightsError::Asking)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use driml_protocol::WeightsHeader;
+
     use super::*;
 
     fn weights(version: u64) -> Option<Weights> {
-        Some((WeightsHeader::new(version, 0, &[]), Vec::new()))
+        Some(Weights {
+            header: WeightsHeader::new(version, 0, &[]),
+            safetensors: Vec::new(),
+        })
     }
 
     #[test]
@@ -279,7 +320,10 @@ mod tests {
         newest.put(weights(2));
         newest.announce(3);
         assert_eq!(wanted(), None, "the last ones were not taken yet");
-        assert_eq!(newest.take_within(Duration::ZERO).unwrap().0.version, 2);
+        assert_eq!(
+            newest.take_within(Duration::ZERO).unwrap().header.version,
+            2
+        );
         assert_eq!(wanted(), Some(2));
         // A stranger's announcement: nothing newer is there, and nobody waits for it.
         newest.announce(1 << 60);
@@ -298,7 +342,7 @@ mod tests {
             watcher.put(weights(2));
         });
         let taken = newest.take_within(Duration::from_secs(3600));
-        assert_eq!(taken.unwrap().0.version, 2);
+        assert_eq!(taken.unwrap().header.version, 2);
         pull.join().unwrap();
     }
 }

@@ -1,22 +1,26 @@
 //! The list of commands. Each has its flags and its code in a file of `commands`, or in the crate that it is named for.
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use driml_bench::flags::BenchCommand;
 use driml_experiments::{
-    flags::ExperimentCommand,
+    flags::{ExperimentCommand, GridArgs, TradeoffArgs},
     plot::{self, flags::PlotArgs},
 };
 
 use crate::commands::{
     actor::{self, ActorArgs},
+    completions::{self, CompletionsArgs, ManArgs},
     doctor::{self, DoctorArgs},
     evaluate::{self, EvaluateArgs},
+    inspect::{self, InspectArgs},
     learner::{self, LearnerArgs},
     parity::{self, ParityArgs},
     presets::{self, PresetsArgs},
     procgen::{self, ProcgenCommand},
     replay_server::{self, ReplayServerArgs},
+    status::{self, StatusArgs},
     train::{self, TrainArgs},
+    watch::{self, WatchArgs},
 };
 
 /// Deep Reinforcement and InfoMax Learning: actors, a replay server and a learner.
@@ -38,15 +42,25 @@ pub(crate) enum Command {
     ReplayServer(ReplayServerArgs),
     /// The learner of a run whose replay server is reached at ENDPOINT
     Learner(LearnerArgs),
+    /// Who takes part in a run, who waits for whom and since when, and what it would take to go on
+    Status(StatusArgs),
+    /// Show how a run goes, wherever its parts are and whoever started them, and record it in a folder
+    Watch(WatchArgs),
     /// Play whole episodes with a run's newest weights, beside a random policy
     Evaluate(EvaluateArgs),
+    /// What a world and an agent build, compute and send, what it would be if everything were on, and why
+    Inspect(InspectArgs),
     /// Check the learner's arithmetic against updates computed elsewhere in float64
     Parity(ParityArgs),
     /// Draw what runs recorded over their frames: return, losses, k, speed; or their action affinity
     Plot(PlotArgs),
+    /// Train with every combination of settings, several seeds each: a table and a plot
+    Grid(GridArgs),
     /// Run one of the paper's experiments: figures, data and a page
     #[command(subcommand)]
     Experiment(ExperimentCommand),
+    /// Measure what each setting that buys speed costs in accuracy: benches, short trainings, a page
+    Tradeoff(TradeoffArgs),
     /// Measure how fast the parts are, alone and beside what others use
     #[command(subcommand)]
     Bench(BenchCommand),
@@ -57,32 +71,49 @@ pub(crate) enum Command {
     /// Procgen's engine
     #[command(subcommand)]
     Procgen(ProcgenCommand),
+    /// Print what a shell needs to complete driml's commands, such as `driml completions bash > driml.bash`
+    Completions(CompletionsArgs),
+    /// Write driml's manual pages, such as `driml man share/man/man1`
+    Man(ManArgs),
 }
 
 impl Command {
-    /// Runs it.
+    /// Whether it listens with certificates, and so is to say whom it refuses.
+    pub(crate) const fn is_guarded(&self) -> bool {
+        match self {
+            Self::ReplayServer(args) => args.tls.is_set(),
+            _ => false,
+        }
+    }
+
+    /// Runs the command.
     pub(crate) fn run(self) -> anyhow::Result<()> {
         match self {
             Self::Train(args) => train::run(args),
             Self::Actor(args) => actor::run(args),
             Self::ReplayServer(args) => replay_server::run(args),
             Self::Learner(args) => learner::run(args),
+            Self::Status(args) => status::run(&args),
+            Self::Watch(args) => watch::run(&args),
             Self::Evaluate(args) => evaluate::run(&args),
+            Self::Inspect(args) => inspect::run(&args),
             Self::Parity(args) => parity::run(&args),
             Self::Plot(args) => plot::run(&args),
+            Self::Grid(args) => driml_experiments::grid(&args),
             Self::Experiment(command) => driml_experiments::run(&command),
+            Self::Tradeoff(args) => driml_experiments::tradeoff(&args),
             Self::Bench(command) => driml_bench::run(&command),
             Self::Presets(args) => presets::run(&args),
             Self::Doctor(args) => doctor::run(&args),
             Self::Procgen(command) => procgen::run(&command),
+            Self::Completions(args) => completions::completions(&args, Cli::command()),
+            Self::Man(args) => completions::man(&args, Cli::command()),
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
-
     use super::*;
 
     #[test]

@@ -29,7 +29,7 @@ pub fn main() -> ExitCode {
             };
         }
     };
-    console::log_to_stderr();
+    console::log_to_stderr(cli.command.is_guarded());
     match cli.command.run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) if e.is::<Interrupted>() => ExitCode::from(EXIT_INTERRUPTED),

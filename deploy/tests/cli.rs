@@ -41,24 +41,24 @@ fn usage(args: &[&str]) -> String {
 #[test]
 fn names_that_nothing_has() {
     expect![[r#"
-        error: --env: no world is named "procgen:bigfihs"; did you mean "procgen:bigfish"? (the worlds: procgen:GAME, mspacman, ising, chain; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
+        error: --env: no world is named "procgen:bigfihs"; did you mean "procgen:bigfish"? (the worlds: procgen:GAME, mspacman, ising, chain, exec:COMMAND, libenv:PATH:GAME; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
     "#]].assert_eq(&usage(&["local", "--env", "procgen:bigfihs"]));
     expect![[r#"
-        error: --env: no world is named "pong"; did you mean "ising"? (the worlds: procgen:GAME, mspacman, ising, chain; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
+        error: --env: no world is named "pong"; did you mean "ising"? (the worlds: procgen:GAME, mspacman, ising, chain, exec:COMMAND, libenv:PATH:GAME; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
     "#]].assert_eq(&usage(&["local", "--env", "pong"]));
     expect![[r#"
         error: there is no agent "driml"; --agent takes c51, driml-fix, driml-ada, driml-randk, driml-noact, cpc, curl
     "#]]
     .assert_eq(&usage(&["local", "--agent", "driml"]));
     expect![[r#"
-        error: there is no preset "papper" (did you mean "paper"?); --preset takes paper, paper-observation, split, smoke (`driml presets` describes them)
+        error: there is no preset "papper" (did you mean "paper"?); --preset takes paper, paper-observation, split, exact, balanced, fast, smoke (`driml presets` describes them)
     "#]].assert_eq(&usage(&["local", "--preset", "papper"]));
     expect![[r#"
         error: preset "split" is for procgen only, not for mspacman; take --preset paper
     "#]]
     .assert_eq(&usage(&["local", "--preset", "split", "--env", "mspacman"]));
     expect![[r#"
-        error: there is no setting "learner.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_rows, batches_in_flight, checkpoint_period_updates, checkpoints_kept, publish_period_updates, unreachable_max_ms, update
+        error: there is no setting "learner.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, equal_states, precision, publish_as, publish_period_updates, unreachable_max_ms, update
     "#]].assert_eq(&usage(&["local", "--set", "learner.lr=1"]));
 }
 
@@ -69,14 +69,14 @@ fn values_that_cannot_work() {
     "#]]
     .assert_eq(&usage(&["local", "--set", "run.gamma=2"]));
     expect![[r#"
-        error: --set learner.batch_rows=many: the value is a whole number, and many is a word
+        error: --set learner.batch_size=many: the value is a whole number, and many is a word
     "#]]
-    .assert_eq(&usage(&["local", "--set", "learner.batch_rows=many"]));
+    .assert_eq(&usage(&["local", "--set", "learner.batch_size=many"]));
     expect![[r#"
         error: 10 frames are no more than the warm-up of 500: ask for more --frames, or --set replay.warmup_transitions=1
     "#]].assert_eq(&usage(&["local", "--env", "chain", "--frames", "10"]));
     expect![[r#"
-        error: "localhost" is no endpoint: take tcp/HOST:PORT, tls/HOST:PORT or unixsock-stream/PATH
+        error: "localhost" is no endpoint: take tcp/HOST:PORT, quic/HOST:PORT or unixsock-stream/PATH
     "#]]
     .assert_eq(&usage(&["local", "--listen", "localhost"]));
     expect![[r#"
@@ -92,6 +92,21 @@ fn values_that_cannot_work() {
         error: reading the settings no-such.toml: No such file or directory (os error 2)
     "#]]
     .assert_eq(&usage(&["local", "--config", "no-such.toml"]));
+}
+
+/// It would have to forget what going on exactly needs.
+#[test]
+fn lockstep_keeps_its_replay_whole_or_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = "replay.disk_bytes_max=100000000";
+    let args = ["local", "--lockstep", "--env", "chain", "--set", set];
+    let output = driml_in(folder.path(), &args);
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(64), "{text}");
+    assert!(
+        text.contains("cannot keep it within replay.disk_bytes_max"),
+        "{text}"
+    );
 }
 
 #[test]
@@ -210,9 +225,22 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
     let output = driml(&["bench", "policy", "--quick", "--json", "-"]);
     let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let figures = report["figures"].as_array().unwrap();
-    assert_eq!((figures.len(), &report["bench"]), (4, &"policy".into()));
+    assert_eq!((figures.len(), &report["bench"]), (8, &"policy".into()));
     assert!(figures.iter().all(|it| it["value"].as_f64().unwrap() > 0.0));
 
+    let growth = [
+        "bench",
+        "learner",
+        "--growth",
+        "--quick",
+        "--precision",
+        "bf16",
+    ];
+    let output = driml(&[&growth[..], &["--json", "-"]].concat());
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let figures = report["figures"].as_array().unwrap();
+    let speeds = figures.iter().filter(|it| it["unit"] == "GFLOP/s").count();
+    assert_eq!((figures.len(), speeds), (26, 13));
     let peers = ["bench", "peers", "--quick", "--only", "policy"];
     let output = driml(&[&peers[..], &["--python", "no-such-python"]].concat());
     let table = String::from_utf8(output.stdout).unwrap();
@@ -223,12 +251,82 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
             .lines()
             .filter(|line| line.ends_with("  skipped"))
             .count(),
-        4,
+        8,
         "{table}"
     );
     assert_eq!(
         table.lines().filter(|line| *line == skipped).count(),
         1,
         "{table}"
+    );
+}
+
+#[test]
+fn an_actors_number_from_the_environment() {
+    let id = |id: &str, value: &str| {
+        let output = Command::new(env!("CARGO_BIN_EXE_driml"))
+            .args(["actor", "--connect", "tcp/127.0.0.1:1", "--id", id])
+            .env("RANK_OF_A_TEST", value)
+            .output()
+            .unwrap();
+        assert_eq!(output.status.code(), Some(64));
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let said = id("env:NO_SUCH_RANK", "");
+    assert!(
+        said.contains("the environment has no NO_SUCH_RANK"),
+        "{said}"
+    );
+    let said = id("env:RANK_OF_A_TEST", "x3");
+    assert!(said.contains("RANK_OF_A_TEST is \"x3\""), "{said}");
+    let said = id("first", "");
+    assert!(
+        said.contains("a whole number from 0, or env:NAME"),
+        "{said}"
+    );
+    // The number is read: its certificate is what is missing then.
+    let output = Command::new(env!("CARGO_BIN_EXE_driml"))
+        .args([
+            "actor",
+            "--connect",
+            "quic/127.0.0.1:1",
+            "--tls-dir",
+            "/nonexistent",
+        ])
+        .args(["--id", "env:RANK_OF_A_TEST"])
+        .env("RANK_OF_A_TEST", "17")
+        .output()
+        .unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("actor-17"), "{said}");
+}
+
+#[test]
+fn completions_and_pages() {
+    for (shell, part) in [
+        ("bash", "complete -F"),
+        ("zsh", "#compdef driml"),
+        ("fish", "complete -c driml"),
+    ] {
+        let output = driml(&["completions", shell]);
+        assert!(output.status.success());
+        let script = String::from_utf8(output.stdout).unwrap();
+        assert!(
+            script.contains(part) && script.contains("evaluate-every"),
+            "{script}"
+        );
+    }
+    assert!(usage(&["completions", "tcsh"]).contains("bash"));
+    let root = tempfile::tempdir().unwrap();
+    let out = root.path().join("man1");
+    let output = driml(&["man", out.to_str().unwrap()]);
+    assert!(output.status.success());
+    let page = std::fs::read_to_string(out.join("driml-train.1")).unwrap();
+    assert!(page.contains("\\-\\-frames"), "{page}");
+    let (code, said) = said(&["man", "/proc/none/man1"]);
+    assert_eq!(code, 1);
+    assert!(
+        said.contains("writing pages into /proc/none/man1"),
+        "{said}"
     );
 }

@@ -124,6 +124,15 @@ fn ising() {
     );
 }
 
+/// Every routine keeps what it promises here too, in whatever build this is, or the command would have failed.
+#[test]
+fn stability() {
+    check(
+        "stability",
+        &["promises.csv", "refused.csv", "worst.png", "worst.svg"],
+    );
+}
+
 /// The parts of a page, and the files beside it.
 fn check_page(folder: &Path, files: &[&str]) -> String {
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
@@ -274,6 +283,74 @@ fn pacman() {
     assert!(!config("ghosts-c51-seed1").contains("[world.ising]"));
 }
 
+/// A plan, then one dial, then one more in the same folder: what is finished stays as it is.
+#[test]
+fn tradeoff() {
+    let root = tempfile::tempdir().unwrap();
+    let call = |more: &[&str]| {
+        let args = ["tradeoff", "--env", "chain", "--smoke", "--out", "t"];
+        run(root.path(), &[&args[..], more].concat())
+    };
+    let folder = root.path().join("t");
+    let precision = ["--dials", "learner.precision"];
+    let planned = call(&[&precision[..], &["--plan"]].concat());
+    assert!(
+        planned.contains("level       learner.precision = bf16: about"),
+        "{planned}"
+    );
+    assert!(
+        !folder.join("runs/c51-seed1").exists(),
+        "a plan runs nothing"
+    );
+
+    call(&precision);
+    let summary = |run: &str| fs::read(folder.join("runs").join(run).join("summary.json"));
+    let first = summary("c51-seed1").unwrap();
+    let planned = call(&[
+        "--dials",
+        "learner.precision,DIM",
+        "--plan",
+        "--budget",
+        "0",
+    ]);
+    assert!(
+        planned.contains("learner.precision = bf16: finished\n")
+            && planned.contains("DIM = driml-fix: does not fit"),
+        "{planned}"
+    );
+    call(&["--dials", "DIM"]);
+    assert_eq!(summary("c51-seed1").unwrap(), first, "it was not run again");
+    let files = data(&folder);
+    let names = [
+        "levels.csv",
+        "pareto.png",
+        "pareto.svg",
+        "runs.csv",
+        "wall.png",
+        "wall.svg",
+    ];
+    assert_eq!(files.keys().collect::<Vec<_>>(), names);
+    let rows = |name: &str| String::from_utf8_lossy(&files[name]).lines().count() - 1;
+    // Of the base two seeds, of each level one.
+    assert_eq!((rows("levels.csv"), rows("runs.csv")), (3, 2 + 3));
+    let page = fs::read_to_string(folder.join("README.md")).unwrap();
+    for part in [
+        "smoke length",
+        "| learner.precision | bf16 | c51 |",
+        "| DIM | driml-ada | driml-ada |",
+        "at equal wall-clock time",
+        "against float64",
+    ] {
+        assert!(page.contains(part), "{part}\n{page}");
+    }
+    let again = call(&["--report"]);
+    assert!(
+        again.contains("learner.precision = bf16 (c51): x"),
+        "{again}"
+    );
+    assert_eq!(data(&folder), files);
+}
+
 /// A killed experiment takes its runs with it, and goes on at the next call.
 #[test]
 fn killed_and_resumed() {
@@ -358,4 +435,102 @@ fn an_experiment_that_is_not_there() {
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("making file/pieces"), "{said}");
+}
+
+#[test]
+fn a_grid_makes_every_combination_once() {
+    let root = tempfile::tempdir().unwrap();
+    let fixed = [
+        "grid",
+        "--env",
+        "chain",
+        "--agent",
+        "c51,driml-ada",
+        "--preset",
+        "smoke",
+    ];
+    let sets = [
+        "--frames",
+        "320",
+        "--set",
+        "learner.update.adam.lr=1e-4,1e-3",
+    ];
+    fn call<'a>(parts: [&[&'a str]; 3]) -> Vec<&'a str> {
+        parts.concat()
+    }
+    let said = |args: &[&str]| {
+        let output = driml(root.path(), args);
+        (
+            output.status.code(),
+            String::from_utf8(output.stderr).unwrap(),
+        )
+    };
+    // What cannot work is said before anything starts.
+    let (code, text) = said(&[&fixed[..], &["--set", "learner.update.adam.lr=1e-4,fast"]].concat());
+    assert_eq!(code, Some(64));
+    assert!(
+        text.contains("agent=c51") && text.contains("lr=fast"),
+        "{text}"
+    );
+    let (code, text) = said(&call([
+        &fixed,
+        &sets,
+        &["--set", "learner.update.adam.lr=1"],
+    ]));
+    assert!(code == Some(64) && text.contains("is set twice"), "{text}");
+    let (code, text) = said(&call([&fixed, &sets, &["--report"]]));
+    assert!(
+        code == Some(64) && text.contains("there is nothing to report"),
+        "{text}"
+    );
+
+    let printed = run(root.path(), &call([&fixed, &sets, &["--jobs", "2"]]));
+    let folder = root.path().join("experiments/grid");
+    assert!(printed.ends_with("grid.svg\n"), "{printed}");
+    let table = fs::read_to_string(folder.join("grid.csv")).unwrap();
+    let rows: Vec<Vec<&str>> = table.lines().map(|row| row.split(',').collect()).collect();
+    assert_eq!(
+        rows[0][..4],
+        ["env", "agent", "learner.update.adam.lr", "seeds"]
+    );
+    let cells: Vec<&[&str]> = rows[1..].iter().map(|row| &row[1..4]).collect();
+    let expected = [
+        ["c51", "1e-4", "1"],
+        ["c51", "1e-3", "1"],
+        ["driml-ada", "1e-4", "1"],
+        ["driml-ada", "1e-3", "1"],
+    ];
+    assert_eq!(cells, expected);
+    assert!(
+        folder
+            .join("runs/1-c51-lr=1e-4-seed1/summary.json")
+            .is_file()
+    );
+    // One seed more makes what is missing alone.
+    let made = |name: &str| {
+        fs::metadata(folder.join("runs").join(name))
+            .unwrap()
+            .modified()
+            .unwrap()
+    };
+    let before = made("1-c51-lr=1e-4-seed1/summary.json");
+    run(
+        root.path(),
+        &call([&fixed, &sets, &["--seeds", "2", "--jobs", "2"]]),
+    );
+    assert_eq!(made("1-c51-lr=1e-4-seed1/summary.json"), before);
+    let table = fs::read_to_string(folder.join("grid.csv")).unwrap();
+    assert!(
+        table
+            .lines()
+            .skip(1)
+            .all(|row| row.split(',').nth(3) == Some("2")),
+        "{table}"
+    );
+    // Another grid does not mix with it.
+    let (code, text) = said(&[&fixed[..], &["--frames", "352"]].concat());
+    assert!(
+        code == Some(64) && text.contains("other settings"),
+        "{text}"
+    );
 }

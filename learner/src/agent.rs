@@ -1,10 +1,11 @@
 //! One update: C51 plus the auxiliary objective, clipped, through Adam; then the target network's turn.
 //! It does not fetch batches, publish weights or keep checkpoints, and knows no process but its own.
 
-use std::collections::HashMap;
+use std::{borrow::Cow, collections::HashMap};
 
 use candle_core::Tensor;
-use driml_model::{Compute, DimHeads, ModelConfig, Network, Parameters};
+use driml_model::{Compute, DimHeads, ModelConfig, Network, Parameters, StoredAs};
+use driml_protocol::NO_ACTION;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
@@ -15,7 +16,7 @@ use crate::{
     batch::Batch,
     error::UpdateError,
     losses::{
-        c51::{kl_loss, softmax},
+        c51::{kl_loss, row_kls, softmax},
         projection::project,
     },
     optimiser::{
@@ -23,6 +24,7 @@ use crate::{
         gradients::{Gradients, clip_factor},
         target,
     },
+    repeats::{Distinct, EqualStates, State, one_after_another},
     settings::LearnerSettings,
     tensors::states,
 };
@@ -30,8 +32,10 @@ use crate::{
 /// What one update did: the numbers of a row of metrics.
 #[derive(Clone, Debug, PartialEq)]
 pub struct UpdateReport {
-    /// Mean KL divergence of the prediction from the projected target, in nats.
+    /// Mean KL divergence of the prediction from the projected target, in nats; of weighted rows the mean of weight times divergence.
     pub c51_kl: f32,
+    /// Of weighted rows, each one's divergence [B] before its weight, in nats; else empty, and not computed.
+    pub row_kls: Vec<f32>,
     /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
     pub losses: Vec<(&'static str, f32)>,
     /// `c51_kl + sum of weight * loss`.
@@ -45,15 +49,17 @@ pub struct UpdateReport {
 /// The losses of a batch and all that led to them, before any step is taken.
 #[derive(Debug)]
 pub struct Evaluation {
-    /// Mean KL divergence, in nats.
+    /// Mean KL divergence, in nats; of weighted rows the mean of weight times divergence.
     pub c51_kl: f32,
+    /// Of weighted rows, each one's divergence [B] before its weight, in nats; else empty, and not computed.
+    pub row_kls: Vec<f32>,
     /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
     pub losses: Vec<(&'static str, f32)>,
     /// `c51_kl + sum of weight * loss`.
     pub total: f32,
-    /// Online logits of s_t [B, A, N], without a graph.
-    pub logits_t: Tensor,
-    /// Greedy action in s_{t+n} [B].
+    /// Online logits [B, N] of the actions taken in s_t, without a graph.
+    pub taken_logits: Tensor,
+    /// Greedy action in s_{t+n} [B]; [`NO_ACTION`] where the row does not bootstrap, as nothing is computed of that state.
     pub next_greedy_action: Vec<u8>,
     /// Projected target distributions [B, N].
     pub target_projection: Vec<f32>,
@@ -78,6 +84,7 @@ pub struct Agent {
     model: ModelConfig,
     settings: LearnerSettings,
     compute: Compute,
+    equal_states: EqualStates,
     auxiliary: Box<dyn AuxiliaryLoss>,
     pub(crate) online: Parameters,
     pub(crate) target: Parameters,
@@ -155,6 +162,7 @@ impl Agent {
             key,
             adam: Adam::new(settings.adam, &online, kernels)?,
             compute: compute.clone(),
+            equal_states: EqualStates::default(),
             auxiliary,
             updates: 0,
             model,
@@ -162,6 +170,13 @@ impl Agent {
             online,
             target,
         })
+    }
+
+    /// The same, with equal states of a batch computed so. Without this each is computed.
+    #[must_use]
+    pub const fn with_equal_states(mut self, equal_states: EqualStates) -> Self {
+        self.equal_states = equal_states;
+        self
     }
 
     /// The online network's sizes, its auxiliary heads included.
@@ -199,9 +214,16 @@ impl Agent {
     /// # Errors
     /// A weight that is not finite; a failing serialisation.
     pub fn weights(&self) -> Result<Vec<u8>, UpdateError> {
-        Ok(self
-            .online
-            .to_safetensors(|name| !name.starts_with(target::AUXILIARY_PREFIX))?)
+        self.weights_as(StoredAs::F32)
+    }
+
+    /// [`Agent::weights`] with scalars of another type.
+    ///
+    /// # Errors
+    /// As there, and a weight that is too large for the type.
+    pub fn weights_as(&self, stored: StoredAs) -> Result<Vec<u8>, UpdateError> {
+        let acting = |name: &str| !name.starts_with(target::AUXILIARY_PREFIX);
+        Ok(self.online.to_safetensors_as(stored, acting)?)
     }
 
     /// Learns from one batch.
@@ -210,11 +232,18 @@ impl Agent {
     /// A batch that does not fit, or losses or gradients that are not finite: nothing has then changed. A step beyond the
     /// finite numbers, [`UpdateError::Diverged`]: the learner is then good for nothing, and can be neither published nor saved.
     pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
+        // On a thread of the pool: from outside, every product would wake the pool up and be woken by it.
+        rayon::scope(|_| self.update_here(batch))
+    }
+
+    fn update_here(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
         let evaluation = self.evaluate(batch)?;
         let grad_norm = self.apply(&evaluation.gradients)?;
-        let q_sum: f32 = self.taken_values(&evaluation, batch.action)?.iter().sum();
+        let taken = evaluation.taken_logits.unsqueeze(1)?;
+        let q_sum: f32 = flat(&self.online_network.q_values(&taken)?)?.iter().sum();
         Ok(UpdateReport {
             c51_kl: evaluation.c51_kl,
+            row_kls: evaluation.row_kls,
             losses: evaluation.losses,
             total: evaluation.total,
             grad_norm,
@@ -243,13 +272,16 @@ impl Agent {
             &self.model,
             &*self.auxiliary,
             batch,
+            self.equal_states,
             &self.compute.device,
         )?;
-        let logits = self.online_network.logits(&features.now.f4)?;
+        let taken_logits = self
+            .online_network
+            .taken_logits(&features.now.f4, batch.action)?;
         let kl = kl_loss(
-            &logits,
-            batch.action,
+            &taken_logits,
             target_projection.clone(),
+            batch.importance_weight.map(<[f32]>::to_vec),
             self.compute.kernels,
         )?;
         let auxiliary = self.auxiliary.losses(&LossInputs {
@@ -265,44 +297,40 @@ impl Agent {
             total = (total + loss.affine(*weight, 0.0)?)?;
         }
         // Before any number is read: reading waits for a GPU, which should have all its work by then.
-        let gradients = Gradients::take(&self.online, total.backward()?)?;
+        let gradients = Gradients::of(&self.online, &total)?;
         let c51_kl = finite("the C51 loss", &kl)?;
         let mut losses = Vec::with_capacity(auxiliary.len());
         for WeightedLoss { name, loss, .. } in &auxiliary {
             losses.push((*name, finite(name, loss)?));
         }
+        let taken_logits = taken_logits.detach();
+        let row_kls = match batch.importance_weight {
+            None => Vec::new(),
+            Some(_) => {
+                let kls = row_kls(&flat(&taken_logits)?, &target_projection, self.model.atoms);
+                kls.into_iter().map(|kl| kl as f32).collect()
+            }
+        };
         Ok(Evaluation {
             c51_kl,
+            row_kls,
             losses,
             total: finite("the total loss", &total)?,
-            logits_t: logits.detach(),
+            taken_logits,
             next_greedy_action,
             target_projection,
             gradients,
         })
     }
 
-    /// Online values of s_t [B, A], of an evaluation by this agent.
+    /// Online values [B, A] of the batch's s_t, by a pass of their own: an update needs those of the actions taken alone.
     ///
     /// # Errors
-    /// A failing allocation.
-    pub fn q_values_t(&self, evaluation: &Evaluation) -> Result<Vec<f32>, UpdateError> {
-        flat(&self.online_network.q_values(&evaluation.logits_t)?)
-    }
-
-    /// Online values [B] of the actions taken in s_t.
-    fn taken_values(
-        &self,
-        evaluation: &Evaluation,
-        action: &[u8],
-    ) -> Result<Vec<f32>, UpdateError> {
-        let (rows, _, atoms) = evaluation.logits_t.dims3()?;
-        let indices: Vec<u32> = action.iter().map(|&action| action.into()).collect();
-        let indices = Tensor::from_vec(indices, (rows, 1, 1), evaluation.logits_t.device())?
-            .broadcast_as((rows, 1, atoms))?
-            .contiguous()?;
-        let taken = evaluation.logits_t.gather(&indices, 1)?;
-        flat(&self.online_network.q_values(&taken)?)
+    /// States that do not fit the network.
+    pub fn q_values_t(&self, batch: &Batch<'_>) -> Result<Vec<f32>, UpdateError> {
+        let states = self.states(batch.states_t)?;
+        let logits = distribution(&self.online_network, &states)?;
+        flat(&self.online_network.q_values(&logits)?)
     }
 
     /// Clips `gradients` and takes one step with them; moves the slow networks whose turn it is.
@@ -332,43 +360,31 @@ impl Agent {
     }
 
     /// Greedy actions in s_{t+n} [B] and their distributions one Bellman step earlier [B, N], without a graph.
+    ///
+    /// Rows without a bootstrap are left out of the pass: whatever s_{t+n} is, all of their mass goes to their return.
     fn make_target(&self, batch: &Batch<'_>) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
         let ModelConfig {
-            num_actions,
             atoms,
             v_min,
             v_max,
             ..
         } = self.model;
-        let states_n = self.states(batch.states_n)?;
-        let target_logits = distribution(&self.target_network, &states_n)?;
-        let next_q_values = if self.settings.double_dqn {
-            self.online_network
-                .q_values(&distribution(&self.online_network, &states_n)?)?
-        } else {
-            self.target_network.q_values(&target_logits)?
-        };
-        let next_q_values = flat(&next_q_values)?;
-        if !next_q_values.iter().all(|q| q.is_finite()) {
-            let network = if self.settings.double_dqn {
-                "online"
-            } else {
-                "target"
-            };
-            return Err(UpdateError::NonFinite {
-                what: format!("the {network} network's value of an s_{{t+n}}"),
-            });
-        }
-        let next_greedy: Vec<u8> = next_q_values
-            .chunks_exact(num_actions)
-            .map(greedy)
-            .collect();
-
-        let logits = flat(&target_logits)?;
+        let mut next_greedy = vec![NO_ACTION; batch.rows];
         let mut probs = vec![0f32; batch.rows * atoms];
-        for (row, (probs, &action)) in probs.chunks_exact_mut(atoms).zip(&next_greedy).enumerate() {
-            let at = (row * num_actions + usize::from(action)) * atoms;
-            softmax(&logits[at..at + atoms], probs);
+        for probs in probs.chunks_exact_mut(atoms) {
+            probs[0] = 1.0;
+        }
+        let bootstraps: Vec<usize> = batch.bootstraps().collect();
+        if !bootstraps.is_empty() {
+            let (actions, logits) = self.next_greedy(batch)?;
+            for ((&row, action), logits) in bootstraps
+                .iter()
+                .zip(actions)
+                .zip(logits.chunks_exact(atoms))
+            {
+                next_greedy[row] = action;
+                softmax(logits, &mut probs[row * atoms..][..atoms]);
+            }
         }
         if !probs.iter().all(|p| p.is_finite()) {
             return Err(UpdateError::NonFinite {
@@ -385,6 +401,49 @@ impl Agent {
             &mut projected,
         );
         Ok((next_greedy, projected))
+    }
+
+    /// Greedy actions in s_{t+n} of the rows that bootstrap [n], and the target network's logits [n, N] of them.
+    fn next_greedy(&self, batch: &Batch<'_>) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
+        let ModelConfig {
+            num_actions, atoms, ..
+        } = self.model;
+        let len = self.model.frame_len();
+        let frames: Vec<State<'_>> = batch.next_states(len).into_iter().map(Some).collect();
+        let once = self.equal_states.once_by(self.compute.kernels);
+        let distinct = once.then(|| Distinct::of(&frames)).flatten();
+        let states_n = match &distinct {
+            Some(distinct) => Cow::Owned(distinct.gather(&frames, len)),
+            None if batch.states_n.len() == frames.len() * len => Cow::Borrowed(batch.states_n),
+            None => Cow::Owned(one_after_another(frames.iter().copied(), len)),
+        };
+        let states_n = states(&self.model, states_n, &self.compute.device)?;
+        let target_logits = distribution(&self.target_network, &states_n)?;
+        let (network, values) = if self.settings.double_dqn {
+            let logits = distribution(&self.online_network, &states_n)?;
+            ("online", self.online_network.q_values(&logits)?)
+        } else {
+            ("target", self.target_network.q_values(&target_logits)?)
+        };
+        let values = flat(&values)?;
+        if !values.iter().all(|q| q.is_finite()) {
+            return Err(UpdateError::NonFinite {
+                what: format!("the {network} network's value of an s_{{t+n}}"),
+            });
+        }
+        let of_state: Vec<u8> = values.chunks_exact(num_actions).map(greedy).collect();
+        let logits = flat(&target_logits)?;
+        let (mut actions, mut chosen) = (Vec::new(), Vec::with_capacity(frames.len() * atoms));
+        for row in 0..frames.len() {
+            let state = distinct
+                .as_ref()
+                .map_or(row, |it| it.places()[row] as usize);
+            let action = of_state[state];
+            let at = (state * num_actions + usize::from(action)) * atoms;
+            chosen.extend_from_slice(&logits[at..at + atoms]);
+            actions.push(action);
+        }
+        Ok((actions, chosen))
     }
 
     fn states(&self, bytes: &[u8]) -> candle_core::Result<Tensor> {

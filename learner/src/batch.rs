@@ -19,9 +19,9 @@ pub struct Batch<'a> {
     pub anchors: Option<&'a [u8]>,
     /// Positives of a row, P; 0 where the agent has no use for any.
     pub positives: usize,
-    /// s_{t+k} as the auxiliary objective sees it [P, B, H, W, C].
+    /// s_{t+k} as the auxiliary objective sees it [P, B, H, W, C]; or of those positives alone that rows have, in this order.
     pub states_k: &'a [u8],
-    /// s_{t+n} [B, H, W, C].
+    /// s_{t+n} [B, H, W, C]; or of those rows alone that bootstrap.
     pub states_n: &'a [u8],
     /// a_t [B].
     pub action: &'a [u8],
@@ -33,9 +33,12 @@ pub struct Batch<'a> {
     pub bootstrap_discount: &'a [f32],
     /// 0 where the row has no such positive [P, B].
     pub positive_valid: &'a [u8],
+    /// What each row's C51 loss is multiplied by [B], from 0 on, where rows were not drawn equally likely. The auxiliary losses are
+    /// not weighted: they compare a batch's rows with one another, and none is the mean of a loss a row.
+    pub importance_weight: Option<&'a [f32]>,
 }
 
-impl Batch<'_> {
+impl<'a> Batch<'a> {
     /// Checks lengths against `model`, positives against what the auxiliary loss `wants`, actions, returns and discounts.
     ///
     /// # Errors
@@ -58,19 +61,44 @@ impl Batch<'_> {
         for (name, length, row_length) in [
             ("states_t", self.states_t.len(), state_bytes),
             ("anchors", anchors.len(), state_bytes),
-            ("states_k", self.states_k.len(), positives * state_bytes),
-            ("states_n", self.states_n.len(), state_bytes),
             ("action", self.action.len(), 1),
             ("next_action", self.next_action.len(), 1),
             ("n_step_return", self.n_step_return.len(), 1),
             ("bootstrap_discount", self.bootstrap_discount.len(), 1),
             ("positive_valid", self.positive_valid.len(), positives),
+            (
+                "importance_weight",
+                self.importance_weight.map_or(rows, <[f32]>::len),
+                1,
+            ),
         ] {
             if length != rows * row_length {
                 return fault(format!(
                     "{name} has {length} values, not {rows} rows of {row_length}"
                 ));
             }
+        }
+        let bootstraps = self.bootstraps().count();
+        let valid = self.positive_valid.iter().filter(|valid| **valid != 0);
+        for (name, length, all, there) in [
+            (
+                "states_k",
+                self.states_k.len(),
+                rows * positives,
+                valid.count(),
+            ),
+            ("states_n", self.states_n.len(), rows, bootstraps),
+        ] {
+            if length != all * state_bytes && length != there * state_bytes {
+                return fault(format!(
+                    "{name} has {length} values, not {all} states of {state_bytes}, nor the {there} that its rows have"
+                ));
+            }
+        }
+        let bad = |weight: &f32| !(weight.is_finite() && *weight >= 0.0);
+        let weights = self.importance_weight.unwrap_or_default();
+        if let Some(row) = weights.iter().position(bad) {
+            return fault(format!("row {row} has the weight {}", weights[row]));
         }
         let known = |action: u8| usize::from(action) < model.num_actions;
         for row in 0..rows {
@@ -89,6 +117,35 @@ impl Batch<'_> {
             }
         }
         Ok(())
+    }
+
+    /// The rows that bootstrap.
+    pub(crate) fn bootstraps(&self) -> impl Iterator<Item = usize> {
+        let discounts = self.bootstrap_discount.iter().enumerate();
+        discounts.filter_map(|(row, &discount)| (discount != 0.0).then_some(row))
+    }
+
+    /// s_{t+n} of [`Batch::bootstraps`], of a batch that is valid with states of this length.
+    pub(crate) fn next_states(&self, state_bytes: usize) -> Vec<&'a [u8]> {
+        let whole = self.states_n.len() == self.rows * state_bytes;
+        let bytes: &'a [u8] = self.states_n;
+        let at = |(place, row): (usize, usize)| {
+            let place = if whole { row } else { place };
+            &bytes[place * state_bytes..][..state_bytes]
+        };
+        self.bootstraps().enumerate().map(at).collect()
+    }
+
+    /// s_{t+k} [P, B] of a batch that is valid with states of this length; none where a row has no such positive.
+    pub fn positive_states(&self, state_bytes: usize) -> Vec<Option<&'a [u8]>> {
+        let whole = self.states_k.len() == self.positive_valid.len() * state_bytes;
+        let mut states = self.states_k.chunks_exact(state_bytes);
+        let positives = self.positive_valid.iter().map(|&valid| {
+            let there = valid != 0;
+            let state = if there || whole { states.next() } else { None };
+            state.filter(|_| there)
+        });
+        positives.collect()
     }
 
     /// The pairs (a_t, a_{t+1}) of the rows that have both.

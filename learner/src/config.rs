@@ -1,9 +1,9 @@
 //! The learner's settings, and what it takes from the run's other tables.
 //! It fills in no number: presets do, with their sources.
 
-use driml_model::{ModelConfig, Precision};
+use driml_model::{InputSize, ModelConfig, Precision, StoredAs};
 use driml_protocol::{
-    RunSpec, RunSpecError,
+    RunSpec, RunSpecError, Sampling,
     config::{Settings, TransportConfig},
 };
 use rand_chacha::ChaCha8Rng;
@@ -17,6 +17,7 @@ use crate::{
     augment::AugmentSettings,
     auxiliary::positives::Positives,
     error::UpdateError,
+    repeats::EqualStates,
     settings::LearnerSettings,
 };
 
@@ -25,13 +26,19 @@ use crate::{
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// Rows of one update, B.
-    pub batch_rows: u32,
+    pub batch_size: u32,
     /// In which numbers an update's products are computed; weights, moments, losses and sums are f32 in either. Settings of
     /// earlier versions do not have it: f32.
     #[serde(default)]
     pub precision: Precision,
+    /// What is done with states of a batch that are equal. Settings of earlier versions do not have it: each is computed.
+    #[serde(default)]
+    pub equal_states: EqualStates,
     /// Batches asked for ahead of the one being learned from.
     pub batches_in_flight: u32,
+    /// What the scalars of published weights are. Settings of earlier versions do not have it: f32.
+    #[serde(default)]
+    pub publish_as: StoredAs,
     /// Updates from one version of the weights to the next.
     pub publish_period_updates: u64,
     /// Updates from one checkpoint to the next.
@@ -163,7 +170,7 @@ impl Config {
     /// The first field that cannot work, and why.
     pub fn validate(&self) -> Result<(), ConfigError> {
         for (key, value, max) in [
-            ("batch_rows", u64::from(self.batch_rows), 65_536),
+            ("batch_size", u64::from(self.batch_size), 65_536),
             ("batches_in_flight", u64::from(self.batches_in_flight), 64),
             (
                 "publish_period_updates",
@@ -226,17 +233,9 @@ impl Config {
     }
 }
 
-/// The size at which the network sees a frame: the `[input]` table.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct InputSize {
-    height: usize,
-    width: usize,
-}
-
 /// Why a run's settings are none that a learner can work with.
 #[derive(Debug, thiserror::Error)]
-pub enum LearnerPartError {
+pub enum LearnerConfigError {
     /// Not TOML, or a table that is missing or does not fit.
     #[error(transparent)]
     Tables(#[from] driml_protocol::config::ConfigError),
@@ -261,41 +260,65 @@ pub enum LearnerPartError {
 
 /// Everything a learner needs to know of a run.
 #[derive(Clone, Debug)]
-pub struct LearnerPart {
+pub struct LearnerConfig {
     /// What all parts agree on.
     pub spec: RunSpec,
     /// The network's sizes: the `[model]` table.
     pub model: ModelConfig,
+    /// The size at which the network sees a frame: the `[input]` table.
+    pub input: InputSize,
     /// The learner's own numbers: the `[learner]` table.
     pub learner: Config,
     /// How messages travel: the `[transport]` table.
     pub transport: TransportConfig,
+    /// By which rule rows are drawn: `sampling` of the `[replay]` table.
+    pub sampling: Sampling,
 }
 
-impl LearnerPart {
+/// What a learner reads of the `[replay]` table.
+#[derive(Deserialize)]
+struct ReplayTable {
+    #[serde(default)]
+    sampling: Sampling,
+}
+
+impl LearnerConfig {
     /// Reads the tables from a run's resolved settings.
     ///
     /// # Errors
     /// A table that is missing or does not fit, or values that cannot work.
-    pub fn from_toml(text: &str) -> Result<Self, LearnerPartError> {
+    pub fn from_toml(text: &str) -> Result<Self, LearnerConfigError> {
         let settings = Settings::parse(text)?;
         let this = Self {
             spec: settings.table("run")?,
             model: settings.table("model")?,
+            input: settings.table("input")?,
             learner: settings.table("learner")?,
             transport: settings.table("transport")?,
+            sampling: settings.table::<ReplayTable>("replay")?.sampling,
         };
-        let input: InputSize = settings.table("input")?;
         this.spec.validate()?;
         this.model.validate()?;
         this.learner.validate()?;
         this.learner.update.validate()?;
+        let (height, width) = this.input.whole_input();
+        let sent = (
+            this.spec.frame_height as usize,
+            this.spec.frame_width as usize,
+        );
         let states = (this.spec.frame_channels * this.spec.frame_stack) as usize;
-        let sizes = (this.model.height, this.model.width, this.model.channels);
-        let follows = sizes == (input.height, input.width, states)
-            && this.model.num_actions == this.spec.num_actions as usize;
+        let whole = ModelConfig {
+            height,
+            width,
+            ..this.model.clone()
+        };
+        // What is cut of the input is nothing that a layer reads.
+        let follows = this.model.channels == states
+            && this.model.num_actions == this.spec.num_actions as usize
+            && this.model.local_shape() == whole.local_shape()
+            && this.input.enlarge(sent, &this.model).is_ok();
         if !follows {
-            return Err(LearnerPartError::Sizes);
+            return Err(LearnerConfigError::Sizes);
         }
         Ok(this)
     }

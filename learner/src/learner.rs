@@ -3,8 +3,8 @@
 
 use std::path::{Path, PathBuf};
 
-use driml_model::{Compute, Enlarge};
-use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, WeightsHeader};
+use driml_model::{Compute, Enlarge, ModelConfig};
+use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, Weights, WeightsHeader};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -16,12 +16,10 @@ use crate::{
     auxiliary::positives::Positives,
     batch::Batch,
     checkpoint::{self, CheckpointError, RunState},
-    config::{ConfigError, LearnerPart},
+    config::{ConfigError, LearnerConfig},
     error::UpdateError,
+    importance::importance_weights,
 };
-
-/// Weights as they travel: what they say of themselves, and a safetensors file.
-pub type Weights = (WeightsHeader, Vec<u8>);
 
 /// Why a learner could not be made, learn or be saved.
 #[derive(Debug, thiserror::Error)]
@@ -51,7 +49,7 @@ pub enum LearnerError {
 
 /// Everything that a learner changes while it learns.
 pub struct Learner {
-    part: LearnerPart,
+    config: LearnerConfig,
     spec_hash: u64,
     agent: Agent,
     affinity: Option<AffinityEstimator>,
@@ -70,27 +68,31 @@ impl Learner {
     ///
     /// # Errors
     /// Settings that cannot work.
-    pub fn new(part: LearnerPart, compute: &Compute) -> Result<Self, LearnerError> {
-        let spec = &part.spec;
+    pub fn new(config: LearnerConfig, compute: &Compute) -> Result<Self, LearnerError> {
+        let spec = &config.spec;
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
         let mut rng = ChaCha8Rng::from_seed(spec.seed_for("learner", 0));
         let agent = Agent::new(
-            part.model.clone(),
-            part.learner.update.clone(),
+            config.model.clone(),
+            config.learner.update.clone(),
             compute,
             &mut init,
-        )?;
-        let affinity = part
+        )?
+        .with_equal_states(config.learner.equal_states);
+        let affinity = config
             .learner
             .affinity
-            .estimator(part.model.num_actions, &mut rng)?;
-        let from = (spec.frame_height as usize, spec.frame_width as usize);
-        let to = (part.model.height, part.model.width);
-        let enlarge = (from != to)
-            .then(|| Enlarge::new(from, to, part.model.channels))
-            .transpose()?;
-        let augment = part.learner.augment.map(|settings| {
-            let size = (to.0, to.1, part.model.channels);
+            .estimator(config.model.num_actions, &mut rng)?;
+        let sent = (spec.frame_height as usize, spec.frame_width as usize);
+        let enlarge = config.input.enlarge(sent, &config.model)?;
+        let augment = config.learner.augment.map(|settings| {
+            let ModelConfig {
+                height,
+                width,
+                channels,
+                ..
+            } = config.model;
+            let size = (height, width, channels);
             Augment::new(settings, size, spec.frame_channels as usize)
         });
         Ok(Self {
@@ -103,7 +105,7 @@ impl Learner {
             augment,
             seen: Default::default(),
             weights_version: 0,
-            part,
+            config,
         })
     }
 
@@ -112,15 +114,15 @@ impl Learner {
     /// # Errors
     /// Settings that cannot work, or a checkpoint that is damaged, of another run or of other settings.
     pub fn resume(
-        part: LearnerPart,
+        config: LearnerConfig,
         compute: &Compute,
         folder: &Path,
     ) -> Result<Self, LearnerError> {
-        let mut this = Self::new(part, compute)?;
+        let mut this = Self::new(config, compute)?;
         let restored = checkpoint::load_latest(
             folder,
-            &this.part.model,
-            &this.part.learner.update,
+            &this.config.model,
+            &this.config.learner.update,
             compute,
             this.spec_hash,
         )?;
@@ -136,7 +138,9 @@ impl Learner {
             return Err(LearnerError::OtherAffinity(folder.to_owned()));
         }
         this.weights_version = restored.weights_version;
-        this.agent = restored.agent;
+        this.agent = restored
+            .agent
+            .with_equal_states(this.config.learner.equal_states);
         this.affinity = restored.affinity;
         this.rng = restored.rng;
         tracing::info!(
@@ -145,6 +149,11 @@ impl Learner {
             folder.display()
         );
         Ok(this)
+    }
+
+    /// The networks, and how they learn.
+    pub const fn agent(&self) -> &Agent {
+        &self.agent
     }
 
     /// Hash of the run spec.
@@ -177,17 +186,28 @@ impl Learner {
         let mut rng = self.rng.clone();
         let all_valid;
         if let Some(augment) = &mut self.augment {
-            if self.part.learner.update.objective.positives() == Positives::OtherView {
+            if self.config.learner.update.objective.positives() == Positives::OtherView {
                 // Two views of the same state; every row has them.
                 all_valid = vec![1; batch.rows()];
                 (states_k, positives, valid) = (states_t, 1, all_valid.as_slice());
             }
             let [seen_t, seen_k] = &mut self.seen;
             augment.apply(states_t, seen_t, &mut rng);
-            augment.apply(states_k, seen_k, &mut rng);
+            // Draws for every positive, also for those that rows do not have: a run's views do not depend on which came.
+            let missing = states_k.len() < valid.len() * self.config.model.frame_len();
+            if missing {
+                spread(states_k, valid, self.config.model.frame_len(), seen_k);
+                let spread = std::mem::take(seen_k);
+                augment.apply(&spread, seen_k, &mut rng);
+            } else {
+                augment.apply(states_k, seen_k, &mut rng);
+            }
             (anchors, states_k) = (Some(seen_t.as_slice()), seen_k);
         }
         let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
+        let beta = self.config.sampling.beta(self.agent.updates());
+        let weights = batch.probabilities();
+        let weights = weights.map(|probabilities| importance_weights(&probabilities, beta));
         let batch = Batch {
             rows: batch.rows(),
             states_t,
@@ -200,6 +220,7 @@ impl Learner {
             n_step_return: &returns,
             bootstrap_discount: &discounts,
             positive_valid: valid,
+            importance_weight: weights.as_deref(),
         };
         self.agent.check(&batch)?;
         let mut affinity = self.affinity.clone();
@@ -242,7 +263,7 @@ impl Learner {
     pub const fn publication_is_due(&self) -> bool {
         self.agent
             .updates()
-            .is_multiple_of(self.part.learner.publish_period_updates)
+            .is_multiple_of(self.config.learner.publish_period_updates)
     }
 
     /// Whether a checkpoint is due after this many updates.
@@ -250,7 +271,7 @@ impl Learner {
         self.updates() > 0
             && self
                 .updates()
-                .is_multiple_of(self.part.learner.checkpoint_period_updates)
+                .is_multiple_of(self.config.learner.checkpoint_period_updates)
     }
 
     /// The present weights as a new version.
@@ -258,10 +279,13 @@ impl Learner {
     /// # Errors
     /// The tensor library failed.
     pub fn next_weights(&mut self) -> Result<Weights, LearnerError> {
-        let safetensors = self.agent.weights()?;
+        let safetensors = self.agent.weights_as(self.config.learner.publish_as)?;
         self.weights_version += 1;
         let header = WeightsHeader::new(self.weights_version, self.updates(), &safetensors);
-        Ok((header, safetensors))
+        Ok(Weights {
+            header,
+            safetensors,
+        })
     }
 
     /// Writes a checkpoint into `folder`.
@@ -269,16 +293,44 @@ impl Learner {
     /// # Errors
     /// The file system refused; older checkpoints are untouched.
     pub fn save(&self, folder: &Path) -> Result<(), LearnerError> {
+        self.save_with(folder, None)
+    }
+
+    /// Writes a checkpoint into `folder` and, in it, what its caller keeps with it: [`checkpoint::companion`] reads that.
+    ///
+    /// # Errors
+    /// As [`Learner::save`].
+    pub fn save_with(&self, folder: &Path, companion: Option<&[u8]>) -> Result<(), LearnerError> {
+        let LearnerConfig {
+            spec, model, input, ..
+        } = &self.config;
         let state = RunState {
+            description: &checkpoint::describe(spec, model, input),
             agent: &self.agent,
             affinity: self.affinity.as_ref(),
             rng: &self.rng,
             weights_version: self.weights_version,
             run_spec_hash: self.spec_hash,
+            companion,
         };
-        let path = checkpoint::save(folder, &state, self.part.learner.checkpoints_kept as usize)?;
+        let path = checkpoint::save(
+            folder,
+            &state,
+            self.config.learner.checkpoints_kept as usize,
+        )?;
         tracing::info!("saved {}", path.display());
         Ok(())
+    }
+}
+
+/// Puts `states`, those that are `there`, each in its place among blank ones, into `all`.
+fn spread(states: &[u8], there: &[u8], state_bytes: usize, all: &mut Vec<u8>) {
+    all.clear();
+    all.resize(there.len() * state_bytes, 0);
+    let places = all.chunks_exact_mut(state_bytes).zip(there);
+    let places = places.filter(|(_, there)| **there != 0);
+    for ((place, _), state) in places.zip(states.chunks_exact(state_bytes)) {
+        place.copy_from_slice(state);
     }
 }
 

@@ -29,6 +29,7 @@
 //!     n_step_return: &[0.5, -0.5],
 //!     bootstrap_discount: &[0.9, 0.0],
 //!     positive_valid: &[1, 1],
+//!     importance_weight: None,
 //! })?;
 //! assert_eq!(report.losses[0].0, "dim_4t4");
 //! assert!(report.total.is_finite() && agent.updates() == 1);
@@ -53,15 +54,19 @@ pub mod auxiliary;
 mod batch;
 pub mod checkpoint;
 mod config;
+pub mod cost;
 #[cfg(test)]
 mod edges;
 mod error;
+mod importance;
+pub mod insight;
 mod learner;
 pub mod losses;
 pub mod optimiser;
 pub mod parity;
 mod ranges;
 pub mod remote;
+mod repeats;
 mod settings;
 mod tensors;
 
@@ -73,11 +78,13 @@ pub use augment::{Augment, AugmentSettings};
 pub use auxiliary::{Objective, positives::Positives, settings::Lambda};
 pub use batch::Batch;
 pub use config::{
-    AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerPart, LearnerPartError,
+    AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerConfig,
+    LearnerConfigError,
 };
 pub use driml_model::{Compute, DeviceName, Kernels, Precision};
 pub use error::UpdateError;
-pub use learner::{Learner, LearnerError, Weights};
+pub use learner::{Learner, LearnerError};
 pub use optimiser::adam::AdamSettings;
 pub use remote::run::{RunArgs, run};
+pub use repeats::EqualStates;
 pub use settings::LearnerSettings;

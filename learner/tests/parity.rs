@@ -6,7 +6,7 @@
 use std::{fs, path::PathBuf};
 
 use driml_learner::{
-    Compute, Kernels,
+    Compute, Kernels, Precision,
     parity::{ParityReport, check_file},
 };
 
@@ -38,6 +38,20 @@ fn all_within_tolerance(compute: &Compute) {
 #[test]
 fn every_open_case_is_within_tolerance() {
     all_within_tolerance(&Compute::CPU);
+}
+
+/// With the tolerances of bf16, which are its own; in f32's it fails, so that they are no formality.
+#[test]
+fn so_it_is_in_bf16() {
+    let bf16 = Compute::cpu(Precision::Bf16);
+    all_within_tolerance(&bf16);
+    let report = check_file(&cases()[0], &bf16).unwrap();
+    let f32 = check_file(&cases()[0], &Compute::CPU).unwrap();
+    for (bf16, f32) in report.lines.iter().zip(&f32.lines) {
+        assert!(bf16.name != f32.name || bf16.tolerance >= f32.tolerance);
+    }
+    let farther = report.lines.iter().filter(|line| line.error > 2e-5).count();
+    assert!(farther > 5, "products were not rounded: {report}");
 }
 
 /// What a GPU is given to compute, on the CPU: the same operations in the same order.

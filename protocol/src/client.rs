@@ -36,6 +36,8 @@ pub struct RunClient {
 #[derive(Debug)]
 pub struct Sealed<M> {
     bytes: ZBytes,
+    /// The actor that it speaks for.
+    actor: Option<u32>,
     message: PhantomData<fn() -> M>,
 }
 
@@ -43,6 +45,7 @@ impl<M> Clone for Sealed<M> {
     fn clone(&self) -> Self {
         Self {
             bytes: self.bytes.clone(),
+            actor: self.actor,
             message: PhantomData,
         }
     }
@@ -57,6 +60,7 @@ impl<M: Message> Sealed<M> {
         let bytes = codec::encode(spec_hash, message, &[])?;
         Ok(Self {
             bytes: bytes.into(),
+            actor: message.actor(),
             message: PhantomData,
         })
     }
@@ -72,6 +76,7 @@ impl<M: Message> Sealed<M> {
         writer.append(payload);
         Ok(Self {
             bytes: writer.finish(),
+            actor: message.actor(),
             message: PhantomData,
         })
     }
@@ -124,7 +129,8 @@ impl RunClient {
     /// # Errors
     /// As [`RunClient::ask`].
     pub fn fetch<M: Keyed>(&self, timeout: Duration) -> Result<M, SessionError> {
-        self.query::<M, M>(ZBytes::new(), timeout)?.wait()
+        self.query::<M, M>(self.keys.of::<M>(), ZBytes::new(), timeout)?
+            .wait()
     }
 
     /// A request that is ready to be sent, as often as need be.
@@ -162,15 +168,19 @@ impl RunClient {
         request: Sealed<R>,
         timeout: Duration,
     ) -> Result<PendingReply<R::Reply>, SessionError> {
-        self.query::<R, R::Reply>(request.bytes, timeout)
+        let key = match request.actor {
+            Some(actor) => self.keys.of_actor::<R>(actor),
+            None => self.keys.of_learner::<R>(),
+        };
+        self.query::<R, R::Reply>(key, request.bytes, timeout)
     }
 
     fn query<K: Keyed, M: Message>(
         &self,
+        key: String,
         payload: ZBytes,
         timeout: Duration,
     ) -> Result<PendingReply<M>, SessionError> {
-        let key = self.keys.of::<K>();
         let bytes = session::send(&self.session, &key, payload, K::PRIORITY, timeout)?;
         Ok(PendingReply {
             bytes,

@@ -22,6 +22,11 @@ pub enum ConfigError {
     },
 }
 
+/// What is wrong with a table, and at which of its keys, in one line.
+pub fn in_words(error: &toml::de::Error) -> String {
+    error.to_string().trim_end().replace('\n', ", ")
+}
+
 /// The `[transport]` table: how messages travel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -55,7 +60,7 @@ impl Settings {
         let value = self.0.get(name).ok_or(ConfigError::Missing(name))?;
         let why = |e: toml::de::Error| ConfigError::Table {
             table: name,
-            why: e.message().to_owned(),
+            why: in_words(&e),
         };
         value.clone().try_into().map_err(why)
     }

@@ -11,7 +11,7 @@ use crate::{
         hello::Hello,
         join::{ActorJoin, JoinReply, LearnerJoin},
     },
-    process::shutdown::Shutdown,
+    process::{seldom::Seldom, shutdown::Shutdown},
     session::{self, SessionError},
     wire::{
         codec,
@@ -25,6 +25,8 @@ use crate::{
 const SERVER_MAX: Duration = Duration::from_secs(60);
 /// How long it waits for its predecessor to be gone: a session that was cut off counts as connected for its lease of 30 s.
 const TAKEN_MAX: Duration = Duration::from_secs(45);
+/// How long it waits before it says so.
+const SILENT_MAX: Duration = Duration::from_secs(5);
 /// How long one try waits for its reply.
 const TRY_MAX: Duration = Duration::from_secs(2);
 /// Pause between two tries.
@@ -76,7 +78,7 @@ pub fn hello(
     keys: &Keys,
     shutdown: &Shutdown,
 ) -> Result<Option<Hello>, JoinError> {
-    let started = Instant::now();
+    let (started, mut said) = (Instant::now(), Seldom::default());
     loop {
         let (key, nothing) = (keys.of::<Hello>(), ZBytes::new());
         match session::ask(session, &key, nothing, Hello::PRIORITY, TRY_MAX) {
@@ -84,11 +86,26 @@ pub fn hello(
                 return Ok(Some(codec::decode(&answer.to_bytes(), None)?.0));
             }
             Err(last) if started.elapsed() > SERVER_MAX => return Err(JoinError::Nobody { last }),
-            Err(e) => tracing::debug!("no replay server yet: {e}"),
+            Err(e) => say_waiting(started, &e, &mut said),
         }
         if shutdown.wait_timeout(PAUSE) {
             return Ok(None);
         }
+    }
+}
+
+fn say_waiting(started: Instant, e: &SessionError, said: &mut Seldom) {
+    let since = started.elapsed();
+    if since > SILENT_MAX && said.due().is_some() {
+        let (since, max) = (since.as_secs(), SERVER_MAX.as_secs());
+        // Whoever listens there may be a router between the parts, to which the replay server has yet to connect.
+        let why = match e {
+            SessionError::Nobody { key } => format!(
+                "somebody listens there, and nobody answers at {key}: is it the replay server of this run, with the same --namespace?"
+            ),
+            other => other.to_string(),
+        };
+        tracing::info!("waiting for the replay server since {since} s, for {max} s at most: {why}");
     }
 }
 
@@ -121,7 +138,7 @@ fn take_part(
     join: &impl Request<Reply = JoinReply>,
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
-    let started = Instant::now();
+    let (started, mut waiting_said) = (Instant::now(), Seldom::default());
     let mut said = false;
     loop {
         match client.ask(join, TRY_MAX) {
@@ -148,7 +165,7 @@ fn take_part(
             }
             Err(SessionError::Unreadable { why, .. }) => return Err(why.into()),
             Err(last) if started.elapsed() > SERVER_MAX => return Err(JoinError::Nobody { last }),
-            Err(e) => tracing::debug!("the replay server did not answer: {e}"),
+            Err(e) => say_waiting(started, &e, &mut waiting_said),
         }
         if shutdown.wait_timeout(PAUSE) {
             return Ok(None);

@@ -27,39 +27,49 @@ mod client;
 pub mod config;
 pub mod join;
 pub mod session;
+pub mod tls;
 
 mod messages;
 mod process;
 mod query_workers;
+pub mod reach;
+pub mod reporter;
 mod run_spec;
+mod sampling;
 mod wire;
 
 pub use client::{Announcer, PendingReply, RunClient, Sealed};
 pub use messages::{
     affinity::AffinityUpdate,
-    batch::{Batch, BatchHeader, BatchReply, BatchRowsMut, NO_ACTION, POOL_BATCHES},
+    batch::{Batch, BatchHeader, BatchReply, NO_ACTION, POOL_BATCHES},
     batch_request::{BatchRequest, RequestId},
-    chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES},
+    batch_rows::{BatchStatesMut, RowScalars},
+    chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES, transitions_max},
     done::Done,
     goodbye::Goodbye,
     hello::Hello,
     insert_reply::{Claim, InsertReply},
     join::{ActorJoin, JoinReply, LearnerJoin},
+    parts::{PartName, PartStatus, PartsStatus, WARNINGS_MAX},
+    priorities::{Origin, PriorityPart, PriorityUpdate},
+    report::{Life, Report, Warning},
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
     tally::Tally,
     weights::{
-        Assembly, PIECE_BYTES, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
+        Assembly, PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
         WeightsVersion,
     },
 };
 pub use process::{
-    end_signs, fault,
-    seldom::Seldom,
+    activity::Activity,
+    end_signs, fault, last_warning, lock_file,
+    seldom::{Seldom, SeldomEach},
     shutdown::{Shutdown, join_within},
     whole_file,
 };
 pub use query_workers::{Incoming, QueryWorkers, Responder};
 pub use run_spec::{Horizon, POSITIVES_MAX, RunSpec, RunSpecError, TimeoutRule};
+pub use sampling::{Sampling, SamplingError};
 pub use wire::{
     buffers::{Buffer, BufferPool},
     codec::{self, PROTOCOL_VERSION},

@@ -26,8 +26,9 @@ use crate::{
     session,
     wire::{
         buffers::{Buffer, BufferPool},
-        codec,
+        codec::{self, PAYLOAD_BYTES_MAX},
         error::CodecError,
+        keys::Keys,
         message::{Keyed, Message, Request},
     },
 };
@@ -53,7 +54,9 @@ impl<R: Request> Incoming<R> {
     /// Whatever makes it unfit to be answered.
     pub fn read(&self) -> Result<R, CodecError> {
         let bytes = self.query.payload().map(ZBytes::to_bytes);
-        codec::decode(&bytes.unwrap_or_default(), Some(self.spec_hash)).map(|(request, _)| request)
+        let (request, _) = codec::decode(&bytes.unwrap_or_default(), Some(self.spec_hash))?;
+        self.check_actor(&request)?;
+        Ok(request)
     }
 
     /// Reads a request and copies its payload into own memory of `pool`.
@@ -63,7 +66,21 @@ impl<R: Request> Incoming<R> {
     pub fn receive(&self, pool: &BufferPool) -> Result<(R, Buffer), CodecError> {
         let nothing = ZBytes::new();
         let bytes = self.query.payload().unwrap_or(&nothing);
-        codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))
+        let (request, payload) =
+            codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))?;
+        self.check_actor(&request)?;
+        Ok((request, payload))
+    }
+
+    /// Checks that a request that speaks for an actor, or for the learner beside them, came at its own key, which others may have
+    /// no access to.
+    fn check_actor(&self, request: &R) -> Result<(), CodecError> {
+        let (key, actor) = (self.query.key_expr().as_str(), request.actor());
+        if R::BY_ACTOR && Keys::actor(key) != actor {
+            let key = key.to_owned();
+            return Err(CodecError::Actor { actor, key });
+        }
+        Ok(())
     }
 
     /// What the reply goes through.
@@ -189,9 +206,26 @@ impl<M: Keyed + 'static> QueryWorkers<M> {
     /// # Errors
     /// zenoh refused to declare it.
     pub fn declare(&self, client: &RunClient) -> zenoh::Result<Queryable<()>> {
+        self.declare_limited(client, PAYLOAD_BYTES_MAX, |_| ())
+    }
+
+    /// As [`QueryWorkers::declare`], for queries of at most `bytes_max` bytes: longer ones are dropped before anything is copied,
+    /// and `refused` is told their bytes, on the thread that reads the socket.
+    ///
+    /// # Errors
+    /// As [`QueryWorkers::declare`].
+    pub fn declare_limited(
+        &self,
+        client: &RunClient,
+        bytes_max: usize,
+        refused: impl Fn(usize) + Send + Sync + 'static,
+    ) -> zenoh::Result<Queryable<()>> {
         let (queries, waiting_bytes) = (self.queries.clone(), self.waiting_bytes.clone());
         let take = move |query: Query| {
             let bytes = payload_bytes(&query);
+            if bytes > bytes_max {
+                return refused(bytes);
+            }
             let before = waiting_bytes.fetch_add(bytes, Ordering::Relaxed);
             // A query that is dropped ends: its asker hears that nobody answers.
             if before > WAITING_BYTES_MAX || queries.try_send(query).is_err() {

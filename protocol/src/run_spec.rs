@@ -80,9 +80,9 @@ pub struct RunSpec {
     pub agent: String,
     /// The run's seed; every generator of every part is derived from it.
     pub seed: u64,
-    /// Rows of a frame as the world gives it.
+    /// Rows of a frame as it travels: those of the world's that the network reads, from the top.
     pub frame_height: u32,
-    /// Columns of a frame as the world gives it.
+    /// Columns of a frame as it travels, from the left.
     pub frame_width: u32,
     /// Bytes a pixel of a frame as the world gives it.
     pub frame_channels: u32,
@@ -110,7 +110,7 @@ pub struct RunSpecError {
 }
 
 impl RunSpec {
-    /// Bytes of one frame as the world gives it.
+    /// Bytes of one frame as it travels: neither stacked nor enlarged.
     pub const fn frame_bytes(&self) -> usize {
         self.frame_height as usize * self.frame_width as usize * self.frame_channels as usize
     }

@@ -7,9 +7,10 @@ use std::fmt::Debug;
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, BufferPool,
     Chunk, ChunkHeader, Claim, CodecError, Done, End, Goodbye, Hello, Horizon, InsertReply,
-    JoinReply, Kind, LearnerJoin, LearnerStatus, Message, NO_ACTION, PROTOCOL_VERSION,
-    ReplayStatus, RequestId, Returns, RunSpec, Tally, TimeoutRule, Waiting, WeightsHeader,
-    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
+    JoinReply, Kind, LearnerJoin, LearnerStatus, Life, Message, NO_ACTION, Origin,
+    PROTOCOL_VERSION, PartName, PartStatus, PartsStatus, PriorityPart, PriorityUpdate,
+    ReplayStatus, Report, RequestId, Returns, RowScalars, RunSpec, Tally, TimeoutRule, Waiting,
+    Warning, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -47,11 +48,10 @@ fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
 }
 
 fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
-    match codec::decode::<BatchReply>(bytes, Some(SPEC))? {
-        (BatchReply::Batch(header), payload) => {
-            Batch::from_payload(header, payload.to_vec().into()).map(|_| ())
-        }
-        _ => Ok(()),
+    let (reply, payload) = codec::decode::<BatchReply>(bytes, Some(SPEC))?;
+    match reply.header() {
+        Some(header) => Batch::from_payload(header, payload.to_vec().into()).map(|_| ()),
+        None => Ok(()),
     }
 }
 
@@ -80,10 +80,30 @@ fn chunk() -> Chunk {
 }
 
 fn batch() -> Batch {
-    let mut batch = Batch::zeroed(BatchHeader {
+    batch_from(None)
+}
+
+/// Its rows drawn by priority.
+fn prioritised_batch() -> Batch {
+    let mut batch = batch_from(Some(ORIGIN));
+    let draws = [(1 << 40, 0.5), (7, 1.0), (u64::MAX, 1e-30)];
+    batch.set_draws(draws.into_iter());
+    batch
+}
+
+const ORIGIN: Origin = Origin {
+    shard: 2,
+    incarnation: u64::MAX,
+};
+
+/// Of its rows the first does not bootstrap, the second has no positive and ends its episode.
+fn batch_from(origin: Option<Origin>) -> Batch {
+    let header = BatchHeader {
         rows: 3,
         positives: 1,
         state_bytes: 4,
+        states_k: 2,
+        states_n: 1,
         tally: Tally {
             inserted: 99,
             rows_sampled: 12,
@@ -91,22 +111,28 @@ fn batch() -> Batch {
         held: 9,
         mean_age: 12.5,
         weights_versions: (8, 2),
-    });
-    let mut rows = batch.rows_mut();
+        origin,
+    };
+    let rows = [(4, 0.0, 2), (NO_ACTION, 0.0, 0), (6, 0.5, 300)];
+    let scalars = |(row, (next_action, bootstrap_discount, k)): (u8, _)| RowScalars {
+        action: row,
+        next_action,
+        n_step_return: 0.5 + f32::from(row),
+        bootstrap_discount,
+        positives: u32::from(k > 0),
+        k_first: k,
+    };
+    let rows: Vec<_> = (0..).zip(rows).map(scalars).collect();
+    let mut batch = Batch::of_rows(header, &rows, |bytes| Buffer::from(vec![0xAB; bytes]));
+    assert_eq!(batch.header, header);
+    let mut places = batch.states_mut();
     for row in 0..3 {
-        rows.state_t(row).fill(10 + row as u8);
-        rows.state_n(row).fill(20 + row as u8);
-        rows.set(
-            row,
-            row as u8,
-            4 + row as u8,
-            0.5 + row as f32,
-            0.25 * row as f32,
-        );
+        places.t(row).fill(10 + row as u8);
     }
-    rows.set(1, 1, NO_ACTION, 1.5, 0.0);
-    rows.positive(0, 0, 2).fill(30);
-    rows.positive(0, 2, 300).fill(32);
+    assert!(places.n(0).is_none() && places.n(1).is_none() && places.k(0, 1).is_none());
+    places.n(2).unwrap().fill(22);
+    places.k(0, 0).unwrap().fill(30);
+    places.k(0, 2).unwrap().fill(32);
     batch
 }
 
@@ -119,7 +145,7 @@ fn join((mut head, payload): (Vec<u8>, impl AsRef<[u8]>)) -> Vec<u8> {
 /// A batch as it travels.
 fn sealed(batch: Batch) -> Vec<u8> {
     let (header, payload) = batch.into_payload();
-    codec::encode(SPEC, &BatchReply::Batch(header), &payload).unwrap()
+    codec::encode(SPEC, &BatchReply::of(header), &payload).unwrap()
 }
 
 fn weights() -> Vec<u8> {
@@ -129,6 +155,43 @@ fn weights() -> Vec<u8> {
         weights: WeightsHeader::new(4, 312, &payload),
     };
     codec::encode(SPEC, &upload, &payload).unwrap()
+}
+
+fn parts_status() -> PartsStatus {
+    PartsStatus {
+        up_s: 60.0,
+        waiting: Waiting::ActorsWaitForLearner,
+        waiting_s: 2.5,
+        requests_waiting: 1,
+        chunks_waiting: 2,
+        chunk_bytes_waiting: 1 << 20,
+        weights_version: 4,
+        weights_age_s: Some(1.0),
+        last_warning: None,
+        parts: vec![PartStatus {
+            who: PartName::Actor(3),
+            connected: true,
+            since_s: 50.0,
+            lives: 2,
+            heard_s: Some(0.5),
+            held_s: None,
+            weights_version: Some(3),
+            doing: Some(("plays".into(), 5.0, 1.0)),
+            last_warning: Some(Warning::new("late", 9.0)),
+        }],
+    }
+}
+
+fn priority_update() -> PriorityUpdate {
+    PriorityUpdate {
+        learner: 5,
+        number: 9,
+        parts: vec![PriorityPart {
+            origin: ORIGIN,
+            transitions: vec![0, u64::MAX],
+            priorities: vec![0.0, 2.5],
+        }],
+    }
 }
 
 /// One or more messages of every kind.
@@ -217,6 +280,7 @@ fn samples() -> Vec<Sample> {
             other_shards: Some(Tally::default()),
         }),
         Sample::of(&affinity),
+        Sample::of(&priority_update()),
         Sample::of(&WeightsVersion { version: 9 }),
         Sample::of(&goodbye),
         Sample::of(&ReplayStatus::default()),
@@ -250,6 +314,13 @@ fn samples() -> Vec<Sample> {
             offset: 0,
         }),
         Sample::of(&Done),
+        Sample::of(&Report::new(
+            Life::Learner(5),
+            "learns",
+            1.5,
+            Some(Warning::new("a chunk was refused", 3.0)),
+        )),
+        Sample::of(&parts_status()),
     ]);
     let with_payload = [
         (
@@ -259,6 +330,12 @@ fn samples() -> Vec<Sample> {
             read_chunk as fn(&[u8]) -> _,
         ),
         ("batch", Kind::BatchReply, sealed(batch()), read_batch),
+        (
+            "batch drawn by priority",
+            Kind::BatchReply,
+            sealed(prioritised_batch()),
+            read_batch,
+        ),
         ("weights", Kind::WeightsUpload, weights(), read_weights),
     ];
     samples.extend(with_payload.map(|(name, kind, bytes, read)| Sample {
@@ -320,14 +397,8 @@ fn chunk_batch_and_weights_come_back() {
         back.states_t(),
         [10, 10, 10, 10, 11, 11, 11, 11, 12, 12, 12, 12]
     );
-    assert_eq!(
-        back.states_n(),
-        [20, 20, 20, 20, 21, 21, 21, 21, 22, 22, 22, 22]
-    );
-    assert_eq!(
-        back.states_k(),
-        [30, 30, 30, 30, 0, 0, 0, 0, 32, 32, 32, 32]
-    );
+    assert_eq!(back.states_n(), [22; 4], "no state that a row lacks");
+    assert_eq!(back.states_k(), [30, 30, 30, 30, 32, 32, 32, 32]);
     assert_eq!(
         (back.actions(), back.next_actions()),
         (&[0, 1, 2][..], &[4, NO_ACTION, 6][..])
@@ -375,12 +446,101 @@ fn pieces_are_received_as_the_whole_is() {
     }
 }
 
+/// What a uniform run sends has no byte of what priorities need.
+#[test]
+fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
+    let (plain, prioritised) = (batch(), prioritised_batch());
+    let more = prioritised.header.payload_bytes() - plain.header.payload_bytes();
+    assert_eq!((more, plain.probabilities()), (3 * 12, None));
+    let sent = [sealed(plain.clone()), sealed(prioritised.clone())].map(|bytes| bytes.len());
+    // The origin: a byte of the shard, nine of the incarnation.
+    assert_eq!(sent[1] - sent[0], 3 * 12 + 10);
+    assert_eq!(plain.priority_update(5, 9, &[0.0; 3]), None);
+
+    let bytes = sealed(prioritised.clone());
+    let (reply, payload) = codec::decode::<BatchReply>(&bytes, Some(SPEC)).unwrap();
+    assert!(matches!(reply, BatchReply::Prioritised(_, ORIGIN)));
+    let mut back = Batch::from_payload(reply.header().unwrap(), payload.to_vec().into()).unwrap();
+    assert_eq!(back, prioritised);
+    assert_eq!(back.probabilities().unwrap(), [0.5, 1.0, 1e-30]);
+    assert_eq!(
+        (back.actions(), back.ks()),
+        (&[0, 1, 2][..], &[2, 0, 255][..])
+    );
+    let update = back.priority_update(5, 9, &[1.0, 2.0, 3.0]).unwrap();
+    let part = |origin, transitions: &[u64], priorities: &[f32]| PriorityPart {
+        origin,
+        transitions: transitions.to_vec(),
+        priorities: priorities.to_vec(),
+    };
+    let own = [1 << 40, 7, u64::MAX];
+    assert_eq!((update.learner, update.number, update.rows()), (5, 9, 3));
+    assert_eq!(update.parts, [part(ORIGIN, &own, &[1.0, 2.0, 3.0])]);
+
+    // Of two shards, the second of which gives three rows of four.
+    let other = Origin {
+        shard: 0,
+        incarnation: 3,
+    };
+    let mut second = batch_from(Some(other));
+    second.set_draws([(10, 0.5), (11, 0.25), (12, 0.25)].into_iter());
+    back.scale_probabilities(0.25);
+    second.scale_probabilities(0.75);
+    let parts = [back, second];
+    let whole = Batch::merged_header(&parts).unwrap();
+    let merged = Batch::merge(&parts, Buffer::zeroed(whole.payload_bytes()));
+    assert_eq!(
+        merged.probabilities().unwrap(),
+        [0.125, 0.25, 2.5e-31, 0.375, 0.1875, 0.1875]
+    );
+    let found = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0];
+    let update = merged.priority_update(5, 9, &found).unwrap();
+    let expected = [
+        part(ORIGIN, &own, &found[..3]),
+        part(other, &[10, 11, 12], &found[3..]),
+    ];
+    assert_eq!(update.parts, expected);
+    let mixed = [merged, plain];
+    assert_eq!(Batch::merged_header(&mixed), None);
+}
+
+#[test]
+fn draws_and_priorities_that_cannot_be_are_refused() {
+    for chance in [0.0, -0.5, 1.5, f32::NAN, f32::INFINITY] {
+        let mut batch = prioritised_batch();
+        batch.set_draws([(1, 0.5), (2, chance), (3, 0.5)].into_iter());
+        let refused = read_batch(&sealed(batch)).unwrap_err().to_string();
+        assert!(
+            refused.contains("was drawn with the probability"),
+            "{refused}"
+        );
+    }
+    for priority in [-1.0, -1e-30, f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let mut update = priority_update();
+        update.parts[0].priorities[1] = priority;
+        let bytes = codec::encode(SPEC, &update, &[]).unwrap();
+        let refused = codec::decode::<PriorityUpdate>(&bytes, Some(SPEC)).unwrap_err();
+        let said = refused.to_string();
+        assert!(said.contains("no number from 0 on"), "{said}");
+    }
+    let mut update = priority_update();
+    update.parts[0].priorities.pop();
+    let bytes = codec::encode(SPEC, &update, &[]).unwrap();
+    let refused = codec::decode::<PriorityUpdate>(&bytes, Some(SPEC)).unwrap_err();
+    assert!(
+        refused.to_string().contains("1 priorities of 2"),
+        "{refused}"
+    );
+}
+
 #[test]
 fn parts_are_merged_row_by_row() {
-    let header = |rows, mean_age, versions| BatchHeader {
-        rows,
-        positives: 2,
+    let header = |mean_age, versions| BatchHeader {
+        rows: 0,
+        positives: 3,
         state_bytes: 3,
+        states_k: 0,
+        states_n: 0,
         tally: Tally {
             inserted: 10,
             rows_sampled: 1,
@@ -388,39 +548,56 @@ fn parts_are_merged_row_by_row() {
         held: 5,
         mean_age,
         weights_versions: versions,
+        origin: None,
     };
-    let part = |header: BatchHeader, first: u8| {
-        let mut batch = Batch::zeroed(header);
-        let mut rows = batch.rows_mut();
-        for row in 0..header.rows as usize {
-            let value = first + row as u8;
-            rows.set(row, value, value + 100, f32::from(value), 0.5);
-            rows.state_t(row).fill(value);
-            rows.state_n(row).fill(value + 20);
-            rows.positive(0, row, 1).fill(value + 40);
-            rows.positive(1, row, 2).fill(value + 60);
+    // Rows from `first` on, which have fewer positives and bootstraps, the higher their number.
+    let part = |header: BatchHeader, values: std::ops::Range<u8>| {
+        let scalars = |value: u8| RowScalars {
+            action: value,
+            next_action: value + 100,
+            n_step_return: value.into(),
+            bootstrap_discount: if value.is_multiple_of(2) { 0.5 } else { 0.0 },
+            positives: 3 - u32::from(value) % 4,
+            k_first: 1,
+        };
+        let rows: Vec<_> = values.clone().map(scalars).collect();
+        let mut batch = Batch::of_rows(header, &rows, Buffer::zeroed);
+        let mut places = batch.states_mut();
+        for (row, value) in values.enumerate() {
+            places.t(row).fill(value);
+            if let Some(place) = places.n(row) {
+                place.fill(value + 20);
+            }
+            for p in 0..3 {
+                if let Some(place) = places.k(p, row) {
+                    place.fill(value + 40 + 20 * p as u8);
+                }
+            }
         }
         batch
     };
     let parts = [
-        part(header(2, 1.0, (7, 3)), 0),
-        part(header(1, 4.0, (9, 5)), 2),
+        part(header(1.0, (7, 3)), 0..4),
+        part(header(4.0, (9, 5)), 4..6),
+        part(header(1.0, (8, 4)), 6..8),
     ];
     let whole = Batch::merged_header(&parts).unwrap();
     let merged = Batch::merge(&parts, Buffer::from(vec![0xAB; whole.payload_bytes()]));
-    let mut expected = part(whole, 0);
-    assert_eq!((whole.mean_age, whole.weights_versions), (2.0, (9, 3)));
-    assert_eq!((whole.tally.inserted, whole.held), (20, 10));
-    expected.header = whole;
+    let expected = part(whole, 0..8);
+    assert_eq!((whole.mean_age, whole.weights_versions), (1.75, (9, 3)));
+    assert_eq!((whole.tally.inserted, whole.held), (30, 15));
+    assert_eq!((whole.rows, whole.states_k, whole.states_n), (8, 12, 4));
     assert_eq!(merged, expected);
-
-    let other = part(
-        BatchHeader {
-            state_bytes: 4,
-            ..header(1, 0.0, (1, 1))
-        },
-        0,
+    assert_eq!(
+        merged.states_n(),
+        [[20; 3], [22; 3], [24; 3], [26; 3]].concat()
     );
+
+    let other = BatchHeader {
+        state_bytes: 4,
+        ..header(0.0, (1, 1))
+    };
+    let other = part(other, 0..1);
     assert_eq!(Batch::merged_header(&[parts[0].clone(), other]), None);
     assert_eq!(Batch::merged_header(&[]), None);
 }
@@ -428,7 +605,7 @@ fn parts_are_merged_row_by_row() {
 #[test]
 fn every_kind_has_a_sample_that_is_read() {
     let samples = samples();
-    for kind in 1..=18 {
+    for kind in 1..=20 {
         assert!(
             samples.iter().any(|sample| sample.kind as u16 == kind),
             "kind {kind}"
@@ -668,17 +845,27 @@ fn counts_that_do_not_fit_their_payload_are_refused() {
             positives: 0,
             ..header
         },
+        // As long, but other states than those of its rows.
+        BatchHeader {
+            states_k: 1,
+            states_n: 2,
+            ..header
+        },
+        BatchHeader {
+            states_k: most,
+            ..header
+        },
         BatchHeader {
             rows: most,
             positives: most,
             state_bytes: most,
+            states_k: most,
+            states_n: most,
             ..header
         },
     ] {
-        assert!(
-            Batch::from_payload(wrong, Buffer::zeroed(3 * 24)).is_err(),
-            "{wrong:?}"
-        );
+        let (_, payload) = batch().into_payload();
+        assert!(Batch::from_payload(wrong, payload).is_err(), "{wrong:?}");
     }
     assert!(
         Batch::from_payload(BatchHeader { rows: 0, ..header }, Buffer::zeroed(0)).is_err(),

@@ -1,7 +1,10 @@
 //! What can be set about the replay server, and the checks that keep a run from stalling.
 //! It does not hold the rules of the return or of k: those are the run spec's, shared by every part.
 
-use driml_protocol::{BatchHeader, RunSpec, RunSpecError, codec::PAYLOAD_BYTES_MAX};
+use driml_protocol::{
+    BatchHeader, RunSpec, RunSpecError, Sampling, SamplingError, TRANSITION_BYTES,
+    codec::PAYLOAD_BYTES_MAX,
+};
 use serde::{Deserialize, Serialize};
 
 use crate::storage::frame_store::log::OVERHEAD_BYTES_MAX;
@@ -9,19 +12,22 @@ use crate::storage::frame_store::log::OVERHEAD_BYTES_MAX;
 /// Most shards of one replay.
 pub(crate) const SHARDS_MAX: u32 = 256;
 
-/// A known fault of the paper's published code, reproduced to show what it does: for studies alone.
+/// Smallest segment of a replay that is kept on disk.
+pub(crate) const SEGMENT_BYTES_MIN: u64 = 1 << 20;
+
+/// A known bug of the paper's published code, reproduced to show what it does. No other run has one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Study {
+pub enum ReproducedBug {
     /// The n-step return bootstraps from s_{t+1} instead of s_{t+n}, at gamma^n, unless step t itself ended the episode.
     BootstrapFromNextState,
 }
 
-impl Study {
-    /// Every fault there is.
+impl ReproducedBug {
+    /// Every bug there is.
     pub const ALL: [Self; 1] = [Self::BootstrapFromNextState];
 
-    /// As settings and `--study` have it.
+    /// As settings and `--reproduce-bug` have it.
     pub const fn name(self) -> &'static str {
         match self {
             Self::BootstrapFromNextState => "bootstrap-from-next-state",
@@ -50,6 +56,9 @@ pub struct Config {
     /// Replay servers among which the capacity and the actors are spread; the learner draws from each in proportion to what it
     /// holds.
     pub shards: u32,
+    /// By which rule rows are drawn. Settings of earlier versions do not have it: uniformly.
+    #[serde(default)]
+    pub sampling: Sampling,
     /// How frames are kept in memory; batches do not depend on it.
     #[serde(default)]
     pub compression: Compression,
@@ -65,9 +74,18 @@ pub struct Config {
     pub slack_transitions: u64,
     /// Transitions of the whole run, warm-up included: once that many are stored, no more are taken. None runs on.
     pub transitions_max: Option<u64>,
-    /// A known fault to reproduce; none in every run that is not a study of it.
+    /// Where the replay is kept on disk (`--replay-dir`, `--durable`): most bytes that all shards may take there. Beyond it the oldest
+    /// transitions go, from memory too, before `capacity_transitions` are held. Without it they take as much as uncompressed ones
+    /// in memory, and up to a segment more.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub study: Option<Study>,
+    pub disk_bytes_max: Option<u64>,
+    /// Where the replay is kept on disk: milliseconds after which what was written is flushed, so that it survives a power cut too;
+    /// the death of the process it always survives. 0 flushes before each answer. Without it 1,000.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fsync_ms: Option<u64>,
+    /// A known bug to train with, chosen by `--reproduce-bug`; none in every other run.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reproduced_bug: Option<ReproducedBug>,
 }
 
 /// Why settings were refused.
@@ -88,6 +106,13 @@ pub enum ConfigError {
     RunSpec(#[from] RunSpecError),
 }
 
+impl From<SamplingError> for ConfigError {
+    fn from(SamplingError { key, value, why }: SamplingError) -> Self {
+        let why = why.into();
+        Self::Key { key, value, why }
+    }
+}
+
 /// Environment steps that must follow an anchor in its stream, unless its episode ends before: max(n_step, k_max).
 pub(crate) const fn reach(spec: &RunSpec) -> u32 {
     let k_max = spec.horizon.k_max();
@@ -99,14 +124,14 @@ pub(crate) const fn reach(spec: &RunSpec) -> u32 {
 }
 
 impl Config {
-    /// Checks every value, alone and against `batch_rows`, the rows of the learner's batches.
+    /// Checks every value, alone and against `batch_size`, the rows of the learner's batches.
     ///
-    /// The run cannot stall if slack_transitions * replay_ratio >= batch_rows: inserts then wait only while a whole batch
+    /// The run cannot stall if slack_transitions * replay_ratio >= batch_size: inserts then wait only while a whole batch
     /// may be sampled.
     ///
     /// # Errors
     /// The first key that cannot work, its value and what to do.
-    pub fn validate(&self, spec: &RunSpec, batch_rows: u32) -> Result<(), ConfigError> {
+    pub fn validate(&self, spec: &RunSpec, batch_size: u32) -> Result<(), ConfigError> {
         spec.validate()?;
         let bad = |key, value: String, why: String| Err(ConfigError::Key { key, value, why });
         let ratio = self.replay_ratio;
@@ -117,10 +142,11 @@ impl Config {
                 "rows per transition must be a number above 0".into(),
             );
         }
-        let rows_max = rows_max(spec);
-        if batch_rows == 0 || batch_rows > rows_max {
+        self.sampling.validate()?;
+        let rows_max = rows_max(spec, &self.sampling);
+        if batch_size == 0 || batch_size > rows_max {
             let why = format!("a batch of this run has 1 to {rows_max} rows");
-            return bad("learner.batch_rows", batch_rows.to_string(), why);
+            return bad("learner.batch_size", batch_size.to_string(), why);
         }
         if !(1..=SHARDS_MAX).contains(&self.shards) {
             let why = format!("a replay has 1 to {SHARDS_MAX} shards");
@@ -165,6 +191,15 @@ impl Config {
                 return bad("replay.compressed_bytes_max", max.to_string(), why);
             }
         }
+        if let Some(max) = self.disk_bytes_max {
+            let least = disk_bytes_least(spec, self);
+            if max < least {
+                let why = format!(
+                    "it must hold the transitions before the first batch twice, and some segments; use at least {least}"
+                );
+                return bad("replay.disk_bytes_max", max.to_string(), why);
+            }
+        }
         if self.warmup_transitions > self.capacity_transitions {
             let why = format!(
                 "the first of them would be overwritten before any is sampled; use at most capacity_transitions = {}",
@@ -176,10 +211,10 @@ impl Config {
                 why,
             );
         }
-        if (self.slack_transitions as f64) * ratio < f64::from(batch_rows) {
-            let least = (f64::from(batch_rows) / ratio).ceil();
+        if (self.slack_transitions as f64) * ratio < f64::from(batch_size) {
+            let least = (f64::from(batch_size) / ratio).ceil();
             let why = format!(
-                "actors and learner would wait for each other; use at least batch rows / replay_ratio = {batch_rows} / {ratio} = {least}"
+                "actors and learner would wait for each other; use at least learner.batch_size / replay_ratio = {batch_size} / {ratio} = {least}"
             );
             return bad(
                 "replay.slack_transitions",
@@ -188,11 +223,11 @@ impl Config {
             );
         }
         if let Some(max) = self.transitions_max {
-            let batch = (f64::from(batch_rows) / ratio).ceil();
+            let batch = (f64::from(batch_size) / ratio).ceil();
             let least = self.warmup_transitions as f64 + batch;
             if (max as f64) < least {
                 let why = format!(
-                    "the run would end before its first batch; use at least warmup_transitions + batch rows / replay_ratio = {least}"
+                    "the run would end before its first batch; use at least warmup_transitions + learner.batch_size / replay_ratio = {least}"
                 );
                 return bad("replay.transitions_max", max.to_string(), why);
             }
@@ -208,8 +243,18 @@ pub(crate) const fn compressed_bytes_least(transitions: u64, frame_bytes: usize)
         .saturating_add(OVERHEAD_BYTES_MAX)
 }
 
+/// Least disk budget of a replay: room for the transitions before the first batch, and for the segments that come and go.
+fn disk_bytes_least(spec: &RunSpec, config: &Config) -> u64 {
+    let row_bytes = (spec.frame_bytes() + TRANSITION_BYTES) as u64;
+    let warmup = config.warmup_transitions.saturating_mul(row_bytes);
+    let segments = u64::from(config.shards) * 4 * SEGMENT_BYTES_MIN;
+    warmup.saturating_mul(2).saturating_add(segments)
+}
+
 /// Most rows of one batch of this run, so that it stays below the codec's limit; larger requests are refused.
-pub(crate) fn rows_max(spec: &RunSpec) -> u32 {
-    let row_bytes = BatchHeader::of(spec, 1).payload_bytes();
+pub(crate) fn rows_max(spec: &RunSpec, sampling: &Sampling) -> u32 {
+    let row_bytes = BatchHeader::of(spec, 1)
+        .sampled_by(sampling)
+        .payload_bytes();
     u32::try_from(PAYLOAD_BYTES_MAX / row_bytes).unwrap_or(u32::MAX)
 }

@@ -56,6 +56,13 @@ impl RateLimiter {
             .saturating_add(self.other_shards.inserted)
     }
 
+    /// Rows sampled from all shards.
+    pub const fn rows_sampled_total(&self) -> u64 {
+        self.this_shard
+            .rows_sampled
+            .saturating_add(self.other_shards.rows_sampled)
+    }
+
     /// Takes what the other shards have counted; counts never fall.
     pub fn set_other_shards(&mut self, other_shards: Tally) {
         let Tally {
@@ -64,6 +71,11 @@ impl RateLimiter {
         } = &mut self.other_shards;
         *inserted = other_shards.inserted.max(*inserted);
         *rows_sampled = other_shards.rows_sampled.max(*rows_sampled);
+    }
+
+    /// What the other shards have counted, as far as heard.
+    pub(crate) const fn other_shards(&self) -> Tally {
+        self.other_shards
     }
 
     fn after_warmup(&self) -> u64 {
@@ -116,6 +128,11 @@ impl RateLimiter {
     pub fn sampled(&mut self, rows: u32) {
         debug_assert!(self.may_sample(rows), "{rows} rows beyond the replay ratio");
         self.this_shard.rows_sampled += u64::from(rows);
+    }
+
+    /// Counts `rows` that were sampled before, whatever the replay ratio allowed then.
+    pub(crate) fn sampled_before(&mut self, rows: u64) {
+        self.this_shard.rows_sampled += rows;
     }
 
     /// Counts `rows` that were sampled, and of which nothing was learned, as not sampled.

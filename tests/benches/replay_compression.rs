@@ -21,7 +21,7 @@ use driml_envs::{
     DistributionMode, Environment, Game, ProcgenConfig, ProcgenEngine, ProcgenWorld, StepEnd,
 };
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
+    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
 };
 use driml_replay_server::{Compression, Config, Replay};
 use rand::{Rng, SeedableRng};
@@ -55,7 +55,10 @@ fn replay(compression: Compression, frame_stack: u32) -> Replay {
         shards: 1,
         compression,
         compressed_bytes_max: None,
-        study: None,
+        sampling: Sampling::Uniform,
+        disk_bytes_max: None,
+        fsync_ms: None,
+        reproduced_bug: None,
         replay_ratio: 1e9,
         warmup_transitions: 0,
         slack_transitions: 1 << 50,
@@ -83,6 +86,9 @@ fn chunks(engine: &ProcgenEngine, game: Game, runs_right: bool) -> Vec<Chunk> {
         use_backgrounds: true,
         center_agent: true,
         restrict_themes: false,
+        frame_side: 64,
+        grey: false,
+        library: None,
     };
     let mut world = ProcgenWorld::with_engine(engine, &config, COPIES, 1, 0).unwrap();
     let frame_bytes = world.frame_shape().bytes();

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Makes the parity cases of the agents that came after the first five files: no_action, cpc*, curl*.
+"""Makes the parity cases of the agents that came after the first five files: no_action, cpc*, curl*, weighted_rows.
 
 Needs PyTorch and safetensors; nothing in the project needs either. Everything is float64 and automatic differentiation, and
 written from the formulas in README.md, not from the learner's code.
@@ -149,13 +149,17 @@ def update(case, config):
             config, after[rows, greedy], case["input.n_step_return"].double(), case["input.bootstrap_discount"].double()
         )
     log_probs = distribution(online, config, features(online, config, case["input.frames_t"])[1])
-    kl = (torch.xlogy(goal, goal) - goal * log_probs[rows, case["input.action"]]).sum(1).mean()
+    row_kl = (torch.xlogy(goal, goal) - goal * log_probs[rows, case["input.action"]]).sum(1)
+    weight = case.get("input.importance_weight")
+    kl = row_kl.mean() if weight is None else (weight.double() * row_kl).mean()
     losses = auxiliary_losses(online, key, config, case)
     total = kl + sum(config["lambda"][pair] * loss for pair, loss in losses.items() if config["lambda"][pair] > 0)
 
     expect["q_values_t"] = (log_probs.exp() @ atoms).detach()
     expect["next_action"] = greedy
     expect["target_projection"] = goal
+    if weight is not None:
+        expect["row_kl"] = row_kl.detach()
     expect["loss.c51_kl"] = kl.detach().view(1)
     expect["loss.total"] = total.detach().view(1)
     for pair, loss in losses.items():
@@ -219,7 +223,7 @@ def parameters(config, heads, action, generator, scale):
     return made
 
 
-def make(seed, rows, height, width, objective, lambdas, positives=1, action=False, heads=None, scale=1.5, **settings):
+def make(seed, rows, height, width, objective, lambdas, positives=1, action=False, heads=None, scale=1.5, beta=None, **settings):
     """One case: inputs, parameters, and what the update of them gives."""
     g = torch.Generator().manual_seed(seed)
     config = {
@@ -271,6 +275,10 @@ def make(seed, rows, height, width, objective, lambdas, positives=1, action=Fals
         case["input.frames_k"] = frames(rows)
         case["input.positive_valid"] = torch.ones(rows, dtype=torch.uint8)
         case["input.positive_valid"][0] = 0
+    if beta is not None:
+        # As of rows drawn by priority: (N P)^-beta over the batch's largest.
+        chance = torch.rand(rows, generator=g).double() ** 4 + 1e-4
+        case["input.importance_weight"] = ((chance.min() / chance) ** beta).float()
     return case, config
 
 
@@ -290,6 +298,9 @@ CASES = {
     "curl_clipped": dict(
         seed=15, rows=9, height=44, width=36, objective="curl", lambdas=[0.0, 0.0, 0.0, 0.5], heads=["psi4"],
         double_dqn=True, max_grad_norm=0.25, tanh_clip=5.0, key_tau=0.3,
+    ),
+    "weighted_rows": dict(
+        seed=16, rows=8, height=36, width=44, objective="dim", lambdas=[0.0, 0.0, 0.0, 1.0], action=True, beta=0.4,
     ),
 }  # fmt: skip
 

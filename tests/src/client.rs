@@ -33,18 +33,8 @@ pub struct Client {
 }
 
 impl Client {
-    pub(crate) fn join(endpoint: &str, deadline: Instant) -> Self {
-        let endpoints = Endpoints {
-            listen: Vec::new(),
-            connect: vec![endpoint.to_owned()],
-        };
-        // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
-        let session = loop {
-            match session::open(&endpoints) {
-                Ok(session) => break session,
-                Err(e) => assert!(Instant::now() < deadline, "{e}"),
-            }
-        };
+    /// A client over a session that a test has opened in its own way.
+    pub fn over(session: Session) -> Self {
         let keys = Keys::new(NAMESPACE).unwrap();
         let hello = join::hello(&session, &keys, &Shutdown::default())
             .unwrap()
@@ -59,6 +49,21 @@ impl Client {
             spec,
             config_toml: hello.config_toml,
         }
+    }
+
+    pub(crate) fn join(endpoint: &str, deadline: Instant) -> Self {
+        let endpoints = Endpoints {
+            listen: Vec::new(),
+            connect: vec![endpoint.to_owned()],
+        };
+        // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
+        let session = loop {
+            match session::open(&endpoints) {
+                Ok(session) => break session,
+                Err(e) => assert!(Instant::now() < deadline, "{e}"),
+            }
+        };
+        Self::over(session)
     }
 
     /// Sends bytes and gives the bytes of the answer.
@@ -141,16 +146,16 @@ impl Client {
 
     /// Sends a chunk as an actor would.
     pub fn insert(&self, chunk: &Chunk) -> InsertReply {
-        self.insert_bytes(sealed(chunk, self.spec.hash()))
+        self.insert_bytes(chunk.header.actor, sealed(chunk, self.spec.hash()))
     }
 
-    /// Sends bytes to the place where chunks go.
+    /// Sends bytes to the place where the chunks of `actor` go.
     ///
     /// # Panics
     /// If nobody answers, or not in the run's own words.
-    pub fn insert_bytes(&self, bytes: Vec<u8>) -> InsertReply {
+    pub fn insert_bytes(&self, actor: u32, bytes: Vec<u8>) -> InsertReply {
         let reply = self
-            .ask(&self.keys.of::<ChunkHeader>(), bytes)
+            .ask(&self.keys.of_actor::<ChunkHeader>(actor), bytes)
             .expect("chunks are always answered");
         codec::decode(&reply, Some(self.spec.hash())).unwrap().0
     }

@@ -25,6 +25,7 @@ pub struct Summary {
     pub transitions_lost: u64,
     pub transitions_duplicated: u64,
     pub rows_sampled: u64,
+    pub rows_unlearned: u64,
     pub replay_ratio: Option<f64>,
     pub episodes: u64,
     pub mean_return: Option<f64>,
@@ -37,6 +38,10 @@ pub struct Summary {
     pub weights_version: u64,
     pub weights_sha256: String,
     pub chunks_retried: u64,
+    #[serde(default)]
+    pub replay_servers_restarted: u32,
+    /// How often an actor that had died was started again.
+    pub actors_restarted: u32,
     pub messages_refused: u64,
 }
 
@@ -186,10 +191,15 @@ impl RunFolder {
         );
         assert_eq!(summary.messages_refused, 0, "{said}");
         assert_eq!(summary.frames, summary.transitions_inserted, "{said}");
-        let rows_before = summary.resumed_after_updates * self.setting("learner.batch_rows") as u64;
+        // A replay that was kept knows of the k of all the run.
+        let before = match self.path.join("replay").is_dir() {
+            true => 0,
+            false => summary.resumed_after_updates,
+        };
+        let rows_before = before * self.setting("learner.batch_size") as u64;
         assert_eq!(
             rows_before + summary.k_histogram.iter().sum::<u64>(),
-            summary.rows_sampled,
+            summary.rows_sampled + summary.rows_unlearned,
             "{said}"
         );
         assert!(
@@ -235,7 +245,7 @@ impl RunFolder {
     pub fn check_finished(&self) -> Summary {
         let summary = self.check("finished");
         let said = format!("{summary:#?}");
-        let rows = self.setting("learner.batch_rows") as u64;
+        let rows = self.setting("learner.batch_size") as u64;
         let (warmup, ratio) = (
             self.setting("replay.warmup_transitions") as u64,
             self.setting("replay.replay_ratio"),

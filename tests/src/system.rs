@@ -88,8 +88,17 @@ impl TestSystem {
 
     /// How the program is started, for tests that do it in their own way.
     pub fn command(&self, args: &str) -> Command {
-        let mut command = Command::new(&self.program);
+        self.command_after(&[], args)
+    }
+
+    /// [`Self::command`] with other words before the program, such as those that put it on another machine.
+    pub fn command_after(&self, words: &[String], args: &str) -> Command {
+        let program = self.program.as_os_str();
+        let mut words = words.iter().map(AsRef::as_ref).chain([program]);
+        let first = words.next().unwrap_or(program);
+        let mut command = Command::new(first);
         command
+            .args(words)
             .args(args.split_whitespace())
             .current_dir(self.folder.path())
             .env(MARK, &self.mark)
@@ -108,10 +117,22 @@ impl TestSystem {
         self.start(&format!("{args} --exit-with-parent {parent}"))
     }
 
-    /// Starts a replay server on this system's endpoint, with the settings that `flags` ask for.
+    /// [`Self::start_part`] with other words before the program.
+    pub fn start_part_after(&self, words: &[String], args: &str) -> Process {
+        let args = format!("{args} --exit-with-parent {}", std::process::id());
+        Process::start(args.clone(), self.command_after(words, &args))
+    }
+
+    /// Runs the program to its end, with other words before it.
+    pub fn run_after(&self, words: &[String], args: &str) -> Ended {
+        Process::start(args.to_owned(), self.command_after(words, args)).wait()
+    }
+
+    /// Starts a replay server on this system's endpoint, with the settings that `flags` ask for. When the run is over it stays to be
+    /// asked, as the learner does.
     pub fn start_replay_server(&self, flags: &str) -> Process {
         self.start_part(&format!(
-            "replay-server --listen {} {flags}",
+            "replay-server --stay --listen {} {flags}",
             self.endpoint()
         ))
     }
@@ -119,7 +140,7 @@ impl TestSystem {
     /// Starts a learner whose checkpoints go into the run folder `run_dir`.
     pub fn start_learner(&self, run_dir: &str) -> Process {
         self.start_part(&format!(
-            "learner --connect {} --run-dir {run_dir}",
+            "learner --stay --connect {} --run-dir {run_dir}",
             self.endpoint()
         ))
     }

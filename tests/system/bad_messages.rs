@@ -76,7 +76,7 @@ impl Served {
     /// Sends bytes to the place of chunks and checks that they are refused for the reason, and counted.
     fn refused(&self, bytes: Vec<u8>, reason: &str) {
         let before = self.client.replay().unwrap();
-        match self.client.insert_bytes(bytes) {
+        match self.client.insert_bytes(0, bytes) {
             InsertReply::Refused { why } => {
                 assert!(why.contains(reason), "wanted {reason:?}, got {why:?}")
             }
@@ -275,9 +275,9 @@ fn everything_else_that_a_replay_server_takes() {
         matrix: vec![0.5; 4],
     };
     for (key, bytes) in [
-        (client.keys.of::<Goodbye>(), garbage.clone()),
+        (client.keys.of_actor::<Goodbye>(0), garbage.clone()),
         (
-            client.keys.of::<Goodbye>(),
+            client.keys.of_actor::<Goodbye>(0),
             codec::encode(hash ^ 1, &goodbye, &[]).unwrap(),
         ),
         (client.keys.of::<AffinityUpdate>(), garbage),

@@ -1,7 +1,7 @@
-//! Weights that a replay server must not take and an actor must not act with, and greetings that no part must follow: of other
+//! Weights that a replay server must not take and an actor must not act with, and greetings that no process must follow: of other
 //! runs and versions, of strangers, damaged. The learner, or the replay server, is played by the test itself.
 
-use driml_learner::{Compute, Learner, LearnerPart};
+use driml_learner::{Compute, Learner, LearnerConfig};
 use driml_protocol::{
     Hello, Keys, PROTOCOL_VERSION, Tally, WeightsHeader, WeightsUpload, WeightsVersion, codec,
     session::{self, Endpoints},
@@ -63,11 +63,12 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
         system.start_replay_server(&format!("{flags} --set replay.warmup_transitions=19000000"));
     let client = system.connect();
     let hash = client.spec.hash();
-    let part = LearnerPart::from_toml(&client.config_toml).unwrap();
-    let (_, good) = Learner::new(part, &Compute::CPU)
+    let config = LearnerConfig::from_toml(&client.config_toml).unwrap();
+    let good = Learner::new(config, &Compute::CPU)
         .unwrap()
         .next_weights()
-        .unwrap();
+        .unwrap()
+        .safetensors;
     let learner = FakeLearner { client: &client };
     let upload = FakeLearner::upload;
 
@@ -156,8 +157,8 @@ fn parts_of_another_protocol_version_do_not_join() {
             .callback(answer)
             .wait()
             .unwrap();
-        for part in [system.start_actor(0), system.start_learner("run")] {
-            part.wait().expect_code(1).expect_said(reason);
+        for process in [system.start_actor(0), system.start_learner("run")] {
+            process.wait().expect_code(1).expect_said(reason);
         }
         queryable.undeclare().wait().unwrap();
     }

@@ -55,6 +55,63 @@ fn parts_find_each_other_and_end_in_order() {
 }
 
 #[test]
+fn parts_end_by_themselves_when_the_run_is_over() {
+    for shards in [1, 2] {
+        let system = system();
+        let listen = |shard| {
+            format!(
+                "unixsock-stream/{}",
+                system.path(&format!("{shard}.sock")).display()
+            )
+        };
+        let endpoints: Vec<_> = (0..shards).map(listen).collect();
+        let flags = format!("--agent driml-ada --replay-shards {shards} --actors {shards} {SHORT}");
+        let mut parts = Vec::new();
+        for (shard, endpoint) in endpoints.iter().enumerate() {
+            parts.push(system.start_part(&format!(
+                "replay-server --listen {endpoint} --shard {shard} {flags}"
+            )));
+        }
+        let connect: Vec<_> = endpoints
+            .iter()
+            .map(|it| format!("--connect {it}"))
+            .collect();
+        let learner = format!("learner {} --run-dir run", connect.join(" "));
+        parts.push(system.start_part(&learner));
+        for (id, connect) in connect.iter().enumerate() {
+            parts.push(system.start_part(&format!("actor {connect} --id {id}")));
+        }
+        for part in parts {
+            part.wait().expect_code(0);
+        }
+        assert_eq!(system.survivors(), []);
+        system.run("evaluate --run run --episodes 2").expect_code(0);
+    }
+}
+
+/// An actor that stands still does not hold the others up for long.
+#[test]
+fn a_replay_server_does_not_wait_for_a_frozen_actor_for_ever() {
+    let system = system();
+    let listen = system.endpoint();
+    let server = system.start_part(&format!(
+        "replay-server --listen {listen} --agent c51 {SHORT}"
+    ));
+    let mut frozen = system.start_actor(1);
+    frozen.wait_for_stderr("waiting for the learner's first weights");
+    frozen.signal(Signal::SIGSTOP);
+    let learner = system.start_part(&format!("learner --connect {listen} --run-dir run"));
+    system.start_actor(0).wait().expect_code(0);
+    learner.wait().expect_code(0);
+    server
+        .wait()
+        .expect_code(0)
+        .expect_said("the run is over, and ");
+    frozen.signal(Signal::SIGKILL);
+    frozen.wait();
+}
+
+#[test]
 fn parts_that_are_told_to_stop_lose_nothing() {
     let system = system();
     let mut server = system.start_replay_server(&format!("--agent c51 {LONG}"));

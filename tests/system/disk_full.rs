@@ -14,13 +14,13 @@ use nix::sys::signal::Signal;
 use crate::{LONG, system};
 
 /// A small disk. Dropping it takes it away.
-struct Disk {
+pub(crate) struct Disk {
     folder: PathBuf,
 }
 
 impl Disk {
     /// One of so many KiB at `folder`; none, and a line that `test` is skipped, if it cannot be mounted.
-    fn mount(test: &str, folder: PathBuf, kib: u32) -> Option<Self> {
+    pub(crate) fn mount(test: &str, folder: PathBuf, kib: u32) -> Option<Self> {
         fs::create_dir(&folder).unwrap();
         let mut mount = Command::new("mount");
         mount.args(["-t", "tmpfs", "-o", &format!("size={kib}k"), "tmpfs"]);
@@ -39,7 +39,7 @@ impl Disk {
     }
 
     /// Takes all room that there is.
-    fn fill(&self) -> Filler {
+    pub(crate) fn fill(&self) -> Filler {
         let path = self.folder.join("filler");
         let mut file = File::create(&path).unwrap();
         while file.write_all(&[0; 4096]).is_ok() {}
@@ -57,12 +57,12 @@ impl Drop for Disk {
 }
 
 /// A file that takes all room of a disk.
-struct Filler {
+pub(crate) struct Filler {
     path: PathBuf,
 }
 
 impl Filler {
-    fn remove(self) {
+    pub(crate) fn remove(self) {
         fs::remove_file(&self.path).unwrap();
     }
 }

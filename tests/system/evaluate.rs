@@ -51,6 +51,141 @@ fn it_prints_the_agent_beside_a_random_policy() {
 }
 
 #[test]
+fn it_tells_programs_what_it_tells_people() {
+    let system = with_run();
+    let flags = "evaluate run --episodes 7 --seed 2";
+    let lines = system.run(flags).expect_code(0).stdout;
+    let ended = system
+        .run(&format!("{flags} --json --returns returns.csv"))
+        .expect_code(0);
+    let told: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
+    assert_eq!(
+        (&told["world"], &told["updates"]),
+        (&"chain".into(), &540.into())
+    );
+    let table = fs::read_to_string(system.path("returns.csv")).unwrap();
+    for policy in ["driml-fix", "random"] {
+        let mean = told["policies"][policy]["mean_return"].as_f64().unwrap();
+        assert!(
+            lines.contains(&format!("{policy:12} mean return {mean:8.3}")),
+            "{lines}"
+        );
+        let rows = table
+            .lines()
+            .filter_map(|row| row.strip_prefix(&format!("{policy},")));
+        let returns: Vec<f64> = rows
+            .map(|row| row.split_once(',').unwrap().1.parse().unwrap())
+            .collect();
+        assert_eq!(returns.len(), 7);
+        assert!((returns.iter().sum::<f64>() / 7.0 - mean).abs() < 1e-9);
+    }
+    system
+        .run("evaluate run --returns none/returns.csv")
+        .expect_code(1)
+        .expect_said("--returns none/returns.csv");
+}
+
+#[test]
+fn it_plays_any_checkpoint_that_is_there() {
+    let system = with_run();
+    let kept = system.run_folder("run").checkpoints();
+    let updates = |path: &std::path::Path| -> u64 {
+        let name = path.file_name().unwrap().to_str().unwrap();
+        name.strip_prefix("checkpoint-").unwrap().parse().unwrap()
+    };
+    let oldest = updates(&kept[0]);
+    assert!(oldest < 540);
+    let ended = system
+        .run(&format!("evaluate run --episodes 2 --checkpoint {oldest}"))
+        .expect_code(0);
+    let said = format!("weights after {oldest} updates");
+    assert!(ended.stdout.contains(&said), "{}", ended.stdout);
+    system
+        .run("evaluate run --checkpoint 7")
+        .expect_code(64)
+        .expect_said("no checkpoint after 7 updates; it has those after");
+}
+
+/// Checkpoints of a run of processes, and of one in lockstep, are played as it goes on; the best is kept.
+#[test]
+fn it_plays_checkpoints_while_the_run_goes_on() {
+    let system = system();
+    for (name, lockstep, rows_min) in [("processes", "", 1), ("lockstep", "--lockstep", 5)] {
+        let flags = "--agent c51 --evaluate-every 100 --evaluate-episodes 4";
+        let ended = system
+            .run(&format!(
+                "local {SHORT} {flags} {lockstep} --run-dir {name}"
+            ))
+            .expect_code(0);
+        assert!(ended.stderr.contains("evaluated after"), "{}", ended.stderr);
+        let folder = system.run_folder(name);
+        let table = fs::read_to_string(folder.path().join("evaluations.csv")).unwrap();
+        let mut lines = table.lines();
+        assert_eq!(
+            lines.next(),
+            Some("seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd")
+        );
+        let rows: Vec<Vec<f64>> = lines
+            .map(|row| row.split(',').map(|it| it.parse().unwrap()).collect())
+            .collect();
+        assert!(rows.len() >= rows_min, "{table}");
+        let last = rows.last().unwrap();
+        assert_eq!(last[2], 540.0, "the last checkpoint is played: {table}");
+        assert!(
+            rows.is_sorted_by(|a, b| a[2] < b[2] && a[1] <= b[1]),
+            "{table}"
+        );
+        let most = rows.iter().map(|row| row[4]).fold(f64::MIN, f64::max);
+        let best = rows.iter().find(|row| row[4] == most).unwrap();
+        // Played again with the same seed, the best earns the same.
+        let again = system
+            .run(&format!("evaluate {name} --checkpoint best --episodes 4"))
+            .expect_code(0);
+        assert!(
+            again
+                .stdout
+                .contains(&format!("weights after {} updates", best[2]))
+                && again.stdout.contains(&format!("mean return {most:8.3}")),
+            "{}{table}",
+            again.stdout
+        );
+        system
+            .run(&format!(
+                "plot {name} --column evaluated_return --out {name}.svg"
+            ))
+            .expect_code(0);
+    }
+}
+
+#[test]
+fn an_evaluation_can_be_kept_by_hand() {
+    let system = with_run();
+    system
+        .run("evaluate run --checkpoint best")
+        .expect_code(64)
+        .expect_said("run has no best checkpoint");
+    let keep = "evaluate run --keep --episodes 3";
+    let said = system.run(keep).expect_code(0).stdout;
+    assert!(
+        said.ends_with("over 3 episodes, the most so far\n"),
+        "{said}"
+    );
+    system
+        .run("evaluate run --checkpoint best --episodes 1")
+        .expect_code(0);
+    system
+        .run("evaluate run --checkpoint bset")
+        .expect_code(64)
+        .expect_said("the updates of a checkpoint");
+    system
+        .run(&format!(
+            "local {SHORT} --evaluate-every 150 --set learner.checkpoint_period_updates=100"
+        ))
+        .expect_code(64)
+        .expect_said("local.evaluation.every_updates = 150: checkpoints are played");
+}
+
+#[test]
 fn a_folder_that_is_no_run_s() {
     let system = system();
     fs::create_dir(system.path("empty")).unwrap();
@@ -131,4 +266,64 @@ fn weights_of_another_run_are_refused() {
         .run("evaluate --run run")
         .expect_code(64)
         .expect_said("has no checkpoint yet");
+}
+
+#[test]
+fn a_film_changes_nothing_that_is_played() {
+    let system = system();
+    system
+        .run("local --lockstep --env mspacman --agent driml-ada --preset smoke --frames 320 --run-dir run")
+        .expect_code(0);
+    let plain = system.run("evaluate run --episodes 3").expect_code(0);
+    let film =
+        "evaluate run --episodes 3 --record play.gif --overlay --record-steps 40 --record-copies 2";
+    let filmed = system.run(film).expect_code(0);
+    let said: Vec<_> = filmed.stdout.lines().collect();
+    assert_eq!(said[1], "filmed 40 steps: play.gif");
+    let rest: Vec<_> = said
+        .iter()
+        .filter(|line| !line.starts_with("filmed"))
+        .copied()
+        .collect();
+    assert_eq!(rest, plain.stdout.lines().collect::<Vec<_>>());
+    let bytes = fs::read(system.path("play.gif")).unwrap();
+    assert!(bytes.starts_with(b"GIF89a") && bytes.ends_with(b";"));
+    system.run(film).expect_code(0);
+    let again = fs::read(system.path("play.gif")).unwrap();
+    assert!(bytes == again, "the same play is the same film");
+    assert!(!system.path("play.gif.tmp").exists());
+}
+
+#[test]
+fn films_that_cannot_be_are_refused_before_anything_is_played() {
+    let system = with_run();
+    for (flags, said) in [
+        ("--record play.mp4", "take one that ends in .gif"),
+        (
+            "--record none/play.gif",
+            "--record none/play.gif: No such file or directory",
+        ),
+        ("--overlay", "--record <FILE.gif>"),
+        (
+            "--record play.gif --record-steps 0",
+            "0 is not in 1..=10000",
+        ),
+    ] {
+        let ended = system.run(&format!("evaluate run {flags}")).expect_code(64);
+        ended.expect_said(said);
+    }
+    fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
+    system
+        .run("evaluate run --record play.gif")
+        .expect_code(64)
+        .expect_said("has no checkpoint yet");
+    let left = fs::read_dir(system.path(".")).unwrap();
+    let left = left.filter(|it| {
+        it.as_ref()
+            .unwrap()
+            .file_name()
+            .to_string_lossy()
+            .contains("play")
+    });
+    assert_eq!(left.count(), 0);
 }

@@ -64,9 +64,39 @@ fn a_dead_learner_ends_the_run() {
     dies("learner", "learner");
 }
 
+/// What the dead one had not delivered is gone with it, and in no count; all else is as planned.
 #[test]
-fn a_dead_actor_ends_the_run() {
-    dies("actor", "actor-0");
+fn a_dead_actor_is_started_again() {
+    let system = system();
+    let flags = "--env chain --agent c51 --preset smoke --frames 12000 --actors 2";
+    let mut process = system.start(&format!(
+        "local {flags} --set replay.replay_ratio=32 --run-dir run --listen {}",
+        system.endpoint()
+    ));
+    let client = system.connect();
+    for restarts in 1..=2 {
+        client.wait_for_replay("both actors", |replay| replay.actors == 2);
+        let before = client.replay().unwrap().transitions_inserted;
+        client.wait_for_replay("some transitions", |replay| {
+            replay.transitions_inserted > before + 500
+        });
+        system.find_part("actor").signal(Signal::SIGKILL);
+        process.wait_for_stderr(&format!(
+            "is started again ({restarts} of 16 times in a run)"
+        ));
+    }
+    drop(client);
+    process
+        .wait()
+        .expect_code(0)
+        .expect_said("was ended by signal 9 SIGKILL (log: ");
+    let summary = system.run_folder("run").check_finished();
+    assert_eq!(summary.actors_restarted, 2);
+    assert_eq!(
+        (summary.transitions_lost, summary.transitions_duplicated),
+        (0, 0)
+    );
+    assert_eq!(system.survivors(), []);
 }
 
 #[test]

@@ -163,7 +163,7 @@ fn what_is_learned_tells_the_positive_from_other_rows() {
         assert_ne!(longer, SHORT);
         system
             .run(&format!(
-                "local --agent {agent} {longer} --set learner.batch_rows=64 --run-dir run"
+                "local --agent {agent} {longer} --set learner.batch_size=64 --run-dir run"
             ))
             .expect_code(0);
         let run = system.run_folder("run");

@@ -2,19 +2,11 @@
 //! It starts one process only.
 
 use driml_envs::{CorridorConfig, optimal_return};
-use driml_tests::{Summary, TestSystem};
+use driml_settings::presets::AGENTS;
+use driml_tests::{Summary, TestSystem, skipped_offline, wait_for};
+use nix::sys::signal::Signal;
 
 use crate::{SHORT, system};
-
-const AGENTS: [&str; 7] = [
-    "c51",
-    "driml-fix",
-    "driml-ada",
-    "driml-randk",
-    "driml-noact",
-    "cpc",
-    "curl",
-];
 
 fn run(system: &TestSystem, flags: &str, name: &str) -> Summary {
     system
@@ -39,6 +31,88 @@ fn the_seed_decides_the_weights() {
     // And so do the settings that the first run left.
     let again = run(&system, "--config first/config.toml", "again");
     assert_eq!(first.weights_sha256, again.weights_sha256);
+}
+
+#[test]
+fn the_seed_decides_the_weights_in_bf16_too() {
+    let system = system();
+    let flags = format!("{SHORT} --agent driml-ada --seed 3");
+    let bf16 = format!("{flags} --set learner.precision=bf16 --set actor.precision=bf16");
+    let first = run(&system, &bf16, "first");
+    let same = run(&system, &bf16, "same");
+    let f32 = run(&system, &flags, "f32");
+    assert_eq!(first.weights_sha256, same.weights_sha256);
+    assert_ne!(first.weights_sha256, f32.weights_sha256);
+}
+
+/// Starts a run, ends it with `signal` once it has saved and goes on, and resumes it to its end.
+fn interrupted(system: &TestSystem, flags: &str, signal: Signal) -> Summary {
+    let process = system.start(&format!("local --lockstep {flags} --run-dir run"));
+    let run = system.run_folder("run");
+    // The first checkpoint is after 200.
+    wait_for("updates after a checkpoint", || {
+        run.updates_recorded().filter(|&updates| updates > 300)
+    });
+    process.signal(signal);
+    let ended = process.wait();
+    if signal == Signal::SIGINT {
+        ended
+            .expect_code(130)
+            .expect_said("`driml local --resume run` goes on with it");
+    }
+    let ended = system.run("local --resume run").expect_code(0);
+    assert!(
+        ended.stdout.contains("all parts in lockstep"),
+        "{}",
+        ended.stdout
+    );
+    let summary = run.check_finished();
+    assert!((200..6_300).contains(&summary.resumed_after_updates));
+    summary
+}
+
+/// By Ctrl-C, which saves, and by death, after which what was learned since the last checkpoint is learned again.
+#[test]
+fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
+    // 6,300 updates, some seconds, so that it is caught on its way.
+    let flags = "--env chain --agent driml-ada --preset smoke --frames 12800 --actors 2 \
+                 --set replay.replay_ratio=8 --set learner.checkpoint_period_updates=200";
+    let whole = run(&system(), flags, "whole");
+    for signal in [Signal::SIGINT, Signal::SIGKILL] {
+        let resumed = interrupted(&system(), flags, signal);
+        assert_eq!(resumed.weights_sha256, whole.weights_sha256, "{signal}");
+        assert_eq!(
+            (resumed.updates, resumed.episodes, resumed.k_histogram),
+            (whole.updates, whole.episodes, whole.k_histogram.clone()),
+            "{signal}"
+        );
+    }
+}
+
+/// N updates, saved and resumed for N more, are 2 N.
+#[test]
+fn a_run_that_is_prolonged_is_a_longer_one() {
+    let mut worlds = vec!["mspacman"];
+    if !skipped_offline("lockstep::a_run_that_is_prolonged_is_a_longer_one (Procgen)") {
+        worlds.extend(["procgen:coinrun", "procgen:maze"]);
+    }
+    for world in worlds {
+        let system = system();
+        let flags = format!("--env {world} --agent driml-ada --preset smoke");
+        let whole = run(&system, &format!("{flags} --frames 1216"), "whole");
+        let half = run(&system, &format!("{flags} --frames 608"), "half");
+        assert_ne!(half.weights_sha256, whole.weights_sha256);
+        system
+            .run("local --resume half")
+            .expect_code(64)
+            .expect_said("to train on, add --frames with more than these");
+        system
+            .run("local --resume half --frames 1216")
+            .expect_code(0);
+        let resumed = system.run_folder("half").check_finished();
+        assert_eq!(resumed.weights_sha256, whole.weights_sha256, "{world}");
+        assert_eq!(resumed.mean_return, whole.mean_return, "{world}");
+    }
 }
 
 /// The augmentation draws from the learner's generator, which the seed decides.
@@ -69,7 +143,7 @@ fn a_compressed_replay_leads_to_the_same_weights() {
 fn every_agent_runs_in_every_world_that_needs_nothing() {
     let system = system();
     for world in ["chain", "mspacman", "ising"] {
-        for agent in AGENTS {
+        for agent in AGENTS.iter().map(|agent| agent.name) {
             let flags = format!("--env {world} --agent {agent} --preset smoke --frames 256");
             let summary = run(&system, &flags, &format!("{world}-{agent}"));
             let looks_ahead = !["c51", "curl"].contains(&agent);

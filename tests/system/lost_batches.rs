@@ -11,15 +11,17 @@ use std::{
 
 use driml_learner::remote::batch_source::{BatchSource, Next, Requests};
 use driml_protocol::{
-    ActorJoin, BatchReply, BatchRequest, Buffer, Chunk, ChunkHeader, Horizon, InsertReply, Keys,
-    ReplayStatus, RunClient, RunSpec, Shutdown, TimeoutRule, codec,
+    BatchReply, BatchRequest, Buffer, Horizon, InsertReply, Keys, ReplayStatus, RunClient, RunSpec,
+    Shutdown, codec,
     session::{self, Endpoints},
 };
-use driml_replay_server::{Compression, Config, Replay};
+use driml_replay_server::{Config, Replay};
 use zenoh::{
     Session, Wait,
     query::{Query, Queryable},
 };
+
+use crate::tiny_replay;
 
 /// Rows of a batch.
 const ROWS: u32 = 16;
@@ -29,33 +31,14 @@ const TRANSITIONS: u64 = 384;
 const LOSES: u32 = 4;
 
 fn spec() -> RunSpec {
-    RunSpec {
-        world: "chain".into(),
-        agent: "driml-randk".into(),
-        seed: 1,
-        frame_height: 4,
-        frame_width: 4,
-        frame_channels: 1,
-        frame_stack: 1,
-        num_actions: 3,
-        n_step: 1,
-        gamma: 0.99,
-        horizon: Horizon::Uniform { k_max: 2 },
-        timeout: TimeoutRule::Terminal,
-    }
+    tiny_replay::spec("driml-randk", Horizon::Uniform { k_max: 2 })
 }
 
 fn config(shards: u32) -> Config {
     Config {
-        capacity_transitions: 1_000,
         shards,
-        compression: Compression::None,
-        compressed_bytes_max: None,
-        replay_ratio: 1.0,
-        warmup_transitions: 0,
-        slack_transitions: 1_000,
         transitions_max: Some(TRANSITIONS),
-        study: None,
+        ..tiny_replay::config(1_000)
     }
 }
 
@@ -63,24 +46,9 @@ fn config(shards: u32) -> Config {
 fn full(shard: u32, shards: u32) -> Replay {
     let spec = spec();
     let mut replay = Replay::shard(&spec, &config(shards), ROWS, shard).unwrap();
-    replay
-        .join_actor(ActorJoin {
-            actor: 0,
-            incarnation: 1,
-        })
-        .unwrap();
+    tiny_replay::join(&mut replay, 0);
     for sequence in 0..TRANSITIONS / 8 / u64::from(shards) {
-        let chunk = Chunk::zeroed(ChunkHeader {
-            actor: 0,
-            incarnation: 1,
-            sequence,
-            first_transition: 8 * sequence,
-            weights_version: 1,
-            leaving: false,
-            streams: 1,
-            steps: 8,
-            frame_bytes: spec.frame_bytes() as u32,
-        });
+        let chunk = tiny_replay::chunk(&spec, 0, sequence, 8);
         let stored = replay.insert(&chunk);
         assert!(matches!(stored, InsertReply::Stored { .. }), "{stored:?}");
     }
@@ -100,7 +68,7 @@ fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
         Ok(_) if drawn.fetch_add(1, Ordering::Relaxed).is_multiple_of(LOSES) => return,
         Ok(draft) => {
             let (header, payload) = draft.unpack().into_payload();
-            codec::encode(hash, &BatchReply::Batch(header), &payload).unwrap()
+            codec::encode(hash, &BatchReply::of(header), &payload).unwrap()
         }
         Err(unready) => codec::encode(hash, &BatchReply::from(unready), &[]).unwrap(),
     };
@@ -162,7 +130,7 @@ fn every_batch_comes_once(shards: u32) {
                 batches += 1;
             }
             Next::Finished => break,
-            Next::NotYet => panic!("no batch in a minute, after {batches}"),
+            Next::NotYet(_) => panic!("no batch in a minute, after {batches}"),
         }
     }
     assert_eq!(batches * u64::from(ROWS), TRANSITIONS);

@@ -1,6 +1,7 @@
 //! Real Procgen through all processes. The engine is fetched into the cache folder once, as `driml local` does.
 //! With `DRIML_OFFLINE=1` each test here is skipped and says so; what each game does is tested beside the worlds.
 
+use driml_settings::config::RunConfig;
 use driml_tests::skipped_offline;
 
 use crate::system;
@@ -27,6 +28,71 @@ fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
         "{}",
         ended.stdout
     );
+}
+
+/// Frames as the engine gives them lose a border that no convolution reads; at 104 x 80 they are enlarged after that.
+#[test]
+fn a_border_that_no_convolution_reads_changes_no_bit() {
+    if skipped_offline("procgen::a_border_that_no_convolution_reads_changes_no_bit") {
+        return;
+    }
+    let system = system();
+    for (name, sets, cut) in [
+        ("64", "", [60, 60]),
+        (
+            "104",
+            "--set input.height=104 --set input.width=80",
+            [62, 61],
+        ),
+    ] {
+        let flags = "--env procgen:coinrun --agent driml-ada --preset smoke --frames 416";
+        system
+            .run(&format!(
+                "local --lockstep {flags} {sets} --run-dir cut-{name}"
+            ))
+            .expect_code(0);
+        let folder = system.run_folder(&format!("cut-{name}"));
+        let text = std::fs::read_to_string(system.path(&format!("cut-{name}")).join("config.toml"));
+        let config = RunConfig::parse("config.toml", &text.unwrap()).unwrap();
+        assert_eq!([config.run.frame_height, config.run.frame_width], cut);
+        let whole = config.with_whole_frames().unwrap();
+        assert_eq!([whole.run.frame_height, whole.run.frame_width], [64, 64]);
+        std::fs::write(system.path(&format!("{name}.toml")), whole.to_toml()).unwrap();
+        system
+            .run(&format!(
+                "local --lockstep --config {name}.toml --run-dir whole-{name}"
+            ))
+            .expect_code(0);
+        let whole = system.run_folder(&format!("whole-{name}")).check_finished();
+        assert_eq!(folder.check_finished().weights_sha256, whole.weights_sha256);
+        let played = ["cut", "whole"].map(|run| {
+            let ended = system
+                .run(&format!("evaluate --run {run}-{name} --episodes 2"))
+                .expect_code(0);
+            ended.stdout
+        });
+        assert_eq!(played[0], played[1]);
+    }
+}
+
+#[test]
+fn an_agent_chooses_among_the_actions_that_differ() {
+    if skipped_offline("procgen::an_agent_chooses_among_the_actions_that_differ") {
+        return;
+    }
+    let system = system();
+    system
+        .run(
+            "local --lockstep --env procgen:plunder --agent driml-ada --preset smoke --frames 416 \
+             --set actor.actions=visible --set learner.affinity.alphabet=visible --run-dir run",
+        )
+        .expect_code(0);
+    system.run_folder("run").check_finished();
+    let config = system.run_folder("run").config();
+    assert_eq!(config["model"]["num_actions"].as_integer(), Some(4));
+    system
+        .run("evaluate --run run --episodes 2 --levels unseen")
+        .expect_code(0);
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 use std::fs;
 
+use driml_settings::config::RunConfig;
 use driml_tests::{RunFolder, Summary, TestSystem};
 use nix::sys::signal::Signal;
 
@@ -71,6 +72,33 @@ fn an_interrupted_run_goes_on() {
         .run("local --resume run")
         .expect_code(64)
         .expect_said("to train on, add --frames with more than these");
+}
+
+/// Runs of earlier versions recorded whole frames where a border of them is cut today.
+#[test]
+fn a_run_with_whole_frames_goes_on_and_is_evaluated() {
+    let system = system();
+    let border =
+        "--set world.height=15 --set world.width=17 --set input.height=15 --set input.width=17";
+    system
+        .run(&format!("local --lockstep {SHORT} {border} --run-dir cut"))
+        .expect_code(0);
+    let text = fs::read_to_string(system.path("cut").join("config.toml")).unwrap();
+    let cut = RunConfig::parse("config.toml", &text).unwrap();
+    assert_eq!((cut.run.frame_height, cut.run.frame_width), (14, 16));
+    let old = cut.with_whole_frames().unwrap();
+    fs::write(system.path("old.toml"), old.to_toml()).unwrap();
+    system
+        .run("local --config old.toml --run-dir run")
+        .expect_code(0);
+    resumes(&system);
+    let config = system.run_folder("run").config();
+    assert_eq!(config["run"]["frame_height"].as_integer(), Some(15));
+    for run in ["run", "cut"] {
+        system
+            .run(&format!("evaluate --run {run} --episodes 3"))
+            .expect_code(0);
+    }
 }
 
 #[test]

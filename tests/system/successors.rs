@@ -6,6 +6,9 @@ use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
 
+/// Versions that a learner may have named and not sent when it is killed.
+const UNSENT_MAX: u64 = 5;
+
 /// A learner that was killed between two checkpoints has forgotten updates; its successor makes them again.
 #[test]
 fn killed_learners_cost_no_update_of_the_plan() {
@@ -25,8 +28,10 @@ fn killed_learners_cost_no_update_of_the_plan() {
         learner.wait();
         learner = system.start_learner("run");
         let next = client.wait_for_learner("the successor", |it| it.weights_version > version);
+        // A learner names a version when it hands it over: the last ones may not have left the one that was killed, and what
+        // nobody has seen may come again. Its checkpoint's version is far below.
         assert!(
-            next.weights_version > killed.weights_version,
+            next.weights_version + UNSENT_MAX > killed.weights_version,
             "actors take the successor's weights: {killed:#?} {next:#?}"
         );
         version = next.weights_version;
@@ -109,7 +114,7 @@ fn a_learner_whose_replay_server_was_started_anew_saves_and_says_so() {
     // Its successor would count the updates twice, and says what to do.
     system
         .run(&format!(
-            "learner --connect {} --run-dir run",
+            "learner --stay --connect {} --run-dir run",
             system.endpoint()
         ))
         .expect_code(1)

@@ -33,6 +33,9 @@ fn steps(criterion: &mut Criterion) {
                 use_backgrounds: true,
                 center_agent: true,
                 restrict_themes: false,
+                frame_side: 64,
+                grey: false,
+                library: None,
             };
             let mut world =
                 ProcgenWorld::with_engine(&engine, &config, NUM_ENVS, 1, threads).unwrap();

@@ -65,4 +65,21 @@ pub trait Environment: Send {
         rewards: &mut [f32],
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError>;
+
+    /// All copies' complete state, generators included: a world made with the same arguments that [`load`](Self::load)s it goes on
+    /// exactly as this one does.
+    ///
+    /// # Errors
+    /// [`EnvError::NotSaved`] where a world cannot do this, as it does unless it says otherwise; a fault of the engine.
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        Err(EnvError::NotSaved)
+    }
+
+    /// Takes the state that [`save`](Self::save) gave. That the bytes are undamaged is the caller's to check.
+    ///
+    /// # Errors
+    /// Bytes of another world, of other settings or of another number of copies; the world must then not be used any more.
+    fn load(&mut self, _state: &[u8]) -> Result<(), EnvError> {
+        Err(EnvError::NotSaved)
+    }
 }

@@ -1,5 +1,7 @@
 //! Why a world could not be made or stepped.
 
+use crate::worlds::exec::error::ExecError;
+
 /// Why a world could not be made or stepped.
 #[derive(Debug, thiserror::Error)]
 pub enum EnvError {
@@ -9,6 +11,9 @@ pub enum EnvError {
     /// Procgen's engine could not be had, or refused something.
     #[error(transparent)]
     Procgen(#[from] procgen_sys::ProcgenError),
+    /// The process that is the world could not be started, or failed.
+    #[error(transparent)]
+    Exec(Box<ExecError>),
     /// A step was asked for with an action that the world does not have.
     #[error("action {action} of copy {env} is out of range: this world has {num_actions} actions")]
     ActionOutOfRange {
@@ -19,6 +24,12 @@ pub enum EnvError {
         /// The world's number of actions; valid ones are below it.
         num_actions: usize,
     },
+    /// This world cannot say how it stands.
+    #[error("this world's state cannot be saved")]
+    NotSaved,
+    /// Bytes that are no saved state of this world.
+    #[error("no state of this world: {0}")]
+    State(String),
     /// A step was asked for with a buffer of the wrong length.
     #[error("{name} has {got} entries, but the world has {num_envs} copies")]
     BufferLength {
@@ -29,4 +40,10 @@ pub enum EnvError {
         /// The world's copies.
         num_envs: usize,
     },
+}
+
+impl From<ExecError> for EnvError {
+    fn from(error: ExecError) -> Self {
+        Self::Exec(Box::new(error))
+    }
 }

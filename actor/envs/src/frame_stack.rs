@@ -3,6 +3,7 @@
 
 use crate::environment::FrameShape;
 use crate::error::EnvError;
+use crate::saved;
 
 /// Most frames in a stack; more are rejected.
 const STACK_MAX: usize = 64;
@@ -88,6 +89,16 @@ impl FrameStack {
     /// The stacked observations [N, H, W, C * stack].
     pub fn stacked(&self) -> &[u8] {
         &self.stacked
+    }
+
+    /// Takes the stacked observations [N, H, W, C * stack] that another stack of these sizes had.
+    ///
+    /// # Errors
+    /// Another length.
+    pub fn load(&mut self, stacked: &[u8]) -> Result<(), EnvError> {
+        saved::check(stacked.len() == self.stacked.len(), "a stack of frames")?;
+        self.stacked.copy_from_slice(stacked);
+        Ok(())
     }
 
     /// Copies the stacked observations into `out` [N, H, W, C * stack].

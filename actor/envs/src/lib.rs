@@ -10,11 +10,14 @@
 //! | `mspacman` | 21 x 19 x 3 | 5 | continual learning and predictability: four ghosts, lethal by choice |
 //! | `ising` | 84 x 84 x 1 | 1 | an Ising patch in noise: what can be predicted and what cannot |
 //! | `chain` | settable x 1 | 3 | a corridor with a known best return, for fast learning tests |
+//! | `exec:COMMAND` | as it declares | as it declares | a world of your own, in a process of its own |
+//! | `libenv:PATH:GAME` | 64 x 64 x 3 | 15 | one of Procgen's games by another build of its library |
 //!
 //! [`WorldConfig`] holds the settings of any of them (`kind` says which) and builds it, and [`WorldName`] reads the names
 //! above from a command line. [`FrameStack`] stacks frames without crossing the end of an episode.
 //!
-//! To add a world, write a file in `worlds/` with its settings, which implement [`WorldSettings`], and the world itself,
+//! To add a world in another language, write a program that speaks the protocol of [`ExecWorld`]. To add one in Rust without a
+//! change here, [`register`] it. To add one here, write a file in `worlds/` with its settings, which implement [`WorldSettings`], and the world itself,
 //! which implements [`Environment`]; then give it a line in `registry.rs`.
 //!
 //! ```
@@ -43,17 +46,24 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::print_stdout))]
 
+mod action_set;
 mod copies;
+mod cut_frames;
 mod environment;
 mod error;
 mod frame_stack;
+mod own;
 mod registry;
+mod saved;
 mod settings;
 mod worlds;
 
+pub use action_set::{ActionSet, FewerActions};
+pub use cut_frames::CutFrames;
 pub use environment::{Environment, FrameShape, StepEnd};
 pub use error::EnvError;
 pub use frame_stack::FrameStack;
+pub use own::{OwnWorld, preset as own_preset, register};
 pub use procgen_sys::{
     DistributionMode, Engine as ProcgenEngine, Game, InstallError, ProcgenError,
 };
@@ -62,6 +72,7 @@ pub use settings::{Levels, Variants, WorldSettings};
 pub use worlds::corridor::{
     CorridorConfig, CorridorWorld, optimal_discounted_return, optimal_return,
 };
+pub use worlds::exec::{ExecConfig, ExecError, ExecWorld, declaration as exec_declaration};
 pub use worlds::ising::{Boundary, IsingConfig, IsingLattice, IsingWorld};
 pub use worlds::pacman::{IsingOverlay, LethalSchedule, PacmanConfig, PacmanWorld};
 pub use worlds::procgen::{ProcgenConfig, ProcgenWorld, visible_actions};

@@ -1,15 +1,22 @@
-//! The worlds there are, and their names on a command line. A new world is a line in `worlds!` and a file in `worlds/`.
+//! The worlds there are, and their names on a command line. A new world is a line in `worlds!` and a file in `worlds/`; one that a
+//! program adds without a change here is `own`'s.
 //! It holds no numbers: each world's settings are described beside that world.
 
+use std::collections::BTreeSet;
 use std::fmt;
 use std::str::FromStr;
+use std::sync::{Mutex, PoisonError};
 
-use serde::{Deserialize, Serialize};
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize};
 
+use crate::action_set::ActionSet;
 use crate::environment::{Environment, FrameShape};
 use crate::error::EnvError;
-use crate::settings::{Levels, Variants, WorldSettings};
+use crate::own::{self, OwnWorld};
+use crate::settings::{Levels, Variants, WorldSettings, no_levels};
 use crate::worlds::corridor::CorridorConfig;
+use crate::worlds::exec::ExecConfig;
 use crate::worlds::ising::IsingConfig;
 use crate::worlds::pacman::PacmanConfig;
 use crate::worlds::procgen::ProcgenConfig;
@@ -18,19 +25,38 @@ use crate::worlds::procgen::ProcgenConfig;
 macro_rules! worlds {
     ($($(#[$doc:meta])* $kind:literal $World:ident($Settings:ty);)+) => {
         /// The settings of one world; `kind` in the file says of which.
-        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+        #[derive(Clone, Debug, PartialEq, Serialize)]
         #[serde(tag = "kind")]
         pub enum WorldConfig {
             $($(#[$doc])* #[serde(rename = $kind)] $World($Settings),)+
+            /// One that the program added.
+            #[serde(untagged)]
+            Own(OwnWorld),
         }
 
-        /// Every world: what a file calls it, and which variants of it are worlds of their own.
+        /// Those of this crate.
+        #[derive(Deserialize)]
+        #[serde(tag = "kind")]
+        enum Ours {
+            $(#[serde(rename = $kind)] $World($Settings),)+
+        }
+
+        impl From<Ours> for WorldConfig {
+            fn from(ours: Ours) -> Self {
+                match ours {
+                    $(Ours::$World(settings) => Self::$World(settings)),+
+                }
+            }
+        }
+
+        /// Every world of this crate: what a file calls it, and which variants of it are worlds of their own.
         const KINDS: &[(&str, fn() -> Variants)] = &[$(($kind, <$Settings>::variants)),+];
 
         impl WorldConfig {
             fn settings(&self) -> (&'static str, &dyn WorldSettings) {
                 match self {
-                    $(Self::$World(settings) => ($kind, settings)),+
+                    $(Self::$World(settings) => ($kind, settings),)+
+                    Self::Own(own) => (own.kind(), own.settings()),
                 }
             }
 
@@ -40,7 +66,9 @@ macro_rules! worlds {
             /// A world without levels, or without unseen ones; says what to ask for.
             pub fn with_levels(&self, levels: Levels) -> Result<Self, EnvError> {
                 match self {
-                    $(Self::$World(settings) => settings.with_levels(levels).map(Self::$World)),+
+                    $(Self::$World(settings) => settings.with_levels(levels).map(Self::$World),)+
+                    Self::Own(_) if levels == Levels::Train => Ok(self.clone()),
+                    Self::Own(_) => Err(no_levels()),
                 }
             }
         }
@@ -56,6 +84,31 @@ worlds! {
     "ising" Ising(IsingConfig);
     /// The corridor.
     "chain" Chain(CorridorConfig);
+    /// A process that a command starts.
+    "exec" Exec(ExecConfig);
+}
+
+/// What `libenv:PATH:GAME` begins with: one of Procgen's games, by another build of its library.
+const LIBENV: &str = "libenv";
+
+/// The kind whose games other libraries may have.
+const LIBENV_KIND: &str = "procgen";
+
+impl<'de> Deserialize<'de> for WorldConfig {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let table = toml::Table::deserialize(deserializer)?;
+        let ours = table
+            .get("kind")
+            .and_then(toml::Value::as_str)
+            .is_some_and(|name| KINDS.iter().any(|(kind, _)| *kind == name));
+        if !ours && let Some(own) = OwnWorld::read(&table) {
+            return own.map(Self::Own).map_err(D::Error::custom);
+        }
+        let ours: Ours = table
+            .try_into()
+            .map_err(|e: toml::de::Error| D::Error::custom(e.message()))?;
+        Ok(ours.into())
+    }
 }
 
 impl WorldConfig {
@@ -64,7 +117,8 @@ impl WorldConfig {
         let (kind, settings) = self.settings();
         WorldName {
             kind,
-            variant: settings.variant(),
+            variant: settings.variant().map(kept),
+            library: settings.library().map(kept),
         }
     }
 
@@ -80,8 +134,13 @@ impl WorldConfig {
     }
 
     /// The names of the world's actions; an action is a place in this list.
-    pub fn action_names(&self) -> &'static [&'static str] {
+    pub fn action_names(&self) -> Vec<&str> {
         self.settings().1.action_names()
+    }
+
+    /// Steps a second at which a person plays the game, or can follow it.
+    pub fn steps_per_second(&self) -> f64 {
+        self.settings().1.steps_per_second()
     }
 
     /// Number of the world's actions; valid ones are below it.
@@ -92,6 +151,43 @@ impl WorldConfig {
     /// For each action, the one that it amounts to in this world; an action that stands for itself maps to itself.
     pub fn visible_actions(&self) -> Vec<u8> {
         self.settings().1.visible_actions()
+    }
+
+    /// The actions of `set`, in their order: each is a place in [`action_names`](Self::action_names).
+    pub fn actions(&self, set: ActionSet) -> Vec<u8> {
+        let mut actions = match set {
+            ActionSet::All => (0..self.num_actions()).map(|action| action as u8).collect(),
+            ActionSet::Visible => self.visible_actions(),
+        };
+        actions.sort_unstable();
+        actions.dedup();
+        actions
+    }
+
+    /// The same world by the code that `name` has, where its own code is a person's: a command, or a library. A machine may have them
+    /// elsewhere than the one on which the run was made.
+    ///
+    /// # Errors
+    /// A name of another world.
+    pub fn with_code_of(&self, name: WorldName) -> Result<Self, EnvError> {
+        let mut changed = self.clone();
+        match &mut changed {
+            Self::Exec(config) if let Some(command) = name.command() => {
+                config.command = command.to_owned();
+            }
+            Self::Procgen(config) if let Some(library) = name.library() => {
+                config.library = Some(library.to_owned());
+            }
+            _ => {}
+        }
+        if changed.name() == name {
+            Ok(changed)
+        } else {
+            Err(EnvError::Config(format!(
+                "the run's world is {}, and not {name}",
+                self.name()
+            )))
+        }
     }
 
     /// Whether a run in this world can be resumed: no episode depends on how many were played before.
@@ -129,17 +225,87 @@ impl WorldConfig {
 pub struct WorldName {
     kind: &'static str,
     variant: Option<&'static str>,
+    /// The library that is loaded instead of the world's own.
+    library: Option<&'static str>,
+}
+
+/// A text of a person's own, kept until the process ends: a run has one or two, and names stay small and easy to hand around.
+fn kept(text: &str) -> &'static str {
+    static KEPT: Mutex<BTreeSet<&'static str>> = Mutex::new(BTreeSet::new());
+    let mut all = KEPT.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(known) = all.get(text) {
+        return known;
+    }
+    let new: &'static str = Box::leak(text.into());
+    all.insert(new);
+    new
 }
 
 impl WorldName {
-    /// Every name there is: each of Procgen's games, then the others.
+    /// Every name there is: each of Procgen's games, then the others, then those that the program added. Names that are a person's
+    /// own, such as a command, are not among them.
     pub fn all() -> impl Iterator<Item = WorldName> {
-        KINDS.iter().flat_map(|(kind, variants)| {
-            let names = variants().names;
-            let one = names.is_empty().then_some(None);
+        let ours = KINDS.iter().flat_map(|(kind, variants)| {
+            let Variants { names, is_open, .. } = variants();
+            let one = (names.is_empty() && !is_open).then_some(None);
             let variants = one.into_iter().chain(names.iter().copied().map(Some));
-            variants.map(|variant| WorldName { kind, variant })
+            variants.map(|variant| WorldName {
+                kind,
+                variant,
+                library: None,
+            })
+        });
+        let own = own::kinds().into_iter().map(|kind| WorldName {
+            kind,
+            variant: None,
+            library: None,
+        });
+        ours.chain(own)
+    }
+
+    /// A name with something of a person's own in it, such as a command.
+    fn open(text: &str) -> Option<Self> {
+        let (first, rest) = text.split_once(':')?;
+        if first == LIBENV {
+            let (library, game) = rest.rsplit_once(':')?;
+            let known = Self::all().find(|it| it.kind == LIBENV_KIND && it.variant == Some(game));
+            return known.filter(|_| !library.is_empty()).map(|known| Self {
+                library: Some(kept(library)),
+                ..known
+            });
+        }
+        let (kind, _) = KINDS
+            .iter()
+            .find(|(kind, variants)| *kind == first && variants().is_open)?;
+        (!rest.trim().is_empty()).then(|| Self {
+            kind,
+            variant: Some(kept(rest)),
+            library: None,
         })
+    }
+
+    /// The command that makes the world, if it is a process of its own.
+    pub fn command(self) -> Option<&'static str> {
+        let (_, variants) = KINDS.iter().find(|(kind, _)| *kind == self.kind)?;
+        self.variant.filter(|_| variants().is_open)
+    }
+
+    /// The code that the world brings along, and that is no part of this program: a command, or a library by its path.
+    pub fn foreign_code(self) -> Option<&'static str> {
+        self.command().or(self.library)
+    }
+
+    /// The same world by the engine that belongs to it: what holds of it holds of other builds too.
+    pub const fn with_own_library(self) -> Self {
+        Self {
+            library: None,
+            ..self
+        }
+    }
+
+    /// The library that is loaded instead of the world's own, by its path.
+    pub const fn library(self) -> Option<&'static str> {
+        self.library
     }
 
     /// What a file's `kind` calls the world.
@@ -147,16 +313,21 @@ impl WorldName {
         self.kind
     }
 
-    /// The setting and its value that say which of several worlds of one kind it is.
-    pub fn variant(self) -> Option<(&'static str, &'static str)> {
-        let (_, variants) = KINDS.iter().find(|(kind, _)| *kind == self.kind)?;
-        Some((variants().key, self.variant?))
+    /// The settings and their values that say which of several worlds of one kind it is.
+    pub fn settings(self) -> impl Iterator<Item = (&'static str, &'static str)> {
+        let known = KINDS.iter().find(|(kind, _)| *kind == self.kind);
+        let variant = known.and_then(|(_, variants)| Some((variants().key, self.variant?)));
+        let library = self.library.map(|path| ("library", path));
+        variant.into_iter().chain(library)
     }
 }
 
 impl fmt::Display for WorldName {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.kind)?;
+        match self.library {
+            Some(library) => write!(f, "{LIBENV}:{library}")?,
+            None => f.write_str(self.kind)?,
+        }
         self.variant.map_or(Ok(()), |name| write!(f, ":{name}"))
     }
 }
@@ -166,6 +337,7 @@ impl FromStr for WorldName {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let known = WorldName::all().find(|name| name.to_string() == text);
+        let known = known.or_else(|| WorldName::open(text));
         known.ok_or_else(|| WorldNameError {
             text: text.into(),
             nearest: nearest(text),
@@ -189,8 +361,14 @@ impl fmt::Display for WorldNameError {
         let mut names = Vec::new();
         let mut variants = String::new();
         for (kind, of) in KINDS {
-            let Variants { key, names: of } = of();
-            if of.is_empty() {
+            let Variants {
+                key,
+                names: of,
+                is_open,
+            } = of();
+            if is_open {
+                names.push(format!("{kind}:{}", key.to_uppercase()));
+            } else if of.is_empty() {
                 names.push((*kind).to_owned());
             } else {
                 let key = key.to_uppercase();
@@ -198,6 +376,8 @@ impl fmt::Display for WorldNameError {
                 variants += &format!("; {key} is one of {}", of.join(", "));
             }
         }
+        names.push(format!("{LIBENV}:PATH:GAME"));
+        names.extend(own::kinds().into_iter().map(str::to_owned));
         write!(f, " (the worlds: {}{variants})", names.join(", "))
     }
 }

@@ -28,7 +28,12 @@ pub trait WorldSettings {
     fn frame_shape(&self) -> FrameShape;
 
     /// The names of the actions; an action is a place in this list, so there are at most 256.
-    fn action_names(&self) -> &'static [&'static str];
+    fn action_names(&self) -> Vec<&str>;
+
+    /// Steps a second at which a person plays the game, or can follow it.
+    fn steps_per_second(&self) -> f64 {
+        10.0
+    }
 
     /// Builds `num_envs` copies. Copy i depends on (`seed`, i) and its actions only. `threads` is how many threads of its own
     /// the world may start, 0 for none.
@@ -51,7 +56,12 @@ pub trait WorldSettings {
     }
 
     /// Which of [`variants`](Self::variants) this is.
-    fn variant(&self) -> Option<&'static str> {
+    fn variant(&self) -> Option<&str> {
+        None
+    }
+
+    /// The library that is loaded instead of the world's own, by its path.
+    fn library(&self) -> Option<&str> {
         None
     }
 
@@ -78,9 +88,7 @@ pub trait WorldSettings {
     {
         match levels {
             Levels::Train => Ok(self.clone()),
-            _ => Err(EnvError::Config(
-                "this run's world has no levels: use --levels train".into(),
-            )),
+            _ => Err(no_levels()),
         }
     }
 
@@ -93,6 +101,11 @@ pub trait WorldSettings {
     }
 }
 
+/// What a world without levels says of others than those trained on.
+pub(crate) fn no_levels() -> EnvError {
+    EnvError::Config("this run's world has no levels: use --levels train".into())
+}
+
 /// Kinds of one world, each named on a command line as `world:variant`.
 #[derive(Clone, Copy, Debug)]
 pub struct Variants {
@@ -100,6 +113,8 @@ pub struct Variants {
     pub key: &'static str,
     /// Their names; none for a world that is only one.
     pub names: &'static [&'static str],
+    /// Whether every other name is one too, such as a command.
+    pub is_open: bool,
 }
 
 impl Variants {
@@ -107,5 +122,6 @@ impl Variants {
     pub const NONE: Self = Self {
         key: "",
         names: &[],
+        is_open: false,
     };
 }

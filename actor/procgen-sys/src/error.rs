@@ -152,6 +152,22 @@ pub enum InstallError {
         /// What is wrong with it.
         reason: String,
     },
+    /// Another build of the library that is not there.
+    #[error("the library {}, another build of Procgen's, cannot be found: {reason}", library.display())]
+    NoLibrary {
+        /// The path that was given.
+        library: PathBuf,
+        /// What the system said.
+        reason: String,
+    },
+    /// Another build of the library, without the pictures that it reads.
+    #[error(
+        "the library {} is no engine without its pictures: put Procgen's folder `assets` beside it or beside its folder", library.display()
+    )]
+    NoAssets {
+        /// The library's file.
+        library: PathBuf,
+    },
     /// The file system refused something.
     #[error("installing procgen's engine: {doing} {path}: {source} {WITHOUT_ENGINE}")]
     Io {

@@ -23,6 +23,8 @@ const WAIT_MAX: Duration = Duration::from_secs(120);
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Engine {
     root: PathBuf,
+    library: PathBuf,
+    assets: PathBuf,
 }
 
 impl Engine {
@@ -70,6 +72,34 @@ impl Engine {
         Engine::unpack_into(&Cache::from_env()?, wheel, WHEEL_SHA256, PINNED)
     }
 
+    /// Another build of the engine than the published one, by the path of its library. Its pictures are in the folder `assets`
+    /// beside the library or beside the library's folder, as in Procgen's own source tree. It is code that runs as this user: it is
+    /// loaded as it is, whoever made it.
+    ///
+    /// # Errors
+    /// A library or pictures that are not there, or a machine that cannot run it.
+    pub fn other(library: &Path) -> Result<Engine, InstallError> {
+        library::check_machine()?;
+        // The loader takes a name without a folder for one of the system's.
+        let library = fs::canonicalize(library).map_err(|error| InstallError::NoLibrary {
+            library: library.to_owned(),
+            reason: error.to_string(),
+        })?;
+        let folders = library.ancestors().skip(1).take(2);
+        let assets = folders
+            .map(|folder| folder.join("assets"))
+            .find(|assets| assets.is_dir());
+        let root = library.parent().unwrap_or(&library).to_owned();
+        match assets {
+            Some(assets) => Ok(Engine {
+                root,
+                library,
+                assets,
+            }),
+            None => Err(InstallError::NoAssets { library }),
+        }
+    }
+
     /// The folder that holds everything.
     pub fn root(&self) -> &Path {
         &self.root
@@ -77,12 +107,21 @@ impl Engine {
 
     /// The engine's library.
     pub fn library(&self) -> PathBuf {
-        self.root.join("libenv.so")
+        self.library.clone()
     }
 
     /// The folder of the pictures.
     pub fn assets(&self) -> PathBuf {
-        self.root.join("assets")
+        self.assets.clone()
+    }
+
+    /// The engine that is unpacked in `root`.
+    fn unpacked_in(root: PathBuf) -> Engine {
+        Engine {
+            library: root.join("libenv.so"),
+            assets: root.join("assets"),
+            root,
+        }
     }
 
     fn root_in(cache: &Cache) -> PathBuf {
@@ -206,7 +245,7 @@ impl Engine {
             return Err(InstallError::Missing { root });
         }
         check::check(&root, hashes)?;
-        Ok(Engine { root })
+        Ok(Engine::unpacked_in(root))
     }
 }
 

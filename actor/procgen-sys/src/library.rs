@@ -78,7 +78,8 @@ pub(crate) fn check_machine() -> Result<(), LoadError> {
 }
 
 fn open(path: &Path) -> Result<Api, LoadError> {
-    // SAFETY: running the library's initialisers is what loading means; `check` compared its hash with the pinned one just before.
+    // SAFETY: running the library's initialisers is what loading means; either `check` compared its hash with
+    // the pinned one just before, or a person has named another build.
     let library = unsafe { Library::open(Some(path), RTLD_NOW | RTLD_LOCAL) };
     let library = library.map_err(|error| explain(path, &error.to_string()))?;
     let missing = |error: libloading::Error| LoadError::Other {

@@ -2,14 +2,17 @@
 //! It passes the engine's flags on as they are and does not say what they mean for episodes.
 
 use std::ffi::c_void;
+use std::time::Instant;
 
 use crate::error::{InstallError, ProcgenError};
 use crate::ffi::{self, DTYPE_INT32, DTYPE_UINT8, Handle, LibenvBuffers, LibenvTensortype};
 use crate::game::Game;
 use crate::install::Engine;
 use crate::library::{self, Api};
+use crate::nap::Nap;
 use crate::options::{NUM_ACTIONS, Options, RawOptions};
 use crate::pinned::Pinned;
+use crate::state::State;
 
 /// Rows and columns of a frame.
 pub const FRAME_SIDE: usize = 64;
@@ -24,20 +27,6 @@ pub const RESET: i32 = -1;
 /// fit; states seen are below 100 kB.
 const STATE_BYTES: usize = 1 << 20;
 
-/// A copy's complete state, as the engine wrote it. Only the engine makes one, because it trusts what it reads back.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct State {
-    game: Game,
-    bytes: Vec<u8>,
-}
-
-impl State {
-    /// The engine's bytes.
-    pub fn bytes(&self) -> &[u8] {
-        &self.bytes
-    }
-}
-
 /// N copies of one game. One thread at a time may use it; different ones may be used by different threads.
 pub struct VecGame {
     api: &'static Api,
@@ -45,6 +34,8 @@ pub struct VecGame {
     game: Game,
     num_envs: usize,
     state_bytes: usize,
+    /// How long to leave the engine's own threads alone; `None` where the calling thread steps.
+    nap: Option<Nap>,
     // The engine keeps the addresses of all of these until `close`, which `Drop` calls before they go.
     frames: Pinned<u8>,
     rewards: Pinned<f32>,
@@ -101,6 +92,7 @@ impl VecGame {
             game: options.game,
             num_envs: n,
             state_bytes: STATE_BYTES,
+            nap: (options.num_threads > 0).then(Nap::default),
             frames: Pinned::new(0, n * FRAME_BYTES),
             rewards: Pinned::new(0.0, n),
             first: Pinned::new(0, n),
@@ -184,11 +176,16 @@ impl VecGame {
         }
         // SAFETY: `act` below is the only call during which the engine reads the actions.
         unsafe { self.actions.as_mut_slice() }.copy_from_slice(actions);
+        let started = Instant::now();
         // SAFETY: the handle is open, the buffers are set, and no reference into them is alive thanks to `&mut self`.
-        // `observe` returns once every copy is stepped, so that nothing is written after this.
-        unsafe {
-            (self.api.act)(self.handle);
-            (self.api.observe)(self.handle);
+        unsafe { (self.api.act)(self.handle) };
+        if let Some(nap) = &self.nap {
+            nap.take();
+        }
+        // SAFETY: as for `act`. It returns once every copy is stepped, so that nothing is written after this.
+        unsafe { (self.api.observe)(self.handle) };
+        if let Some(nap) = &mut self.nap {
+            nap.learn(started.elapsed());
         }
         Ok(())
     }
@@ -217,10 +214,7 @@ impl VecGame {
         }
         bytes.truncate(used);
         bytes.shrink_to_fit();
-        Ok(State {
-            game: self.game,
-            bytes,
-        })
+        Ok(State::written_by_engine(self.game, bytes))
     }
 
     /// Puts copy `env` into a state of the same game; its frame, reward and flags become those of that state.
@@ -229,20 +223,21 @@ impl VecGame {
     /// No such copy, or a state of another game.
     pub fn set_state(&mut self, env: usize, state: &State) -> Result<(), ProcgenError> {
         let index = self.index(env)?;
-        if state.game != self.game {
+        if state.game() != self.game {
             return Err(ProcgenError::State(format!(
                 "a state of {} for a copy of {}",
-                state.game, self.game
+                state.game(),
+                self.game
             )));
         }
-        let len = i32::try_from(state.bytes.len()).expect("the engine gave its length as an i32");
+        let len = i32::try_from(state.bytes().len()).expect("the engine gave its length as an i32");
         // SAFETY: the handle is open, its buffers are set, `index` is one of its copies, and the bytes are what the
         // engine wrote for this game. It only reads them; the pointer is `*mut` for want of `const` in its header.
         unsafe {
             (self.api.set_state)(
                 self.handle,
                 index,
-                state.bytes.as_ptr().cast_mut().cast(),
+                state.bytes().as_ptr().cast_mut().cast(),
                 len,
             )
         };

@@ -84,6 +84,16 @@ impl Delivery {
         self.state.finished.load(Ordering::Relaxed)
     }
 
+    /// What the next chunk would wait for now; none if it would not.
+    pub fn waits_in_words(&self) -> Option<&'static str> {
+        let waiting = *self.state.waiting();
+        match self.state.is_held() {
+            true if waiting >= 1 => Some("waits until the rate limiter lets its chunk in"),
+            false if waiting >= self.limit => Some("waits for the replay server's answer"),
+            _ => None,
+        }
+    }
+
     /// Queues a chunk, waiting while too many are not acknowledged: one, where the rate limiter makes chunks wait. `false`: the
     /// thread has ended; [`Self::finish`] says why.
     pub fn send(&self, chunk: Chunk) -> bool {

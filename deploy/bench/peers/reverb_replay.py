@@ -23,7 +23,7 @@ import tensorflow
 
 import measure
 
-STREAMS, FRAME = 8, (64, 64, 3)
+STREAMS, FRAME = 8, (60, 60, 3)  # what driml keeps and sends of a frame of 64 x 64: the part that a convolution reads
 CAPACITY = 20_000
 ROWS = 256
 SPAN = 8
@@ -109,7 +109,7 @@ def batches(address, table, effort):
 
 def main():
     arguments = measure.parser(__doc__)
-    arguments.add_argument("--frames", help=f"raw bytes [steps, {STREAMS}, 64, 64, 3]")
+    arguments.add_argument("--frames", help=f"raw bytes [steps, {STREAMS}, {FRAME}]")
     arguments.add_argument("--serve", type=int, metavar="PORT", help="be the server; for the script itself")
     args = arguments.parse_args()
     if args.serve:

@@ -1,4 +1,4 @@
-//! A bench in a process of its own, with the environment that the launcher gives the parts of a run.
+//! A bench in a process of its own, with the environment that the launcher gives the processes of a run.
 //! It measures nothing itself.
 
 use std::process::{Command, Stdio};
@@ -8,24 +8,26 @@ use driml_launch::managed_process;
 use driml_learner::DeviceName;
 
 use crate::{
-    flags::{BenchFlags, BenchPart},
+    flags::{BenchFlags, Component},
     measurements::{Measurement, Report},
 };
 
-/// Runs this program again for one part's figures. Its progress goes to stderr.
+/// Runs this program again for one component's figures, those that it gives with the flags `more`. Its progress goes to stderr.
 ///
 /// # Errors
 /// A process that could not be started or failed.
 pub(super) fn figures(
-    part: BenchPart,
+    component: Component,
+    more: &[String],
     flags: &BenchFlags,
     device: DeviceName,
 ) -> anyhow::Result<Vec<Measurement>> {
     let program = std::env::current_exe().context("finding this program's own file")?;
     let mut command = Command::new(program);
     command
-        .args(["bench", part.name(), "--here", "--json", "-"])
+        .args(["bench", component.name(), "--here", "--json", "-"])
         .args(["--threads", &flags.threads.to_string()])
+        .args(more)
         .args(flags.quick.then_some("--quick"))
         .args(
             flags
@@ -40,7 +42,7 @@ pub(super) fn figures(
         .stdin(Stdio::null())
         .stderr(Stdio::inherit());
     managed_process::set_thread_env(&mut command, flags.threads);
-    let doing = || format!("measuring the {}", part.name());
+    let doing = || format!("measuring the {}", component.name());
     let output = command.output().with_context(doing)?;
     ensure!(
         output.status.success(),

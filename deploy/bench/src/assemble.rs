@@ -23,7 +23,7 @@ use crate::{
 /// A replay that does not store or sample.
 pub(super) fn measure(recording: &Recording, effort: &Effort) -> anyhow::Result<[Measurement; 2]> {
     let config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
-    let (rows, frame_bytes) = (config.learner.batch_rows, recording.frame_bytes());
+    let (rows, frame_bytes) = (config.learner.batch_size, recording.frame_bytes());
     let mut replay = Replay::new(&config.run, &config.replay, rows)?;
     let join = ActorJoin {
         actor: 0,

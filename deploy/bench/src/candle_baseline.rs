@@ -230,7 +230,7 @@ mod tests {
     #[test]
     fn it_learns_what_the_learner_learns() {
         let small = [
-            "learner.batch_rows=8",
+            "learner.batch_size=8",
             "model.hidden=32",
             "model.rkhs=32",
             "model.action_embed=8",

@@ -67,6 +67,29 @@ impl Effort {
         Ok(durations)
     }
 
+    /// Calls a second of each of `works`, by the median. They take turns, so that a load of the machine meets them alike; each is told
+    /// how many calls it had.
+    ///
+    /// # Errors
+    /// The first of a call's.
+    pub(super) fn rates_in_turn<E>(
+        &self,
+        works: &mut [&mut dyn FnMut(usize) -> Result<(), E>],
+    ) -> Result<Vec<f64>, E> {
+        let mut seconds = vec![Vec::new(); works.len()];
+        let (first, mut calls, warmup) = (Instant::now(), 0, self.warmup_calls as usize);
+        while calls < warmup + self.calls_min || first.elapsed() < self.time_min {
+            for (work, seconds) in works.iter_mut().zip(&mut seconds) {
+                let started = Instant::now();
+                work(calls)?;
+                seconds.push(started.elapsed().as_secs_f64());
+            }
+            calls += 1;
+        }
+        let rate = |seconds: &Vec<f64>| 1.0 / median(&seconds[warmup..]);
+        Ok(seconds.iter().map(rate).collect())
+    }
+
     /// Whether something that began at `started` has been measured for long enough.
     pub(super) fn is_spent(&self, started: Instant) -> bool {
         started.elapsed() >= self.time_min

@@ -1,4 +1,4 @@
-//! Procgen's steps through our wrapper, frames copied out after each as an actor does.
+//! Procgen's steps through our wrapper, or those of other worlds, frames copied out after each as an actor does.
 //! No policy is measured: actions are drawn beforehand.
 
 use driml_envs::StepEnd;
@@ -26,28 +26,49 @@ pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
     let mut figures = Vec::new();
     for game in GAMES {
         for threads in ENGINE_THREADS {
-            let config = settings::of_run(&format!("procgen:{game}"), "c51", "paper", &[])?;
-            let mut world = config.world.build(ENVS, 1, threads)?;
-            let actions: Vec<[u8; ENVS]> = (0..STEPS)
-                .map(|_| std::array::from_fn(|_| rng.random_range(0..15)))
-                .collect();
-            let mut frames = vec![0; ENVS * world.frame_shape().bytes()];
-            let (mut rewards, mut ends) = ([0.0; ENVS], [StepEnd::Running; ENVS]);
-            // A step that starts episodes takes longer than others, so the mean counts.
-            let rate = effort.rate_overall(|| {
-                actions.iter().try_for_each(|actions| {
-                    world.step(actions, &mut rewards, &mut ends)?;
-                    world.observe(&mut frames);
-                    Ok::<_, driml_envs::EnvError>(())
-                })
-            })?;
+            let world = format!("procgen:{game}");
+            let rate = rate(&world, threads, effort, &mut rng)?;
             let name = format!("{game}, {ENVS} copies, {threads} engine threads");
-            figures.push(Measurement::found(
-                name,
-                rate * (STEPS * ENVS) as f64,
-                "steps/s",
-            ));
+            figures.push(Measurement::found(name, rate, "steps/s"));
         }
     }
     Ok(figures)
+}
+
+/// Steps a second of some worlds, each copy's counted.
+///
+/// # Errors
+/// A world that cannot be had or fails.
+pub(super) fn measure_worlds(
+    effort: &Effort,
+    worlds: &[String],
+) -> anyhow::Result<Vec<Measurement>> {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let mut figures = Vec::new();
+    for world in worlds {
+        let rate = rate(world, 0, effort, &mut rng)?;
+        let name = format!("{world}, {ENVS} copies");
+        figures.push(Measurement::found(name, rate, "steps/s"));
+    }
+    Ok(figures)
+}
+
+fn rate(world: &str, threads: usize, effort: &Effort, rng: &mut ChaCha8Rng) -> anyhow::Result<f64> {
+    let config = settings::of_run(world, "c51", "paper", &[])?;
+    let mut world = config.world.build(ENVS, 1, threads)?;
+    let num_actions = world.num_actions() as u8;
+    let actions: Vec<[u8; ENVS]> = (0..STEPS)
+        .map(|_| std::array::from_fn(|_| rng.random_range(0..num_actions)))
+        .collect();
+    let mut frames = vec![0; ENVS * world.frame_shape().bytes()];
+    let (mut rewards, mut ends) = ([0.0; ENVS], [StepEnd::Running; ENVS]);
+    // A step that starts episodes takes longer than others, so the mean counts.
+    let calls = effort.rate_overall(|| {
+        actions.iter().try_for_each(|actions| {
+            world.step(actions, &mut rewards, &mut ends)?;
+            world.observe(&mut frames);
+            Ok::<_, driml_envs::EnvError>(())
+        })
+    })?;
+    Ok(calls * (STEPS * ENVS) as f64)
 }

@@ -4,8 +4,9 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
+use driml_envs::WorldName;
 use driml_learner::{DeviceName, Precision};
-use driml_machine::device::DeviceFlag;
+use driml_machine::{device::DeviceFlag, whole_number};
 
 /// What to measure.
 #[derive(Debug, Subcommand)]
@@ -15,9 +16,9 @@ pub enum BenchCommand {
     /// Frames through an actor's policy
     Policy(BenchFlags),
     /// Transitions into a replay server and batches out of it, over the wire; and its batches without the wire
-    Replay(BenchFlags),
-    /// Procgen's steps through our wrapper
-    Env(BenchFlags),
+    Replay(BenchReplayArgs),
+    /// Procgen's steps through our wrapper, or those of other worlds
+    Env(BenchEnvArgs),
     /// A short run with real processes: its speed, how long the learner computes and waits, its memory
     System(BenchSystemArgs),
     /// More and more actors, synthetic and real: what is stored and served, how long each waits, how old the weights are
@@ -41,7 +42,7 @@ pub struct BenchFlags {
     /// Precision of products, for the learner and the policy; may be given several times [default: both]
     #[arg(long, value_name = "PRECISION")]
     pub(crate) precision: Vec<Precision>,
-    /// Measure in this very process, whose environment is already that of a part
+    /// Measure in this very process, whose environment is already that of a run's process
     #[arg(long, hide = true)]
     pub(crate) here: bool,
 }
@@ -64,8 +65,53 @@ impl BenchFlags {
 /// What `driml bench learner` takes.
 #[derive(Clone, Debug, Args)]
 pub struct BenchLearnerArgs {
+    /// Instead: C51 + global DIM as batch, observation, atoms and vectors grow, beside the FLOPs of an update
+    #[arg(long)]
+    pub(crate) growth: bool,
+    /// Instead: driml-ada on batches that random play gave in these worlds, equal states computed once and each
+    #[arg(
+        long,
+        value_name = "WORLD,..",
+        value_delimiter = ',',
+        conflicts_with = "growth"
+    )]
+    pub(crate) played: Vec<WorldName>,
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
+    #[command(flatten)]
+    pub(crate) flags: BenchFlags,
+}
+
+/// What `driml bench env` takes.
+#[derive(Clone, Debug, Args)]
+pub struct BenchEnvArgs {
+    /// Instead: this world, such as "exec:COMMAND"; may be given several times
+    #[arg(long, value_name = "WORLD")]
+    pub(crate) env: Vec<String>,
+    #[command(flatten)]
+    pub(crate) flags: BenchFlags,
+}
+
+/// What `driml bench replay` takes.
+#[derive(Clone, Debug, Args)]
+pub struct BenchReplayArgs {
+    /// Instead: a server that keeps its replay on disk in this folder, which is emptied, in turn with one that does not; and how long it
+    /// takes to read it back
+    #[arg(long, value_name = "DIR")]
+    pub(crate) replay_dir: Option<PathBuf>,
+    /// Instead: rows drawn uniformly and by priority, without a wire
+    #[arg(long, conflicts_with_all = ["replay_dir", "tls_dir"])]
+    pub(crate) sampling: bool,
+    /// With --replay-dir: transitions that are held and read back, of 10.8 kB each. With --sampling: transitions that are held, of 96
+    /// bytes each
+    #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = whole_number::within(1_000..=100_000_000))]
+    pub(crate) held: u64,
+    /// With --replay-dir: rounds of both
+    #[arg(long, value_name = "N", default_value_t = 3, requires = "replay_dir")]
+    pub(crate) rounds: u32,
+    /// Instead: over TCP and over QUIC, with the certificates of replay-server, observer, learner and actors 1 to 5 in this folder
+    #[arg(long, value_name = "DIR", conflicts_with = "replay_dir")]
+    pub(crate) tls_dir: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) flags: BenchFlags,
 }
@@ -74,7 +120,7 @@ pub struct BenchLearnerArgs {
 #[derive(Debug, Args)]
 pub struct BenchSystemArgs {
     /// Frames of the run [default: 12000, or 2500 with --quick]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(2_000..=100_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(2_000..=100_000_000))]
     pub(crate) frames: Option<u64>,
     #[command(flatten)]
     pub(crate) flags: BenchFlags,
@@ -124,9 +170,9 @@ fn rate(text: &str) -> Result<f64, String> {
 /// What `driml bench peers` takes.
 #[derive(Debug, Args)]
 pub struct BenchPeersArgs {
-    /// Only these parts
-    #[arg(long, value_enum, value_delimiter = ',', value_name = "PARTS")]
-    pub(crate) only: Vec<BenchPart>,
+    /// Only these components
+    #[arg(long, value_enum, value_delimiter = ',', value_name = "COMPONENTS")]
+    pub(crate) only: Vec<Component>,
     /// Rounds of ours, theirs [default: 5, or 1 with --quick]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) rounds: Option<u32>,
@@ -146,21 +192,21 @@ pub struct BenchPeersArgs {
     pub(crate) flags: BenchFlags,
 }
 
-/// A part that is measured by itself, and beside a peer.
+/// A component that is measured by itself, and beside a peer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
-pub enum BenchPart {
-    /// Beside PyTorch
+pub enum Component {
+    /// Updates, beside PyTorch's
     Learner,
-    /// Beside PyTorch
+    /// Frames through the policy, beside PyTorch's
     Policy,
-    /// Beside Reverb
+    /// Inserts and batches, beside Reverb's
     Replay,
-    /// Beside gym3
+    /// Steps of Procgen, beside gym3's
     Env,
 }
 
-impl BenchPart {
-    /// As the command line has it.
+impl Component {
+    /// Its name on the command line.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Learner => "learner",

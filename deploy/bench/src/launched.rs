@@ -32,7 +32,7 @@ const WAIT_MAX: Duration = Duration::from_secs(300);
 /// Exit code of a run that was interrupted.
 const INTERRUPTED: i32 = 130;
 
-/// What the parts said of themselves, and when.
+/// What the processes said of themselves, and when.
 #[derive(Clone)]
 pub(super) struct Moment {
     pub(super) at: Instant,
@@ -40,7 +40,7 @@ pub(super) struct Moment {
     pub(super) learner: LearnerStatus,
 }
 
-/// A launcher, which ends its parts when it is killed.
+/// A launcher, which ends its processes when it is killed.
 pub(super) struct Launched {
     launcher: Child,
     statuses: Statuses,
@@ -74,7 +74,7 @@ impl Launched {
         })
     }
 
-    /// What the parts say now; none while they do not answer, as they start after the replay server and end before it.
+    /// What the processes say now; none while they do not answer, as they start after the replay server and end before it.
     ///
     /// # Errors
     /// The run has ended.

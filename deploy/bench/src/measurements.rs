@@ -1,4 +1,4 @@
-//! What a bench found, for a person and as JSON.
+//! What a bench found, as a table and as JSON.
 //! It measures nothing and compares nothing.
 
 use std::{fs, path::Path};
@@ -6,6 +6,7 @@ use std::{fs, path::Path};
 use anyhow::Context;
 use driml_launch::console::{self, print};
 use driml_learner::{DeviceName, Precision};
+use driml_machine::resources::{self, Machine};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::{flags::BenchFlags, table};
@@ -22,7 +23,7 @@ pub(super) struct Measurement {
 }
 
 impl Measurement {
-    /// A figure, which is told to whoever watches stderr.
+    /// A figure, which is printed to stderr at once.
     pub(super) fn found(what: impl Into<String>, value: f64, unit: &str) -> Self {
         let (what, unit) = (what.into(), unit.to_owned());
         console::line(&format!("  {what}: {} {unit}", table::number(value)));
@@ -45,12 +46,11 @@ pub(super) struct MachineNote {
 }
 
 impl MachineNote {
-    /// This one.
+    /// What this machine is, and how busy it is now.
     pub(super) fn this() -> Self {
-        let cpuinfo = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
         Self {
-            processor: processor(&cpuinfo).unwrap_or("unknown").to_owned(),
-            cores: driml_machine::resources::Machine::this().cores,
+            processor: resources::processor(),
+            cores: Machine::this().cores,
             load: load(&fs::read_to_string("/proc/loadavg").unwrap_or_default()).unwrap_or(0.0),
             gpu: None,
         }
@@ -86,19 +86,10 @@ fn load(loadavg: &str) -> Option<f64> {
     loadavg.split_whitespace().next()?.parse().ok()
 }
 
-/// The processor's name in the kernel's table.
-fn processor(cpuinfo: &str) -> Option<&str> {
-    let mut lines = cpuinfo.lines();
-    let (_, name) = lines
-        .find(|line| line.starts_with("model name"))?
-        .split_once(':')?;
-    Some(name.trim())
-}
-
 /// A bench's figures as JSON has them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Report {
-    /// Which bench.
+    /// The name of the bench that measured.
     pub(super) bench: String,
     /// Whether it took a few iterations only.
     pub(super) quick: bool,
@@ -174,10 +165,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_machine_is_described() {
-        let cpuinfo = "processor\t: 0\nmodel name\t: AMD EPYC 9999\nflags\t: fpu\n";
-        assert_eq!(processor(cpuinfo), Some("AMD EPYC 9999"));
-        assert_eq!(processor(""), None);
+    fn the_load_is_described() {
         assert_eq!(load("6.60 5.35 4.10 3/200 1234"), Some(6.6));
     }
 

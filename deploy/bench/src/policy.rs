@@ -23,7 +23,8 @@ const PRESETS: [&str; 2] = ["paper", "paper-observation"];
 pub(super) fn measure(effort: &Effort, precision: Precision) -> anyhow::Result<Vec<Measurement>> {
     let mut figures = Vec::new();
     for preset in PRESETS {
-        let model = settings::of_run(settings::WORLD, "c51", preset, &[])?.model;
+        let config = settings::of_run(settings::WORLD, "c51", preset, &[])?;
+        let model = config.with_whole_frames()?.model;
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let parameters = Parameters::init(&model, &mut rng, &candle_core::Device::Cpu)?;
         let mut policy =

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use driml_envs::StepEnd;
+use driml_envs::{CutFrames, StepEnd};
 use driml_launch::console;
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 use rand::{Rng, SeedableRng};
@@ -22,7 +22,7 @@ pub(super) struct Recording {
     frame_bytes: usize,
     /// [STEPS, STREAMS, frame bytes].
     frames: Vec<u8>,
-    /// [STEPS, STREAMS].
+    /// Action, reward and end of each step [STEPS, STREAMS].
     steps: Vec<(u8, f32, End)>,
 }
 
@@ -34,7 +34,11 @@ impl Recording {
     pub(super) fn play() -> anyhow::Result<Self> {
         procgen_sys::Engine::install(&mut console::line)?;
         let config = settings::of_run(settings::WORLD, "c51", "paper", &[])?;
-        let mut world = config.world.build(STREAMS, 1, 0)?;
+        let sent = (
+            config.run.frame_height as usize,
+            config.run.frame_width as usize,
+        );
+        let mut world = CutFrames::of(config.world.build(STREAMS, 1, 0)?, sent)?;
         let frame_bytes = world.frame_shape().bytes();
         let mut frames = vec![0; STEPS * STREAMS * frame_bytes];
         let mut steps = Vec::with_capacity(STEPS * STREAMS);
@@ -70,7 +74,7 @@ impl Recording {
         self.frame_bytes
     }
 
-    /// Chunk after chunk of one actor, so many steps of the first so many streams each, in memory of `pool`; the recording
+    /// Chunk after chunk of one actor, `steps` steps of the first `streams` streams each, in memory of `pool`; the recording
     /// plays round and round.
     pub(super) fn chunks(
         &self,
@@ -118,7 +122,7 @@ impl Chunks<'_> {
         self.next.weights_version = version;
     }
 
-    /// The next chunk, of so many steps.
+    /// The next chunk, of `steps` steps.
     pub(super) fn next_of(&mut self, steps: u32) -> Chunk {
         self.next.steps = steps;
         let Recording {

@@ -3,7 +3,7 @@
 
 use std::{
     hint::black_box,
-    path::Path,
+    path::{Path, PathBuf},
     time::{Duration, Instant},
 };
 
@@ -15,12 +15,13 @@ use driml_launch::{
     managed_process::{ManagedProcess, Surroundings},
 };
 use driml_learner::{
-    LearnerPart,
+    LearnerConfig,
     remote::batch_source::{BatchSource, Next, Requests},
 };
 use driml_protocol::{
-    Keys, RunClient, Shutdown, join,
-    session::{self, Endpoints},
+    BufferPool, Keys, RunClient, Shutdown, join,
+    session::{self, Endpoints, MESSAGE_BYTES_MAX, SessionError},
+    tls::{Credentials, Role, TlsError},
 };
 use zenoh::{Session, Wait};
 
@@ -30,9 +31,9 @@ use crate::{
 };
 
 /// Transitions of a chunk: streams and steps of each. An actor of 16 copies sends the last size.
-const CHUNKS: [(u32, u32); 4] = [(4, 1), (8, 4), (8, 16), (8, 32)];
+pub(super) const CHUNKS: [(u32, u32); 4] = [(4, 1), (8, 4), (8, 16), (8, 32)];
 /// How long the server may take to listen, and a batch or an insert to come.
-const ANSWER_MAX: Duration = Duration::from_secs(30);
+pub(super) const ANSWER_MAX: Duration = Duration::from_secs(30);
 
 /// Transitions stored a second and batches a second, over each wire; batches without a wire, and a plain copy.
 ///
@@ -48,21 +49,82 @@ pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
         ("unix socket", format!("unixsock-stream/{socket}"), false),
         ("tcp", format!("tcp/{}", free_port()?), false),
     ];
-    for (wire, endpoint, shared_memory) in wires {
-        let mut run = Run::start(&endpoint, shared_memory, folder.path())?;
-        run.deliver(&recording, CHUNKS[3], |sent, _| sent >= settings::CAPACITY)?;
-        for chunk in CHUNKS {
-            let transitions = chunk.0 * chunk.1;
-            let rate = run.deliver(&recording, chunk, |_, started| effort.is_spent(started))?;
-            let name = format!("insert, {transitions} transitions a chunk, {wire}");
-            figures.push(Measurement::found(name, rate, "transitions/s"));
-        }
-        let (rate, name) = (run.fetch(effort)?, format!("batch of 3 states, {wire}"));
-        figures.push(Measurement::found(name, rate, "batches/s"));
-        run.end();
+    for (name, endpoint, shared_memory) in wires {
+        let wire = Wire {
+            endpoint: &endpoint,
+            shared_memory,
+            tls_dir: None,
+        };
+        let run = Run::start(wire, folder.path(), &[])?;
+        figures.extend(over_wire(name, run, &recording, effort)?);
     }
     figures.extend(assemble::measure(&recording, effort)?);
     Ok(figures)
+}
+
+/// The same over TCP and, with the certificates in `tls_dir`, over QUIC.
+///
+/// # Errors
+/// As [`measure`]; certificates that are missing or not good.
+pub(super) fn measure_guarded(effort: &Effort, tls_dir: &Path) -> anyhow::Result<Vec<Measurement>> {
+    let recording = Recording::play()?;
+    let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
+    let mut figures = Vec::new();
+    for (name, tls_dir) in [("tcp", None), ("quic", Some(tls_dir))] {
+        let endpoint = format!("{name}/{}", free_port()?);
+        let wire = Wire {
+            endpoint: &endpoint,
+            shared_memory: false,
+            tls_dir,
+        };
+        let run = Run::start(wire, folder.path(), &[])?;
+        figures.extend(over_wire(name, run, &recording, effort)?);
+    }
+    Ok(figures)
+}
+
+/// Transitions stored a second and batches a second over the wire of this name.
+fn over_wire(
+    wire: &str,
+    mut run: Run,
+    recording: &Recording,
+    effort: &Effort,
+) -> anyhow::Result<Vec<Measurement>> {
+    let mut figures = Vec::new();
+    run.deliver(recording, CHUNKS[3], |sent, _| sent >= settings::CAPACITY)?;
+    for chunk in CHUNKS {
+        let transitions = chunk.0 * chunk.1;
+        let rate = run.deliver(recording, chunk, |_, started| effort.is_spent(started))?;
+        let name = format!("insert, {transitions} transitions a chunk, {wire}");
+        figures.push(Measurement::found(name, rate, "transitions/s"));
+    }
+    let (rate, name) = (run.fetch(effort)?, format!("batch of 3 states, {wire}"));
+    figures.push(Measurement::found(name, rate, "batches/s"));
+    run.end();
+    Ok(figures)
+}
+
+/// How clients reach a server.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Wire<'a> {
+    pub(super) endpoint: &'a str,
+    pub(super) shared_memory: bool,
+    /// Certificates for all roles, if it is guarded.
+    pub(super) tls_dir: Option<&'a Path>,
+}
+
+impl Wire<'_> {
+    fn endpoints(&self) -> Endpoints {
+        Endpoints {
+            listen: Vec::new(),
+            connect: vec![self.endpoint.to_owned()],
+        }
+    }
+
+    fn credentials(&self, role: Role) -> Result<Option<Credentials>, TlsError> {
+        let read = |folder| Credentials::read(folder, role);
+        self.tls_dir.map(read).transpose()
+    }
 }
 
 /// A free port at the loopback address: the system's choice, given back at once.
@@ -71,19 +133,27 @@ fn free_port() -> std::io::Result<std::net::SocketAddr> {
 }
 
 /// A replay server and a client of its run.
-struct Run {
+pub(super) struct Run {
     server: ManagedProcess,
-    session: Session,
+    /// The first may do anything where nothing is guarded, else only look; then each role has one of its own.
+    sessions: Vec<Session>,
+    guarded: Option<(Endpoints, PathBuf)>,
     keys: Keys,
     actor: ActorSettings,
-    learner: LearnerPart,
+    pub(super) learner: LearnerConfig,
     /// Deliveries so far; each is another actor.
     deliveries: u32,
 }
 
 impl Run {
-    fn start(endpoint: &str, shared_memory: bool, folder: &Path) -> anyhow::Result<Self> {
-        let words = ["replay-server", "--listen", endpoint];
+    /// Starts a server whose flags are those of every bench and `more`.
+    pub(super) fn start(wire: Wire<'_>, folder: &Path, more: &[String]) -> anyhow::Result<Self> {
+        let Wire {
+            endpoint,
+            shared_memory,
+            tls_dir,
+        } = wire;
+        let words = ["replay-server", "--stay", "--listen", endpoint];
         let run = ["--env", settings::WORLD, "--agent", settings::AGENT];
         let transport = format!("transport.shared_memory={shared_memory}");
         let sets = settings::REPLAY.into_iter().chain([transport.as_str()]);
@@ -91,6 +161,8 @@ impl Run {
         let args: Vec<String> = words
             .chain(sets.flat_map(|set| ["--set", set]))
             .map(Into::into)
+            .chain(tls_dir.map(|dir| format!("--tls-dir={}", dir.display())))
+            .chain(more.iter().cloned())
             .collect();
         let surroundings = Surroundings {
             logs: folder,
@@ -98,32 +170,34 @@ impl Run {
             meeting: None,
         };
         let mut server = ManagedProcess::start("replay-server", &args, 1, surroundings)?;
-        let session = reach(endpoint, &mut server)?;
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
+        let credentials = wire.credentials(Role::Observer)?;
+        let endpoints = wire.endpoints();
+        let session = reach(&mut server, || {
+            session::open_as(&endpoints, &keys, credentials.as_ref(), MESSAGE_BYTES_MAX)
+        })?;
         let hello = join::hello(&session, &keys, &Shutdown::default())?
             .context("nobody told this client to stop")?;
         Ok(Self {
             server,
-            session,
+            sessions: vec![session],
+            guarded: tls_dir.map(|dir| (endpoints, dir.to_owned())),
             keys,
             actor: ActorSettings::from_toml(&hello.config_toml)?,
-            learner: LearnerPart::from_toml(&hello.config_toml)?,
+            learner: LearnerConfig::from_toml(&hello.config_toml)?,
             deliveries: 0,
         })
     }
 
     /// Delivers chunks until `is_enough` of what was sent and since when, and gives transitions stored a second, from the
     /// first chunk's making to the last one's acknowledgement.
-    fn deliver(
+    pub(super) fn deliver(
         &mut self,
         recording: &Recording,
         chunk: (u32, u32),
         is_enough: impl Fn(u64, Instant) -> bool,
     ) -> anyhow::Result<f64> {
-        let pool = self.actor.chunk_memory();
-        self.deliveries += 1;
-        let (spec_hash, actor) = (self.actor.spec.hash(), self.deliveries);
-        let client = self.client(spec_hash);
+        let (client, actor, pool) = self.next_actor()?;
         let alive = taking_part::join_as_actor(&client, actor)?;
         let delivery = Delivery::start(
             client,
@@ -147,26 +221,68 @@ impl Run {
         Ok(chunks.transitions() as f64 / seconds)
     }
 
-    fn client(&self, spec_hash: u64) -> RunClient {
-        RunClient::new(self.session.clone(), self.keys.clone(), spec_hash)
+    /// A client of an actor that has not been there before, its number, and memory for its chunks.
+    ///
+    /// # Errors
+    /// A certificate that is missing, a server that does not answer.
+    pub(super) fn next_actor(&mut self) -> anyhow::Result<(RunClient, u32, BufferPool)> {
+        self.deliveries += 1;
+        let role = Role::Actor(self.deliveries);
+        let client = self.client(role, self.actor.spec.hash())?;
+        Ok((client, self.deliveries, self.actor.chunk_memory()))
+    }
+
+    /// A client of the learner.
+    ///
+    /// # Errors
+    /// As [`Run::next_actor`].
+    pub(super) fn learner_client(&mut self) -> anyhow::Result<RunClient> {
+        self.client(Role::Learner, self.learner.spec.hash())
+    }
+
+    /// Ends the server at once, as when its process dies.
+    pub(super) fn kill(mut self) {
+        self.close();
+        self.server.kill();
+        self.server
+            .wait_until(Instant::now() + ANSWER_MAX, || false);
+    }
+
+    fn client(&mut self, role: Role, spec_hash: u64) -> anyhow::Result<RunClient> {
+        let session = match &self.guarded {
+            None => self.sessions[0].clone(),
+            Some((endpoints, dir)) => {
+                let own = Credentials::read(dir, role)?;
+                let session =
+                    session::open_as(endpoints, &self.keys, Some(&own), MESSAGE_BYTES_MAX)?;
+                self.sessions.push(session.clone());
+                session
+            }
+        };
+        Ok(RunClient::new(session, self.keys.clone(), spec_hash))
+    }
+
+    fn close(&self) {
+        for session in &self.sessions {
+            if let Err(e) = session.close().wait() {
+                tracing::debug!("closing a session: {e}");
+            }
+        }
     }
 
     /// Batches a second, each read as a learner would.
-    fn fetch(&self, effort: &Effort) -> anyhow::Result<f64> {
+    fn fetch(&mut self, effort: &Effort) -> anyhow::Result<f64> {
         let shutdown = Shutdown::default();
-        let LearnerPart {
-            spec,
-            learner,
-            transport,
-            ..
+        let client = self.learner_client()?;
+        let LearnerConfig {
+            learner, transport, ..
         } = &self.learner;
-        let client = self.client(spec.hash());
         let _alive = taking_part::join_as_learner(&client)?;
         let mut source = BatchSource::start(
             std::slice::from_ref(&client),
             Requests {
                 learner: taking_part::LEARNER,
-                rows: learner.batch_rows,
+                rows: learner.batch_size,
                 in_flight: learner.batches_in_flight,
                 shared_memory: transport.shared_memory,
                 unreachable_max: ANSWER_MAX,
@@ -179,7 +295,9 @@ impl Run {
                 black_box(planes.map(touched));
                 Ok(())
             }
-            Next::NotYet => bail!("no batch came within {} s", ANSWER_MAX.as_secs()),
+            Next::NotYet(waiting) => {
+                bail!("no batch came within {} s: {waiting}", ANSWER_MAX.as_secs())
+            }
             Next::Finished => bail!("the replay server says that the run is over"),
         });
         // A request that is on its way wants its answer before the session is closed.
@@ -188,10 +306,8 @@ impl Run {
         rate
     }
 
-    fn end(mut self) {
-        if let Err(e) = self.session.close().wait() {
-            tracing::debug!("closing the session: {e}");
-        }
+    pub(super) fn end(mut self) {
+        self.close();
         self.server.ask_to_stop();
         self.server
             .wait_until(Instant::now() + ANSWER_MAX, || false);
@@ -199,14 +315,13 @@ impl Run {
 }
 
 /// A session to the server as soon as it listens.
-pub(super) fn reach(endpoint: &str, server: &mut ManagedProcess) -> anyhow::Result<Session> {
-    let endpoints = Endpoints {
-        listen: Vec::new(),
-        connect: vec![endpoint.to_owned()],
-    };
+pub(super) fn reach(
+    server: &mut ManagedProcess,
+    open: impl Fn() -> Result<Session, SessionError>,
+) -> anyhow::Result<Session> {
     let deadline = Instant::now() + ANSWER_MAX;
     loop {
-        match session::open(&endpoints) {
+        match open() {
             Ok(session) => return Ok(session),
             Err(e) if Instant::now() > deadline => return Err(e.into()),
             Err(_) if server.end().is_some() => bail!("{}", server.exit_report()),
@@ -216,6 +331,6 @@ pub(super) fn reach(endpoint: &str, server: &mut ManagedProcess) -> anyhow::Resu
 }
 
 /// A sum over one byte of each cache line, so that all of a plane has come.
-fn touched(plane: &[u8]) -> u64 {
+pub(super) fn touched(plane: &[u8]) -> u64 {
     plane.iter().step_by(64).map(|&byte| u64::from(byte)).sum()
 }

@@ -3,8 +3,9 @@
 
 use driml_machine::{error::Usage, resources::Machine};
 use driml_settings::{
-    config::{Flags, RunConfig},
+    config::RunConfig,
     flags::{self, RunFlags},
+    resolve::Flags,
 };
 
 /// The world where it does not matter which.

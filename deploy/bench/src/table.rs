@@ -1,4 +1,4 @@
-//! Columns of text and numbers for a person.
+//! Columns of text and numbers, aligned.
 //! It knows no bench.
 
 /// Rows as lines whose columns are aligned: to the left, or to the right for the columns in `right`.

@@ -21,13 +21,7 @@ const UPLOAD_MAX: Duration = Duration::from_secs(10);
 /// # Errors
 /// The replay server does not answer or refuses.
 pub(super) fn join_as_actor(client: &RunClient, actor: u32) -> anyhow::Result<LivelinessToken> {
-    let alive = alive(
-        client,
-        Alive::Actor {
-            actor,
-            incarnation: INCARNATION,
-        },
-    )?;
+    let alive = alive(client, Alive::actor(actor, INCARNATION))?;
     let join = ActorJoin {
         actor,
         incarnation: INCARNATION,
@@ -42,7 +36,7 @@ pub(super) fn join_as_actor(client: &RunClient, actor: u32) -> anyhow::Result<Li
 /// # Errors
 /// As [`join_as_actor`].
 pub(super) fn join_as_learner(client: &RunClient) -> anyhow::Result<LivelinessToken> {
-    let alive = alive(client, Alive::Learner(LEARNER))?;
+    let alive = alive(client, Alive::learner(LEARNER))?;
     let join = LearnerJoin {
         learner: LEARNER,
         rows_sampled: 0,
@@ -57,7 +51,7 @@ fn alive(client: &RunClient, who: Alive) -> anyhow::Result<LivelinessToken> {
     token.map_err(|e| anyhow::anyhow!("declaring a client alive: {e}"))
 }
 
-/// Hands over weights, as the learner does after so many `updates`.
+/// Hands over weights, as the learner does after `updates` updates.
 ///
 /// # Errors
 /// The replay server does not answer or refuses.

@@ -122,7 +122,7 @@ mod tests {
 
     #[test]
     fn the_interquartile_mean_leaves_out_both_ends() {
-        // As scipy.stats.trim_mean(_, 0.25) has it: of ten values two go at each end.
+        // As in scipy.stats.trim_mean(_, 0.25): of ten values two are dropped at each end.
         let scores: Vec<f64> = (0..10).map(|i| f64::from(i * i)).collect();
         let expected = (4.0 + 9.0 + 16.0 + 25.0 + 36.0 + 49.0) / 6.0;
         assert_eq!(interquartile_mean(scores.iter()), expected);

@@ -4,6 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
+use driml_machine::whole_number;
 use serde::de::DeserializeOwned;
 
 /// The paper's experiments.
@@ -17,6 +18,8 @@ pub enum ExperimentCommand {
     Pacman(PacmanArgs),
     /// Table 1: agents on Procgen's games, from a queue of whole runs
     Procgen(ProcgenArgs),
+    /// Every numeric routine at the extremes of its range beside float64: what it promises, and the worst that was found
+    Stability(ExperimentFlags),
 }
 
 /// What every experiment takes.
@@ -58,10 +61,10 @@ pub struct PacmanArgs {
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) agents: Vec<String>,
     /// Frames of each run with ghosts that move at random (a)
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1_000..=1_000_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(1_000..=1_000_000_000))]
     pub(crate) frames: Option<u64>,
     /// Episodes until the next ghost is the lethal one (b, c); the paper's are 5000
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(1..=10_000_000))]
     pub(crate) episodes_per_task: Option<u64>,
 }
 
@@ -79,7 +82,7 @@ pub struct ProcgenArgs {
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) agents: Vec<String>,
     /// Frames of each run; the paper's are 50000000
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(500..=1_000_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(500..=1_000_000_000))]
     pub(crate) frames: Option<u64>,
     /// Episodes played with each run's weights on each kind of levels
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
@@ -90,6 +93,102 @@ pub struct ProcgenArgs {
     /// Instead: short runs of c51 on every game, to see on which it learns soonest
     #[arg(long)]
     pub(crate) screen: bool,
+}
+
+/// What `driml tradeoff` takes.
+#[derive(Clone, Debug, Args)]
+pub struct TradeoffArgs {
+    /// World, such as mspacman, coinrun or chain
+    #[arg(long, value_name = "WORLD", default_value = "mspacman")]
+    pub(crate) env: String,
+    /// Minutes of this machine for the runs that are not there yet; it decides how many levels fit, each with all its seeds
+    #[arg(long, value_name = "MINUTES", default_value_t = 180, value_parser = clap::value_parser!(u32).range(0..=100_000))]
+    pub(crate) budget: u32,
+    /// Dials, such as learner.precision,DIM [default: all that the world has; a wrong name lists them]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) dials: Vec<String>,
+    /// Measure speeds and print the plan; run nothing
+    #[arg(long)]
+    pub(crate) plan: bool,
+    /// Frames of each run [default: as the world's settings say, fewer where the budget is small]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(1_000..=1_000_000_000))]
+    pub(crate) frames: Option<u64>,
+    /// Episodes played with each run's weights [default: 100]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub(crate) episodes: Option<u32>,
+    #[command(flatten)]
+    pub(crate) flags: ExperimentFlags,
+    #[command(flatten)]
+    pub(crate) queue: QueueFlags,
+}
+
+/// What `driml grid` takes.
+#[derive(Clone, Debug, Args)]
+pub struct GridArgs {
+    /// Worlds, such as coinrun,maze or mspacman [default: as `driml local`]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) env: Vec<String>,
+    /// Agents, such as c51,driml-ada [default: as `driml local`]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) agent: Vec<String>,
+    /// Named settings of every run; `driml presets` lists them
+    #[arg(long, value_name = "NAME")]
+    pub(crate) preset: Option<String>,
+    /// Frames of each run
+    #[arg(long, value_name = "N", value_parser = whole_number::within(1..=i64::MAX as u64))]
+    pub(crate) frames: Option<u64>,
+    /// A setting by its dotted path and the values that it is to have, such as learner.batch_size=64,256; may be given several times:
+    /// every combination is made
+    #[arg(long = "set", value_name = "KEY=VALUE,..")]
+    pub(crate) sets: Vec<String>,
+    /// Seeds 1 to N of every combination
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub(crate) seeds: u32,
+    /// Runs at once, which share the cores
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub(crate) jobs: u32,
+    /// Start nothing: table and plot of the runs that are finished
+    #[arg(long)]
+    pub(crate) report: bool,
+    /// Where runs, table and plot go; a grid that was stopped goes on there [default: experiments/grid]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+}
+
+impl GridArgs {
+    /// Where it works, as experiments say it.
+    pub(crate) fn folder(&self) -> ExperimentFlags {
+        ExperimentFlags {
+            smoke: false,
+            out: self.out.clone(),
+            seeds: None,
+        }
+    }
+}
+
+#[cfg(test)]
+impl TradeoffArgs {
+    /// A call that names the world alone.
+    pub(crate) fn of(env: &str, smoke: bool) -> Self {
+        Self {
+            env: env.into(),
+            budget: 180,
+            dials: Vec::new(),
+            plan: false,
+            frames: None,
+            episodes: None,
+            flags: ExperimentFlags {
+                smoke,
+                out: None,
+                seeds: None,
+            },
+            queue: QueueFlags {
+                jobs: None,
+                report: false,
+                sets: Vec::new(),
+            },
+        }
+    }
 }
 
 /// The settings of an experiment, of its full or its smoke length; both are built in.
@@ -108,7 +207,7 @@ pub(crate) fn settings<T: DeserializeOwned>(
     })
 }
 
-/// The command that repeats an experiment, as its page has it.
+/// The command that repeats an experiment, for its page.
 pub(crate) fn command_line(name: &str, flags: &ExperimentFlags, out: &Path) -> String {
     let mut words = format!("driml experiment {name}");
     if flags.smoke {

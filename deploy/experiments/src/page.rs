@@ -48,7 +48,7 @@ impl Page {
         Self { template, values }
     }
 
-    /// As Markdown. `seconds` is the time that all pieces took together, of which so many are made `at_once`.
+    /// As Markdown. `seconds` is the time that all pieces took together, made `at_once` at a time.
     pub(super) fn text(&self, seconds: f64, at_once: u32) -> String {
         let at_once = match at_once {
             1 => String::new(),

@@ -63,7 +63,7 @@ impl Progress {
     /// Counts work done.
     ///
     /// # Errors
-    /// [`Interrupted`] if a person has asked to stop.
+    /// [`Interrupted`] after a Ctrl-C or a signal to stop.
     pub(super) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
         self.done += units;
         let period = if self.screen.bar().is_some() {
@@ -87,7 +87,7 @@ impl Progress {
         self.screen.line(line);
     }
 
-    /// How often a person has asked to stop.
+    /// How many times Ctrl-C or a signal has asked to stop.
     pub(super) fn interrupts(&self) -> u32 {
         self.interrupts.count()
     }

@@ -4,10 +4,8 @@
 
 use std::{
     collections::VecDeque,
-    fs::{self, File, TryLockError},
-    io::{Read, Seek, SeekFrom},
+    fs::File,
     os::unix::process::CommandExt,
-    path::{Path, PathBuf},
     process::{Child, Command, Stdio},
     time::{Duration, Instant},
 };
@@ -16,54 +14,31 @@ use anyhow::Context;
 use driml_launch::{
     managed_process::exit_with_this_process,
     resume,
-    run_folder::{
-        Outcome, Progress as RunProgress, RunFolder, Summary, progress as how_far, write_whole,
-    },
+    run_folder::{Progress as RunProgress, progress as how_far},
 };
 use driml_machine::{
     error::{EXIT_USAGE, usage},
     resources::Machine,
 };
-use driml_settings::config::Flags;
+use driml_protocol::lock_file;
+use driml_settings::resolve::Flags;
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
 };
 
-use crate::{progress::Progress, session::Session};
+use crate::{
+    progress::Progress,
+    runs::{FinishedRun, PlannedRun, Runs, move_aside},
+    session::Session,
+};
 
 /// Times that a run is tried in one call. A run may lose contact with its parts on a machine that is busy with much else.
 const TRIES: u32 = 2;
-/// Where the runs lie in an experiment's folder. Git does not keep them.
-const RUNS: &str = "runs";
 /// How often running children are looked at.
 const POLL: Duration = Duration::from_millis(250);
 /// How long children may take to save once they were asked to stop; after that they are killed.
 const DRAIN_MAX: Duration = Duration::from_secs(240);
-/// Bytes at the end of a run's output that are shown if it fails.
-const LAST_WORDS_BYTES: u64 = 1200;
-
-/// A run to be made.
-#[derive(Clone, Debug)]
-pub(super) struct PlannedRun {
-    /// Its folder's name.
-    pub(super) name: String,
-    /// What follows `driml local`.
-    pub(super) args: Vec<String>,
-    /// Its length.
-    pub(super) frames: u64,
-    /// Episodes after which it is long enough, if that comes first.
-    pub(super) episodes: Option<u64>,
-    /// Its share of the experiment's work.
-    pub(super) units: u64,
-}
-
-/// A finished run.
-#[derive(Clone, Debug)]
-pub(super) struct FinishedRun {
-    pub(super) folder: RunFolder,
-    pub(super) summary: Summary,
-}
 
 /// Makes all runs, `jobs` at once, in the order of `plans`; with `report` it makes none. The result has a place for each
 /// plan: none where the run is missing or failed.
@@ -77,16 +52,14 @@ pub(super) fn run_all(
     report: bool,
 ) -> anyhow::Result<Vec<Option<FinishedRun>>> {
     let (folder, progress) = session.work();
-    let root = folder.join(RUNS);
-    fs::create_dir_all(&root).with_context(|| format!("making {}", root.display()))?;
     let mut queue = Queue {
-        root,
+        runs: Runs::open(folder)?,
         jobs,
         waiting: VecDeque::new(),
         running: Vec::new(),
     };
     for plan in plans {
-        if queue.finished(plan).is_some() {
+        if queue.runs.finished(plan).is_some() {
             progress.find(plan.units);
         } else if !report {
             queue.waiting.push_back((0, plan.clone()));
@@ -97,7 +70,7 @@ pub(super) fn run_all(
         queue.stop(progress);
     }
     made?;
-    let ran: Vec<_> = plans.iter().map(|plan| queue.finished(plan)).collect();
+    let ran: Vec<_> = plans.iter().map(|plan| queue.runs.finished(plan)).collect();
     let seconds = ran.iter().flatten().map(|it| it.summary.wall_seconds);
     session.spend(seconds.sum(), jobs);
     Ok(ran)
@@ -117,7 +90,7 @@ pub(super) fn check_made(missing: &[String], report_only: bool) -> anyhow::Resul
 }
 
 struct Queue {
-    root: PathBuf,
+    runs: Runs,
     /// Runs at once.
     jobs: u32,
     /// How often each was tried, and its plan.
@@ -139,30 +112,6 @@ struct Running {
 }
 
 impl Queue {
-    /// The plan's run, if it is there, was made by this plan, and is whole and long enough.
-    fn finished(&self, plan: &PlannedRun) -> Option<FinishedRun> {
-        if !self.is_made_by(plan) {
-            return None;
-        }
-        let folder = self.folder(plan);
-        how_far(&folder)?;
-        let summary = Summary::read(&folder).ok()?;
-        let enough = plan.episodes.is_some_and(|all| summary.episodes >= all);
-        let good = match summary.outcome {
-            Outcome::Finished => true,
-            Outcome::Interrupted => enough,
-            Outcome::Failed => false,
-        };
-        good.then_some(FinishedRun { folder, summary })
-    }
-
-    /// Whether what lies in the plan's folder was begun by this very plan.
-    fn is_made_by(&self, plan: &PlannedRun) -> bool {
-        let call = fs::read(self.call(plan)).ok();
-        let call = call.and_then(|text| serde_json::from_slice::<Vec<String>>(&text).ok());
-        call.is_some_and(|args| args == plan.args)
-    }
-
     /// Starts and watches until nothing waits or runs.
     fn make(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         loop {
@@ -193,7 +142,7 @@ impl Queue {
         while at < self.running.len() {
             let running = &mut self.running[at];
             let plan = &running.plan;
-            let folder = RunFolder::new(self.root.join(&plan.name));
+            let folder = self.runs.folder(plan);
             let RunProgress { frames, episodes } = how_far(&folder).unwrap_or_default();
             let share = |part: u64, all: u64| part as f64 / all.max(1) as f64;
             let share = plan
@@ -219,11 +168,11 @@ impl Queue {
                         done,
                         ..
                     } = self.running.remove(at);
-                    if self.finished(&plan).is_some() {
+                    if self.runs.finished(&plan).is_some() {
                         progress.advance(plan.units - done)?;
                         continue;
                     }
-                    let words = last_words(&self.log(&plan));
+                    let words = self.runs.last_words(&plan);
                     let name = &plan.name;
                     // Settings that cannot work will not work for the others either.
                     if status.code() == Some(EXIT_USAGE.into()) && !resumed {
@@ -247,19 +196,6 @@ impl Queue {
         Ok(())
     }
 
-    fn folder(&self, plan: &PlannedRun) -> RunFolder {
-        RunFolder::new(self.root.join(&plan.name))
-    }
-
-    /// Where the arguments are that a run was made with.
-    fn call(&self, plan: &PlannedRun) -> PathBuf {
-        self.root.join(format!("{}.call.json", plan.name))
-    }
-
-    fn log(&self, plan: &PlannedRun) -> PathBuf {
-        self.root.join(format!("{}.log", plan.name))
-    }
-
     /// Starts a run in a process group of its own, so that Ctrl-C reaches it through us alone.
     fn start(
         &self,
@@ -267,16 +203,16 @@ impl Queue {
         tried: u32,
         progress: &mut Progress,
     ) -> anyhow::Result<Running> {
-        let path = self.log(&plan);
+        let path = self.runs.log(&plan);
         let doing = || format!("making {}", path.display());
         let log = File::options()
             .create(true)
             .append(true)
             .open(&path)
             .with_context(doing)?;
-        self.wait_for_the_last(&log, &plan, progress)?;
+        wait_for_the_last(&log, &plan, progress)?;
         log.set_len(0).with_context(doing)?;
-        let folder = self.folder(&plan).path().to_owned();
+        let folder = self.runs.folder(&plan).path().to_owned();
         let resumed = folder.exists() && self.is_resumable(&plan, tried, progress)?;
         if !resumed && let Some(aside) = move_aside(&folder)? {
             progress.line(&format!(
@@ -285,8 +221,7 @@ impl Queue {
                 aside.display()
             ));
         }
-        let call = serde_json::to_vec(&plan.args).context("writing down a call")?;
-        write_whole(&self.call(&plan), &call)?;
+        self.runs.write_call(&plan)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
         command.arg("local").args(exit_with_this_process());
@@ -320,9 +255,9 @@ impl Queue {
         tried: u32,
         progress: &mut Progress,
     ) -> anyhow::Result<bool> {
-        let folder = self.folder(plan);
+        let folder = self.runs.folder(plan);
         resume::wait_until_free(&folder)?;
-        if tried > 1 || !self.is_made_by(plan) {
+        if tried > 1 || !self.runs.is_made_by(plan) {
             return Ok(false);
         }
         match resume::find(&folder, &Flags::default(), &Machine::this()) {
@@ -344,35 +279,6 @@ impl Queue {
         }
         let threads = (Machine::this().cores / self.jobs).max(1);
         vec!["--set".into(), format!("local.learner_threads={threads}")]
-    }
-
-    /// A run whose parent was killed still saves what it has. It holds its log's lock, as a child shares our open file, so
-    /// that two never write into one folder.
-    fn wait_for_the_last(
-        &self,
-        log: &File,
-        plan: &PlannedRun,
-        progress: &mut Progress,
-    ) -> anyhow::Result<()> {
-        let mut said = false;
-        loop {
-            match log.try_lock() {
-                Ok(()) => return Ok(()),
-                Err(TryLockError::Error(e)) => {
-                    return Err(e).context("locking a run's log");
-                }
-                Err(TryLockError::WouldBlock) => {}
-            }
-            if !said {
-                said = true;
-                let name = &plan.name;
-                progress.line(&format!(
-                    "an earlier {name} still runs or saves: waiting for it"
-                ));
-            }
-            std::thread::sleep(POLL);
-            progress.advance(0)?;
-        }
     }
 
     /// Asks all children to stop and waits until they have saved; a second wish, or too long a time, kills them.
@@ -410,85 +316,22 @@ fn signal(child: &Child, signal: Signal) {
     }
 }
 
-/// Renames what lies at `folder`, if anything does; says where it is now.
-fn move_aside(folder: &Path) -> anyhow::Result<Option<PathBuf>> {
-    if !folder.exists() {
-        return Ok(None);
-    }
-    let name = |number: u32| {
-        let mut name = folder.as_os_str().to_owned();
-        name.push(format!(".unfinished-{number}"));
-        PathBuf::from(name)
-    };
-    let free = (1..).map(name).find(|path| !path.exists());
-    let aside = free.expect("there are more numbers than folders");
-    fs::rename(folder, &aside).with_context(|| format!("moving {} aside", folder.display()))?;
-    Ok(Some(aside))
-}
-
-fn last_words(log: &Path) -> String {
-    tail(log, LAST_WORDS_BYTES).unwrap_or_default()
-}
-
-/// The end of a file.
-fn tail(path: &Path, bytes: u64) -> Option<String> {
-    let mut file = File::open(path).ok()?;
-    let length = file.metadata().ok()?.len();
-    file.seek(SeekFrom::Start(length.saturating_sub(bytes)))
-        .ok()?;
-    let mut end = Vec::new();
-    file.read_to_end(&mut end).ok()?;
-    Some(String::from_utf8_lossy(&end).into_owned())
-}
-
-#[cfg(test)]
-mod tests {
-    use driml_protocol::{LearnerStatus, ReplayStatus};
-
-    use super::*;
-    use crate::made_up;
-    use driml_launch::run_folder::Recorder;
-
-    #[test]
-    fn a_run_counts_for_the_plan_that_made_it_alone() {
-        let root = tempfile::tempdir().unwrap();
-        let queue = Queue {
-            root: root.path().to_owned(),
-            jobs: 1,
-            waiting: VecDeque::new(),
-            running: Vec::new(),
-        };
-        let plan = |frames: u64| PlannedRun {
-            name: "run".into(),
-            args: vec!["--frames".into(), frames.to_string()],
-            frames,
-            episodes: None,
-            units: frames,
-        };
-        let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
-        let folder = RunFolder::new(queue.root.join("run"));
-        let mut recorder = Recorder::create(&folder, "", &[], &[]).unwrap();
-        recorder.record(std::slice::from_ref(&replay), &learner, &[]);
-        let summary = recorder.summarise(Outcome::Finished, &made_up::spec(), &replay, &learner);
-        summary.write(&folder).unwrap();
-        assert!(queue.finished(&plan(10)).is_none(), "nobody knows its call");
-        let call = serde_json::to_vec(&plan(10).args).unwrap();
-        fs::write(queue.call(&plan(10)), call).unwrap();
-        assert!(queue.finished(&plan(10)).is_some());
-        assert!(queue.finished(&plan(20)).is_none());
-        fs::write(folder.metrics(), "seconds,frames\n").unwrap();
-        assert!(queue.finished(&plan(10)).is_none(), "its metrics are gone");
-    }
-
-    #[test]
-    fn what_is_in_the_way_is_moved_and_kept() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = root.path().join("run");
-        assert_eq!(move_aside(&folder).unwrap(), None);
-        for number in 1..3 {
-            fs::create_dir(&folder).unwrap();
-            let aside = move_aside(&folder).unwrap().unwrap();
-            assert!(aside.ends_with(format!("run.unfinished-{number}")) && aside.exists());
+/// A run whose parent was killed still saves what it has. It holds its log's lock, as a child shares our open file, so
+/// that two never write into one folder.
+fn wait_for_the_last(log: &File, plan: &PlannedRun, progress: &mut Progress) -> anyhow::Result<()> {
+    let mut said = false;
+    loop {
+        if lock_file::try_lock(log).context("locking a run's log")? {
+            return Ok(());
         }
+        if !said {
+            said = true;
+            let name = &plan.name;
+            progress.line(&format!(
+                "an earlier {name} still runs or saves: waiting for it"
+            ));
+        }
+        std::thread::sleep(POLL);
+        progress.advance(0)?;
     }
 }

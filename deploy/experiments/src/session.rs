@@ -15,6 +15,7 @@ use driml_launch::{
     run_folder::write_whole,
 };
 use driml_machine::error::{Interrupted, usage};
+use driml_settings::renamed;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::{
@@ -61,10 +62,11 @@ impl Session {
         let folder = folder(name, flags);
         let pieces = folder.join(PIECES);
         fs::create_dir_all(&pieces).with_context(|| format!("making {}", pieces.display()))?;
-        let settings = serde_json::to_vec_pretty(settings).context("writing down the settings")?;
+        let settings =
+            serde_json::to_string_pretty(settings).context("writing down the settings")?;
         let path = pieces.join(SETTINGS);
         match fs::read(&path) {
-            Ok(found) if found == settings => {}
+            Ok(found) if renamed::update_json(&String::from_utf8_lossy(&found)) == settings => {}
             Ok(_) => {
                 return Err(usage!(
                     "{} holds what was made with other settings: choose another --out, or remove that folder",
@@ -72,7 +74,7 @@ impl Session {
                 )
                 .into());
             }
-            Err(_) => write_whole(&path, &settings)?,
+            Err(_) => write_whole(&path, settings.as_bytes())?,
         }
         let interrupts = Interrupts::listen(None).context("listening for interrupts")?;
         Ok(Self {
@@ -105,6 +107,14 @@ impl Session {
         Self::open(name, flags, settings, units)
     }
 
+    /// Whether the piece of this name was made.
+    pub(super) fn has_piece(&self, key: &str) -> bool {
+        self.folder
+            .join(PIECES)
+            .join(format!("{key}.json"))
+            .is_file()
+    }
+
     /// Where everything goes.
     pub(super) fn folder(&self) -> &Path {
         &self.folder
@@ -115,7 +125,7 @@ impl Session {
         (&self.folder, &mut self.progress)
     }
 
-    /// Counts the time that such work took, added up over runs of which so many are made at once.
+    /// Counts the time that such work took, added up over runs that are made `at_once` at a time.
     pub(super) fn spend(&mut self, seconds: f64, at_once: u32) {
         self.seconds += seconds;
         self.at_once = at_once;
@@ -217,6 +227,12 @@ impl Session {
             self.folder.join("README.md").display()
         ))
     }
+}
+
+/// The settings that the experiment's pieces were made with; none if there are none yet, or they cannot be read.
+pub(super) fn settings_of<T: DeserializeOwned>(name: &str, flags: &ExperimentFlags) -> Option<T> {
+    let text = fs::read_to_string(folder(name, flags).join(PIECES).join(SETTINGS)).ok()?;
+    serde_json::from_str(&renamed::update_json(&text)).ok()
 }
 
 /// The folder of the experiment `name`, by what the flags say.

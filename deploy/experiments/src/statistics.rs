@@ -53,6 +53,81 @@ impl fmt::Display for Spread {
     }
 }
 
+/// 0.975 quantiles of Student's t with 1, 2, .. degrees of freedom. Source: the tables of any textbook; beyond them the normal law's.
+const T: [f64; 15] = [
+    12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160,
+    2.145, 2.131,
+];
+const NORMAL: f64 = 1.960;
+
+/// A mean over seeds and the interval in which it lies with 95% confidence if seeds are normal: Student's.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Interval {
+    pub(super) mean: f64,
+    /// Both none for a single seed, of which nothing is known.
+    pub(super) ends: Option<(f64, f64)>,
+}
+
+impl Interval {
+    /// Of these values; none of no value.
+    pub(super) fn of(values: &[f64]) -> Option<Self> {
+        let Spread {
+            mean, sd, count, ..
+        } = Spread::of(values.iter().copied())?;
+        let ends = (count > 1).then(|| {
+            let by = T.get(count - 2).unwrap_or(&NORMAL) * sd / (count as f64).sqrt();
+            (mean - by, mean + by)
+        });
+        Some(Self { mean, ends })
+    }
+
+    /// Of the mean of `to` minus that of `from`, of runs that have nothing in common: Welch's, with his degrees of freedom rounded down.
+    /// No ends where either has a single value.
+    pub(super) fn of_difference(from: &[f64], to: &[f64]) -> Option<Self> {
+        let (from, to) = (
+            Spread::of(from.iter().copied())?,
+            Spread::of(to.iter().copied())?,
+        );
+        let mean = to.mean - from.mean;
+        if from.count < 2 || to.count < 2 {
+            return Some(Self { mean, ends: None });
+        }
+        let square = |it: &Spread| it.sd.powi(2) / it.count as f64;
+        let (a, b) = (square(&from), square(&to));
+        let by = match a + b {
+            0.0 => 0.0,
+            sum => {
+                let each = a * a / (from.count - 1) as f64 + b * b / (to.count - 1) as f64;
+                let freedom = (sum * sum / each) as usize;
+                T.get(freedom.max(1) - 1).unwrap_or(&NORMAL) * sum.sqrt()
+            }
+        };
+        Some(Self {
+            mean,
+            ends: Some((mean - by, mean + by)),
+        })
+    }
+
+    /// Whether 0 is outside of it.
+    pub(super) fn is_apart_from_zero(&self) -> bool {
+        self.ends.is_some_and(|(low, high)| low > 0.0 || high < 0.0)
+    }
+}
+
+impl fmt::Display for Interval {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let decimals = f.precision().unwrap_or(2);
+        match self.ends {
+            None => write!(f, "{:.decimals$}", self.mean),
+            Some((low, high)) => write!(
+                f,
+                "{:.decimals$} [{low:.decimals$}, {high:.decimals$}]",
+                self.mean
+            ),
+        }
+    }
+}
+
 /// Ranks from 1; equal values share the mean of their ranks.
 fn ranks(values: &[f64]) -> Vec<f64> {
     let mut order: Vec<usize> = (0..values.len()).collect();
@@ -106,6 +181,32 @@ mod tests {
         assert!((spread.sd - 2f64.sqrt()).abs() < 1e-12);
         assert_eq!(Spread::of([]), None);
         assert_eq!(Spread::of([5.0]).unwrap().sd, 0.0);
+    }
+
+    #[test]
+    fn an_interval_is_students() {
+        // By hand: mean 2, standard deviation 1, 4.303 / sqrt(3) = 2.484.
+        let found = Interval::of(&[1.0, 2.0, 3.0]).unwrap();
+        let (low, high) = found.ends.unwrap();
+        assert!((low + 0.484).abs() < 1e-3 && (high - 4.484).abs() < 1e-3);
+        assert!(!found.is_apart_from_zero());
+        assert!(Interval::of(&[3.0, 3.1, 3.2]).unwrap().is_apart_from_zero());
+        let one = Interval::of(&[3.0]).unwrap();
+        assert_eq!((one.ends, one.is_apart_from_zero()), (None, false));
+        assert_eq!(format!("{one} {found:.1}"), "3.00 2.0 [-0.5, 4.5]");
+        assert_eq!(Interval::of(&[]), None);
+        // By hand: both of variance 1 and three values, so 4 degrees of freedom, and 2.776 * sqrt(2 / 3) = 2.267.
+        let apart = Interval::of_difference(&[1.0, 2.0, 3.0], &[4.0, 5.0, 6.0]).unwrap();
+        let (low, high) = apart.ends.unwrap();
+        assert!(apart.mean == 3.0 && (low - 0.733).abs() < 1e-3 && (high - 5.267).abs() < 1e-3);
+        assert_eq!(
+            Interval::of_difference(&[1.0], &[4.0, 5.0]).unwrap().ends,
+            None
+        );
+        assert_eq!(
+            Interval::of_difference(&[1.0; 2], &[2.0; 2]).unwrap().ends,
+            Some((1.0, 1.0))
+        );
     }
 
     #[test]

@@ -56,7 +56,7 @@ pub(super) struct TextStyle {
     pub(super) upright: bool,
 }
 
-/// A pen.
+/// How a line is drawn: colour, width, dashes.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Stroke {
     pub(super) colour: Colour,
@@ -74,7 +74,7 @@ impl Stroke {
     }
 }
 
-/// Something drawn.
+/// One shape or text of a picture, in the order of drawing.
 #[derive(Debug)]
 pub(super) enum Shape {
     /// A line through points.
@@ -134,12 +134,12 @@ impl Canvas {
         }
     }
 
-    /// A disc.
+    /// Draws a filled disc.
     pub(super) fn dot(&mut self, middle: Point, radius: f64, fill: Colour) {
         self.area(circle(middle, radius).collect(), fill);
     }
 
-    /// A circle.
+    /// Draws a circle that is not filled.
     pub(super) fn ring(&mut self, middle: Point, radius: f64, colour: Colour) {
         let again = circle(middle, radius).take(1);
         let points = circle(middle, radius).chain(again).collect();

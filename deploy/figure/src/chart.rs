@@ -3,7 +3,7 @@
 
 use super::{
     canvas::{Anchor, Canvas, Point, Rect, Stroke, TextStyle, titled},
-    colours::{Colour, GRID, INK, INK_SOFT, series_colour},
+    colours::{Colour, GRID, INK, INK_SOFT, SERIES_COLOURS, series_colour},
     font::{self, Weight},
     ticks,
 };
@@ -22,13 +22,13 @@ const SLACK: f64 = 0.05;
 /// How an axis spreads its values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Scale {
-    /// Evenly.
+    /// Equal steps are equally long.
     Linear,
     /// By their logarithm; values of 0 and below are left out.
     Log,
 }
 
-/// An axis.
+/// One axis of a chart: its name, its scale and what it must span.
 #[derive(Clone, Debug)]
 pub struct Axis {
     /// What it counts, with its unit.
@@ -79,7 +79,7 @@ impl Axis {
         value.is_finite() && (self.scale == Scale::Linear || value > 0.0)
     }
 
-    /// Evenly spread.
+    /// The value where equal steps are equally long: itself or its logarithm.
     fn spread(&self, value: f64) -> f64 {
         match self.scale {
             Scale::Linear => value,
@@ -132,12 +132,12 @@ pub enum Mark {
     Bars,
 }
 
-/// A series.
+/// Points of one colour and one entry of the legend.
 #[derive(Clone, Debug)]
 pub struct Series {
-    /// As the legend has it; empty for none.
+    /// Its entry in the legend; empty for none.
     pub name: String,
-    /// Its colour.
+    /// The colour of its marks and of its entry in the legend.
     pub colour: Colour,
     /// How it is drawn.
     pub mark: Mark,
@@ -148,12 +148,16 @@ pub struct Series {
 }
 
 impl Series {
-    /// A line in the colour of this index.
+    /// A line in the colour of this index, dashed where the colours come again.
     pub fn line(name: &str, index: usize, points: Vec<(f64, f64)>) -> Self {
         Self {
             name: name.to_owned(),
             colour: series_colour(index),
-            mark: Mark::Line,
+            mark: if (index / SERIES_COLOURS).is_multiple_of(2) {
+                Mark::Line
+            } else {
+                Mark::Dashed
+            },
             points,
             band: Vec::new(),
         }
@@ -178,7 +182,7 @@ impl Series {
     }
 }
 
-/// A chart.
+/// Series over two axes, with a title and a legend.
 #[derive(Debug)]
 pub struct Chart {
     title: String,

@@ -55,17 +55,31 @@ pub enum FigureError {
     /// The picture has no area, or is too large for memory.
     #[error("drawing {}: {why}", .path.display())]
     Draw {
-        /// The file.
+        /// The file that was to be written.
         path: PathBuf,
         /// What is wrong with it.
         why: String,
     },
+    /// The name is no film's.
+    #[error("{} is no name of a film: take one that ends in .gif", .0.display())]
+    NoFilm(PathBuf),
+    /// A picture or film of no area, or too large.
+    #[error("a picture of {width} x {height} pixels cannot be made")]
+    Size {
+        /// Pixels across.
+        width: usize,
+        /// Pixels down.
+        height: usize,
+    },
+    /// A picture cannot be encoded.
+    #[error("encoding a picture: {0}")]
+    Encode(String),
     /// The file system refused.
     #[error("writing {}", .path.display())]
     Write {
-        /// The file.
+        /// The file that was to be written.
         path: PathBuf,
-        /// Its reason.
+        /// What the file system said.
         source: std::io::Error,
     },
 }
@@ -75,7 +89,7 @@ pub enum FigureError {
 pub enum Format {
     /// Scalable, with text as text.
     Svg,
-    /// Pixels.
+    /// Pixels, with the font that comes along.
     Png,
 }
 

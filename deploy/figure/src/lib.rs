@@ -1,7 +1,8 @@
 //! Figures: charts, heat maps and lattices on a light card, written as SVG or PNG from one description.
 //!
 //! Start with [`Figure`]: a title, notes, and panels in a grid, each a [`Chart`], a [`Heat`] map or a [`Lattice`]. The same
-//! figure gives the same bytes on every machine, as the font comes along. It knows no run and no experiment.
+//! figure gives the same bytes on every machine, as the font comes along. A [`Film`] is [`Picture`]s in turn, as a GIF. It knows no run
+//! and no experiment.
 //!
 //! ```
 //! use driml_figure::{Axis, Chart, Figure, Panel, Series};
@@ -33,9 +34,11 @@ mod canvas;
 mod chart;
 mod colours;
 mod figure;
+mod film;
 mod font;
 mod heat;
 mod lattice;
+mod picture;
 mod png;
 mod svg;
 mod ticks;
@@ -44,6 +47,8 @@ pub use crate::{
     chart::{Axis, Chart, Mark, Series},
     colours::{Colour, GREY},
     figure::{Figure, FigureError, Format, Panel},
+    film::Film,
     heat::{Field, Heat, Outline},
     lattice::Lattice,
+    picture::{Area, Image, Ink, Picture},
 };

@@ -29,7 +29,8 @@ pub(super) fn encode(canvas: &Canvas, zoom: f32) -> Result<Vec<u8>, String> {
         .map_err(|e| format!("encoding a picture: {e}"))
 }
 
-fn draw(pixmap: &mut Pixmap, shape: &Shape, scale: Transform) {
+/// Draws one shape, `scale` pixels to a unit.
+pub(super) fn draw(pixmap: &mut Pixmap, shape: &Shape, scale: Transform) {
     let mut fill = |path: Option<Path>, colour: Colour, smooth: bool, at: Transform| {
         if let Some(path) = path {
             let paint = paint(colour, smooth);

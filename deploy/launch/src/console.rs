@@ -1,17 +1,30 @@
-//! Everything that this program writes to stdout and stderr: lines for a person, the log, progress bars, results.
+//! Everything that this program writes to stdout and stderr: messages, the log, progress bars, results.
 //! A terminal or pipe that is gone takes nothing and is no error here; `driml_protocol::end_signs` notices it.
 
-use std::io::{self, ErrorKind, IsTerminal, Write, stderr};
+use std::{
+    fmt,
+    io::{self, ErrorKind, IsTerminal, Write, stderr},
+};
 
-use anyhow::Context;
+use anyhow::Context as _;
 use console::Term;
+use driml_protocol::{last_warning, tls};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
-use tracing_subscriber::EnvFilter;
+use tracing::{
+    Event, Level, Subscriber,
+    field::{Field, Visit},
+};
+use tracing_subscriber::{
+    EnvFilter, Layer,
+    filter::Targets,
+    layer::{Context as LayerContext, SubscriberExt},
+    util::SubscriberInitExt,
+};
 
 /// How often a progress bar is drawn at most, times a second.
 const DRAWS_PER_SECOND: u8 = 20;
 
-/// Writes a line to stderr. What cannot be written is dropped: nobody reads it, or the disk is full, and a run goes on.
+/// Writes a line to stderr. What cannot be written is dropped: the pipe is closed or the disk is full, and a run goes on.
 pub fn line(text: &str) {
     // In one write, so that lines of several threads do not mix.
     let _ = stderr().write_all(format!("{text}\n").as_bytes());
@@ -50,11 +63,14 @@ pub fn describe(error: &anyhow::Error) -> String {
 
 /// Sends the log to stderr. `DRIML_LOG` says what is logged, in the form of `RUST_LOG`.
 ///
-/// zenoh warns of each try to reach a part that is not there yet or any more, which is ours to judge: so only its errors are
+/// zenoh warns of each try to reach a process that is not there yet or any more, which is ours to judge: so only its errors are
 /// logged, and of those neither what its session says of messages that come while it closes, as at the end of every run, nor
-/// that nobody wants an answer any more.
-pub fn log_to_stderr() {
-    let usual = "warn,driml=info,zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off";
+/// that no answer is wanted any more. Nor what it says of connections over QUIC that did not come about, and what quinn warns of.
+///
+/// With `guarded`, what zenoh says of those whom it refuses is heard too: [`tls::overhear`].
+pub fn log_to_stderr(guarded: bool) {
+    let usual = "warn,driml=info,zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off,\
+                 zenoh_link_commons::quic=off,quinn=error";
     let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
     let filter = wanted.map_or_else(
         || EnvFilter::new(usual),
@@ -67,16 +83,61 @@ pub fn log_to_stderr() {
             })
         },
     );
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let log = tracing_subscriber::fmt::layer()
         .with_writer(stderr)
         // It would say with `eprintln!`, which panics, that stderr cannot be written to.
         .log_internal_errors(false)
         .with_ansi(stderr().is_terminal())
+        .with_filter(filter.clone());
+    let refusals = guarded.then(|| {
+        let targets = Targets::new()
+            .with_target(tls::HANDSHAKE_TARGET, Level::WARN)
+            .with_target(tls::ACCESS_TARGET, Level::TRACE);
+        Refusals.with_filter(targets)
+    });
+    tracing_subscriber::registry()
+        .with(log)
+        .with(LastWarning.with_filter(filter))
+        .with(refusals)
         .init();
 }
 
-/// Where lines for a person go: stderr, above a progress bar if stderr is a terminal. Clones share the bar.
+/// Hands on what zenoh says of those whom it refuses.
+struct Refusals;
+
+impl<S: Subscriber> Layer<S> for Refusals {
+    fn on_event(&self, event: &Event<'_>, _: LayerContext<'_, S>) {
+        tls::overhear(event.metadata().target(), &text(event));
+    }
+}
+
+/// Keeps the last warning or error of the log for those who ask this process how it is.
+struct LastWarning;
+
+impl<S: Subscriber> Layer<S> for LastWarning {
+    fn on_event(&self, event: &Event<'_>, _: LayerContext<'_, S>) {
+        if *event.metadata().level() <= Level::WARN {
+            last_warning::note(text(event));
+        }
+    }
+}
+
+/// The text of a line of the log.
+fn text(event: &Event<'_>) -> String {
+    struct Text(String);
+    impl Visit for Text {
+        fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+            if field.name() == "message" {
+                self.0 = format!("{value:?}");
+            }
+        }
+    }
+    let mut text = Text(String::new());
+    event.record(&mut text);
+    text.0
+}
+
+/// Where messages go: stderr, above a progress bar if stderr is a terminal. Clones share the bar.
 #[derive(Clone, Debug)]
 pub struct Screen {
     bar: Option<ProgressBar>,
@@ -124,6 +185,30 @@ impl Screen {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
+    }
+}
+
+/// Pages on stdout that each take the place of the one before, on a terminal; elsewhere they follow each other.
+pub struct Pages(Option<Term>);
+
+impl Pages {
+    /// None shown yet.
+    pub fn on_stdout() -> Self {
+        Self(io::stdout().is_terminal().then(Term::stdout))
+    }
+
+    /// Shows one.
+    ///
+    /// # Errors
+    /// As [`print`].
+    pub fn show(&self, text: &str) -> anyhow::Result<()> {
+        if let Some(term) = &self.0 {
+            term.clear_screen().or_else(|e| match is_gone(&e) {
+                true => Ok(()),
+                false => Err(e),
+            })?;
+        }
+        print(text)
     }
 }
 

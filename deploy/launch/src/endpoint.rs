@@ -1,51 +1,183 @@
 //! Where the processes of a run meet: endpoints that zenoh can open, and the prefix of the run's keys.
 //! It opens nothing.
 
+use std::net::ToSocketAddrs;
+
 use driml_machine::error::{Usage, usage};
 
 /// The prefix of a run's keys unless it is told otherwise.
 pub const NAMESPACE: &str = "driml";
 
-/// Refuses what zenoh could not open.
-pub fn check_endpoints(endpoints: &[String]) -> Result<(), Usage> {
-    let good = |endpoint: &str| match endpoint.split_once('/') {
-        Some(("tcp" | "tls", address)) => address
-            .rsplit_once(':')
-            .is_some_and(|(host, _)| !host.is_empty()),
-        Some(("unixsock-stream", path)) => !path.is_empty(),
-        _ => false,
-    };
-    match endpoints.iter().find(|endpoint| !good(endpoint)) {
-        Some(endpoint) => Err(usage!(
-            "{endpoint:?} is no endpoint: take tcp/HOST:PORT, tls/HOST:PORT or unixsock-stream/PATH"
-        )),
-        None => Ok(()),
+/// What a person has said about who may connect.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Guard {
+    /// `--tls-dir`: there are certificates.
+    pub tls: bool,
+    /// `--insecure-network`: everybody who can connect is trusted.
+    pub insecure_network: bool,
+}
+
+/// Refuses endpoints to connect to that zenoh could not open, or that do not fit `--tls-dir`.
+///
+/// # Errors
+/// The first that cannot work, and what to do.
+pub fn check_endpoints(endpoints: &[String], tls: bool) -> Result<(), Usage> {
+    endpoints.iter().try_for_each(|it| {
+        check_endpoint(it, tls)?;
+        if it.starts_with("quic/[") {
+            return Err(usage!(
+                "{it}: zenoh looks for this address, with its brackets, in the certificate and does not find it: connect by a name"
+            ));
+        }
+        Ok(())
+    })
+}
+
+/// Refuses endpoints to listen on that zenoh could not open, and those that others can reach and nothing guards.
+///
+/// # Errors
+/// The first that cannot work, and what to do.
+pub fn check_listening(endpoints: &[String], guard: Guard) -> Result<(), Usage> {
+    for endpoint in endpoints {
+        check_endpoint(endpoint, guard.tls)?;
+        if !is_open(endpoint) {
+            continue;
+        }
+        if !guard.insecure_network {
+            return Err(usage!(
+                "{endpoint} can be reached from other machines, and whoever reaches it can read the run, change what is learned, and \
+                 end it. Listen on quic/HOST:PORT with --tls-dir DIR (deploy/certs.sh makes the certificates); or, where every machine \
+                 that can connect is trusted, add --insecure-network"
+            ));
+        }
+        tracing::warn!(
+            "--insecure-network: whoever reaches {endpoint} can read the run, change what is learned, and end it"
+        );
     }
+    Ok(())
+}
+
+fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
+    let has_host = |address: &str| {
+        address
+            .rsplit_once(':')
+            .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok())
+    };
+    // Behind # zenoh takes settings of its own, which could undo ours.
+    match endpoint.split_once('/') {
+        Some(("tcp", address)) if tls && has_host(address) => Err(usage!(
+            "{endpoint} is not encrypted: with --tls-dir it is quic/{address}"
+        )),
+        Some(("tls", address)) if has_host(address) => Err(usage!(
+            "{endpoint}: TLS over TCP is not used, as zenoh's may break a connection or end the process \
+             (https://github.com/eclipse-zenoh/zenoh/issues/2557): with --tls-dir it is quic/{address}, the TLS of QUIC over UDP"
+        )),
+        Some(("quic", address)) if !tls && has_host(address) => Err(usage!(
+            "{endpoint} needs certificates: add --tls-dir DIR, which deploy/certs.sh makes"
+        )),
+        Some(("tcp" | "quic", address)) if has_host(address) => Ok(()),
+        Some(("unixsock-stream", path)) if !path.is_empty() => Ok(()),
+        _ => Err(usage!(
+            "{endpoint:?} is no endpoint: take tcp/HOST:PORT, quic/HOST:PORT or unixsock-stream/PATH"
+        )),
+    }
+}
+
+/// Whether other machines may reach an endpoint, and nothing tells who they are.
+fn is_open(endpoint: &str) -> bool {
+    let Some(("tcp", address)) = endpoint.split_once('/') else {
+        return false;
+    };
+    // A name that is not known is none of this machine's; zenoh says what is wrong with it.
+    let Ok(mut addresses) = address.to_socket_addrs() else {
+        return false;
+    };
+    !addresses.all(|it| it.ip().to_canonical().is_loopback())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn listening(endpoint: &str, guard: Guard) -> Result<(), String> {
+        check_listening(&[endpoint.into()], guard).map_err(|e| e.to_string())
+    }
+
+    const TLS: Guard = Guard {
+        tls: true,
+        insecure_network: false,
+    };
+
     #[test]
     fn endpoints_that_zenoh_cannot_open_are_refused() {
         for good in [
             "tcp/127.0.0.1:7447",
             "tcp/[::1]:7447",
-            "tls/host:1",
             "unixsock-stream//tmp/driml.sock",
         ] {
-            assert!(check_endpoints(&[good.into()]).is_ok(), "{good}");
+            assert!(check_endpoints(&[good.into()], false).is_ok(), "{good}");
         }
         for bad in [
             "",
             "localhost:7447",
             "tcp/localhost",
             "tcp/:1",
+            "tcp/127.0.0.1:7447#so_sndbuf=1",
+            "tcp/127.0.0.1:70000",
             "udp/1.2.3.4:5",
             "unixsock-stream/",
         ] {
-            assert!(check_endpoints(&[bad.into()]).is_err(), "{bad}");
+            assert!(check_endpoints(&[bad.into()], false).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn certificates_and_endpoints_go_together() {
+        let refused = |endpoint: &str, tls| {
+            let checked = check_endpoints(&[endpoint.into()], tls);
+            checked.unwrap_err().to_string()
+        };
+        assert!(check_endpoints(&["quic/host:1".into()], true).is_ok());
+        assert!(check_endpoints(&["unixsock-stream//tmp/s".into()], true).is_ok());
+        assert!(refused("quic/host:1", false).contains("add --tls-dir DIR"));
+        assert!(refused("quic/[::1]:1", true).contains("connect by a name"));
+        assert_eq!(listening("quic/[::]:1", TLS), Ok(()));
+        assert!(refused("tcp/host:1", true).contains("it is quic/host:1"));
+        assert!(refused("quic/host:1#enable_mtls=false", true).contains("no endpoint"));
+        for tls in [false, true] {
+            let said = refused("tls/host:1", tls);
+            assert!(said.contains("with --tls-dir it is quic/host:1"), "{said}");
+            assert!(said.contains("issues/2557"), "{said}");
+        }
+    }
+
+    #[test]
+    fn what_other_machines_reach_is_guarded() {
+        let nothing = Guard::default();
+        for closed in [
+            "tcp/127.0.0.1:1",
+            "tcp/127.9.9.9:1",
+            "tcp/[::1]:1",
+            "tcp/localhost:1",
+            "unixsock-stream//tmp/s",
+        ] {
+            assert_eq!(listening(closed, nothing), Ok(()), "{closed}");
+        }
+        for open in ["tcp/0.0.0.0:7447", "tcp/[::]:1", "tcp/192.0.2.1:1"] {
+            let said = listening(open, nothing).unwrap_err();
+            for way_out in [
+                "--tls-dir DIR",
+                "--insecure-network",
+                "change what is learned",
+            ] {
+                assert!(said.contains(way_out), "{said}");
+            }
+            let trusted = Guard {
+                insecure_network: true,
+                ..nothing
+            };
+            assert_eq!(listening(open, trusted), Ok(()), "{open}");
+            assert_eq!(listening(&open.replace("tcp", "quic"), TLS), Ok(()));
         }
     }
 }

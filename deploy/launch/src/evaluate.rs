@@ -1,17 +1,29 @@
 //! Whole episodes with a run's newest checkpoint, and a random policy's beside them.
 //! It trains nothing and changes nothing in the run folder.
 
+use std::{
+    path::{Path, PathBuf},
+    str::FromStr,
+};
+
 use anyhow::Context;
 use clap::ValueEnum;
-use driml_actor::{NetworkPolicy, Policy, RandomPolicy, episode_returns};
-use driml_envs::WorldConfig;
-use driml_learner::{Compute, checkpoint};
-use driml_machine::error::{Usage, usage};
+use driml_actor::{Evaluation, NetworkPolicy, Policy, RandomPolicy, Step, episode_returns};
+use driml_envs::{CutFrames, FewerActions, WorldConfig};
+use driml_learner::{
+    Agent, Compute, UpdateError, checkpoint,
+    insight::{Insight, Seen},
+};
+use driml_machine::{
+    error::{Usage, usage},
+    whole_number,
+};
+use driml_model::Enlarge;
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::run_folder::RunFolder;
+use crate::run_folder::{Candidate, Evaluated, RunFolder};
 
 /// Probability of a random action. Source: section 2 of the project's specification, after rlpyt.
 const EPSILON: f64 = 0.001;
@@ -33,6 +45,33 @@ pub enum Levels {
     Unseen,
 }
 
+/// Which checkpoint of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Which {
+    /// The newest.
+    Newest,
+    /// The one after so many updates.
+    After(u64),
+    /// The one that earned most when checkpoints were played.
+    Best,
+}
+
+impl FromStr for Which {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "best" => Ok(Self::Best),
+            "newest" => Ok(Self::Newest),
+            _ => whole_number::within(1..=u64::MAX)(text)
+                .map(Self::After)
+                .map_err(|e| {
+                    format!("{e}: give the updates of a checkpoint, \"best\" or \"newest\"")
+                }),
+        }
+    }
+}
+
 /// Who chooses the actions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Who {
@@ -44,10 +83,11 @@ pub enum Who {
 
 /// A run's newest weights and its world, ready to play.
 pub struct Player {
-    /// Its settings.
+    /// The settings of the run that trained them.
     pub config: RunConfig,
-    /// As safetensors.
+    /// The network's parameters, a safetensors file.
     weights: Vec<u8>,
+    agent: Agent,
     /// Updates behind its weights.
     pub updates: u64,
 }
@@ -58,34 +98,33 @@ impl Player {
     /// # Errors
     /// A folder that is no run's or has no checkpoint, a damaged checkpoint.
     pub fn load(folder: &RunFolder) -> anyhow::Result<Self> {
-        let path = folder.config();
-        let text = std::fs::read_to_string(&path).map_err(|e| {
-            usage!(
-                "{} is not the folder of a run: reading {}: {e}",
-                folder.display(),
-                path.display()
-            )
-        })?;
-        let config = RunConfig::parse(&path.display().to_string(), &text)?;
-        let restored = checkpoint::load_latest(
-            &folder.checkpoints(),
+        Self::load_at(folder, Which::Newest)
+    }
+
+    /// Reads one of the checkpoints in a run's folder.
+    ///
+    /// # Errors
+    /// A folder that is no run's or does not have that checkpoint, a damaged checkpoint.
+    pub fn load_at(folder: &RunFolder, which: Which) -> anyhow::Result<Self> {
+        let config = config_of(folder)?;
+        Self::read(config, &checkpoint_at(folder, which)?)
+    }
+
+    fn read(config: RunConfig, checkpoint: &Path) -> anyhow::Result<Self> {
+        let restored = checkpoint::load(
+            checkpoint,
             &config.model,
             &config.learner.update,
             &Compute::CPU,
             config.run.hash(),
-        )?
-        .ok_or_else(|| {
-            usage!(
-                "{} has no checkpoint yet: let the run go on",
-                folder.display()
-            )
-        })?;
+        )?;
         let weights = restored.agent.weights()?;
         let updates = restored.agent.updates();
         Ok(Self {
             config,
             weights,
             updates,
+            agent: restored.agent,
         })
     }
 
@@ -117,29 +156,202 @@ impl Player {
         episodes: usize,
         seed: u64,
     ) -> anyhow::Result<Vec<f64>> {
-        let spec = &self.config.run;
-        let frame = (spec.frame_height as usize, spec.frame_width as usize);
+        self.play_watched(who, world, episodes, seed, &mut |_| ())
+    }
+
+    /// [`Player::play`], with every step shown to `watch`, which changes nothing.
+    ///
+    /// # Errors
+    /// As [`Player::play`].
+    pub fn play_watched(
+        &self,
+        who: Who,
+        world: &WorldConfig,
+        episodes: usize,
+        seed: u64,
+        watch: &mut dyn FnMut(&Step<'_>),
+    ) -> anyhow::Result<Vec<f64>> {
         let mut policy: Box<dyn Policy> = match who {
             Who::Agent => Box::new(NetworkPolicy::new(
                 &self.config.model,
-                frame,
+                self.enlarge()?,
                 &self.weights,
                 self.config.actor.precision,
             )?),
-            Who::Random => Box::new(RandomPolicy::new(u8::try_from(spec.num_actions)?)),
+            Who::Random => Box::new(random_policy(&self.config)?),
         };
-        let copies = episodes.min(COPIES_MAX);
-        let rounds = episodes.div_ceil(copies) as u64;
-        episode_returns(
-            world.build(copies, seed, 0)?,
-            spec.frame_stack as usize,
-            policy.as_mut(),
-            EPSILON,
-            episodes,
-            rounds * STEPS_A_ROUND_MAX,
-            policy_rng(seed),
-        )
+        play_with(&self.config, policy.as_mut(), world, episodes, seed, watch)
+    }
+
+    /// Copies of the world that play so many episodes.
+    pub fn copies(episodes: usize) -> usize {
+        episodes.min(COPIES_MAX)
+    }
+
+    /// What the network that plays makes of the states it sees.
+    ///
+    /// # Errors
+    /// Settings that do not fit each other.
+    pub fn viewer(&self) -> anyhow::Result<Viewer> {
+        Ok(Viewer {
+            insight: Insight::of(&self.agent, Compute::cpu(self.config.actor.precision))?,
+            enlarge: self.enlarge()?,
+            enlarged: Vec::new(),
+        })
+    }
+
+    fn enlarge(&self) -> anyhow::Result<Option<Enlarge>> {
+        let config = &self.config;
+        Ok(config.input.enlarge(sent(config), &config.model)?)
+    }
+}
+
+/// Returns of whole episodes of a random policy in a run's world, on the levels trained on. It needs no checkpoint.
+///
+/// # Errors
+/// The world failed, or episodes do not end.
+pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow::Result<Vec<f64>> {
+    let world = levels(&config.world, Levels::Train)?;
+    let mut policy = random_policy(config)?;
+    play_with(config, &mut policy, &world, episodes, seed, &mut |_| ())
+}
+
+fn random_policy(config: &RunConfig) -> anyhow::Result<RandomPolicy> {
+    Ok(RandomPolicy::new(u8::try_from(config.run.num_actions)?))
+}
+
+fn play_with(
+    config: &RunConfig,
+    policy: &mut dyn Policy,
+    world: &WorldConfig,
+    episodes: usize,
+    seed: u64,
+    watch: &mut dyn FnMut(&Step<'_>),
+) -> anyhow::Result<Vec<f64>> {
+    let spec = &config.run;
+    let copies = Player::copies(episodes);
+    let actions = world.actions(config.actor.actions);
+    let fewer = FewerActions::of(world.build(copies, seed, 0)?, actions)?;
+    let rounds = episodes.div_ceil(copies) as u64;
+    let evaluation = Evaluation {
+        frame_stack: spec.frame_stack as usize,
+        epsilon: EPSILON,
+        episodes,
+        steps_max: rounds * STEPS_A_ROUND_MAX,
+    };
+    let (world, rng) = (CutFrames::of(fewer, sent(config))?, policy_rng(seed));
+    episode_returns(world, policy, evaluation, rng, watch)
         .with_context(|| format!("playing {}", spec.world))
+}
+
+/// Rows and columns of a frame as it travels.
+const fn sent(config: &RunConfig) -> (usize, usize) {
+    let spec = &config.run;
+    (spec.frame_height as usize, spec.frame_width as usize)
+}
+
+/// Plays a checkpoint of a run on the levels trained on, adds what it earned to the run's table, and keeps it where it earned
+/// more than all before. Says what it earned, and whether it is the best.
+///
+/// # Errors
+/// As [`Player::load_at`] and [`Player::play`], and a file system that refuses.
+pub fn keep(
+    folder: &RunFolder,
+    which: Which,
+    episodes: u32,
+    seed: u64,
+) -> anyhow::Result<(Evaluated, bool)> {
+    let config = config_of(folder)?;
+    let path = checkpoint_at(folder, which)?;
+    let candidate = Candidate::hold(folder, &path)?;
+    let player = Player::read(config, &path)?;
+    let world = levels(&player.config.world, Levels::Train)?;
+    let returns = player.play(Who::Agent, &world, episodes as usize, seed)?;
+    let earned = Evaluated::at(
+        folder,
+        player.updates,
+        episodes,
+        mean_and_deviation(&returns),
+    );
+    let is_best = candidate.judge(folder, &earned)?;
+    Ok((earned, is_best))
+}
+
+/// The settings of the run in `folder`.
+fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
+    let path = folder.config();
+    let text = std::fs::read_to_string(&path).map_err(|e| {
+        usage!(
+            "{} is not the folder of a run: reading {}: {e}",
+            folder.display(),
+            path.display()
+        )
+    })?;
+    Ok(RunConfig::parse(&path.display().to_string(), &text)?)
+}
+
+/// The folder of a checkpoint.
+fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<PathBuf> {
+    let updates = match which {
+        Which::Newest => None,
+        Which::After(updates) => Some(updates),
+        Which::Best => {
+            let mut best = checkpoint::list(&folder.best())?;
+            let (_, path) = best.pop().ok_or_else(|| {
+                usage!(
+                    "{} has no best checkpoint: none was played while it trained. Train with --evaluate-every UPDATES, or judge those \
+                     that are there with `driml evaluate {} --checkpoint UPDATES --keep`",
+                    folder.display(),
+                    folder.display()
+                )
+            })?;
+            return Ok(path);
+        }
+    };
+    let mut all = checkpoint::list(&folder.checkpoints())?;
+    let Some((newest, _)) = all.last() else {
+        return Err(usage!(
+            "{} has no checkpoint yet: let the run go on",
+            folder.display()
+        )
+        .into());
+    };
+    let wanted = updates.unwrap_or(*newest);
+    let known: Vec<String> = all.iter().map(|(updates, _)| updates.to_string()).collect();
+    let found = all.iter().position(|(updates, _)| *updates == wanted);
+    let at = found.ok_or_else(|| {
+        usage!(
+            "{} has no checkpoint after {wanted} updates; it has those after {}. learner.checkpoints_kept says how many stay",
+            folder.display(),
+            known.join(", ")
+        )
+    })?;
+    Ok(all.swap_remove(at).1)
+}
+
+/// Sees what the policy sees.
+#[derive(Debug)]
+pub struct Viewer {
+    /// The network.
+    pub insight: Insight,
+    enlarge: Option<Enlarge>,
+    enlarged: Vec<u8>,
+}
+
+impl Viewer {
+    /// What the network makes of a step's states.
+    ///
+    /// # Errors
+    /// Bytes that are not whole states.
+    pub fn look(&mut self, states: &[u8]) -> Result<Seen, UpdateError> {
+        let Some(enlarge) = &self.enlarge else {
+            return self.insight.look(states);
+        };
+        // An input has as many states as there were, whatever their sizes.
+        let count = states.len() / enlarge.input_bytes();
+        self.enlarged.resize(count * enlarge.output_bytes(), 0);
+        enlarge.apply(states, &mut self.enlarged);
+        self.insight.look(&self.enlarged)
     }
 }
 

@@ -1,4 +1,4 @@
-//! Counts how often a person has asked this process to stop: by Ctrl-C, by SIGTERM, or by closing the terminal or pipe.
+//! Counts how often this process was asked to stop: by Ctrl-C, by SIGTERM, or by closing the terminal or pipe.
 //! The first is a wish to drain, the second to end at once; the caller decides.
 
 use std::{
@@ -38,9 +38,9 @@ impl Interrupts {
     /// Counts a sign that was heard at `now`. `last` is when the last wish began.
     fn hear(&self, sign: EndSign, last: &mut Option<Instant>, now: Instant) {
         let is_new = match sign {
-            // Counted from the wish's first signal: whoever keeps pressing is heard.
+            // Counted from the first signal of a request, so that repeated Ctrl-C always counts.
             EndSign::Asked => last.is_none_or(|last| now - last > ONE_WISH),
-            // Nobody is there who could be in a hurry: a closed terminal sends SIGHUP, and the other signs follow.
+            // A closed terminal sends SIGHUP, and the other signs follow: no user is there who wants it faster.
             EndSign::Abandoned => last.is_none(),
         };
         if is_new {

@@ -1,8 +1,9 @@
-//! The launcher: starts the parts as processes, watches them to the end of the run, and ends them in order.
+//! The launcher: starts replay servers, learner and actors as processes, watches them to the end of the run, and ends them in
+//! order.
 //! Each is a `managed_process`; `status_client` asks how they are, `live_view` shows it and `run_folder` keeps it.
 
 use std::{
-    path::Path,
+    path::{Path, PathBuf},
     time::{Duration, Instant},
 };
 
@@ -11,89 +12,121 @@ use driml_machine::{
     error::{Interrupted, Usage},
     units::duration,
 };
-use driml_protocol::{
-    Keys, fault,
-    session::{self, Endpoints},
-};
+use driml_protocol::{Keys, session};
 use driml_settings::config::RunConfig;
 
 use crate::{
+    connect::connect,
     console::{self, Screen, print},
     endpoint::NAMESPACE,
+    evaluator::Evaluator,
     interrupts::Interrupts,
-    live_view::{Display, TEMPLATE},
+    live_view::{Display, TEMPLATE, silence},
     managed_process::{ManagedProcess, Surroundings},
     meeting::Meeting,
+    processes::{Processes, stop},
     resume,
-    run_folder::{Outcome, Recorder, ResumePoint, RunFolder, Summary},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     status_client::Statuses,
 };
 
-/// How often the parts are asked how they are.
+/// How often the processes are asked how they are.
 const POLL: Duration = Duration::from_secs(1);
-/// How long the replay server may take to listen.
-const LISTEN_MAX: Duration = Duration::from_secs(30);
-/// How long a part may leave questions unanswered, from its start too, before the run is given up.
+/// How long a process may leave questions unanswered, from its start too, before the run is given up.
 const SILENCE_MAX: Duration = Duration::from_secs(120);
 /// How long a run may make no progress before it is given up.
 const STALL_MAX: Duration = Duration::from_secs(600);
 /// How long actors may take to deliver what they have, once they are not needed or told to stop.
 const ACTORS_DRAIN_MAX: Duration = Duration::from_secs(60);
-/// How long actors may take to end once another part has failed.
+/// How long actors may take to end once another process has failed.
 const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
 /// How long the learner may take to save, once it is told to stop.
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 /// How long the replay server may take to end, once it is told to stop.
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
+/// How often replay servers that keep their replay on disk are started again in a run, all together.
+const RESTARTS_MAX: u32 = 8;
+/// How often actors that have died are started again in one run, all together; one more is an error.
+const ACTOR_RESTARTS_MAX: u32 = 16;
 /// How often a learner that saves is asked whether it is done.
 const DRAIN_POLL: Duration = Duration::from_millis(100);
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
-const PART_THREADS: u32 = 1;
+const PROCESS_THREADS: u32 = 1;
 
-/// Trains with one process for each part, and leaves `run_dir`; a run that is `resumed` has it already, and so much behind it.
+/// Where the replay server is reached from outside the run.
+#[derive(Clone, Debug, Default)]
+pub struct Outside {
+    /// Where the parts meet, if not at a unix socket of their own; with certificates, where it listens beside that.
+    pub listen: Option<String>,
+    /// The folder of certificates.
+    pub tls_dir: Option<PathBuf>,
+    /// Whether everybody is trusted who can connect.
+    pub insecure_network: bool,
+}
+
+/// Trains with a process for each replay server, the learner and each actor, and leaves `run_dir`; a run that is `resumed` has
+/// that folder already and goes on from the point given.
 ///
 /// # Errors
-/// A part that failed or went silent, a file system that refuses; [`Interrupted`] if a person ended the run.
+/// A process that failed or went silent, a file system that refuses; [`Interrupted`] if the run was asked to stop.
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
     resumed: Option<ResumePoint>,
-    listen: Option<String>,
+    outside: Outside,
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
     let servers = server_names(config.replay.shards);
-    let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
-    let names: Vec<_> = servers
-        .iter()
-        .cloned()
-        .chain(["learner".into()])
-        .chain(actors)
-        .collect();
+    let names = process_names(config);
     let (text, losses) = (config.to_toml(), config.learner.update.objective.losses());
     let mut recorder = match resumed {
-        Some(behind) => Recorder::go_on(run_dir, &text, losses, &names, behind, config.frames())?,
-        None => Recorder::create(run_dir, &text, losses, &names)?,
+        Some(resume_point) => RunRecorder::go_on(
+            run_dir,
+            &text,
+            losses,
+            &names,
+            resume_point,
+            config.frames(),
+        )?,
+        None => RunRecorder::create(run_dir, &text, losses, &names)?,
     };
-    let behind = resumed.unwrap_or_default();
+    if config.local.tensorboard {
+        recorder.write_events(run_dir)?;
+    }
+    let resume_point = resumed.unwrap_or_default();
+    let evaluator = config.local.evaluation;
+    let evaluator = evaluator
+        .map(|it| Evaluator::new(it, run_dir))
+        .transpose()?;
     let meeting = Meeting::create()?;
     let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
-    if let Some(listen) = listen {
-        endpoints[0] = listen;
+    if let (Some(listen), None) = (&outside.listen, &outside.tls_dir) {
+        endpoints[0].clone_from(listen);
     }
+    write_whole(&run_dir.endpoints(), endpoints.join("\n").as_bytes())?;
     let screen = Screen::new(config.frames(), TEMPLATE);
-    let display = Display::new(screen.clone(), config.frames(), config.updates(), behind);
+    let display = Display::new(
+        screen.clone(),
+        config.frames(),
+        config.updates(),
+        resume_point,
+    );
     let mut launch = Launch {
         config,
         run_dir,
-        behind,
+        resume_point,
         servers,
         endpoints,
+        outside,
         meeting,
         screen,
         display,
         interrupts,
-        parts: Vec::new(),
+        processes: Processes::default(),
+        evaluator,
+        restarts: 0,
+        actor_restarts: 0,
         statuses: None,
     };
 
@@ -108,6 +141,16 @@ pub fn run(
         _ => Outcome::Failed,
     };
     let (summary, written) = launch.conclude(&mut recorder, outcome);
+    // Whoever interrupts a run, or whose run failed, does not wait for it.
+    if let Some(mut evaluator) = launch.evaluator.take()
+        && outcome == Outcome::Finished
+    {
+        evaluator.finish(&launch.screen, &|| launch.interrupts.count() > 0);
+    }
+    // Nobody is there any more who could be asked; where this file is left, the lock tells.
+    if let Err(e) = std::fs::remove_file(run_dir.endpoints()) {
+        tracing::debug!("removing {}: {e}", run_dir.endpoints().display());
+    }
     if let Err(failed) = ran.and(ended) {
         // It is what the run is remembered by; that the disk is full too is said before.
         if let Err(e) = written {
@@ -124,15 +167,10 @@ pub fn run(
         )
     })?;
     if outcome == Outcome::Interrupted {
-        if resume::is_resumable(&config.world, run_dir) {
-            console::line(&format!(
-                "`driml local --resume {}` goes on with it",
-                run_dir.display()
-            ));
-        }
+        resume::say_how(&config.world, run_dir);
         Err(Interrupted.into())
     } else {
-        Ok(())
+        print(&summary.next_steps(run_dir))
     }
 }
 
@@ -140,17 +178,36 @@ pub fn run(
 struct Launch<'a> {
     config: &'a RunConfig,
     run_dir: &'a RunFolder,
-    behind: ResumePoint,
+    resume_point: ResumePoint,
     /// Names of the replay servers, one a shard, and where each listens.
     servers: Vec<String>,
     endpoints: Vec<String>,
+    outside: Outside,
     meeting: Meeting,
     screen: Screen,
     display: Display,
     interrupts: Interrupts,
-    /// Replay servers, learner, actors, in this order, as far as they were started.
-    parts: Vec<ManagedProcess>,
+    processes: Processes,
+    /// Plays the checkpoints, if they are to be.
+    evaluator: Option<Evaluator>,
+    /// How often a replay server that had died was started again.
+    restarts: u32,
+    /// How often an actor was.
+    actor_restarts: u32,
     statuses: Option<Statuses>,
+}
+
+fn words(args: &[&str]) -> Vec<String> {
+    args.iter().map(|&arg| arg.to_owned()).collect()
+}
+
+/// The processes of a run that is started on one machine: replay servers, learner, actors.
+pub(crate) fn process_names(config: &RunConfig) -> Vec<String> {
+    let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
+    let others = ["learner".into()].into_iter().chain(actors);
+    let mut names = server_names(config.replay.shards);
+    names.extend(others);
+    names
 }
 
 /// `replay-server`, or one for each of several shards.
@@ -161,17 +218,22 @@ fn server_names(shards: u32) -> Vec<String> {
     }
 }
 
+impl Outside {
+    /// What the first replay server is told of it, beside where the parts meet.
+    fn flags(&self) -> Vec<String> {
+        let mut flags = Vec::new();
+        if let (Some(listen), Some(folder)) = (&self.listen, &self.tls_dir) {
+            flags.extend(["--listen".into(), listen.clone()]);
+            flags.extend(["--tls-dir".into(), folder.display().to_string()]);
+        }
+        if self.insecure_network {
+            flags.push("--insecure-network".into());
+        }
+        flags
+    }
+}
+
 impl Launch<'_> {
-    /// The learner's place in `parts`.
-    fn learner(&self) -> usize {
-        self.servers.len()
-    }
-
-    /// The first actor's place in `parts`.
-    fn first_actor(&self) -> usize {
-        self.servers.len() + 1
-    }
-
     fn surroundings<'a>(&'a self, logs: &'a Path) -> Surroundings<'a> {
         Surroundings {
             logs,
@@ -180,39 +242,16 @@ impl Launch<'_> {
         }
     }
 
-    fn start_and_watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
+    fn start_and_watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
         let logs = self.run_dir.logs();
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
-        let config = recorder.config_path().display().to_string();
-        let part = |words: &[&str]| {
-            words
-                .iter()
-                .map(|&word| word.to_owned())
-                .collect::<Vec<_>>()
-        };
-        for (shard, (name, endpoint)) in self.servers.iter().zip(&self.endpoints).enumerate() {
-            let (shard, after) = (shard.to_string(), self.behind.updates.to_string());
-            let mut args = part(&[
-                "replay-server",
-                "--listen",
-                endpoint,
-                "--shard",
-                &shard,
-                "--after-updates",
-                &after,
-                "--config",
-                &config,
-            ]);
-            if let Some(study) = self.config.replay.study {
-                args.extend(part(&["--study", study.name()]));
-            }
-            let server =
-                ManagedProcess::start(name, &args, PART_THREADS, self.surroundings(&logs))?;
-            self.parts.push(server);
+        for shard in 0..self.servers.len() {
+            let server = self.start_server(shard, self.resume_point.updates)?;
+            self.processes.replay_servers.push(server);
         }
         let mut sessions = Vec::new();
         for endpoint in self.endpoints.clone() {
-            match self.connect(&endpoint)? {
+            match connect(&endpoint, &self.interrupts, || self.processes.check_alive())? {
                 Some(session) => sessions.push(session),
                 None => return Ok(Outcome::Interrupted),
             }
@@ -222,87 +261,137 @@ impl Launch<'_> {
 
         let folder = self.run_dir.display().to_string();
         let device = self.config.local.learner_device.to_string();
-        let mut args = part(&["learner", "--run-dir", &folder, "--device", &device]);
+        let mut args = words(&[
+            "learner",
+            "--stay",
+            "--run-dir",
+            &folder,
+            "--device",
+            &device,
+        ]);
         for endpoint in &self.endpoints {
-            args.extend(part(&["--connect", endpoint]));
+            args.extend(words(&["--connect", endpoint]));
         }
-        self.parts.push(ManagedProcess::start(
+        self.processes.learner = Some(ManagedProcess::start(
             "learner",
             &args,
             self.config.local.learner_threads,
             self.surroundings(&logs),
         )?);
         for id in 0..self.config.local.actors {
-            let args = part(&[
-                "actor",
-                "--connect",
-                &self.endpoints[id as usize % self.endpoints.len()],
-                "--id",
-                &id.to_string(),
-            ]);
-            self.parts.push(ManagedProcess::start(
-                &format!("actor-{id}"),
-                &args,
-                PART_THREADS,
-                self.surroundings(&logs),
-            )?);
+            let actor = self.start_actor(id)?;
+            self.processes.actors.push(actor);
         }
         self.watch(recorder)
     }
 
-    /// A session to the replay server as soon as it listens; none if a person was faster.
-    fn connect(&mut self, endpoint: &str) -> anyhow::Result<Option<zenoh::Session>> {
-        let endpoints = Endpoints {
-            listen: Vec::new(),
-            connect: vec![endpoint.to_owned()],
-        };
-        let deadline = Instant::now() + LISTEN_MAX;
-        loop {
-            // Opening may take seconds of its own, in which the replay server may end: so it is not waited for here.
-            let endpoints = endpoints.clone();
-            let (tell, told) = std::sync::mpsc::channel();
-            let open = move || {
-                fault::point("connect");
-                // Nobody listens any more if the run has ended meanwhile.
-                let _ = tell.send(session::open(&endpoints));
-            };
-            let thread = std::thread::Builder::new().name("connect".into());
-            thread.spawn(open).context("starting a thread")?;
-            let opened = loop {
-                self.check_alive()?;
-                if self.interrupts.count() > 0 {
-                    return Ok(None);
-                }
-                match told.recv_timeout(Duration::from_millis(50)) {
-                    Ok(opened) => break opened,
-                    Err(_) if Instant::now() > deadline => {
-                        bail!(
-                            "the replay server does not listen on {endpoint} after {}",
-                            duration(LISTEN_MAX)
-                        )
-                    }
-                    Err(_) => {}
-                }
-            };
-            match opened {
-                Ok(session) => return Ok(Some(session)),
-                Err(e) if Instant::now() > deadline => {
-                    return Err(e).context("reaching the replay server");
-                }
-                Err(e) => tracing::debug!("the replay server does not listen yet: {e}"),
-            }
+    fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
+        let mut args = words(&[
+            "actor",
+            "--connect",
+            &self.endpoints[id as usize % self.endpoints.len()],
+            "--id",
+            &id.to_string(),
+        ]);
+        if self.config.world.name().foreign_code().is_some() {
+            args.extend(words(&["--env", &self.config.run.world]));
         }
+        let logs = self.run_dir.logs();
+        let name = format!("actor-{id}");
+        ManagedProcess::start(&name, &args, PROCESS_THREADS, self.surroundings(&logs))
+    }
+
+    /// Starts actors that have died again. What one had not delivered is gone with it; the run goes on.
+    ///
+    /// # Errors
+    /// The process cannot be started.
+    fn revive_actors(&mut self) -> anyhow::Result<()> {
+        for id in 0..self.processes.actors.len() {
+            let actor = &mut self.processes.actors[id];
+            if self.actor_restarts == ACTOR_RESTARTS_MAX || !actor.may_be_started_again() {
+                continue;
+            }
+            self.actor_restarts += 1;
+            let report = actor.exit_report();
+            self.screen.line(&format!(
+                "{report}\nactor-{id} is started again ({} of {ACTOR_RESTARTS_MAX} times in a run)",
+                self.actor_restarts
+            ));
+            session::sweep_shared_memory();
+            self.processes.actors[id] = self.start_actor(id as u32)?;
+        }
+        Ok(())
+    }
+
+    /// Starts the replay server of one shard, in a run that goes on after so many updates.
+    fn start_server(&self, shard: usize, after_updates: u64) -> anyhow::Result<ManagedProcess> {
+        let config = self.run_dir.config().display().to_string();
+        let (number, after) = (shard.to_string(), after_updates.to_string());
+        let mut args = words(&[
+            "replay-server",
+            "--stay",
+            "--listen",
+            &self.endpoints[shard],
+            "--shard",
+            &number,
+            "--after-updates",
+            &after,
+            "--config",
+            &config,
+        ]);
+        if shard == 0 {
+            args.extend(self.outside.flags());
+        }
+        if let Some(bug) = self.config.replay.reproduced_bug {
+            args.extend(words(&["--reproduce-bug", bug.name()]));
+        }
+        if self.config.local.durable {
+            let folder = self.run_dir.replay().display().to_string();
+            args.extend(words(&["--replay-dir", &folder]));
+        }
+        let logs = self.run_dir.logs();
+        let name = &self.servers[shard];
+        ManagedProcess::start(name, &args, PROCESS_THREADS, self.surroundings(&logs))
+    }
+
+    /// Starts replay servers that have died again, if they go on with what they have kept.
+    ///
+    /// # Errors
+    /// It has happened too often, or the process cannot be started.
+    fn revive_servers(&mut self) -> anyhow::Result<()> {
+        if !self.config.local.durable {
+            return Ok(());
+        }
+        for shard in 0..self.processes.replay_servers.len() {
+            let server = &mut self.processes.replay_servers[shard];
+            if server.end().is_none() || self.restarts == RESTARTS_MAX {
+                continue;
+            }
+            self.restarts += 1;
+            let report = server.exit_report();
+            self.screen.line(&format!(
+                "{report}\n{} is started again with what it has kept ({} of {RESTARTS_MAX} times in a run)",
+                self.servers[shard], self.restarts
+            ));
+            session::sweep_shared_memory();
+            // What the learner has learned meanwhile, the log knows.
+            let server = self.start_server(shard, self.resume_point.updates)?;
+            self.processes.replay_servers[shard] = server;
+        }
+        Ok(())
     }
 
     /// Asks, shows and records once a second until the run is over.
-    fn watch(&mut self, recorder: &mut Recorder) -> anyhow::Result<Outcome> {
+    fn watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
         let mut heard = [Instant::now(); 2];
         let mut progress = (Instant::now(), (0, 0));
         loop {
             if self.interrupts.wait_timeout(POLL) > 0 {
                 return Ok(Outcome::Interrupted);
             }
-            self.check_alive()?;
+            self.revive_servers()?;
+            self.revive_actors()?;
+            self.processes.check_alive()?;
             let statuses = self
                 .statuses
                 .as_mut()
@@ -324,13 +413,21 @@ impl Launch<'_> {
             }
             let (replay, mut learner) = (statuses.replay.clone(), statuses.learner.clone());
             // Until the learner has answered, too.
-            learner.updates = learner.updates.max(self.behind.updates);
-            let rss: Vec<_> = self.parts.iter_mut().map(ManagedProcess::rss_mib).collect();
+            learner.updates = learner.updates.max(self.resume_point.updates);
+            let rss = self.processes.rss_mib();
             for line in recorder.record(&statuses.shards, &learner, &rss) {
                 self.screen.line(&line);
             }
+            let notes: Vec<_> = ["replay server", "learner"]
+                .into_iter()
+                .zip(heard)
+                .filter_map(|(part, heard)| silence(part, heard))
+                .collect();
             self.display
-                .show(&replay, &learner, recorder.episodes(&replay));
+                .show(&replay, &learner, recorder.episodes(&replay), &notes);
+            if let Some(evaluator) = &mut self.evaluator {
+                evaluator.look(&self.screen);
+            }
             if replay.finished && learner.finished {
                 return Ok(Outcome::Finished);
             }
@@ -350,20 +447,7 @@ impl Launch<'_> {
         }
     }
 
-    /// Whether all parts are as they should be: running, or actors that are not needed any more.
-    fn check_alive(&mut self) -> anyhow::Result<()> {
-        let first_actor = self.first_actor();
-        for (at, part) in self.parts.iter_mut().enumerate() {
-            if let Some(status) = part.end()
-                && !(at >= first_actor && status.success())
-            {
-                bail!("{}", part.exit_report());
-            }
-        }
-        Ok(())
-    }
-
-    /// Ends all parts: actors first, so that what they have is stored; the learner saves; the replay server is last, so
+    /// Ends all processes: actors first, so that what they have is stored; the learner saves; the replay server is last, so
     /// that it can be asked for the final counts. A second interrupt ends everything at once.
     fn end(&mut self, ran: &anyhow::Result<Outcome>) -> anyhow::Result<()> {
         if matches!(ran, Ok(Outcome::Interrupted)) {
@@ -374,17 +458,15 @@ impl Launch<'_> {
         let interrupts = self.interrupts.clone();
         let abort = move || interrupts.count() > allowed;
         let finished = matches!(ran, Ok(Outcome::Finished));
-        // Once a part has failed, what the actors still have will hardly be learned from.
+        // Once a process has failed, what the actors still have will hardly be learned from.
         let actors_max = if ran.is_ok() {
             ACTORS_DRAIN_MAX
         } else {
             FAILED_DRAIN_MAX
         };
         let mut late = Vec::new();
-        let last = self.parts.len();
-        let (learner, first_actor) = (self.learner().min(last), self.first_actor().min(last));
         // When the run is finished, actors hear it from the replay server and end by themselves.
-        let actors = self.stop(first_actor..last, !finished, actors_max, &abort);
+        let actors = stop(&mut self.processes.actors, !finished, actors_max, &abort);
         if finished {
             late.extend(actors);
         } else {
@@ -394,7 +476,12 @@ impl Launch<'_> {
                 .for_each(|actor| self.screen.line(&format!("while stopping, {actor}")));
         }
         self.wait_for_final_checkpoint(&abort);
-        late.extend(self.stop(learner..first_actor, true, LEARNER_DRAIN_MAX, &abort));
+        late.extend(stop(
+            self.processes.learner.as_mut_slice(),
+            true,
+            LEARNER_DRAIN_MAX,
+            &abort,
+        ));
         if let Some(statuses) = &mut self.statuses {
             if let Err(e) = statuses.ask_replay() {
                 tracing::debug!("the replay server's last word: {e:#}");
@@ -402,7 +489,12 @@ impl Launch<'_> {
             // Before its router goes away, so that it does not try to reach it again.
             statuses.close();
         }
-        late.extend(self.stop(0..learner, true, REPLAY_DRAIN_MAX, &abort));
+        late.extend(stop(
+            &mut self.processes.replay_servers,
+            true,
+            REPLAY_DRAIN_MAX,
+            &abort,
+        ));
         if abort() {
             bail!("ended at once by an interrupt: what was not saved is lost");
         }
@@ -414,8 +506,7 @@ impl Launch<'_> {
 
     /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
     fn wait_for_final_checkpoint(&mut self, abort: &impl Fn() -> bool) {
-        let at = self.learner();
-        let Some(learner) = self.parts.get_mut(at) else {
+        let Some(learner) = &mut self.processes.learner else {
             return;
         };
         learner.ask_to_stop();
@@ -435,44 +526,10 @@ impl Launch<'_> {
         }
     }
 
-    /// Waits for some parts to end, asking them first if `ask`; says which did not end well in time. None is left.
-    fn stop(
-        &mut self,
-        which: std::ops::Range<usize>,
-        ask: bool,
-        drain_max: Duration,
-        abort: &impl Fn() -> bool,
-    ) -> Vec<String> {
-        let parts = &mut self.parts[which];
-        if ask {
-            parts.iter_mut().for_each(ManagedProcess::ask_to_stop);
-        }
-        let deadline = Instant::now() + drain_max;
-        let mut late = Vec::new();
-        for part in parts {
-            match part.wait_until(deadline, abort) {
-                Some(status) if status.success() => {}
-                Some(_) => late.push(part.exit_report()),
-                None => {
-                    if !abort() {
-                        late.push(format!(
-                            "{} did not end within {} and was killed",
-                            part.name,
-                            duration(drain_max)
-                        ));
-                    }
-                    part.kill();
-                    part.wait_until(Instant::now() + REPLAY_DRAIN_MAX, || false);
-                }
-            }
-        }
-        late
-    }
-
     /// Writes the last row and the summary, says what could not be written before, and whether the summary could.
     fn conclude(
         &mut self,
-        recorder: &mut Recorder,
+        recorder: &mut RunRecorder,
         outcome: Outcome,
     ) -> (Summary, anyhow::Result<()>) {
         let (shards, replay, learner) = match &self.statuses {
@@ -480,13 +537,12 @@ impl Launch<'_> {
             None => Default::default(),
         };
         recorder.record(shards, &learner, &[]);
-        let logs = self
-            .parts
-            .iter()
-            .filter_map(ManagedProcess::missing_log_lines);
+        let logs = self.processes.missing_log_lines();
         let missing = recorder.missing().into_iter().chain(logs);
         missing.for_each(|line| console::line(&line));
-        let summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);
+        let mut summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);
+        summary.replay_servers_restarted = self.restarts;
+        summary.actors_restarted = self.actor_restarts;
         let written = summary.write(self.run_dir);
         (summary, written)
     }

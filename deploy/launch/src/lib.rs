@@ -1,7 +1,7 @@
 //! Starting, watching and ending a run on this machine, and what it leaves in its folder.
 //!
-//! Start with [`launcher::run`], which trains with one process for each part, or [`lockstep::run`], which does it in this
-//! process and in a fixed order. [`run_folder::RunFolder`] knows the names of a run's files:
+//! Start with [`launcher::run`], which trains with replay servers, learner and actors as processes, or [`lockstep::run`], which
+//! does it in this process and in a fixed order. [`run_folder::RunFolder`] knows the names of a run's files:
 //!
 //! ```
 //! use driml_launch::run_folder::{RunFolder, Summary, progress};
@@ -16,13 +16,16 @@
 //! # Ok::<(), anyhow::Error>(())
 //! ```
 //!
-//! It draws nothing and compares no runs: that is for `driml-experiments`.
+//! It compares no runs, and draws nothing but the pictures among a run's events: figures are for `driml-experiments`.
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
+mod connect;
 pub mod console;
 pub mod endpoint;
 pub mod evaluate;
+mod evaluator;
+pub mod inspect;
 pub mod interrupts;
 pub mod launcher;
 pub mod live_view;
@@ -32,8 +35,11 @@ pub mod meeting;
 pub mod panics;
 pub mod plan;
 pub mod process_log;
+mod processes;
 mod rates;
 pub mod resume;
 pub mod run_folder;
 pub mod shared_memory;
+pub mod status;
 pub mod status_client;
+pub mod watch;

@@ -1,5 +1,5 @@
 //! The live view of a run: one progress display on a terminal, a plain line now and then elsewhere.
-//! It asks nobody: the launcher and the lockstep mode tell it.
+//! It asks no process: the launcher and the lockstep mode hand it the numbers.
 
 use std::time::{Duration, Instant};
 
@@ -14,10 +14,12 @@ use crate::{
 
 /// How often a line is written where there is no terminal.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
+/// How long a part may be silent before it is said.
+const SILENT_MAX: Duration = Duration::from_secs(10);
 /// The progress display: how far, then two lines of numbers.
 pub const TEMPLATE: &str = "{bar:40} {percent:>3}%  {elapsed_precise}\n{msg}";
 
-/// An auxiliary loss for a person to read: `DIM 4t4` of `dim_4t4`.
+/// The display name of an auxiliary loss: `DIM 4t4` of `dim_4t4`.
 pub fn loss_title(name: &str) -> String {
     match name.split_once('_') {
         Some((kind, of_what)) => format!("{} {of_what}", kind.to_uppercase()),
@@ -36,10 +38,15 @@ pub struct Display {
 }
 
 impl Display {
-    /// A view of a run of so many frames and updates, with so much `behind` it.
-    pub fn new(screen: Screen, frames_max: u64, updates_max: u64, behind: ResumePoint) -> Self {
+    /// A view of a run of `frames_max` frames and `updates_max` updates that starts at `resume_point`.
+    pub fn new(
+        screen: Screen,
+        frames_max: u64,
+        updates_max: u64,
+        resume_point: ResumePoint,
+    ) -> Self {
         let mut rates = Rates::default();
-        rates.add(Instant::now(), behind.frames, behind.updates);
+        rates.add(Instant::now(), resume_point.frames, resume_point.updates);
         Self {
             screen,
             frames_max,
@@ -49,20 +56,29 @@ impl Display {
         }
     }
 
-    /// Shows the state of the run.
-    pub fn show(&mut self, replay: &ReplayStatus, learner: &LearnerStatus, episodes: Episodes) {
+    /// Shows the state of the run, and `notes` under it, such as who does not answer.
+    pub fn show(
+        &mut self,
+        replay: &ReplayStatus,
+        learner: &LearnerStatus,
+        episodes: Episodes,
+        notes: &[String],
+    ) {
         let now = Instant::now();
         self.rates
             .add(now, replay.transitions_inserted, learner.updates);
-        let parts = self.text(replay, learner, episodes);
+        let mut texts = self.text(replay, learner, episodes).to_vec();
+        if !notes.is_empty() {
+            texts.push(notes.join("; "));
+        }
         match self.screen.bar() {
             Some(bar) => {
                 bar.set_position(replay.transitions_inserted.min(self.frames_max));
-                bar.set_message(parts.join("\n"));
+                bar.set_message(texts.join("\n"));
             }
             None if now >= self.plain_next => {
                 self.plain_next = now + PLAIN_PERIOD;
-                self.screen.line(&parts.join("  "));
+                self.screen.line(&texts.join("  "));
             }
             None => {}
         }
@@ -113,6 +129,12 @@ impl Display {
             ),
         ]
     }
+}
+
+/// What to say of a part that was heard so long ago; nothing of one that was heard just now.
+pub(crate) fn silence(part: &str, heard: Instant) -> Option<String> {
+    let silent = heard.elapsed();
+    (silent >= SILENT_MAX).then(|| format!("{part}: no answer for {}", duration(silent)))
 }
 
 /// Who waits for whom, and how many actors do.

@@ -1,5 +1,5 @@
-//! One part of a run as a child process: started, watched, asked to stop.
-//! It does not know what the parts do or in which order they end.
+//! A child process of a run: started, watched, asked to stop.
+//! It does not know what the processes do or in which order they end.
 
 use std::{
     os::unix::process::{CommandExt, ExitStatusExt},
@@ -16,20 +16,23 @@ use nix::{
 
 use crate::{console::Screen, meeting::Meeting, process_log::ProcessLog};
 
-/// How often a part that should end is looked at.
+/// A process that ends with an error within this time of its start would do so again.
+const AT_ONCE: Duration = Duration::from_secs(10);
+/// How often a process that should end is looked at.
 const POLL: Duration = Duration::from_millis(20);
 
-/// A started part.
+/// A process that was started.
 #[derive(Debug)]
 pub struct ManagedProcess {
     /// Its name: `replay-server`, `learner`, `actor-0`.
     pub name: String,
     child: Child,
+    started: Instant,
     end: Option<ExitStatus>,
     log: ProcessLog,
 }
 
-/// What all parts of a run have in common when they start.
+/// What all processes of a run have in common when they start.
 #[derive(Clone, Copy, Debug)]
 pub struct Surroundings<'a> {
     /// The folder of their logs.
@@ -40,15 +43,15 @@ pub struct Surroundings<'a> {
     pub meeting: Option<&'a Meeting>,
 }
 
-/// What suits candle in every part: its second pool spins while it waits, which costs more than it gives on busy cores, and
-/// glibc returns each large tensor to the system and faults it in again unless told to keep it.
+/// The environment that suits candle in every process: its second pool spins while it waits, which costs more than it gives on
+/// busy cores, and glibc returns each large tensor to the system and faults it in again unless told to keep it.
 const FOR_CANDLE: [(&str, &str); 3] = [
     ("CANDLE_NUM_THREADS", "1"),
     ("MALLOC_MMAP_THRESHOLD_", "1000000000"),
     ("MALLOC_TRIM_THRESHOLD_", "10000000000"),
 ];
 
-/// Gives a process the environment of every part, with so many threads for arithmetic.
+/// Gives a process the environment of every process of a run, with `threads` threads for arithmetic.
 pub fn set_thread_env(command: &mut Command, threads: u32) {
     command
         .env("RAYON_NUM_THREADS", threads.to_string())
@@ -106,6 +109,7 @@ impl ManagedProcess {
         Ok(Self {
             name: name.into(),
             child,
+            started: Instant::now(),
             end: None,
             log,
         })
@@ -114,6 +118,16 @@ impl ManagedProcess {
     /// The process's number.
     pub fn pid(&self) -> u32 {
         self.child.id()
+    }
+
+    /// Whether it has died in a way that another start may mend: somebody killed it, or it had run for a while. A broken
+    /// invariant of our own aborts it.
+    pub(crate) fn may_be_started_again(&mut self) -> bool {
+        let killed = |signal| signal != Signal::SIGABRT as i32;
+        self.end().is_some_and(|status| {
+            let was_killed = status.signal().is_some_and(killed);
+            !status.success() && (was_killed || self.started.elapsed() > AT_ONCE)
+        })
     }
 
     /// How it ended, if it has.
@@ -168,12 +182,12 @@ impl ManagedProcess {
         rss_mib(&std::fs::read_to_string(format!("/proc/{}/status", self.pid())).ok()?)
     }
 
-    /// Lines of its log that could not be written, for a person; none if all were.
+    /// What to say about lines of its log that could not be written; `None` if all were.
     pub(crate) fn missing_log_lines(&self) -> Option<String> {
         self.log.missing()
     }
 
-    /// How and with which last words it ended, for a person.
+    /// How it ended and its last lines, as one message.
     pub fn exit_report(&mut self) -> String {
         self.wait_until(Instant::now(), || false);
         let how = match self.end {

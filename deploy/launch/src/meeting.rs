@@ -1,9 +1,9 @@
-//! The folder in which the parts of a run meet at unix sockets: private, beside other temporary files, and removed with the last
-//! process that uses it. A socket's path must be short, so it is not in the run folder.
+//! The folder in which the processes of a run meet at unix sockets: private, beside other temporary files, and removed with the
+//! last process that uses it. A socket's path must be short, so it is not in the run folder.
 //!
-//! The folder counts as used as long as anybody holds the lock of one file in it: the launcher, and each part, which has the
-//! file as its standard input. So those of a launcher that was killed are known, and swept by the next that starts or the last
-//! part that ends.
+//! The folder is in use as long as a process holds the lock of one file in it: the launcher, and each process that it started,
+//! which has the file as its standard input. A folder whose launcher was killed is recognised by this, and removed by the next
+//! launcher that starts or the last process that ends.
 
 use std::{
     fs::{self, File, Permissions},
@@ -13,6 +13,7 @@ use std::{
 };
 
 use anyhow::Context;
+use driml_protocol::lock_file;
 use nix::unistd::{dup2_stdin, geteuid};
 
 const PREFIX: &str = "driml-run-";
@@ -27,7 +28,7 @@ pub struct Meeting {
 }
 
 impl Meeting {
-    /// Makes one, and sweeps those that nobody uses any more.
+    /// Makes one, and removes those that are no longer in use.
     ///
     /// # Errors
     /// A file system that refuses.
@@ -38,23 +39,23 @@ impl Meeting {
     }
 
     fn create_in(place: &Path) -> io::Result<Self> {
-        // Whoever can reach the socket can take part in the run.
+        // Any process that can reach the socket can take part in the run.
         let folder = tempfile::Builder::new()
             .prefix(PREFIX)
             .permissions(Permissions::from_mode(0o700))
             .tempdir_in(place)?;
-        // Locked before it has the name by which it is known, or somebody who sweeps just now would find it without a holder.
+        // Locked before it has the name by which it is known, or a process that sweeps just now would find it without a holder.
         let fresh = folder.path().join("new");
         let lock = File::create(&fresh)?;
-        if let Err(e) = lock.try_lock() {
-            // Nobody sweeps what cannot be locked.
+        if let Err(e) = lock_file::try_lock(&lock) {
+            // What cannot be locked is not swept.
             tracing::debug!("locking {}: {e}", fresh.display());
         }
         fs::rename(fresh, folder.path().join(IN_USE))?;
         Ok(Self { folder, lock })
     }
 
-    /// Where a part of this name listens.
+    /// Where a process of this name listens.
     pub(crate) fn endpoint(&self, name: &str) -> String {
         let path = self.folder.path().join(format!("{name}.sock"));
         format!("unixsock-stream/{}", path.display())
@@ -69,7 +70,7 @@ impl Meeting {
     }
 }
 
-/// What a part does at its orderly end: uses no such folder any more, and sweeps, as its launcher may have been killed.
+/// What a process does at its orderly end: uses no such folder any more, and sweeps, as its launcher may have been killed.
 pub fn leave() {
     let nothing = File::open("/dev/null").map_err(|e| e.to_string());
     match nothing.and_then(|nothing| dup2_stdin(nothing).map_err(|e| e.to_string())) {
@@ -78,7 +79,7 @@ pub fn leave() {
     }
 }
 
-/// Removes folders of this user in `place` that nobody uses any more. What cannot be removed stays: it is in nobody's way.
+/// Removes folders of this user in `place` that are no longer in use. What cannot be removed stays and does no harm.
 fn sweep(place: &Path) {
     let entries = fs::read_dir(place).into_iter().flatten().flatten();
     for entry in entries.filter(|it| it.file_name().to_string_lossy().starts_with(PREFIX)) {
@@ -95,7 +96,8 @@ fn sweep(place: &Path) {
 }
 
 fn is_unused(folder: &Path) -> bool {
-    File::open(folder.join(IN_USE)).is_ok_and(|lock| lock.try_lock().is_ok())
+    let lock = File::open(folder.join(IN_USE));
+    lock.is_ok_and(|lock| matches!(lock_file::try_lock(&lock), Ok(true)))
 }
 
 #[cfg(test)]
@@ -119,7 +121,7 @@ mod tests {
         sweep(place.path());
         assert_eq!(folders(place.path()), 3);
 
-        // As after the launcher was killed: a part still uses it.
+        // As after the launcher was killed: a process still uses it.
         let part = meeting.hold().unwrap();
         let Meeting { folder, lock } = meeting;
         let path = folder.keep();

@@ -1,4 +1,4 @@
-//! A panic in any thread ends the process: a part that goes on without one of its threads looks alive and does its work no more.
+//! A panic in any thread ends the process: one that goes on without one of its threads looks alive and no longer does its work.
 //! Nothing in this program catches a panic.
 
 use std::{
@@ -8,7 +8,7 @@ use std::{
 
 /// Makes every panic say thread, place and message on stderr in one line, and then abort the process.
 ///
-/// The launcher shows that line and says which part it was; parts whose launcher aborts end in order.
+/// The launcher shows that line and says which process it was; processes whose launcher aborts end in order.
 pub fn end_the_process() {
     std::panic::set_hook(Box::new(|panic| {
         say(&line(panic, std::thread::current().name()));

@@ -1,12 +1,17 @@
-//! What a run will do and about how long it takes, for a person to read before it starts.
+//! What a run will do and about how long it takes, printed before it starts.
 //! It decides nothing, and its time is an estimate from the network's arithmetic, not a promise.
 
 use std::time::Duration;
 
-use driml_learner::{DeviceName, auxiliary::loss::Passes};
+use driml_learner::{
+    DeviceName, Precision,
+    cost::{UpdateCost, UpdateShape},
+};
 use driml_machine::{resources::Machine, units::duration};
-use driml_model::ModelConfig;
-use driml_settings::config::{COMPRESSED_FIELDS_BYTES, RunConfig, replay_bytes_each};
+use driml_settings::{
+    config::RunConfig,
+    memory::{COMPRESSED_FIELDS_BYTES, replay_bytes_each},
+};
 
 use crate::run_folder::{ResumePoint, RunFolder};
 
@@ -17,87 +22,24 @@ use crate::run_folder::{ResumePoint, RunFolder};
 /// have narrower registers, so this is half of it.
 const GFLOPS_PER_CORE: f64 = 75.0;
 
-/// Multiplications and additions, each counted as one, of one row through parts of the network.
-struct RowFlops {
-    /// Torso up to f3.
-    local: f64,
-    /// From f3 to f4.
-    global: f64,
-    /// C51 head.
-    head: f64,
-    /// DIM heads that exist, at every location where they are applied.
-    dim: f64,
-}
-
-fn row_flops(model: &ModelConfig) -> RowFlops {
-    let mut flops = RowFlops {
-        local: 0.0,
-        global: 0.0,
-        head: 0.0,
-        dim: 0.0,
-    };
-    for layer in model.conv_shapes() {
-        flops.local += 2.0 * (layer.locations() * layer.weight_len()) as f64;
-    }
-    let (height, width, _) = model.local_shape();
-    for (name, shape) in model.parameter_shapes() {
-        if shape.len() != 2 {
-            continue;
-        }
-        let product = 2.0 * shape.iter().product::<usize>() as f64;
-        match name.as_str() {
-            "torso.fc.weight" => flops.global += product,
-            "head.weight" => flops.head += product,
-            local if local.starts_with("dim.psi3") || local.starts_with("dim.phi3") => {
-                flops.dim += product * (height * width) as f64;
-            }
-            _ => flops.dim += product,
-        }
-    }
-    flops
-}
-
-/// About how long the run takes on `cores` cores.
-///
-/// An update passes s_t forward and backward (3 times the forward arithmetic), s_{t+n} forward, and each positive s_{t+k}
-/// forward and backward; an augmented s_t once more; CURL's query both ways and its key forward. The InfoNCE scores come on
-/// top: locations * rows^2 * rkhs for each positive. A frame is one forward pass.
+/// About how long the run takes on `cores` cores: its updates, and one forward pass a frame.
 pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
-    let (model, rows) = (&config.model, f64::from(config.learner.batch_rows));
-    let RowFlops {
-        local,
-        global,
-        head,
-        dim,
-    } = row_flops(model);
-    let forward = local + global + head;
-    let loss = config.learner.update.auxiliary();
-    let augmented = config.learner.augment.is_some();
-    let passes = loss.map_or_else(
-        |_| Passes::default(),
-        |loss| loss.passes(config.run.horizon.positives(), augmented),
-    );
-    let (height, width, _) = model.local_shape();
-    let locations = if passes.local {
-        (height * width) as f64
-    } else {
-        1.0
-    };
-    let scores = passes.scores * 6.0 * locations * rows * rows * model.rkhs as f64;
-    let more_passes = passes.torso * (local + global) + passes.heads * dim;
-    let update = rows * (4.0 * forward + more_passes) + scores;
-    let flops = config.updates() as f64 * update + config.frames() as f64 * forward;
+    let shape = UpdateShape::of(&config.learner, config.run.horizon.positives());
+    let update = UpdateCost::of(&config.model, &shape).total() as f64;
+    let layers = config.model.without_dim().layer_costs();
+    let forward: u64 = layers.iter().map(|layer| layer.forward).sum();
+    let flops = config.updates() as f64 * update + config.frames() as f64 * forward as f64;
     let seconds = flops / (GFLOPS_PER_CORE * 1e9 * f64::from(cores.max(1)));
     Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX)
 }
 
-/// The plan of a run that has so much `behind` it, one fact a line.
+/// The plan of a run that starts at `resume_point`, one fact a line.
 pub fn describe(
     config: &RunConfig,
     from: &str,
     run_dir: &RunFolder,
     lockstep: bool,
-    behind: ResumePoint,
+    resume_point: ResumePoint,
     machine: &Machine,
 ) -> String {
     let RunConfig {
@@ -113,7 +55,7 @@ pub fn describe(
         max.saturating_add(held * COMPRESSED_FIELDS_BYTES)
     });
     let bytes = compressed.min(held * replay_bytes_each(run));
-    let left = 1.0 - behind.updates as f64 / config.updates().max(1) as f64;
+    let left = 1.0 - resume_point.updates as f64 / config.updates().max(1) as f64;
     let processes = if lockstep {
         "one, all parts in lockstep".into()
     } else {
@@ -122,7 +64,13 @@ pub fn describe(
             shards => format!("{shards} replay servers"),
         };
         let learner = match local.learner_device {
-            DeviceName::Cpu => format!("with {} threads", local.learner_threads),
+            DeviceName::Cpu if learner.precision == Precision::F32 => {
+                format!("with {} threads", local.learner_threads)
+            }
+            DeviceName::Cpu => {
+                let (threads, precision) = (local.learner_threads, learner.precision);
+                format!("with {threads} threads, in {precision}")
+            }
             gpu => format!("on {gpu}"),
         };
         let actors = if local.actors == 1 { "actor" } else { "actors" };
@@ -145,7 +93,7 @@ pub fn describe(
                 "{} in all, with {} updates of {} rows (replay ratio {})",
                 config.frames(),
                 config.updates(),
-                learner.batch_rows,
+                learner.batch_size,
                 replay.replay_ratio
             ),
         ),
@@ -153,8 +101,12 @@ pub fn describe(
         (
             "replay",
             format!(
-                "the newest {held} transitions, up to {} of memory",
-                size(bytes)
+                "the newest {held} transitions, up to {} of memory{}",
+                size(bytes),
+                match local.durable || lockstep {
+                    true => " and about as much of disk, in the run folder",
+                    false => "",
+                }
             ),
         ),
         ("run folder", run_dir.display().to_string()),
@@ -176,7 +128,7 @@ pub fn describe(
     text
 }
 
-/// Bytes for a person.
+/// Bytes in a unit that fits them.
 fn size(bytes: u64) -> String {
     match bytes >> 20 {
         mib @ 0..1024 => format!("{} MiB", mib + 1),
@@ -201,8 +153,8 @@ mod tests {
 
     use super::*;
     use driml_settings::{
-        config::{Flags, Source, resolve},
         presets::PRESETS,
+        resolve::{Flags, Source, resolve},
     };
 
     const MACHINE: Machine = Machine {
@@ -239,18 +191,6 @@ mod tests {
             replay      the newest 200000 transitions, up to 2.3 GiB of memory
             run folder  runs/x
         "#]].assert_eq(&plan);
-    }
-
-    #[test]
-    fn the_arithmetic_is_that_of_the_network() {
-        // Mnih et al.'s network on 84 x 84 x 4: 20x20, 9x9, 7x7 maps.
-        let mut model = config("mspacman", "c51").model;
-        model.channels = 4;
-        let flops = row_flops(&model);
-        let conv = 20 * 20 * 32 * 4 * 64 + 9 * 9 * 64 * 32 * 16 + 7 * 7 * 64 * 64 * 9;
-        assert_eq!(flops.local, 2.0 * f64::from(conv));
-        assert_eq!(flops.global, 2.0 * 3136.0 * 512.0);
-        assert_eq!(flops.dim, 0.0);
     }
 
     #[test]

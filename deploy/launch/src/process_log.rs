@@ -1,4 +1,4 @@
-//! What a part says: carried to its log file, its warnings and errors to the screen too, its last lines kept for the end.
+//! What a process writes: carried to its log file, its warnings and errors to the screen too, its last lines kept for the end.
 //! A full disk costs lines of the log, never the run.
 
 use std::{
@@ -15,10 +15,10 @@ use driml_protocol::fault;
 
 use crate::console::Screen;
 
-/// Last lines that are kept to be shown if the part fails.
+/// Last lines that are kept to be shown if the process fails.
 const TAIL_LINES_MAX: usize = 8;
 
-/// A part's log, and the threads that write it.
+/// A process's log, and the threads that write it.
 #[derive(Debug)]
 pub(crate) struct ProcessLog {
     name: String,
@@ -39,7 +39,7 @@ struct Kept {
 }
 
 impl ProcessLog {
-    /// Opens the log of the part `name` in the folder `logs`, to go on at its end.
+    /// Opens the log of the process `name` in the folder `logs`, to go on at its end.
     ///
     /// # Errors
     /// A file system that refuses.
@@ -112,7 +112,8 @@ impl ProcessLog {
         ))
     }
 
-    /// Waits until all that the part said is carried. The part has ended, and nobody else holds the pipes' other ends.
+    /// Waits until everything that the process wrote is in the log. The process has ended, and no other one holds the pipes'
+    /// other ends.
     pub(crate) fn finish(&mut self) {
         for thread in self.threads.drain(..) {
             thread.join().expect("a panic has ended the process");

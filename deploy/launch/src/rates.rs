@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Rates are means over the last so much time.
+/// The time over which rates are means.
 const RATE_WINDOW: Duration = Duration::from_secs(20);
 
 /// Frames and updates a second, over the last while.

@@ -1,13 +1,19 @@
-//! `driml local --resume`: the settings of an interrupted run, and what it has behind it.
-//! It changes nothing in the run's folder, and waits there for whoever still saves.
+//! `driml local --resume`: the settings of an interrupted run, and the point from which it goes on.
+//! It changes nothing in the run's folder, and waits until an earlier learner has saved there.
 
-use std::time::{Duration, Instant};
+use std::{
+    path::Path,
+    time::{Duration, Instant},
+};
 
 use anyhow::Context;
 use driml_envs::WorldConfig;
 use driml_learner::checkpoint::{self, CheckpointError};
 use driml_machine::{error::usage, resources::Machine};
-use driml_settings::config::{Flags, RunConfig, Source, resolve};
+use driml_settings::{
+    config::RunConfig,
+    resolve::{Flags, Source, resolve},
+};
 
 use crate::{
     console,
@@ -20,8 +26,25 @@ const SAVING_MAX: Duration = Duration::from_secs(120);
 /// Whether the run in `folder`, which is in this world, can be resumed: it has a checkpoint, which holds nothing of a world's own
 /// progress.
 pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
-    let saved = checkpoint::list(&folder.checkpoints());
-    world.is_resumable() && saved.is_ok_and(|all| !all.is_empty())
+    let saved = checkpoint::list(&folder.checkpoints()).unwrap_or_default();
+    saved
+        .last()
+        .is_some_and(|(_, newest)| world.is_resumable() || is_in_lockstep(newest).unwrap_or(false))
+}
+
+/// Whether a checkpoint is of a run in lockstep, and holds all its parts.
+fn is_in_lockstep(checkpoint: &Path) -> Result<bool, CheckpointError> {
+    checkpoint::companion(checkpoint).map(|it| it.is_some())
+}
+
+/// Says how an interrupted run goes on, if it can.
+pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
+    if is_resumable(world, folder) {
+        console::line(&format!(
+            "`driml local --resume {}` goes on with it",
+            folder.display()
+        ));
+    }
 }
 
 /// Waits until the learner of the run in `folder` has saved, if the run was ended.
@@ -53,15 +76,22 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The settings with which the run in `folder` goes on, and what it has behind it.
+/// How a run goes on.
+#[derive(Debug)]
+pub struct Resumed {
+    /// Its settings.
+    pub config: RunConfig,
+    /// From where.
+    pub point: ResumePoint,
+    /// All its parts are in one process, in a fixed order.
+    pub lockstep: bool,
+}
+
+/// The settings with which the run in `folder` goes on, and from which point.
 ///
 /// # Errors
-/// A folder that is no run's, settings that cannot work, no checkpoint, nothing left to do, somebody who is at it.
-pub fn find(
-    folder: &RunFolder,
-    flags: &Flags,
-    machine: &Machine,
-) -> anyhow::Result<(RunConfig, ResumePoint)> {
+/// A folder that is no run's, settings that cannot work, no checkpoint, nothing left to do, a run that is still going on.
+pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Result<Resumed> {
     let path = folder.config();
     let name = path.display().to_string();
     let text = std::fs::read_to_string(&path).map_err(|e| {
@@ -72,26 +102,28 @@ pub fn find(
     // First, as a run that is still ending holds memory.
     wait_until_free(folder)?;
     let flags = Flags {
-        study: RunConfig::parse(&name, &text)?.replay.study,
+        reproduce_bug: RunConfig::parse(&name, &text)?.replay.reproduced_bug,
         ..flags.clone()
     };
     let config = resolve(&Source::File(name, text), &flags, machine)?;
-    if !config.world.is_resumable() {
-        return Err(usage!(
-            "the ghosts of the run in {} change as episodes pass, and a checkpoint does not hold how far they are: start it anew",
-            folder.display()
-        )
-        .into());
-    }
     let checkpoints = folder.checkpoints();
     let all = checkpoint::list(&checkpoints).context("looking for checkpoints")?;
-    let Some(&(updates, _)) = all.last() else {
+    let Some((updates, newest)) = all.last() else {
         return Err(usage!(
             "there is no checkpoint in {}: start the run anew, in another folder",
             checkpoints.display()
         )
         .into());
     };
+    let updates = *updates;
+    let lockstep = is_in_lockstep(newest)?;
+    if !lockstep && !config.world.is_resumable() {
+        return Err(usage!(
+            "the ghosts of the run in {} change as episodes pass, and a checkpoint does not hold how far they are: start it anew",
+            folder.display()
+        )
+        .into());
+    }
     // One that has all its updates and did not come to its end does so now.
     if updates >= config.updates() && Summary::is_finished(folder) {
         return Err(usage!(
@@ -101,11 +133,22 @@ pub fn find(
         )
         .into());
     }
-    if updates == 0 {
-        return Ok((config, ResumePoint::default()));
-    }
-    let rows = updates as f64 * f64::from(config.learner.batch_rows);
-    let frames =
-        config.replay.warmup_transitions + (rows / config.replay.replay_ratio).ceil() as u64;
-    Ok((config, ResumePoint { updates, frames }))
+    let replay_is_kept = lockstep || config.local.durable && folder.replay().is_dir();
+    let point = ResumePoint {
+        updates,
+        frames: match updates {
+            0 => 0,
+            _ => {
+                let rows = updates as f64 * f64::from(config.learner.batch_size);
+                let after_warmup = (rows / config.replay.replay_ratio).ceil() as u64;
+                config.replay.warmup_transitions + after_warmup
+            }
+        },
+        replay_is_kept: replay_is_kept && (lockstep || updates > 0),
+    };
+    Ok(Resumed {
+        config,
+        point,
+        lockstep,
+    })
 }

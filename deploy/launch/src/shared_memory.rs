@@ -1,13 +1,13 @@
 //! The shared memory that a process leaves behind in `/dev/shm`. zenoh's own bookkeeping keeps some of it open to the end of the
-//! process, so that it stays there until the next one sweeps; a part that ends in order removes it itself.
+//! process, so that it stays there until the next one sweeps; a process that ends in order removes it itself.
 //! What others use too, or could use, it leaves alone.
 
 use std::{fs, os::unix::fs::MetadataExt, path::Path};
 
+use driml_protocol::shared_memory::FOLDER;
 use nix::sys::stat::{major, minor};
 
-const FOLDER: &str = "/dev/shm";
-/// The extension of zenoh's segments. Whoever has one open holds a lock on it.
+/// The extension of zenoh's segments. A process that has one open holds a lock on it.
 const EXTENSION: &str = "zenoh";
 
 /// Removes the segments of shared memory that this process alone holds. It must not use them any more.
@@ -64,7 +64,7 @@ struct FileId {
     inode: u64,
 }
 
-/// Whether the process `pid` and nobody else holds a lock on the file, by the kernel's table of locks.
+/// Whether the process `pid` alone holds a lock on the file, by the kernel's table of locks.
 fn is_held_by_alone(locks: &str, file: &FileId, pid: u32) -> bool {
     let FileId {
         major,

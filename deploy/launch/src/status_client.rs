@@ -1,4 +1,4 @@
-//! What the parts say of themselves, asked for over zenoh as any client would.
+//! The status of the replay servers and the learner, asked for over zenoh as any client would.
 //! It keeps the last answers and judges nothing.
 
 use std::time::Duration;
@@ -7,10 +7,10 @@ use anyhow::Context;
 use driml_protocol::{Keys, LearnerStatus, ReplayStatus, RunClient};
 use zenoh::{Session, Wait};
 
-/// How long an answer may take; a part that is busy answers the next time.
+/// How long an answer may take; a process that is busy answers the next time.
 const ANSWER_MAX: Duration = Duration::from_secs(2);
 
-/// A client of a run that asks its parts how they are.
+/// A client of a run that asks its processes for their status.
 pub struct Statuses {
     /// One for each shard of the replay.
     clients: Vec<RunClient>,

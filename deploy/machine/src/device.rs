@@ -1,5 +1,5 @@
 //! Which device a command computes on, and whether this program can compute there.
-//! A program without CUDA goes on as the flavour that has it.
+//! A program without CUDA goes on as `driml-cuda`.
 
 use clap::Args;
 use driml_model::DeviceName;
@@ -12,7 +12,7 @@ pub struct DeviceFlag {
     pub device: DeviceName,
 }
 
-/// Makes sure that this program can compute on `device`: without CUDA in it, it goes on as the flavour that has it.
+/// Makes sure that this program can compute on `device`: without CUDA in it, it goes on as `driml-cuda`.
 ///
 /// # Errors
 /// There is no such flavour, it cannot start here, or there is no such device.

@@ -125,7 +125,7 @@ pub(crate) fn missing_libraries(program: &Path) -> anyhow::Result<Vec<String>> {
 /// # Errors
 /// It cannot be started, or has not ended after [`ANSWER_MAX`]; then it is killed.
 pub(crate) fn answer(mut command: Command) -> anyhow::Result<Output> {
-    // Files and not pipes: nobody has to read while it runs.
+    // Files and not pipes, which would have to be read while it runs.
     let (stdout, stderr) = (tempfile::tempfile()?, tempfile::tempfile()?);
     let mut child = command
         .stdin(Stdio::null())

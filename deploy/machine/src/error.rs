@@ -22,7 +22,7 @@ pub const EXIT_USAGE: u8 = 64;
 /// Exit code after Ctrl-C, as shells have it.
 pub const EXIT_INTERRUPTED: u8 = 130;
 
-/// The run was ended by a person, its state saved. Exit code 130, as shells have it for Ctrl-C.
+/// The run was asked to stop and has saved its state. Exit code 130, a shell's for Ctrl-C.
 #[derive(Debug, thiserror::Error)]
 #[error("interrupted")]
 pub struct Interrupted;

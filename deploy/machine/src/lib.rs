@@ -20,3 +20,4 @@ mod driml_cuda;
 pub mod error;
 pub mod resources;
 pub mod units;
+pub mod whole_number;

@@ -7,7 +7,7 @@ use std::fs;
 const ENVS: u32 = 16;
 /// Share of the free memory that a replay sized by the machine may take; the learner and the system need the rest.
 const REPLAY_SHARE: f64 = 0.5;
-/// Share of the free memory that a replay sized by a person may take.
+/// Share of the free memory that a replay may take whose size was asked for.
 const REPLAY_SHARE_MAX: f64 = 0.9;
 
 /// What a learner takes on Procgen (266 MiB measured), and some room.
@@ -71,7 +71,7 @@ impl Machine {
         share.min(self.beside_actors(actors_bytes))
     }
 
-    /// Bytes that a replay sized by a person may take, where the actors take `actors_bytes`.
+    /// Bytes that a replay may take whose size was asked for, where the actors take `actors_bytes`.
     pub fn replay_bytes_max(&self, actors_bytes: u64) -> u64 {
         let share = (self.memory_bytes as f64 * REPLAY_SHARE_MAX) as u64;
         share.min(self.beside_actors(actors_bytes))
@@ -82,6 +82,21 @@ impl Machine {
         let taken = actors_bytes.saturating_add(LEARNER_BYTES);
         self.memory_bytes.saturating_sub(taken)
     }
+}
+
+/// The processor's name; "unknown" where the kernel does not say it.
+pub fn processor() -> String {
+    let cpuinfo = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    processor_in(&cpuinfo).unwrap_or("unknown").to_owned()
+}
+
+/// The processor's name in the kernel's table.
+fn processor_in(cpuinfo: &str) -> Option<&str> {
+    let mut lines = cpuinfo.lines();
+    let (_, name) = lines
+        .find(|line| line.starts_with("model name"))?
+        .split_once(':')?;
+    Some(name.trim())
 }
 
 /// The kernel's estimate of available memory, or what the control group leaves, if that is less.
@@ -112,6 +127,13 @@ mod tests {
             "MemTotal:       24600000 kB\nMemFree:        1000 kB\nMemAvailable:    2000 kB\n";
         assert_eq!(meminfo_available(text), Some(2000 * 1024));
         assert_eq!(meminfo_available("MemTotal: 1 kB"), None);
+    }
+
+    #[test]
+    fn the_processor_is_named() {
+        let cpuinfo = "processor\t: 0\nmodel name\t: AMD EPYC 9999\nflags\t: fpu\n";
+        assert_eq!(processor_in(cpuinfo), Some("AMD EPYC 9999"));
+        assert_eq!(processor_in(""), None);
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Times and sizes as a person reads them.
+//! Times and sizes in human-readable form.
 
 use std::time::Duration;
 

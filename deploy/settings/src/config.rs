@@ -1,342 +1,117 @@
 //! The resolved settings of a run: one TOML with a table for each part, checked as a whole.
-//! It fills in no number but those that follow from others and those that the machine decides.
+//! It fills in no number: `resolve` does.
 
-use clap::{
-    Args,
-    builder::{PossibleValue, PossibleValuesParser, TypedValueParser},
-};
-use driml_actor::InputSize;
-use driml_envs::{WorldConfig, WorldName};
+use driml_envs::WorldConfig;
 use driml_learner::{DeviceName, EstimatorKind};
-use driml_machine::{
-    error::{Usage, usage},
-    resources::{self, Machine},
-    units::gib,
+use driml_machine::error::{Usage, usage};
+use driml_model::{InputSize, ModelConfig};
+use driml_protocol::{
+    Horizon, RunSpec,
+    config::{TransportConfig, in_words},
 };
-use driml_model::ModelConfig;
-use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
-use driml_replay_server::{Compression, Study};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
-use toml::{Table, Value};
+use toml::Table;
 
-use crate::{
-    derived::{self, derive},
-    overrides::Override,
-    presets::{self, Preset},
-};
+use crate::{derived, presets, renamed};
 
-/// What `driml local` does with the parts.
+/// How many processes the launcher starts, and with what.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LocalConfig {
-    /// Actor processes.
+    /// Number of actor processes.
     pub actors: u32,
     /// Threads of the learner.
     pub learner_threads: u32,
     /// What the learner computes on.
     pub learner_device: DeviceName,
+    /// Whether the replay is kept on disk, in the run folder: a replay server that died is started again with it, and a resumed
+    /// run goes on with it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub durable: bool,
+    /// Whether events for TensorBoard are written beside the metrics, about a kilobyte a second.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub tensorboard: bool,
+    /// When checkpoints are played while the run goes on; none if they are not.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub evaluation: Option<EvaluationConfig>,
+}
+
+/// Whole episodes with checkpoints of a run that goes on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EvaluationConfig {
+    /// Updates from one to the next; if that is less than one takes, some are left out. A multiple of
+    /// `learner.checkpoint_period_updates`.
+    pub every_updates: u64,
+    /// Episodes of each, 1 to 1,000,000.
+    pub episodes: u32,
+}
+
+impl EvaluationConfig {
+    fn validate(&self, checkpoint_period_updates: u64) -> Result<(), Usage> {
+        let Self {
+            every_updates,
+            episodes,
+        } = *self;
+        if every_updates == 0 || !every_updates.is_multiple_of(checkpoint_period_updates) {
+            return Err(usage!(
+                "local.evaluation.every_updates = {every_updates}: checkpoints are played, and there is one every \
+                 {checkpoint_period_updates} updates; take a multiple of that, or --set learner.checkpoint_period_updates"
+            ));
+        }
+        if !(1..=1_000_000).contains(&episodes) {
+            return Err(usage!(
+                "local.evaluation.episodes = {episodes}: an evaluation has 1 to 1,000,000 episodes"
+            ));
+        }
+        Ok(())
+    }
 }
 
 /// The resolved settings of a run. TOML is what they come from and travel as; between, there is this form alone.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RunConfig {
-    /// What every part agrees on.
+    /// What all processes of the run agree on.
     pub run: RunSpec,
-    /// The world.
+    /// The world and its own settings.
     pub world: WorldConfig,
     /// The size to which frames are enlarged.
     pub input: InputSize,
-    /// The actors' own.
+    /// The `[actor]` table.
     pub actor: driml_actor::Config,
-    /// The replay server's own.
+    /// The `[replay]` table.
     pub replay: driml_replay_server::Config,
-    /// The learner's own.
+    /// The `[learner]` table.
     pub learner: driml_learner::Config,
-    /// The network.
+    /// Sizes of the network.
     pub model: ModelConfig,
     /// How messages travel.
     pub transport: TransportConfig,
-    /// The launcher's own.
+    /// The `[local]` table, which the launcher reads.
     pub local: LocalConfig,
-    /// What a person should know before the run starts.
+    /// Notes that are printed before the run starts.
     #[serde(skip)]
     pub notes: Vec<String>,
 }
 
-/// Where the settings come from before flags are applied.
-#[derive(Clone, Debug)]
-pub enum Source {
-    /// Layers: preset, world, agent.
-    Layers(&'static Preset, WorldName, &'static str),
-    /// A file that driml wrote: its name and text.
-    File(String, String),
-}
-
-/// Flags over the source; `--set` applies after the others.
-#[derive(Clone, Debug, Default, Args)]
-pub struct Flags {
-    /// Actor processes [default: by cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
-    pub actors: Option<u32>,
-    /// Replay servers among which the actors and the memory are spread [default: 1]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
-    pub replay_shards: Option<u32>,
-    /// Copies of the world in each actor [default: 16]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
-    pub envs: Option<u32>,
-    /// Frames of the whole run; it ends when they are in and their updates done
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=i64::MAX as u64))]
-    pub frames: Option<u64>,
-    /// Seed of every generator of the run
-    #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=i64::MAX as u64))]
-    pub seed: Option<u64>,
-    /// For studies alone: train with a known fault of the paper's published code
-    #[arg(long, value_name = "FAULT", value_parser = studies())]
-    pub study: Option<Study>,
-    /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    pub sets: Vec<String>,
-}
-
-/// The faults by their names, with what they are for `--help`.
-fn studies() -> impl TypedValueParser<Value = Study> {
-    let named = |study: Study| {
-        let about = match study {
-            Study::BootstrapFromNextState => {
-                "n-step returns that bootstrap from s_{t+1}, with the end of an episode seen at step t alone"
-            }
-        };
-        PossibleValue::new(study.name()).help(about)
-    };
-    PossibleValuesParser::new(Study::ALL.map(named)).map(|name| {
-        let known = Study::ALL.into_iter().find(|study| study.name() == name);
-        known.expect("clap lets no other name pass")
-    })
-}
-
-/// Resolves the settings of a run: source, flags, `--set`, what the machine decides, what follows from the rest.
+/// Reads one table of the settings.
 ///
 /// # Errors
-/// The first setting that is unknown, of the wrong type, out of range, or at odds with another.
-pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunConfig, Usage> {
-    let mut table = match source {
-        Source::Layers(preset, world, agent) => {
-            let mut table = presets::layers(preset, *world, presets::agent(agent)?)?;
-            derived::name(&mut table, &world.to_string(), agent);
-            table
-        }
-        Source::File(name, text) => {
-            let mut read: Table = text
-                .parse()
-                .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
-            derived::complete(&mut read);
-            derived::check(&read).map_err(|e| usage!("{name}: {e}"))?;
-            read
-        }
-    };
-    let sized_by_machine = matches!(source, Source::Layers(..));
-    if sized_by_machine {
-        fill(&mut table, "local", "actors", machine.actors());
-        fill(
-            &mut table,
-            "local",
-            "learner_threads",
-            machine.learner_threads(),
-        );
-        fill(&mut table, "local", "learner_device", "cpu");
-        fill(&mut table, "actor", "envs", machine.envs());
-        fill(&mut table, "actor", "world_threads", 0);
-    }
-    let by_flag = [
-        ("local.actors", flags.actors.map(u64::from)),
-        ("actor.envs", flags.envs.map(u64::from)),
-        ("replay.transitions_max", flags.frames),
-        ("replay.shards", flags.replay_shards.map(u64::from)),
-        ("run.seed", flags.seed),
-    ];
-    for (path, value) in by_flag {
-        if let Some(value) = value {
-            Override::parse(&format!("{path}={value}"))?.apply(&mut table)?;
-        }
-    }
-    study(&mut table, flags.study)?;
-    let capacity_set = set(&mut table, &flags.sets)? || !sized_by_machine;
-    let note = fit_memory(&mut table, capacity_set, machine)?;
-    derive(&mut table)?;
-    let mut config = RunConfig::from_table(&table).map_err(|e| match source {
-        Source::File(name, _) if flags.sets.is_empty() => usage!("{name}: {e}"),
-        _ => e,
-    })?;
-    config.notes.extend(note);
-    Ok(config)
-}
-
-/// Sets the fault to be studied; refuses settings that have one which nobody asked for.
-fn study(table: &mut Table, asked: Option<Study>) -> Result<(), Usage> {
-    let Some(replay) = table.get_mut("replay").and_then(Value::as_table_mut) else {
-        return Ok(());
-    };
-    if let (Some(found), None) = (replay.get("study"), asked) {
-        return Err(usage!(
-            "replay.study = {found}: these settings train with a known fault, for studies alone; add --study {} if that is meant",
-            found.as_str().unwrap_or("FAULT")
-        ));
-    }
-    if let Some(study) = asked {
-        let name = Value::try_from(study).map_err(|e| usage!("--study as TOML: {e}"))?;
-        replay.insert("study".into(), name);
-    }
-    Ok(())
-}
-
-/// Applies every `--set`; returns whether the replay's capacity was among them.
-fn set(table: &mut Table, sets: &[String]) -> Result<bool, Usage> {
-    let mut capacity_set = false;
-    for text in sets {
-        let one = Override::parse(text)?;
-        derived::refuse(&one.path)?;
-        capacity_set |= one.path == "replay.capacity_transitions";
-        let mut tried = table.clone();
-        let new = one.apply(&mut tried)?;
-        // A key that was not there may be an optional one. Its table's own type knows; if it does not, nobody does.
-        if new {
-            let mut derived = tried.clone();
-            let read = derive(&mut derived).and_then(|()| parts_read(&derived));
-            if read.is_err_and(|e| e.0.contains("unknown field")) {
-                return Err(one.unknown(table));
-            }
-        }
-        *table = tried;
-    }
-    Ok(capacity_set)
-}
-
-fn fill(table: &mut Table, name: &str, key: &str, value: impl Into<Value>) {
-    let inner = table
-        .entry(name)
-        .or_insert_with(|| Value::Table(Table::new()));
-    if let Some(inner) = inner.as_table_mut() {
-        inner.entry(key).or_insert(value.into());
-    }
-}
-
-/// Makes the replay as small as the memory, saying so, or refuses one that a person sized too large.
-fn fit_memory(
-    table: &mut Table,
-    capacity_set: bool,
-    machine: &Machine,
-) -> Result<Option<String>, Usage> {
-    let mut derived = table.clone();
-    derive(&mut derived)?;
-    let run: RunSpec = read(&derived, "run")?;
-    let replay: driml_replay_server::Config = read(&derived, "replay")?;
-    let local: LocalConfig = read(&derived, "local")?;
-    let actors = resources::actors_bytes(local.actors, &run.world);
-    if machine.beside_actors(actors) == 0 {
-        return Err(usage!(
-            "{} actors of {} take about {}, and {} are free: use fewer --actors, with more --envs each",
-            local.actors,
-            run.world,
-            gib(actors),
-            gib(machine.memory_bytes)
-        ));
-    }
-    if replay.compression != Compression::None {
-        return fit_compressed(table, &run, &replay, (machine, actors));
-    }
-    let bytes_each = replay_bytes_each(&run);
-    let fits = |bytes: u64| bytes / bytes_each;
-    let free = gib(machine.memory_bytes);
-    let asked = replay.capacity_transitions;
-    if capacity_set && asked > fits(machine.replay_bytes_max(actors)) {
-        return Err(usage!(
-            "replay.capacity_transitions = {asked} needs {}, and {free} are free: --set replay.capacity_transitions={}",
-            gib(asked.saturating_mul(bytes_each)),
-            fits(machine.replay_bytes(actors))
-        ));
-    }
-    let capacity = fits(machine.replay_bytes(actors));
-    if capacity_set || asked <= capacity {
-        return Ok(None);
-    }
-    Override::parse(&format!("replay.capacity_transitions={capacity}"))?.apply(table)?;
-    // A replay that holds the whole run anyway is as good as a larger one.
-    let is_smaller_than_the_run = replay
-        .transitions_max
-        .is_none_or(|frames| frames > capacity);
-    Ok(is_smaller_than_the_run.then(|| {
-        format!(
-            "the replay holds the newest {capacity} transitions instead of {asked}: {free} of memory are free, and it takes half, or what actors and learner leave"
-        )
-    }))
-}
-
-/// Bounds the bytes of a compressed replay, as nobody knows beforehand how well its frames compress.
-///
-/// Half the free memory is taken, or what a person allowed; nothing is bounded where even frames that do not compress fit.
-fn fit_compressed(
-    table: &mut Table,
-    run: &RunSpec,
-    replay: &driml_replay_server::Config,
-    (machine, actors): (&Machine, u64),
-) -> Result<Option<String>, Usage> {
-    let free = gib(machine.memory_bytes);
-    let asked = replay.capacity_transitions;
-    let fields = asked.saturating_mul(COMPRESSED_FIELDS_BYTES);
-    let frames = asked.saturating_mul(run.frame_bytes() as u64);
-    let bytes = machine.replay_bytes(actors).saturating_sub(fields);
-    if fields > machine.replay_bytes(actors) / 2 {
-        return Err(usage!(
-            "replay.capacity_transitions = {asked} needs {} beside the frames, and {free} are free: --set replay.capacity_transitions={}",
-            gib(fields),
-            machine.replay_bytes(actors) / 2 / COMPRESSED_FIELDS_BYTES
-        ));
-    }
-    match replay.compressed_bytes_max {
-        Some(max) if max.min(frames) > machine.replay_bytes_max(actors) => Err(usage!(
-            "replay.compressed_bytes_max = {max} is {}, and {free} are free: --set replay.compressed_bytes_max={bytes}",
-            gib(max)
-        )),
-        Some(_) => Ok(None),
-        None if frames <= bytes => Ok(None),
-        None => {
-            Override::parse(&format!("replay.compressed_bytes_max={bytes}"))?.apply(table)?;
-            let run_frames = replay.transitions_max.unwrap_or(u64::MAX);
-            let is_smaller_than_the_run =
-                run_frames.saturating_mul(run.frame_bytes() as u64) > bytes;
-            Ok(is_smaller_than_the_run.then(|| {
-                format!(
-                    "compressed frames may take {}, as {free} of memory are free; if they compress badly, the replay holds fewer than {asked} transitions",
-                    gib(bytes)
-                )
-            }))
-        }
-    }
-}
-
-/// Bytes that one transition takes in the replay: its frame and its small fields.
-pub const fn replay_bytes_each(run: &RunSpec) -> u64 {
-    run.frame_bytes() as u64 + 32
-}
-
-/// Bytes that one transition takes at most in a compressed replay, beside its frame: its small fields, and its share of the
-/// list of blocks if each holds one frame.
-pub const COMPRESSED_FIELDS_BYTES: u64 = 128;
-
-fn read<T: DeserializeOwned>(table: &Table, name: &'static str) -> Result<T, Usage> {
+/// It is missing or does not fit.
+pub(crate) fn read<T: DeserializeOwned>(table: &Table, name: &'static str) -> Result<T, Usage> {
     let value = table
         .get(name)
         .ok_or_else(|| usage!("the settings have no [{name}] table"))?;
     value
         .clone()
         .try_into()
-        .map_err(|e: toml::de::Error| usage!("in the settings' [{name}] table: {}", e.message()))
+        .map_err(|e: toml::de::Error| usage!("in the settings' [{name}] table: {}", in_words(&e)))
 }
 
 /// Reads every table as its part will.
-fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
+pub(crate) fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
     let tables = [
         "run",
         "world",
@@ -369,13 +144,22 @@ fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
 }
 
 impl RunConfig {
-    fn from_table(table: &Table) -> Result<Self, Usage> {
+    /// Bytes of a version of the weights as the learner publishes it.
+    ///
+    /// # Errors
+    /// A network that cannot be.
+    pub fn weights_bytes(&self) -> driml_model::Result<usize> {
+        let published = self.model.without_dim();
+        published.weights_bytes(self.learner.publish_as)
+    }
+
+    pub(crate) fn from_table(table: &Table) -> Result<Self, Usage> {
         let mut config = parts_read(table)?;
         config.validate()?;
         config.notes = presets::notes(&config.run.agent, &config.run.world);
-        if config.replay.study.is_some() {
+        if config.replay.reproduced_bug.is_some() {
             let note =
-                "a study: the targets have a known fault of the paper's published code (--study)";
+                "the targets have a known bug of the paper's published code (--reproduce-bug)";
             config.notes.push(note.into());
         }
         Ok(config)
@@ -384,11 +168,12 @@ impl RunConfig {
     /// Reads resolved settings, as in a run folder's `config.toml`.
     ///
     /// # Errors
-    /// As [`resolve`].
+    /// As [`resolve`](crate::resolve::resolve).
     pub fn parse(name: &str, text: &str) -> Result<Self, Usage> {
         let mut table: Table = text
             .parse()
             .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
+        renamed::update(&mut table);
         derived::complete(&mut table);
         derived::check(&table)
             .and_then(|()| Self::from_table(&table))
@@ -398,9 +183,31 @@ impl RunConfig {
     /// The settings as every part reads them, sorted by name.
     pub fn to_toml(&self) -> String {
         let text = toml::to_string(self).expect("a struct of plain values is TOML");
-        // As text, a number of 32 bits has the digits that a person wrote; as a value of 64 it would have more.
+        // As text, a number of 32 bits has the digits that were set; as a value of 64 it would have more.
         let sorted: Table = text.parse().expect("it was just written");
         toml::to_string(&sorted).expect("a table of plain values is TOML")
+    }
+
+    /// The same settings with frames that are recorded and sent whole, as those of earlier versions: what is computed is the same.
+    ///
+    /// # Errors
+    /// None, of settings that were resolved.
+    pub fn with_whole_frames(&self) -> Result<Self, Usage> {
+        let text = self.to_toml();
+        let mut table: Table = text.parse().map_err(|e| usage!("the settings: {e}"))?;
+        derived::keep_whole_frames(&mut table);
+        derived::derive(&mut table)?;
+        Self::from_table(&table)
+    }
+
+    /// The names of the run's actions; an action is a place in this list.
+    pub fn action_names(&self) -> Vec<String> {
+        let actions = self.world.actions(self.actor.actions);
+        let names = self.world.action_names();
+        actions
+            .into_iter()
+            .map(|it| names[usize::from(it)].to_owned())
+            .collect()
     }
 
     /// Transitions of the whole run.
@@ -411,7 +218,7 @@ impl RunConfig {
     /// Updates that belong to all transitions, at the replay ratio.
     pub fn updates(&self) -> u64 {
         let after = self.frames().saturating_sub(self.replay.warmup_transitions);
-        (after as f64 * self.replay.replay_ratio / f64::from(self.learner.batch_rows)).floor()
+        (after as f64 * self.replay.replay_ratio / f64::from(self.learner.batch_size)).floor()
             as u64
     }
 
@@ -420,6 +227,13 @@ impl RunConfig {
         let said = |e: &dyn std::fmt::Display| Usage(e.to_string());
         self.run.validate().map_err(|e| said(&e))?;
         self.world.validate().map_err(|e| said(&e))?;
+        let name = self.world.name().to_string();
+        if name != self.run.world {
+            return Err(usage!(
+                "run.world = {:?}, but the table [world] is of {name:?}: correct the one or the other",
+                self.run.world
+            ));
+        }
         self.actor.validate().map_err(|e| said(&e))?;
         if self.replay.transitions_max.is_none() {
             return Err(usage!(
@@ -435,7 +249,7 @@ impl RunConfig {
             ));
         }
         self.replay
-            .validate(&self.run, self.learner.batch_rows)
+            .validate(&self.run, self.learner.batch_size)
             .map_err(|e| said(&e))?;
         self.learner.validate().map_err(|e| said(&e))?;
         self.learner
@@ -455,6 +269,13 @@ impl RunConfig {
                 self.local.learner_threads
             ));
         }
+        if let Some(evaluation) = &self.local.evaluation {
+            evaluation.validate(self.learner.checkpoint_period_updates)?;
+        }
+        self.local
+            .learner_device
+            .check(self.learner.precision)
+            .map_err(|e| said(&e))?;
         self.check_objective()?;
         let learns_affinity = self.learner.affinity.estimator != EstimatorKind::None;
         let affinity = self
@@ -499,6 +320,3 @@ impl RunConfig {
         ))
     }
 }
-
-#[cfg(test)]
-mod tests;

@@ -1,41 +1,103 @@
 //! The settings that follow from others: filled in, checked when read back, refused when set by hand.
 //! It decides nothing of its own.
 
-use driml_envs::{WorldConfig, WorldName};
+use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::LearnerSettings;
 use driml_machine::error::{Usage, usage};
+use driml_model::{ConvLayer, FrameSize, InputRead, InputSize};
+use driml_protocol::config::in_words;
 use toml::{Table, Value};
 
 use crate::overrides::inline;
 
 /// What follows, and from what.
-const FOLLOWS: [(&str, &str); 14] = [
+const FOLLOWS: [(&str, &str); 17] = [
     ("run.world", "is chosen by --env"),
     ("run.agent", "is chosen by --agent"),
-    ("run.frame_height", "follows from the world"),
-    ("run.frame_width", "follows from the world"),
+    (
+        "run.frame_height",
+        "follows from the world and what model.conv reads",
+    ),
+    (
+        "run.frame_width",
+        "follows from the world and what model.conv reads",
+    ),
     ("run.frame_channels", "follows from the world"),
-    ("run.num_actions", "follows from the world"),
+    (
+        "run.num_actions",
+        "follows from the world and actor.actions",
+    ),
     ("world.kind", "is chosen by --env"),
     ("world.game", "is chosen by --env"),
-    ("model.height", "follows from input.height"),
-    ("model.width", "follows from input.width"),
+    ("world.command", "is chosen by --env"),
+    ("world.library", "is chosen by --env"),
+    ("input.frame", "follows from the world"),
+    (
+        "model.height",
+        "follows from input.height and what model.conv reads",
+    ),
+    (
+        "model.width",
+        "follows from input.width and what model.conv reads",
+    ),
     (
         "model.channels",
         "follows from the world and run.frame_stack",
     ),
-    ("model.num_actions", "follows from the world"),
+    (
+        "model.num_actions",
+        "follows from the world and actor.actions",
+    ),
     ("model.dim", "follows from learner.update"),
     (
-        "replay.study",
-        "is a fault to be studied, and chosen by --study",
+        "replay.reproduced_bug",
+        "is a known bug to train with, and chosen by --reproduce-bug",
     ),
 ];
+
+/// Where a whole frame's size is, if frames are cut.
+const FRAME: &str = "input.frame";
 
 /// Writes the names that everything else follows from.
 pub(crate) fn name(table: &mut Table, world: &str, agent: &str) {
     put(table, "run.world", Value::String(world.into()));
     put(table, "run.agent", Value::String(agent.into()));
+}
+
+/// The limits of a world that is a process of its own, in `[world]`.
+const LIMITS: [&str; 2] = ["start_timeout_ms", "step_timeout_ms"];
+
+/// Asks a world that is a process of its own what it is, and fills that in: shapes, actions, and the size at which its frames are seen.
+///
+/// # Errors
+/// A command that declares no world.
+pub(crate) fn declare(table: &mut Table, command: &str) -> Result<(), Usage> {
+    let [start, step] = LIMITS.map(|limit| whole_size(table, &format!("world.{limit}")));
+    let declared = driml_envs::exec_declaration(command, start? as u64, step? as u64)
+        .map_err(|e| usage!("--env: {e}"))?;
+    for (path, side) in [
+        ("input.height", declared.height),
+        ("input.width", declared.width),
+    ] {
+        if find(table, path).is_none() {
+            put(table, path, Value::Integer(side as i64));
+        }
+    }
+    let declared = Value::try_from(declared).map_err(|e| usage!("a world as TOML: {e}"))?;
+    put(table, "world", declared);
+    Ok(())
+}
+
+/// Lets frames be cut to what the network reads. Settings of earlier versions do not: what they say of a run stays true of it.
+pub(crate) fn cut_frames(table: &mut Table) {
+    put(table, FRAME, Value::Table(Table::new()));
+}
+
+/// Lets frames be recorded and sent whole.
+pub(crate) fn keep_whole_frames(table: &mut Table) {
+    if let Some(input) = table.get_mut("input").and_then(Value::as_table_mut) {
+        input.remove("frame");
+    }
 }
 
 /// Refuses a `--set` of something that follows from something else.
@@ -72,31 +134,50 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         .parse()
         .map_err(|e| usage!("run.world: {e}"))?;
     put(table, "world.kind", Value::String(world.kind().into()));
-    if let Some((key, variant)) = world.variant() {
-        put(
-            table,
-            &format!("world.{key}"),
-            Value::String(variant.into()),
-        );
+    for (key, value) in world.settings() {
+        put(table, &format!("world.{key}"), Value::String(value.into()));
     }
-    let config: WorldConfig = part(table, "world")?;
-    let update: LearnerSettings = part(table, "learner.update")?;
+    let config: WorldConfig = table_at(table, "world")?;
+    let update: LearnerSettings = table_at(table, "learner.update")?;
     let shape = config.frame_shape();
-    let num_actions = config.num_actions();
+    let frame = (shape.height, shape.width);
+    let mut read = InputRead {
+        input: (
+            whole_size(table, "input.height")?,
+            whole_size(table, "input.width")?,
+        ),
+        frame,
+    };
+    if find(table, FRAME).is_some() {
+        let size = FrameSize {
+            height: shape.height as u32,
+            width: shape.width as u32,
+        };
+        let size = Value::try_from(size).map_err(|e| usage!("a frame's size as TOML: {e}"))?;
+        put(table, FRAME, size);
+        // A crop reads the borders too.
+        if find(table, "learner.augment").is_none() {
+            let input: InputSize = table_at(table, "input")?;
+            let conv: Vec<ConvLayer> = table_at(table, "model.conv")?;
+            read = input.read(&conv, frame);
+        }
+    }
+    let set: ActionSet = match find(table, "actor.actions") {
+        Some(_) => table_at(table, "actor.actions")?,
+        None => ActionSet::All,
+    };
+    let num_actions = config.actions(set).len();
     let stack = whole(table, "run.frame_stack")?;
     let dim = update.dim_heads(num_actions);
     let size = |value: usize| Value::Integer(value as i64);
     let dim = Value::try_from(dim).map_err(|e| usage!("the DIM heads as TOML: {e}"))?;
     for (path, value) in [
-        ("run.frame_height", size(shape.height)),
-        ("run.frame_width", size(shape.width)),
+        ("run.frame_height", size(read.frame.0)),
+        ("run.frame_width", size(read.frame.1)),
         ("run.frame_channels", size(shape.channels)),
         ("run.num_actions", size(num_actions)),
-        (
-            "model.height",
-            Value::Integer(whole(table, "input.height")?),
-        ),
-        ("model.width", Value::Integer(whole(table, "input.width")?)),
+        ("model.height", size(read.input.0)),
+        ("model.width", size(read.input.1)),
         (
             "model.channels",
             Value::Integer(stack.saturating_mul(shape.channels as i64)),
@@ -106,12 +187,13 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     ] {
         put(table, path, value);
     }
-    visible_actions(table, &config);
+    visible_actions(table, &config, set);
     ladder(table);
+    beta_updates(table);
     Ok(())
 }
 
-/// Fills in for how many actors the ladder of epsilons is, where there is one and nobody says it.
+/// Fills in for how many actors the ladder of epsilons is, where there is one and it is not set.
 fn ladder(table: &mut Table) {
     let asked = find(table, "actor.epsilon_ladder").is_some_and(Value::is_table);
     if asked
@@ -122,11 +204,40 @@ fn ladder(table: &mut Table) {
     }
 }
 
+/// Fills in over how many updates beta rises, where rows are drawn by priority and it is not set: those of the whole run.
+fn beta_updates(table: &mut Table) {
+    const PATH: &str = "replay.sampling.beta_updates";
+    let rule = find(table, "replay.sampling.rule").and_then(Value::as_str);
+    if rule != Some("prioritised") || find(table, PATH).is_some() {
+        return;
+    }
+    let number = |path| {
+        let value = find(table, path)?;
+        let whole = value.as_integer().map(|whole| whole as f64);
+        value.as_float().or(whole)
+    };
+    let updates = || {
+        let transitions = number("replay.transitions_max")? - number("replay.warmup_transitions")?;
+        let rows = transitions * number("replay.replay_ratio")?;
+        Some(rows / number("learner.batch_size")?)
+    };
+    // What is missing, or no number above 0, its own check says.
+    if let Some(updates) = updates().filter(|updates| updates.is_finite() && *updates > 0.0) {
+        let whole = (updates as i64).max(1);
+        put(table, PATH, Value::Integer(whole));
+    }
+}
+
 /// Fills in what each action amounts to in the world, where that is asked for and not given.
-fn visible_actions(table: &mut Table, world: &WorldConfig) {
+fn visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
     let asked = find(table, "learner.affinity.alphabet").and_then(Value::as_str) == Some("visible");
     if asked && find(table, "learner.affinity.visible").is_none() {
-        let map = world.visible_actions().into_iter();
+        let map = match set {
+            ActionSet::All => world.visible_actions(),
+            // They are told apart already.
+            ActionSet::Visible => (0..world.actions(set).len()).map(|it| it as u8).collect(),
+        };
+        let map = map.into_iter();
         let map = map.map(|action| Value::Integer(action.into())).collect();
         put(table, "learner.affinity.visible", Value::Array(map));
     }
@@ -225,12 +336,18 @@ fn whole(table: &Table, path: &str) -> Result<i64, Usage> {
     })
 }
 
-fn part<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
+/// A whole number that is a size; one that cannot be is left to the model's check.
+fn whole_size(table: &Table, path: &str) -> Result<usize, Usage> {
+    let size = whole(table, path)?;
+    usize::try_from(size).map_err(|_| usage!("{path} = {size}: a size is not below 0"))
+}
+
+fn table_at<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
     let value = find(table, path).ok_or_else(|| {
         usage!("the settings have no [{path}] table: use a config.toml that driml wrote")
     })?;
     value
         .clone()
         .try_into()
-        .map_err(|e: toml::de::Error| usage!("in the settings' [{path}] table: {}", e.message()))
+        .map_err(|e: toml::de::Error| usage!("in the settings' [{path}] table: {}", in_words(&e)))
 }

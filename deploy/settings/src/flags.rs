@@ -11,17 +11,20 @@ use driml_machine::{
 };
 
 use crate::{
-    config::{self, Flags, RunConfig, Source},
+    config::RunConfig,
     presets,
+    resolve::{self, Flags, Source},
 };
 
-const ENV: &str = "procgen:bigfish";
+const ENV: &str = "procgen:coinrun";
 const AGENT: &str = "driml-ada";
 
 /// What to train, and with which settings.
 #[derive(Clone, Debug, Args)]
 pub struct RunFlags {
-    /// World, such as procgen:coinrun or mspacman; `driml presets` lists them [default: procgen:bigfish]
+    /// World, such as procgen:coinrun or mspacman; `driml presets` lists them. Your own: "exec:COMMAND", a process that declares
+    /// itself, such as driml_env.py around a Gymnasium environment [default: procgen:coinrun, on which agents
+    /// learn within minutes]
     #[arg(long, value_name = "WORLD")]
     pub env: Option<String>,
     /// Agent: c51, driml-fix, driml-ada, driml-randk, driml-noact, cpc or curl [default: driml-ada]
@@ -66,5 +69,5 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
             )
         }
     };
-    Ok((config::resolve(&source, &args.over, machine)?, from))
+    Ok((resolve::resolve(&source, &args.over, machine)?, from))
 }

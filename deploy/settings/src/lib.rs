@@ -1,13 +1,13 @@
 //! The settings of a run: presets in layers, flags over them, what the machine decides, and what follows from the rest.
 //!
-//! Start with [`config::resolve`], which makes a [`config::RunConfig`] of a [`config::Source`] and [`config::Flags`]; the
+//! Start with [`resolve::resolve`], which makes a [`config::RunConfig`] of a [`resolve::Source`] and [`resolve::Flags`]; the
 //! commands that start a run do so through [`flags::resolve`]. `presets/*.toml` has every number, each with its source.
 //!
 //! ```
 //! use driml_machine::resources::Machine;
 //! use driml_settings::{
-//!     config::{Flags, Source, resolve},
 //!     presets,
+//!     resolve::{Flags, Source, resolve},
 //! };
 //!
 //! let world = presets::world("bigfish")?;
@@ -28,6 +28,9 @@
 pub mod config;
 mod derived;
 pub mod flags;
+pub mod memory;
 pub mod menu;
 mod overrides;
 pub mod presets;
+pub mod renamed;
+pub mod resolve;

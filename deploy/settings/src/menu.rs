@@ -11,9 +11,9 @@ use driml_machine::{
 use toml::{Table, Value};
 
 use crate::{
-    config::{self, Flags, Source},
     derived,
-    presets::{AGENTS, Agent, Layer, Only, PRESETS, Preset, agent, layers, stack},
+    presets::{Agent, Layer, Only, PRESETS, Preset, agent, agents, layers, stack},
+    resolve::{Flags, Source, resolve},
 };
 
 /// Where a setting's source begins, if the setting leaves room.
@@ -27,10 +27,21 @@ const BY_MACHINE: [&str; 5] = [
     "actor.world_threads",
 ];
 
+/// What a world that is a process of its own says of itself.
+const DECLARED: [&str; 6] = [
+    "world.height",
+    "world.width",
+    "world.channels",
+    "world.actions",
+    "input.height",
+    "input.width",
+];
+
 /// Presets, agents, and what differs by game.
 pub fn menu() -> Result<String, Usage> {
     let presets = PRESETS.iter().map(|preset| (preset.name, preset.about));
-    let agents = AGENTS.iter().map(|agent| (agent.name, agent.about));
+    let agents = agents();
+    let agents = agents.iter().map(|agent| (agent.name, agent.about));
     let width = presets
         .clone()
         .chain(agents.clone())
@@ -101,14 +112,14 @@ pub fn sourced(preset: &'static Preset, world: WorldName, agent: &Agent) -> Resu
         memory_bytes: u64::MAX,
         ..Machine::this()
     };
-    let config = config::resolve(&source, &Flags::default(), &machine)?;
+    let config = resolve(&source, &Flags::default(), &machine)?;
     let table: Table = config
         .to_toml()
         .parse()
         .map_err(|e: toml::de::Error| usage!("the settings as TOML: {}", e.message()))?;
     let mut sources = BTreeMap::new();
     for layer in stack(preset, world, agent) {
-        note_sources(&layer, &world.to_string(), &mut sources);
+        note_sources(&layer, &world.with_own_library().to_string(), &mut sources);
     }
     let mut text = format!(
         "# {} in {world}, preset {}: every setting and its source. `driml local --config` takes this file.\n",
@@ -135,7 +146,9 @@ fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, ou
     }
     for (key, value) in lines {
         let setting = format!("{} = {value}", quoted(key));
-        let source = source_of(&inner(key), sources);
+        // Nothing else has one.
+        let is_process = sources.contains_key("world.start_timeout_ms");
+        let source = source_of(&inner(key), sources, is_process);
         out.push_str(&format!("{setting:SOURCE_COLUMN$} # {source}\n"));
     }
     for (key, value) in tables {
@@ -145,7 +158,7 @@ fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, ou
     }
 }
 
-/// A key as TOML has it.
+/// A key in TOML's form.
 fn quoted(key: &str) -> String {
     let bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
     if key.chars().all(bare) {
@@ -155,12 +168,15 @@ fn quoted(key: &str) -> String {
     }
 }
 
-fn source_of(path: &str, sources: &BTreeMap<String, String>) -> String {
+fn source_of(path: &str, sources: &BTreeMap<String, String>, is_process: bool) -> String {
     if let Some(source) = sources.get(path) {
         return source.clone();
     }
     if BY_MACHINE.contains(&path) {
         return "this machine".into();
+    }
+    if is_process && DECLARED.contains(&path) {
+        return "the world declares it".into();
     }
     derived::follows(path).unwrap_or("not said").to_owned()
 }
@@ -219,12 +235,12 @@ pub(crate) fn comments(text: &str) -> Vec<(String, String)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::RunConfig;
+    use crate::{config::RunConfig, presets::AGENTS};
 
     #[test]
     fn every_setting_of_every_game_and_agent_has_a_source_and_reads_back() {
         for world in WorldName::all() {
-            for agent in &AGENTS {
+            for agent in AGENTS {
                 let text = sourced(&PRESETS[0], world, agent).unwrap();
                 assert!(!text.contains("not said"), "{text}");
                 RunConfig::parse("printed", &text).unwrap();

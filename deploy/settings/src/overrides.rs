@@ -4,6 +4,9 @@
 use driml_machine::error::{Usage, nearest, usage};
 use toml::{Table, Value};
 
+/// Up to here a float is exactly the whole number that was written.
+const WHOLE_MAX: f64 = (1u64 << 53) as f64;
+
 /// A parsed `--set`.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Override {
@@ -73,6 +76,12 @@ impl Override {
     fn as_type_of(&self, old: &Value) -> Result<Value, Usage> {
         match (old, &self.value) {
             (Value::Float(_), Value::Integer(whole)) => Ok(Value::Float(*whole as f64)),
+            // 1e6 is a number of frames, too. Floats are whole numbers up to 2^53.
+            (Value::Integer(_), Value::Float(number))
+                if number.fract() == 0.0 && number.abs() <= WHOLE_MAX =>
+            {
+                Ok(Value::Integer(*number as i64))
+            }
             (old, new) if old.same_type(new) => Ok(new.clone()),
             (old, new) => Err(usage!(
                 "--set {}={}: the value is {}, and {new} is {}",
@@ -164,7 +173,7 @@ mod tests {
 
     fn settings() -> Table {
         "[run]\nseed = 1\ngamma = 0.99\ntimeout = \"terminal\"\nhorizon = { rule = \"fixed\", k = 5 }\n\
-         [learner]\nbatch_rows = 256\n[learner.update.adam]\nlr = 1e-3\nbeta1 = 0.9"
+         [learner]\nbatch_size = 256\n[learner.update.adam]\nlr = 1e-3\nbeta1 = 0.9"
             .parse()
             .unwrap()
     }
@@ -211,7 +220,7 @@ mod tests {
             .assert_eq(&said("run.seed=many"));
         expect![[r#"--set run.seed=1.5: the value is a whole number, and 1.5 is a number"#]]
             .assert_eq(&said("run.seed=1.5"));
-        expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has batch_rows, update"#]]
+        expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has batch_size, update"#]]
             .assert_eq(&said("learner.adam.lr=1"));
         expect![[r#"there is no setting "seed" (did you mean "run.seed"?); the settings have the tables learner, run"#]]
             .assert_eq(&said("seed=1"));

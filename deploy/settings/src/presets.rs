@@ -3,6 +3,9 @@
 
 #[cfg(test)]
 mod pinned;
+pub(crate) mod prices;
+
+use std::sync::{Mutex, PoisonError};
 
 use driml_envs::WorldName;
 use driml_machine::error::{Usage, nearest, usage};
@@ -17,10 +20,10 @@ pub(crate) struct Layer {
 }
 
 macro_rules! layer {
-    ($path:literal) => {
+    ($($path:literal)+) => {
         Layer {
-            name: $path,
-            text: include_str!(concat!("../presets/", $path, ".toml")),
+            name: concat!($($path),+),
+            text: include_str!(concat!("../presets/", $($path,)+ ".toml")),
         }
     };
 }
@@ -38,37 +41,64 @@ pub struct Preset {
     layers: &'static [Layer],
     /// The worlds it is made for; none means all.
     families: &'static [&'static str],
+    /// Whether a run says what it gives up for speed, with its measured price.
+    pub(crate) is_priced: bool,
 }
 
 /// Every preset, the default first.
-pub const PRESETS: [Preset; 4] = [
+pub const PRESETS: &[Preset] = &[
     Preset {
         name: "paper",
         about: "as the paper's authors ran it, at the world's own frame size (the default)",
         layers: &[],
         families: &[],
+        is_priced: false,
     },
     Preset {
         name: "paper-observation",
         about: "`paper` with Procgen's frame enlarged to the paper's 104 x 80: 2.3 times the arithmetic",
         layers: &[layer!("variant/paper-observation")],
         families: &["procgen"],
+        is_priced: false,
     },
     Preset {
         name: "split",
         about: "`paper` with each of the 500 Procgen levels an episode of its own, and unseen ones to test on",
         layers: &[layer!("variant/split")],
         families: &["procgen"],
+        is_priced: false,
+    },
+    Preset {
+        name: "exact",
+        about: "`paper`, with nothing given up for speed, whatever its own choices become",
+        layers: &[layer!("variant/exact")],
+        families: &[],
+        is_priced: false,
+    },
+    Preset {
+        name: "balanced",
+        about: "`exact` in the learner; actors and broadcasts give up what costs the least, and a run says what",
+        layers: &[layer!("variant/balanced")],
+        families: &[],
+        is_priced: true,
+    },
+    Preset {
+        name: "fast",
+        about: "bf16 in learner and actors, half the bytes of a broadcast; a run says what that costs",
+        layers: &[layer!("variant/fast")],
+        families: &[],
+        is_priced: true,
     },
     Preset {
         name: "smoke",
         about: "a tiny network, batch and replay: shows within a minute that all parts work together",
         layers: &[layer!("variant/smoke")],
         families: &[],
+        is_priced: false,
     },
 ];
 
-/// An agent.
+/// An agent: its name and its layer of settings.
 #[derive(Clone, Debug)]
 pub struct Agent {
     /// As `--agent` takes it.
@@ -78,57 +108,67 @@ pub struct Agent {
     layer: Layer,
 }
 
-/// Every agent.
-pub const AGENTS: [Agent; 7] = [
-    Agent {
-        name: "c51",
-        about: "the return alone",
-        layer: layer!("agent/c51"),
-    },
-    Agent {
-        name: "driml-fix",
-        about: "DIM at a fixed k, chosen by game; augments its states on seven of them",
-        layer: layer!("agent/driml-fix"),
-    },
-    Agent {
-        name: "driml-ada",
-        about: "DIM at a k that follows how predictable the stored actions are (the default)",
-        layer: layer!("agent/driml-ada"),
-    },
-    Agent {
-        name: "driml-randk",
-        about: "DIM at a k drawn uniformly",
-        layer: layer!("agent/driml-randk"),
-    },
-    Agent {
-        name: "driml-noact",
-        about: "DIM that is not told the action",
-        layer: layer!("agent/driml-noact"),
-    },
-    Agent {
-        name: "cpc",
-        about: "one InfoNCE for each of k = 1..5, not told the action",
-        layer: layer!("agent/cpc"),
-    },
-    Agent {
-        name: "curl",
-        about: "two augmentations of the same state, the second one seen by a moving average of the network",
-        layer: layer!("agent/curl"),
-    },
-];
+/// Makes [`AGENTS`]: a line has an agent's name, which is that of its file in `presets/agent/`, and what it is.
+macro_rules! agents {
+    ($($name:literal: $about:literal;)+) => {
+        /// Every agent that `--agent` takes.
+        pub const AGENTS: &[Agent] = &[$(Agent {
+            name: $name,
+            about: $about,
+            layer: layer!("agent/" $name),
+        }),+];
+    };
+}
+
+agents! {
+    "c51": "the return alone";
+    "driml-fix": "DIM at a fixed k, chosen by game; augments its states on seven of them";
+    "driml-ada": "DIM at a k that follows how predictable the stored actions are (the default)";
+    "driml-randk": "DIM at a k drawn uniformly";
+    "driml-noact": "DIM that is not told the action";
+    "cpc": "one InfoNCE for each of k = 1..5, not told the action";
+    "curl": "two augmentations of the same state, the second one seen by a moving average of the network";
+}
+
+/// Those that the program added.
+static OWN_AGENTS: Mutex<Vec<&'static Agent>> = Mutex::new(Vec::new());
+
+/// Makes an agent known, before anything else is done: `--agent NAME` takes it from then on. `layer` is its settings, TOML as in
+/// `presets/agent/`. A name that is known already keeps its agent.
+pub fn register_agent(name: &'static str, about: &'static str, layer: &'static str) {
+    let agent = Agent {
+        name,
+        about,
+        layer: Layer { name, text: layer },
+    };
+    let mut own = OWN_AGENTS.lock().unwrap_or_else(PoisonError::into_inner);
+    own.push(Box::leak(Box::new(agent)));
+}
+
+/// Every agent, with those that the program added.
+pub(crate) fn agents() -> Vec<&'static Agent> {
+    let own = OWN_AGENTS.lock().unwrap_or_else(PoisonError::into_inner);
+    AGENTS.iter().chain(own.iter().copied()).collect()
+}
 
 /// One for each kind of world in the registry of worlds.
-const WORLDS: [Layer; 4] = [
+const WORLDS: &[Layer] = &[
     layer!("world/procgen"),
     layer!("world/mspacman"),
     layer!("world/chain"),
     layer!("world/ising"),
+    layer!("world/exec"),
 ];
 
 fn world_layer(world: WorldName) -> Layer {
     let name = format!("world/{}", world.kind());
-    let found = WORLDS.into_iter().find(|layer| layer.name == name);
-    found.expect("a test looks for a layer of each kind")
+    let found = WORLDS.iter().find(|layer| layer.name == name).copied();
+    let own = driml_envs::own_preset(world.kind()).map(|text| Layer {
+        name: world.kind(),
+        text,
+    });
+    let layer = found.or(own);
+    layer.expect("a test looks for a layer of each kind, and whoever adds one brings it along")
 }
 
 /// A world by its name, or by its game's.
@@ -145,14 +185,16 @@ pub fn world(name: &str) -> Result<WorldName, Usage> {
 /// # Errors
 /// Says which agents there are.
 pub fn agent(name: &str) -> Result<&'static Agent, Usage> {
-    AGENTS
+    let agents = agents();
+    agents
         .iter()
+        .copied()
         .find(|agent| agent.name == name)
         .ok_or_else(|| {
-            let names = AGENTS.map(|agent| agent.name);
+            let names: Vec<_> = agents.iter().map(|agent| agent.name).collect();
             usage!(
                 "there is no agent {name:?}{}; --agent takes {}",
-                nearest(name, names),
+                nearest(name, names.iter().copied()),
                 names.join(", ")
             )
         })
@@ -167,10 +209,10 @@ pub fn preset(name: &str) -> Result<&'static Preset, Usage> {
         .iter()
         .find(|preset| preset.name == name)
         .ok_or_else(|| {
-            let names = PRESETS.map(|preset| preset.name);
+            let names: Vec<_> = PRESETS.iter().map(|preset| preset.name).collect();
             usage!(
                 "there is no preset {name:?}{}; --preset takes {} (`driml presets` describes them)",
-                nearest(name, names),
+                nearest(name, names.iter().copied()),
                 names.join(", ")
             )
         })
@@ -190,7 +232,7 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
     }
     let mut table = Table::new();
     for layer in stack(preset, world, agent) {
-        lay(&mut table, &layer, &world.to_string());
+        lay(&mut table, &layer, &world.with_own_library().to_string());
     }
     Ok(table)
 }
@@ -216,7 +258,7 @@ fn lay(table: &mut Table, layer: &Layer, world: &str) {
     }
 }
 
-/// What a person should know of an agent in a world before it starts.
+/// Notes on an agent in a world, to be printed before the run starts.
 pub fn notes(name: &str, world: &str) -> Vec<String> {
     let blocks = agent(name)
         .map(|agent| agent.layer.read().1)
@@ -236,7 +278,7 @@ pub struct Only {
     /// What it sets.
     #[serde(default)]
     set: Table,
-    /// What a person should know before the run starts.
+    /// A note that is printed before the run starts.
     note: Option<String>,
 }
 
@@ -245,7 +287,7 @@ impl Layer {
     fn read(&self) -> (Table, Vec<Only>) {
         let bad = |e| -> ! {
             panic!(
-                "presets/{}.toml is built in, and a test reads it: {e}",
+                "presets/{}.toml, or what a program has registered by that name, is no layer of settings: {e}",
                 self.name
             )
         };
@@ -286,9 +328,9 @@ mod tests {
     }
 
     fn all_layers() -> Vec<Layer> {
-        let agents = AGENTS.into_iter().map(|agent| agent.layer);
+        let agents = AGENTS.iter().map(|agent| agent.layer);
         let worlds = WorldName::all().map(world_layer);
-        let variants = PRESETS.into_iter().flat_map(|preset| preset.layers);
+        let variants = PRESETS.iter().flat_map(|preset| preset.layers);
         let variants = variants.map(|layer| Layer {
             name: layer.name,
             text: layer.text,

@@ -2,22 +2,49 @@
 
 use clap::Args;
 use driml_launch::endpoint::check_endpoints;
+use driml_machine::error::usage;
+use driml_protocol::tls::Role;
+use driml_settings::presets;
 
-use super::join::{JoinFlags, clean_up_after, join};
+use super::join::{JoinFlags, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct ActorArgs {
-    /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; may be given several times
+    /// Endpoint of the replay server, such as quic/10.0.0.1:7447; may be given several times
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) connect: Vec<String>,
-    /// Which actor this is; unique in the run
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    /// Which actor this is; unique in the run. env:NAME takes it from the environment, such as env:SLURM_PROCID or
+    /// env:JOB_COMPLETION_INDEX
+    #[arg(long, value_name = "N", default_value = "0", value_parser = actor_id)]
     pub(crate) id: u32,
     /// Copies of the world [default: as the run's settings say]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub(crate) envs: Option<u32>,
+    /// The run's world, where it is code of your own: exec:COMMAND or libenv:PATH:GAME as this machine has it. An actor
+    /// starts or loads no code because a replay server says so
+    #[arg(long, value_name = "WORLD")]
+    pub(crate) env: Option<String>,
+    #[command(flatten)]
+    pub(crate) tls: TlsFlags,
     #[command(flatten)]
     pub(crate) join: JoinFlags,
+}
+
+/// An actor's number, given as such or by the name of the variable that holds it.
+fn actor_id(text: &str) -> Result<u32, String> {
+    let Some(name) = text.strip_prefix("env:") else {
+        return text.parse().map_err(|_| {
+            "give a whole number from 0, or env:NAME for one that the environment holds".into()
+        });
+    };
+    match std::env::var(name) {
+        Ok(value) => value.trim().parse().map_err(|_| {
+            format!("the environment's {name} is {value:?}, and no number of an actor")
+        }),
+        Err(_) => Err(format!(
+            "the environment has no {name}: whoever starts this process has to set it"
+        )),
+    }
 }
 
 /// Plays until the run ends.
@@ -25,13 +52,20 @@ pub(crate) struct ActorArgs {
 /// # Errors
 /// A call that cannot work, or what the actor met.
 pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
-    check_endpoints(&args.connect)?;
+    check_endpoints(&args.connect, args.tls.is_set())?;
+    let credentials = args.tls.credentials(Role::Actor(args.id))?;
+    let world = match &args.env {
+        Some(name) => Some(presets::world(name).map_err(|e| usage!("--env: {e}"))?),
+        None => None,
+    };
     let shutdown = join(&args.join)?;
     let run = driml_actor::RunArgs {
         connect: args.connect,
+        credentials,
         namespace: args.join.namespace,
         actor: args.id,
         envs: args.envs,
+        world,
     };
     clean_up_after(driml_actor::run(run, &shutdown))
 }

@@ -1,12 +1,20 @@
 //! What the commands that take part in a run share: how they reach it, and what they leave when they end.
 
+use std::{path::PathBuf, sync::Arc};
+
 use anyhow::Context;
 use clap::Args;
-use driml_launch::{endpoint::NAMESPACE, meeting, shared_memory};
+use driml_launch::{
+    endpoint::{Guard, NAMESPACE},
+    meeting, shared_memory,
+};
 use driml_machine::error::Usage;
-use driml_protocol::{Keys, Shutdown, session};
+use driml_protocol::{
+    Keys, Shutdown, session,
+    tls::{Credentials, Role},
+};
 
-/// How a part reaches the run.
+/// How a process reaches the run.
 #[derive(Debug, Args)]
 pub(crate) struct JoinFlags {
     /// Prefix of the run's keys
@@ -17,7 +25,61 @@ pub(crate) struct JoinFlags {
     pub(crate) exit_with_parent: Option<u32>,
 }
 
-/// Checks how a part reaches the run, and starts to listen for signals.
+/// When a replay server or a learner ends.
+#[derive(Debug, Args)]
+pub(crate) struct StayFlag {
+    /// Stay when the run is over, to be asked, until this is ended by Ctrl-C or a signal
+    #[arg(long)]
+    pub(super) stay: bool,
+}
+
+/// With which certificate a process takes part.
+#[derive(Debug, Args)]
+pub(crate) struct TlsFlags {
+    /// Talk over mutual TLS (in QUIC, so over UDP), with the certificates in DIR that deploy/certs.sh makes: ca.pem, and ROLE.pem
+    /// and ROLE.key, where ROLE is actor-N (N is its --id), learner, replay-server or, to only look, observer. Endpoints are then
+    /// quic/HOST:PORT, or unix sockets, and the replay server lets each role do what it needs and no more
+    #[arg(long, value_name = "DIR")]
+    pub(crate) tls_dir: Option<PathBuf>,
+}
+
+/// Whether everybody is trusted who can connect.
+#[derive(Debug, Args)]
+pub(crate) struct NetworkFlag {
+    /// Listen also where other machines can connect without certificates: whoever reaches the endpoint can read the run, change
+    /// what is learned, and end it
+    #[arg(long)]
+    pub(crate) insecure_network: bool,
+}
+
+impl NetworkFlag {
+    /// What a person has said about who may connect.
+    pub(super) const fn guard(&self, tls: &TlsFlags) -> Guard {
+        Guard {
+            tls: tls.is_set(),
+            insecure_network: self.insecure_network,
+        }
+    }
+}
+
+impl TlsFlags {
+    /// Whether there are certificates.
+    pub(crate) const fn is_set(&self) -> bool {
+        self.tls_dir.is_some()
+    }
+
+    /// The certificate of `role`, if one was asked for.
+    ///
+    /// # Errors
+    /// One that is missing or not good, and what to do.
+    pub(super) fn credentials(&self, role: Role) -> Result<Option<Arc<Credentials>>, Usage> {
+        let read = |folder: &PathBuf| Credentials::read(folder, role).map(Arc::new);
+        let read = self.tls_dir.as_ref().map(read).transpose();
+        read.map_err(|e| Usage(e.to_string()))
+    }
+}
+
+/// Checks how a process reaches the run, and starts to listen for signals.
 ///
 /// # Errors
 /// A namespace that is none.
@@ -29,7 +91,7 @@ pub(super) fn join(flags: &JoinFlags) -> anyhow::Result<Shutdown> {
     Shutdown::on_signals(flags.exit_with_parent).context("listening for signals")
 }
 
-/// What a part does when it has ended, well or not: nothing of it is left outside the run folder.
+/// What a process does when it has ended, well or not: nothing of it is left outside the run folder.
 pub(super) fn clean_up_after(ran: anyhow::Result<()>) -> anyhow::Result<()> {
     meeting::leave();
     shared_memory::remove_own();

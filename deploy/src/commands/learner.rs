@@ -5,12 +5,13 @@ use std::path::PathBuf;
 use clap::Args;
 use driml_launch::endpoint::check_endpoints;
 use driml_machine::device::{DeviceFlag, ready_for};
+use driml_protocol::tls::Role;
 
-use super::join::{JoinFlags, clean_up_after, join};
+use super::join::{JoinFlags, StayFlag, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct LearnerArgs {
-    /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; once for each of the run's replay shards
+    /// Endpoint of the replay server, such as quic/10.0.0.1:7447; once for each of the run's replay shards
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) connect: Vec<String>,
     /// Where checkpoints go: DIR/checkpoints
@@ -18,6 +19,10 @@ pub(crate) struct LearnerArgs {
     pub(crate) run_dir: PathBuf,
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
+    #[command(flatten)]
+    pub(crate) until: StayFlag,
+    #[command(flatten)]
+    pub(crate) tls: TlsFlags,
     #[command(flatten)]
     pub(crate) join: JoinFlags,
 }
@@ -27,14 +32,17 @@ pub(crate) struct LearnerArgs {
 /// # Errors
 /// A call that cannot work, or what the learner met.
 pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
-    check_endpoints(&args.connect)?;
+    check_endpoints(&args.connect, args.tls.is_set())?;
+    let credentials = args.tls.credentials(Role::Learner)?;
     ready_for(args.on.device)?;
     let shutdown = join(&args.join)?;
     let run = driml_learner::RunArgs {
         connect: args.connect,
+        credentials,
         namespace: args.join.namespace,
         run_dir: args.run_dir,
         device: args.on.device,
+        stay: args.until.stay,
     };
     clean_up_after(driml_learner::run(run, &shutdown))
 }

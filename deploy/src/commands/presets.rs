@@ -8,7 +8,7 @@ use driml_settings::{
     presets::{self, PRESETS},
 };
 
-/// World and agent of which nothing is said, as `driml local` has it.
+/// World and agent where none is given: those of `driml train`.
 const GAME: &str = "bigfish";
 const AGENT: &str = "driml-ada";
 

@@ -1,20 +1,23 @@
 //! `driml replay-server`: the replay server of a run, which hands its settings to the others.
 
+use std::path::PathBuf;
+
 use clap::Args;
-use driml_launch::endpoint::check_endpoints;
+use driml_launch::endpoint::{check_endpoints, check_listening};
 use driml_machine::resources::Machine;
+use driml_protocol::tls::Role;
 use driml_settings::flags::{self, RunFlags};
 
-use super::join::{JoinFlags, clean_up_after, join};
+use super::join::{JoinFlags, NetworkFlag, StayFlag, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct ReplayServerArgs {
-    /// Endpoint to listen on, such as tcp/127.0.0.1:7447; may be given several times. Whoever reaches it can take part in the
-    /// run and change what is learned: an address that others reach, such as tcp/0.0.0.0:7447, belongs in a trusted network
+    /// Endpoint to listen on, such as tcp/127.0.0.1:7447; may be given several times. One that other machines reach is
+    /// quic/HOST:PORT, such as quic/0.0.0.0:7447, with --tls-dir
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) listen: Vec<String>,
-    /// Router to connect to as well
-    #[arg(long, value_name = "ENDPOINT")]
+    /// Router to connect to as well; not with --tls-dir, as its rules would not be ours
+    #[arg(long, value_name = "ENDPOINT", conflicts_with = "tls_dir")]
     pub(crate) connect: Vec<String>,
     /// Which of the run's --replay-shards this is
     #[arg(long, value_name = "I", default_value_t = 0)]
@@ -22,8 +25,18 @@ pub(crate) struct ReplayServerArgs {
     /// Go on after so many updates: those of the newest checkpoint in the learner's run folder
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=u64::from(u32::MAX)))]
     pub(crate) after_updates: u64,
+    /// Keep the replay on disk in this folder, and go on with the one that is there: a server that died is started again with the
+    /// same flags [default: in memory alone]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) replay_dir: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) run: RunFlags,
+    #[command(flatten)]
+    pub(crate) until: StayFlag,
+    #[command(flatten)]
+    pub(crate) tls: TlsFlags,
+    #[command(flatten)]
+    pub(crate) network: NetworkFlag,
     #[command(flatten)]
     pub(crate) join: JoinFlags,
 }
@@ -33,8 +46,9 @@ pub(crate) struct ReplayServerArgs {
 /// # Errors
 /// A call or settings that cannot work, or what the server met.
 pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
-    check_endpoints(&args.listen)?;
-    check_endpoints(&args.connect)?;
+    check_listening(&args.listen, args.network.guard(&args.tls))?;
+    check_endpoints(&args.connect, args.tls.is_set())?;
+    let credentials = args.tls.credentials(Role::ReplayServer)?;
     let (config, _) = flags::resolve(&args.run, &Machine::this())?;
     let shutdown = join(&args.join)?;
     for note in &config.notes {
@@ -43,9 +57,13 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
     let run = driml_replay_server::RunArgs {
         listen: args.listen,
         connect: args.connect,
+        credentials,
         namespace: args.join.namespace,
         shard: args.shard,
         after_updates: args.after_updates,
+        weights_bytes_max: config.weights_bytes()?,
+        dir: args.replay_dir,
+        stay: args.until.stay,
         config_toml: config.to_toml(),
     };
     clean_up_after(driml_replay_server::run(run, &shutdown))

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use driml_launch::{
     console::{self, print},
-    endpoint::check_endpoints,
+    endpoint::check_listening,
     launcher, lockstep, plan, resume,
     run_folder::RunFolder,
 };
@@ -15,12 +15,15 @@ use driml_machine::{
     device::ready_for,
     error::{Usage, usage},
     resources::Machine,
+    whole_number,
 };
-use driml_protocol::RunSpec;
+use driml_protocol::{RunSpec, session, tls::Role};
 use driml_settings::{
     config::RunConfig,
     flags::{RunFlags, resolve},
 };
+
+use super::join::{NetworkFlag, TlsFlags};
 
 /// What a resumed run has settled.
 const RESUMED: [&str; 11] = [
@@ -32,7 +35,7 @@ const RESUMED: [&str; 11] = [
     "replay_shards",
     "envs",
     "seed",
-    "study",
+    "reproduce_bug",
     "run_dir",
     "lockstep",
 ];
@@ -51,12 +54,31 @@ pub(crate) struct TrainArgs {
     /// What the learner computes on: cpu, cuda (the first GPU) or cuda:N [default: as the settings say, cpu]
     #[arg(long, value_name = "DEVICE")]
     pub(crate) device: Option<DeviceName>,
-    /// All parts in one process in a fixed order: the same seed gives the same weights
+    /// Keep the replay on disk too, in the run folder: a replay server that dies goes on with it, and so does --resume
+    #[arg(long)]
+    pub(crate) durable: bool,
+    /// Write events for TensorBoard too, in the run folder: `tensorboard --logdir RUN`
+    #[arg(long)]
+    pub(crate) tensorboard: bool,
+    /// Play the newest checkpoint every so many updates, in a process of its own beside the run (which takes a core meanwhile), and
+    /// keep the best: evaluations.csv, `driml evaluate RUN --checkpoint best`
+    #[arg(long, value_name = "UPDATES", value_parser = whole_number::within(1..=u64::MAX))]
+    pub(crate) evaluate_every: Option<u64>,
+    /// Whole episodes of each of these evaluations
+    #[arg(long, value_name = "N", default_value_t = 20, requires = "evaluate_every",
+          value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub(crate) evaluate_episodes: u32,
+    /// All parts in one process in a fixed order: the same seed gives the same weights, also if the run is interrupted and resumed
     #[arg(long, conflicts_with = "listen")]
     pub(crate) lockstep: bool,
-    /// Endpoint on which the parts meet [default: a unix socket in a fresh folder]
+    /// Endpoint on which the parts meet [default: a unix socket in a fresh folder]; or, with --tls-dir, on which the replay server
+    /// listens for parts of other machines, such as quic/0.0.0.0:7447, while those of this one meet at a unix socket
     #[arg(long, value_name = "ENDPOINT")]
     pub(crate) listen: Option<String>,
+    #[command(flatten)]
+    pub(crate) tls: TlsFlags,
+    #[command(flatten)]
+    pub(crate) network: NetworkFlag,
     /// End as after Ctrl-C when the process that started this one, which has this number, ends
     #[arg(long, value_name = "PID", hide = true)]
     pub(crate) exit_with_parent: Option<u32>,
@@ -74,18 +96,41 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             .sets
             .push(format!("local.learner_device={device}"));
     }
-    let (config, from, behind) = match &args.resume {
+    if args.durable {
+        args.run.over.sets.push("local.durable=true".into());
+    }
+    if args.tensorboard {
+        args.run.over.sets.push("local.tensorboard=true".into());
+    }
+    if let Some(every) = args.evaluate_every {
+        let (sets, episodes) = (&mut args.run.over.sets, args.evaluate_episodes);
+        // Before what the user sets: checkpoints may be more frequent.
+        sets.insert(0, format!("learner.checkpoint_period_updates={every}"));
+        sets.push(format!(
+            "local.evaluation={{every_updates={every},episodes={episodes}}}"
+        ));
+    }
+    let (config, from, resume_point) = match &args.resume {
         Some(folder) => {
-            let (config, behind) = resume::find(&RunFolder::new(folder), &args.run.over, &machine)?;
-            let from = format!("its checkpoint after {} updates", behind.updates);
-            (config, from, Some(behind))
+            let found = resume::find(&RunFolder::new(folder), &args.run.over, &machine)?;
+            args.lockstep = found.lockstep;
+            let from = format!("its checkpoint after {} updates", found.point.updates);
+            (found.config, from, Some(found.point))
         }
         None => {
             let (config, from) = resolve(&args.run, &machine)?;
             (config, from, None)
         }
     };
-    check_endpoints(args.listen.as_slice())?;
+    check_listening(args.listen.as_slice(), args.network.guard(&args.tls))?;
+    if args.tls.is_set() && !args.listen.as_deref().is_some_and(session::is_quic) {
+        return Err(usage!(
+            "--tls-dir is for parts of other machines, which need somewhere to connect to: add --listen quic/HOST:PORT"
+        )
+        .into());
+    }
+    // What is wrong with them is said before anything is made.
+    args.tls.credentials(Role::ReplayServer)?;
     ready_for(config.local.learner_device)?;
     let (shards, actors) = (config.replay.shards, config.local.actors);
     if shards > actors {
@@ -109,7 +154,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
         &from,
         &run_dir,
         args.lockstep,
-        behind.unwrap_or_default(),
+        resume_point.unwrap_or_default(),
         &machine,
     ))?;
     config.world.install(&mut console::line)?;
@@ -120,13 +165,24 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             )
             .into());
         }
-        lockstep::run(&config, &run_dir, args.exit_with_parent)
+        if let Some(max) = config.replay.disk_bytes_max {
+            return Err(usage!(
+                "--lockstep keeps the whole replay in the run folder, so that the run can be resumed exactly, and cannot keep it within \
+                 replay.disk_bytes_max = {max}: leave that out, or lower replay.capacity_transitions"
+            )
+            .into());
+        }
+        lockstep::run(&config, &run_dir, resume_point, args.exit_with_parent)
     } else {
         launcher::run(
             &config,
             &run_dir,
-            behind,
-            args.listen,
+            resume_point,
+            launcher::Outside {
+                listen: args.listen,
+                tls_dir: args.tls.tls_dir,
+                insecure_network: args.network.insecure_network,
+            },
             args.exit_with_parent,
         )
     }

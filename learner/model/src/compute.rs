@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::kernels::{
     candle::{self, ConvLayerTensors},
-    conv, linear,
+    conv, dots, grouped, linear,
     precision::Precision,
 };
 
@@ -52,6 +52,34 @@ impl Kernels {
         }
     }
 
+    /// The layer on maps [B, h, w, c], flattened as PyTorch's weights expect: channel, row, column.
+    pub(crate) fn linear_of_maps(
+        self,
+        maps: &Tensor,
+        w: &Tensor,
+        b: &Tensor,
+    ) -> candle_core::Result<Tensor> {
+        match self {
+            Self::Fused(precision) => linear::linear_of_maps(maps, w, b, precision),
+            Self::Candle => candle::linear(&maps.permute((0, 3, 1, 2))?.flatten_from(1)?, w, b),
+        }
+    }
+
+    /// Of the layer on `x` [B, in] the outputs [B, out] of one group a row, of `w` [groups * out, in].
+    pub(crate) fn grouped_linear(
+        self,
+        x: &Tensor,
+        w: &Tensor,
+        b: &Tensor,
+        groups: &[u8],
+        out: usize,
+    ) -> candle_core::Result<Tensor> {
+        match self {
+            Self::Fused(precision) => grouped::grouped_linear(x, w, b, groups, out, precision),
+            Self::Candle => candle::grouped_linear(x, w, b, groups, out),
+        }
+    }
+
     pub(crate) fn linear_relu(
         self,
         x: &Tensor,
@@ -61,6 +89,18 @@ impl Kernels {
         match self {
             Self::Fused(precision) => linear::linear_relu(x, w, b, precision),
             Self::Candle => candle::relu(&candle::linear(x, w, b)?),
+        }
+    }
+
+    /// Dot products [L, B, B] of anchors and candidates, location by location, in f32. `psi` and `phi` are [B, L, R], or [B, R] where
+    /// one vector meets every location of the other.
+    ///
+    /// # Errors
+    /// Vectors that do not fit each other.
+    pub fn dot_products(self, psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
+        match self {
+            Self::Fused(_) => dots::dot_products(psi, phi),
+            Self::Candle => candle::dot_products(psi, phi),
         }
     }
 
@@ -142,17 +182,28 @@ pub enum DeviceError {
 }
 
 impl DeviceName {
+    /// Checks that products can be computed in `precision` on such a device, whether or not it is there.
+    ///
+    /// # Errors
+    /// bf16 on a GPU.
+    pub fn check(self, precision: Precision) -> Result<(), DeviceError> {
+        match (self, precision) {
+            (Self::Cuda(_), Precision::Bf16) => Err(DeviceError::Precision {
+                device: self,
+                precision,
+            }),
+            _ => Ok(()),
+        }
+    }
+
     /// The device with the faster kernels that it has, products in `precision`.
     ///
     /// # Errors
     /// A GPU that is not there, or a program that was built without the feature `cuda`; bf16 on a GPU.
     pub fn open(self, precision: Precision) -> Result<Compute, DeviceError> {
+        self.check(precision)?;
         match self {
             Self::Cpu => Ok(Compute::cpu(precision)),
-            Self::Cuda(_) if precision != Precision::F32 => Err(DeviceError::Precision {
-                device: self,
-                precision,
-            }),
             Self::Cuda(ordinal) => {
                 let device = Device::new_cuda(ordinal)
                     .map_err(|why| DeviceError::Open { device: self, why })?;

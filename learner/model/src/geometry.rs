@@ -100,3 +100,78 @@ impl ConvShape {
         self.weight_len() + self.channels_out
     }
 }
+
+/// Rows and columns, from the upper left corner of an image of (height, width), that windows of the layers of `conv` reach: what
+/// lies beyond them changes no output. `None` if a kernel does not fit.
+///
+/// The last layer's whole output is read; a layer that gives n rows reads `stride * (n - 1) + kernel` of its input's.
+pub fn reach(conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
+    let mut size = (image.0, image.1, 1);
+    for layer in conv {
+        size = ConvShape::new(size, *layer)?.output();
+    }
+    let back = |outputs: usize| {
+        let layers = conv.iter().rev();
+        layers.fold(outputs, |n, layer| layer.stride * (n - 1) + layer.kernel)
+    };
+    Some((back(size.0), back(size.1)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn layers(all: &[(usize, usize)]) -> Vec<ConvLayer> {
+        let layer = |&(kernel, stride)| ConvLayer {
+            out: 2,
+            kernel,
+            stride,
+        };
+        all.iter().map(layer).collect()
+    }
+
+    #[test]
+    fn what_the_dqn_network_reaches() {
+        let dqn = layers(&[(8, 4), (4, 2), (3, 1)]);
+        for (image, reached) in [
+            ((64, 64), Some((60, 60))),
+            ((104, 80), Some((100, 76))),
+            ((84, 84), Some((84, 84))),
+            ((36, 36), Some((36, 36))),
+            ((35, 64), None),
+        ] {
+            assert_eq!(reach(&dqn, image), reached, "{image:?}");
+        }
+        assert_eq!(reach(&[], (3, 5)), Some((3, 5)));
+    }
+
+    /// For every size: the part that is reached gives maps of the same size, and one row or column less does not.
+    #[test]
+    fn no_smaller_part_gives_the_same_maps() {
+        let maps = |conv: &[ConvLayer], image: (usize, usize)| {
+            let mut size = (image.0, image.1, 1);
+            for layer in conv {
+                size = ConvShape::new(size, *layer)?.output();
+            }
+            Some((size.0, size.1))
+        };
+        for conv in [
+            layers(&[(3, 2)]),
+            layers(&[(2, 3)]),
+            layers(&[(8, 4), (4, 2), (3, 1)]),
+            layers(&[(5, 3), (1, 2)]),
+        ] {
+            for side in 1..80 {
+                let Some((height, width)) = reach(&conv, (side, 79)) else {
+                    assert_eq!(maps(&conv, (side, 79)), None);
+                    continue;
+                };
+                let whole = maps(&conv, (side, 79));
+                assert!(height <= side && width <= 79);
+                assert_eq!(maps(&conv, (height, width)), whole);
+                assert_ne!(maps(&conv, (height - 1, width)), whole);
+                assert_ne!(maps(&conv, (height, width - 1)), whole);
+            }
+        }
+    }
+}

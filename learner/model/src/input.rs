@@ -1,7 +1,100 @@
-//! Frames to the network's input size: enlargement by nearest neighbour on plain bytes.
+//! Frames to the network's input: enlargement by nearest neighbour on plain bytes, of what the network reads.
 //! It does not stack frames and does not convert them to floats.
 
+use serde::{Deserialize, Serialize};
+
+use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
+use crate::geometry::{ConvLayer, reach};
+
+/// The size at which the network sees a world's frame: the `[input]` table.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct InputSize {
+    /// Rows of a whole frame after enlargement.
+    pub height: u32,
+    /// Columns of a whole frame after enlargement.
+    pub width: u32,
+    /// A whole frame as the world gives it. Where it is there, what the network does not read is cut before a frame is recorded;
+    /// settings of earlier versions do not have it, and frames are whole.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frame: Option<FrameSize>,
+}
+
+/// Rows and columns of a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FrameSize {
+    /// Rows of pixels.
+    pub height: u32,
+    /// Pixels in a row.
+    pub width: u32,
+}
+
+/// What a network reads, from the upper left corner, (height, width).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct InputRead {
+    /// Of the enlarged frame.
+    pub input: (usize, usize),
+    /// Of the frame as the world gives it.
+    pub frame: (usize, usize),
+}
+
+impl InputSize {
+    /// Rows and columns of a whole frame after enlargement.
+    pub const fn whole_input(&self) -> (usize, usize) {
+        (self.height as usize, self.width as usize)
+    }
+
+    /// Rows and columns of a whole frame as the world gives it, where frames of `sent` rows and columns travel.
+    pub fn whole_frame(&self, sent: (usize, usize)) -> (usize, usize) {
+        self.frame
+            .map_or(sent, |whole| (whole.height as usize, whole.width as usize))
+    }
+
+    /// What the layers of `conv` read of a frame of (height, width) that is enlarged to this size; all of it if they do not fit.
+    pub fn read(&self, conv: &[ConvLayer], frame: (usize, usize)) -> InputRead {
+        let whole = self.whole_input();
+        let Some(input) = reach(conv, whole) else {
+            return InputRead {
+                input: whole,
+                frame,
+            };
+        };
+        let of_side = |read: usize, from: usize, to: usize| source(read - 1, from, to) + 1;
+        InputRead {
+            input,
+            frame: (
+                of_side(input.0, frame.0, whole.0),
+                of_side(input.1, frame.1, whole.1),
+            ),
+        }
+    }
+
+    /// What makes the input of a network of `model` from frames of (height, width) as they travel; `None` where they are it.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] if the network takes what these frames do not have.
+    pub fn enlarge(&self, sent: (usize, usize), model: &ModelConfig) -> Result<Option<Enlarge>> {
+        let (frame, whole) = (self.whole_frame(sent), self.whole_input());
+        let taken = (model.height, model.width);
+        if frame != whole {
+            let enlarge = Enlarge::new(frame, whole, model.channels)?;
+            return enlarge.part(sent, taken).map(Some);
+        }
+        if sent == taken {
+            return Ok(None);
+        }
+        Err(ModelError::Config(format!(
+            "the network takes {taken:?} of {whole:?}, and frames of {sent:?} travel"
+        )))
+    }
+}
+
+/// The source pixel of output pixel `at`, along one side.
+const fn source(at: usize, from: usize, to: usize) -> usize {
+    (2 * at + 1) * from / (2 * to)
+}
 
 /// Resizes u8 images [n, h, w, c] to another height and width by nearest neighbour.
 ///
@@ -26,14 +119,37 @@ impl Enlarge {
                 "resizing {from:?} to {to:?} with {channels} channels"
             )));
         }
-        let sources =
-            |from: usize, to: usize| (0..to).map(|at| (2 * at + 1) * from / (2 * to)).collect();
+        let sources = |from: usize, to: usize| (0..to).map(|at| source(at, from, to)).collect();
         Ok(Self {
             from,
             channels,
             source_rows: sources(from.0, to.0),
             source_cols: sources(from.1, to.1),
         })
+    }
+
+    /// The same for images of which only a part is there, to a part of what they would become; both begin at the upper left corner.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] if that part needs more of the images, or if there is no more of them.
+    pub fn part(mut self, from: (usize, usize), to: (usize, usize)) -> Result<Self> {
+        let whole = (self.from, (self.source_rows.len(), self.source_cols.len()));
+        self.source_rows.truncate(to.0);
+        self.source_cols.truncate(to.1);
+        let fits = |sources: &[usize], whole: usize, wanted: usize, there: usize| {
+            let last = sources.last().copied();
+            sources.len() == wanted && there <= whole && last.is_some_and(|last| last < there)
+        };
+        if fits(&self.source_rows, whole.0.0, to.0, from.0)
+            && fits(&self.source_cols, whole.0.1, to.1, from.1)
+        {
+            self.from = from;
+            return Ok(self);
+        }
+        Err(ModelError::Config(format!(
+            "resizing {from:?} of {:?} to {to:?} of {:?}",
+            whole.0, whole.1
+        )))
     }
 
     /// Bytes of one source image.
@@ -124,6 +240,68 @@ mod tests {
         let mut enlarged = [0; 32];
         enlarge.apply(&[10, 20], &mut enlarged);
         assert_eq!(enlarged, [10, 10, 10, 10, 20, 20, 20, 20].repeat(4)[..]);
+    }
+
+    /// The upper left `part` of images [h, w, 1].
+    fn cut(images: &[u8], width: usize, part: (usize, usize)) -> Vec<u8> {
+        let rows = images.chunks_exact(width).take(part.0);
+        rows.flat_map(|row| &row[..part.1]).copied().collect()
+    }
+
+    #[test]
+    fn what_is_read_is_the_same_of_a_part_as_of_the_whole() {
+        let conv = [(8, 4), (4, 2), (3, 1)].map(|(kernel, stride)| ConvLayer {
+            out: 1,
+            kernel,
+            stride,
+        });
+        for (frame, input, read) in [
+            ((64, 64), (64, 64), ((60, 60), (60, 60))),
+            ((64, 64), (104, 80), ((100, 76), (62, 61))),
+            ((21, 19), (84, 84), ((84, 84), (21, 19))),
+            ((64, 50), (80, 64), ((76, 60), (61, 47))),
+        ] {
+            let size = InputSize {
+                height: input.0 as u32,
+                width: input.1 as u32,
+                frame: Some(FrameSize {
+                    height: frame.0 as u32,
+                    width: frame.1 as u32,
+                }),
+            };
+            let found = size.read(&conv, frame);
+            assert_eq!((found.input, found.frame), read);
+            let image: Vec<u8> = (0..frame.0 * frame.1)
+                .map(|at| (at * 7 % 251) as u8)
+                .collect();
+            let mut whole = vec![0; input.0 * input.1];
+            let enlarge = Enlarge::new(frame, input, 1).unwrap();
+            enlarge.apply(&image, &mut whole);
+            let model = ModelConfig {
+                height: found.input.0,
+                width: found.input.1,
+                channels: 1,
+                num_actions: 1,
+                atoms: 2,
+                v_min: 0.0,
+                v_max: 1.0,
+                conv: conv.to_vec(),
+                hidden: 1,
+                rkhs: 1,
+                action_embed: 1,
+                dim: crate::DimHeads::NONE,
+            };
+            let sent = cut(&image, frame.1, found.frame);
+            let mut part = vec![0; found.input.0 * found.input.1];
+            match size.enlarge(found.frame, &model).unwrap() {
+                Some(enlarge) => enlarge.apply(&sent, &mut part),
+                None => part.copy_from_slice(&sent),
+            }
+            assert_eq!(part, cut(&whole, input.1, found.input), "{frame:?}");
+            // One row less does not do.
+            let less = (found.frame.0 - 1, found.frame.1);
+            assert!(size.enlarge(less, &model).is_err(), "{frame:?}");
+        }
     }
 
     #[test]

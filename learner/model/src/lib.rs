@@ -29,9 +29,11 @@
 
 mod compute;
 mod config;
+mod cost;
 mod encoder;
 mod error;
 mod geometry;
+mod gradients;
 mod heads;
 mod init;
 mod input;
@@ -39,18 +41,24 @@ mod kernels;
 mod network;
 mod parameters;
 mod policy;
+mod stored;
 mod torso;
 
 pub use compute::{Compute, DeviceError, DeviceName, Kernels};
 pub use config::{DimHeads, ModelConfig};
+pub use cost::LayerCost;
 pub use encoder::Encoder;
 pub use error::{ModelError, Result};
-pub use geometry::{ConvLayer, ConvShape};
-pub use input::Enlarge;
+pub use geometry::{ConvLayer, ConvShape, reach};
+pub use gradients::Backward;
+pub use heads::c51::EXPECTED_RETURN_ERROR;
+pub use input::{Enlarge, FrameSize, InputRead, InputSize};
 pub use kernels::conv::{conv_stack, conv2d_relu};
+pub use kernels::exponentials::{exp_below, soft_clip};
 pub use kernels::linear::{linear, linear_relu, relu};
 pub use kernels::precision::{Precision, UnknownPrecision};
 pub use kernels::units::kernels_in_words;
 pub use network::{Features, Network};
 pub use parameters::Parameters;
 pub use policy::PolicyNetwork;
+pub use stored::StoredAs;

@@ -8,6 +8,7 @@ use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
 use crate::heads::c51::C51Head;
 use crate::heads::dim::{ActionEmbedding, Head};
+use crate::kernels::rows::select_rows;
 use crate::parameters::Parameters;
 use crate::torso::Torso;
 
@@ -24,11 +25,22 @@ impl Features {
     /// Those of `rows` rows from `first` on.
     ///
     /// # Errors
-    /// Fewer rows.
+    /// There are fewer rows than that.
     pub fn narrow(&self, first: usize, rows: usize) -> candle_core::Result<Self> {
         Ok(Self {
             f3: self.f3.narrow(0, first, rows)?,
             f4: self.f4.narrow(0, first, rows)?,
+        })
+    }
+
+    /// Those of these rows, each as often as it is asked for. On the CPU alone; gradients of a row's copies are summed first to last.
+    ///
+    /// # Errors
+    /// A row that is not there.
+    pub fn select(&self, rows: &[u32]) -> candle_core::Result<Self> {
+        Ok(Self {
+            f3: select_rows(&self.f3, rows)?,
+            f4: select_rows(&self.f4, rows)?,
         })
     }
 }
@@ -114,7 +126,17 @@ impl Network {
         self.head.logits(f4)
     }
 
-    /// Expected returns [B, A] of `logits` [B, A, atoms]. No gradient flows through them.
+    /// Of [`Network::logits`] those [B, atoms] of the actions [B] that were taken, each below the number of actions; the others
+    /// are not computed.
+    ///
+    /// # Errors
+    /// Another shape, or an action out of range.
+    pub fn taken_logits(&self, f4: &Tensor, actions: &[u8]) -> Result<Tensor> {
+        self.head.taken_logits(f4, actions)
+    }
+
+    /// Expected returns [B, A] of `logits` [B, A, atoms]. No gradient flows through them. On the CPU they are right to
+    /// [`EXPECTED_RETURN_ERROR`](crate::EXPECTED_RETURN_ERROR) of the support's width beside their own last place.
     ///
     /// # Errors
     /// Another shape.

@@ -5,10 +5,11 @@ use std::collections::{BTreeMap, HashMap};
 
 use candle_core::{DType, Device, Tensor, Var};
 use rand_chacha::ChaCha8Rng;
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use safetensors::tensor::{SafeTensors, TensorView};
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
+use crate::stored::{self, StoredAs};
 
 /// Parameters by name, as candle variables with PyTorch's names and shapes.
 ///
@@ -116,21 +117,55 @@ impl Parameters {
     /// # Errors
     /// A parameter that is not finite, which no reader would take; a failure to read a variable or to serialise.
     pub fn to_safetensors(&self, filter: impl Fn(&str) -> bool) -> Result<Vec<u8>> {
+        self.to_safetensors_as(StoredAs::F32, filter)
+    }
+
+    /// [`Parameters::to_safetensors`] with scalars of another type.
+    ///
+    /// # Errors
+    /// As there, and a parameter that is too large for the type.
+    pub fn to_safetensors_as(
+        &self,
+        stored: StoredAs,
+        filter: impl Fn(&str) -> bool,
+    ) -> Result<Vec<u8>> {
+        self.serialized(stored, filter, None)
+    }
+
+    /// All parameters as a safetensors file whose metadata has `value` under `key`: for readers that know nothing else of the
+    /// network. One entry, as more would be written in an order of their own each time.
+    ///
+    /// # Errors
+    /// As [`Parameters::to_safetensors`].
+    pub fn to_described_safetensors(&self, key: &str, value: &str) -> Result<Vec<u8>> {
+        let entry = HashMap::from([(key.to_owned(), value.to_owned())]);
+        self.serialized(StoredAs::F32, |_| true, Some(entry))
+    }
+
+    fn serialized(
+        &self,
+        stored: StoredAs,
+        filter: impl Fn(&str) -> bool,
+        metadata: Option<HashMap<String, String>>,
+    ) -> Result<Vec<u8>> {
         let mut tensors = Vec::new();
         for (name, var) in self.iter().filter(|(name, _)| filter(name)) {
             let values = var.flatten_all()?.to_vec1::<f32>()?;
             check_finite(name, &values)?;
-            let bytes: Vec<u8> = values
-                .iter()
-                .flat_map(|value| value.to_le_bytes())
-                .collect();
+            let bytes = stored.encode(&values).map_err(|at| {
+                let why = format!("is {} at index {at}, too large for {stored:?}", values[at]);
+                ModelError::parameter(name, why)
+            })?;
             tensors.push((name, var.dims().to_vec(), bytes));
         }
         let mut views = Vec::with_capacity(tensors.len());
         for (name, shape, bytes) in &tensors {
-            views.push((*name, TensorView::new(Dtype::F32, shape.clone(), bytes)?));
+            views.push((
+                *name,
+                TensorView::new(stored.dtype(), shape.clone(), bytes)?,
+            ));
         }
-        Ok(safetensors::serialize(views, None)?)
+        Ok(safetensors::serialize(views, metadata)?)
     }
 
     /// The parameter of this name, for example `torso.conv1.weight`.
@@ -225,18 +260,11 @@ pub(crate) fn decode(
         let view = found
             .remove(name.as_str())
             .ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
-        if view.dtype() != Dtype::F32 {
-            return Err(ModelError::parameter(
-                &name,
-                format!("has type {:?}, wanted F32", view.dtype()),
-            ));
-        }
         check_shape(&name, view.shape(), &shape)?;
-        let (scalars, _) = view.data().as_chunks::<4>();
-        let values: Vec<f32> = scalars
-            .iter()
-            .map(|bytes| f32::from_le_bytes(*bytes))
-            .collect();
+        let values = stored::decode(view.dtype(), view.data()).ok_or_else(|| {
+            let why = format!("has type {:?}, wanted F32, F16 or BF16", view.dtype());
+            ModelError::parameter(&name, why)
+        })?;
         check_finite(&name, &values)?;
         parameters.insert(name, (shape, values));
     }

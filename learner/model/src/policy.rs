@@ -12,11 +12,12 @@ use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
 use crate::heads::c51::expected_returns;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::convolution::{Convolution, Images, PADDING, Pixels, forward};
+use crate::kernels::convolution::{Convolution, forward};
+use crate::kernels::images::{Images, PADDING, Pixels};
 use crate::kernels::linear::relu_of;
+use crate::kernels::panels::{Matrix, Panels, Threads};
 use crate::kernels::precision::Precision;
-use crate::kernels::product::{Matrix, Panels, Threads};
-use crate::kernels::units::{Element, ForUnit, Left, Mode, Unit, row_tiles, with_unit};
+use crate::kernels::units::{Element, ForUnit, Left, Mode, Unit, vectorized, with_unit};
 use crate::parameters::{decode, is_dim};
 
 /// Frames that go through the network together on one thread.
@@ -202,36 +203,37 @@ impl<U: Unit> UnitWeights<U> {
     fn tile_q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]) {
         let unit = self.unit;
         let count = values.len() * support.len() / self.head.bias.len();
-        let (mut maps, mut scale) = Pixels::Bytes(frames).operands(unit);
-        for layer in &self.convolutions {
+        let mut maps = Buffer::<U::Element>::new(0);
+        for (index, layer) in self.convolutions.iter().enumerate() {
             let len = count * layer.shape.map_len();
             let mut output = Buffer::<U::Element>::new(len + PADDING);
             output[len..].fill(U::Element::default());
-            let images = Images {
-                values: &maps,
-                scale,
+            let images = match index {
+                0 => Images::Pixels(Pixels::Bytes(frames)),
+                _ => Images::Maps(&maps),
             };
-            forward(unit, layer, images, count, |first, row| {
-                for (value, &map) in output[first..].iter_mut().zip(row) {
-                    *value = U::Element::of(map);
-                }
-            });
-            (maps, scale) = (output, 1.0);
+            forward(unit, layer, images, &mut output[..len]);
+            maps = output;
         }
         let hidden = self.fc.forward(unit, &maps, count);
         let stride = self.fc.bias.len().next_multiple_of(U::Element::DEPTH);
         let mut active = Buffer::<U::Element>::new(count * stride);
-        unit.vectorize(|| {
-            let rows = active.chunks_exact_mut(stride);
-            for (row, hidden) in rows.zip(hidden.chunks_exact(self.fc.bias.len())) {
-                row.fill(U::Element::default());
-                for (value, &hidden) in row.iter_mut().zip(hidden) {
-                    *value = U::Element::of(relu_of(hidden));
-                }
-            }
-        });
+        activate(unit, &hidden, self.fc.bias.len(), &mut active);
         let logits = self.head.forward(unit, &active, count);
         expected_returns(&logits, support, values);
+    }
+}
+
+vectorized! {
+    /// relu of `hidden` [rows, cols] as rows of whole steps.
+    fn activate<U>(unit, hidden: &'a [f32], cols: usize, active: &'a mut [U::Element]) {
+        let rows = active.chunks_exact_mut(cols.next_multiple_of(U::Element::DEPTH));
+        for (row, hidden) in rows.zip(hidden.chunks_exact(cols)) {
+            row.fill(U::Element::default());
+            for (value, &hidden) in row.iter_mut().zip(hidden) {
+                *value = U::Element::of(relu_of(hidden));
+            }
+        }
     }
 }
 
@@ -272,19 +274,17 @@ impl<U: Unit> Dense<U> {
         }
         let depth = U::Element::DEPTH;
         let row_stride = self.inputs.next_multiple_of(depth);
-        for (row, rows) in row_tiles::<U>(count, self.weight.vecs()) {
-            let left = Left {
-                values: x,
-                start: row * row_stride,
-                row_stride,
-                step: depth,
-                steps: row_stride / depth,
-                run_stride: 0,
-                runs: 1,
-            };
-            self.weight
-                .multiply(unit, rows, left, Mode::Add, &mut y[row * outputs..]);
-        }
+        let left = Left {
+            values: x,
+            start: 0,
+            row_stride,
+            step: depth,
+            steps: row_stride / depth,
+            run_stride: 0,
+            runs: 1,
+        };
+        self.weight
+            .multiply_rows(unit, count, left, Mode::Add, &mut y);
         y
     }
 }

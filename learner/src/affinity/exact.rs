@@ -23,6 +23,10 @@ pub struct ExactSettings {
     pub smoothing: f64,
 }
 
+/// Largest error of an entry of A, as a share of it: an f32's last place, while the counts stay below 1e300. Rows sum to 1 within
+/// 1e-6.
+pub const ENTRY_ERROR: f64 = 6.1e-8;
+
 /// Bounds of the smoothing, far within f64's, so that ratios of counts are finite and above 0.
 const SMOOTHING: RangeInclusive<f64> = 1e-100..=1e100;
 

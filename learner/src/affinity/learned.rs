@@ -64,16 +64,27 @@ impl LearnedSettings {
             eps,
             keep,
         } = *self;
-        let above_0 = |x: f64| x > 0.0 && x.is_finite();
-        let share = |x: f64| (0.0..1.0).contains(&x);
-        if (1..=HIDDEN_MAX).contains(&hidden)
-            && above_0(lr)
-            && above_0(eps)
-            && [beta1, beta2, keep].into_iter().all(share)
-        {
-            return Ok(());
+        let above_0 = |x: f64| (x > 0.0 && x.is_finite(), "above 0 and finite");
+        let share = |x: f64| ((0.0..1.0).contains(&x), "at least 0 and below 1");
+        if !(1..=HIDDEN_MAX).contains(&hidden) {
+            return Err(AffinityError(format!(
+                "hidden = {hidden}, which is not within 1 and {HIDDEN_MAX}"
+            )));
         }
-        Err(AffinityError(format!("settings out of range: {self:?}")))
+        for (name, value, (is_fine, range)) in [
+            ("lr", lr, above_0(lr)),
+            ("eps", eps, above_0(eps)),
+            ("beta1", beta1, share(beta1)),
+            ("beta2", beta2, share(beta2)),
+            ("keep", keep, share(keep)),
+        ] {
+            if !is_fine {
+                return Err(AffinityError(format!(
+                    "{name} = {value:?}, which is not {range}"
+                )));
+            }
+        }
+        Ok(())
     }
 }
 

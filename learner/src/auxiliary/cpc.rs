@@ -1,7 +1,7 @@
 //! CPC: one InfoNCE for each offset 1, .., P, on the heads that DIM has, which all offsets share.
 //! It holds no parameters, and has no recurrent context: s_t, with its stack of frames, is the context.
 
-use std::{borrow::Cow, ops::Range};
+use std::ops::Range;
 
 use candle_core::Tensor;
 use driml_model::{DimHeads, Features, Network};
@@ -15,6 +15,7 @@ use crate::{
     batch::Batch,
     error::UpdateError,
     losses::{info_nce::info_nce_loss, scores::Dots},
+    repeats::State,
 };
 
 /// Its line of the menu.
@@ -57,8 +58,10 @@ impl AuxiliaryLoss for Cpc {
         Passes::of_pairs(self.pairs.lambda, positives, augmented)
     }
 
-    fn later_states<'a>(&self, batch: &Batch<'a>) -> Cow<'a, [u8]> {
-        present(batch.states_k, batch.positive_valid)
+    /// Those that exist, offset by offset: nothing is computed for the others.
+    fn later_states<'a>(&self, batch: &Batch<'a>, state_bytes: usize) -> Vec<State<'a>> {
+        let states = batch.positive_states(state_bytes);
+        states.into_iter().filter(Option::is_some).collect()
     }
 
     /// For each pair with a weight above 0 the mean over the P offsets of the InfoNCE of the rows that have a positive there, 0
@@ -170,40 +173,10 @@ fn of_offset(
             .transpose()
     };
     Ok(Vectors {
+        kernels: vectors.kernels,
         psi3: psi(&vectors.psi3)?,
         phi3: phi(&vectors.phi3)?,
         psi4: psi(&vectors.psi4)?,
         phi4: phi(&vectors.phi4)?,
     })
-}
-
-/// Of the positives' states [P, B, ..] those that exist, offset by offset: nothing is computed for the others.
-fn present<'a>(states: &'a [u8], valid: &[u8]) -> Cow<'a, [u8]> {
-    if valid.iter().all(|&valid| valid != 0) {
-        return Cow::Borrowed(states);
-    }
-    let state_bytes = states.len() / valid.len();
-    let count = valid.iter().filter(|&&valid| valid != 0).count();
-    let mut there = Vec::with_capacity(count * state_bytes);
-    for (state, _) in states
-        .chunks_exact(state_bytes)
-        .zip(valid)
-        .filter(|(_, valid)| **valid != 0)
-    {
-        there.extend_from_slice(state);
-    }
-    Cow::Owned(there)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn states_without_a_positive_are_left_out() {
-        let states = [1, 1, 2, 2, 3, 3, 4, 4];
-        assert_eq!(*present(&states, &[1; 4]), states);
-        assert_eq!(*present(&states, &[0, 1, 0, 1]), [2, 2, 4, 4]);
-        assert!(present(&states, &[0; 4]).is_empty());
-    }
 }

@@ -7,8 +7,6 @@
 //! "exactly the same networks for measuring similarity (i.e. one residual block for CURL and CPC)", hence no bilinear
 //! product and no second head.
 
-use std::borrow::Cow;
-
 use driml_model::DimHeads;
 use serde::{Deserialize, Serialize};
 
@@ -23,6 +21,7 @@ use crate::{
     error::UpdateError,
     losses::{info_nce::info_nce_loss, scores::Scores},
     ranges::{TAU, check_range},
+    repeats::State,
 };
 
 /// Its line of the menu.
@@ -89,16 +88,17 @@ impl AuxiliaryLoss for Curl {
     /// The query forward and backward, the key forward.
     fn passes(&self, _positives: usize, _augmented: bool) -> Passes {
         Passes {
-            torso: 4.0,
-            heads: 4.0,
-            scores: 1.0,
-            local: false,
+            states: 1,
+            keys: 1,
+            psi: 1,
+            global_scores: 1,
+            ..Passes::default()
         }
     }
 
     /// None: the other view is the key encoder's.
-    fn later_states<'a>(&self, _batch: &Batch<'a>) -> Cow<'a, [u8]> {
-        Cow::Borrowed(&[])
+    fn later_states<'a>(&self, _batch: &Batch<'a>, _state_bytes: usize) -> Vec<State<'a>> {
+        Vec::new()
     }
 
     /// InfoNCE of the online network's vectors of one view with the key encoder's of the other. All rows take part: a state
@@ -107,7 +107,7 @@ impl AuxiliaryLoss for Curl {
         let keys = inputs.keys()?;
         let anchors = &inputs.features.anchors;
         let query = inputs.online.psi4(&anchors.f4, &inputs.action()?)?;
-        let dots = dim::global_dots(&query, &keys)?;
+        let dots = dim::dots_of(inputs.online.kernels(), &query, &keys)?;
         let all = vec![1; inputs.batch.rows];
         let scores = Scores::new(dots.rkhs, self.tanh_clip);
         let loss = info_nce_loss(&dots.dots, &all, scores, inputs.online.kernels())?;

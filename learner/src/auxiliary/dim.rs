@@ -1,10 +1,8 @@
 //! Deep InfoMax: InfoNCE between features of (s_t, a_t) and of s_{t+k}, for up to four pairs of levels.
 //! It holds no parameters (the model does) and does not mask beyond `positive_valid`.
 
-use std::borrow::Cow;
-
 use candle_core::Tensor;
-use driml_model::{DimHeads, Features, Network};
+use driml_model::{DimHeads, Features, Kernels, Network};
 
 use super::{
     loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
@@ -18,6 +16,7 @@ use crate::{
         info_nce::info_nce_loss,
         scores::{Dots, Scores},
     },
+    repeats::State,
 };
 
 /// Its line of the menu.
@@ -102,8 +101,9 @@ impl AuxiliaryLoss for Dim {
         Passes::of_pairs(self.lambda, positives, augmented)
     }
 
-    fn later_states<'a>(&self, batch: &Batch<'a>) -> Cow<'a, [u8]> {
-        Cow::Borrowed(batch.states_k)
+    /// A row without a positive keeps its place, so that row meets row; what the blank state gives is masked.
+    fn later_states<'a>(&self, batch: &Batch<'a>, state_bytes: usize) -> Vec<State<'a>> {
+        batch.positive_states(state_bytes)
     }
 
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
@@ -147,6 +147,8 @@ pub fn dots(
 /// What the heads make of anchors (psi) and candidates (phi): [B, L, R] of local features, [B, R] of global ones.
 #[derive(Debug)]
 pub struct Vectors {
+    /// What multiplies them.
+    pub kernels: Kernels,
     /// Psi_3 of the anchors; there if a local anchor is compared.
     pub psi3: Option<Tensor>,
     /// Phi_3 of the candidates; there if a local candidate is compared.
@@ -171,6 +173,7 @@ impl Vectors {
     ) -> Result<Self, UpdateError> {
         let [local_local, local_global, global_local, global_global] = wanted;
         Ok(Self {
+            kernels: network.kernels(),
             psi3: when(local_local || local_global, || {
                 network.psi3(&features_t.f3, action)
             })?,
@@ -190,87 +193,46 @@ impl Vectors {
     /// Vectors that do not fit each other.
     pub fn dots(&self, wanted: [bool; 4]) -> candle_core::Result<[Option<Dots>; 4]> {
         let Self {
+            kernels,
             psi3,
             phi3,
             psi4,
             phi4,
         } = self;
-        let pair =
-            |wanted: bool, psi: &Option<Tensor>, phi: &Option<Tensor>, multiply: Multiply| {
-                let both = psi.as_ref().zip(phi.as_ref()).filter(|_| wanted);
-                both.map(|(psi, phi)| with_rkhs(multiply(psi, phi)?, psi))
-                    .transpose()
-            };
+        let pair = |wanted: bool, psi: &Option<Tensor>, phi: &Option<Tensor>| {
+            let both = psi.as_ref().zip(phi.as_ref()).filter(|_| wanted);
+            both.map(|(psi, phi)| dots_of(*kernels, psi, phi))
+                .transpose()
+        };
         let [local_local, local_global, global_local, global_global] = wanted;
         Ok([
-            pair(local_local, psi3, phi3, local_local_dots)?,
-            pair(local_global, psi3, phi4, local_global_dots)?,
-            pair(global_local, psi4, phi3, global_local_dots)?,
-            pair(global_global, psi4, phi4, global_global_dots)?,
+            pair(local_local, psi3, phi3)?,
+            pair(local_global, psi3, phi4)?,
+            pair(global_local, psi4, phi3)?,
+            pair(global_global, psi4, phi4)?,
         ])
     }
 }
 
-/// Dot products of global vectors: `psi` [B, R] of anchors, `phi` [B, R] of candidates.
+/// Dot products of `psi` of anchors and `phi` of candidates, each [B, L, R] or [B, R].
 ///
 /// # Errors
 /// Vectors that do not fit each other.
-pub fn global_dots(psi: &Tensor, phi: &Tensor) -> candle_core::Result<Dots> {
-    with_rkhs(global_global_dots(psi, phi)?, psi)
+pub fn dots_of(kernels: Kernels, psi: &Tensor, phi: &Tensor) -> candle_core::Result<Dots> {
+    Ok(Dots {
+        dots: kernels.dot_products(psi, phi)?,
+        rkhs: psi.dims()[psi.rank() - 1],
+    })
 }
-
-fn with_rkhs(dots: Tensor, psi: &Tensor) -> candle_core::Result<Dots> {
-    let rkhs = psi.dims()[psi.rank() - 1];
-    Ok(Dots { dots, rkhs })
-}
-
-/// Dot products [L, B, B] of anchors and candidates.
-type Multiply = fn(&Tensor, &Tensor) -> candle_core::Result<Tensor>;
 
 fn when<E>(wanted: bool, make: impl FnOnce() -> Result<Tensor, E>) -> Result<Option<Tensor>, E> {
     if wanted { make().map(Some) } else { Ok(None) }
 }
 
-/// `batch` as a batched product takes it: the CPU's in any layout, others in one piece.
-fn as_operand(batch: Tensor) -> candle_core::Result<Tensor> {
-    if batch.device().is_cpu() {
-        Ok(batch)
-    } else {
-        batch.contiguous()
-    }
-}
-
-/// `psi` [B, L, R], `phi` [B, L, R].
-fn local_local_dots(psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
-    as_operand(psi.transpose(0, 1)?)?.matmul(&as_operand(phi.permute((1, 2, 0))?)?)
-}
-
-/// `psi` [B, L, R], `phi` [B, R].
-fn local_global_dots(psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
-    let (rows, locations, rkhs) = psi.dims3()?;
-    let dots = psi.reshape((rows * locations, rkhs))?.matmul(&phi.t()?)?;
-    dots.reshape((rows, locations, rows))?
-        .transpose(0, 1)?
-        .contiguous()
-}
-
-/// `psi` [B, R], `phi` [B, L, R].
-fn global_local_dots(psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
-    let (rows, locations, rkhs) = phi.dims3()?;
-    let dots = phi.reshape((rows * locations, rkhs))?.matmul(&psi.t()?)?;
-    dots.reshape((rows, locations, rows))?
-        .permute((1, 2, 0))?
-        .contiguous()
-}
-
-/// `psi` [B, R], `phi` [B, R].
-fn global_global_dots(psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
-    psi.matmul(&phi.t()?)?.unsqueeze(0)
-}
-
 #[cfg(test)]
 mod tests {
     use candle_core::Device;
+    use driml_model::Precision;
 
     use super::*;
 
@@ -300,6 +262,19 @@ mod tests {
 
     #[test]
     fn every_pair_of_levels_meets_as_it_should() -> candle_core::Result<()> {
+        for kernels in [
+            Kernels::FUSED,
+            Kernels::Fused(Precision::Bf16),
+            Kernels::Candle,
+        ] {
+            levels_meet(|psi, phi| kernels.dot_products(psi, phi))?;
+        }
+        Ok(())
+    }
+
+    fn levels_meet(
+        dots: impl Fn(&Tensor, &Tensor) -> candle_core::Result<Tensor>,
+    ) -> candle_core::Result<()> {
         let (psi3, phi3) = (ramp(&[3, 2, 4], 1.0), ramp(&[3, 2, 4], -2.0));
         let (psi4, phi4) = (ramp(&[3, 4], 3.0), ramp(&[3, 4], -1.0));
         let local = |t: &Tensor| t.to_vec3::<f32>().unwrap();
@@ -311,19 +286,19 @@ mod tests {
             |v: &Vec<Vec<f32>>, i: usize| v[i].clone(),
         );
         assert_eq!(
-            got(local_local_dots(&psi3, &phi3)?),
+            got(dots(&psi3, &phi3)?),
             plain(|i, at| l(&p3, i, at), |j, at| l(&q3, j, at))
         );
         assert_eq!(
-            got(local_global_dots(&psi3, &phi4)?),
+            got(dots(&psi3, &phi4)?),
             plain(|i, at| l(&p3, i, at), |j, _| g(&q4, j))
         );
         assert_eq!(
-            got(global_local_dots(&psi4, &phi3)?),
+            got(dots(&psi4, &phi3)?),
             plain(|i, _| g(&p4, i), |j, at| l(&q3, j, at))
         );
         let once = plain(|i, _| g(&p4, i), |j, _| g(&q4, j))[..9].to_vec();
-        assert_eq!(got(global_global_dots(&psi4, &phi4)?), once);
+        assert_eq!(got(dots(&psi4, &phi4)?), once);
         Ok(())
     }
 }

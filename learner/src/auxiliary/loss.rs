@@ -11,7 +11,13 @@ use super::{
     positives::Positives,
     settings::{AuxiliarySettings, Lambda},
 };
-use crate::{batch::Batch, error::UpdateError, losses::scores::Dots, tensors::states};
+use crate::{
+    batch::Batch,
+    error::UpdateError,
+    losses::scores::Dots,
+    repeats::{Distinct, EqualStates, State, one_after_another},
+    tensors::states,
+};
 
 /// An item of the menu: what is known of a loss before its settings are read.
 #[derive(Debug)]
@@ -37,12 +43,12 @@ pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
         None
     }
 
-    /// What an update costs beyond C51's, where a row has `positives` later states; for an estimate of a run's time.
+    /// What an update costs beyond C51's, where a row has `positives` later states; as `cost` counts it.
     fn passes(&self, positives: usize, augmented: bool) -> Passes;
 
-    /// The later states [.., H, W, C] that the loss needs the online network's features of, if any. They pass through it together
-    /// with s_t.
-    fn later_states<'a>(&self, batch: &Batch<'a>) -> Cow<'a, [u8]>;
+    /// The later states, each of so many bytes, that the loss needs the online network's features of, if any. They pass through it
+    /// together with s_t, a blank one where there is none.
+    fn later_states<'a>(&self, batch: &Batch<'a>, state_bytes: usize) -> Vec<State<'a>>;
 
     /// The losses of one batch, with their graphs.
     ///
@@ -51,30 +57,35 @@ pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError>;
 }
 
-/// Passes through parts of the network beyond C51's, a row; one with its backward pass counts three times.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// What passes through parts of the networks beyond what C51 needs, for each row of a batch.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Passes {
-    /// Passes through the torso, f4 included.
-    pub torso: f64,
-    /// Passes through all heads that the loss needs.
-    pub heads: f64,
-    /// Matrices of scores [B, B], a location.
-    pub scores: f64,
-    /// Whether there are scores at every location of f3, not of the global features alone.
-    pub local: bool,
+    /// States beyond s_t through the torso, forward and backward.
+    pub states: u64,
+    /// States through the key encoder, torso and Psi_4, forward alone.
+    pub keys: u64,
+    /// Vectors of every Psi that there is, forward and backward.
+    pub psi: u64,
+    /// Vectors of every Phi that there is, forward and backward.
+    pub phi: u64,
+    /// Matrices of dot products [B, B] at each location of f3.
+    pub local_scores: u64,
+    /// Matrices of dot products [B, B] of global features alone.
+    pub global_scores: u64,
 }
 
 impl Passes {
     /// Those of InfoNCE between levels of (s_t, a_t) and of each of `positives` later states: each state forward and backward.
     pub fn of_pairs(lambda: Lambda, positives: usize, augmented: bool) -> Self {
-        let [pairs @ .., _] = lambda.wanted();
-        let positives = positives as f64;
+        let [local @ .., global] = lambda.wanted();
+        let positives = positives as u64;
         Self {
-            torso: 3.0 * (positives + f64::from(u8::from(augmented))),
-            // Half of the heads are for s_t.
-            heads: 3.0 * (1.0 + positives) / 2.0,
-            scores: positives,
-            local: pairs.contains(&true),
+            states: positives + u64::from(augmented),
+            keys: 0,
+            psi: 1,
+            phi: positives,
+            local_scores: positives * local.into_iter().map(u64::from).sum::<u64>(),
+            global_scores: positives * u64::from(global),
         }
     }
 }
@@ -106,7 +117,7 @@ pub struct OnlineFeatures {
 }
 
 impl OnlineFeatures {
-    /// Passes what `loss` needs of `batch` through `network`.
+    /// Passes what `loss` needs of `batch` through `network`; augmented states are taken for distinct, as each is drawn by itself.
     ///
     /// # Errors
     /// States that do not fit the network.
@@ -115,24 +126,44 @@ impl OnlineFeatures {
         model: &ModelConfig,
         loss: &dyn AuxiliaryLoss,
         batch: &Batch<'_>,
+        equal_states: EqualStates,
         device: &Device,
     ) -> Result<Self, UpdateError> {
-        let later = loss.later_states(batch);
-        let parts = [batch.states_t, batch.anchors.unwrap_or_default(), &later];
-        let all = if parts[1..].iter().all(|part| part.is_empty()) {
+        let len = model.frame_len();
+        let mut all: Vec<State<'_>> = batch.states_t.chunks_exact(len).map(Some).collect();
+        let anchors = batch.anchors.unwrap_or_default().chunks_exact(len);
+        all.extend(anchors.map(Some));
+        let anchors = all.len() - batch.rows;
+        all.extend(loss.later_states(batch, len));
+
+        if anchors == 0
+            && equal_states.once_by(network.kernels())
+            && let Some(distinct) = Distinct::of(&all)
+        {
+            let features = network.features(&states(model, distinct.gather(&all, len), device)?)?;
+            let (now, later) = distinct.places().split_at(batch.rows);
+            let now = features.select(now)?;
+            let later = (!later.is_empty()).then(|| features.select(later));
+            return Ok(Self {
+                anchors: now.clone(),
+                now,
+                later: later.transpose()?,
+            });
+        }
+        let bytes = if all.len() == batch.rows {
             Cow::Borrowed(batch.states_t)
         } else {
-            Cow::Owned(parts.concat())
+            Cow::Owned(one_after_another(all.iter().copied(), len))
         };
-        let features = network.features(&states(model, all, device)?)?;
+        let features = network.features(&states(model, bytes, device)?)?;
         let mut first = 0;
-        let mut cut = |part: &[u8]| -> candle_core::Result<Option<Features>> {
-            let rows = part.len() / model.frame_len();
+        let mut cut = |rows: usize| -> candle_core::Result<Option<Features>> {
             let start = first;
             first += rows;
             (rows > 0).then(|| features.narrow(start, rows)).transpose()
         };
-        let [now, anchors, later] = [cut(parts[0])?, cut(parts[1])?, cut(parts[2])?];
+        let later = all.len() - anchors - batch.rows;
+        let [now, anchors, later] = [cut(batch.rows)?, cut(anchors)?, cut(later)?];
         let now = now.unwrap_or(features.clone());
         Ok(Self {
             anchors: anchors.unwrap_or_else(|| now.clone()),

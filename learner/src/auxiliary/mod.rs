@@ -2,7 +2,7 @@
 //!
 //! Each loss is a file of this folder that implements [`AuxiliaryLoss`], and a line of [`MENU`]. Nothing
 //! outside this folder asks which loss it is: what the rest must know (heads, positives, names of what is reported) the
-//! loss says itself.
+//! loss says itself. A program of its own [`register`]s one without a change here.
 
 pub mod cpc;
 pub mod curl;
@@ -13,7 +13,11 @@ pub mod none;
 pub mod positives;
 pub mod settings;
 
-use std::{fmt, str::FromStr};
+use std::{
+    fmt,
+    str::FromStr,
+    sync::{Mutex, PoisonError},
+};
 
 use loss::{AuxiliaryLoss, MenuItem};
 use positives::Positives;
@@ -25,7 +29,23 @@ use crate::error::UpdateError;
 /// Every auxiliary loss; a new one gets its line here.
 pub const MENU: &[&MenuItem] = &[&none::NONE, &dim::DIM, &cpc::CPC, &curl::CURL];
 
-/// The auxiliary loss of an agent: an item of the [`MENU`], by its name in settings.
+/// Those that the program added.
+static OWN: Mutex<Vec<&'static MenuItem>> = Mutex::new(Vec::new());
+
+/// Adds a loss to the menu, before anything else is done: `learner.update.objective` takes its name from then on. A name that is
+/// in the menu already keeps its loss.
+pub fn register(item: &'static MenuItem) {
+    let mut own = OWN.lock().unwrap_or_else(PoisonError::into_inner);
+    own.push(item);
+}
+
+/// The menu, with what the program added.
+fn all() -> Vec<&'static MenuItem> {
+    let own = OWN.lock().unwrap_or_else(PoisonError::into_inner);
+    MENU.iter().chain(own.iter()).copied().collect()
+}
+
+/// The auxiliary loss of an agent: an item of the [`MENU`] or one that was [`register`]ed, by its name in settings.
 #[derive(Clone, Copy, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "&'static str")]
 pub struct Objective(&'static MenuItem);
@@ -91,9 +111,10 @@ impl FromStr for Objective {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
-        let item = MENU.iter().copied().find(|item| item.name == name);
+        let all = all();
+        let item = all.iter().copied().find(|item| item.name == name);
         item.map(Self).ok_or_else(|| {
-            let known: Vec<_> = MENU.iter().map(|item| format!("`{}`", item.name)).collect();
+            let known: Vec<_> = all.iter().map(|item| format!("`{}`", item.name)).collect();
             format!(
                 "unknown variant `{name}`, expected one of {}",
                 known.join(", ")

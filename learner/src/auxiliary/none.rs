@@ -1,7 +1,5 @@
 //! No auxiliary loss: the agent learns the return alone, without a second pass and without heads.
 
-use std::borrow::Cow;
-
 use driml_model::DimHeads;
 
 use super::{
@@ -9,7 +7,7 @@ use super::{
     positives::Positives,
     settings::{AuxiliarySettings, PAIRS},
 };
-use crate::{batch::Batch, error::UpdateError};
+use crate::{batch::Batch, error::UpdateError, repeats::State};
 
 /// Its line of the menu.
 pub const NONE: MenuItem = MenuItem {
@@ -41,8 +39,8 @@ impl AuxiliaryLoss for ReturnAlone {
         Passes::default()
     }
 
-    fn later_states<'a>(&self, _batch: &Batch<'a>) -> Cow<'a, [u8]> {
-        Cow::Borrowed(&[])
+    fn later_states<'a>(&self, _batch: &Batch<'a>, _state_bytes: usize) -> Vec<State<'a>> {
+        Vec::new()
     }
 
     fn losses(&self, _inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {

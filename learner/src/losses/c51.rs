@@ -6,55 +6,102 @@ use driml_model::Kernels;
 
 use super::{candle, scalar_op::scalar_op};
 
-/// Mean over rows of `KL(target || softmax(logits of the taken action))`, and its gradient.
+/// Largest error of a probability or of a slope of the loss, as a share of it: an f32's last place. Below 1.2e-38, the least normal
+/// number, it is that share of 1.2e-38.
+pub const ENTRY_ERROR: f64 = 6.1e-8;
+/// Largest error of a slope beside [`ENTRY_ERROR`], where probability and target cancel in f64.
+pub const SLOPE_ERROR: f64 = 1e-15;
+/// Largest error of a row's divergence, as a share of `10 + sum_i target_i (max logit - logit_i)`.
+pub const KL_ERROR: f64 = 1e-13;
+
+/// Mean over rows of `KL(target || softmax(logits))`, and its gradient.
 ///
-/// `logits` [B, A, N]; `action` [B], each below `num_actions`; `target` [B, N], rows sum to 1.
+/// `logits` [B, N], those of the action that each row took; `target` [B, N], rows sum to 1; N is `atoms`.
 /// Loss: `1/B * sum_b sum_i target * (ln target - ln softmax)`, with `0 ln 0 = 0`, in nats.
-/// `gradient` [B, A, N] is overwritten with the derivative by the logits: `(softmax - target) / B` for the taken
-/// action, 0 for the others. The arithmetic is f64 and shifts by the largest logit, so any finite logits are fine; a loss
-/// beyond the finite f32 needs logits that differ by more than 1e38.
+/// `gradient` [B, N] is overwritten with the derivative by the logits: `(softmax - target) / B`. The arithmetic is f64 and shifts by
+/// the largest logit, so any finite logits are fine: the loss is right to [`KL_ERROR`], its slopes to [`ENTRY_ERROR`] and
+/// [`SLOPE_ERROR`]. A loss beyond the finite f32 needs logits that differ by more than 1e38. A logit that is not finite gives a loss
+/// that is not, which the update refuses.
 /// Source: Bellemare et al. 2017, equation 7.
 ///
 /// # Panics
-/// If the lengths disagree or an action is out of range: the caller has checked its batch by then.
-pub fn kl(
-    logits: &[f32],
-    action: &[u8],
-    num_actions: usize,
-    target: &[f32],
-    gradient: &mut [f32],
-) -> f64 {
-    let rows = action.len();
+/// If the lengths disagree, or there is no row: the caller has checked its batch by then.
+pub fn kl(logits: &[f32], target: &[f32], atoms: usize, gradient: &mut [f32]) -> f64 {
+    let rows = logits.len() / atoms;
     assert!(
-        rows > 0 && target.len().is_multiple_of(rows),
-        "whole rows of target"
+        rows > 0 && logits.len() == rows * atoms,
+        "whole rows of logits"
     );
-    let atoms = target.len() / rows;
-    assert_eq!(logits.len(), rows * num_actions * atoms, "logits [B, A, N]");
+    assert_eq!(logits.len(), target.len(), "logits and target [B, N]");
     assert_eq!(
         logits.len(),
         gradient.len(),
         "the gradient has the shape of the logits"
     );
-    gradient.fill(0.0);
     let mut total = 0.0;
-    for (row, (&action, target)) in action.iter().zip(target.chunks_exact(atoms)).enumerate() {
-        assert!(
-            usize::from(action) < num_actions,
-            "action {action} of {num_actions}"
-        );
-        let at = (row * num_actions + usize::from(action)) * atoms;
-        let logits = &logits[at..at + atoms];
+    for ((logits, target), gradient) in logits
+        .chunks_exact(atoms)
+        .zip(target.chunks_exact(atoms))
+        .zip(gradient.chunks_exact_mut(atoms))
+    {
         let log_p = LogSoftmax::of(logits);
         let mass: f64 = target.iter().map(|&t| f64::from(t)).sum();
-        for ((&logit, &t), gradient) in logits.iter().zip(target).zip(&mut gradient[at..at + atoms])
-        {
+        for ((&logit, &t), gradient) in logits.iter().zip(target).zip(gradient) {
             let (log_p, t) = (log_p.at(logit), f64::from(t));
             if t > 0.0 {
                 total += t * (t.ln() - log_p);
             }
             *gradient = ((mass * log_p.exp() - t) / rows as f64) as f32;
         }
+    }
+    total / rows as f64
+}
+
+/// [`kl`] of each row by itself: `KL(target || softmax(logits))` [B], in nats, right to [`KL_ERROR`]. What is below 0 by rounding is 0.
+///
+/// # Panics
+/// As [`kl`].
+pub fn row_kls(logits: &[f32], target: &[f32], atoms: usize) -> Vec<f64> {
+    let rows = logits.chunks_exact(atoms).zip(target.chunks_exact(atoms));
+    let row = |(logits, target)| kl(logits, target, atoms, &mut vec![0.0; atoms]).max(0.0);
+    rows.map(row).collect()
+}
+
+/// [`kl`] with each row's divergence, and its slopes, times its weight: `1/B * sum_b weight_b KL_b`.
+///
+/// `weights` [B], finite and not negative; all else as there.
+/// Source: Schaul et al. 2016, Prioritized Experience Replay, algorithm 1, line 12.
+///
+/// # Panics
+/// As [`kl`], and if there is not a weight a row.
+pub fn weighted_kl(
+    logits: &[f32],
+    target: &[f32],
+    weights: &[f32],
+    atoms: usize,
+    gradient: &mut [f32],
+) -> f64 {
+    let rows = weights.len();
+    assert_eq!(logits.len(), rows * atoms, "a weight a row");
+    assert_eq!(logits.len(), target.len(), "logits and target [B, N]");
+    assert_eq!(
+        logits.len(),
+        gradient.len(),
+        "the gradient has the shape of the logits"
+    );
+    let mut total = 0.0;
+    for (((logits, target), gradient), &weight) in logits
+        .chunks_exact(atoms)
+        .zip(target.chunks_exact(atoms))
+        .zip(gradient.chunks_exact_mut(atoms))
+        .zip(weights)
+    {
+        // Of a single row the mean is the row's.
+        total += f64::from(weight) * kl(logits, target, atoms, gradient);
+        let share = f64::from(weight) / rows as f64;
+        gradient
+            .iter_mut()
+            .for_each(|slope| *slope = (f64::from(*slope) * share) as f32);
     }
     total / rows as f64
 }
@@ -85,8 +132,8 @@ impl LogSoftmax {
     }
 }
 
-/// Writes softmax of `row` to `out`, both of one length. Finite logits of any size give a law whose entries are right to an f32's
-/// last place.
+/// Writes softmax of `row` to `out`, both of one length. Finite logits of any size give a law whose entries are right to
+/// [`ENTRY_ERROR`].
 pub fn softmax(row: &[f32], out: &mut [f32]) {
     let log_p = LogSoftmax::of(row);
     for (out, &x) in out.iter_mut().zip(row) {
@@ -94,31 +141,39 @@ pub fn softmax(row: &[f32], out: &mut [f32]) {
     }
 }
 
-/// [`kl`] as a candle operation: `logits` [B, A, N] to a scalar.
+/// [`kl`], or with `weights` [`weighted_kl`], as a candle operation: `logits` [B, N] to a scalar.
 ///
 /// # Errors
-/// Logits that are not [B, A, N] f32 with the B and N of `action` and `target`.
+/// Logits that are not [B, N] f32 of as many values as `target`, or not of as many rows as there are weights.
 pub fn kl_loss(
     logits: &Tensor,
-    action: &[u8],
     target: Vec<f32>,
+    weights: Option<Vec<f32>>,
     kernels: Kernels,
 ) -> Result<Tensor> {
-    let (rows, num_actions, atoms) = logits.dims3()?;
-    if rows != action.len() || target.len() != rows * atoms {
+    let (rows, atoms) = logits.dims2()?;
+    if target.len() != rows * atoms {
         bail!(
-            "logits of {rows} rows and {atoms} atoms meet {} actions and a target of {} values",
-            action.len(),
+            "logits of {rows} rows and {atoms} atoms meet a target of {} values",
             target.len()
         );
     }
-    if kernels == Kernels::Candle {
-        return candle::kl_loss(logits, action, target);
+    if let Some(weights) = &weights
+        && weights.len() != rows
+    {
+        bail!("logits of {rows} rows meet {} weights", weights.len());
     }
-    let action = action.to_vec();
-    scalar_op("c51-kl", logits, move |logits, gradient| {
-        kl(logits, &action, num_actions, &target, gradient)
-    })
+    if kernels == Kernels::Candle {
+        return candle::kl_loss(logits, target, weights);
+    }
+    match weights {
+        None => scalar_op("c51-kl", logits, move |logits, gradient| {
+            kl(logits, &target, atoms, gradient)
+        }),
+        Some(weights) => scalar_op("c51-weighted-kl", logits, move |logits, gradient| {
+            weighted_kl(logits, &target, &weights, atoms, gradient)
+        }),
+    }
 }
 
 #[cfg(test)]
@@ -127,23 +182,21 @@ mod tests {
 
     use super::*;
 
-    const ACTIONS: usize = 2;
-    const LOGITS: [f32; 12] = [
-        0.3, -1.0, 0.7, 2.0, 0.1, -0.4, 1.5, 1.4, -2.0, 0.0, 0.2, 0.9,
-    ];
+    const ATOMS: usize = 3;
+    const LOGITS: [f32; 6] = [2.0, 0.1, -0.4, 1.5, 1.4, -2.0];
     const TARGET: [f32; 6] = [0.2, 0.5, 0.3, 0.0, 0.0, 1.0];
 
     #[test]
     fn the_gradient_is_the_slope_of_the_loss() {
-        let mut gradient = [0f32; 12];
-        let mut scratch = [0f32; 12];
-        kl(&LOGITS, &[1, 0], ACTIONS, &TARGET, &mut gradient);
+        let mut gradient = [0f32; 6];
+        let mut scratch = [0f32; 6];
+        kl(&LOGITS, &TARGET, ATOMS, &mut gradient);
         for i in 0..LOGITS.len() {
             let mut shifted = |by: f32| {
                 let mut logits = LOGITS;
                 logits[i] += by;
                 (
-                    kl(&logits, &[1, 0], ACTIONS, &TARGET, &mut scratch),
+                    kl(&logits, &TARGET, ATOMS, &mut scratch),
                     f64::from(logits[i]),
                 )
             };
@@ -155,21 +208,67 @@ mod tests {
                 gradient[i]
             );
         }
-        assert_eq!(gradient[0..3], [0.0; 3], "the action that was not taken");
+    }
+
+    #[test]
+    fn a_row_s_weight_is_that_of_its_loss_and_of_its_slopes() -> Result<()> {
+        let weights = [0.25f32, 1.0];
+        let rows = row_kls(&LOGITS, &TARGET, ATOMS);
+        let weighted = (0.25 * rows[0] + rows[1]) / 2.0;
+        let (mut gradient, mut plain) = ([0f32; 6], [0f32; 6]);
+        let loss = weighted_kl(&LOGITS, &TARGET, &weights, ATOMS, &mut gradient);
+        assert!((loss - weighted).abs() < 1e-14);
+        let unweighted = kl(&LOGITS, &TARGET, ATOMS, &mut plain);
+        assert!((unweighted - (rows[0] + rows[1]) / 2.0).abs() < 1e-14);
+        for (i, (slope, plain)) in gradient.iter().zip(plain).enumerate() {
+            let expected = f64::from(plain) * f64::from(weights[i / ATOMS]);
+            assert!((f64::from(*slope) - expected).abs() < 1e-8, "logit {i}");
+        }
+        // Finite differences.
+        let mut scratch = [0f32; 6];
+        for i in 0..LOGITS.len() {
+            let mut shifted = |by: f32| {
+                let mut logits = LOGITS;
+                logits[i] += by;
+                let loss = weighted_kl(&logits, &TARGET, &weights, ATOMS, &mut scratch);
+                (loss, f64::from(logits[i]))
+            };
+            let ((high, x_high), (low, x_low)) = (shifted(1e-3), shifted(-1e-3));
+            let slope = (high - low) / (x_high - x_low);
+            assert!((slope - f64::from(gradient[i])).abs() < 1e-6, "logit {i}");
+        }
+        for kernels in [Kernels::FUSED, Kernels::Candle] {
+            let logits = Var::from_slice(&LOGITS, (2, ATOMS), &Device::Cpu)?;
+            let loss = kl_loss(&logits, TARGET.to_vec(), Some(weights.to_vec()), kernels)?;
+            let error = f64::from(loss.to_scalar::<f32>()?) - weighted;
+            assert!(error.abs() < 1e-6, "{kernels:?}: {error}");
+            let grads = loss.backward()?;
+            let got = grads.get(&logits).expect("a gradient").flatten_all()?;
+            for (got, expected) in got.to_vec1::<f32>()?.iter().zip(gradient) {
+                assert!(
+                    (got - expected).abs() < 1e-6,
+                    "{kernels:?}: {got}, {expected}"
+                );
+            }
+        }
+        let logits = Var::from_slice(&LOGITS, (2, ATOMS), &Device::Cpu)?;
+        let one = Some(vec![1.0]);
+        assert!(kl_loss(&logits, TARGET.to_vec(), one, Kernels::FUSED).is_err());
+        Ok(())
     }
 
     #[test]
     fn a_perfect_prediction_costs_nothing() {
         let logits: Vec<f32> = [0.2f32, 0.5, 0.3].iter().map(|p| p.ln()).collect();
         let mut gradient = [0f32; 3];
-        let loss = kl(&logits, &[0], 1, &[0.2, 0.5, 0.3], &mut gradient);
+        let loss = kl(&logits, &[0.2, 0.5, 0.3], ATOMS, &mut gradient);
         assert!(loss.abs() < 1e-7 && gradient.iter().all(|g| g.abs() < 1e-7));
     }
 
     #[test]
     fn extreme_logits_stay_finite() {
         let mut gradient = [0f32; 3];
-        let loss = kl(&[1e4, -1e4, 0.0], &[0], 1, &[0.0, 1.0, 0.0], &mut gradient);
+        let loss = kl(&[1e4, -1e4, 0.0], &[0.0, 1.0, 0.0], ATOMS, &mut gradient);
         assert!((loss - 2e4).abs() < 1e-6);
         assert_eq!(gradient, [1.0, -1.0, 0.0]);
     }
@@ -183,7 +282,7 @@ mod tests {
             let (mut probs, mut gradient) = ([0f32; ATOMS], [0f32; ATOMS]);
             let mut logits = [offset; ATOMS];
             softmax(&logits, &mut probs);
-            let loss = kl(&logits, &[0], 1, &target, &mut gradient);
+            let loss = kl(&logits, &target, ATOMS, &mut gradient);
             assert!(
                 probs.iter().all(|p| (p * 51.0 - 1.0).abs() < 1e-6),
                 "{offset}: {probs:?}"
@@ -208,11 +307,11 @@ mod tests {
 
     #[test]
     fn the_operation_gives_the_function() -> Result<()> {
-        let logits = Var::from_slice(&LOGITS, (2, ACTIONS, 3), &Device::Cpu)?;
-        let loss = kl_loss(&logits, &[1, 0], TARGET.to_vec(), Kernels::FUSED)?;
+        let logits = Var::from_slice(&LOGITS, (2, ATOMS), &Device::Cpu)?;
+        let loss = kl_loss(&logits, TARGET.to_vec(), None, Kernels::FUSED)?;
         let grads = loss.affine(3.0, 0.0)?.backward()?;
-        let mut gradient = [0f32; 12];
-        let expected = kl(&LOGITS, &[1, 0], ACTIONS, &TARGET, &mut gradient);
+        let mut gradient = [0f32; 6];
+        let expected = kl(&LOGITS, &TARGET, ATOMS, &mut gradient);
         assert_eq!(loss.to_scalar::<f32>()?, expected as f32);
         let got = grads
             .get(&logits)
@@ -227,10 +326,10 @@ mod tests {
     fn candle_s_own_operations_give_it_too() -> Result<()> {
         for scale in [1.0, 1e4] {
             let logits = LOGITS.map(|logit| logit * scale);
-            let var = Var::from_slice(&logits, (2, ACTIONS, 3), &Device::Cpu)?;
-            let loss = kl_loss(&var, &[1, 0], TARGET.to_vec(), Kernels::Candle)?;
-            let mut gradient = [0f32; 12];
-            let expected = kl(&logits, &[1, 0], ACTIONS, &TARGET, &mut gradient);
+            let var = Var::from_slice(&logits, (2, ATOMS), &Device::Cpu)?;
+            let loss = kl_loss(&var, TARGET.to_vec(), None, Kernels::Candle)?;
+            let mut gradient = [0f32; 6];
+            let expected = kl(&logits, &TARGET, ATOMS, &mut gradient);
             let error = f64::from(loss.to_scalar::<f32>()?) - expected;
             assert!(error.abs() <= 1e-6 * expected, "{scale}: {error}");
             let grads = loss.backward()?;

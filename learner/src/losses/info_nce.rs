@@ -2,10 +2,19 @@
 //! It does not compute the scores, and does not know which features they compare.
 
 use candle_core::{Result, Tensor, bail};
-use driml_model::Kernels;
+use driml_model::{Kernels, exp_below, soft_clip};
 use rayon::prelude::*;
 
 use super::{candle, scalar_op::scalar_op, scores::Scores};
+
+/// Largest error of the loss, as a share of 10 plus the largest score, in nats.
+pub const LOSS_ERROR: f64 = 1e-13;
+
+/// Largest error of a slope: 1e-7 of itself, an f32's last place, and what the rounding of scores up to `largest` leaves open of a
+/// probability. `weight` is 1 / (L valid rows).
+pub fn slope_error(slope: f64, weight: f64, scores: Scores, largest: f64) -> f64 {
+    1e-7 * slope.abs() + weight * scores.scale * (1e-14 * largest).min(1.0) + 1e-15
+}
 
 /// InfoNCE of every valid row against every valid row of its batch, at each location, and its gradient.
 ///
@@ -13,8 +22,8 @@ use super::{candle, scalar_op::scalar_op, scores::Scores};
 /// positive. `valid` [B]: a row with 0 is neither anchor nor candidate. With `s = clip(dots)` the loss is the mean over
 /// l and valid i of `ln sum_{valid j} exp(s_lij) - s_lii`, in nats: 0 if fewer than two rows are valid.
 /// `gradient` [L, B, B] is overwritten with the derivative by `dots`, 0 in the rows and columns that are not valid.
-/// Every finite input gives a finite result. It is computed in f64: the loss is right to 1e-12 beside the largest score's last
-/// place, the gradient to that of an f32.
+/// Every finite input gives a finite result. It is computed in f64: the loss is right to [`LOSS_ERROR`], its slopes to
+/// [`slope_error`].
 /// Source: van den Oord et al. 2018, equation 4; the clip is Bachman et al. 2019, section 3.
 ///
 /// # Panics
@@ -42,7 +51,7 @@ pub fn info_nce(dots: &[f32], valid: &[u8], scores: Scores, gradient: &mut [f32]
         .zip(gradient.par_chunks_exact_mut(rows))
         .enumerate()
         .map_init(
-            || vec![(0f64, 0f64); candidates.len()],
+            || Scratch::new(candidates.len()),
             |scratch, (at, (dots, gradient))| {
                 gradient.fill(0.0);
                 let anchor = at % rows;
@@ -57,6 +66,24 @@ pub fn info_nce(dots: &[f32], valid: &[u8], scores: Scores, gradient: &mut [f32]
     losses.iter().sum::<f64>() * weight
 }
 
+/// Room for one anchor's numbers, one a candidate.
+struct Scratch {
+    dots: Vec<f32>,
+    /// First the scores, then their exponentials.
+    scores: Vec<f64>,
+    slopes: Vec<f64>,
+}
+
+impl Scratch {
+    fn new(candidates: usize) -> Self {
+        Self {
+            dots: vec![0.0; candidates],
+            scores: vec![0.0; candidates],
+            slopes: vec![0.0; candidates],
+        }
+    }
+}
+
 /// One anchor's `ln sum exp(s) - s_positive`; its `gradient` row, times `weight`.
 fn anchor_loss(
     dots: &[f32],
@@ -64,26 +91,25 @@ fn anchor_loss(
     candidates: &[usize],
     scores: Scores,
     weight: f64,
-    scratch: &mut [(f64, f64)],
+    scratch: &mut Scratch,
     gradient: &mut [f32],
 ) -> f64 {
-    let mut max = f64::NEG_INFINITY;
-    let mut positive = 0.0;
-    for (entry, &j) in scratch.iter_mut().zip(candidates) {
-        *entry = scores.clip(dots[j]);
-        max = max.max(entry.0);
-        if j == anchor {
-            positive = entry.0;
-        }
+    for (dot, &j) in scratch.dots.iter_mut().zip(candidates) {
+        *dot = dots[j];
     }
-    let mut sum = 0.0;
-    for (score, _) in scratch.iter_mut() {
-        *score = (*score - max).exp();
-        sum += *score;
-    }
-    for (&(exp, slope), &j) in scratch.iter().zip(candidates) {
+    let Scores { scale, tanh_clip } = scores;
+    let (values, slopes) = (&mut scratch.scores[..], &mut scratch.slopes[..]);
+    soft_clip(&scratch.dots, scale, tanh_clip, values, slopes);
+    let positive = candidates
+        .binary_search(&anchor)
+        .map_or(f64::NAN, |at| values[at]);
+    let max = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    exp_below(values, max);
+    let sum: f64 = values.iter().sum();
+    let share = 1.0 / sum;
+    for ((&exp, &slope), &j) in values.iter().zip(&*slopes).zip(candidates) {
         let target = if j == anchor { 1.0 } else { 0.0 };
-        gradient[j] = ((exp / sum - target) * slope * weight) as f32;
+        gradient[j] = ((exp * share - target) * slope * weight) as f32;
     }
     sum.ln() + max - positive
 }
@@ -221,6 +247,32 @@ mod tests {
             .flatten_all()?
             .to_vec1::<f32>()?;
         assert_eq!(got, gradient.iter().map(|g| g * 2.0).collect::<Vec<_>>());
+        Ok(())
+    }
+
+    /// The bounds that settings may have, in f32 throughout.
+    #[test]
+    fn candle_s_own_operations_hold_at_both_ends_of_the_clip() -> Result<()> {
+        for tanh_clip in [1e-30, 1e-6, 1e6, 1e15, 1e30] {
+            let scores = Scores {
+                scale: 0.25,
+                tanh_clip,
+            };
+            let var = Var::from_vec(dots(), (LOCATIONS, ROWS, ROWS), &Device::Cpu)?;
+            let loss = info_nce_loss(&var, &[1; ROWS], scores, Kernels::Candle)?;
+            let mut gradient = vec![f32::NAN; var.elem_count()];
+            let expected = info_nce(&dots(), &[1; ROWS], scores, &mut gradient);
+            let error = f64::from(loss.to_scalar::<f32>()?) - expected;
+            assert!(error.abs() < 1e-5, "{tanh_clip}: {error}");
+            let grads = loss.backward()?;
+            let got = grads.get(&var).expect("a gradient").flatten_all()?;
+            for (got, expected) in got.to_vec1::<f32>()?.iter().zip(gradient) {
+                assert!(
+                    (got - expected).abs() < 1e-6,
+                    "{tanh_clip}: {got}, {expected}"
+                );
+            }
+        }
         Ok(())
     }
 

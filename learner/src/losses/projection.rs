@@ -1,6 +1,17 @@
 //! The C51 projection: one Bellman step of a return distribution, put back onto the atoms.
 //! It does not choose the action, and it does not check for NaN: its callers do.
 
+/// Largest difference between the mass of a row before and after its projection.
+pub const MASS_ERROR: f64 = 1e-6;
+
+/// Largest error of a projected probability over this support: 1e-7, and what f64 leaves open of the place of a return where the
+/// support lies far from 0 beside its width.
+pub fn entry_error(atoms: usize, v_min: f32, v_max: f32) -> f64 {
+    let (v_min, v_max) = (f64::from(v_min), f64::from(v_max));
+    let far = v_min.abs().max(v_max.abs()) / (v_max - v_min);
+    1e-7 + 1e-15 * atoms as f64 * far
+}
+
 /// Moves return distributions one Bellman step and back onto the atoms.
 ///
 /// With atoms `z_i = v_min + i * (v_max - v_min) / (N - 1)`, atom i of a row moves to
@@ -8,9 +19,8 @@
 /// between `floor(b)` and the next atom in proportion to nearness; where `b` is an atom that atom gets all of it.
 ///
 /// `probs` [B, N], rows sum to 1; `reward` [B], in units of return; `discount` [B], 0 where the episode ended.
-/// `out` [B, N] is overwritten; its rows sum to what the rows of `probs` sum to, within 1e-6, and no entry is negative. Positions
-/// are computed in f64: an entry is right to 1e-7 for finite and infinite rewards over any support that is not 1e8 times as far
-/// from 0 as it is wide.
+/// `out` [B, N] is overwritten; its rows sum to what the rows of `probs` sum to, within [`MASS_ERROR`], and no entry is negative.
+/// Positions are computed in f64: an entry is right to [`entry_error`] for finite and infinite rewards.
 /// Source: Bellemare et al. 2017, algorithm 1.
 ///
 /// # Panics

@@ -1,6 +1,19 @@
 //! Scores of an InfoNCE loss: dot products, scaled and softly clipped.
 
 use candle_core::Tensor;
+use driml_model::soft_clip;
+
+/// Largest error of a clipped score, as a share of it.
+pub const CLIP_ERROR: f64 = 2e-15;
+
+/// Slopes below it are as good as 0: what is far enough below is given as 0.
+pub const LEAST_SLOPE: f64 = 1e-290;
+
+/// Largest error of a clipped score's slope, as a share of it: where the score saturates, the exponent `2 |x| / c` is known to its
+/// own last place only. Below [`LEAST_SLOPE`] it is that share of it.
+pub fn slope_error(score: f64, tanh_clip: f64) -> f64 {
+    CLIP_ERROR + 1e-15 * (2.0 * score / tanh_clip).abs()
+}
 
 /// Dot products of every anchor with every candidate.
 #[derive(Debug)]
@@ -34,18 +47,12 @@ impl Scores {
         self.clip(dot).0
     }
 
-    /// The clipped score of a dot product, and its derivative by the dot product.
-    ///
-    /// With `e = exp(-2 |x| / c)`: `tanh = (1 - e) / (1 + e)` and its slope `4 e / (1 + e)^2`, which, unlike
-    /// `1 - tanh^2`, keeps its precision where the score saturates. `1 - e` is taken as `expm1`, which keeps its own where the
-    /// bound is far above the score: both results are within a relative 2e-15 for scores and bounds from 1e-150 to 1e150.
-    pub(super) fn clip(&self, dot: f32) -> (f64, f64) {
-        let x = f64::from(dot) * self.scale;
-        let exponent = -2.0 * x.abs() / self.tanh_clip;
-        let e = exponent.exp();
-        let sum = 1.0 + e;
-        let tanh = (-exponent.exp_m1() / sum).copysign(x);
-        (self.tanh_clip * tanh, self.scale * 4.0 * e / (sum * sum))
+    /// The clipped score of a dot product, and its derivative by the dot product, as [`soft_clip`] has them: for scores and bounds
+    /// from 1e-150 to 1e150 the score is right to [`CLIP_ERROR`], its slope to [`slope_error`] of the score before the clip.
+    pub fn clip(&self, dot: f32) -> (f64, f64) {
+        let (mut score, mut slope) = ([0.0], [0.0]);
+        soft_clip(&[dot], self.scale, self.tanh_clip, &mut score, &mut slope);
+        (score[0], slope[0])
     }
 }
 

@@ -35,11 +35,28 @@ const BETA: RangeInclusive<f64> = 0.0..=0.99999;
 /// The least is 10,000 times the root of the least second moment that f32 holds.
 const EPS: RangeInclusive<f64> = 1e-15..=1e30;
 
+/// Largest error of a parameter against the same steps in f64, as a share of the way it went, beside [`step_floor`].
+pub const STEP_ERROR: f64 = 0.004;
+
+/// Largest error of a moment against f64 while gradients go on, as a share of the decayed mean of their sizes, or of their squares:
+/// `beta` and each product and sum are rounded to f32, and 1 / (1 - beta) steps add up.
+pub fn moment_error(beta: f64) -> f64 {
+    2e-7 / (1.0 - beta)
+}
+
+/// What each step may add to the error of a parameter beside [`STEP_ERROR`]: half of the last place of a parameter of size
+/// `parameter`, and what `lr * m` loses below the normal numbers before it is divided.
+pub fn step_floor(parameter: f64, eps: f64) -> f64 {
+    let least = f64::from(f32::MIN_POSITIVE);
+    parameter.abs().max(least) / 2f64.powi(24) + least / eps.min(1.0)
+}
+
 /// Adam's numbers. Source: Kingma and Ba 2015, algorithm 1.
 ///
 /// A step is taken in f32, and the ranges are those in which it is what it would be in f64: the second moments that f32 does not
 /// hold, below 1.2e-38, are of gradients below `1.1e-19 / sqrt(1 - beta2)`, beside which `eps` must be large. At its least
-/// `eps` and `beta2` = 0.999 a step is within 0.4%.
+/// `eps` and `beta2` = 0.999 a step is within [`STEP_ERROR`], 0.4%. Gradients are within 1e15, the largest `max_grad_norm`: the square
+/// of one above 1e19 is not finite.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AdamSettings {
@@ -267,9 +284,9 @@ impl Adam {
     }
 }
 
-/// One step's numbers, the same for every element.
-#[derive(Clone, Copy)]
-struct Rule {
+/// One step's numbers, the same for every element: what [`Adam::step`] does to a stretch of a parameter.
+#[derive(Clone, Copy, Debug)]
+pub struct Rule {
     factor: f32,
     beta1: f32,
     rest1: f32,
@@ -284,7 +301,7 @@ struct Rule {
 
 impl Rule {
     /// The numbers of step number `step`, counted from 1, on gradients times `factor`.
-    fn new(settings: AdamSettings, step: u64, factor: f64) -> Self {
+    pub fn new(settings: AdamSettings, step: u64, factor: f64) -> Self {
         let AdamSettings {
             lr,
             beta1,
@@ -305,13 +322,13 @@ impl Rule {
         }
     }
 
-    /// Takes the step on one stretch; says whether its parameters and second moments are finite after it. (So are then the
+    /// Takes the step on one stretch of parameters `p`, gradients `g` and moments `m` and `v`, all of one length; says whether its parameters and second moments are finite after it. (So are then the
     /// first moments, as a mean is no larger than the root of the mean square.)
     ///
-    /// Once in [`FLUSH_PERIOD`] steps, moments below the normal numbers become 0. Those of a gradient that is gone would else stay
+    /// Once in 32 steps, moments below the normal numbers become 0. Those of a gradient that is gone would else stay
     /// there for good, as 0.9 times the smallest numbers rounds back to them, and make each later step several times as slow.
     #[allow(clippy::eq_op, reason = "x - x tells finite numbers from others")]
-    fn apply(&self, p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32]) -> bool {
+    pub fn apply(&self, p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32]) -> bool {
         if self.flushes {
             flush(m);
             flush(v);
@@ -405,118 +422,4 @@ impl InplaceOp2 for Step<'_> {
 }
 
 #[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-    use crate::edges::any_finite;
-
-    const SETTINGS: AdamSettings = AdamSettings {
-        lr: 1.0,
-        beta1: 0.9,
-        beta2: 0.999,
-        eps: 1e-8,
-    };
-
-    #[test]
-    fn moments_of_a_gradient_that_is_gone_end_at_zero() {
-        let (mut p, mut m, mut v) = (vec![1.0f32; 9], vec![0.0; 9], vec![0.0; 9]);
-        // The last element's gradient stays.
-        let mut g = vec![1e-3f32; 9];
-        let mut updates = 0;
-        let mut run = |g: &[f32], count: u64| {
-            for _ in 0..count {
-                updates += 1;
-                let rule = Rule::new(SETTINGS, updates, 1.0);
-                assert!(rule.apply(&mut p, g, &mut m, &mut v));
-            }
-            (m.clone(), v.clone())
-        };
-        run(&g, 10);
-        g[..8].fill(0.0);
-        let (m, v) = run(&g, 2_000);
-        assert_eq!(m[..8], [0.0; 8], "0.9^2000 of what it was");
-        assert!((m[8] / 1e-3 - 1.0).abs() < 1e-5 && v[0] > f32::MIN_POSITIVE);
-        let (_, v) = run(&g, 75_000);
-        assert_eq!(v[..8], [0.0; 8], "0.999^77000 of what it was");
-        assert!((v[8] / 1e-6 - 1.0).abs() < 1e-3);
-    }
-
-    /// Whether a step is fine at this parameter and gradient, in the last of that many `elements`.
-    fn fine(settings: AdamSettings, elements: usize, parameter: f32, gradient: f32) -> bool {
-        let rule = Rule::new(settings, 1, 1.0);
-        let (mut p, mut g) = (vec![0.5; elements], vec![0.1; elements]);
-        (p[elements - 1], g[elements - 1]) = (parameter, gradient);
-        let (mut m, mut v) = (vec![0.0; elements], vec![0.0; elements]);
-        rule.apply(&mut p, &g, &mut m, &mut v)
-    }
-
-    #[test]
-    fn a_step_beyond_the_finite_numbers_is_noticed_wherever_it_is() {
-        for elements in [1, 2, 7, 16, 33] {
-            assert!(fine(SETTINGS, elements, 3e38, 1.0));
-            let far = AdamSettings {
-                lr: 1e37,
-                ..SETTINGS
-            };
-            assert!(fine(far, elements, 3e38, 1.0), "towards 0");
-            assert!(
-                !fine(far, elements, 3.4e38, -1.0),
-                "past the largest number"
-            );
-            assert!(!fine(SETTINGS, elements, f32::NAN, 1.0));
-            assert!(!fine(SETTINGS, elements, f32::NEG_INFINITY, 1.0));
-            // The square of the gradient is not finite: the parameter would stand still for good.
-            assert!(!fine(SETTINGS, elements, 0.0, 1e30));
-        }
-    }
-
-    /// The same steps in float64 on one parameter that starts at 0; where it goes, and how far in all.
-    fn in_f64(settings: AdamSettings, gradients: &[f64]) -> (f64, f64) {
-        let AdamSettings {
-            lr,
-            beta1,
-            beta2,
-            eps,
-        } = settings;
-        let (mut p, mut way, mut m, mut v) = (0.0, 0.0, 0.0, 0.0);
-        for (t, g) in (1..).zip(gradients) {
-            m = beta1 * m + (1.0 - beta1) * g;
-            v = beta2 * v + (1.0 - beta2) * g * g;
-            let root = (v / (1.0 - beta2.powi(t))).sqrt();
-            let step: f64 = lr / (1.0 - beta1.powi(t)) * m / (root + eps);
-            p -= step;
-            way += step.abs();
-        }
-        (p, way)
-    }
-
-    proptest! {
-        /// Gradients of any size up to the largest `max_grad_norm`, zeros and subnormal ones among them.
-        #[test]
-        fn steps_are_those_of_float64(
-            gradients in prop::collection::vec(
-                prop_oneof![Just(0.0f32), any_finite().prop_map(|g| g.clamp(-1e15, 1e15))],
-                1..120,
-            ),
-            repeats in any::<bool>(),
-            lr in prop::sample::select(vec![1e-30, 1e-4, 1.0]),
-            (beta1, beta2) in prop::sample::select(vec![(0.0, 0.0), (0.0, 0.9), (0.9, 0.99), (0.9, 0.999), (0.5, 0.99999)]),
-            eps in prop::sample::select(vec![1e-15, 1e-8, 3.9e-5, 1.0, 1e30]),
-        ) {
-            let settings = AdamSettings { lr, beta1, beta2, eps };
-            settings.validate().unwrap();
-            let gradients: Vec<f32> = if repeats { vec![gradients[0]; gradients.len()] } else { gradients };
-            let (mut p, mut m, mut v) = ([0f32], [0f32], [0f32]);
-            for (step, g) in (1..).zip(&gradients) {
-                prop_assert!(Rule::new(settings, step, 1.0).apply(&mut p, &[*g], &mut m, &mut v));
-            }
-            let gradients: Vec<f64> = gradients.iter().map(|&g| g.into()).collect();
-            let (expected, way) = in_f64(settings, &gradients);
-            let error = (f64::from(p[0]) - expected).abs();
-            // What lr * m loses below the normal numbers, before it is divided.
-            let least = gradients.len() as f64 * f64::from(f32::MIN_POSITIVE) / eps.min(1.0);
-            prop_assert!(error <= 0.004 * way + least, "{:e}, {expected:e} on a way of {way:e}", p[0]);
-        }
-    }
-}
+mod tests;

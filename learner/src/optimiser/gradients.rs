@@ -1,16 +1,19 @@
-//! The gradients of one loss: taken out of a backward pass, their global norm, and the clipping that follows from it.
+//! The gradients of one loss: of a backward pass, their global norm, and the clipping that follows from it.
 //! It changes no parameter; `optim` does.
 
 use std::collections::BTreeMap;
 
-use candle_core::{DType, Storage, Tensor, backprop::GradStore, bail};
-use driml_model::{Kernels, Parameters};
+use candle_core::{DType, Storage, Tensor, bail};
+use driml_model::{Backward, Kernels, Parameters};
 use rayon::prelude::*;
 
 use crate::{error::UpdateError, tensors::slice};
 
 /// Elements a thread sums at a time.
 const CHUNK: usize = 1 << 14;
+
+/// Largest error of the norm of up to 2^32 gradients, as a share of it.
+pub const NORM_ERROR: f64 = 1e-12;
 
 /// Gradients of one loss, by parameter name. A parameter that the loss does not touch has none.
 #[derive(Debug)]
@@ -19,16 +22,16 @@ pub struct Gradients {
 }
 
 impl Gradients {
-    /// Takes the gradients of `parameters` out of what a backward pass gave.
+    /// The gradients of `loss`, a scalar, by `parameters`.
     ///
     /// # Errors
-    /// A failing copy of a gradient that is not contiguous.
-    pub fn take(parameters: &Parameters, mut store: GradStore) -> Result<Self, UpdateError> {
+    /// A backward pass that failed.
+    pub fn of(parameters: &Parameters, loss: &Tensor) -> Result<Self, UpdateError> {
+        let mut backward = Backward::of(loss)?;
         let mut by_name = BTreeMap::new();
         for (name, var) in parameters.iter() {
-            if let Some(gradient) = store.remove(var) {
-                // candle leaves some gradients tied to the pass they come from; moments made of them would keep every pass.
-                by_name.insert(name.to_owned(), gradient.contiguous()?.detach());
+            if let Some(gradient) = backward.remove(var)? {
+                by_name.insert(name.to_owned(), gradient);
             }
         }
         Ok(Self { by_name })
@@ -39,7 +42,7 @@ impl Gradients {
         self.by_name.get(name)
     }
 
-    /// Global 2-norm of all gradients together, accumulated in f64.
+    /// Global 2-norm of all gradients together, accumulated in f64: right to [`NORM_ERROR`] for any finite gradients.
     ///
     /// # Errors
     /// [`UpdateError::NonFinite`] with the first parameter whose gradient is infinite or NaN.
@@ -99,7 +102,8 @@ fn sum_of_squares(values: &[f32]) -> f64 {
 
 /// Factor on gradients of global norm `norm` so that their norm stays within `max_norm`.
 ///
-/// `max_norm / (norm + 1e-6)` where that is below 1, else 1. Source: PyTorch's `clip_grad_norm_`.
+/// `max_norm / (norm + 1e-6)` where that is below 1, else 1. It is used as an f32, whose last place it keeps for norms up to 8e37
+/// times `max_norm`. Source: PyTorch's `clip_grad_norm_`.
 pub fn clip_factor(norm: f64, max_norm: f64) -> f64 {
     (max_norm / (norm + 1e-6)).min(1.0)
 }

@@ -12,10 +12,23 @@ use crate::{
 /// Names of the parameters that only the auxiliary loss uses begin so.
 pub const AUXILIARY_PREFIX: &str = "dim.";
 
+/// Parameters up to this size can be followed: the difference of two is then finite.
+pub const FOLLOWED_MAX: f32 = f32::MAX / 2.0;
+
+/// Largest error of a target against f64 after any number of moves, as a share of the largest that it or the online network ever
+/// was (of 1.2e-38 if that is larger): half of a last place a move, of which 1 / tau add up. 0 for a tau of 1.
+pub fn follow_error(tau: f64) -> f64 {
+    if tau >= 1.0 {
+        return 0.0;
+    }
+    6e-8 / tau + 3e-7
+}
+
 /// Moves `target` towards `online`, in place: `target <- target + tau * (online - target)`.
 ///
 /// `tau` in (0, 1]; at 1 the copy is exact. `1 - tau` is never made, as in f32 it is not what a small tau leaves. Where the online
-/// network stands still, the target comes as near to it as half of a parameter's last place divided by tau, 6e-8 / tau of its size.
+/// network stands still, the target comes as near to it as half of a parameter's last place divided by tau: [`follow_error`].
+/// Parameters are within [`FOLLOWED_MAX`]; beyond it a target is infinite, which the next update refuses as the target network's.
 ///
 /// # Errors
 /// A parameter of the target that the online network lacks.

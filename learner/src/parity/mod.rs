@@ -2,6 +2,9 @@
 //! It has no arithmetic of its own beyond the comparison, and does not print.
 
 mod case;
+pub mod deviation;
+pub mod float64;
+mod tolerance;
 
 use std::{
     fmt,
@@ -10,9 +13,11 @@ use std::{
 
 use candle_core::Tensor;
 use driml_model::{Compute, DimHeads, Encoder, ModelConfig, Network, Parameters};
+use driml_protocol::NO_ACTION;
 
 use case::Case;
 pub use case::ParityError;
+use tolerance::Tolerances;
 
 use crate::{
     agent::{Agent, NetworkParameters},
@@ -24,18 +29,8 @@ use crate::{
         settings::{AuxiliarySettings, Lambda},
     },
     losses::scores::{Dots, Scores},
+    repeats::EqualStates,
 };
-
-/// Values of s_t, in units of return, as a share of the support's width.
-const Q_VALUES: f64 = 1e-5;
-/// Projected target distributions, each probability.
-const PROJECTION: f64 = 5e-6;
-/// Losses, relative; the second where scores saturate; the third absolute.
-const LOSS: (f64, f64, f64) = (1e-5, 1e-4, 1e-6);
-/// Gradients: share of the tensor's own 2-norm, and of the global one.
-const GRADIENT: (f64, f64) = (1e-4, 1e-6);
-/// Parameters after the step.
-const UPDATED: f64 = 4e-6;
 
 /// One tensor group's comparison.
 #[derive(Clone, Debug, PartialEq)]
@@ -114,18 +109,9 @@ pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityRep
 }
 
 fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError> {
-    let sizes = case.model(DimHeads::NONE);
-    let model = case.model(case.settings.dim_heads(sizes.num_actions));
-    let slow = model.without_dim();
-    let device = &compute.device;
-    let parameters = NetworkParameters {
-        online: Parameters::from_tensors(&model, case.parameters("online.", &model), device)?,
-        target: Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?,
-        key: key_parameters(case, &model, compute)?,
-    };
-    let mut agent =
-        Agent::from_parameters(model.clone(), case.settings.clone(), compute, parameters)?;
+    let (mut agent, model) = agent_of(case, compute)?;
 
+    let allowed = Tolerances::of(compute.kernels);
     let mut lines = Vec::new();
     let forward = forward_losses(case, compute)?;
     let evaluation = agent.evaluate(&case.batch())?;
@@ -135,8 +121,8 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
     let expected = case.expected("q_values_t", &[rows, num_actions])?;
     lines.push(line(
         "q_values_t",
-        largest(&widened(&agent.q_values_t(&evaluation)?), &expected),
-        Q_VALUES * width,
+        largest(&widened(&agent.q_values_t(&case.batch())?), &expected),
+        allowed.q_values * width,
     ));
     let expected = case.expected("next_action", &[rows])?;
     let chosen: Vec<f64> = evaluation
@@ -144,18 +130,41 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
         .iter()
         .map(|&action| f64::from(action))
         .collect();
-    lines.push(line("next_action", largest(&chosen, &expected), 0.0));
-    let expected = case.expected("target_projection", &[rows, atoms])?;
+    // Of a row that does not bootstrap no action is chosen.
+    let agree = |(&got, &wanted): (&f64, &f64)| got == f64::from(NO_ACTION) || got == wanted;
+    let same: Vec<bool> = chosen.iter().zip(&expected).map(agree).collect();
+    let others = same.iter().filter(|same| !**same).count();
     lines.push(line(
-        "target_projection",
-        largest(&widened(&evaluation.target_projection), &expected),
-        PROJECTION,
+        "next_action (share of rows)",
+        others as f64 / rows as f64,
+        allowed.next_action_rows,
     ));
+    let expected = case.expected("target_projection", &[rows, atoms])?;
+    let error = widened(&evaluation.target_projection)
+        .chunks(atoms)
+        .zip(expected.chunks(atoms))
+        .zip(same)
+        .filter(|(_, same)| *same)
+        .map(|((got, expected), _)| largest(got, expected))
+        .fold(0.0, nan_or_larger);
+    lines.push(line("target_projection", error, allowed.projection));
+
+    if !evaluation.row_kls.is_empty() {
+        let expected = case.expected("row_kl", &[rows])?;
+        let error = largest(&widened(&evaluation.row_kls), &expected);
+        let most = expected.iter().copied().fold(0.0, f64::max);
+        let tolerance = (allowed.loss * most).max(allowed.least_loss);
+        lines.push(line("row_kl", error, tolerance));
+    }
 
     let mut loss_line = |name: &str, got: f32, saturated: bool| -> Result<(), ParityError> {
         let expected = case.expected(name, &[1])?[0];
-        let relative = if saturated { LOSS.1 } else { LOSS.0 };
-        let tolerance = (relative * expected.abs()).max(LOSS.2);
+        let relative = if saturated {
+            allowed.saturated_loss
+        } else {
+            allowed.loss
+        };
+        let tolerance = (relative * expected.abs()).max(allowed.least_loss);
         lines.push(line(name, (f64::from(got) - expected).abs(), tolerance));
         Ok(())
     };
@@ -173,7 +182,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
     loss_line("loss.total", evaluation.total, total_saturates)?;
 
     let global_norm = case.expected("grad_norm", &[1])?[0];
-    let mut worst = Worst::default();
+    let (mut worst, mut angles) = (Worst::default(), Worst::default());
     for (name, tensor) in case.online() {
         let expected = case.expected(&format!("grad.{name}"), tensor.dims())?;
         let got = match evaluation.gradients.get(name) {
@@ -185,15 +194,23 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
                 .zip(&expected)
                 .map(|(got, expected)| got - expected),
         );
-        let tolerance = GRADIENT.0 * norm(expected.iter().copied()) + GRADIENT.1 * global_norm;
+        let own = norm(expected.iter().copied());
+        let tolerance = allowed.gradient * own + allowed.gradient_of_global * global_norm;
         worst.add("grad", name, difference, tolerance);
+        if let Some(angle) = allowed.angle.filter(|_| own >= 0.1 * global_norm) {
+            let dot: f64 = got.iter().zip(&expected).map(|(a, b)| a * b).sum();
+            let cosine = dot / (own * norm(got.iter().copied()));
+            angles.add("1 - cosine", name, 1.0 - cosine, angle);
+        }
     }
     lines.extend(worst.lines);
+    lines.extend(angles.lines);
+    let updated = allowed.updated + allowed.updated_rates * case.settings.adam.lr;
     let got = agent.apply(&evaluation.gradients)?;
     lines.push(line(
         "grad_norm",
         (got - global_norm).abs(),
-        GRADIENT.0 * global_norm,
+        allowed.norm * global_norm,
     ));
 
     let mut worst = Worst::default();
@@ -206,7 +223,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
                 .get(name)
                 .map_or(tensor, |var| var.as_tensor()),
         )?;
-        worst.add("updated", name, largest(&got, &expected), UPDATED);
+        worst.add("updated", name, largest(&got, &expected), updated);
     }
     lines.extend(worst.lines);
     let mut worst = Worst::default();
@@ -216,12 +233,27 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
             "updated_key",
             name,
             largest(&values(var)?, &expected),
-            UPDATED,
+            updated,
         );
     }
     lines.extend(worst.lines);
     case.check_all_expectations_used()?;
     Ok(lines)
+}
+
+/// The agent of a case before its update, and its model.
+fn agent_of(case: &Case, compute: &Compute) -> Result<(Agent, ModelConfig), ParityError> {
+    let sizes = case.model(DimHeads::NONE);
+    let model = case.model(case.settings.dim_heads(sizes.num_actions));
+    let slow = model.without_dim();
+    let device = &compute.device;
+    let parameters = NetworkParameters {
+        online: Parameters::from_tensors(&model, case.parameters("online.", &model), device)?,
+        target: Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?,
+        key: key_parameters(case, &model, compute)?,
+    };
+    let agent = Agent::from_parameters(model.clone(), case.settings.clone(), compute, parameters)?;
+    Ok((agent, model))
 }
 
 /// The parameters of the case's key encoder, if its objective has one.
@@ -271,7 +303,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
         _ => None,
     };
     let batch = case.batch();
-    let features = OnlineFeatures::new(&online, &model, &*loss, &batch, device)?;
+    let features = OnlineFeatures::new(&online, &model, &*loss, &batch, EqualStates::Each, device)?;
     let losses = loss.losses(&LossInputs {
         online: &online,
         model: &model,
@@ -367,11 +399,14 @@ fn largest(got: &[f64], expected: &[f64]) -> f64 {
         .iter()
         .zip(expected)
         .map(|(got, expected)| (got - expected).abs());
-    differences.fold(0.0, |largest, d| {
-        if d.is_nan() || d > largest {
-            d
-        } else {
-            largest
-        }
-    })
+    differences.fold(0.0, nan_or_larger)
+}
+
+/// The larger one; NaN if either is.
+fn nan_or_larger(largest: f64, d: f64) -> f64 {
+    if d.is_nan() || d > largest {
+        d
+    } else {
+        largest
+    }
 }

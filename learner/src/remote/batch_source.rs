@@ -7,16 +7,18 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, bail};
 use driml_protocol::{
     Batch, BatchHeader, BatchReply, BatchRequest, BufferPool, PendingReply, ReplayStatus,
-    RequestId, RunClient, Seldom, Shutdown, Tally, fault, join_within, session::SessionError,
-    shared_memory::Trust,
+    RequestId, RunClient, Seldom, Shutdown, Tally, Waiting, fault, join_within,
+    session::SessionError, shared_memory::Trust,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::shards::{self, Count};
+use super::{
+    error::BatchError,
+    shards::{self, Count},
+};
 
 /// One request; the replay server answers within a second, if only to say that there is nothing yet.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
@@ -47,7 +49,7 @@ pub struct Requests {
 enum Fetched {
     Batch(Batch),
     Finished,
-    Failed(anyhow::Error),
+    Failed(BatchError),
 }
 
 /// The queue of fetched batches.
@@ -56,6 +58,8 @@ pub struct BatchSource {
     /// Threads that have not said that they are finished.
     fetching: u32,
     threads: Vec<JoinHandle<()>>,
+    /// Who waits for whom, by the last answer that was no batch.
+    waiting: Arc<Mutex<Waiting>>,
     shutdown: Shutdown,
 }
 
@@ -63,8 +67,8 @@ pub struct BatchSource {
 pub enum Next {
     /// A batch to learn from.
     Batch(Batch),
-    /// No batch came within the time given; ask again.
-    NotYet,
+    /// No batch came within the time given; ask again. The replay server says who waits for whom.
+    NotYet(Waiting),
     /// The run is over: no further batch will come.
     Finished,
 }
@@ -83,6 +87,7 @@ impl BatchSource {
         // A batch a thread, and the one that is learned from.
         let pool = BufferPool::new(requests.in_flight as usize + clients.len());
         let partial = Arc::new(Mutex::new(PartialBatch::new(clients.len())));
+        let waiting = Arc::<Mutex<Waiting>>::default();
         let mut threads = Vec::new();
         for i in 0..requests.in_flight {
             // Which rows come from which shard follows from the order of answers, so this need not be the run's.
@@ -96,6 +101,7 @@ impl BatchSource {
                 pool: pool.clone(),
                 trust: Trust::default(),
                 said: Seldom::default(),
+                waiting: waiting.clone(),
                 shutdown: shutdown.clone(),
             };
             let sender = sender.clone();
@@ -108,6 +114,7 @@ impl BatchSource {
             fetched,
             fetching: requests.in_flight,
             threads,
+            waiting,
             shutdown: shutdown.clone(),
         })
     }
@@ -122,7 +129,7 @@ impl BatchSource {
     ///
     /// # Errors
     /// The replay server was out of reach for too long, or refuses.
-    pub fn next(&mut self, timeout: Duration) -> anyhow::Result<Next> {
+    pub fn next(&mut self, timeout: Duration) -> Result<Next, BatchError> {
         let deadline = Instant::now() + timeout;
         while self.fetching > 0 {
             let left = deadline.saturating_duration_since(Instant::now());
@@ -130,10 +137,15 @@ impl BatchSource {
                 Ok(Fetched::Batch(batch)) => return Ok(Next::Batch(batch)),
                 Ok(Fetched::Finished) => self.fetching -= 1,
                 Ok(Fetched::Failed(e)) => return Err(e),
-                Err(mpsc::RecvTimeoutError::Timeout) => return Ok(Next::NotYet),
+                Err(mpsc::RecvTimeoutError::Timeout) => {
+                    let waiting = self.waiting.lock();
+                    return Ok(Next::NotYet(
+                        *waiting.unwrap_or_else(PoisonError::into_inner),
+                    ));
+                }
                 Err(mpsc::RecvTimeoutError::Disconnected) if self.shutdown.is_set() => break,
                 Err(mpsc::RecvTimeoutError::Disconnected) => {
-                    bail!("the threads that fetch batches have ended")
+                    return Err(BatchError::ThreadsEnded);
                 }
             }
         }
@@ -147,6 +159,8 @@ struct PartialBatch {
     counts: Vec<Count>,
     /// Rows that are still to come from each shard.
     pending: Vec<u32>,
+    /// The chance with which each row was given to each shard.
+    shares: Vec<f64>,
     /// The request for a part that each shard gets next.
     ids: Vec<RequestId>,
     parts: Vec<Batch>,
@@ -157,6 +171,7 @@ impl PartialBatch {
         Self {
             counts: vec![Count::default(); shards],
             pending: vec![0; shards],
+            shares: vec![0.0; shards],
             ids: vec![RequestId::first(rand::random()); shards],
             parts: Vec::new(),
         }
@@ -174,6 +189,7 @@ struct Fetcher {
     /// Whether batches may come through shared memory.
     trust: Trust,
     said: Seldom,
+    waiting: Arc<Mutex<Waiting>>,
     shutdown: Shutdown,
 }
 
@@ -189,12 +205,14 @@ impl Fetcher {
                 }
                 Ok(Some(fetched)) => fetched,
                 Err(e) if answered.elapsed() > self.requests.unreachable_max => {
-                    let max = self.requests.unreachable_max;
-                    Fetched::Failed(e.context(format!("no batch and no answer for {max:?}")))
+                    Fetched::Failed(BatchError::Unreachable {
+                        unreachable_max: self.requests.unreachable_max,
+                        source: Box::new(e),
+                    })
                 }
                 Err(e) => {
                     if let Some(more) = self.said.due() {
-                        tracing::warn!("asking for a batch again: {e:#}{more}");
+                        tracing::warn!("asking for a batch again: {e}{more}");
                     }
                     self.shutdown.wait_timeout(RETRY_PAUSE);
                     continue;
@@ -209,7 +227,7 @@ impl Fetcher {
     }
 
     /// One batch; `None` where the replay has nothing yet.
-    fn fetch(&mut self) -> anyhow::Result<Option<Fetched>> {
+    fn fetch(&mut self) -> Result<Option<Fetched>, BatchError> {
         if self.clients.len() > 1 {
             return self.fetch_from_shards();
         }
@@ -221,24 +239,28 @@ impl Fetcher {
             Answer::Batch(batch) => Some(Fetched::Batch(batch)),
             Answer::Wait => None,
             Answer::Finished => Some(Fetched::Finished),
-            Answer::Refused(why) => Some(refused(&why)),
+            Answer::Refused(why) => Some(Fetched::Failed(BatchError::Refused(why))),
         })
     }
 
     /// One batch, put together from what the shards give. One is put together at a time: each shard is told what the others
     /// give, so that their rate limiters decide as one.
-    fn fetch_from_shards(&mut self) -> anyhow::Result<Option<Fetched>> {
+    fn fetch_from_shards(&mut self) -> Result<Option<Fetched>, BatchError> {
         let partial = self.partial.clone();
         let mut partial = partial.lock().unwrap_or_else(PoisonError::into_inner);
         let PartialBatch {
             counts,
             pending,
+            shares,
             ids,
             parts,
         } = &mut *partial;
         if parts.is_empty() && pending.iter().all(|&rows| rows == 0) {
             match shards::split(self.requests.rows, counts, &mut self.rng) {
-                Some(split) => *pending = split,
+                Some(split) => {
+                    *pending = split;
+                    *shares = shards::shares(counts);
+                }
                 None => {
                     self.shutdown.wait_timeout(LOOK_AGAIN);
                     return self.recount(counts).map(|()| None);
@@ -264,23 +286,32 @@ impl Fetcher {
             };
             ids[shard] = ids[shard].next();
             match answer {
-                Answer::Batch(part) => {
-                    let BatchHeader { tally, held, .. } = part.header;
+                Answer::Batch(mut part) => {
+                    let BatchHeader {
+                        tally,
+                        held,
+                        origin,
+                        ..
+                    } = part.header;
                     counts[shard] = Count { tally, held };
                     pending[shard] = 0;
+                    if origin.is_some() {
+                        part.scale_probabilities(shares[shard] as f32);
+                    }
                     parts.push(part);
                 }
                 Answer::Wait => {}
                 Answer::Finished => finished = true,
-                Answer::Refused(why) => return Ok(Some(refused(&why))),
+                Answer::Refused(why) => {
+                    return Ok(Some(Fetched::Failed(BatchError::Refused(why))));
+                }
             }
         }
         if let Some(e) = failed {
             return Err(e);
         }
         if pending.iter().all(|&rows| rows == 0) {
-            let header =
-                Batch::merged_header(parts).context("the shards' parts do not fit together")?;
+            let header = Batch::merged_header(parts).ok_or(BatchError::DifferentShards)?;
             let memory = self.pool.take_own(header.payload_bytes());
             let whole = Batch::merge(parts, memory);
             parts.clear();
@@ -292,9 +323,9 @@ impl Fetcher {
     }
 
     /// Asks all shards what they have counted.
-    fn recount(&self, counts: &mut [Count]) -> anyhow::Result<()> {
+    fn recount(&self, counts: &mut [Count]) -> Result<(), BatchError> {
         for (client, count) in self.clients.iter().zip(counts) {
-            let status: ReplayStatus = client.fetch(REQUEST_TIMEOUT).context("a shard's status")?;
+            let status: ReplayStatus = client.fetch(REQUEST_TIMEOUT).map_err(BatchError::Status)?;
             *count = Count {
                 tally: Tally {
                     inserted: status.transitions_inserted,
@@ -313,7 +344,7 @@ impl Fetcher {
         id: RequestId,
         rows: u32,
         other_shards: Option<Tally>,
-    ) -> anyhow::Result<(PendingReply<BatchReply>, bool)> {
+    ) -> Result<(PendingReply<BatchReply>, bool), BatchError> {
         let request = BatchRequest {
             learner: self.requests.learner,
             id,
@@ -329,7 +360,7 @@ impl Fetcher {
     fn answer(
         &mut self,
         (asked, shared_memory): (PendingReply<BatchReply>, bool),
-    ) -> anyhow::Result<Answer> {
+    ) -> Result<Answer, BatchError> {
         // A process that may not map shared memory never sees the reply: to it the request looks unanswered.
         let (reply, payload) = asked.receive(&self.pool).inspect_err(|e| {
             let unheard = matches!(
@@ -341,13 +372,17 @@ impl Fetcher {
             }
         })?;
         Ok(match reply {
-            BatchReply::Batch(header) => {
+            BatchReply::Batch(_) | BatchReply::Prioritised(..) => {
                 if shared_memory {
                     self.trust.worked();
                 }
+                let header = reply.header().expect("a batch has a header");
                 Answer::Batch(Batch::from_payload(header, payload)?)
             }
-            BatchReply::Wait(_) => Answer::Wait,
+            BatchReply::Wait(waiting) => {
+                *self.waiting.lock().unwrap_or_else(PoisonError::into_inner) = waiting;
+                Answer::Wait
+            }
             BatchReply::Finished => Answer::Finished,
             BatchReply::Refused { why } => Answer::Refused(why),
         })
@@ -360,9 +395,4 @@ enum Answer {
     Wait,
     Finished,
     Refused(String),
-}
-
-/// The end of all fetching: what was refused once will be refused again.
-fn refused(why: &str) -> Fetched {
-    Fetched::Failed(anyhow::anyhow!("the replay server refuses: {why}"))
 }

@@ -2,6 +2,9 @@
 //! What is learned, and how, it does not know: `learner` does.
 
 pub mod batch_source;
+mod error;
 mod publish;
 pub mod run;
 mod shards;
+
+pub use error::BatchError;

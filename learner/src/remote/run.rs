@@ -3,12 +3,16 @@
 
 use std::{
     path::{Path, PathBuf},
+    sync::Arc,
     time::{Duration, Instant},
 };
 
 use anyhow::Context;
 use driml_model::DeviceName;
-use driml_protocol::{BatchHeader, Keys, Shutdown, shared_memory, whole_file};
+use driml_protocol::{
+    Activity, BatchHeader, Keys, Life, Shutdown, reporter, shared_memory, tls::Credentials,
+    whole_file,
+};
 
 use super::{
     batch_source::{BatchSource, Next, Requests},
@@ -17,12 +21,14 @@ use super::{
 };
 use crate::{
     checkpoint,
-    config::LearnerPart,
+    config::LearnerConfig,
     learner::{Learner, LearnerError},
 };
 
 /// How long a learner that was told to stop stays to be asked for its last status.
 const LAST_WORD_MAX: Duration = Duration::from_secs(3);
+/// How long a batch may take before a person hears what it is waited for.
+const SILENT_MAX: Duration = Duration::from_secs(10);
 /// How often a waiting learner looks whether it should stop.
 const TICK: Duration = Duration::from_millis(200);
 
@@ -31,45 +37,53 @@ const TICK: Duration = Duration::from_millis(200);
 pub struct RunArgs {
     /// Endpoints of the replay server; one for each shard.
     pub connect: Vec<String>,
+    /// With which certificate it takes part; none without TLS.
+    pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
     /// Where checkpoints go: `RUN_DIR/checkpoints`.
     pub run_dir: PathBuf,
     /// The device on which updates are computed.
     pub device: DeviceName,
+    /// Stay when the run is over, to be asked, until `shutdown`.
+    pub stay: bool,
 }
 
-/// Runs the learner until `shutdown`. When the run has no more batches it saves, and stays to answer questions. Whatever ends it
-/// before, it saves what it has learned.
+/// Runs the learner until the run has no more batches, or `shutdown`. Whatever ends it, it saves what it has learned.
 ///
 /// # Errors
 /// A device that is not there, no replay server to join, settings that cannot work, an update that failed, a disk that refuses.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let Some(shards) = Shards::join(&args.connect, &keys, shutdown)? else {
+    let credentials = args.credentials.as_deref();
+    let Some(shards) = Shards::join(&args.connect, &keys, credentials, shutdown)? else {
         return Ok(());
     };
-    let part = LearnerPart::from_toml(&shards.config_toml)
+    let config = LearnerConfig::from_toml(&shards.config_toml)
         .context("the settings that the replay server sent")?;
-    let compute = args.device.open(part.learner.precision)?;
+    let compute = args.device.open(config.learner.precision)?;
     let folder = args.run_dir.join(checkpoint::FOLDER);
     let _lock = checkpoint::lock(&folder)?;
-    let rows = part.learner.batch_rows;
+    let rows = config.learner.batch_size;
     let mut requests = Requests {
         learner: rand::random(),
         rows,
-        in_flight: part.learner.batches_in_flight,
-        shared_memory: part.transport.shared_memory,
-        unreachable_max: Duration::from_millis(part.learner.unreachable_max_ms),
+        in_flight: config.learner.batches_in_flight,
+        shared_memory: config.transport.shared_memory,
+        unreachable_max: Duration::from_millis(config.learner.unreachable_max_ms),
     };
     if requests.shared_memory
-        && let Err(why) =
-            shared_memory::check_lockable(BatchHeader::of(&part.spec, rows).pool_bytes())
+        && let Err(why) = shared_memory::check_lockable(
+            BatchHeader::of(&config.spec, rows)
+                .sampled_by(&config.sampling)
+                .pool_bytes(),
+        )
     {
         tracing::warn!("batches come through sockets, which is slower: {why}");
         requests.shared_memory = false;
     }
-    let mut learner = Learner::resume(part, &compute, &folder)?;
+    let sampling = config.sampling;
+    let mut learner = Learner::resume(config, &compute, &folder)?;
     let updates = learner.updates();
     let after_updates = shards.after_updates;
     anyhow::ensure!(
@@ -94,7 +108,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     };
     learner.publish_above(membership.weights_version);
     keep_settings(&args.run_dir, &shards.config_toml)?;
-    let outlets = Outlets::open(&clients, spec_hash, requests.learner, shutdown)?;
+    let outlets = Outlets::open(&clients, spec_hash, requests.learner, &sampling, shutdown)?;
     outlets.publish(learner.next_weights()?);
     if updates > 0 {
         outlets.with_status(|status| status.updates = updates);
@@ -102,6 +116,13 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             outlets.send_affinity(affinity);
         }
     }
+    let activity = Activity::new("waits for its first batch");
+    reporter::start(
+        clients.clone(),
+        Life::Learner(requests.learner),
+        activity.clone(),
+        shutdown.clone(),
+    )?;
     let mut batches = BatchSource::start(&clients, requests, shutdown)?;
     tracing::info!(
         "learning on {} from batches of {rows} rows, run {spec_hash:016x}",
@@ -109,10 +130,18 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     );
 
     let mut saving = Saving::new(folder);
-    let learned = learn(&mut learner, &mut batches, &outlets, &mut saving, shutdown);
+    let learned = learn(
+        &mut learner,
+        &mut batches,
+        &outlets,
+        &mut saving,
+        &activity,
+        shutdown,
+    );
     if let Err(e) = &learned {
         tracing::error!("ends after {} updates: {e:#}", learner.updates());
     }
+    activity.begin("saves its last checkpoint");
     let saved = saving.finish(&learner);
     if learned.is_ok() && !learner.publication_is_due() {
         outlets.publish(learner.next_weights()?);
@@ -120,8 +149,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     learned.and(saved.map_err(Into::into))?;
     outlets.with_status(|status| status.finished = true);
     tracing::info!("finished after {} updates", learner.updates());
-    shutdown.wait();
+    if args.stay {
+        activity.begin("has finished and stays to be asked");
+        shutdown.wait();
+    }
     outlets.wait_until_heard(LAST_WORD_MAX);
+    if !shutdown.is_set() {
+        reporter::say_finished(&clients, Life::Learner(requests.learner));
+    }
     drop(membership);
     let closed = shards.close();
     batches.end();
@@ -137,17 +172,35 @@ fn learn(
     batches: &mut BatchSource,
     outlets: &Outlets,
     saving: &mut Saving,
+    activity: &Activity,
     shutdown: &Shutdown,
 ) -> anyhow::Result<()> {
-    let mut waiting_since = Instant::now();
+    // A wait is said after some seconds, then ever more seldom.
+    let (mut waiting_since, mut said_next) = (Instant::now(), SILENT_MAX);
     while !shutdown.is_set() {
         let batch = match batches.next(TICK)? {
             Next::Batch(batch) => batch,
-            Next::NotYet => continue,
+            Next::NotYet(waiting) => {
+                activity.begin("waits for a batch");
+                let since = waiting_since.elapsed();
+                if since > said_next {
+                    let since = since.as_secs();
+                    tracing::info!("waiting for a batch since {since} s: {waiting}");
+                    said_next *= 2;
+                }
+                continue;
+            }
             Next::Finished => break,
         };
+        activity.begin("learns");
+        said_next = SILENT_MAX;
         let started = Instant::now();
         let report = learner.update(&batch)?;
+        // Numbered by updates, which no life of the learner counts backwards.
+        let (by, number) = (outlets.learner(), learner.updates());
+        if let Some(priorities) = batch.priority_update(by, number, &report.row_kls) {
+            outlets.send_priorities(priorities);
+        }
         if let Some(affinity) = learner.affinity_update(outlets.learner()) {
             outlets.send_affinity(affinity);
         }

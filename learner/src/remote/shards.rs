@@ -5,6 +5,7 @@ use anyhow::{Context, ensure};
 use driml_protocol::{
     Alive, Hello, Keys, LearnerJoin, RunClient, Shutdown, Tally, join,
     session::{self, Endpoints},
+    tls::Credentials,
 };
 use rand::Rng;
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
@@ -34,15 +35,18 @@ impl Shards {
     pub(crate) fn join(
         connect: &[String],
         keys: &Keys,
+        credentials: Option<&Credentials>,
         shutdown: &Shutdown,
     ) -> anyhow::Result<Option<Self>> {
         let mut sessions = Vec::new();
         let mut hellos = Vec::new();
         for endpoint in connect {
-            let session = session::open(&Endpoints {
+            let endpoints = Endpoints {
                 listen: Vec::new(),
                 connect: vec![endpoint.clone()],
-            })?;
+            };
+            let session =
+                session::open_as(&endpoints, keys, credentials, session::MESSAGE_BYTES_MAX)?;
             let Some(hello) = join::hello(&session, keys, shutdown)? else {
                 return Ok(None);
             };
@@ -93,7 +97,7 @@ impl Shards {
         let learned = learned(&self.served, rows);
         for (client, rows_sampled) in clients.iter().zip(learned) {
             // Before it joins, so that no other learner can take its place from then on.
-            let alive = client.declare_alive(Alive::Learner(learner));
+            let alive = client.declare_alive(Alive::learner(learner));
             let alive = alive.map_err(|e| anyhow::anyhow!("declaring the learner alive: {e}"))?;
             membership._alive.push(alive);
             let join = LearnerJoin {
@@ -200,6 +204,13 @@ pub(crate) fn split(rows: u32, counts: &[Count], rng: &mut impl Rng) -> Option<V
         }
     }
     Some(split)
+}
+
+/// The chance that [`split`] gives a row to each shard.
+pub(crate) fn shares(counts: &[Count]) -> Vec<f64> {
+    let total: u64 = counts.iter().map(|count| count.held).sum();
+    let shares = counts.iter().map(|count| count.held as f64 / total as f64);
+    shares.collect()
 }
 
 /// What all shards but `this` will have counted once each has given its `pending` rows.

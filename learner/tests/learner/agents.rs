@@ -4,12 +4,13 @@
 use std::{collections::BTreeMap, fs};
 
 use driml_learner::{
-    AffinityConfig, Agent, AugmentSettings, Batch, Config, EstimatorKind, Lambda, Learner,
-    LearnerPart, LearnerSettings, NetworkParameters, Objective, UpdateError,
+    AffinityConfig, Agent, AugmentSettings, Batch, Config, EqualStates, EstimatorKind, Lambda,
+    Learner, LearnerConfig, LearnerSettings, NetworkParameters, Objective, UpdateError,
 };
-use driml_model::{Compute, DimHeads, ModelConfig, Parameters};
+use driml_model::{Compute, DimHeads, InputSize, ModelConfig, Parameters};
 use driml_protocol::{
-    Batch as WireBatch, BatchHeader, Horizon, RunSpec, Tally, TimeoutRule, config::TransportConfig,
+    Batch as WireBatch, BatchHeader, Buffer, Horizon, RowScalars, RunSpec, Sampling, TimeoutRule,
+    config::TransportConfig,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -145,6 +146,62 @@ fn positives_that_are_missing_change_nothing() {
     }
     let after = agent.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
     assert_eq!((before.losses, before.total), (after.losses, after.total));
+}
+
+/// `states` without those that are not `there`.
+fn packed(states: &[u8], there: &[bool]) -> Vec<u8> {
+    let states = states.chunks_exact(states.len() / there.len());
+    let present = states.zip(there).filter(|(_, there)| **there);
+    present.flat_map(|(state, _)| state.to_vec()).collect()
+}
+
+#[test]
+fn states_that_rows_do_not_have_may_be_left_out() {
+    for (objective, lambda) in [(Objective::NONE, NO_DIM), (DIM, ALL_DIM), (CPC, ALL_DIM)] {
+        let mut rows = Rows::random(6, 4);
+        rows.bootstrap_discount = vec![0.9, 0.0, 0.9, 0.9, 0.0, 0.9];
+        rows.positive_valid = vec![0, 1, 0, 1, 1, 1];
+        let several = later(&rows);
+        let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]].concat();
+        let whole = if objective == CPC {
+            cpc(&rows, &several, &valid)
+        } else {
+            rows.batch()
+        };
+        let there: Vec<_> = whole.positive_valid.iter().map(|it| *it != 0).collect();
+        let states_k = packed(whole.states_k, &there);
+        let there: Vec<_> = rows
+            .bootstrap_discount
+            .iter()
+            .map(|it| *it != 0.0)
+            .collect();
+        let states_n = packed(whole.states_n, &there);
+        let parts = Batch {
+            states_k: &states_k,
+            states_n: &states_n,
+            ..whole
+        };
+        assert!(states_k.len() < whole.states_k.len() && states_n.len() < whole.states_n.len());
+        let learned = [whole, parts].map(|batch| {
+            let mut agent = agent(objective, lambda);
+            let reports = [agent.update(&batch).unwrap(), agent.update(&batch).unwrap()];
+            (reports, values(agent.online()))
+        });
+        assert!(learned[0] == learned[1], "{objective:?}");
+
+        for (states_k, states_n, what) in [
+            (&states_k[1..], &states_n[..], "states_k"),
+            (&states_k, &states_n[1..], "states_n"),
+        ] {
+            let batch = Batch {
+                states_k,
+                states_n,
+                ..whole
+            };
+            let error = agent(objective, lambda).evaluate(&batch).unwrap_err();
+            assert!(error.to_string().contains(what), "{error}");
+        }
+    }
 }
 
 #[test]
@@ -391,14 +448,14 @@ fn a_psi_that_is_not_given_the_action_does_not_see_it() {
 
 const STATE: usize = 20 * 24 * 2;
 
-fn part(objective: Objective, augment: Option<AugmentSettings>) -> LearnerPart {
+fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConfig {
     let (model, update) = of(objective, GLOBAL);
     let horizon = match objective.name() {
         "cpc" => Horizon::All { k_max: 3 },
         "dim" => Horizon::Fixed { k: 1 },
         _ => Horizon::None,
     };
-    LearnerPart {
+    LearnerConfig {
         spec: RunSpec {
             world: "test".into(),
             agent: objective.name().into(),
@@ -413,10 +470,17 @@ fn part(objective: Objective, augment: Option<AugmentSettings>) -> LearnerPart {
             horizon,
             timeout: TimeoutRule::Terminal,
         },
+        input: InputSize {
+            height: model.height as u32,
+            width: model.width as u32,
+            frame: None,
+        },
         model,
         learner: Config {
+            equal_states: EqualStates::Once,
             precision: Default::default(),
-            batch_rows: 6,
+            publish_as: Default::default(),
+            batch_size: 6,
             batches_in_flight: 1,
             publish_period_updates: 2,
             checkpoint_period_updates: 2,
@@ -432,6 +496,7 @@ fn part(objective: Objective, augment: Option<AugmentSettings>) -> LearnerPart {
                 exact: None,
             },
         },
+        sampling: Sampling::Uniform,
         transport: TransportConfig {
             shared_memory: false,
         },
@@ -439,30 +504,43 @@ fn part(objective: Objective, augment: Option<AugmentSettings>) -> LearnerPart {
 }
 
 /// A batch as the replay server of this run would send it.
-fn served(part: &LearnerPart, seed: u64) -> WireBatch {
-    let positives = part.spec.horizon.positives();
-    let mut batch = WireBatch::zeroed(BatchHeader {
-        rows: 6,
-        positives: positives as u32,
-        state_bytes: STATE as u32,
-        tally: Tally::default(),
-        held: 9,
-        mean_age: 0.0,
-        weights_versions: (1, 1),
-    });
+fn served(config: &LearnerConfig, seed: u64) -> WireBatch {
+    served_with(config, seed, |_| {})
+}
+
+/// [`served`], with its rows changed.
+fn served_with(config: &LearnerConfig, seed: u64, change: impl Fn(&mut [RowScalars])) -> WireBatch {
+    let positives = config.spec.horizon.positives();
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut rows = batch.rows_mut();
+    let row = |row: usize| RowScalars {
+        action: (row % 4) as u8,
+        next_action: 0,
+        n_step_return: rng.random_range(-1.0..1.0),
+        // The last one's episode ends.
+        bootstrap_discount: if row < 5 { 0.9 } else { 0.0 },
+        positives: positives.min(row) as u32,
+        k_first: 1,
+    };
+    let mut rows: Vec<_> = (0..6).map(row).collect();
+    change(&mut rows);
+    let header = BatchHeader {
+        state_bytes: STATE as u32,
+        held: 9,
+        weights_versions: (1, 1),
+        ..BatchHeader::of(&config.spec, 6)
+    };
+    let mut batch = WireBatch::of_rows(header, &rows, Buffer::zeroed);
+    let mut places = batch.states_mut();
     for row in 0..6 {
-        rng.fill(rows.state_t(row));
-        rng.fill(rows.state_n(row));
+        rng.fill(places.t(row));
+        if let Some(place) = places.n(row) {
+            rng.fill(place);
+        }
         for p in 0..positives {
-            if row > p {
-                rng.fill(rows.positive(p, row, p as u32 + 1));
-            } else {
-                rows.no_positive(p, row);
+            if let Some(place) = places.k(p, row) {
+                rng.fill(place);
             }
         }
-        rows.set(row, (row % 4) as u8, 0, rng.random_range(-1.0..1.0), 0.9);
     }
     batch
 }
@@ -486,9 +564,9 @@ const NOTHING: AugmentSettings = AugmentSettings {
 fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
     for objective in [DIM, CPC] {
         let report = |augment| {
-            let part = part(objective, augment);
-            let batch = served(&part, 1);
-            Learner::new(part, &Compute::CPU)
+            let config = config(objective, augment);
+            let batch = served(&config, 1);
+            Learner::new(config, &Compute::CPU)
                 .unwrap()
                 .update(&batch)
                 .unwrap()
@@ -515,18 +593,18 @@ fn an_augmenting_run_resumes_bit_for_bit() {
             std::process::id()
         ));
         let _ = fs::remove_dir_all(&folder);
-        let part = part(objective, Some(STRONG));
+        let config = config(objective, Some(STRONG));
         let learn = |learner: &mut Learner, updates: std::ops::Range<u64>| {
             for seed in updates {
-                learner.update(&served(&part, seed)).unwrap();
+                learner.update(&served(&config, seed)).unwrap();
             }
         };
-        let mut straight = Learner::new(part.clone(), &Compute::CPU).unwrap();
+        let mut straight = Learner::new(config.clone(), &Compute::CPU).unwrap();
         learn(&mut straight, 0..8);
-        let mut half = Learner::new(part.clone(), &Compute::CPU).unwrap();
+        let mut half = Learner::new(config.clone(), &Compute::CPU).unwrap();
         learn(&mut half, 0..4);
         half.save(&folder).unwrap();
-        let mut resumed = Learner::resume(part.clone(), &Compute::CPU, &folder).unwrap();
+        let mut resumed = Learner::resume(config.clone(), &Compute::CPU, &folder).unwrap();
         assert_eq!(resumed.updates(), 4);
         learn(&mut resumed, 4..8);
         let (mut a, mut b) = (folder.join("a"), folder.join("b"));
@@ -554,12 +632,12 @@ fn an_augmenting_run_resumes_bit_for_bit() {
 #[test]
 fn a_curl_checkpoint_without_a_key_encoder_is_refused() {
     let folder = Folder::new("old-curl");
-    let part = part(CURL, Some(STRONG));
-    let learner = Learner::new(part.clone(), &Compute::CPU).unwrap();
+    let config = config(CURL, Some(STRONG));
+    let learner = Learner::new(config.clone(), &Compute::CPU).unwrap();
     learner.save(&folder.0).unwrap();
     let path = folder.0.join("checkpoint-000000000000");
     change_state(&path, |state| state["format"] = 1.into());
-    let resume = || Learner::resume(part.clone(), &Compute::CPU, &folder.0).map(|_| ());
+    let resume = || Learner::resume(config.clone(), &Compute::CPU, &folder.0).map(|_| ());
     let said = resume().unwrap_err().to_string();
     assert!(
         said.contains("keys came from the target network") && said.contains("begin anew"),
@@ -579,16 +657,15 @@ fn a_curl_checkpoint_without_a_key_encoder_is_refused() {
 /// A refused batch leaves the generator where it was.
 #[test]
 fn a_refused_batch_draws_nothing() {
-    let part = part(CURL, Some(STRONG));
-    let good = served(&part, 1);
-    let mut bad = served(&part, 2);
-    bad.rows_mut().set(0, 77, 0, 0.0, 0.9);
-    let mut learner = Learner::new(part.clone(), &Compute::CPU).unwrap();
+    let config = config(CURL, Some(STRONG));
+    let good = served(&config, 1);
+    let bad = served_with(&config, 2, |rows| rows[0].action = 77);
+    let mut learner = Learner::new(config.clone(), &Compute::CPU).unwrap();
     assert!(learner.update(&bad).is_err());
     let after = learner.update(&good).unwrap();
     assert_eq!(
         after,
-        Learner::new(part, &Compute::CPU)
+        Learner::new(config, &Compute::CPU)
             .unwrap()
             .update(&good)
             .unwrap()
@@ -598,14 +675,14 @@ fn a_refused_batch_draws_nothing() {
 #[test]
 fn augmentation_and_objective_belong_together() {
     let said = |objective, augment| {
-        part(objective, augment)
+        config(objective, augment)
             .learner
             .validate()
             .unwrap_err()
             .to_string()
     };
     assert!(said(CURL, None).contains("take the agent curl"));
-    let mut c51 = part(DIM, Some(STRONG)).learner;
+    let mut c51 = config(DIM, Some(STRONG)).learner;
     c51.update.objective = Objective::NONE;
     assert!(
         c51.validate()
@@ -619,10 +696,72 @@ fn augmentation_and_objective_belong_together() {
         "learner.augment.hue = 0.7 cannot work: it must lie between 0 and 0.5, half a turn either way"
     );
     assert_eq!(
-        part(CURL, Some(NOTHING)).model.dim,
+        config(CURL, Some(NOTHING)).model.dim,
         DimHeads {
             psi4: true,
             ..DimHeads::NONE
         }
     );
+}
+
+/// The chance of each row weights its C51 loss, at the beta of the update's number; nothing else, and the row's own loss comes back.
+#[test]
+fn rows_drawn_by_priority_are_weighted_and_answered() {
+    let uniform = config(DIM, None);
+    let sampling = Sampling::Prioritised {
+        alpha: 0.5,
+        beta_start: 0.5,
+        beta_end: 1.0,
+        beta_updates: 1,
+    };
+    let config = LearnerConfig {
+        sampling,
+        ..uniform.clone()
+    };
+    let chances = [0.5f32, 0.25, 0.125, 0.1, 0.5, 1.0];
+    let drawn = |chances: &[f32]| {
+        let plain = served(&config, 1);
+        let header = BatchHeader::of(&config.spec, 6).sampled_by(&sampling);
+        let header = BatchHeader {
+            origin: header.origin,
+            ..plain.header
+        };
+        let (_, payload) = plain.into_payload();
+        let mut more = Buffer::zeroed(header.payload_bytes());
+        more[..payload.len()].copy_from_slice(&payload);
+        for (row, chance) in chances.iter().enumerate() {
+            let at = payload.len() + 6 * 8 + row * 4;
+            more[at..at + 4].copy_from_slice(&chance.to_le_bytes());
+        }
+        WireBatch::from_payload(header, more).unwrap()
+    };
+    let learner = |config: &LearnerConfig| Learner::new(config.clone(), &Compute::CPU).unwrap();
+    let plain = learner(&uniform).update(&served(&uniform, 1)).unwrap();
+    assert!(plain.row_kls.is_empty());
+
+    // Equal chances are a weight of 1 each.
+    let mut equal = learner(&config);
+    let report = equal.update(&drawn(&[0.25; 6])).unwrap();
+    assert_eq!(report.losses, plain.losses);
+    assert!((report.c51_kl - plain.c51_kl).abs() < 1e-6 * plain.c51_kl);
+    assert!((report.grad_norm - plain.grad_norm).abs() < 1e-5 * plain.grad_norm);
+
+    let mut learner = learner(&config);
+    for beta in [0.5, 1.0, 1.0] {
+        let report = learner.update(&drawn(&chances)).unwrap();
+        let weighted = chances.iter().zip(&report.row_kls).map(|(chance, kl)| {
+            let weight = (0.1 / f64::from(*chance)).powf(beta);
+            weight * f64::from(*kl)
+        });
+        let mean = weighted.sum::<f64>() / 6.0;
+        let error = f64::from(report.c51_kl) - mean;
+        assert!(error.abs() < 1e-6 * mean, "beta {beta}: {error} of {mean}");
+        let dim: f32 = report.losses.iter().map(|it| it.1).sum();
+        assert!(
+            (report.total - report.c51_kl - dim).abs() < 1e-5,
+            "DIM is as it is"
+        );
+    }
+    let rows = report.row_kls.iter().map(|kl| f64::from(*kl)).sum::<f64>();
+    assert!((rows / 6.0 - f64::from(plain.c51_kl)).abs() < 1e-6 * f64::from(plain.c51_kl));
 }

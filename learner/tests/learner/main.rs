@@ -6,6 +6,7 @@
 mod agents;
 mod augment;
 mod checkpoint;
+mod equal_states;
 mod made_up;
 mod ranges;
 mod update;

@@ -6,6 +6,7 @@ use std::collections::HashMap;
 use candle_core::{Device, Tensor};
 use driml_learner::{Agent, NetworkParameters, UpdateError};
 use driml_model::{Compute, Parameters};
+use driml_protocol::NO_ACTION;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -165,23 +166,32 @@ fn one_valid_positive_or_none_gives_dim_losses_of_zero() {
 }
 
 #[test]
-fn an_all_terminal_batch_ignores_what_comes_after() {
-    let mut rows = Rows::random(6, 9);
-    rows.bootstrap_discount.fill(0.0);
-    let agent = agent(NO_DIM, 10);
-    let first = agent.evaluate(&rows.batch()).unwrap();
-    rows.frames[2].fill(0);
-    let second = agent.evaluate(&rows.batch()).unwrap();
-    let close = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-6;
-    assert!(
-        first
-            .target_projection
-            .iter()
-            .zip(&second.target_projection)
-            .all(close)
-    );
-    let sum: f32 = first.target_projection.iter().sum();
-    assert!((sum - 6.0).abs() < 1e-5);
+fn rows_without_a_bootstrap_ignore_what_comes_after() {
+    for ended in [&[0, 1, 2, 3, 4, 5][..], &[1, 4]] {
+        let mut rows = Rows::random(6, 9);
+        rows.bootstrap_discount.fill(0.93);
+        let (agent, len) = (agent(NO_DIM, 10), rows.frames[2].len() / 6);
+        for &row in ended {
+            rows.bootstrap_discount[row] = 0.0;
+        }
+        let first = agent.evaluate(&rows.batch()).unwrap();
+        for &row in ended {
+            rows.frames[2][row * len..][..len].fill(0);
+        }
+        let second = agent.evaluate(&rows.batch()).unwrap();
+        assert_eq!(first.target_projection, second.target_projection);
+        assert_eq!(first.total, second.total);
+        assert_eq!(first.next_greedy_action, second.next_greedy_action);
+        for (row, law) in first.target_projection.chunks_exact(21).enumerate() {
+            assert!((law.iter().sum::<f32>() - 1.0).abs() < 1e-6);
+            let action = first.next_greedy_action[row];
+            assert_eq!(ended.contains(&row), action == NO_ACTION);
+            if ended.contains(&row) {
+                // All of its mass is at its return, on the two atoms around it.
+                assert!(law.iter().filter(|&&p| p > 0.0).count() <= 2, "{law:?}");
+            }
+        }
+    }
 }
 
 #[test]
@@ -225,7 +235,8 @@ fn saturated_scores_and_extreme_returns_stay_finite() {
 
 #[test]
 fn double_dqn_chooses_by_the_online_network() {
-    let rows = Rows::random(12, 15);
+    let mut rows = Rows::random(12, 15);
+    rows.bootstrap_discount.fill(0.93);
     let mut settings = settings(NO_DIM);
     let mut chosen = Vec::new();
     for double_dqn in [false, true] {
@@ -483,4 +494,26 @@ fn gradients_hold_nothing_of_the_pass_that_they_come_from() {
             "{name}"
         );
     }
+}
+
+#[test]
+fn learners_of_one_process_do_not_touch_each_other() {
+    // They share the pool: a thread that waits for one's products takes up another's whole update.
+    const UPDATES: u64 = 12;
+    let learned = |lambda| {
+        let mut agent = agent(lambda, 1);
+        for seed in 0..UPDATES {
+            agent.update(&Rows::random(64, seed).batch()).unwrap();
+        }
+        values(agent.online())
+    };
+    let alone = [learned(ALL_DIM), learned(NO_DIM)];
+    std::thread::scope(|scope| {
+        let start = |i: usize| scope.spawn(move || learned([ALL_DIM, NO_DIM][i % 2]));
+        let all: Vec<_> = (0..16).map(start).collect();
+        for (i, learner) in all.into_iter().enumerate() {
+            let learned = learner.join().expect("no learner is refused or panics");
+            assert!(learned == alone[i % 2], "learner {i} learnt something else");
+        }
+    });
 }

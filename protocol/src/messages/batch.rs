@@ -5,11 +5,14 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     batch_layout::{BatchLayout, Column},
+    batch_rows::{BatchStatesMut, RowScalars},
+    priorities::{Origin, PriorityPart, PriorityUpdate},
     status::Waiting,
     tally::Tally,
 };
 use crate::{
     run_spec::RunSpec,
+    sampling::Sampling,
     wire::{
         buffers::Buffer,
         error::CodecError,
@@ -33,6 +36,10 @@ pub struct BatchHeader {
     pub positives: u32,
     /// Bytes of one state.
     pub state_bytes: u32,
+    /// States s_{t+k} that travel: one for each positive that a row has, at most P for each row.
+    pub states_k: u32,
+    /// States s_{t+n} that travel: one for each row that bootstraps, at most B.
+    pub states_n: u32,
     /// What the replay server that drew this had counted then, this batch included.
     pub tally: Tally,
     /// Transitions that it held.
@@ -41,19 +48,36 @@ pub struct BatchHeader {
     pub mean_age: f64,
     /// Version of the newest weights that chose an action of this batch, and of the oldest.
     pub weights_versions: (u64, u64),
+    /// Who drew the rows, where they are drawn by priority; it travels as [`BatchReply::Prioritised`], and other batches have no
+    /// byte of it.
+    #[serde(skip)]
+    pub origin: Option<Origin>,
 }
 
 impl BatchHeader {
-    /// A batch of `rows` rows of this run, before any row is written.
+    /// A batch of `rows` rows of this run, before any row is drawn: as large as one can be.
     pub fn of(spec: &RunSpec, rows: u32) -> Self {
+        let positives = spec.horizon.positives() as u32;
         Self {
             rows,
-            positives: spec.horizon.positives() as u32,
+            positives,
             state_bytes: spec.state_bytes() as u32,
+            states_k: rows.saturating_mul(positives),
+            states_n: rows,
             tally: Tally::default(),
             held: 0,
             mean_age: 0.0,
             weights_versions: (0, u64::MAX),
+            origin: None,
+        }
+    }
+
+    /// The same where rows are drawn by this rule.
+    #[must_use]
+    pub fn sampled_by(self, sampling: &Sampling) -> Self {
+        Self {
+            origin: sampling.is_prioritised().then(Origin::default),
+            ..self
         }
     }
 
@@ -77,21 +101,43 @@ impl BatchHeader {
             rows: self.rows as usize,
             positives: self.positives as usize,
             state_bytes: self.state_bytes as usize,
+            states_k: self.states_k as usize,
+            states_n: self.states_n as usize,
+            is_prioritised: self.origin.is_some(),
         }
     }
 
-    /// Checks that `payload` is as long as such a batch's.
+    /// Checks that `payload` is as long as such a batch's, and has as many states as its rows say.
     fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
-        if self.layout().bytes() == Some(payload.len()) && self.rows > 0 {
-            return Ok(());
+        let layout = self.layout();
+        if layout.bytes() != Some(payload.len()) || self.rows == 0 {
+            return Err(CodecError::Header(format!(
+                "{} rows with {} positives of {} bytes, {} and {} of them there, do not fill {} bytes of payload",
+                self.rows,
+                self.positives,
+                self.state_bytes,
+                self.states_k,
+                self.states_n,
+                payload.len()
+            )));
         }
-        Err(CodecError::Header(format!(
-            "{} rows with {} positives of {} bytes do not fill {} bytes of payload",
-            self.rows,
-            self.positives,
-            self.state_bytes,
-            payload.len()
-        )))
+        let rows = (layout.positives_there(payload), layout.bootstraps(payload));
+        let count = |there: &[bool]| there.iter().filter(|there| **there).count();
+        let counted = (count(&rows.0), count(&rows.1));
+        if counted != (layout.states_k, layout.states_n) {
+            return Err(CodecError::Header(format!(
+                "rows with {} positives and {} bootstraps come with {} and {} states",
+                counted.0, counted.1, self.states_k, self.states_n
+            )));
+        }
+        let (chances, _) = payload[layout.range(Column::Probability)].as_chunks();
+        let mut chances = chances.iter().map(|&chance| f32::from_le_bytes(chance));
+        if let Some(chance) = chances.find(|chance| !(*chance > 0.0 && *chance <= 1.0)) {
+            return Err(CodecError::Header(format!(
+                "a row that was drawn with the probability {chance}"
+            )));
+        }
+        Ok(())
     }
 }
 
@@ -109,44 +155,91 @@ pub enum BatchReply {
         /// The replay server's reason, a sentence.
         why: String,
     },
+    /// The payload that follows is a batch whose rows were drawn by priority, and who drew them.
+    Prioritised(BatchHeader, Origin),
+}
+
+impl BatchReply {
+    /// The reply with a batch of this header.
+    pub const fn of(header: BatchHeader) -> Self {
+        match header.origin {
+            None => Self::Batch(header),
+            Some(origin) => Self::Prioritised(header, origin),
+        }
+    }
+
+    /// The header of the batch, if it is one.
+    pub const fn header(&self) -> Option<BatchHeader> {
+        match *self {
+            Self::Batch(header) => Some(header),
+            Self::Prioritised(header, origin) => Some(BatchHeader {
+                origin: Some(origin),
+                ..header
+            }),
+            Self::Wait(_) | Self::Finished | Self::Refused { .. } => None,
+        }
+    }
 }
 
 impl Message for BatchReply {
     const KIND: Kind = Kind::BatchReply;
 
     fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
-        match self {
-            Self::Batch(header) => header.check_payload(payload),
-            Self::Wait(_) | Self::Finished | Self::Refused { .. } => no_payload(payload),
+        match self.header() {
+            Some(header) => header.check_payload(payload),
+            None => no_payload(payload),
         }
     }
 }
 
 /// Rows (s_t, a_t, a_{t+1}, R_t, discount, s_{t+k}, s_{t+n}), as the replay server made them.
 ///
-/// Buffer, one after the other, B rows each: states_t, states_k [P, B, ..], states_n [B, state bytes]; n-step return f32,
-/// bootstrap discount f32 (little-endian); action, next action, positive valid [P, B], k [P, B] (u8).
+/// Buffer, one after the other: states_t [B, state bytes]; states_k of the positives that rows have, in the order of [P, B];
+/// states_n of the rows that bootstrap; then B rows each: n-step return f32, bootstrap discount f32 (little-endian); action, next action,
+/// positive valid [P, B], k [P, B] (u8). Where rows are drawn by priority, then: transition u64, probability f32. No state travels
+/// that a row does not have.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Batch {
     /// What it says of itself.
     pub header: BatchHeader,
     payload: Buffer,
+    /// Of a merged batch, who drew its rows by priority: so many at a time.
+    origins: Vec<(Origin, usize)>,
 }
 
 impl Batch {
-    /// A batch of zeros, to be filled in place.
-    pub fn zeroed(header: BatchHeader) -> Self {
-        let payload = Buffer::zeroed(header.payload_bytes());
-        Self { header, payload }
-    }
-
-    /// A batch in memory that may hold anything: every row is to be written with [`Batch::rows_mut`].
+    /// A batch of `rows`, whose states are then to be written with [`Batch::states_mut`]; rows and states of `header` are set to
+    /// what `rows` has. `memory` gives so many bytes, with anything in them.
     ///
     /// # Panics
-    /// If the memory is not of [`BatchHeader::payload_bytes`].
-    pub fn in_memory(header: BatchHeader, payload: Buffer) -> Self {
+    /// If the memory is of another size, or a row has more positives than the header.
+    pub fn of_rows(
+        header: BatchHeader,
+        rows: &[RowScalars],
+        memory: impl FnOnce(usize) -> Buffer,
+    ) -> Self {
+        let header = BatchHeader {
+            rows: rows.len() as u32,
+            states_k: rows.iter().map(|row| row.positives).sum(),
+            states_n: rows.iter().filter(|row| row.bootstraps()).count() as u32,
+            ..header
+        };
+        let mut batch = Self::in_memory(header, memory(header.payload_bytes()));
+        let layout = header.layout();
+        for (row, scalars) in rows.iter().enumerate() {
+            scalars.write(&layout, &mut batch.payload, row);
+        }
+        batch
+    }
+
+    /// A batch in memory that may hold anything.
+    fn in_memory(header: BatchHeader, payload: Buffer) -> Self {
         assert_eq!(payload.len(), header.payload_bytes(), "memory for a batch");
-        Self { header, payload }
+        Self {
+            header,
+            payload,
+            origins: Vec::new(),
+        }
     }
 
     /// The rows of all `parts`, one part after the other, in memory that may hold anything; as many bytes as
@@ -158,23 +251,39 @@ impl Batch {
         let header = Self::merged_header(parts).expect("parts of one batch");
         let mut merged = Self::in_memory(header, memory);
         let whole = header.layout();
-        let mut first_row = 0;
-        for part in parts {
-            let rows = part.rows();
-            for column in Column::ALL {
-                let row_bytes = whole.value_bytes(column);
-                let to = &mut merged.payload[whole.range(column)];
-                let from = part.column(column);
-                // Of each positive, the rows of the part come together.
-                for positive in 0..whole.values_a_row(column) {
-                    let from = &from[positive * rows * row_bytes..][..rows * row_bytes];
-                    let row = positive * whole.rows + first_row;
-                    to[row * row_bytes..][..from.len()].copy_from_slice(from);
+        for column in Column::ALL {
+            let mut to = &mut merged.payload[whole.range(column)];
+            // Of each positive, the rows of the part come together.
+            for positive in 0..whole.values_a_row(column) {
+                for part in parts {
+                    let from = part.of_positive(column, positive);
+                    let place = to.split_off_mut(..from.len());
+                    place
+                        .expect("the parts fill the column")
+                        .copy_from_slice(from);
                 }
             }
-            first_row += rows;
         }
+        let origin = |part: &Self| Some((part.header.origin?, part.rows()));
+        merged.origins = parts.iter().filter_map(origin).collect();
         merged
+    }
+
+    /// The values of a column that are of this positive; all of a column that is not of positives.
+    fn of_positive(&self, column: Column, positive: usize) -> &[u8] {
+        let values = self.column(column);
+        match column {
+            Column::StatesK => {
+                let valid = self.positive_valid().chunks_exact(self.rows());
+                let there = |valid: &[u8]| valid.iter().filter(|valid| **valid != 0).count();
+                let before: usize = valid.clone().take(positive).map(there).sum();
+                let own = valid.clone().nth(positive).map_or(0, there);
+                let state_bytes = self.header.state_bytes as usize;
+                &values[before * state_bytes..(before + own) * state_bytes]
+            }
+            Column::PositiveValid | Column::K => &values[positive * self.rows()..][..self.rows()],
+            _ => values,
+        }
     }
 
     /// The header of [`Batch::merge`]; none if `parts` are none or differ in shape.
@@ -182,20 +291,28 @@ impl Batch {
         let mut merged = parts.first()?.header;
         let mut age_total = 0.0;
         (merged.rows, merged.tally, merged.held) = (0, Tally::default(), 0);
+        (merged.states_k, merged.states_n) = (0, 0);
         for BatchHeader {
             rows,
             positives,
             state_bytes,
+            states_k,
+            states_n,
             tally,
             held,
             mean_age,
             weights_versions: (newest, oldest),
+            origin,
         } in parts.iter().map(|part| part.header)
         {
-            if (positives, state_bytes) != (merged.positives, merged.state_bytes) {
+            if (positives, state_bytes) != (merged.positives, merged.state_bytes)
+                || origin.is_some() != merged.origin.is_some()
+            {
                 return None;
             }
             merged.rows += rows;
+            merged.states_k += states_k;
+            merged.states_n += states_n;
             merged.tally = merged.tally + tally;
             merged.held += held;
             age_total += mean_age * f64::from(rows);
@@ -230,12 +347,12 @@ impl Batch {
         self.column(Column::StatesT)
     }
 
-    /// s_{t+k} [P, B, state bytes]; rows without a positive hold zeros.
+    /// s_{t+k} of the positives that rows have, in the order of [P, B].
     pub fn states_k(&self) -> &[u8] {
         self.column(Column::StatesK)
     }
 
-    /// s_{t+n} [B, state bytes]; rows that do not bootstrap hold zeros.
+    /// s_{t+n} of the rows that bootstrap.
     pub fn states_n(&self) -> &[u8] {
         self.column(Column::StatesN)
     }
@@ -270,104 +387,99 @@ impl Batch {
         self.column(Column::K)
     }
 
-    /// Everything of one row, to be written in place.
-    pub fn rows_mut(&mut self) -> BatchRowsMut<'_> {
+    /// The chance with which each row was drawn [B], where rows are drawn by priority.
+    pub fn probabilities(&self) -> Option<Vec<f32>> {
+        self.header.origin?;
+        Some(self.column_f32(Column::Probability))
+    }
+
+    /// The transition of each row [B], by its number since the start of the replay that drew it; none where rows are drawn uniformly.
+    fn transitions(&self) -> Vec<u64> {
+        let (values, _) = self.column(Column::Transition).as_chunks();
+        values.iter().copied().map(u64::from_le_bytes).collect()
+    }
+
+    /// Writes of each row which transition it is, and the chance with which it was drawn.
+    ///
+    /// # Panics
+    /// If these are not as many as the rows, or the rows are drawn uniformly.
+    pub fn set_draws(&mut self, draws: impl ExactSizeIterator<Item = (u64, f32)>) {
+        assert!(self.header.origin.is_some(), "rows drawn by priority");
+        assert_eq!(draws.len(), self.rows(), "a draw a row");
         let layout = self.header.layout();
-        let mut rest = &mut self.payload[..];
-        // They lie in the order of their names here.
-        let mut take = |column| -> &mut [u8] {
-            let bytes = layout.column_bytes(column);
-            rest.split_off_mut(..bytes)
-                .expect("the columns fill the payload")
-        };
-        BatchRowsMut {
-            rows: layout.rows,
-            state_bytes: layout.state_bytes,
-            states_t: take(Column::StatesT),
-            states_k: take(Column::StatesK),
-            states_n: take(Column::StatesN),
-            n_step_return: take(Column::NStepReturn),
-            bootstrap_discount: take(Column::BootstrapDiscount),
-            action: take(Column::Action),
-            next_action: take(Column::NextAction),
-            positive_valid: take(Column::PositiveValid),
-            k: take(Column::K),
+        for (row, (transition, probability)) in draws.enumerate() {
+            let mut put = |column, bytes: &[u8]| {
+                let column = &mut self.payload[layout.range(column)];
+                column[row * bytes.len()..][..bytes.len()].copy_from_slice(bytes);
+            };
+            put(Column::Transition, &transition.to_le_bytes());
+            put(Column::Probability, &probability.to_le_bytes());
         }
     }
 
-    /// Header and payload, to travel as a [`BatchReply::Batch`].
+    /// Makes the chance of each row `share` of what it was: that its replay server was chosen.
+    ///
+    /// # Panics
+    /// As [`Batch::set_draws`].
+    pub fn scale_probabilities(&mut self, share: f32) {
+        let chances = self.probabilities().expect("rows drawn by priority");
+        let scaled = chances.into_iter().map(|chance| chance * share);
+        let draws: Vec<_> = self.transitions().into_iter().zip(scaled).collect();
+        self.set_draws(draws.into_iter());
+    }
+
+    /// What `learner` says back of rows that were drawn by priority: update `number`, with the `priorities` [B]; none where rows
+    /// are drawn uniformly.
+    ///
+    /// # Panics
+    /// If these are not as many as the rows.
+    pub fn priority_update(
+        &self,
+        learner: u64,
+        number: u64,
+        priorities: &[f32],
+    ) -> Option<PriorityUpdate> {
+        let whole = [(self.header.origin?, self.rows())];
+        assert_eq!(priorities.len(), self.rows(), "a priority a row");
+        let origins = match self.origins.as_slice() {
+            [] => &whole[..],
+            origins => origins,
+        };
+        let (mut transitions, mut priorities) = (&self.transitions()[..], priorities);
+        let part = |&(origin, rows): &(Origin, usize)| {
+            let (own, rest) = transitions.split_at(rows);
+            transitions = rest;
+            let (found, rest) = priorities.split_at(rows);
+            priorities = rest;
+            PriorityPart {
+                origin,
+                transitions: own.to_vec(),
+                priorities: found.to_vec(),
+            }
+        };
+        Some(PriorityUpdate {
+            learner,
+            number,
+            parts: origins.iter().map(part).collect(),
+        })
+    }
+
+    /// The places of all states that the rows have.
+    pub fn states_mut(&mut self) -> BatchStatesMut<'_> {
+        BatchStatesMut::new(self.header.layout(), &mut self.payload)
+    }
+
+    /// Header and payload, to travel as [`BatchReply::of`] the header.
     pub fn into_payload(self) -> (BatchHeader, Buffer) {
         (self.header, self.payload)
     }
 
-    /// Takes the payload of a decoded reply, checking that it is as long as its header says.
+    /// Takes the payload of a decoded reply, checking that it is as long as its header says, with the states that its rows say.
     ///
     /// # Errors
-    /// Buffer of another length.
+    /// Buffer of another length, or rows that say otherwise.
     pub fn from_payload(header: BatchHeader, payload: Buffer) -> Result<Self, CodecError> {
         header.check_payload(&payload)?;
-        Ok(Self { header, payload })
-    }
-}
-
-/// The columns of a batch, borrowed for writing, row by row.
-#[derive(Debug)]
-pub struct BatchRowsMut<'a> {
-    rows: usize,
-    state_bytes: usize,
-    states_t: &'a mut [u8],
-    states_k: &'a mut [u8],
-    states_n: &'a mut [u8],
-    n_step_return: &'a mut [u8],
-    bootstrap_discount: &'a mut [u8],
-    action: &'a mut [u8],
-    next_action: &'a mut [u8],
-    positive_valid: &'a mut [u8],
-    k: &'a mut [u8],
-}
-
-impl BatchRowsMut<'_> {
-    /// Where s_t of `row` is written.
-    pub fn state_t(&mut self, row: usize) -> &mut [u8] {
-        &mut self.states_t[row * self.state_bytes..(row + 1) * self.state_bytes]
-    }
-
-    /// Where s_{t+n} of `row` is written; zeros if the row does not bootstrap.
-    pub fn state_n(&mut self, row: usize) -> &mut [u8] {
-        &mut self.states_n[row * self.state_bytes..(row + 1) * self.state_bytes]
-    }
-
-    /// Positives a row, P.
-    pub const fn positives(&self) -> usize {
-        self.positive_valid.len() / self.rows
-    }
-
-    /// Marks `row` as having no positive `p`.
-    pub fn no_positive(&mut self, p: usize, row: usize) {
-        self.positive(p, row, 0).fill(0);
-        self.positive_valid[p * self.rows + row] = 0;
-    }
-
-    /// Marks positive `p` of `row` as `k` steps ahead and gives where s_{t+k} is written.
-    pub fn positive(&mut self, p: usize, row: usize, k: u32) -> &mut [u8] {
-        let at = p * self.rows + row;
-        self.positive_valid[at] = 1;
-        self.k[at] = u8::try_from(k).unwrap_or(u8::MAX);
-        &mut self.states_k[at * self.state_bytes..(at + 1) * self.state_bytes]
-    }
-
-    /// Writes the scalars of `row`.
-    pub fn set(
-        &mut self,
-        row: usize,
-        action: u8,
-        next_action: u8,
-        n_step_return: f32,
-        discount: f32,
-    ) {
-        self.action[row] = action;
-        self.next_action[row] = next_action;
-        self.n_step_return[4 * row..4 * row + 4].copy_from_slice(&n_step_return.to_le_bytes());
-        self.bootstrap_discount[4 * row..4 * row + 4].copy_from_slice(&discount.to_le_bytes());
+        Ok(Self::in_memory(header, payload))
     }
 }

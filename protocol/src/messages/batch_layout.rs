@@ -4,7 +4,7 @@
 use std::ops::Range;
 
 /// The columns of a batch, in the order in which they lie one after the other. Each has a value for every row; those of the
-/// positives have one for every row of the first positive, then of the second, and so on.
+/// positives have one for every row of the first positive, then of the second, and so on. States that a row does not have are left out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Column {
     /// s_t, the state of the anchor.
@@ -25,11 +25,15 @@ pub(super) enum Column {
     PositiveValid,
     /// k of each positive.
     K,
+    /// The transition's number since the start of the replay, u64; where rows are drawn by priority.
+    Transition,
+    /// The chance with which the row was drawn, f32; where rows are drawn by priority.
+    Probability,
 }
 
 impl Column {
     /// All of them, in their order.
-    pub(super) const ALL: [Self; 9] = [
+    pub(super) const ALL: [Self; 11] = [
         Self::StatesT,
         Self::StatesK,
         Self::StatesN,
@@ -39,6 +43,8 @@ impl Column {
         Self::NextAction,
         Self::PositiveValid,
         Self::K,
+        Self::Transition,
+        Self::Probability,
     ];
 
     /// Whether it has a value for each positive of a row.
@@ -46,52 +52,44 @@ impl Column {
         matches!(self, Self::StatesK | Self::PositiveValid | Self::K)
     }
 
-    /// Whether its values are states, whose size is the run's.
-    const fn holds_states(self) -> bool {
-        matches!(self, Self::StatesT | Self::StatesK | Self::StatesN)
+    /// Whether it is there only where rows are drawn by priority.
+    const fn is_of_priorities(self) -> bool {
+        matches!(self, Self::Transition | Self::Probability)
     }
 
     /// Bytes of a value that is no state.
     const fn scalar_bytes(self) -> usize {
         match self {
             Self::StatesT | Self::StatesK | Self::StatesN => 0,
-            Self::NStepReturn | Self::BootstrapDiscount => size_of::<f32>(),
+            Self::NStepReturn | Self::BootstrapDiscount | Self::Probability => size_of::<f32>(),
+            Self::Transition => size_of::<u64>(),
             Self::Action | Self::NextAction | Self::PositiveValid | Self::K => size_of::<u8>(),
         }
     }
 }
 
-/// What the columns of one kind take together.
-struct Widths {
-    states: usize,
-    scalar_bytes: usize,
-}
-
-/// States and bytes of scalars, of a row itself or of one of its positives.
-const fn widths(per_positive: bool) -> Widths {
-    let (mut states, mut scalar_bytes, mut at) = (0, 0, 0);
+/// Bytes of all scalars of a row itself, or of one of its positives; of those that every row has, or of those of priorities.
+const fn scalar_bytes(per_positive: bool, of_priorities: bool) -> usize {
+    let (mut bytes, mut at) = (0, 0);
     while at < Column::ALL.len() {
         let column = Column::ALL[at];
         assert!(
             column as usize == at,
             "the order of ALL is that of the columns"
         );
-        if column.is_per_positive() == per_positive {
-            states += column.holds_states() as usize;
-            scalar_bytes += column.scalar_bytes();
+        if column.is_per_positive() == per_positive && column.is_of_priorities() == of_priorities {
+            bytes += column.scalar_bytes();
         }
         at += 1;
     }
-    Widths {
-        states,
-        scalar_bytes,
-    }
+    bytes
 }
 
-const ROW: Widths = widths(false);
-const POSITIVE: Widths = widths(true);
-const _: () = assert!(ROW.states == 2 && ROW.scalar_bytes == 10);
-const _: () = assert!(POSITIVE.states == 1 && POSITIVE.scalar_bytes == 2);
+const ROW_SCALAR_BYTES: usize = scalar_bytes(false, false);
+const POSITIVE_SCALAR_BYTES: usize = scalar_bytes(true, false);
+const PRIORITY_SCALAR_BYTES: usize = scalar_bytes(false, true);
+const _: () =
+    assert!(ROW_SCALAR_BYTES == 10 && POSITIVE_SCALAR_BYTES == 2 && PRIORITY_SCALAR_BYTES == 12);
 
 /// The shape of a batch, from which the place of every value follows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -102,19 +100,45 @@ pub(super) struct BatchLayout {
     pub(super) positives: usize,
     /// Bytes of one state.
     pub(super) state_bytes: usize,
+    /// States s_{t+k} that are there, at most P for each row.
+    pub(super) states_k: usize,
+    /// States s_{t+n} that are there, at most one for each row.
+    pub(super) states_n: usize,
+    /// Whether rows say which transition they are and how likely they were.
+    pub(super) is_prioritised: bool,
 }
 
 impl BatchLayout {
-    /// Bytes of all columns; none if they are more than the address space.
+    /// Bytes of all columns; none if they are more than the address space, or if there are more states than rows can have.
     pub(super) fn bytes(&self) -> Option<usize> {
-        let row = self.width(&ROW)?;
-        let positives = self.width(&POSITIVE)?.checked_mul(self.positives)?;
-        self.rows.checked_mul(row.checked_add(positives)?)
+        let positives = self.rows.checked_mul(self.positives)?;
+        if self.states_k > positives || self.states_n > self.rows {
+            return None;
+        }
+        let states = self.rows.checked_add(self.states_k)?;
+        let states = states.checked_add(self.states_n)?;
+        let states = states.checked_mul(self.state_bytes)?;
+        let of_priorities = if self.is_prioritised {
+            PRIORITY_SCALAR_BYTES
+        } else {
+            0
+        };
+        let of_rows = self.rows.checked_mul(ROW_SCALAR_BYTES + of_priorities)?;
+        let of_positives = positives.checked_mul(POSITIVE_SCALAR_BYTES)?;
+        states.checked_add(of_rows)?.checked_add(of_positives)
     }
 
-    fn width(&self, of: &Widths) -> Option<usize> {
-        let states = of.states.checked_mul(self.state_bytes)?;
-        states.checked_add(of.scalar_bytes)
+    /// Whether each row [B] bootstraps, in a payload whose scalars are written.
+    pub(super) fn bootstraps(&self, payload: &[u8]) -> Vec<bool> {
+        let (discounts, _) = payload[self.range(Column::BootstrapDiscount)].as_chunks();
+        let bootstraps = |&discount: &[u8; 4]| f32::from_le_bytes(discount) != 0.0;
+        discounts.iter().map(bootstraps).collect()
+    }
+
+    /// Whether each positive [P, B] is there, in a payload whose scalars are written.
+    pub(super) fn positives_there(&self, payload: &[u8]) -> Vec<bool> {
+        let valid = payload[self.range(Column::PositiveValid)].iter();
+        valid.map(|&valid| valid != 0).collect()
     }
 
     /// Values that a row has in a column.
@@ -126,18 +150,15 @@ impl BatchLayout {
         }
     }
 
-    /// Bytes of one value of a column.
-    pub(super) const fn value_bytes(&self, column: Column) -> usize {
-        if column.holds_states() {
-            self.state_bytes
-        } else {
-            column.scalar_bytes()
-        }
-    }
-
     /// Bytes of a column.
     pub(super) const fn column_bytes(&self, column: Column) -> usize {
-        self.rows * self.values_a_row(column) * self.value_bytes(column)
+        match column {
+            Column::StatesT => self.rows * self.state_bytes,
+            Column::StatesK => self.states_k * self.state_bytes,
+            Column::StatesN => self.states_n * self.state_bytes,
+            _ if column.is_of_priorities() && !self.is_prioritised => 0,
+            _ => self.rows * self.values_a_row(column) * column.scalar_bytes(),
+        }
     }
 
     /// Where a column lies in the payload.
@@ -154,11 +175,19 @@ mod tests {
 
     #[test]
     fn columns_fill_the_payload_without_gaps() {
-        for (rows, positives, state_bytes) in [(1, 0, 1), (3, 1, 4), (256, 5, 12_288)] {
+        for (rows, positives, state_bytes, states_k, states_n) in [
+            (1, 0, 1, 0, 0),
+            (3, 1, 4, 2, 3),
+            (256, 5, 12_288, 1200, 17),
+            (256, 5, 12_288, 1280, 256),
+        ] {
             let layout = BatchLayout {
                 rows,
                 positives,
                 state_bytes,
+                states_k,
+                states_n,
+                is_prioritised: rows % 2 == 0,
             };
             let mut end = 0;
             for column in Column::ALL {
@@ -168,11 +197,39 @@ mod tests {
             }
             assert_eq!(layout.bytes(), Some(end));
         }
-        let huge = BatchLayout {
-            rows: usize::MAX,
+        let small = BatchLayout {
+            rows: 2,
             positives: 2,
             state_bytes: 1,
+            states_k: 4,
+            states_n: 2,
+            is_prioritised: false,
         };
-        assert_eq!(huge.bytes(), None);
+        assert_eq!(small.bytes(), Some(2 * (3 + 1 + 10 + 2 * 2)));
+        let prioritised = BatchLayout {
+            is_prioritised: true,
+            ..small
+        };
+        assert_eq!(prioritised.bytes(), Some(2 * (3 + 1 + 10 + 2 * 2 + 12)));
+        for wrong in [
+            BatchLayout {
+                rows: usize::MAX,
+                ..small
+            },
+            BatchLayout {
+                states_k: 5,
+                ..small
+            },
+            BatchLayout {
+                states_n: 3,
+                ..small
+            },
+            BatchLayout {
+                state_bytes: usize::MAX / 4,
+                ..small
+            },
+        ] {
+            assert_eq!(wrong.bytes(), None, "{wrong:?}");
+        }
     }
 }

@@ -87,14 +87,31 @@ impl Message for ChunkHeader {
             payload.len()
         )))
     }
+
+    fn actor(&self) -> Option<u32> {
+        Some(self.actor)
+    }
 }
 
 impl Keyed for ChunkHeader {
     const KEY: &'static str = "ingest";
+    const BY_ACTOR: bool = true;
 }
 
 impl Request for ChunkHeader {
     type Reply = InsertReply;
+}
+
+/// Transitions that a chunk of any run may have: an actor may step so many copies of the world, whatever the settings say.
+const TRANSITIONS_LEAST: u64 = 4096;
+
+/// Transitions that the longest chunk of a run has, by its settings `actor.envs`, `steps_per_chunk` and `round_transitions_max`;
+/// at least 4,096, as an actor may step up to so many copies (`--envs`).
+pub fn transitions_max(envs: u32, steps_per_chunk: u32, round_transitions_max: Option<u64>) -> u64 {
+    let envs = u64::from(envs);
+    let whole = envs.saturating_mul(steps_per_chunk.into());
+    let longest = round_transitions_max.map_or(whole, |round| whole.min(round.max(envs)));
+    longest.max(TRANSITIONS_LEAST)
 }
 
 impl ChunkHeader {
@@ -231,6 +248,11 @@ impl Chunk {
             codec::seal(spec_hash, &self.header, &self.payload)?,
             &self.payload,
         ))
+    }
+
+    /// The payload: all columns, one after the other.
+    pub fn payload(&self) -> &[u8] {
+        &self.payload
     }
 
     /// The payload, to travel after a head from [`Chunk::seal`].

@@ -19,10 +19,15 @@ pub struct Goodbye {
 
 impl Message for Goodbye {
     const KIND: Kind = Kind::Goodbye;
+
+    fn actor(&self) -> Option<u32> {
+        Some(self.actor)
+    }
 }
 
 impl Keyed for Goodbye {
     const KEY: &'static str = "goodbye";
+    const BY_ACTOR: bool = true;
 }
 
 impl Request for Goodbye {

@@ -20,10 +20,15 @@ pub struct Claim {
 
 impl Message for Claim {
     const KIND: Kind = Kind::Claim;
+
+    fn actor(&self) -> Option<u32> {
+        Some(self.actor)
+    }
 }
 
 impl Keyed for Claim {
     const KEY: &'static str = "claim";
+    const BY_ACTOR: bool = true;
 }
 
 impl Request for Claim {

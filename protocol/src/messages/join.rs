@@ -16,10 +16,15 @@ pub struct ActorJoin {
 
 impl Message for ActorJoin {
     const KIND: Kind = Kind::ActorJoin;
+
+    fn actor(&self) -> Option<u32> {
+        Some(self.actor)
+    }
 }
 
 impl Keyed for ActorJoin {
     const KEY: &'static str = "join/actor";
+    const BY_ACTOR: bool = true;
 }
 
 impl Request for ActorJoin {

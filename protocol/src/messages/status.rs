@@ -101,8 +101,10 @@ pub struct ReplayStatus {
     pub chunks_retried: u64,
     /// Batches that did not reach the learner, which asked again; they do not count as served.
     pub batches_retried: u64,
-    /// Messages refused as malformed or foreign.
+    /// Messages refused as malformed or foreign, or because their sender's role may not send them.
     pub messages_refused: u64,
+    /// Connections refused, for want of a good certificate.
+    pub connections_refused: u64,
     /// Rows served since the start.
     pub rows_sampled: u64,
     /// Rows served to a learner that died before it saved what it learned from them; they do not count as sampled.
@@ -163,7 +165,8 @@ impl ReplayStatus {
             return Self::default();
         };
         let add = |sums: &mut Vec<u64>, counts: &[u64]| {
-            sums.iter_mut().zip(counts).for_each(|(sum, n)| *sum += n);
+            let each = sums.iter_mut().zip(counts);
+            each.for_each(|(sum, n)| *sum = sum.saturating_add(*n));
         };
         let mut sum = first.clone();
         for it in others {
@@ -177,6 +180,7 @@ impl ReplayStatus {
                 chunks_retried,
                 batches_retried,
                 messages_refused,
+                connections_refused,
                 rows_sampled,
                 rows_unlearned,
                 // Every shard has the whole run's.
@@ -200,26 +204,31 @@ impl ReplayStatus {
                 affinity_version,
                 finished,
             } = it;
-            sum.transitions_inserted += transitions_inserted;
-            sum.transitions_held += transitions_held;
-            sum.frame_bytes_held += frame_bytes_held;
-            sum.transitions_lost += transitions_lost;
-            sum.transitions_duplicated += transitions_duplicated;
-            sum.chunks_retried += chunks_retried;
-            sum.batches_retried += batches_retried;
-            sum.messages_refused += messages_refused;
-            sum.rows_sampled += rows_sampled;
-            sum.rows_unlearned += rows_unlearned;
-            sum.episodes += episodes;
-            sum.returns.known += returns.known;
+            sum.transitions_inserted = sum
+                .transitions_inserted
+                .saturating_add(*transitions_inserted);
+            sum.transitions_held = sum.transitions_held.saturating_add(*transitions_held);
+            sum.frame_bytes_held = sum.frame_bytes_held.saturating_add(*frame_bytes_held);
+            sum.transitions_lost = sum.transitions_lost.saturating_add(*transitions_lost);
+            sum.transitions_duplicated = sum
+                .transitions_duplicated
+                .saturating_add(*transitions_duplicated);
+            sum.chunks_retried = sum.chunks_retried.saturating_add(*chunks_retried);
+            sum.batches_retried = sum.batches_retried.saturating_add(*batches_retried);
+            sum.messages_refused = sum.messages_refused.saturating_add(*messages_refused);
+            sum.connections_refused = sum.connections_refused.saturating_add(*connections_refused);
+            sum.rows_sampled = sum.rows_sampled.saturating_add(*rows_sampled);
+            sum.rows_unlearned = sum.rows_unlearned.saturating_add(*rows_unlearned);
+            sum.episodes = sum.episodes.saturating_add(*episodes);
+            sum.returns.known = sum.returns.known.saturating_add(returns.known);
             sum.returns.newest.extend(&returns.newest);
             add(&mut sum.k_histogram, k_histogram);
             add(&mut sum.action_histogram, action_histogram);
             sum.learner_waited_s += learner_waited_s;
             sum.actors_waited_s += actors_waited_s;
-            sum.actors += actors;
-            sum.actors_acting += actors_acting;
-            sum.actors_waiting += actors_waiting;
+            sum.actors = sum.actors.saturating_add(*actors);
+            sum.actors_acting = sum.actors_acting.saturating_add(*actors_acting);
+            sum.actors_waiting = sum.actors_waiting.saturating_add(*actors_waiting);
             sum.answer_ms = Quantiles::worst(sum.answer_ms, *answer_ms);
             sum.insert_ms = Quantiles::worst(sum.insert_ms, *insert_ms);
             sum.weights_behind_s = Quantiles::worst(sum.weights_behind_s, *weights_behind_s);
@@ -251,13 +260,10 @@ impl ReplayStatus {
 
     /// Mean k, over the rows served with a positive, of the furthest; none before the first.
     pub fn mean_k(&self) -> Option<f64> {
-        let positives: u64 = self.k_histogram.iter().skip(1).sum();
-        let weighted: u64 = self
-            .k_histogram
-            .iter()
-            .enumerate()
-            .map(|(k, &n)| k as u64 * n)
-            .sum();
+        // Counts of another process, which may be any.
+        let counts = || self.k_histogram.iter().map(|&n| u128::from(n));
+        let positives: u128 = counts().skip(1).sum();
+        let weighted: u128 = (0_u128..).zip(counts()).map(|(k, n)| k * n).sum();
         (positives > 0).then(|| weighted as f64 / positives as f64)
     }
 
@@ -338,6 +344,7 @@ mod tests {
             chunks_retried: 6 * n,
             batches_retried: 7 * n,
             messages_refused: 8 * n,
+            connections_refused: 9 * n,
             rows_sampled: 9 * n,
             rows_unlearned: 19 * n,
             warmup_transitions: 1_000,

@@ -44,6 +44,15 @@ pub struct WeightsHeader {
     pub sha256: [u8; 32],
 }
 
+/// One version of the learner's weights, whole.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Weights {
+    /// What they say of themselves.
+    pub header: WeightsHeader,
+    /// The networks' parameters, a safetensors file.
+    pub safetensors: Vec<u8>,
+}
+
 /// New weights on their way to the replay server; the payload is a safetensors file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WeightsUpload {
@@ -230,9 +239,12 @@ impl Assembly {
     ///
     /// # Errors
     /// It is not what the header describes.
-    pub fn finish(self) -> Result<(WeightsHeader, Vec<u8>), CodecError> {
+    pub fn finish(self) -> Result<Weights, CodecError> {
         self.weights.check(&self.have)?;
-        Ok((self.weights, self.have))
+        Ok(Weights {
+            header: self.weights,
+            safetensors: self.have,
+        })
     }
 }
 
@@ -258,7 +270,11 @@ mod tests {
         assert!(!assembly.is_whole());
         assembly.take(weights, at, second).unwrap();
         assert!(assembly.is_whole());
-        assert_eq!(assembly.finish().unwrap(), (weights, file.clone()));
+        let whole = Weights {
+            header: weights,
+            safetensors: file.clone(),
+        };
+        assert_eq!(assembly.finish().unwrap(), whole);
 
         let mut damaged = Assembly::new(weights, 10).unwrap();
         damaged.take(weights, 0, second).unwrap();

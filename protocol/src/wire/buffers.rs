@@ -19,10 +19,7 @@ use zenoh::{
     },
 };
 
-use super::shared_memory::{self, Trust};
-
-/// Where the operating system keeps shared memory.
-const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
+use super::shared_memory::{self, FOLDER, Trust};
 
 /// Memory for the payload of a message. Clones have memory of their own.
 pub struct Buffer(Memory);
@@ -143,12 +140,12 @@ impl Shared {
 /// A pool of `bytes` bytes of shared memory, or why there is none.
 fn provider(bytes: usize) -> Result<ShmProvider<PosixShmProviderBackend>, String> {
     // The system would grant more than there is, and kill the process that writes to it.
-    let free = nix::sys::statvfs::statvfs(SHARED_MEMORY_FOLDER)
+    let free = nix::sys::statvfs::statvfs(FOLDER)
         .map(|it| it.blocks_available().saturating_mul(it.fragment_size()))
-        .map_err(|e| format!("{SHARED_MEMORY_FOLDER}: {e}"))?;
+        .map_err(|e| format!("{FOLDER}: {e}"))?;
     if free < bytes as u64 {
         return Err(format!(
-            "{SHARED_MEMORY_FOLDER} has {free} bytes free, {bytes} are needed (a container needs --shm-size)"
+            "{FOLDER} has {free} bytes free, {bytes} are needed (a container needs --shm-size)"
         ));
     }
     shared_memory::check_lockable(bytes)?;

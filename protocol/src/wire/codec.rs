@@ -1,5 +1,5 @@
 //! The bytes of a message: a fixed prefix, a bincode header, then a raw payload that serde never touches.
-//! It does not know what a message means, and it is the only file that calls bincode.
+//! It does not know what a message means, and it is the only file of what travels that calls bincode.
 //!
 //! The prefix's fields are in `prefix`.
 
@@ -13,7 +13,7 @@ use super::{
 };
 
 /// The version of every message in this crate; parts of different versions refuse each other.
-pub const PROTOCOL_VERSION: u16 = 3;
+pub const PROTOCOL_VERSION: u16 = 4;
 
 /// Length of the fixed prefix, bytes.
 pub const PREFIX_BYTES: usize = Prefix::BYTES;
@@ -41,6 +41,39 @@ fn encode_header<H: Serialize>(header: &H) -> Result<Vec<u8>, CodecError> {
 /// The bincode bytes of a value, for hashing and for small files of our own.
 pub(crate) fn canonical_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
     encode_header(value)
+}
+
+/// Longest value of [`encode_value`], bytes.
+const VALUE_BYTES_MAX: usize = 1 << 28;
+
+/// The bytes of a value that travels in no message, for files.
+///
+/// # Errors
+/// A value over the limit, or one that serde cannot write.
+pub fn encode_value<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
+    let bytes = bincode::serde::encode_to_vec(value, bincode::config::standard())
+        .map_err(|e| CodecError::Header(e.to_string()))?;
+    if bytes.len() > VALUE_BYTES_MAX {
+        return Err(CodecError::TooLarge {
+            have: bytes.len(),
+            max: VALUE_BYTES_MAX,
+        });
+    }
+    Ok(bytes)
+}
+
+/// Reads what [`encode_value`] wrote. That the bytes are undamaged is the caller's to check.
+///
+/// # Errors
+/// Bytes that are no such value, or more than one.
+pub fn decode_value<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> {
+    let config = bincode::config::standard().with_limit::<VALUE_BYTES_MAX>();
+    let (value, used) = bincode::serde::decode_from_slice(bytes, config)
+        .map_err(|e| CodecError::Header(e.to_string()))?;
+    match bytes.len() - used {
+        0 => Ok(value),
+        over => Err(CodecError::Header(format!("{over} bytes after its end"))),
+    }
 }
 
 /// Prefix and header of a message; the wire carries these bytes followed by `payload`, which is not copied.

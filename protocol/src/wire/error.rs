@@ -47,6 +47,17 @@ pub enum CodecError {
         /// What this part has, or expects here.
         ours: u64,
     },
+    /// A message of one actor at the key of another.
+    #[error(
+        "the message speaks for {} at the key {key:?}: each part speaks for itself alone",
+        .actor.map_or("the learner".into(), |actor| format!("actor {actor}"))
+    )]
+    Actor {
+        /// Whom the message speaks for; none is the learner.
+        actor: Option<u32>,
+        /// Where it came.
+        key: String,
+    },
     /// Bytes that were changed on the way.
     #[error("the message's checksum is wrong: it was damaged on the way")]
     Checksum,

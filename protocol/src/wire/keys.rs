@@ -1,5 +1,7 @@
 //! Where each message travels: its own key under the run's namespace, and one for each part that is connected.
-//! Identities of actors and versions are in the messages, never in a key.
+//! What an actor says stands under its number, so that access can be given by key; versions and lives are in the messages.
+
+use sha2::{Digest, Sha256};
 
 use super::message::Keyed;
 
@@ -32,19 +34,54 @@ impl Keys {
         format!("{}/{name}", self.namespace)
     }
 
-    /// Where messages of type `M` are asked, fetched or announced.
+    /// Where messages of type `M` are answered, fetched or announced: of those that have a key an actor, all of them.
     pub fn of<M: Keyed>(&self) -> String {
-        self.key(M::KEY)
+        if M::BY_ACTOR {
+            self.key(&format!("{}/*", M::KEY))
+        } else {
+            self.key(M::KEY)
+        }
+    }
+
+    /// Where `actor` asks messages of type `M`.
+    pub fn of_actor<M: Keyed>(&self, actor: u32) -> String {
+        if M::BY_ACTOR {
+            self.key(&format!("{}/{actor}", M::KEY))
+        } else {
+            self.key(M::KEY)
+        }
+    }
+
+    /// Where the learner asks messages of type `M`, of which each actor may have a key of its own.
+    pub fn of_learner<M: Keyed>(&self) -> String {
+        if M::BY_ACTOR {
+            self.key(&format!("{}/learner", M::KEY))
+        } else {
+            self.key(M::KEY)
+        }
+    }
+
+    /// The actor under whose number `key` stands; none where it stands under no single one.
+    pub(crate) fn actor(key: &str) -> Option<u32> {
+        key.rsplit('/').next()?.parse().ok()
     }
 
     /// The key of the liveliness token of one life of an actor, or of a learner.
     pub fn alive_key(&self, who: Alive) -> String {
         match who {
-            Alive::Actor { actor, incarnation } => {
-                self.key(&format!("alive/actor/{actor}/{incarnation:016x}"))
-            }
-            Alive::Learner(learner) => self.key(&format!("alive/learner/{learner:016x}")),
+            Alive::Actor { actor, mark } => self.key(&format!("alive/actor/{actor}/{mark:016x}")),
+            Alive::Learner { mark } => self.key(&format!("alive/learner/{mark:016x}")),
         }
+    }
+
+    /// The keys of the liveliness tokens of all lives of an actor.
+    pub(crate) fn lives_of_actor(&self, actor: u32) -> String {
+        self.key(&format!("alive/actor/{actor}/*"))
+    }
+
+    /// The keys of the liveliness tokens of all learners.
+    pub(crate) fn lives_of_learner(&self) -> String {
+        self.key("alive/learner/*")
     }
 
     /// Liveliness tokens of all actors and learners.
@@ -57,48 +94,88 @@ impl Keys {
         let rest = key.strip_prefix(&self.namespace)?.strip_prefix("/alive/")?;
         let hex = |text| u64::from_str_radix(text, 16).ok();
         match rest.split('/').collect::<Vec<_>>()[..] {
-            ["actor", actor, incarnation] => Some(Alive::Actor {
+            ["actor", actor, mark] => Some(Alive::Actor {
                 actor: actor.parse().ok()?,
-                incarnation: hex(incarnation)?,
+                mark: hex(mark)?,
             }),
-            ["learner", learner] => Some(Alive::Learner(hex(learner)?)),
+            ["learner", mark] => Some(Alive::Learner { mark: hex(mark)? }),
             _ => None,
         }
     }
 }
 
-/// A part whose liveliness token was seen.
+/// A part whose liveliness token was seen. Anybody may see tokens, so they do not show the numbers by which the replay server
+/// knows its actors and its learner: who knew such a number could speak for them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Alive {
     /// One life of an actor.
     Actor {
         /// The actor's number in the run.
         actor: u32,
-        /// Which life of it.
-        incarnation: u64,
+        /// The mark of one life of it.
+        mark: u64,
     },
-    /// A learner, by its random number.
-    Learner(u64),
+    /// A learner.
+    Learner {
+        /// Its mark.
+        mark: u64,
+    },
+}
+
+impl Alive {
+    /// This life of an actor.
+    pub fn actor(actor: u32, incarnation: u64) -> Self {
+        let mark = mark(incarnation);
+        Self::Actor { actor, mark }
+    }
+
+    /// The learner of this number.
+    pub fn learner(learner: u64) -> Self {
+        let mark = mark(learner);
+        Self::Learner { mark }
+    }
+}
+
+/// What shows that somebody knows `number`, and does not tell it: the first 8 bytes of its SHA-256.
+fn mark(number: u64) -> u64 {
+    let digest = Sha256::digest(number.to_le_bytes());
+    u64::from_le_bytes(digest[..8].try_into().expect("SHA-256 has 32 bytes"))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::messages::{affinity::AffinityUpdate, goodbye::Goodbye, report::Report};
+
+    #[test]
+    fn what_an_actor_says_stands_under_its_number() {
+        let keys = Keys::new("a/7").unwrap();
+        assert_eq!(keys.of::<Goodbye>(), "a/7/goodbye/*");
+        assert_eq!(keys.of_actor::<Goodbye>(7), "a/7/goodbye/7");
+        assert_eq!(keys.of_actor::<AffinityUpdate>(7), "a/7/affinity");
+        assert_eq!(keys.of_learner::<AffinityUpdate>(), "a/7/affinity");
+        assert_eq!(keys.of_learner::<Report>(), "a/7/report/learner");
+        assert_eq!(Keys::actor("a/7/report/learner"), None);
+        assert_eq!(Keys::actor("a/7/goodbye/7"), Some(7));
+        for nobody_s in ["a/7/goodbye/*", "a/7/affinity", "", "a/4294967296", "a/-1"] {
+            assert_eq!(Keys::actor(nobody_s), None, "{nobody_s}");
+        }
+    }
 
     #[test]
     fn liveliness_tokens_say_whose_they_are() {
         let keys = Keys::new("a/b").unwrap();
-        let actor = Alive::Actor {
-            actor: 7,
-            incarnation: u64::MAX,
-        };
+        let actor = Alive::actor(7, u64::MAX);
         assert_eq!(keys.alive(&keys.alive_key(actor)), Some(actor));
-        let learner = Alive::Learner(9);
+        let learner = Alive::learner(9);
         assert_eq!(keys.alive(&keys.alive_key(learner)), Some(learner));
-        assert_eq!(
-            keys.alive_key(learner),
-            "a/b/alive/learner/0000000000000009"
+        let seen = keys.alive_key(learner);
+        assert!(seen.starts_with("a/b/alive/learner/"), "{seen}");
+        assert!(
+            !seen.ends_with("0000000000000009"),
+            "the number is not shown"
         );
+        assert_ne!(Alive::actor(7, 1), Alive::actor(7, 2));
         for strange in [
             "a/b/alive/actor/7",
             "a/alive/learner/9",

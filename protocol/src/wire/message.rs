@@ -19,12 +19,21 @@ pub trait Message: Serialize + DeserializeOwned {
     fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
         no_payload(payload)
     }
+
+    /// The actor that it speaks for, if it is one actor's word.
+    fn actor(&self) -> Option<u32> {
+        None
+    }
 }
 
 /// A message with a key of its own: where it is asked, fetched or announced. Replies have none, they travel back.
 pub trait Keyed: Message {
     /// Its key under the run's namespace.
     const KEY: &'static str;
+    /// Whether each actor has a key of its own for it, `KEY/<number>`. Then whoever guards the keys can tell who may speak for
+    /// which actor, without reading messages; the receiver checks that key and message agree. What the learner says stands at
+    /// `KEY/learner`.
+    const BY_ACTOR: bool = false;
     /// How urgent it is beside other messages on the same link.
     const PRIORITY: Priority = Priority::Data;
 }
@@ -85,4 +94,10 @@ pub enum Kind {
     WeightsUpload = 17,
     /// A request for a piece of the newest weights, actor to replay server.
     WeightsRequest = 18,
+    /// What a part says of itself, actor or learner to replay server.
+    Report = 19,
+    /// The replay server's account of who takes part.
+    PartsStatus = 20,
+    /// Priorities of the rows of a batch, learner to replay server.
+    Priorities = 21,
 }

@@ -3,6 +3,8 @@
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
+/// Where the operating system keeps memory that the processes of a host share.
+pub const FOLDER: &str = "/dev/shm";
 /// After a message in shared memory was lost, how many go through the socket before shared memory is tried again.
 const AVOID_COUNT: u32 = 64;
 /// So many losses without a message that arrived between them, and shared memory is not tried again.

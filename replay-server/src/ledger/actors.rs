@@ -1,9 +1,10 @@
 //! Exactly once: which life of each actor counts, which chunk it sends next, what it says it produced, where its streams stand.
 //! It stores no transitions, answers nothing itself and does not know who is connected.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 
 use driml_protocol::{ActorJoin, ChunkHeader, Claim, Goodbye};
+use serde::{Deserialize, Serialize};
 
 use crate::storage::ring::Link;
 
@@ -15,6 +16,7 @@ pub const STREAMS_MAX: u32 = 4096;
 const PAST_INCARNATIONS_MAX: usize = 64;
 
 /// One copy of an actor's world.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Stream {
     /// How its next transition hangs together with the last.
     pub(crate) link: Link,
@@ -23,7 +25,7 @@ pub(crate) struct Stream {
 }
 
 /// What is counted of one life of an actor.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 struct Count {
     incarnation: u64,
     /// Transitions it has produced by its own account, as far as heard.
@@ -41,6 +43,7 @@ impl Count {
     }
 }
 
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Actor {
     current: Count,
     /// Number of the chunk that comes next in the current life.
@@ -49,6 +52,9 @@ struct Actor {
     past: VecDeque<Count>,
     /// Lives before the current one, forgotten ones too.
     earlier_incarnations: u32,
+    /// A chunk of it that came although chunks before it are missing, after the server was started again.
+    #[serde(skip)]
+    insisted: Option<u64>,
 }
 
 /// What is to be done with a chunk.
@@ -83,9 +89,12 @@ impl Difference {
 }
 
 /// All actors that ever joined.
-#[derive(Default)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Actors {
-    actors: HashMap<u32, Actor>,
+    actors: BTreeMap<u32, Actor>,
+    /// This is what was read from disk: what was stored last may have been lost with the machine's power.
+    #[serde(skip)]
+    restored: bool,
 }
 
 impl Actors {
@@ -133,6 +142,7 @@ impl Actors {
                 streams: Vec::new(),
                 past: VecDeque::new(),
                 earlier_incarnations: 0,
+                insisted: None,
             },
         );
         Ok(())
@@ -206,6 +216,52 @@ impl Actors {
         Verdict::Next
     }
 
+    /// Checks that a chunk can be counted: it is of a life that counts, and has its streams.
+    ///
+    /// # Errors
+    /// It cannot; the reason, for a person.
+    pub(crate) fn check_known(&self, header: &ChunkHeader) -> Result<(), String> {
+        let streams = self.living(header.actor, header.incarnation)?.streams.len();
+        if header.sequence == 0 || streams == 0 || streams == header.streams as usize {
+            return Ok(());
+        }
+        Err(format!("{} streams after {streams}", header.streams))
+    }
+
+    /// What follows was read from disk.
+    pub(crate) const fn note_restored(&mut self) {
+        self.restored = true;
+    }
+
+    /// Whether a chunk that was judged out of order is to be stored all the same: those before it were stored by an earlier life of
+    /// this server, which lost them with the machine's power, so that they will never come again.
+    ///
+    /// An actor that sends the same one again, although it was told what is expected, has nothing older.
+    pub(crate) fn insists(&mut self, header: &ChunkHeader) -> bool {
+        let restored = self.restored;
+        let Some(actor) = self.actors.get_mut(&header.actor).filter(|_| restored) else {
+            return false;
+        };
+        let streams = actor.streams.len();
+        let fits = streams == 0 || streams == header.streams as usize;
+        fits && actor.insisted.replace(header.sequence) == Some(header.sequence)
+    }
+
+    /// Transitions from `first_lost` on are gone: streams that end among them hang together with nothing any more.
+    pub(crate) fn cut_streams(&mut self, first_lost: u64) {
+        for stream in self.actors.values_mut().flat_map(|it| &mut it.streams) {
+            stream.link = stream.link.without(first_lost);
+        }
+    }
+
+    /// Actors of which a chunk has come.
+    pub(crate) fn delivered(&self) -> impl Iterator<Item = u32> {
+        let delivered = |actor: &Actor| actor.expected > 0 || actor.earlier_incarnations > 0;
+        let all = self.actors.iter();
+        all.filter(move |(_, actor)| delivered(actor))
+            .map(|(&number, _)| number)
+    }
+
     /// Whether a chunk is stored.
     ///
     /// # Errors
@@ -225,7 +281,7 @@ impl Actors {
             .get_mut(&header.actor)
             .expect("a chunk of an actor that has not joined is never judged Next");
         let difference = Difference::between(header.first_transition, actor.current.produced);
-        if header.sequence == 0 {
+        if header.sequence == 0 || actor.streams.is_empty() {
             let start = || Stream {
                 link: Link::EpisodeStart,
                 episode_return: Some(0.0),
@@ -243,15 +299,39 @@ impl Actors {
         (&mut actor.streams, difference)
     }
 
-    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second goodbye,
-    /// and that of a life that never joined, reveal nothing.
-    pub(crate) fn goodbye(&mut self, goodbye: &Goodbye) -> Difference {
-        let Some(actor) = self.actors.get_mut(&goodbye.actor) else {
-            return Difference::default();
-        };
-        let mut lives = std::iter::once(&mut actor.current).chain(&mut actor.past);
+    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second goodbye
+    /// reveals nothing.
+    ///
+    /// # Errors
+    /// A life that never joined; the reason, for a person.
+    pub(crate) fn goodbye(&mut self, goodbye: &Goodbye) -> Result<Difference, String> {
+        let actor = self.actors.get_mut(&goodbye.actor);
+        let mut lives = actor
+            .into_iter()
+            .flat_map(|it| std::iter::once(&mut it.current).chain(&mut it.past));
         let life = lives.find(|life| life.incarnation == goodbye.incarnation);
-        life.map_or_else(Difference::default, |life| life.goodbye(goodbye.produced))
+        life.map(|life| life.goodbye(goodbye.produced))
+            .ok_or_else(|| format!("no such life of actor {} has joined", goodbye.actor))
+    }
+
+    /// Actors that never sent a chunk and are not connected, if there is no room for one more.
+    pub(crate) fn absent(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
+        if self.actors.len() < ACTORS_MAX {
+            return Vec::new();
+        }
+        let is_absent = |(number, actor): &(&u32, &Actor)| {
+            let has_sent = actor.expected > 0 || !actor.past.is_empty();
+            !has_sent && !is_connected(**number, actor.current.incarnation)
+        };
+        let absent = self.actors.iter().filter(is_absent);
+        absent.map(|(&number, _)| number).collect()
+    }
+
+    /// Forgets these actors.
+    pub(crate) fn forget(&mut self, actors: &[u32]) {
+        for actor in actors {
+            self.actors.remove(actor);
+        }
     }
 }
 

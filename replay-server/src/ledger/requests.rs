@@ -4,6 +4,7 @@
 use std::{cmp::Ordering, collections::VecDeque};
 
 use driml_protocol::RequestId;
+use serde::{Deserialize, Serialize};
 
 /// Clients that are remembered; a learner has one for each batch on its way, and nothing is taken back from one forgotten.
 const CLIENTS_MAX: usize = 1024;
@@ -17,12 +18,16 @@ pub(crate) enum Dedup {
     Superseded,
 }
 
-/// The last request of each client, of the one heard of longest ago first.
-#[derive(Default)]
+/// The last request of each client, of the one whose request is oldest first.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Requests {
     last: VecDeque<Request>,
+    /// How often this has changed, in this process.
+    #[serde(skip)]
+    changes: u64,
 }
 
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Request {
     id: RequestId,
     /// The k of each row that it was given; none before.
@@ -36,6 +41,10 @@ impl Requests {
             .last
             .iter()
             .position(|it| it.id.client_id == id.client_id);
+        if known.is_some_and(|at| self.last[at].id == id && self.last[at].given.is_none()) {
+            return Dedup::Fresh(Vec::new());
+        }
+        self.changes += 1;
         let mut request = known
             .and_then(|at| self.last.remove(at))
             .unwrap_or(Request { id, given: None });
@@ -63,7 +72,13 @@ impl Requests {
     pub(crate) fn complete(&mut self, client_id: u64, ks: Vec<u32>) {
         if let Some(request) = self.last.iter_mut().find(|it| it.id.client_id == client_id) {
             request.given = Some(ks);
+            self.changes += 1;
         }
+    }
+
+    /// How often this has changed, in this process.
+    pub(crate) const fn changes(&self) -> u64 {
+        self.changes
     }
 }
 

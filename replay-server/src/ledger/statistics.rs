@@ -4,9 +4,10 @@
 use std::collections::VecDeque;
 
 use driml_protocol::{RETURNS_OF, Returns};
+use serde::{Deserialize, Serialize};
 
 /// What the status reports beside the ring's and the limiter's own counts.
-#[derive(Default)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Statistics {
     pub(crate) transitions_lost: u64,
     pub(crate) transitions_duplicated: u64,
@@ -15,6 +16,8 @@ pub(crate) struct Statistics {
     /// Rows served to a learner that died before it saved what it learned from them.
     pub(crate) rows_unlearned: u64,
     pub(crate) messages_refused: u64,
+    /// Messages by which an actor's own count differed.
+    pub(crate) differences: u64,
     pub(crate) episodes: u64,
     returns_known: u64,
     returns: VecDeque<f64>,
@@ -34,6 +37,13 @@ impl Statistics {
             action_histogram: vec![0; num_actions as usize],
             ..Self::default()
         }
+    }
+
+    /// Without what is counted of messages that change nothing, which no log knows of.
+    pub(crate) fn of_changes(mut self) -> Self {
+        (self.chunks_retried, self.messages_refused, self.actors) = (0, 0, 0);
+        (self.learner_waited_s, self.actors_waited_s) = (0.0, 0.0);
+        self
     }
 
     /// Counts rows served with these `ks`.

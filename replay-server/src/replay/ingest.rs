@@ -3,7 +3,7 @@
 
 use std::borrow::Cow;
 
-use driml_protocol::{ActorJoin, Chunk, Claim, Goodbye, InsertReply};
+use driml_protocol::{ActorJoin, Chunk, ChunkHeader, Claim, Goodbye, InsertReply};
 
 use super::Replay;
 use crate::{
@@ -18,11 +18,15 @@ use crate::{
     },
 };
 
+/// Transitions that one life of an actor can have produced, by its own account: three years at three million a second.
+const TRANSITIONS_MAX: u64 = 1 << 48;
+
 impl Replay {
     /// Compresses chunks for this replay; it can do so while the replay is in use elsewhere.
     pub fn packer(&self) -> Packer {
         Packer {
             compression: self.config.compression,
+            seal_for: None,
         }
     }
 
@@ -63,7 +67,6 @@ impl Replay {
         };
         match verdict {
             Verdict::Refused(why) => {
-                tracing::warn!("refused a chunk of actor {}: {why}", chunk.header.actor);
                 self.statistics.messages_refused += 1;
                 Some(InsertReply::Refused { why })
             }
@@ -74,6 +77,7 @@ impl Replay {
             _ if self.limiter.all_in() => Some(InsertReply::Finished {
                 inserted_total: self.inserted_total(),
             }),
+            Verdict::OutOfOrder { .. } if self.actors.insists(&chunk.header) => None,
             Verdict::OutOfOrder { expected } => Some(InsertReply::OutOfOrder { expected }),
             Verdict::Next => None,
         }
@@ -82,19 +86,28 @@ impl Replay {
     /// Stores a chunk that [`Replay::settle`] has nothing to say of, if the limiter lets it pass or its actor leaves; else the
     /// answer is to wait.
     pub fn admit(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
-        let leaving = packed.chunk.header.leaving;
-        if self.limiter.may_insert() || self.starving || leaving {
+        if self.may_admit(&packed.chunk.header) {
             self.store(packed);
             self.stored()
         } else {
-            InsertReply::Wait {
-                inserted_total: self.inserted_total(),
-                kept: false,
-            }
+            self.wait()
         }
     }
 
-    fn stored(&self) -> InsertReply {
+    /// Whether the limiter lets a chunk pass now, or its actor leaves.
+    pub(crate) fn may_admit(&self, header: &ChunkHeader) -> bool {
+        self.limiter.may_insert() || self.starving || header.leaving
+    }
+
+    /// The answer to a chunk that is not stored yet.
+    pub(crate) const fn wait(&self) -> InsertReply {
+        InsertReply::Wait {
+            inserted_total: self.inserted_total(),
+            kept: false,
+        }
+    }
+
+    pub(crate) fn stored(&self) -> InsertReply {
         InsertReply::Stored {
             inserted_total: self.inserted_total(),
             actors: self.statistics.actors.saturating_mul(self.config.shards),
@@ -117,7 +130,7 @@ impl Replay {
         }
     }
 
-    fn unfit(&self, chunk: &Chunk) -> Option<String> {
+    pub(crate) fn unfit(&self, chunk: &Chunk) -> Option<String> {
         let header = &chunk.header;
         let frame_bytes = self.spec.frame_bytes();
         if header.frame_bytes as usize != frame_bytes {
@@ -139,8 +152,8 @@ impl Replay {
                 "a chunk that may take {bytes} bytes; compressed_bytes_max is {max}"
             ));
         }
-        if header.sequence == u64::MAX || header.first_transition.checked_add(transitions).is_none()
-        {
+        let count = header.first_transition.checked_add(transitions);
+        if header.sequence == u64::MAX || count.is_none_or(|count| count > TRANSITIONS_MAX) {
             return Some(format!(
                 "counts that no run reaches: chunk {}, transition {}",
                 header.sequence, header.first_transition
@@ -166,7 +179,8 @@ impl Replay {
         ))
     }
 
-    fn store(&mut self, packed: &PackedChunk<'_>) {
+    /// Stores a chunk that is the next of its actor.
+    pub(crate) fn store(&mut self, packed: &PackedChunk<'_>) {
         let chunk = &*packed.chunk;
         let header = chunk.header;
         let (streams, difference) = self.actors.accept(&header);
@@ -177,9 +191,11 @@ impl Replay {
                 let (action, reward) = (chunk.actions()[row], chunk.reward(row));
                 Step::new(action, reward, chunk.end(row), header.weights_version)
             };
-            stream.link = self
-                .ring
-                .push_run(frames, rows.clone().map(step), stream.link);
+            let (link, first) = (stream.link, self.ring.inserted());
+            stream.link = self.ring.push_run(frames, rows.clone().map(step), link);
+            if let Some(priorities) = &mut self.priorities {
+                priorities.stored(&self.ring, &self.episodes, first, link);
+            }
             for step in rows.map(step) {
                 self.statistics.action_histogram[usize::from(step.action)] += 1;
                 stream.episode_return = stream
@@ -197,7 +213,12 @@ impl Replay {
     }
 
     fn count(&mut self, actor: u32, Difference { lost, duplicated }: Difference) {
-        if lost > 0 || duplicated > 0 {
+        if lost == 0 && duplicated == 0 {
+            return;
+        }
+        self.statistics.differences += 1;
+        // Whoever sends nonsense could make the line come at any rate.
+        if self.statistics.differences.is_power_of_two() && !self.quiet {
             tracing::warn!(
                 "actor {actor}: {lost} transitions lost, {duplicated} stored twice, by its own count"
             );
@@ -211,9 +232,36 @@ impl Replay {
         *transitions_duplicated = transitions_duplicated.saturating_add(duplicated);
     }
 
-    /// Takes an actor's last word; what it produced and is not stored counts as lost, the reverse as stored twice.
-    pub fn goodbye(&mut self, goodbye: &Goodbye) {
-        let difference = self.actors.goodbye(goodbye);
-        self.count(goodbye.actor, difference);
+    /// Takes an actor's last word; what it produced and is not stored counts as lost, the reverse as stored twice. One of a life
+    /// that never joined, or with a count that no run reaches, is refused: gives the reason.
+    pub fn goodbye(&mut self, goodbye: &Goodbye) -> Option<String> {
+        let said = match goodbye.produced {
+            0..=TRANSITIONS_MAX => self.actors.goodbye(goodbye),
+            produced => Err(format!(
+                "actor {} says it produced {produced} transitions, a count that no run reaches",
+                goodbye.actor
+            )),
+        };
+        match said {
+            Ok(difference) => {
+                self.count(goodbye.actor, difference);
+                None
+            }
+            Err(why) => {
+                self.note_refused_message();
+                Some(why)
+            }
+        }
+    }
+
+    /// Who is to be forgotten so that an actor has room, if a run's number of them is reached: those that never sent a chunk and of
+    /// which `is_connected` says that their life is gone, as somebody who joins under one number after the other leaves behind.
+    pub(crate) fn absent_actors(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
+        self.actors.absent(is_connected)
+    }
+
+    /// Forgets these actors.
+    pub(crate) fn forget_actors(&mut self, actors: &[u32]) {
+        self.actors.forget(actors);
     }
 }

@@ -1,16 +1,19 @@
 //! The replay server's core: chunks in, batches out, and its account of itself.
 //! It does no I/O, keeps no time and starts no thread: the service around it does.
 
+pub(crate) mod events;
 mod ingest;
+mod priorities;
 mod sample;
+pub(crate) mod snapshot;
 mod status;
 
-use driml_protocol::{BatchReply, RunSpec, Tally, Waiting};
+use driml_protocol::{BatchReply, Origin, RunSpec, Sampling, Tally, Waiting};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    config::{Config, ConfigError, SHARDS_MAX},
+    config::{Config, ConfigError, SHARDS_MAX, reach},
     ledger::{actors::Actors, requests::Requests, statistics::Statistics},
     rate_limiter::RateLimiter,
     sampling::{
@@ -18,6 +21,7 @@ use crate::{
         assemble::Assembler,
         episodes::{Episodes, Window},
         horizon::Affinity,
+        prioritised::Priorities,
     },
     storage::{frame_store::Frames, ring::Ring},
 };
@@ -53,7 +57,7 @@ impl From<Unready> for BatchReply {
 pub struct Replay {
     spec: RunSpec,
     config: Config,
-    batch_rows: u32,
+    batch_size: u32,
     ring: Ring,
     actors: Actors,
     requests: Requests,
@@ -62,6 +66,10 @@ pub struct Replay {
     limiter: RateLimiter,
     episodes: Episodes,
     anchors: Anchors,
+    /// Where rows are drawn by priority.
+    priorities: Option<Priorities>,
+    /// Who draws, as batches say it that are drawn by priority.
+    origin: Origin,
     window: Window,
     assembler: Assembler,
     affinity: Affinity,
@@ -69,16 +77,18 @@ pub struct Replay {
     statistics: Statistics,
     /// The learner found no anchor: one chunk may pass the limiter, or both sides would wait for each other.
     starving: bool,
+    /// What happens has happened before, and was said then.
+    quiet: bool,
 }
 
 impl Replay {
-    /// An empty replay for batches of `batch_rows` rows; its draws follow from `spec.seed` and the order of calls. Of several
+    /// An empty replay for batches of `batch_size` rows; its draws follow from `spec.seed` and the order of calls. Of several
     /// shards it is the first: [`Replay::shard`].
     ///
     /// # Errors
     /// Settings that cannot work, or more memory than the system grants.
-    pub fn new(spec: &RunSpec, config: &Config, batch_rows: u32) -> Result<Self, ConfigError> {
-        Self::shard(spec, config, batch_rows, 0)
+    pub fn new(spec: &RunSpec, config: &Config, batch_size: u32) -> Result<Self, ConfigError> {
+        Self::shard(spec, config, batch_size, 0)
     }
 
     /// Shard `shard` of `config.shards`, which holds its share of the capacity and draws its own numbers.
@@ -88,10 +98,10 @@ impl Replay {
     pub fn shard(
         spec: &RunSpec,
         config: &Config,
-        batch_rows: u32,
+        batch_size: u32,
         shard: u32,
     ) -> Result<Self, ConfigError> {
-        config.validate(spec, batch_rows)?;
+        config.validate(spec, batch_size)?;
         if shard >= config.shards {
             return Err(ConfigError::Key {
                 key: "replay.shards",
@@ -105,7 +115,7 @@ impl Replay {
         let bytes_max = config.compressed_bytes_max.map(|bytes| bytes / shards);
         let frames = Frames::new(config.compression, capacity, frame_bytes, bytes_max);
         let ring = frames.and_then(|frames| Ring::new(capacity, frames));
-        let ring = ring.map_err(|bytes| {
+        let refused = |bytes| {
             let why =
                 format!("the system does not grant the {bytes} bytes that this takes; hold fewer");
             ConfigError::Key {
@@ -113,13 +123,21 @@ impl Replay {
                 value: config.capacity_transitions.to_string(),
                 why,
             }
-        })?;
+        };
+        let ring = ring.map_err(refused)?;
+        let priorities = match config.sampling {
+            Sampling::Uniform => None,
+            Sampling::Prioritised { alpha, .. } => {
+                let made = Priorities::new(alpha, capacity, reach(spec));
+                Some(made.map_err(refused)?)
+            }
+        };
         let mut rng = ChaCha8Rng::seed_from_u64(spec.seed);
         rng.set_stream(RNG_STREAM + u64::from(shard));
         Ok(Self {
             spec: spec.clone(),
             config: config.clone(),
-            batch_rows,
+            batch_size,
             ring,
             actors: Actors::default(),
             requests: Requests::default(),
@@ -132,12 +150,18 @@ impl Replay {
             ),
             episodes: Episodes::new(spec),
             anchors: Anchors::default(),
+            priorities,
+            origin: Origin {
+                shard,
+                incarnation: 0,
+            },
             window: Window::default(),
-            assembler: Assembler::new(spec, config.study),
+            assembler: Assembler::new(spec, config.reproduced_bug),
             affinity: Affinity::uniform(spec.num_actions),
             rng,
             statistics: Statistics::new(spec.horizon.k_max(), spec.num_actions),
             starving: false,
+            quiet: false,
         })
     }
 
@@ -147,7 +171,7 @@ impl Replay {
     /// next row is sampled, as at the start of the run; so the run steps its worlds that many times more than it counts.
     #[must_use]
     pub fn resumed_at(mut self, updates: u64, shard: u32) -> Self {
-        let rows = updates.saturating_mul(u64::from(self.batch_rows));
+        let rows = updates.saturating_mul(u64::from(self.batch_size));
         let inserted = (rows as f64 / self.config.replay_ratio) as u64;
         let (shards, shard) = (u64::from(self.config.shards), u64::from(shard));
         let share = |total: u64| total / shards + u64::from(shard < total % shards);

@@ -9,8 +9,15 @@ use super::{Replay, Unready};
 use crate::{
     config,
     ledger::requests::{Dedup, Requests},
-    sampling::packed_batch::{PackedBatch, PackedStates},
+    sampling::{
+        assemble::RowStates,
+        packed_batch::{PackedBatch, PackedStates},
+    },
 };
+
+/// How far the version of an affinity matrix may be ahead of the rows served, of which a replay that was started anew may not
+/// know all.
+const VERSION_AHEAD_MAX: u64 = 1 << 32;
 
 impl Replay {
     /// A learner takes over that has learned from `rows_sampled` rows of this replay. What was served beyond them, to one that
@@ -41,7 +48,7 @@ impl Replay {
         self.draw(rows).map(PackedBatch::unpack)
     }
 
-    /// A batch of `rows` rows, anchors uniform over the valid ones and drawn with replacement, or why there is none. With
+    /// A batch of `rows` rows, anchors drawn with replacement by the rule of `replay.sampling`, or why there is none. With
     /// compression its frames are left to be unpacked, which needs the replay no more.
     ///
     /// # Errors
@@ -59,7 +66,8 @@ impl Replay {
         rows: u32,
         memory: impl FnOnce(usize) -> Buffer,
     ) -> Result<PackedBatch, Unready> {
-        let rows_max = config::rows_max(&self.spec).min(self.limiter.rows_max());
+        let rows_max = config::rows_max(&self.spec, &self.config.sampling);
+        let rows_max = rows_max.min(self.limiter.rows_max());
         if rows == 0 || rows > rows_max {
             self.statistics.messages_refused += 1;
             let why = format!(
@@ -74,27 +82,18 @@ impl Replay {
             return Err(Unready::Wait(self.limiter.waiting(rows)));
         }
         let mut header = self.batch_header(rows);
-        let mut batch = Batch::in_memory(header, memory(header.payload_bytes()));
-        let pixel_bytes = self.spec.frame_channels as usize;
-        let mut packed = PackedStates::new(self.spec.frame_bytes(), pixel_bytes);
+        let mut drawn = Vec::with_capacity(rows as usize);
         let mut ks = Vec::with_capacity(rows as usize);
         let mut age_total = 0;
-        let mut rows_mut = batch.rows_mut();
-        for row in 0..rows as usize {
-            if !self
-                .anchors
-                .draw(&self.ring, &self.episodes, &mut self.rng, &mut self.window)
-            {
+        for _ in 0..rows {
+            if !self.draw_anchor() {
                 return Err(self.no_anchor());
             }
-            let states = self.assembler.write_row(
-                &self.affinity,
-                &self.window,
-                &mut self.rng,
-                (&mut rows_mut, row),
-            );
-            packed.write_or_take_row(&self.ring, &self.episodes, states, &mut rows_mut, row);
-            ks.push(states.k());
+            let row = self
+                .assembler
+                .row(&self.affinity, &self.window, &mut self.rng);
+            ks.push(row.1.k());
+            drawn.push(row);
             age_total += self.ring.inserted() - 1 - self.window.index(0);
             let version = self.window.step(0).weights_version;
             let (newest, oldest) = header.weights_versions;
@@ -105,9 +104,32 @@ impl Replay {
         self.statistics.served(&ks);
         self.limiter.sampled(rows);
         header.tally = self.limiter.tally();
-        batch.header = header;
+        let (scalars, states): (Vec<_>, Vec<_>) = drawn.into_iter().unzip();
+        let mut batch = Batch::of_rows(header, &scalars, memory);
+        if let Some(priorities) = &self.priorities {
+            // All by the masses that are there now: to find that one was no anchor any more makes the others more likely.
+            let chance = |index| (priorities.chance(index) as f32).clamp(f32::MIN_POSITIVE, 1.0);
+            let drawn = states.iter().map(RowStates::anchor);
+            batch.set_draws(drawn.map(|index| (index, chance(index))));
+        }
+        let pixel_bytes = self.spec.frame_channels as usize;
+        let mut packed = PackedStates::new(self.spec.frame_bytes(), pixel_bytes);
+        let mut places = batch.states_mut();
+        for (row, states) in states.into_iter().enumerate() {
+            packed.write_or_take_row(&self.ring, &self.episodes, states, &mut places, row);
+        }
         self.starving = false;
         Ok(PackedBatch { batch, packed, ks })
+    }
+
+    /// Leaves the window of an anchor in `self.window`; false if there is none.
+    fn draw_anchor(&mut self) -> bool {
+        let (ring, episodes) = (&self.ring, &self.episodes);
+        let (rng, window) = (&mut self.rng, &mut self.window);
+        match &mut self.priorities {
+            None => self.anchors.draw(ring, episodes, rng, window),
+            Some(priorities) => priorities.draw(ring, episodes, rng, window),
+        }
     }
 
     /// [`Replay::draw_in`] for request `id`. What an earlier attempt at this request was given did not arrive: from now on it
@@ -121,19 +143,27 @@ impl Replay {
         rows: u32,
         memory: impl FnOnce(usize) -> Buffer,
     ) -> Result<PackedBatch, Unready> {
-        match self.requests.begin(id) {
-            Dedup::Superseded => return Err(Unready::Wait(self.limiter.waiting(rows))),
-            Dedup::Fresh(lost) => {
-                if !lost.is_empty() {
-                    tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
-                    self.limiter.refund(lost.len() as u64);
-                    self.statistics.refund(&lost);
-                }
-            }
+        if !self.begin_request(id) {
+            return Err(Unready::Wait(self.limiter.waiting(rows)));
         }
         let draft = self.draw_in(rows, memory)?;
         self.requests.complete(id.client_id, draft.ks.clone());
         Ok(draft)
+    }
+
+    /// Takes note of a request, and takes back what an earlier attempt at it was given; `false` if nobody waits for it any more.
+    pub(crate) fn begin_request(&mut self, id: RequestId) -> bool {
+        let Dedup::Fresh(lost) = self.requests.begin(id) else {
+            return false;
+        };
+        if !lost.is_empty() {
+            if !self.quiet {
+                tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
+            }
+            self.limiter.refund(lost.len() as u64);
+            self.statistics.refund(&lost);
+        }
+        true
     }
 
     /// What a batch of `rows` rows says of itself before any row is written.
@@ -141,6 +171,7 @@ impl Replay {
         BatchHeader {
             tally: self.limiter.tally(),
             held: self.ring.inserted() - self.ring.oldest(),
+            origin: self.priorities.is_some().then_some(self.origin),
             ..BatchHeader::of(&self.spec, rows)
         }
     }
@@ -162,9 +193,16 @@ impl Replay {
     /// # Errors
     /// A matrix of another size, or with an entry that is no probability; it counts as a refused message.
     pub fn set_affinity(&mut self, update: &AffinityUpdate) -> Result<(), CodecError> {
-        self.affinity
-            .update(update)
-            .inspect_err(|_| self.note_refused_message())
+        // A version is a count of updates, each of at least one row.
+        let rows = self.limiter.rows_sampled_total();
+        let set = match update.version.saturating_sub(rows) {
+            0..=VERSION_AHEAD_MAX => self.affinity.update(update),
+            _ => Err(CodecError::Header(format!(
+                "version {} of the affinity, in a run that has served {rows} rows",
+                update.version
+            ))),
+        };
+        set.inspect_err(|_| self.note_refused_message())
     }
 
     /// Takes what the replay's other shards have counted.

@@ -31,6 +31,11 @@ impl Replay {
         self.limiter.inserted_total()
     }
 
+    /// Whether all transitions of the run are in.
+    pub fn all_in(&self) -> bool {
+        self.limiter.all_in()
+    }
+
     /// What was counted here since the start.
     pub const fn tally(&self) -> Tally {
         self.limiter.tally()
@@ -38,7 +43,7 @@ impl Replay {
 
     /// Who waits for whom now, for batches of the size that the replay was made for.
     pub fn waiting(&self) -> Waiting {
-        match self.limiter.waiting(self.batch_rows) {
+        match self.limiter.waiting(self.batch_size) {
             Waiting::ActorsWaitForLearner | Waiting::Nobody if self.starving => {
                 Waiting::LearnerWaitsForActors
             }
@@ -58,6 +63,8 @@ impl Replay {
             chunks_retried: statistics.chunks_retried,
             batches_retried: statistics.batches_retried,
             messages_refused: statistics.messages_refused,
+            // As are these, below.
+            connections_refused: 0,
             rows_sampled: self.limiter.tally().rows_sampled,
             rows_unlearned: statistics.rows_unlearned,
             warmup_transitions: self.config.warmup_transitions,
@@ -85,6 +92,9 @@ impl Replay {
     /// Checks the ring and the counts; panics at the first that is wrong. Slow: for tests.
     pub fn check_valid(&self) {
         self.ring.check_valid();
+        if let Some(priorities) = &self.priorities {
+            priorities.check_valid(&self.ring, &self.episodes);
+        }
         let stored: u64 = self.statistics.action_histogram.iter().sum();
         assert_eq!(
             stored,

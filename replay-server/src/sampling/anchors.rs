@@ -15,6 +15,8 @@ pub(crate) struct Anchors {
     valid: Vec<u64>,
     /// Transitions the ring had stored when `valid` was listed; 0 before the first.
     listed_at: u64,
+    /// The oldest one that it held then.
+    listed_from: u64,
 }
 
 impl Anchors {
@@ -28,21 +30,17 @@ impl Anchors {
         rng: &mut impl Rng,
         window: &mut Window,
     ) -> bool {
-        if ring.inserted() == 0 {
+        if ring.oldest() == ring.inserted() {
             return false;
         }
-        if self.listed_at != ring.inserted() {
+        if !self.are_listed(ring) {
             for _ in 0..TRIES_MAX {
                 let t = rng.random_range(ring.oldest()..ring.inserted());
                 if episodes.walk(ring, t, window) {
                     return true;
                 }
             }
-            self.valid.clear();
-            let held = ring.oldest()..ring.inserted();
-            self.valid
-                .extend(held.filter(|&t| episodes.walk(ring, t, window)));
-            self.listed_at = ring.inserted();
+            self.list(ring, episodes, window);
         }
         if self.valid.is_empty() {
             return false;
@@ -51,5 +49,19 @@ impl Anchors {
         let valid = episodes.walk(ring, t, window);
         assert!(valid, "{t} was valid and the ring has not changed");
         valid
+    }
+
+    /// Whether the list is that of the ring as it is.
+    pub(crate) const fn are_listed(&self, ring: &Ring) -> bool {
+        self.listed_at == ring.inserted() && self.listed_from == ring.oldest()
+    }
+
+    /// Lists the valid anchors.
+    pub(crate) fn list(&mut self, ring: &Ring, episodes: &Episodes, window: &mut Window) {
+        self.valid.clear();
+        let held = ring.oldest()..ring.inserted();
+        self.valid
+            .extend(held.filter(|&t| episodes.walk(ring, t, window)));
+        (self.listed_at, self.listed_from) = (ring.inserted(), ring.oldest());
     }
 }

@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use driml_protocol::{Batch, BatchRowsMut};
+use driml_protocol::{Batch, BatchStatesMut};
 use lz4_flex::block::{decompress_into, decompress_into_with_dict};
 
 use super::{
@@ -13,7 +13,7 @@ use super::{
 use crate::storage::{
     frame_store::{
         Frames,
-        compressed::{CompressedFrames, Part},
+        compressed::{BlockPart, CompressedFrames},
     },
     ring::Ring,
 };
@@ -83,11 +83,11 @@ impl PackedStates {
         ring: &Ring,
         episodes: &Episodes,
         states: RowStates,
-        rows: &mut BatchRowsMut<'_>,
+        places: &mut BatchStatesMut<'_>,
         row: usize,
     ) {
         match ring.frames() {
-            Frames::Plain(frames) => states.write(rows, row, |index, out| {
+            Frames::Plain(frames) => states.write(places, row, |index, out| {
                 let stack = episodes.stack(ring, index);
                 stack.write(self.pixel_bytes, out, |index| frames.frame(index));
             }),
@@ -134,7 +134,7 @@ impl PackedStates {
         taken.any(|part| part.transitions.contains(&index))
     }
 
-    fn take(&mut self, frames: &CompressedFrames, part: &Part, key: Option<u64>) {
+    fn take(&mut self, frames: &CompressedFrames, part: &BlockPart, key: Option<u64>) {
         let start = self.bytes.len();
         frames.copy(part, &mut self.bytes);
         self.parts.push(PackedPart {
@@ -146,13 +146,13 @@ impl PackedStates {
 
     /// Unpacks every row's parts and writes its states.
     fn write(&self, batch: &mut Batch) {
-        let mut rows_mut = batch.rows_mut();
+        let mut places = batch.states_mut();
         let mut unpacked = Vec::new();
         for (number, row) in self.rows.iter().enumerate() {
             let parts = &self.parts[row.parts.clone()];
             self.unpack(parts, &mut unpacked);
             let mut stacks = self.stacks[row.stacks.clone()].iter();
-            row.states.write(&mut rows_mut, number, |_, out| {
+            row.states.write(&mut places, number, |_, out| {
                 let stack = stacks.next().expect("every state has its stack");
                 stack.write(self.pixel_bytes, out, |index| {
                     self.frame(parts, &unpacked, index)

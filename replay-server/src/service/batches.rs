@@ -3,16 +3,13 @@
 
 use std::time::{Duration, Instant};
 
-use driml_protocol::{BatchReply, BatchRequest, Buffer, Incoming, Responder, fault};
+use driml_protocol::{Alive, BatchReply, BatchRequest, Buffer, Incoming, Responder, fault};
 
 use super::{
     parked::ParkedRequest,
     server::{Service, State},
 };
-use crate::{
-    replay::{Replay, Unready},
-    sampling::packed_batch::PackedBatch,
-};
+use crate::{durable::DurableReplay, replay::Unready, sampling::packed_batch::PackedBatch};
 
 /// How long a request waits before it is told to come back: far below every learner's time-out.
 const HOLD_MAX: Duration = Duration::from_secs(1);
@@ -33,10 +30,15 @@ impl Service {
             return responder.reply(&BatchReply::Refused { why });
         };
         let mut state = self.state();
-        let is_allowed = state.members.check_learner(request.learner);
+        let is_allowed = state.check_learner(request.learner);
+        let is_allowed = is_allowed.and_then(|()| self.check_rows(request.rows));
         let heard = is_allowed.and_then(|()| self.hear_of_others(&mut state.replay, &request));
         if let Err(why) = heard {
             state.replay.note_refused_message();
+            state.say(
+                "batch",
+                &format!("a request for a batch was refused: {why}"),
+            );
             drop(state);
             return responder.reply(&BatchReply::Refused { why });
         }
@@ -44,6 +46,8 @@ impl Service {
             Some(_) => SHARD_HOLD_MAX,
             None => HOLD_MAX,
         };
+        let learner = Alive::learner(request.learner);
+        state.accounts.heard(learner, None, Instant::now());
         state.requests.park(ParkedRequest {
             request,
             question: responder,
@@ -54,8 +58,22 @@ impl Service {
         self.changed.notify_all();
     }
 
+    /// A batch is as long as the run's are, or a part of one.
+    fn check_rows(&self, rows: u32) -> Result<(), String> {
+        match self.limits.batch_rows {
+            most if (1..=most).contains(&rows) => Ok(()),
+            most => Err(format!(
+                "a batch of {rows} rows; those of this run have {most} (learner.batch_size)"
+            )),
+        }
+    }
+
     /// Takes what the learner says of the other shards.
-    fn hear_of_others(&self, replay: &mut Replay, request: &BatchRequest) -> Result<(), String> {
+    fn hear_of_others(
+        &self,
+        replay: &mut DurableReplay,
+        request: &BatchRequest,
+    ) -> Result<(), String> {
         let (_, shards) = self.shard;
         match request.other_shards {
             None if shards > 1 => Err(format!(
@@ -96,7 +114,7 @@ fn give_batch(responder: Responder<BatchReply>, drawn: Result<PackedBatch, Unrea
     match drawn {
         Ok(draft) => {
             let (header, payload) = draft.unpack().into_payload();
-            responder.reply_with(&BatchReply::Batch(header), payload.freeze());
+            responder.reply_with(&BatchReply::of(header), payload.freeze());
         }
         Err(unready) => responder.reply(&unready.into()),
     }

@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{Chunk, ChunkHeader, Claim, Incoming, InsertReply, fault};
+use driml_protocol::{Alive, Chunk, ChunkHeader, Claim, CodecError, Incoming, InsertReply, fault};
 
 use super::{
     parked::ParkedChunk,
@@ -17,15 +17,19 @@ use crate::storage::frame_store::PackedChunk;
 /// How long the thread sleeps when nothing is parked; it is woken when something is.
 const IDLE: Duration = Duration::from_secs(60);
 
+/// How far the version that acted may be ahead of the newest that is here.
+const VERSION_AHEAD_MAX: u64 = 1 << 32;
+
 /// Answers that are to be sent once the lock is free.
 type Answers = Vec<(Question, InsertReply)>;
 
 impl Service {
     pub(super) fn insert(&self, incoming: Incoming<ChunkHeader>) {
         let arrived = Instant::now();
-        let chunk = incoming
-            .receive(&self.pool)
-            .and_then(|(header, payload)| Chunk::from_payload(header, payload, self.num_actions));
+        let chunk = incoming.receive(&self.pool).and_then(|(header, payload)| {
+            self.check_version(&header)?;
+            Chunk::from_payload(header, payload, self.num_actions)
+        });
         let responder = incoming.into_responder();
         let chunk = match chunk {
             Ok(chunk) => chunk,
@@ -36,9 +40,25 @@ impl Service {
         };
         let packed = self.packer.pack(Cow::Owned(chunk));
         let question = Question { responder, arrived };
-        let answers = self.state().take_chunk(packed, question);
-        self.changed.notify_all();
+        let mut state = self.state();
+        let answers = state.take_chunk(packed, question);
+        let is_awaited = state.is_awaited(Instant::now());
+        drop(state);
+        if is_awaited {
+            self.changed.notify_all();
+        }
         self.answer_all(answers);
+    }
+
+    /// Weights that acted may be newer than those that are here, where this server was started anew, but not by any number.
+    fn check_version(&self, header: &ChunkHeader) -> Result<(), CodecError> {
+        let (acted, newest) = (header.weights_version, self.weights().version());
+        match acted.saturating_sub(newest) {
+            0..=VERSION_AHEAD_MAX => Ok(()),
+            _ => Err(CodecError::Header(format!(
+                "weights {acted} acted, and the newest are {newest}"
+            ))),
+        }
     }
 
     pub(super) fn claim(&self, incoming: Incoming<Claim>) {
@@ -92,11 +112,15 @@ impl State {
     fn take_chunk(&mut self, packed: PackedChunk<'static>, question: Question) -> Answers {
         let header = packed.chunk.header;
         let Question { arrived, .. } = question;
+        let actor = Alive::actor(header.actor, header.incarnation);
+        self.accounts
+            .heard(actor, Some(header.weights_version), arrived);
         let Self {
             replay,
             chunks,
             members,
             timings,
+            said,
             ..
         } = self;
         let reply = match replay.settle(&packed) {
@@ -115,6 +139,12 @@ impl State {
                 reply => reply,
             },
         };
+        if let InsertReply::Refused { why } = &reply
+            && let Some(more) = said.due("chunk")
+        {
+            let actor = header.actor;
+            tracing::warn!("a chunk of actor {actor} was refused: {why}{more}");
+        }
         let mut answers = Answers::new();
         match reply {
             InsertReply::Wait { .. } => {
@@ -138,6 +168,9 @@ impl State {
     /// Says what became of a chunk, or notes who asks about a parked one; that of an actor that leaves is stored.
     fn take_claim(&mut self, claim: &Claim, question: Question) -> Answers {
         if let Some(reply) = self.replay.claim(claim) {
+            if let InsertReply::Refused { why } = &reply {
+                self.say("claim", &format!("a claim was refused: {why}"));
+            }
             return vec![(question, reply)];
         }
         let Some(parked) = self.chunks.claimed(claim) else {

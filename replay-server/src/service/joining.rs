@@ -1,29 +1,44 @@
 //! Parts that join: what they are told of the run, and whether they are let in.
 //! Who is connected and who is served is kept in `members`.
 
+use std::time::Instant;
+
 use driml_protocol::{ActorJoin, Alive, Hello, Incoming, JoinReply, LearnerJoin, Responder};
 use zenoh::sample::SampleKind;
 
 use super::server::{Service, State};
 
+/// Lives of actors that may send through shared memory. What a reader has mapped stays mapped until it ends, also when whoever made
+/// it is gone (zenoh issue 2571): about 3 MiB and two descriptors a life. Later ones send through sockets.
+const SHARED_LIVES_MAX: u32 = 128;
+
 impl Service {
     pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {
-        let mut state = self.state();
-        state.members.note(who, kind == SampleKind::Put);
+        let (mut state, is_connected) = (self.state(), kind == SampleKind::Put);
+        state.members.note(who, is_connected);
+        // A part that this server's predecessor took, whose replay it goes on with, does not join again.
+        if state.takes_part(who) {
+            state.open_account(who);
+        }
+        state
+            .accounts
+            .note_connected(who, is_connected, Instant::now());
         state.count_actors();
     }
 
     pub(super) fn hello(&self, responder: Responder<Hello>) {
         let state = self.state();
         let (inserted_total, tally) = (state.replay.inserted_total(), state.replay.tally());
+        let after_updates = state.replay.after_updates();
+        let shared_memory = self.shared_memory && state.accounts.actor_lives() < SHARED_LIVES_MAX;
         drop(state);
         let hello = Hello {
             config_toml: self.config_toml.clone(),
             inserted_total,
             tally,
-            after_updates: self.after_updates,
+            after_updates,
             shard: self.shard,
-            shared_memory: self.shared_memory,
+            shared_memory,
         };
         responder.reply(&hello);
     }
@@ -31,6 +46,9 @@ impl Service {
     pub(super) fn join_actor(&self, incoming: Incoming<ActorJoin>) {
         if let Some(join) = self.read(&incoming) {
             let reply = self.state().join_actor(join);
+            if !self.state().replay.is_ready() {
+                return;
+            }
             self.welcome(incoming.into_responder(), reply);
         }
     }
@@ -38,6 +56,9 @@ impl Service {
     pub(super) fn join_learner(&self, incoming: Incoming<LearnerJoin>) {
         if let Some(join) = self.read(&incoming) {
             let reply = self.state().join_learner(join);
+            if !self.state().replay.is_ready() {
+                return;
+            }
             self.changed.notify_all();
             self.welcome(incoming.into_responder(), reply);
         }
@@ -53,8 +74,9 @@ impl Service {
             },
             Err(Rejection::Taken(why)) => JoinReply::Taken { why },
             Err(Rejection::Refused(why)) => {
-                tracing::warn!("a part was not let in: {why}");
-                self.state().replay.note_refused_message();
+                let mut state = self.state();
+                state.replay.note_refused_message();
+                state.say("join", &format!("a part was not let in: {why}"));
                 JoinReply::Refused { why }
             }
         };
@@ -76,6 +98,35 @@ impl State {
         self.replay.set_actors(actors);
     }
 
+    /// Whether this life of a part is the one that takes part.
+    fn takes_part(&self, who: Alive) -> bool {
+        match who {
+            Alive::Actor { actor, .. } => {
+                let life = self.replay.actor_incarnation(actor);
+                life.is_some_and(|life| Alive::actor(actor, life) == who)
+            }
+            Alive::Learner { .. } => {
+                let learner = self.replay.learner();
+                learner.is_some_and(|learner| Alive::learner(learner) == who)
+            }
+        }
+    }
+
+    /// Whether `learner` is the one that is served.
+    ///
+    /// # Errors
+    /// It is not; what happened, for a person.
+    pub(super) fn check_learner(&self, learner: u64) -> Result<(), String> {
+        match self.replay.learner() {
+            Some(served) if served == learner => Ok(()),
+            Some(_) => Err("another learner has joined the run since this one did: a run has one learner".into()),
+            None => Err("this replay server does not know the learner: it was started anew since the learner joined, and what it \
+                         held is gone. To go on with the run, start it with --after-updates and the number of the newest checkpoint, \
+                         and then the learner and the actors again"
+                .into()),
+        }
+    }
+
     /// Takes an actor that may take part; gives the number of its earlier lives.
     fn join_actor(&mut self, join: ActorJoin) -> Result<u32, Rejection> {
         let ActorJoin { actor, incarnation } = join;
@@ -83,17 +134,15 @@ impl State {
             .replay
             .actor_incarnation(actor)
             .filter(|&other| other != incarnation);
-        let connected = |incarnation| {
-            self.members
-                .connected
-                .contains(&Alive::Actor { actor, incarnation })
-        };
-        if other.is_some_and(connected) {
+        if other.is_some_and(|life| self.members.is_connected(actor, life)) {
             return Err(Rejection::Taken(format!(
                 "another process is actor {actor} of this run: give each actor a number of its own (--id)"
             )));
         }
+        self.replay
+            .forget_absent_actors(|actor, life| self.members.is_connected(actor, life));
         let earlier_incarnations = self.replay.join_actor(join).map_err(Rejection::Refused)?;
+        self.open_account(Alive::actor(actor, incarnation));
         self.count_actors();
         if other.is_some() {
             // A chunk that was left behind.
@@ -107,20 +156,25 @@ impl State {
             learner,
             rows_sampled,
         } = join;
-        let other = self.members.learner.filter(|&other| other != learner);
-        let connected = |other| self.members.connected.contains(&Alive::Learner(other));
+        let other = self.replay.learner().filter(|&other| other != learner);
+        let connected = |other| self.members.connected.contains(&Alive::learner(other));
         if other.is_some_and(connected) {
             let why = "another learner takes part in this run, which has one alone";
             return Err(Rejection::Taken(why.into()));
         }
         // The same one asks again when it has not heard the answer.
-        if self.members.learner != Some(learner) {
+        if self.replay.learner() != Some(learner) {
             self.replay
-                .learner_starts(rows_sampled)
+                .learner_starts(learner, rows_sampled)
                 .map_err(Rejection::Refused)?;
-            self.members.learner = Some(learner);
             self.requests.keep_only(learner);
+            self.open_account(Alive::learner(learner));
         }
         Ok(0)
+    }
+
+    fn open_account(&mut self, who: Alive) {
+        let is_connected = self.members.connected.contains(&who);
+        self.accounts.joined(who, is_connected, Instant::now());
     }
 }

@@ -48,6 +48,16 @@ impl<Q> ParkedChunks<Q> {
         self.line.len()
     }
 
+    /// Their bytes in memory.
+    pub(super) const fn bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// When the chunk of an actor came that waits.
+    pub(super) fn arrived(&self, actor: u32) -> Option<Instant> {
+        self.by_actor.get(&actor).map(|parked| parked.arrived)
+    }
+
     pub(super) fn is_empty(&self) -> bool {
         self.line.is_empty()
     }
@@ -181,6 +191,15 @@ impl<Q> ParkedRequests<Q> {
         self.0.push_back(parked);
     }
 
+    pub(super) fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    /// When the oldest came.
+    pub(super) fn oldest(&self) -> Option<Instant> {
+        self.0.iter().map(|it| it.arrived).min()
+    }
+
     /// Forgets all but the requests of one learner.
     pub(super) fn keep_only(&mut self, learner: u64) {
         self.0.retain(|it| it.request.learner == learner);
@@ -226,6 +245,7 @@ mod tests {
         });
         let packer = Packer {
             compression: Compression::None,
+            seal_for: None,
         };
         packer.pack(Cow::Owned(chunk))
     }

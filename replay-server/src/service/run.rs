@@ -2,29 +2,38 @@
 //! What an answer is, is in the files named for the messages.
 
 use std::{
+    path::{Path, PathBuf},
     sync::{Arc, Condvar, Mutex},
     thread::JoinHandle,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
-use anyhow::Context;
 use driml_protocol::{
     BatchHeader, BufferPool, Incoming, Keyed, Keys, POOL_BATCHES, QueryWorkers, Request, Responder,
-    RunClient, RunSpec, Shutdown, TRANSITION_BYTES,
+    RunClient, RunSpec, SeldomEach, Shutdown, TRANSITION_BYTES,
     config::{Settings, TransportConfig},
     join_within,
     session::{self, Endpoints},
     shared_memory,
+    tls::{self, Credentials},
 };
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
 use super::{
+    accounts::Accounts,
+    limits::{Limits, number},
     members::Members,
     parked::{ParkedChunks, ParkedRequests},
     server::{Service, State},
     timings::Timings,
+    weights_store::WeightsStore,
 };
-use crate::{config::Config, replay::Replay};
+use crate::{
+    config::Config,
+    durable::{DurableArgs, DurableReplay, shard_dir},
+    replay::Replay,
+    sampling::prioritised::PriorityCounts,
+};
 
 /// Threads that make batches: one assembles while another's reply is being sent.
 const BATCH_THREADS: usize = 2;
@@ -47,12 +56,20 @@ pub struct RunArgs {
     pub listen: Vec<String>,
     /// Routers to connect to, if any.
     pub connect: Vec<String>,
+    /// With which certificate it takes part; none without TLS.
+    pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
     /// Which of the replay's shards this is, from 0.
     pub shard: u32,
     /// Updates of the learner after which the run goes on; 0 starts it.
     pub after_updates: u64,
+    /// Bytes of a version of the weights, of which the replay server itself knows nothing; longer uploads are refused.
+    pub weights_bytes_max: usize,
+    /// The folder in which the replay is kept, if it is kept on disk; of several shards each has a folder of its own there.
+    pub dir: Option<PathBuf>,
+    /// Stay when the run is over, to be asked, until `shutdown`.
+    pub stay: bool,
     /// The run's resolved settings, which it hands to whoever joins.
     pub config_toml: String,
 }
@@ -66,14 +83,24 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let spec: RunSpec = settings.table("run")?;
     spec.validate()?;
     let config: Config = settings.table("replay")?;
-    let batch_rows = number(&settings, "learner", "batch_rows")?;
+    let batch_size = number(&settings, "learner", "batch_size")?;
     let ack_timeout = Duration::from_millis(number(&settings, "actor", "ack_timeout_ms")?.into());
-    let mut replay = Replay::shard(&spec, &config, batch_rows, args.shard)?;
-    if args.after_updates > 0 {
-        replay = replay.resumed_at(args.after_updates, args.shard);
-    }
+    // Of this process alone: priorities of rows that an earlier one drew are not taken for those of others.
+    let incarnation = rand::random();
+    let (replay, weights) = match &args.dir {
+        Some(dir) => open_durable(&args, dir, &spec, &config, batch_size)?,
+        None => {
+            let mut replay = Replay::shard(&spec, &config, batch_size, args.shard)?;
+            if args.after_updates > 0 {
+                replay = replay.resumed_at(args.after_updates, args.shard);
+            }
+            let replay = DurableReplay::in_memory(replay, args.after_updates);
+            (replay, WeightsStore::default())
+        }
+    };
+    let replay = replay.with_incarnation(incarnation);
     let transport: TransportConfig = settings.table("transport")?;
-    let batch = BatchHeader::of(&spec, batch_rows);
+    let batch = BatchHeader::of(&spec, batch_size).sampled_by(&config.sampling);
     let pool = if transport.shared_memory {
         BufferPool::shared(SPARE_MAX, POOL_BATCHES, batch.payload_bytes())
     } else {
@@ -89,32 +116,44 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
                 false
             }
         };
+    let limits = Limits::of(&settings, &spec, args.weights_bytes_max)?;
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let session = session::open(&Endpoints {
+    let endpoints = Endpoints {
         listen: args.listen.clone(),
         connect: args.connect,
-    })?;
+    };
+    // From the first connection on.
+    let reports = args.credentials.is_some().then(tls::listen);
+    let session = session::open_as(
+        &endpoints,
+        &keys,
+        args.credentials.as_deref(),
+        limits.largest(),
+    )?;
     let client = RunClient::new(session, keys, spec.hash());
     let declaring =
         |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
     let service = Arc::new(Service {
         num_actions: spec.num_actions,
+        limits,
         shard: (args.shard, config.shards),
-        after_updates: args.after_updates,
         config_toml: args.config_toml,
         shared_memory: reads_shared_memory,
         hold_max: HOLD_MAX.min(ack_timeout / 4),
         pool,
         packer: replay.packer(),
         state: Mutex::new(State {
+            members: Members::with_acting(replay.actors_delivered()),
             replay,
-            members: Members::default(),
+            accounts: Accounts::new(Instant::now()),
             chunks: ParkedChunks::default(),
             requests: ParkedRequests::default(),
             timings: Timings::default(),
+            connections_refused: 0,
+            said: SeldomEach::default(),
         }),
         changed: Condvar::new(),
-        weights: Mutex::default(),
+        weights: Mutex::new(weights),
         announcements: client.announce().map_err(declaring)?,
         shutdown: shutdown.clone(),
     });
@@ -126,12 +165,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         ..
     } = Answers::declare(&client, &service).map_err(declaring)?;
     threads.extend(service.clone().start_working()?);
+    if let Some(reports) = reports {
+        threads.push(service.clone().start_hearing(reports)?);
+    }
     tracing::info!(
         "replay server listens on {:?}, run {:016x}",
         args.listen,
         client.spec_hash()
     );
-    shutdown.wait();
+    service.wait_until_over(args.stay);
+    // Threads of its own wait for that.
+    shutdown.set();
     service.changed.notify_all();
     tracing::info!(
         "replay server stops with {} transitions stored",
@@ -141,15 +185,62 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     drop(queryables);
     let closed = client.session().close().wait();
     join_within(threads, THREADS_END_MAX);
+    let mut state = service.state();
+    state.replay.flush();
+    if let Some(PriorityCounts {
+        set,
+        gone,
+        repeated,
+    }) = state.replay.priority_counts()
+    {
+        tracing::info!(
+            "priorities of {set} rows were set, {gone} came too late for their transition, {repeated} came twice"
+        );
+    }
+    drop(state);
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
-/// One whole number of another part's settings.
-fn number(settings: &Settings, table: &'static str, key: &str) -> anyhow::Result<u32> {
-    let values: toml::Table = settings.table(table)?;
-    let value = values.get(key).and_then(toml::Value::as_integer);
-    let value = value.with_context(|| format!("{table}.{key} is missing or not a whole number"))?;
-    u32::try_from(value).with_context(|| format!("{table}.{key} = {value} cannot work"))
+/// The replay that is kept in `dir`, and the newest weights that were handed over.
+fn open_durable(
+    args: &RunArgs,
+    dir: &Path,
+    spec: &RunSpec,
+    config: &Config,
+    batch_size: u32,
+) -> anyhow::Result<(DurableReplay, WeightsStore)> {
+    let dir = shard_dir(dir, args.shard, config.shards);
+    let durable = DurableArgs {
+        dir: dir.clone(),
+        shard: args.shard,
+        after_updates: args.after_updates,
+        segment_bytes: None,
+        mark: None,
+    };
+    let (replay, recovery) = DurableReplay::open(&durable, spec, config, batch_size)?;
+    for warning in &recovery.warnings {
+        tracing::warn!("{}: {warning}", dir.display());
+    }
+    if recovery.found {
+        let status = replay.status();
+        tracing::info!(
+            "goes on with the replay in {}: {} transitions stored, {} held, {} rows served; {} MiB read in {:.1} s",
+            dir.display(),
+            status.transitions_inserted,
+            status.transitions_held,
+            status.rows_sampled,
+            recovery.bytes >> 20,
+            recovery.took.as_secs_f64()
+        );
+        if replay.priority_counts().is_some() {
+            tracing::info!(
+                "priorities are not kept on disk: each transition has the highest one until it is learned from"
+            );
+        }
+    } else {
+        tracing::info!("keeps the replay in {}", dir.display());
+    }
+    Ok((replay, WeightsStore::kept_in(&dir, spec.hash())))
 }
 
 /// Bytes of shared memory that all actors of the run make for their chunks together, as far as the settings know of them.
@@ -187,46 +278,68 @@ impl<'a> Answers<'a> {
             queryables: Vec::new(),
             threads: Threads::new(),
         };
-        this.answer("insert", 1, Service::insert)?;
-        this.answer("claim", 1, Service::claim)?;
-        this.answer("request", 1, Service::request)?;
-        this.answer("affinity", 1, Service::affinity)?;
+        let limits = service.limits;
+        this.answer("insert", 1, limits.chunk, Service::insert)?;
+        this.answer("claim", 1, limits.small, Service::claim)?;
+        this.answer("request", 1, limits.small, Service::request)?;
+        this.answer("affinity", 1, limits.affinity, Service::affinity)?;
+        if service.state().replay.priority_counts().is_some() {
+            this.answer("priorities", 1, limits.priorities, Service::priorities)?;
+        }
         this.offer("hello", 1, Service::hello)?;
-        this.answer("join-actor", 1, Service::join_actor)?;
-        this.answer("join-learner", 1, Service::join_learner)?;
-        this.answer("goodbye", 1, Service::goodbye)?;
-        this.answer("weights-upload", 1, Service::take_weights)?;
-        this.answer("weights", WEIGHTS_THREADS, Service::give_weights)?;
+        this.answer("join-actor", 1, limits.small, Service::join_actor)?;
+        this.answer("join-learner", 1, limits.small, Service::join_learner)?;
+        this.answer("goodbye", 1, limits.small, Service::goodbye)?;
+        this.answer("weights-upload", 1, limits.weights, Service::take_weights)?;
+        this.answer(
+            "weights",
+            WEIGHTS_THREADS,
+            limits.small,
+            Service::give_weights,
+        )?;
+        this.answer("report", 1, limits.small, Service::report)?;
         this.offer("status", 1, Service::status)?;
+        this.offer("parts", 1, Service::parts)?;
         Ok(this)
     }
 
-    /// Answers requests `R` with `answer`, on so many threads of this name.
+    /// Answers requests `R` of at most `bytes_max` bytes with `answer`, on so many threads of this name.
     fn answer<R: Request + 'static>(
         &mut self,
-        name: &str,
+        name: &'static str,
         threads: usize,
+        bytes_max: usize,
         answer: fn(&Service, Incoming<R>),
     ) -> zenoh::Result<()> {
         let (service, spec_hash) = (self.service.clone(), self.client.spec_hash());
         let answer = move |incoming| answer(&service, incoming);
-        self.add(QueryWorkers::answer(name, threads, spec_hash, answer)?)
+        let workers = QueryWorkers::answer(name, threads, spec_hash, answer)?;
+        self.add(name, bytes_max, workers)
     }
 
     /// Gives an `M` to whoever fetches it, on so many threads of this name.
     fn offer<M: Keyed + 'static>(
         &mut self,
-        name: &str,
+        name: &'static str,
         threads: usize,
         give: fn(&Service, Responder<M>),
     ) -> zenoh::Result<()> {
         let (service, spec_hash) = (self.service.clone(), self.client.spec_hash());
         let give = move |responder| give(&service, responder);
-        self.add(QueryWorkers::offer(name, threads, spec_hash, give)?)
+        let workers = QueryWorkers::offer(name, threads, spec_hash, give)?;
+        self.add(name, self.service.limits.small, workers)
     }
 
-    fn add<M: Keyed + 'static>(&mut self, workers: QueryWorkers<M>) -> zenoh::Result<()> {
-        self.queryables.push(workers.declare(self.client)?);
+    fn add<M: Keyed + 'static>(
+        &mut self,
+        name: &'static str,
+        bytes_max: usize,
+        workers: QueryWorkers<M>,
+    ) -> zenoh::Result<()> {
+        let service = self.service.clone();
+        let refused = move |bytes| service.refuse_long(name, bytes, bytes_max);
+        let queryable = workers.declare_limited(self.client, bytes_max, refused)?;
+        self.queryables.push(queryable);
         self.threads.extend(workers.into_threads());
         Ok(())
     }
@@ -257,7 +370,10 @@ impl Service {
                 .name(name.into())
                 .spawn(move || work(&service))
         };
-        let mut threads = vec![work("admit", Self::admit_parked)?];
+        let mut threads = vec![
+            work("admit", Self::admit_parked)?,
+            work("missing", Self::say_who_is_missing)?,
+        ];
         for i in 0..BATCH_THREADS {
             threads.push(work(&format!("sample-{i}"), Self::serve_parked)?);
         }

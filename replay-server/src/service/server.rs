@@ -8,22 +8,24 @@ use std::{
 
 use driml_protocol::{
     Announcer, BatchReply, BufferPool, CodecError, Incoming, InsertReply, Request, Responder,
-    Shutdown, WeightsVersion,
+    SeldomEach, Shutdown, WeightsVersion,
 };
 
 use super::{
+    accounts::Accounts,
+    limits::Limits,
     members::Members,
     parked::{ParkedChunks, ParkedRequests},
     timings::Timings,
     weights_store::WeightsStore,
 };
-use crate::{replay::Replay, storage::frame_store::Packer};
+use crate::{durable::DurableReplay, storage::frame_store::Packer};
 
 /// What all threads share.
 pub(super) struct Service {
     pub(super) num_actions: u32,
+    pub(super) limits: Limits,
     pub(super) shard: (u32, u32),
-    pub(super) after_updates: u64,
     pub(super) config_toml: String,
     /// Whether chunks may come through shared memory.
     pub(super) shared_memory: bool,
@@ -43,11 +45,16 @@ pub(super) struct Service {
 
 /// What changes, under one lock.
 pub(super) struct State {
-    pub(super) replay: Replay,
+    pub(super) replay: DurableReplay,
     pub(super) members: Members,
+    pub(super) accounts: Accounts,
     pub(super) chunks: ParkedChunks<Question>,
     pub(super) requests: ParkedRequests<Responder<BatchReply>>,
     pub(super) timings: Timings,
+    /// Connections refused for want of a good certificate.
+    pub(super) connections_refused: u64,
+    /// Lines about what was refused, which a stranger could make come at any rate.
+    pub(super) said: SeldomEach,
 }
 
 /// Who asks about a chunk, and since when.
@@ -63,8 +70,20 @@ impl Service {
 
     /// Counts and logs a message that cannot be read.
     pub(super) fn refuse(&self, what: &str, e: &CodecError) {
-        tracing::warn!("{what} was refused: {e}");
-        self.state().replay.note_refused_message();
+        let mut state = self.state();
+        state.replay.note_refused_message();
+        state.say(what, &format!("{what} was refused: {e}"));
+    }
+
+    /// Counts and logs a message that is longer than any of its kind.
+    pub(super) fn refuse_long(&self, kind: &'static str, bytes: usize, bytes_max: usize) {
+        let mut state = self.state();
+        state.replay.note_refused_message();
+        let why = "has more than a message of this kind can have in this run";
+        state.say(
+            kind,
+            &format!("a message of {bytes} bytes to {kind:?} was refused: it {why}, {bytes_max}"),
+        );
     }
 
     /// Reads a request without payload, or counts it as refused.
@@ -78,12 +97,35 @@ impl Service {
     /// Waits until something has changed, or for `wait_max`.
     pub(super) fn wait<'a>(
         &'a self,
-        state: MutexGuard<'a, State>,
+        mut state: MutexGuard<'a, State>,
         wait_max: Duration,
     ) -> MutexGuard<'a, State> {
+        state.note_waiting(Instant::now());
         self.changed
             .wait_timeout(state, wait_max)
             .unwrap_or_else(PoisonError::into_inner)
             .0
+    }
+}
+
+impl State {
+    /// Notes which side waits now.
+    fn note_waiting(&mut self, now: Instant) {
+        let waiting = self.replay.waiting();
+        self.accounts.note_waiting(waiting, now);
+    }
+
+    /// Whether a chunk or a request waits for what the replay holds; if not, the threads that serve them have nothing to look at, and
+    /// what they would note is noted here. Waking them costs six changes of threads a chunk.
+    pub(super) fn is_awaited(&mut self, now: Instant) -> bool {
+        self.note_waiting(now);
+        !self.chunks.is_empty() || self.requests.len() > 0
+    }
+
+    /// Logs a line of this kind, or counts it where one was logged a short while ago.
+    pub(super) fn say(&mut self, kind: &str, line: &str) {
+        if let Some(more) = self.said.due(kind) {
+            tracing::warn!("{line}{more}");
+        }
     }
 }

@@ -1,15 +1,35 @@
-//! The small messages that need no file of their own: an actor's goodbye, the learner's affinity, and the status.
+//! The small messages that need no file of their own: an actor's goodbye, the learner's affinity, reports, and the status.
 //! None of them ever waits.
 
-use driml_protocol::{AffinityUpdate, Done, Goodbye, Incoming, ReplayStatus, Responder};
+use std::time::{Duration, Instant};
 
-use super::server::Service;
+use driml_protocol::{
+    AffinityUpdate, Done, Goodbye, Incoming, PartName, PartsStatus, PriorityUpdate, ReplayStatus,
+    Report, Responder,
+};
+
+use super::{accounts::own_warning, server::Service};
+
+/// How often it is looked whether somebody is missing.
+const LOOK: Duration = Duration::from_secs(1);
+/// How long a replay server stays for parts that do not leave when the run is over.
+const FAREWELL_MAX: Duration = Duration::from_secs(30);
+/// How long somebody may be missing before it is said.
+const SILENT_MAX: Duration = Duration::from_secs(10);
 
 impl Service {
     pub(super) fn goodbye(&self, incoming: Incoming<Goodbye>) {
         if let Some(goodbye) = self.read(&incoming) {
-            self.state().replay.goodbye(&goodbye);
-            incoming.into_responder().reply(&Done);
+            let mut state = self.state();
+            if let Some(why) = state.replay.goodbye(&goodbye) {
+                state.say("goodbye", &format!("a goodbye was refused: {why}"));
+            }
+            let is_ready = state.replay.is_ready();
+            drop(state);
+            // Whoever says goodbye has nothing to do any more, with whatever it has said.
+            if is_ready {
+                incoming.into_responder().reply(&Done);
+            }
         }
     }
 
@@ -18,7 +38,7 @@ impl Service {
             return;
         };
         let mut state = self.state();
-        let set = match state.members.check_learner(update.learner) {
+        let set = match state.check_learner(update.learner) {
             Ok(()) => state
                 .replay
                 .set_affinity(&update)
@@ -28,16 +48,130 @@ impl Service {
                 Err(why)
             }
         };
+        if let Err(why) = set {
+            let line = format!("an affinity matrix was refused: {why}");
+            state.say("affinity", &line);
+            return;
+        }
+        let is_ready = state.replay.is_ready();
         drop(state);
-        match set {
-            Ok(()) => incoming.into_responder().reply(&Done),
-            Err(why) => tracing::warn!("an affinity matrix was refused: {why}"),
+        if is_ready {
+            incoming.into_responder().reply(&Done);
+        }
+    }
+
+    pub(super) fn priorities(&self, incoming: Incoming<PriorityUpdate>) {
+        let Some(update) = self.read(&incoming) else {
+            return;
+        };
+        let mut state = self.state();
+        let allowed = state.check_learner(update.learner);
+        let allowed = allowed.and_then(|()| self.check_priorities(update.rows()));
+        let set = allowed.and_then(|()| state.replay.set_priorities(&update));
+        if let Err(why) = set {
+            state.replay.note_refused_message();
+            let line = format!("priorities were refused: {why}");
+            return state.say("priorities", &line);
+        }
+        drop(state);
+        incoming.into_responder().reply(&Done);
+    }
+
+    /// Priorities are those of a batch's rows.
+    fn check_priorities(&self, rows: usize) -> Result<(), String> {
+        match self.limits.batch_rows as usize {
+            most if rows <= most => Ok(()),
+            most => Err(format!(
+                "of {rows} rows; a batch of this run has {most} (learner.batch_size)"
+            )),
+        }
+    }
+
+    pub(super) fn report(&self, incoming: Incoming<Report>) {
+        let Some(report) = self.read(&incoming) else {
+            return;
+        };
+        let mut state = self.state();
+        // That of a part which has been replaced, or is about to join.
+        if !state.accounts.reported(report, Instant::now()) {
+            tracing::debug!("a report of a part that does not take part");
+        }
+        drop(state);
+        incoming.into_responder().reply(&Done);
+    }
+
+    pub(super) fn parts(&self, responder: Responder<PartsStatus>) {
+        let weights_version = self.weights().version();
+        let (state, now) = (self.state(), Instant::now());
+        let (waiting, waiting_s) = state.accounts.waiting(now);
+        let (up_s, weights_age_s) = state.accounts.ages(now);
+        let held_since = |who| match who {
+            PartName::Actor(actor) => state.chunks.arrived(actor),
+            PartName::Learner => state.requests.oldest(),
+        };
+        let status = PartsStatus {
+            up_s,
+            waiting,
+            waiting_s,
+            requests_waiting: state.requests.len() as u32,
+            chunks_waiting: state.chunks.len() as u32,
+            chunk_bytes_waiting: state.chunks.bytes() as u64,
+            weights_version,
+            weights_age_s,
+            last_warning: own_warning(),
+            parts: state.accounts.parts(now, held_since),
+        };
+        drop(state);
+        responder.reply(&status);
+    }
+
+    /// Says whom the run waits for, where it could not go on without: after some seconds, then now and then. The thread's whole
+    /// work until the end of the process.
+    pub(super) fn say_who_is_missing(&self) {
+        // Who, since when, and after how long it is said next: ever more seldom.
+        let mut missing: Option<(&str, Instant, Duration)> = None;
+        while !self.shutdown.wait_timeout(LOOK) {
+            let state = self.state();
+            let now = state.accounts.missing(state.replay.all_in());
+            drop(state);
+            if now != missing.map(|(before, ..)| before) {
+                missing = now.map(|now| (now, Instant::now(), SILENT_MAX));
+            }
+            if let Some((missing, since, due)) = &mut missing
+                && since.elapsed() > *due
+            {
+                let since = since.elapsed().as_secs();
+                tracing::info!("{missing}, waiting since {since} s: `driml status` says more");
+                *due *= 2;
+            }
+        }
+    }
+
+    /// Waits until the run is over and nobody is left who would ask, or for the end from outside; with `stay` for that alone.
+    pub(super) fn wait_until_over(&self, stay: bool) {
+        if stay {
+            return self.shutdown.wait();
+        }
+        let mut over_since: Option<Instant> = None;
+        while !self.shutdown.wait_timeout(LOOK) {
+            let state = self.state();
+            let (is_over, connected) = (state.accounts.is_over(), state.accounts.connected());
+            drop(state);
+            if !is_over {
+                over_since = None;
+                continue;
+            }
+            let since = over_since.get_or_insert_with(Instant::now);
+            if connected == 0 || since.elapsed() > FAREWELL_MAX {
+                return tracing::info!("the run is over, and {connected} parts are left");
+            }
         }
     }
 
     pub(super) fn status(&self, responder: Responder<ReplayStatus>) {
         let state = self.state();
         let mut status = state.replay.status();
+        status.connections_refused = state.connections_refused;
         status.actors_acting = state.members.actors_acting();
         status.actors_waiting = state.chunks.len() as u32;
         status.answer_ms = state.timings.answer_ms();

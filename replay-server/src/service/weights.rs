@@ -26,19 +26,27 @@ impl Service {
             Err(e) => return self.refuse("an upload of weights", &e),
         };
         let WeightsUpload { learner, weights } = upload;
-        let allowed = self.state().members.check_learner(learner);
+        let allowed = self.state().check_learner(learner);
         match allowed.and_then(|()| self.weights().put(weights, &safetensors)) {
             Ok(is_new) => {
                 if is_new {
+                    let keeper = self.weights().keeper();
+                    if let Some(keep) = keeper {
+                        keep();
+                    }
                     let now = Instant::now();
-                    self.state().timings.weights_came(&weights, now);
+                    let mut state = self.state();
+                    state.timings.weights_came(&weights, now);
+                    state.accounts.weights_came(now);
+                    drop(state);
                     self.announce(weights.version);
                 }
                 incoming.into_responder().reply(&Done);
             }
             Err(why) => {
-                tracing::warn!("weights were refused: {why}");
-                self.state().replay.note_refused_message();
+                let mut state = self.state();
+                state.replay.note_refused_message();
+                state.say("weights", &format!("weights were refused: {why}"));
             }
         }
     }

@@ -2,11 +2,20 @@
 //! It neither reads nor sends them.
 
 use std::{
+    fs::{self, File},
+    io::{self, Write},
+    path::{Path, PathBuf},
     sync::Arc,
     time::{Duration, Instant},
 };
 
-use driml_protocol::{PIECE_BYTES, WeightsHeader, WeightsReply, WeightsRequest};
+use driml_protocol::{
+    CodecError, PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
+    codec,
+};
+
+/// The file with the newest weights.
+const FILE: &str = "weights.message";
 
 /// Versions that are kept while actors pull them. When so many are being pulled, whoever begins gets the newest of these: many
 /// actors that pull slowly are served to the end, with weights that are a little older.
@@ -16,21 +25,52 @@ const KEPT_FOR: Duration = Duration::from_secs(5);
 /// Most versions that one upload may be ahead of the one before: more is no count of a learner's.
 const VERSION_STEP_MAX: u64 = 1 << 20;
 
-/// Weights as they came.
-pub(super) struct Weights {
-    pub(super) header: WeightsHeader,
-    pub(super) safetensors: Vec<u8>,
-}
-
 /// The newest weights, and older ones that are being pulled.
 #[derive(Default)]
 pub(super) struct WeightsStore {
+    /// Where the newest are kept, if the replay is kept on disk, and the hash of the run's spec.
+    file: Option<(PathBuf, u64)>,
     newest: Option<Arc<Weights>>,
     /// Those that are being pulled, oldest version first, and when each was last asked for.
     pulled: Vec<(Arc<Weights>, Instant)>,
 }
 
 impl WeightsStore {
+    /// Weights that are kept beside the replay in `dir`, from now on and before: actors that start after a restart need some before
+    /// the learner publishes again.
+    pub(super) fn kept_in(dir: &Path, spec_hash: u64) -> Self {
+        let path = dir.join(FILE);
+        let newest = match fs::read(&path) {
+            Ok(bytes) => read(&bytes, spec_hash)
+                .inspect_err(|e| tracing::warn!("{} is not used: {e}", path.display()))
+                .ok(),
+            Err(e) if e.kind() == io::ErrorKind::NotFound => None,
+            Err(e) => {
+                tracing::warn!("{} is not used: {e}", path.display());
+                None
+            }
+        };
+        Self {
+            file: Some((path, spec_hash)),
+            newest: newest.map(Arc::new),
+            pulled: Vec::new(),
+        }
+    }
+
+    /// How to keep the newest weights on disk, if they are to be; done without this in use, as it takes a while.
+    pub(super) fn keeper(&self) -> Option<impl FnOnce() + use<>> {
+        let ((path, spec_hash), weights) = (self.file.clone()?, self.newest.clone()?);
+        Some(move || {
+            if let Err(e) = keep(&path, spec_hash, &weights) {
+                tracing::warn!(
+                    "weights {} were not kept in {}: {e:#}",
+                    weights.header.version,
+                    path.display()
+                );
+            }
+        })
+    }
+
     /// Version of the newest; 0 before the first.
     pub(super) fn version(&self) -> u64 {
         self.newest.as_ref().map_or(0, |it| it.header.version)
@@ -106,6 +146,31 @@ impl WeightsStore {
         self.pulled.push((newest.clone(), now));
         Ok(newest.header.version)
     }
+}
+
+/// Reads weights that were kept.
+fn read(bytes: &[u8], spec_hash: u64) -> Result<Weights, CodecError> {
+    let (upload, safetensors) = codec::decode::<WeightsUpload>(bytes, Some(spec_hash))?;
+    Ok(Weights {
+        header: upload.weights,
+        safetensors: safetensors.to_vec(),
+    })
+}
+
+/// Writes weights in the place of those that are kept. They are not flushed: what a power cut leaves of them has a checksum, and the
+/// learner hands over newer ones.
+fn keep(path: &Path, spec_hash: u64, weights: &Weights) -> anyhow::Result<()> {
+    let upload = WeightsUpload {
+        learner: 0,
+        weights: weights.header,
+    };
+    let head = codec::seal(spec_hash, &upload, &weights.safetensors)?;
+    let beside = path.with_extension("new");
+    let mut file = File::create(&beside)?;
+    file.write_all(&head)?;
+    file.write_all(&weights.safetensors)?;
+    fs::rename(&beside, path)?;
+    Ok(())
 }
 
 #[cfg(test)]

@@ -2,11 +2,12 @@
 //! It does not know actors, sampling or stacks; how frames are kept is `frame_store`'s business.
 
 use driml_protocol::End;
+use serde::{Deserialize, Serialize};
 
 use super::frame_store::{Frames, Run};
 
 /// How a transition hangs together with what its stream stored before; `after` is the index of the one just before.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Link {
     /// First of an episode: nothing before it counts.
     EpisodeStart,
@@ -19,6 +20,16 @@ pub(crate) enum Link {
 }
 
 impl Link {
+    /// The same where transitions from `first_lost` on are gone: what would reach back into them does not.
+    pub(crate) const fn without(self, first_lost: u64) -> Self {
+        match self {
+            Self::LevelStart { after } | Self::Within { after } if after >= first_lost => {
+                Self::Lost
+            }
+            other => other,
+        }
+    }
+
     /// The link of the transition that follows `index`, which ended `end`.
     pub(crate) const fn following(index: u64, end: End) -> Self {
         match end {
@@ -82,9 +93,11 @@ pub(crate) enum Previous {
 }
 
 /// The newest `capacity` transitions, or fewer if their frames may not take the memory; number `i` since the start lies in
-/// slot `i % capacity`.
+/// slot `(i - first) % capacity`.
 pub(crate) struct Ring {
     capacity: u64,
+    /// The first transition that was ever stored here; those before it were stored by an earlier process alone.
+    first: u64,
     oldest: u64,
     inserted: u64,
     /// Grows into its reservation, so that memory is taken only as transitions come.
@@ -104,11 +117,43 @@ impl Ring {
         steps.try_reserve_exact(length).map_err(|_| asked)?;
         Ok(Self {
             capacity,
+            first: 0,
             oldest: 0,
             inserted: 0,
             steps,
             frames,
         })
+    }
+
+    /// The same, empty, where the next transition has the number `first`.
+    ///
+    /// # Panics
+    /// Transitions are stored already.
+    pub(crate) fn start_at(&mut self, first: u64) {
+        assert!(self.steps.is_empty(), "an empty ring starts anywhere");
+        (self.first, self.oldest, self.inserted) = (first, first, first);
+        self.frames.start_at(first);
+    }
+
+    /// The first transition that was ever stored here.
+    pub(crate) const fn first(&self) -> u64 {
+        self.first
+    }
+
+    /// Lets go of the transitions before `oldest`.
+    pub(crate) fn forget_before(&mut self, oldest: u64) {
+        self.oldest = self.oldest.max(oldest.min(self.inserted));
+        self.frames.forget_before(self.oldest);
+    }
+
+    /// Takes the place of consecutive transitions that are gone, which hang together with nothing and are no anchors.
+    pub(crate) fn push_gone(&mut self, frames: Run<'_>, count: u64) {
+        let inserted = self.inserted + count;
+        let oldest = inserted.saturating_sub(self.capacity).max(self.oldest);
+        self.oldest = self.frames.push(frames, oldest);
+        for _ in 0..count {
+            self.push(Step::new(0, 0.0, End::Running, 0), Link::Lost);
+        }
     }
 
     /// Stores consecutive transitions of one stream, over the oldest ones once the ring is full.
@@ -159,7 +204,7 @@ impl Ring {
     }
 
     fn slot(&self, index: u64) -> usize {
-        (index % self.capacity) as usize
+        ((index - self.first) % self.capacity) as usize
     }
 
     /// Most transitions held.
@@ -205,14 +250,15 @@ impl Ring {
     pub(crate) fn check_valid(&self) {
         assert_eq!(
             self.steps.len() as u64,
-            self.inserted.min(self.capacity),
+            (self.inserted - self.first).min(self.capacity),
             "one step a transition, until they are overwritten"
         );
         assert!(
             self.inserted - self.oldest <= self.capacity,
             "no more are held than fit"
         );
-        self.frames.check_valid(self.oldest, self.inserted);
+        self.frames
+            .check_valid(self.first, self.oldest, self.inserted);
         for index in self.oldest()..self.inserted {
             let step = self.step(index);
             if let Some(next) = step.next() {

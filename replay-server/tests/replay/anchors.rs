@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use driml_protocol::{ChunkHeader, Horizon, InsertReply, Waiting};
+use driml_protocol::{ChunkHeader, Horizon, InsertReply, Sampling, Waiting};
 use driml_replay_server::{Compression, Config, Replay, Unready};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -110,7 +110,10 @@ fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
-        study: None,
+        sampling: Sampling::Uniform,
+        disk_bytes_max: None,
+        fsync_ms: None,
+        reproduced_bug: None,
         replay_ratio: 64.0,
         warmup_transitions: 0,
         slack_transitions: 1,

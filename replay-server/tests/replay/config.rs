@@ -1,7 +1,7 @@
 //! Settings that cannot work are refused, by key, with what to do.
 //! It does not test the effects of settings.
 
-use driml_protocol::{Horizon, RunSpec};
+use driml_protocol::{Horizon, RunSpec, Sampling};
 use driml_replay_server::{Compression, Config, ConfigError, Replay};
 
 use crate::history::spec;
@@ -12,7 +12,10 @@ fn good() -> Config {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
-        study: None,
+        sampling: Sampling::Uniform,
+        disk_bytes_max: None,
+        fsync_ms: None,
+        reproduced_bug: None,
         replay_ratio: 8.0,
         warmup_transitions: 1000,
         slack_transitions: 32,
@@ -20,8 +23,8 @@ fn good() -> Config {
     }
 }
 
-fn refusal(config: &Config, spec: &RunSpec, batch_rows: u32) -> String {
-    Replay::new(spec, config, batch_rows)
+fn refusal(config: &Config, spec: &RunSpec, batch_size: u32) -> String {
+    Replay::new(spec, config, batch_size)
         .map(|_| ())
         .unwrap_err()
         .to_string()
@@ -118,7 +121,7 @@ fn each_fault_names_its_key_and_a_way_out() {
             "{text}"
         );
     }
-    assert!(refusal(&good(), &spec, 0).contains("learner.batch_rows = 0"));
+    assert!(refusal(&good(), &spec, 0).contains("learner.batch_size = 0"));
     assert!(refusal(&good(), &spec, u32::MAX).contains("a batch of this run has 1 to"));
     let broken = RunSpec { gamma: 2.0, ..spec };
     assert!(matches!(

@@ -233,11 +233,21 @@ fn what_was_stored_and_never_produced_counts_as_duplicated() {
             produced: u64::MAX,
         });
     }
+    let status = replay.status();
     assert_eq!(
-        replay.status().transitions_lost,
-        u64::MAX,
-        "absurd counts do not overflow"
+        (status.transitions_lost, status.messages_refused),
+        (0, 2),
+        "absurd counts are refused"
     );
+    // The largest that a run could have add up without an overflow.
+    for actor in [1, 2] {
+        replay.goodbye(&Goodbye {
+            actor,
+            incarnation: 0,
+            produced: 1 << 48,
+        });
+    }
+    assert_eq!(replay.status().transitions_lost, 1 << 49);
 }
 
 #[test]
@@ -292,7 +302,8 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
             status.messages_refused,
             status.transitions_lost
         ),
-        (1, 3, 0)
+        // Three chunks and a goodbye.
+        (1, 4, 0)
     );
 }
 

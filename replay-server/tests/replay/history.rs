@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use driml_protocol::{Chunk, ChunkHeader, End, Horizon, NO_ACTION, RunSpec, TimeoutRule};
-use driml_replay_server::{Compression, Config, Study};
+use driml_protocol::{Chunk, ChunkHeader, End, Horizon, NO_ACTION, RunSpec, Sampling, TimeoutRule};
+use driml_replay_server::{Compression, Config, ReproducedBug};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -24,7 +24,7 @@ pub(crate) type StreamKey = (u8, u8, u8, u8);
 /// Everything that was stored.
 pub(crate) struct History {
     pub(crate) spec: RunSpec,
-    pub(crate) study: Option<Study>,
+    pub(crate) reproduced_bug: Option<ReproducedBug>,
     pub(crate) capacity: u64,
     pub(crate) inserted: u64,
     /// Whether episodes and levels ever end.
@@ -72,7 +72,10 @@ pub(crate) fn unlimited(capacity_transitions: u64) -> Config {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
-        study: None,
+        sampling: Sampling::Uniform,
+        disk_bytes_max: None,
+        fsync_ms: None,
+        reproduced_bug: None,
         replay_ratio: 1e6,
         warmup_transitions: 0,
         slack_transitions: 1 << 40,
@@ -111,7 +114,7 @@ impl History {
     pub(crate) fn new(spec: &RunSpec, capacity: u64) -> Self {
         Self {
             spec: spec.clone(),
-            study: None,
+            reproduced_bug: None,
             capacity,
             inserted: 0,
             ends: true,
@@ -252,7 +255,7 @@ impl History {
             }
         }
         let mut power = bootstrap.unwrap_or(0);
-        if self.study == Some(Study::BootstrapFromNextState) {
+        if self.reproduced_bug == Some(ReproducedBug::BootstrapFromNextState) {
             (bootstrap, power) = (Some(1).filter(|_| !records[t].end.is_episode_end()), n);
         }
         let in_level = records[t..]

@@ -31,10 +31,112 @@ fn a_wrong_name_is_answered_with_the_nearest_and_the_list() {
     let text = error("montezuma_revenge");
     assert!(!text.contains("did you mean"), "{text}");
     assert!(
-        text.contains("procgen:GAME, mspacman, ising, chain"),
+        text.contains("procgen:GAME, mspacman, ising, chain, exec:COMMAND, libenv:PATH:GAME"),
         "{text}"
     );
     assert!(!error(&"x".repeat(10_000)).contains("did you mean"));
+}
+
+#[test]
+fn names_may_hold_a_person_s_own_code() {
+    let command = "python3 my world.py --at 'a:b'";
+    let name: WorldName = format!("exec:{command}").parse().unwrap();
+    assert_eq!(name.to_string(), format!("exec:{command}"));
+    assert_eq!(name.foreign_code(), Some(command));
+    let found: Vec<_> = name.settings().collect();
+    assert_eq!((name.kind(), found), ("exec", vec![("command", command)]));
+
+    let text = "libenv:/builds/a:b/libenv.so:coinrun";
+    let name: WorldName = text.parse().unwrap();
+    assert_eq!(name.to_string(), text);
+    assert_eq!(name.kind(), "procgen");
+    assert_eq!(name.foreign_code(), Some("/builds/a:b/libenv.so"));
+    let found: Vec<_> = name.settings().collect();
+    let library = ("library", "/builds/a:b/libenv.so");
+    assert_eq!(found, [("game", "coinrun"), library]);
+    assert_eq!(name.with_own_library(), "procgen:coinrun".parse().unwrap());
+    for wrong in [
+        "exec:",
+        "exec: ",
+        "libenv:coinrun",
+        "libenv::coinrun",
+        "libenv:/a.so:pong",
+    ] {
+        assert!(wrong.parse::<WorldName>().is_err(), "{wrong}");
+    }
+    for name in WorldName::all() {
+        assert_eq!(name.foreign_code(), None, "{name}");
+    }
+}
+
+#[test]
+fn a_machine_s_own_code_is_that_of_the_same_world() {
+    let [exec, chain, ..] = configs();
+    let other = "exec:somewhere/else".parse().unwrap();
+    let here = exec.with_code_of(other).unwrap();
+    assert_eq!(here.name(), other);
+    assert_eq!(here.action_names(), exec.action_names());
+    assert_eq!(chain.with_code_of(chain.name()).unwrap(), chain);
+    let coinrun = procgen(0, 500);
+    let build = "libenv:/builds/libenv.so:coinrun".parse().unwrap();
+    assert_eq!(coinrun.with_code_of(build).unwrap().name(), build);
+    for (world, name) in [
+        (&exec, "chain"),
+        (&chain, "exec:somewhere/else"),
+        (&coinrun, "libenv:/builds/libenv.so:maze"),
+    ] {
+        let said = world.with_code_of(name.parse().unwrap()).unwrap_err();
+        assert!(said.to_string().contains("and not"), "{said}");
+    }
+}
+
+#[test]
+fn a_world_that_a_program_adds_is_as_the_others() {
+    #[derive(Deserialize)]
+    #[serde(deny_unknown_fields)]
+    struct Flat {
+        reward: f32,
+    }
+    impl WorldSettings for Flat {
+        fn validate(&self) -> Result<(), EnvError> {
+            Ok(())
+        }
+        fn frame_shape(&self) -> FrameShape {
+            FrameShape {
+                height: self.reward as usize,
+                width: 2,
+                channels: 1,
+            }
+        }
+        fn action_names(&self) -> Vec<&str> {
+            vec!["only"]
+        }
+        fn build(&self, _: usize, _: u64, _: usize) -> Result<Box<dyn Environment>, EnvError> {
+            Err(EnvError::Config("flat".into()))
+        }
+    }
+    let text = "kind = 'flat'\nreward = 3.5\n";
+    assert!(toml::from_str::<WorldConfig>(text).is_err());
+    own::register::<Flat>("flat", "# preset");
+    // The name of one of ours stays ours.
+    own::register::<Flat>("chain", "");
+    let config: WorldConfig = toml::from_str(text).unwrap();
+    assert_eq!(config.name(), "flat".parse().unwrap());
+    assert_eq!(config.frame_shape().height, 3);
+    assert!(config.validate().is_ok() && config.build(1, 1, 0).is_err());
+    let again = toml::to_string(&config).unwrap();
+    assert_eq!(toml::from_str::<WorldConfig>(&again).unwrap(), config);
+    assert!(config.with_levels(Levels::Train).is_ok());
+    assert!(config.with_levels(Levels::Unseen).is_err());
+    assert_eq!(own::preset("flat"), Some("# preset"));
+    let error = toml::from_str::<WorldConfig>(&text.replace("3.5", "3.5\ncolour = 1"));
+    assert!(error.unwrap_err().to_string().contains("colour"));
+    assert!(WorldName::all().any(|name| name.to_string() == "flat"));
+    let [_, chain, ..] = configs();
+    assert_eq!(
+        toml::from_str::<WorldConfig>(&toml::to_string(&chain).unwrap()).unwrap(),
+        chain
+    );
 }
 
 #[test]
@@ -72,8 +174,20 @@ fn settings_are_read_by_kind_and_unknown_keys_are_rejected() {
 }
 
 /// One set of settings for each world that needs no engine.
-fn configs() -> [WorldConfig; 3] {
+fn configs() -> [WorldConfig; 4] {
     [
+        WorldConfig::Exec(ExecConfig {
+            command: format!(
+                "exec python3 {}/../../tests/worlds/numbered.py",
+                env!("CARGO_MANIFEST_DIR")
+            ),
+            height: 12,
+            width: 12,
+            channels: 1,
+            actions: ["no-op", "left", "right"].map(str::to_owned).to_vec(),
+            start_timeout_ms: 60_000,
+            step_timeout_ms: 60_000,
+        }),
         WorldConfig::Chain(CorridorConfig {
             cells: 8,
             height: 9,
@@ -148,6 +262,9 @@ fn procgen(start_level: u32, num_levels: u32) -> WorldConfig {
         use_backgrounds: true,
         center_agent: true,
         restrict_themes: false,
+        frame_side: 64,
+        grey: false,
+        library: None,
     })
 }
 

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::copies::{check_num_envs, check_step};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
+use crate::saved;
 use crate::settings::WorldSettings;
 
 /// The cell in which every episode starts: beside the near end.
@@ -126,8 +127,8 @@ impl WorldSettings for CorridorConfig {
         CorridorConfig::frame_shape(self)
     }
 
-    fn action_names(&self) -> &'static [&'static str] {
-        &CorridorWorld::ACTION_NAMES
+    fn action_names(&self) -> Vec<&str> {
+        CorridorWorld::ACTION_NAMES.to_vec()
     }
 
     fn build(
@@ -196,6 +197,22 @@ impl Environment for CorridorWorld {
                 (self.cells[env], self.episode_steps[env]) = (START_CELL, 0);
             }
         }
+        Ok(())
+    }
+
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        let copies = self.cells.iter().zip(&self.episode_steps);
+        saved::encode(&copies.collect::<Vec<_>>())
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        let copies: Vec<(usize, u32)> = saved::decode(state, self.num_envs())?;
+        let inner = 1..self.config.cells - 1;
+        saved::check(
+            copies.iter().all(|(cell, _)| inner.contains(cell)),
+            "a cell",
+        )?;
+        (self.cells, self.episode_steps) = copies.into_iter().unzip();
         Ok(())
     }
 }

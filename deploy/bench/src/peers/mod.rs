@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use crate::{
     alone,
     effort::median,
-    flags::{BenchPart, BenchPeersArgs},
+    flags::{BenchPeersArgs, Component},
     measurements::{self, MachineNote, Measurement},
     peers::{
         pairs::{PAIRS, Pair, Theirs},
@@ -32,7 +32,7 @@ const ROUNDS: (u32, u32) = (5, 1);
 /// What one side found in every round, by what was measured.
 type Samples = BTreeMap<String, Vec<f64>>;
 
-/// A part's figures, and its peer's or why there are none.
+/// A component's figures, and its peer's or why there are none.
 #[derive(Debug, Default)]
 struct Sides {
     ours: Samples,
@@ -45,7 +45,8 @@ struct Sides {
 /// One line of the comparison.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Row {
-    part: String,
+    #[serde(rename = "part")]
+    component: String,
     what: String,
     unit: String,
     /// Median over the rounds.
@@ -64,7 +65,7 @@ struct Row {
     skipped: Option<String>,
 }
 
-/// The comparison as JSON has it.
+/// The comparison, as it is written to JSON.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Comparison {
     rounds: u32,
@@ -78,26 +79,26 @@ struct Comparison {
 /// Measures, and reports.
 ///
 /// # Errors
-/// A part of ours that failed, or a file that cannot be written. A peer that is missing or fails is reported as skipped.
+/// A component of ours that failed, or a file that cannot be written. A peer that is missing or fails is reported as skipped.
 pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
     let rounds = args.rounds.unwrap_or(match args.flags.quick {
         true => ROUNDS.1,
         false => ROUNDS.0,
     });
-    let parts: BTreeSet<_> = match args.only.as_slice() {
-        [] => PAIRS.iter().map(|pair| pair.part).collect(),
+    let components: BTreeSet<_> = match args.only.as_slice() {
+        [] => PAIRS.iter().map(|pair| pair.component).collect(),
         only => only.iter().copied().collect(),
     };
     let machine = MachineNote::this();
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
     script::write_all(folder.path())?;
     let frames = folder.path().join("frames");
-    if parts.contains(&BenchPart::Replay) {
+    if components.contains(&Component::Replay) {
         Recording::play()?.write_frames(&frames)?;
     }
     let mut sides = BTreeMap::new();
-    for &part in &parts {
-        let script = Script::new(part, args, folder.path(), &frames);
+    for &component in &components {
+        let script = Script::new(component, args, folder.path(), &frames);
         let mut found = Sides {
             peer: script.peer().name().to_owned(),
             ..Sides::default()
@@ -105,15 +106,20 @@ pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
         if let Err(absent) = script.check() {
             found.skip(absent);
         }
-        sides.insert(part, (script, found));
+        sides.insert(component, (script, found));
     }
     for round in 1..=rounds {
-        for (part, (script, sides)) in &mut sides {
+        for (component, (script, sides)) in &mut sides {
             console::line(&format!(
                 "round {round} of {rounds}: {} of ours",
-                part.name()
+                component.name()
             ));
-            sides.add_ours(alone::figures(*part, &args.flags, DeviceName::Cpu)?);
+            sides.add_ours(alone::figures(
+                *component,
+                &[],
+                &args.flags,
+                DeviceName::Cpu,
+            )?);
             if sides.absent.is_none() {
                 console::line(&format!("round {round} of {rounds}: {}", sides.peer));
                 match script.run() {
@@ -123,9 +129,11 @@ pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
             }
         }
     }
-    let of_part = |pair: &&Pair| sides.contains_key(&pair.part);
-    let rows = PAIRS.iter().filter(of_part).map(|pair| {
-        let (_, sides) = &sides[&pair.part];
+    let precisions = args.flags.precisions(DeviceName::Cpu);
+    let is_measured =
+        |pair: &&Pair| sides.contains_key(&pair.component) && pair.is_asked(&precisions);
+    let rows = PAIRS.iter().filter(is_measured).map(|pair| {
+        let (_, sides) = &sides[&pair.component];
         row(pair, sides).with_context(|| format!("comparing {:?}", pair.ours))
     });
     let comparison = Comparison {
@@ -179,7 +187,7 @@ fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
         None => format!("{peer} was not measured"),
     };
     Some(Row {
-        part: pair.part.name().into(),
+        component: pair.component.name().into(),
         what: pair.ours.into(),
         unit: sides.units.get(pair.ours)?.clone(),
         ours: median(ours),

@@ -10,7 +10,7 @@ use std::{
 use anyhow::Context;
 use serde::Deserialize;
 
-use crate::flags::{BenchPart, BenchPeersArgs};
+use crate::flags::{BenchPeersArgs, Component};
 
 /// The scripts, which this program carries, so that it can be started anywhere.
 const FILES: [(&str, &str); 6] = [
@@ -60,7 +60,7 @@ pub(super) enum Peer {
 }
 
 impl Peer {
-    /// Its name for a person.
+    /// Its name in tables and messages.
     pub(super) const fn name(self) -> &'static str {
         match self {
             Self::Torch => "PyTorch",
@@ -79,7 +79,7 @@ impl Peer {
     }
 }
 
-/// Why a peer has no figures, for a person.
+/// Why a peer has no figures, as the table says it.
 #[derive(Debug)]
 pub(super) struct Absent(pub(super) String);
 
@@ -102,22 +102,22 @@ struct Answer {
 }
 
 impl Script {
-    /// The script that does a part's work, in `folder`; `frames` is the file that Reverb's frames come from.
+    /// The script that does a component's work, in `folder`; `frames` is the file that Reverb's frames come from.
     pub(super) fn new(
-        part: BenchPart,
+        component: Component,
         args: &BenchPeersArgs,
         folder: &Path,
         frames: &Path,
     ) -> Self {
-        let (peer, name, own) = match part {
-            BenchPart::Learner => (Peer::Torch, "torch_update.py", &args.torch_python),
-            BenchPart::Policy => (Peer::Torch, "torch_policy.py", &args.torch_python),
-            BenchPart::Replay => (Peer::Reverb, "reverb_replay.py", &args.reverb_python),
-            BenchPart::Env => (Peer::Gym3, "gym3_steps.py", &args.gym3_python),
+        let (peer, name, own) = match component {
+            Component::Learner => (Peer::Torch, "torch_update.py", &args.torch_python),
+            Component::Policy => (Peer::Torch, "torch_policy.py", &args.torch_python),
+            Component::Replay => (Peer::Reverb, "reverb_replay.py", &args.reverb_python),
+            Component::Env => (Peer::Gym3, "gym3_steps.py", &args.gym3_python),
         };
         let mut words = vec!["--threads".to_owned(), args.flags.threads.to_string()];
         words.extend(args.flags.quick.then(|| "--quick".to_owned()));
-        if part == BenchPart::Replay {
+        if component == Component::Replay {
             words.extend(["--frames".to_owned(), frames.display().to_string()]);
         }
         Self {

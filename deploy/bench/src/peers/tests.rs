@@ -1,5 +1,6 @@
 //! The comparison's arithmetic and its table, without any measurement.
 
+use driml_learner::Precision;
 use expect_test::expect;
 
 use super::*;
@@ -16,7 +17,7 @@ fn samples(of: &[(&str, &[f64])]) -> Samples {
 
 fn pair(theirs: Theirs, goal: Option<f64>) -> Pair {
     Pair {
-        part: BenchPart::Learner,
+        component: Component::Learner,
         ours: "C51",
         theirs,
         goal,
@@ -83,15 +84,34 @@ fn a_peer_that_is_missing_is_shown_as_skipped() {
 
 #[test]
 fn every_peer_s_figure_is_named_in_its_script() {
-    for Pair { part, theirs, .. } in PAIRS {
+    for Pair {
+        component, theirs, ..
+    } in PAIRS
+    {
         let Theirs::Peers(name) = theirs else {
             continue;
         };
-        // Names that a script puts together are checked by running it.
-        if matches!(part, BenchPart::Learner | BenchPart::Replay) {
+        // Names that a script puts together are checked by running it; the precision is one it appends.
+        let name = name.strip_suffix(", bf16").unwrap_or(name);
+        if matches!(component, Component::Learner | Component::Replay) {
             let quoted = format!("\"{name}\"");
             let scripts = script::texts();
             assert!(scripts.iter().any(|text| text.contains(&quoted)), "{name}");
         }
     }
+}
+
+#[test]
+fn rows_of_a_precision_that_was_not_asked_for_are_left_out() {
+    let asked = |precisions: &[Precision]| {
+        let learners = PAIRS.iter().filter(|it| it.component == Component::Learner);
+        let asked = learners.filter(|pair| pair.is_asked(precisions));
+        asked.map(|pair| pair.ours).collect::<Vec<_>>()
+    };
+    let (f32, bf16) = (asked(&[Precision::F32]), asked(&[Precision::Bf16]));
+    assert!(bf16.iter().all(|name| name.ends_with(", bf16")));
+    assert!(!f32.iter().any(|name| name.contains("bf16")));
+    let all = asked(&[Precision::F32, Precision::Bf16]);
+    assert_eq!(f32.len() + bf16.len(), all.len());
+    assert!(!f32.is_empty() && !bf16.is_empty());
 }

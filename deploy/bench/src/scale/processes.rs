@@ -56,7 +56,7 @@ pub(super) fn measure(args: &BenchScaleArgs) -> anyhow::Result<Table> {
     Ok(table)
 }
 
-/// A run with so many actors, from its start until it has been watched.
+/// A run with `actors` actors, from its start until it has been watched.
 fn watch(
     args: &BenchScaleArgs,
     actors: u32,

@@ -48,7 +48,7 @@ pub(super) struct Watched {
 
 /// The replay servers that are measured.
 pub(super) struct Servers {
-    parts: Vec<ManagedProcess>,
+    processes: Vec<ManagedProcess>,
     endpoints: Vec<String>,
     pub(super) keys: Keys,
 }
@@ -56,13 +56,13 @@ pub(super) struct Servers {
 impl Servers {
     /// Starts `shards` of them, each once the one before it listens.
     pub(super) fn start(shards: u32, sets: &[String], folder: &Path) -> anyhow::Result<Self> {
-        let (mut parts, mut endpoints) = (Vec::new(), Vec::new());
+        let (mut processes, mut endpoints) = (Vec::new(), Vec::new());
         for shard in 0..shards {
             let name = format!("replay-server-{shard}");
             let socket = folder.join(format!("{shard}.sock"));
             let endpoint = format!("unixsock-stream/{}", socket.display());
             let shard = shard.to_string();
-            let words = ["replay-server", "--listen", &endpoint];
+            let words = ["replay-server", "--stay", "--listen", &endpoint];
             let run = [
                 "--shard",
                 &shard,
@@ -82,16 +82,20 @@ impl Servers {
                 screen: &Screen::plain(),
                 meeting: None,
             };
-            let mut part = ManagedProcess::start(&name, &args, 1, surroundings)?;
-            let session = reach(&endpoint, &mut part)?;
+            let mut process = ManagedProcess::start(&name, &args, 1, surroundings)?;
+            let at = Endpoints {
+                listen: Vec::new(),
+                connect: vec![endpoint.clone()],
+            };
+            let session = reach(&mut process, || session::open(&at))?;
             if let Err(e) = session.close().wait() {
                 tracing::debug!("closing a session: {e}");
             }
-            parts.push(part);
+            processes.push(process);
             endpoints.push(endpoint);
         }
         Ok(Self {
-            parts,
+            processes,
             endpoints,
             keys: Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?,
         })
@@ -107,7 +111,7 @@ impl Servers {
 
     /// A new session with each of them.
     pub(super) fn sessions(&self) -> anyhow::Result<Vec<Session>> {
-        (0..self.parts.len() as u32)
+        (0..self.processes.len() as u32)
             .map(|shard| self.session(shard))
             .collect()
     }
@@ -129,7 +133,7 @@ impl Servers {
         thread::sleep(Duration::from_secs_f64(seconds));
         let (ended, stored_after, served_after, busy_after) = moment(self)?;
         let elapsed = (ended - started).as_secs_f64();
-        let memory = self.parts.iter_mut().map(ManagedProcess::rss_mib);
+        let memory = self.processes.iter_mut().map(ManagedProcess::rss_mib);
         Ok(Watched {
             stored: (stored_after - stored) as f64 / elapsed,
             batches: (served_after - served) as f64 / elapsed,
@@ -143,11 +147,11 @@ impl Servers {
     fn processor_seconds(&mut self) -> anyhow::Result<f64> {
         let ticks_a_second = sysconf(SysconfVar::CLK_TCK)?.context("the system's clock ticks")?;
         let mut ticks = 0;
-        for part in &mut self.parts {
-            if part.end().is_some() {
-                bail!("{}", part.exit_report());
+        for process in &mut self.processes {
+            if process.end().is_some() {
+                bail!("{}", process.exit_report());
             }
-            let path = format!("/proc/{}/stat", part.pid());
+            let path = format!("/proc/{}/stat", process.pid());
             let stat = std::fs::read_to_string(&path).with_context(|| format!("reading {path}"))?;
             ticks +=
                 processor_ticks(&stat).with_context(|| format!("{path} is not as expected"))?;
@@ -157,9 +161,9 @@ impl Servers {
 
     /// Ends them in order.
     pub(super) fn end(&mut self) {
-        for part in &mut self.parts {
-            part.ask_to_stop();
-            part.wait_until(Instant::now() + END_MAX, || false);
+        for process in &mut self.processes {
+            process.ask_to_stop();
+            process.wait_until(Instant::now() + END_MAX, || false);
         }
     }
 }

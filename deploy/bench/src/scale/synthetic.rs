@@ -9,7 +9,7 @@ use std::{
 
 use driml_actor::{ActorSettings, Delivery, DeliveryLimits, WeightsSource};
 use driml_learner::{
-    LearnerPart,
+    LearnerConfig,
     remote::batch_source::{BatchSource, Next, Requests},
 };
 use driml_protocol::{Keys, RunClient, Shutdown};
@@ -26,7 +26,7 @@ const PUBLISH_PERIOD: u64 = 8;
 /// When an actor sends.
 #[derive(Clone, Copy)]
 pub(super) enum Pace {
-    /// A chunk of so many steps in each period; the first one later.
+    /// A chunk of `steps` steps in each period; the first one is sent later.
     Every {
         steps: u32,
         period: Duration,
@@ -84,8 +84,8 @@ impl Actor<'_> {
                     steps
                 }
                 Pace::Unpaced => {
-                    if let Some((weights, _)) = newest.take_within(delivery.fresh_weights_max()) {
-                        chunks.act_with(weights.version);
+                    if let Some(weights) = newest.take_within(delivery.fresh_weights_max()) {
+                        chunks.act_with(weights.header.version);
                     }
                     settings
                         .actor
@@ -126,12 +126,12 @@ impl Learner<'_> {
         stop: &Shutdown,
         count: &AtomicU64,
     ) -> anyhow::Result<()> {
-        let LearnerPart {
+        let LearnerConfig {
             spec,
             learner,
             transport,
             ..
-        } = LearnerPart::from_toml(&self.config.to_toml())?;
+        } = LearnerConfig::from_toml(&self.config.to_toml())?;
         let spec_hash = spec.hash();
         let mut alive = Vec::new();
         let client = |session: &Session| RunClient::new(session.clone(), keys.clone(), spec_hash);
@@ -141,7 +141,7 @@ impl Learner<'_> {
         }
         let requests = Requests {
             learner: taking_part::LEARNER,
-            rows: learner.batch_rows,
+            rows: learner.batch_size,
             in_flight: learner.batches_in_flight,
             shared_memory: transport.shared_memory,
             unreachable_max: ANSWER_MAX,

@@ -8,8 +8,8 @@ use driml_envs::{WorldConfig, WorldName};
 use driml_figure::{Axis, Chart, Field, Figure, GREY, Heat, Lattice, Mark, Outline, Panel, Series};
 use driml_machine::{error::usage, resources::Machine};
 use driml_settings::{
-    config::{self, Flags, Source},
     presets,
+    resolve::{Flags, Source, resolve},
 };
 
 use self::{
@@ -41,7 +41,8 @@ fn task(settings: &Settings) -> anyhow::Result<Task> {
         sets: settings.sets.clone(),
         ..Flags::default()
     };
-    let config = config::resolve(&source, &flags, &Machine::this())?;
+    // The experiment plays in the world itself, whose frames are whole.
+    let config = resolve(&source, &flags, &Machine::this())?.with_whole_frames()?;
     let WorldConfig::Ising(world) = config.world else {
         return Err(usage!("the Ising world's settings are those of another world").into());
     };
@@ -198,8 +199,8 @@ fn fig2(task: &Task, first: &Trained) -> anyhow::Result<Figure> {
         notes: vec![format!(
             "Seed 1; episodes that were not trained on; the patch is outlined. Score: log-softmax of the true pair among \
              {} episodes, plus ln {}, at each of the {} places of the last convolution.",
-            settings.batch_rows,
-            settings.batch_rows,
+            settings.batch_size,
+            settings.batch_size,
             view.columns * view.columns,
         )],
         columns: shown,
@@ -272,7 +273,7 @@ fn page(task: &Task, trained: &[Trained], command: &str, smoke: bool) -> Page {
     let over_seeds = |value: &dyn Fn(&Trained) -> f64| {
         Spread::of(trained.iter().map(value)).map_or("none".to_owned(), |it| it.to_string())
     };
-    let batch_rows = settings.batch_rows;
+    let batch_size = settings.batch_size;
     let mut values = Values::default();
     values
         .set("from_t", settings.from_t)
@@ -289,8 +290,8 @@ fn page(task: &Task, trained: &[Trained], command: &str, smoke: bool) -> Page {
         .set("auc_pairs", over_seeds(&|one| one.last.auc_pairs))
         .set("untrained", over_seeds(&|one| one.checks[0].1.auc))
         .set("loss", over_seeds(&|one| one.last.loss))
-        .set("batch_rows", batch_rows)
-        .set("blind_loss", format!("{:.2}", (batch_rows as f64).ln()));
+        .set("batch_size", batch_size)
+        .set("blind_loss", format!("{:.2}", (batch_size as f64).ln()));
     values
         .set("lattice", task.world.lattice_size)
         .set("patch", task.world.patch_size)

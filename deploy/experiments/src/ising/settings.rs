@@ -2,11 +2,11 @@
 
 use serde::{Deserialize, Serialize};
 
-/// `deploy/experiments/src/ising/*.toml`.
+/// The contents of `config.toml` or `smoke.toml` beside this file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {
-    /// What differs from the settings of a run in this world, as `--set` has it.
+    /// What differs from the settings of a run in this world, in the form of `--set`.
     pub(super) sets: Vec<String>,
     /// Seeds 1 to this. No piece depends on it, so that more can be added later.
     #[serde(skip_serializing)]
@@ -14,7 +14,7 @@ pub(super) struct Settings {
     /// Updates of a training.
     pub(super) updates: u64,
     /// Pairs in a batch, each with all others as negatives.
-    pub(super) batch_rows: usize,
+    pub(super) batch_size: usize,
     /// Measurements before the end.
     pub(super) checks: u64,
     /// Episodes of each.

@@ -86,7 +86,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
         let (now, next) = pairs.batch(&mut rng)?;
         let value = scorer.loss(&now, &next)?;
         loss.push(value.to_scalar::<f32>()?);
-        let gradients = Gradients::take(&parameters, value.backward()?)?;
+        let gradients = Gradients::of(&parameters, &value)?;
         let factor = clip_factor(gradients.norm(Kernels::FUSED)?, task.learner.max_grad_norm);
         adam.step(&parameters, &gradients, factor)?;
         progress.advance(1)?;
@@ -147,7 +147,7 @@ impl Episodes {
     /// A world that cannot be.
     pub(super) fn measured(task: &Task, steps: u32) -> anyhow::Result<Self> {
         let seed = MEASURED_SEED;
-        Self::play(&task.world, task.settings.batch_rows, steps, seed)
+        Self::play(&task.world, task.settings.batch_size, steps, seed)
     }
 }
 
@@ -179,7 +179,7 @@ impl<'a> Pairs<'a> {
         let steps = (world.episode_steps - 1).max(1);
         // Below the measured worlds' seeds.
         let seed = rng.random_range(0..MEASURED_SEED);
-        self.episodes = Episodes::play(world, settings.batch_rows, steps, seed)?;
+        self.episodes = Episodes::play(world, settings.batch_size, steps, seed)?;
         // As many batches as there are pairs in an episode: each is used once, on average.
         self.batches_left = steps;
         Ok(())
@@ -193,7 +193,7 @@ impl<'a> Pairs<'a> {
         let bytes = self.task.world.frame_shape().bytes();
         let frames = &self.episodes.frames;
         let (mut now, mut next) = (Vec::new(), Vec::new());
-        for row in 0..self.task.settings.batch_rows {
+        for row in 0..self.task.settings.batch_size {
             let t = rng.random_range(0..frames.len() - 1);
             let place = row * bytes..(row + 1) * bytes;
             now.extend_from_slice(&frames[t][place.clone()]);
@@ -258,7 +258,7 @@ impl Scorer<'_> {
             settings,
             ..
         } = self.task;
-        let rows = settings.batch_rows;
+        let rows = settings.batch_size;
         let t = settings.from_t as usize;
         let view = View::of(model);
         let mut tally = Tally::default();

@@ -1,9 +1,10 @@
 //! The picture of Fig. 3. It draws nothing beyond the episodes and frames that the settings ask for.
 
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
+use driml_protocol::RETURNS_OF;
 
 use super::{
-    results::{LOSSES, RETURNS_OF, Results, Trace, loss_of},
+    results::{LOSSES, Results, Trace, loss_of},
     settings::Continual,
 };
 use crate::{

@@ -15,7 +15,8 @@ use self::{
 };
 use crate::{
     flags::{PacmanArgs, command_line},
-    queue::{self, PlannedRun},
+    queue,
+    runs::PlannedRun,
     session::Session,
 };
 
@@ -38,9 +39,9 @@ pub(super) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
         runs: Vec::new(),
         missing: Vec::new(),
     };
-    for ((part, seed, plan), ran) in plans.into_iter().zip(ran) {
+    for ((kind, seed, plan), ran) in plans.into_iter().zip(ran) {
         match ran {
-            Some(ran) => results.runs.push((part, seed, ran)),
+            Some(ran) => results.runs.push((kind, seed, ran)),
             None => results.missing.push(plan.name),
         }
     }

@@ -1,17 +1,17 @@
 //! The runs of Fig. 3: what each is for, and its command line.
 
 use super::settings::{Continual, Predictability, Settings};
-use crate::queue::PlannedRun;
+use crate::runs::PlannedRun;
 
 /// Frames of an episode, about; only the estimate of the time left depends on it.
 const EPISODE_FRAMES: u64 = 190;
-/// Most frames of an episode: the world's step limit. A run of so many frames has all its episodes.
+/// Most frames of an episode: the world's step limit. A run of that many frames has all its episodes.
 pub(super) const EPISODE_FRAMES_MAX: u64 = 500;
 
 /// What a run is for.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum RunKind {
-    /// (a)
+    /// (a): ghosts that move at random with this probability.
     Epsilon(f64),
     /// (b), of this agent.
     Ghosts(String),
@@ -25,8 +25,8 @@ impl Settings {
         let mut plans = Vec::new();
         for seed in 1..=self.seeds {
             for &epsilon in &self.predictability.epsilons {
-                let part = RunKind::Epsilon(epsilon);
-                plans.push((part, seed, self.predictability_plan(epsilon, seed)));
+                let kind = RunKind::Epsilon(epsilon);
+                plans.push((kind, seed, self.predictability_plan(epsilon, seed)));
             }
             for agent in &self.agents {
                 let plan = self.continual_plan("ghosts", &self.continual, agent, seed);

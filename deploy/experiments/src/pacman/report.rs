@@ -1,10 +1,12 @@
 //! Data and page of Fig. 3, from the runs' metrics.
 //! It draws nothing beyond the episodes and frames that the settings ask for.
 
+use driml_protocol::RETURNS_OF;
+
 use super::{
     figure::figure,
     plans::{EPISODE_FRAMES_MAX, RunKind},
-    results::{LOSSES, Points, RETURNS_OF, Results, Trace, loss_of, traces},
+    results::{LOSSES, Points, Results, Trace, loss_of, traces},
     settings::Continual,
 };
 use crate::{
@@ -130,8 +132,8 @@ fn loss_table(results: &Results, losses: &[Loss]) -> Table {
         .epsilons
         .iter()
         .map(|&epsilon| {
-            let part = RunKind::Epsilon(epsilon);
-            let here = results.runs.iter().filter(|(of, ..)| *of == part);
+            let kind = RunKind::Epsilon(epsilon);
+            let here = results.runs.iter().filter(|(of, ..)| *of == kind);
             let episodes = here.map(|(.., ran)| ran.summary.episodes as f64);
             let mut row = vec![
                 epsilon.to_string(),
@@ -223,7 +225,7 @@ fn got_losses(losses: &[Loss]) -> Vec<String> {
 }
 
 fn got_tasks(
-    part: &str,
+    panel: &str,
     continual: &Continual,
     results: &Results,
     traces: &[Trace],
@@ -236,7 +238,7 @@ fn got_tasks(
             .filter_map(|trace| Some(trace.task(continual, last)?.0 - trace.task(continual, 0)?.0));
         if let Some(gain) = Spread::of(gains) {
             lines.push(format!(
-                "{part} `{agent}`: return at the end of the last task minus that of the first: {gain}."
+                "{panel} `{agent}`: return at the end of the last task minus that of the first: {gain}."
             ));
         }
     }
@@ -255,7 +257,7 @@ fn got_tasks(
             });
             if let Some(apart) = Spread::of(apart) {
                 lines.push(format!(
-                    "{part} `{agent}` minus `{first}`, return over all tasks, seed by seed: {apart}."
+                    "{panel} `{agent}` minus `{first}`, return over all tasks, seed by seed: {apart}."
                 ));
             }
         }
@@ -272,7 +274,7 @@ fn page(results: &Results, losses: &[Loss], got: Vec<String>, mut values: Values
         .set("missing", missing.join(", "))
         .when("nothing", got.is_empty() && missing.is_empty())
         .items("got", got);
-    let short = ghosts.episodes_per_task.min(noise.episodes_per_task) < 2 * RETURNS_OF;
+    let short = ghosts.episodes_per_task.min(noise.episodes_per_task) < 2 * RETURNS_OF as u64;
     let replay = "replay.capacity_transitions=";
     let mut capacities = ghosts
         .sets

@@ -4,12 +4,10 @@ use super::{
     plans::RunKind,
     settings::{Continual, Settings},
 };
-use crate::{plot::Run, queue::FinishedRun, statistics::Spread};
+use crate::{plot::Run, runs::FinishedRun, statistics::Spread};
 
 /// The DIM losses of the preset: column of the metrics, and what it compares.
 pub(super) const LOSSES: [(&str, &str); 2] = [("dim_3t3", "local"), ("dim_4t4", "global")];
-/// Episodes in the recorded mean return.
-pub(super) const RETURNS_OF: u64 = 100;
 
 /// (x, y) in the order of x.
 pub(super) type Points = Vec<(f64, f64)>;
@@ -52,7 +50,7 @@ pub(super) fn loss_of(
     let runs = results
         .runs
         .iter()
-        .filter(|(part, ..)| *part == RunKind::Epsilon(epsilon));
+        .filter(|(kind, ..)| *kind == RunKind::Epsilon(epsilon));
     runs.map(|(_, seed, ran)| Ok((*seed, Run::read(&ran.folder)?.values(column)?)))
         .collect()
 }
@@ -66,8 +64,8 @@ pub(super) fn traces(results: &Results, noise: bool) -> anyhow::Result<Vec<Trace
         &settings.continual
     };
     let mut traces = Vec::new();
-    for (part, seed, ran) in &results.runs {
-        let agent = match part {
+    for (kind, seed, ran) in &results.runs {
+        let agent = match kind {
             RunKind::Ghosts(agent) if !noise => agent,
             RunKind::Noise(agent) if noise => agent,
             _ => continue,

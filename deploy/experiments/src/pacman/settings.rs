@@ -23,7 +23,7 @@ pub(super) struct Settings {
     pub(super) jobs: u32,
     /// As `--preset` takes it.
     pub(super) preset: String,
-    /// What differs from the preset in every run, as `--set` has it.
+    /// What differs from the preset in every run, in the form of `--set`.
     pub(super) sets: Vec<String>,
     pub(super) predictability: Predictability,
     pub(super) continual: Continual,
@@ -52,7 +52,7 @@ pub(super) struct Continual {
     pub(super) episodes_per_task: u64,
     /// Copies of the world, in one actor.
     pub(super) envs: u64,
-    /// What differs from the other runs, as `--set` has it.
+    /// What differs from the other runs, in the form of `--set`.
     pub(super) sets: Vec<String>,
 }
 

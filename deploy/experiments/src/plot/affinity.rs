@@ -66,9 +66,9 @@ fn action_names(folder: &RunFolder, side: usize) -> Vec<String> {
     let config = std::fs::read_to_string(&path)
         .ok()
         .and_then(|text| RunConfig::parse("config.toml", &text).ok());
-    let names = config.map(|config| config.world.action_names());
+    let names = config.map(|config| config.action_names());
     match names {
-        Some(names) if names.len() == side => names.iter().map(|&name| name.to_owned()).collect(),
+        Some(names) if names.len() == side => names,
         _ => (0..side).map(|action| action.to_string()).collect(),
     }
 }

@@ -6,12 +6,12 @@ use driml_settings::presets;
 use serde::Deserialize;
 
 use super::published;
-use crate::{flags::ProcgenArgs, queue::PlannedRun};
+use crate::{flags::ProcgenArgs, runs::PlannedRun};
 
 const FULL: &str = include_str!("config.toml");
 const SMOKE: &str = include_str!("smoke.toml");
 
-/// `deploy/experiments/src/procgen/*.toml`.
+/// The contents of `config.toml` or `smoke.toml` beside this file.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct File {
@@ -35,7 +35,7 @@ pub(super) struct Settings {
     pub(super) preset: String,
     /// Frames of a run.
     pub(super) frames: u64,
-    /// What differs from the preset, as `--set` has it.
+    /// What differs from the preset, in the form of `--set`.
     pub(super) sets: Vec<String>,
     /// Episodes played on each kind of levels.
     pub(super) episodes: u32,

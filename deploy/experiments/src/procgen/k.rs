@@ -45,7 +45,8 @@ pub(super) fn kinds(world: WorldName, summary: &Summary) -> [f64; 3] {
 
 /// 0 a movement, 1 no-op, 2 special.
 fn kind(world: WorldName, action: usize) -> usize {
-    match world.variant().and_then(|(_, game)| game.parse().ok()) {
+    let game = world.settings().find(|(key, _)| *key == "game");
+    match game.and_then(|(_, game)| game.parse().ok()) {
         Some(game) => match visible_actions(game).get(action) {
             Some(4) => 1,
             Some(0..9) => 0,

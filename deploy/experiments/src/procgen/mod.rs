@@ -26,8 +26,8 @@ use self::{
 };
 use crate::{
     flags::{ProcgenArgs, command_line},
-    plot,
-    queue::{self, FinishedRun, PlannedRun},
+    plot, queue,
+    runs::{FinishedRun, PlannedRun},
     session::Session,
 };
 

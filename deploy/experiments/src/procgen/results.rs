@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::grid::Settings;
-use crate::queue::FinishedRun;
+use crate::runs::FinishedRun;
 
 /// A finished run and how its agent plays.
 pub(super) struct RunResult {

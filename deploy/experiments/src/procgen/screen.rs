@@ -2,6 +2,7 @@
 //! It chooses nothing by itself; the page has the order and says how it was made.
 
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
+use driml_protocol::RETURNS_OF;
 
 use super::{
     grid::short,
@@ -19,8 +20,6 @@ use crate::{
 const ERRORS: f64 = 3.0;
 /// Training episodes before their mean counts.
 const EPISODES_MIN: f64 = 20.0;
-/// Episodes in the recorded mean return.
-const RETURNS_OF: f64 = 100.0;
 /// Standard errors below which a proposed game is called a guess.
 const GUESSED: f64 = 2.0;
 /// Games that the page proposes.
@@ -105,7 +104,7 @@ fn screen(results: &Results, cell: &RunResult) -> anyhow::Result<Option<Screened
 }
 
 /// The frames after which the mean return of the last 100 training episodes stayed above the random policy's mean by
-/// `ERRORS` standard errors of a mean of so many of its episodes, to the end of the run.
+/// `ERRORS` standard errors of a mean of as many of its episodes, to the end of the run.
 fn soonest(run: &Run, random: &Spread) -> anyhow::Result<Option<f64>> {
     let returns = run.values("mean_return")?;
     // Of how many episodes it is; runs of older versions, which cannot be resumed by this one, only have the count of all.
@@ -115,7 +114,7 @@ fn soonest(run: &Run, random: &Spread) -> anyhow::Result<Option<f64>> {
     let mut since = None;
     // Once known, the return is in every row: the last rows of both belong together.
     for (row, episodes) in returns.iter().rev().zip(episodes.iter().rev()) {
-        let error = random.sd / episodes.1.clamp(1.0, RETURNS_OF).sqrt();
+        let error = random.sd / episodes.1.clamp(1.0, RETURNS_OF as f64).sqrt();
         if episodes.1 < EPISODES_MIN || row.1 <= random.mean + ERRORS * error {
             break;
         }

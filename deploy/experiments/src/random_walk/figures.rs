@@ -47,7 +47,7 @@ pub(super) fn fig1(results: &Results) -> Figure {
         title: format!("InfoNCE on a biased random walk over {k} states"),
         notes: vec![format!(
             "Learnt: {} updates of {} independent pairs; stationary sampling.",
-            settings.updates, settings.batch_rows
+            settings.updates, settings.batch_size
         )],
         columns: 2,
         panel_size: (430.0, 380.0),

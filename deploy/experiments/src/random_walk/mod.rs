@@ -1,7 +1,7 @@
 //! Fig. 1: InfoNCE on a biased random walk learns T / rho; does it converge as the spectral gap says?
 //! Closed forms are in `chain`, learning in `training`, pictures in `figures`; here the grid and the page.
 
-mod chain;
+pub(crate) mod chain;
 mod figures;
 mod results;
 mod settings;
@@ -198,7 +198,7 @@ fn page(results: &Results, command: &str, smoke: bool) -> Page {
     closed_forms(k, &mut values);
     values
         .set("rkhs", settings.rkhs)
-        .set("batch_rows", settings.batch_rows)
+        .set("batch_size", settings.batch_size)
         .set("lr", settings.adam.lr)
         .set("updates", settings.updates)
         .set("seeds", settings.seeds);

@@ -3,7 +3,7 @@
 use driml_learner::AdamSettings;
 use serde::{Deserialize, Serialize};
 
-/// `deploy/experiments/src/random_walk/*.toml`.
+/// The contents of `config.toml` or `smoke.toml` beside this file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {
@@ -19,7 +19,7 @@ pub(super) struct Settings {
     /// Updates of a training.
     pub(super) updates: u64,
     /// Pairs in a batch, each with all others as negatives.
-    pub(super) batch_rows: usize,
+    pub(super) batch_size: usize,
     /// Width of the heads.
     pub(super) rkhs: usize,
     /// Rows sampled per transition of a single walker.

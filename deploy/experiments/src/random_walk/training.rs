@@ -53,7 +53,7 @@ impl Sampling {
 pub(super) struct Learnt {
     /// When it was measured.
     pub(super) updates: Vec<u64>,
-    /// How far InfoNCE's loss with ever so many negatives is above its minimum, in nats: E_rho KL(T_i || learnt T_i).
+    /// How far InfoNCE's loss with infinitely many negatives is above its minimum, in nats: E_rho KL(T_i || learnt T_i).
     pub(super) excess: Vec<f64>,
     /// Error of the law of the next state, a probability: E_rho of the total variation between T_i and learnt T_i.
     pub(super) tv: Vec<f64>,
@@ -213,7 +213,7 @@ impl Heads {
             .dim
             .pair_losses(&self.network, &now, &next, &action, &valid)?;
         for loss in losses.iter().flatten() {
-            let gradients = Gradients::take(&self.parameters, loss.backward()?)?;
+            let gradients = Gradients::of(&self.parameters, loss)?;
             let factor = clip_factor(gradients.norm(Kernels::FUSED)?, self.max_grad_norm);
             self.adam.step(&self.parameters, &gradients, factor)?;
         }
@@ -245,7 +245,7 @@ struct Source {
 
 impl Source {
     fn new(chain: &Chain, settings: &Settings, sampling: Sampling, rng: &mut ChaCha8Rng) -> Self {
-        let rows = settings.batch_rows;
+        let rows = settings.batch_size;
         let mut this = Self {
             sampling,
             rows,

@@ -9,7 +9,7 @@ use csv::StringRecord;
 pub struct Columns {
     /// The columns' names.
     pub header: Vec<String>,
-    /// The rows.
+    /// A record for each row, without the header.
     pub rows: Vec<StringRecord>,
 }
 

@@ -2,13 +2,13 @@
 //! puts its checkpoints into `checkpoints/`.
 
 use std::{
-    fs::{self, File, TryLockError},
+    fs::{self, File},
     path::{Path, PathBuf},
 };
 
 use anyhow::Context;
 use driml_machine::error::{Usage, usage};
-use driml_protocol::whole_file;
+use driml_protocol::{lock_file, whole_file};
 
 /// The folder of a run, which need not be there yet.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -52,9 +52,29 @@ impl RunFolder {
         self.path.join("summary.json")
     }
 
+    /// The endpoints of the replay servers, a line each, while `driml local` runs here.
+    pub fn endpoints(&self) -> PathBuf {
+        self.path.join("endpoints")
+    }
+
+    /// What checkpoints earned when they were played.
+    pub fn evaluations(&self) -> PathBuf {
+        self.path.join("evaluations.csv")
+    }
+
+    /// A folder with the checkpoint that earned most.
+    pub fn best(&self) -> PathBuf {
+        self.path.join("best")
+    }
+
     /// A folder for each checkpoint.
     pub fn checkpoints(&self) -> PathBuf {
         self.path.join(driml_learner::checkpoint::FOLDER)
+    }
+
+    /// The replay, where it is kept on disk.
+    pub fn replay(&self) -> PathBuf {
+        self.path.join("replay")
     }
 
     /// A file for each process.
@@ -87,23 +107,14 @@ impl RunFolder {
     pub fn lock(&self) -> anyhow::Result<File> {
         let path = self.path.join(".lock");
         let doing = || format!("locking {}", path.display());
-        let file = File::create(&path).with_context(doing)?;
-        match file.try_lock() {
-            Ok(()) => Ok(file),
-            Err(TryLockError::WouldBlock) => Err(usage!(
+        let lock = lock_file::create(&path, "start no other run there").with_context(doing)?;
+        lock.ok_or_else(|| {
+            usage!(
                 "the run in {} is still going on: end it first, or wait",
                 self.display()
             )
-            .into()),
-            Err(TryLockError::Error(e)) => {
-                // Not every file system of a cluster has locks, and runs were made without them before.
-                tracing::warn!(
-                    "{} cannot be locked: {e}; start no other run there",
-                    path.display()
-                );
-                Ok(file)
-            }
-        }
+            .into()
+        })
     }
 
     /// Writes the settings.

@@ -1,32 +1,12 @@
-//! A CSV file that grows by rows while a run goes on. A full disk never ends the run: rows wait in memory until they can be
-//! written, and only what is still missing at the end, or too much to keep, is lost.
+//! A CSV file that grows by rows while a run goes on.
 
-use std::{
-    collections::VecDeque,
-    fs::File,
-    io::{self, Write},
-    path::Path,
-};
+use std::path::Path;
 
-use anyhow::Context;
-use driml_protocol::whole_file;
+use super::growing_file::GrowingFile;
 
-/// Rows that are kept in memory while they cannot be written; of more the oldest are lost. Some hours of metrics.
-const WAITING_MAX: usize = 10_000;
-
-/// The file and what is not in it yet.
+/// A [`GrowingFile`] of comma-separated rows under a header.
 #[derive(Debug)]
-pub(super) struct GrowingCsv {
-    /// Its name, for messages.
-    name: String,
-    file: File,
-    /// Bytes of it that are whole rows.
-    length: u64,
-    waiting: VecDeque<Vec<u8>>,
-    lost: u64,
-    /// The first error.
-    failed: Option<io::Error>,
-}
+pub(super) struct GrowingCsv(GrowingFile);
 
 impl GrowingCsv {
     /// Makes the file anew, with a header and the rows that it begins with.
@@ -38,30 +18,15 @@ impl GrowingCsv {
         header: &[String],
         rows: &[csv::StringRecord],
     ) -> anyhow::Result<Self> {
-        let doing = || format!("writing {}", path.display());
         let mut csv = csv::Writer::from_writer(Vec::new());
         csv.write_record(header)?;
         for row in rows {
             csv.write_record(row)?;
         }
-        let text = csv.into_inner()?;
-        whole_file::write(path, &text).with_context(doing)?;
-        let file = File::options()
-            .append(true)
-            .open(path)
-            .with_context(doing)?;
-        let name = path.file_name().unwrap_or_default();
-        Ok(Self {
-            name: name.to_string_lossy().into_owned(),
-            file,
-            length: text.len() as u64,
-            waiting: VecDeque::new(),
-            lost: 0,
-            failed: None,
-        })
+        Ok(Self(GrowingFile::create(path, &csv.into_inner()?)?))
     }
 
-    /// Adds a row, after those that wait. What a person should know is said the first time that a row has to wait.
+    /// Adds a row, after those that wait. A warning is returned the first time that a row has to wait.
     ///
     /// # Panics
     /// If a row cannot be made into text, which takes no file.
@@ -69,41 +34,12 @@ impl GrowingCsv {
         let mut csv = csv::Writer::from_writer(Vec::new());
         let row: Vec<_> = row.into_iter().collect();
         csv.write_record(row).expect("a row in memory");
-        self.waiting
-            .push_back(csv.into_inner().expect("a row in memory"));
-        if self.waiting.len() > WAITING_MAX {
-            self.waiting.pop_front();
-            self.lost += 1;
-        }
-        let error = self.write().err()?;
-        let said = self.failed.is_none().then(|| {
-            format!(
-                "{} cannot be written: {error}; the run goes on, and its rows are written once that is possible",
-                self.name
-            )
-        });
-        self.failed.get_or_insert(error);
-        said
+        self.0.add(csv.into_inner().expect("a row in memory"))
     }
 
-    /// Writes all rows that wait, or none.
-    fn write(&mut self) -> io::Result<()> {
-        let bytes = self.waiting.make_contiguous().concat();
-        if let Err(e) = self.file.write_all(&bytes) {
-            // Half a row may be there. Should this fail too, the next try begins with half a row before it.
-            let _ = self.file.set_len(self.length);
-            return Err(e);
-        }
-        self.length += bytes.len() as u64;
-        self.waiting.clear();
-        Ok(())
-    }
-
-    /// How many rows are not in the file, and why; none if all are.
+    /// What is missing in the file, as [`GrowingFile::missing`] says it.
     pub(super) fn missing(&self) -> Option<String> {
-        let rows = self.lost + self.waiting.len() as u64;
-        let error = self.failed.as_ref().filter(|_| rows > 0)?;
-        Some(format!("{rows} rows of {} are lost: {error}", self.name))
+        self.0.missing()
     }
 }
 
@@ -113,55 +49,16 @@ mod tests {
 
     use super::*;
 
-    /// A table on a full disk.
-    fn full(path: &Path) -> GrowingCsv {
-        let mut table = GrowingCsv::create(path, &["a".into()], &[]).unwrap();
-        table.file = File::options().append(true).open("/dev/full").unwrap();
-        table
-    }
-
-    #[test]
-    fn rows_wait_until_they_can_be_written() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("metrics.csv");
-        let mut table = full(&path);
-        let row = |n: u32| [format!("{n}, of five")];
-        let said = table.add(row(1)).unwrap();
-        assert!(
-            said.starts_with("metrics.csv cannot be written: No space left"),
-            "{said}"
-        );
-        assert_eq!(table.add(row(2)), None, "it is said once");
-        let missing = table.missing().unwrap();
-        assert!(
-            missing.starts_with("2 rows of metrics.csv are lost: "),
-            "{missing}"
-        );
-
-        table.file = File::options().append(true).open(&path).unwrap();
-        assert_eq!((table.add(row(3)), table.missing()), (None, None));
-        let text = fs::read_to_string(&path).unwrap();
-        assert_eq!(text, "a\n\"1, of five\"\n\"2, of five\"\n\"3, of five\"\n");
-        assert_eq!(table.length, text.len() as u64);
-    }
-
-    #[test]
-    fn the_oldest_of_too_many_rows_are_lost() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut table = full(&folder.path().join("x.csv"));
-        table.waiting = vec![Vec::new(); WAITING_MAX - 1].into();
-        table.add(["1".into()]);
-        table.add(["2".into()]);
-        assert_eq!((table.lost, table.waiting.len()), (1, WAITING_MAX));
-    }
-
     #[test]
     fn a_table_begins_with_the_rows_that_it_is_given() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x.csv");
         let rows = [csv::StringRecord::from(vec!["1", "2"])];
         let mut table = GrowingCsv::create(&path, &["a".into(), "b".into()], &rows).unwrap();
-        table.add(["3".into(), "4".into()]);
-        assert_eq!(fs::read_to_string(&path).unwrap(), "a,b\n1,2\n3,4\n");
+        table.add(["3".into(), "4, of five".into()]);
+        assert_eq!(
+            fs::read_to_string(&path).unwrap(),
+            "a,b\n1,2\n3,\"4, of five\"\n"
+        );
     }
 }

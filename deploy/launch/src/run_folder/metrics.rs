@@ -119,12 +119,12 @@ fn number(value: f64) -> String {
     }
 }
 
-/// The rows of an interrupted run up to what it has `behind` it, of no more than `frames_max` frames; none where there is no
+/// The rows of an interrupted run up to `resume_point`, of no more than `frames_max` frames; none where there is no
 /// such file.
 pub(super) fn rows_up_to(
     path: &Path,
     header: Vec<String>,
-    behind: ResumePoint,
+    resume_point: ResumePoint,
     frames_max: u64,
 ) -> anyhow::Result<Columns> {
     let reading = || format!("reading {}", path.display());
@@ -140,7 +140,7 @@ pub(super) fn rows_up_to(
     if !found.header.is_empty() && found.header != header {
         return Err(usage!(
             "{} has other columns than a run of several processes by this version of driml: go on with the version that began it; a \
-             run in --lockstep is repeated, not resumed",
+             run in --lockstep whose world cannot be saved is repeated, not resumed",
             path.display()
         )
         .into());
@@ -152,7 +152,7 @@ pub(super) fn rows_up_to(
             return Err(usage!("{}: {row:?} is no row of metrics", path.display()).into());
         };
         // Actors run ahead: without the second condition a run that now ends sooner would end before its rows.
-        if updates <= behind.updates && frames <= frames_max {
+        if updates <= resume_point.updates && frames <= frames_max {
             kept.rows.push(row);
         }
     }

@@ -1,9 +1,8 @@
-//! What is written into the run folder while a run goes on: settings, metrics, returns, and the summary at its end.
-//! It reads no status from anywhere: whoever runs the parts hands them over.
+//! What is written into the run folder while a run goes on: settings, metrics, returns, events on request, and the summary at its end.
+//! It reads no status from anywhere: its caller hands them over.
 
 use std::{
     fs::{self, File},
-    path::PathBuf,
     time::Instant,
 };
 
@@ -12,6 +11,7 @@ use driml_protocol::{LearnerStatus, ReplayStatus, RunSpec};
 
 use super::{
     columns::Columns,
+    events::Events,
     folder::RunFolder,
     growing_csv::GrowingCsv,
     metrics::{Moment, header, rows_up_to},
@@ -30,18 +30,19 @@ const fn none(header: Vec<String>) -> Columns {
 
 /// Writes a run folder.
 #[derive(Debug)]
-pub struct Recorder {
-    /// Nobody else writes to the folder meanwhile.
+pub struct RunRecorder {
+    /// No other launcher writes to the folder while this is held.
     _lock: File,
-    behind: ResumePoint,
+    resume_point: ResumePoint,
     /// Seconds, frames and episodes in the last row before the run was resumed.
     seconds_before: f64,
     frames_before: u64,
     episodes_before: u64,
     /// Mean and standard deviation of k up to there.
     k_before: Option<(f64, f64)>,
-    folder: RunFolder,
     metrics: GrowingCsv,
+    header: Vec<String>,
+    events: Option<Events>,
     returns: TrainingReturns,
     losses: &'static [&'static str],
     processes: Vec<String>,
@@ -50,7 +51,7 @@ pub struct Recorder {
     rates: Rates,
 }
 
-impl Recorder {
+impl RunRecorder {
     /// Makes the folder and writes the settings; the clock starts. `losses` are the agent's auxiliary losses,
     /// `processes` those whose memory is recorded.
     ///
@@ -80,7 +81,7 @@ impl Recorder {
         )
     }
 
-    /// Goes on to `frames_max` frames in the folder of an interrupted run, which has so much `behind` it: the rows of metrics up
+    /// Goes on from `resume_point` to `frames_max` frames in the folder of an interrupted run: the rows of metrics up
     /// to there stay.
     ///
     /// # Errors
@@ -90,19 +91,20 @@ impl Recorder {
         config_toml: &str,
         losses: &'static [&'static str],
         processes: &[String],
-        behind: ResumePoint,
+        resume_point: ResumePoint,
         frames_max: u64,
     ) -> anyhow::Result<Self> {
         let lock = folder.lock()?;
         let head = header(losses, processes);
-        let rows = match behind.updates {
+        let rows = match resume_point.updates {
             0 => none(head),
-            _ => rows_up_to(&folder.metrics(), head, behind, frames_max)?,
+            _ => rows_up_to(&folder.metrics(), head, resume_point, frames_max)?,
         };
-        let returns = TrainingReturns::go_on(folder, rows.last("frames").unwrap_or(0))?;
+        let is_known = resume_point.replay_is_kept;
+        let returns = TrainingReturns::go_on(folder, rows.last("frames").unwrap_or(0), is_known)?;
         Summary::remove(folder)?;
         folder.write_config(config_toml)?;
-        Self::begin(folder, losses, processes, lock, rows, returns, behind)
+        Self::begin(folder, losses, processes, lock, rows, returns, resume_point)
     }
 
     fn begin(
@@ -112,17 +114,26 @@ impl Recorder {
         lock: File,
         rows: Columns,
         returns: TrainingReturns,
-        behind: ResumePoint,
+        resume_point: ResumePoint,
     ) -> anyhow::Result<Self> {
+        // A replay that was kept knows of all the run's episodes and k.
+        let before = |column| match resume_point.replay_is_kept {
+            true => None,
+            false => rows.last(column),
+        };
         let mut this = Self {
             _lock: lock,
-            behind,
+            resume_point,
             seconds_before: rows.last("seconds").unwrap_or(0.0),
             frames_before: rows.last("frames").unwrap_or(0),
-            episodes_before: rows.last("episodes").unwrap_or(0),
-            k_before: rows.last("mean_k").zip(rows.last("sd_k")),
-            folder: folder.clone(),
+            episodes_before: rows
+                .last("episodes")
+                .filter(|_| !resume_point.replay_is_kept)
+                .unwrap_or(0),
+            k_before: before("mean_k").zip(before("sd_k")),
             metrics: GrowingCsv::create(&folder.metrics(), &rows.header, &rows.rows)?,
+            header: rows.header,
+            events: None,
             returns,
             losses,
             processes: processes.to_vec(),
@@ -130,13 +141,24 @@ impl Recorder {
             started: Instant::now(),
             rates: Rates::default(),
         };
-        this.rates.add(this.started, behind.frames, behind.updates);
+        this.rates
+            .add(this.started, resume_point.frames, resume_point.updates);
         Ok(this)
     }
 
-    /// The settings' file, for parts that read it.
-    pub(crate) fn config_path(&self) -> PathBuf {
-        self.folder.config()
+    /// Writes TensorBoard's events from now on, too.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(crate) fn write_events(&mut self, folder: &RunFolder) -> anyhow::Result<()> {
+        let kept = (self.resume_point.updates > 0).then_some(self.frames_before);
+        self.events = Some(Events::create(folder, self.header.clone(), kept)?);
+        Ok(())
+    }
+
+    /// The run has been going on for at least so many seconds.
+    pub(crate) fn count_seconds_from(&mut self, seconds: f64) {
+        self.seconds_before = self.seconds_before.max(seconds);
     }
 
     /// Mean and standard deviation of k over all `updates` of the run, before it was resumed too.
@@ -146,7 +168,7 @@ impl Recorder {
             return since.or(self.k_before);
         };
         // All updates are of as many rows.
-        let share = self.behind.updates as f64 / updates.max(1) as f64;
+        let share = self.resume_point.updates as f64 / updates.max(1) as f64;
         let mixed = |before: f64, since: f64| share * before + (1.0 - share) * since;
         let square = |(mean, sd): (f64, f64)| mean * mean + sd * sd;
         let mean = mixed(before.0, since.0);
@@ -162,7 +184,7 @@ impl Recorder {
     /// of the episodes that ended. `shards` are the replay servers' own accounts; `rss_mib` is in the order of the processes given at
     /// the start, none for one that ended.
     ///
-    /// A disk that is full does not end the run: what a person should know is said the first time, and [`Self::missing`] says
+    /// A disk that is full does not end the run: a warning is returned the first time, and [`Self::missing`] says
     /// at the end what was lost.
     pub fn record(
         &mut self,
@@ -178,8 +200,8 @@ impl Recorder {
         }
         let said = self.returns.hear(shards);
         let (frames, updates) = (replay.transitions_inserted, learner.updates);
-        let resumed = self.behind.updates > 0;
-        if resumed && (updates <= self.behind.updates || frames < self.frames_before) {
+        let resumed = self.resume_point.updates > 0;
+        if resumed && (updates <= self.resume_point.updates || frames < self.frames_before) {
             return said.into_iter().collect();
         }
         let processes = 0..self.processes.len();
@@ -196,12 +218,16 @@ impl Recorder {
                 .collect(),
         };
         let row = moment.row();
-        said.into_iter().chain(self.metrics.add(row)).collect()
+        let events = self.events.as_mut();
+        let drawn = events.and_then(|events| events.add(&row, replay, learner.finished));
+        let written = self.metrics.add(row);
+        said.into_iter().chain(written).chain(drawn).collect()
     }
 
-    /// Rows that could not be written up to now, for a person.
+    /// What to say about rows that could not be written up to now.
     pub fn missing(&self) -> Vec<String> {
-        let missing = [self.metrics.missing(), self.returns.missing()];
+        let events = self.events.as_ref().and_then(Events::missing);
+        let missing = [self.metrics.missing(), self.returns.missing(), events];
         missing.into_iter().flatten().collect()
     }
 
@@ -222,46 +248,29 @@ impl Recorder {
         learner: &LearnerStatus,
     ) -> Summary {
         let wall_seconds = self.seconds();
-        // A resumed run that did not get anywhere still has behind it what it had.
-        let frames = replay.transitions_inserted.max(self.behind.frames);
-        let updates = learner.updates.max(self.behind.updates);
+        // A resumed run that did not get anywhere still has what was done before.
+        let frames = replay.transitions_inserted.max(self.resume_point.frames);
+        let updates = learner.updates.max(self.resume_point.updates);
         let rss = self.processes.iter().zip(&self.rss_max);
-        let episodes = self.episodes(replay);
-        Summary {
+        let of_whole_run = Summary::of(
             outcome,
-            world: run.world.clone(),
-            agent: run.agent.clone(),
-            seed: run.seed,
-            resumed_after_updates: self.behind.updates,
+            run,
+            replay,
+            learner,
+            self.episodes(replay),
+            wall_seconds,
+        );
+        Summary {
+            resumed_after_updates: self.resume_point.updates,
             frames,
             updates,
-            transitions_inserted: replay.transitions_inserted,
-            transitions_lost: replay.transitions_lost,
-            transitions_duplicated: replay.transitions_duplicated,
-            rows_sampled: replay.rows_sampled,
-            rows_unlearned: replay.rows_unlearned,
-            replay_ratio: replay.replay_ratio(),
-            episodes: episodes.count,
-            mean_return: episodes.mean_return.map(|it| it.mean),
-            mean_return_of: episodes.mean_return.map_or(0, |it| it.of as u64),
-            wall_seconds,
             frames_per_second: frames as f64 / wall_seconds,
             updates_per_second: updates as f64 / wall_seconds,
             mean_k: self.k(replay, updates).map(|(mean, _)| mean),
-            k_histogram: replay.k_histogram.clone(),
-            action_histogram: replay.action_histogram.clone(),
-            weights_version: learner.weights_version,
-            weights_sha256: learner.weights_sha256.clone(),
-            chunks_retried: replay.chunks_retried,
-            batches_retried: replay.batches_retried,
-            replay_frame_mib: replay.frame_bytes_held.div_ceil(1 << 20),
-            messages_refused: replay.messages_refused,
-            insert_ms: replay.insert_ms,
-            weights_behind_s: replay.weights_behind_s,
-            weights_behind_updates: replay.weights_behind_updates,
             rss_mib_max: rss
                 .map(|(name, mib)| (name.clone(), mib.map(f64::round).into()))
                 .collect(),
+            ..of_whole_run
         }
     }
 }

@@ -54,7 +54,7 @@ fn statuses() -> (ReplayStatus, LearnerStatus) {
 fn a_run_leaves_settings_metrics_and_a_summary() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
-    let mut recorder = Recorder::create(
+    let mut recorder = RunRecorder::create(
         &run,
         "[run]\n",
         &LOSSES,
@@ -114,7 +114,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
     let processes = ["replay-server".into()];
-    let mut recorder = Recorder::create(&run, "[run]\n", &LOSSES, &processes).unwrap();
+    let mut recorder = RunRecorder::create(&run, "[run]\n", &LOSSES, &processes).unwrap();
     let (mut replay, mut learner) = statuses();
     // Mean k is 1.5 before the run is resumed, and 2 since.
     for (frames, updates, episodes) in [(1_000, 0, 1), (2_000, 31, 7), (3_000, 62, 9)] {
@@ -122,11 +122,12 @@ fn a_resumed_run_goes_on_in_its_metrics() {
         learner.updates = updates;
         recorder.record(std::slice::from_ref(&replay), &learner, &[]);
     }
-    let behind = ResumePoint {
+    let resume_point = ResumePoint {
         updates: 31,
         frames: 2_000,
+        replay_is_kept: false,
     };
-    let said = Recorder::go_on(&run, "", &LOSSES, &processes, behind, 9_999).unwrap_err();
+    let said = RunRecorder::go_on(&run, "", &LOSSES, &processes, resume_point, 9_999).unwrap_err();
     assert!(said.to_string().contains("is still going on"), "{said}");
     let summary = recorder.summarise(Outcome::Interrupted, &spec(), &replay, &learner);
     summary.write(&run).unwrap();
@@ -137,10 +138,10 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     fs::write(&path, format!("{text}9.0,40")).unwrap();
 
     let other = ["replay-server".into(), "actor-0".into()];
-    let said = Recorder::go_on(&run, "", &LOSSES, &other, behind, 9_999).unwrap_err();
+    let said = RunRecorder::go_on(&run, "", &LOSSES, &other, resume_point, 9_999).unwrap_err();
     assert!(said.to_string().contains("has other columns"), "{said}");
     let mut recorder =
-        Recorder::go_on(&run, "[new]\n", &LOSSES, &processes, behind, 9_999).unwrap();
+        RunRecorder::go_on(&run, "[new]\n", &LOSSES, &processes, resume_point, 9_999).unwrap();
     assert!(!run.summary().exists());
     // While the replay fills again nothing is new.
     (replay.transitions_inserted, replay.episodes) = (1_500, 1);
@@ -157,7 +158,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     assert_eq!(summary.resumed_after_updates, 31);
     let all = ResumePoint {
         updates: 99,
-        ..behind
+        ..resume_point
     };
     let read =
         |frames_max| rows_up_to(&path, header(&LOSSES, &processes), all, frames_max).unwrap();

@@ -1,10 +1,12 @@
 //! Where a run begins: at nothing, or where its newest checkpoint stands.
 
-/// What a run has behind it when it starts: nothing, or what its newest checkpoint has learned.
+/// What was done before a run starts: nothing, or what its newest checkpoint has learned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ResumePoint {
-    /// Updates done.
+    /// Updates that the checkpoint has learned.
     pub updates: u64,
     /// Frames that these updates needed, the warm-up included.
     pub frames: u64,
+    /// The replay was kept, and counts all of the run.
+    pub replay_is_kept: bool,
 }

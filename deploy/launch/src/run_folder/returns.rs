@@ -18,7 +18,7 @@ const HEADER: [&str; 3] = ["frames", "episode", "return"];
 /// A mean, and of how many returns it is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MeanReturn {
-    /// The mean.
+    /// The mean return of the newest episodes.
     pub mean: f64,
     /// Episodes: 100, or as many as there were.
     pub of: usize,
@@ -45,6 +45,8 @@ pub(super) struct TrainingReturns {
     frames: u64,
     /// How many each shard knew of when it was heard last.
     heard: Vec<u64>,
+    /// The shards know of the episodes that were heard before this one was made.
+    is_known: bool,
 }
 
 impl TrainingReturns {
@@ -53,15 +55,19 @@ impl TrainingReturns {
     /// # Errors
     /// A file system that refuses.
     pub(super) fn create(folder: &RunFolder) -> anyhow::Result<Self> {
-        Self::begin(folder, &[])
+        Self::begin(folder, &[], false)
     }
 
-    /// Of a run that goes on: with what was heard until it had `frames_max` frames. A run that began with an older version has
+    /// Of a run that goes on: with what was heard until it had `frames_max` frames; `is_known` if its replay knows of them. A run that began with an older version has
     /// no such file, and begins one.
     ///
     /// # Errors
     /// A file that is none of this kind, a file system that refuses.
-    pub(super) fn go_on(folder: &RunFolder, frames_max: u64) -> anyhow::Result<Self> {
+    pub(super) fn go_on(
+        folder: &RunFolder,
+        frames_max: u64,
+        is_known: bool,
+    ) -> anyhow::Result<Self> {
         let path = folder.returns();
         let reading = || format!("reading {}", path.display());
         let text = match fs::read(&path) {
@@ -76,10 +82,14 @@ impl TrainingReturns {
                 rows.push(row);
             }
         }
-        Self::begin(folder, &rows)
+        Self::begin(folder, &rows, is_known)
     }
 
-    fn begin(folder: &RunFolder, rows: &[csv::StringRecord]) -> anyhow::Result<Self> {
+    fn begin(
+        folder: &RunFolder,
+        rows: &[csv::StringRecord],
+        is_known: bool,
+    ) -> anyhow::Result<Self> {
         let table = GrowingCsv::create(&folder.returns(), &HEADER.map(String::from), rows)?;
         let known: Vec<_> = rows.iter().filter_map(read).collect();
         let newest = known.iter().rev().take(RETURNS_OF).rev();
@@ -90,15 +100,19 @@ impl TrainingReturns {
             episode,
             frames,
             heard: Vec::new(),
+            is_known,
         })
     }
 
-    /// Takes what each shard knows now. Says what a person should know about the file.
+    /// Takes what each shard knows now. Returns warnings about the file.
     pub(super) fn hear(&mut self, shards: &[ReplayStatus]) -> Option<String> {
         let frames = shards.iter().map(|it| it.transitions_inserted).sum();
         // While a resumed run's replay fills again it counts frames that it had before.
         self.frames = self.frames.max(frames);
         self.heard.resize(shards.len().max(self.heard.len()), 0);
+        if std::mem::take(&mut self.is_known) {
+            self.take_as_heard(shards);
+        }
         let mut said = None;
         for (shard, status) in shards.iter().enumerate() {
             let Returns { known, newest } = &status.returns;
@@ -112,6 +126,17 @@ impl TrainingReturns {
             }
         }
         said
+    }
+
+    /// What the shards knew of when the last return was heard: all but the newest, which they share as they come.
+    fn take_as_heard(&mut self, shards: &[ReplayStatus]) {
+        let mut unheard: u64 = shards.iter().map(|it| it.returns.known).sum();
+        unheard = unheard.saturating_sub(self.episode);
+        for (heard, status) in self.heard.iter_mut().zip(shards) {
+            let here = unheard.min(status.returns.known);
+            *heard = status.returns.known - here;
+            unheard -= here;
+        }
     }
 
     fn add(&mut self, value: f64) -> Option<String> {
@@ -224,7 +249,7 @@ mod tests {
         let text = fs::read_to_string(&path).unwrap();
         fs::write(&path, text + "3000,91").unwrap();
 
-        let mut returns = TrainingReturns::go_on(&folder, 2_500).unwrap();
+        let mut returns = TrainingReturns::go_on(&folder, 2_500, false).unwrap();
         assert_eq!(returns.mean().unwrap(), MeanReturn { mean: 34.5, of: 70 });
         // Another server, which counts from the start; the replay fills again.
         returns.hear(&[shard(1_500, 40, 1_000)]);
@@ -238,10 +263,21 @@ mod tests {
         );
         assert_eq!(rows(&folder).last().unwrap(), "2000,110,1039");
 
+        // A server that knows of those before, and of four more.
+        let mut returns = TrainingReturns::go_on(&folder, 2_500, true).unwrap();
+        returns.hear(&[shard(2_600, 114, 0)]);
+        returns.hear(&[shard(2_600, 115, 0)]);
+        let text = rows(&folder);
+        assert_eq!(text[text.len() - 5], "2600,111,110");
+        assert_eq!(text.last().unwrap(), "2600,115,114");
+
         fs::remove_file(&path).unwrap();
-        assert_eq!(TrainingReturns::go_on(&folder, 9).unwrap().mean(), None);
+        assert_eq!(
+            TrainingReturns::go_on(&folder, 9, false).unwrap().mean(),
+            None
+        );
         fs::write(&path, "a,b,c\n1,x,3\n").unwrap();
-        let said = TrainingReturns::go_on(&folder, 9).unwrap_err();
+        let said = TrainingReturns::go_on(&folder, 9, false).unwrap_err();
         assert!(said.to_string().contains("is no row of returns"), "{said}");
     }
 }

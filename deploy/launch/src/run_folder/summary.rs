@@ -5,10 +5,10 @@ use std::{fs, time::Duration};
 
 use anyhow::Context;
 use driml_machine::units::duration;
-use driml_protocol::{Quantiles, whole_file};
+use driml_protocol::{LearnerStatus, Quantiles, ReplayStatus, RunSpec, whole_file};
 use serde::{Deserialize, Serialize};
 
-use super::folder::RunFolder;
+use super::{folder::RunFolder, returns::Episodes};
 
 /// How a run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -18,30 +18,30 @@ pub enum Outcome {
     Finished,
     /// A person ended it; what was done is saved.
     Interrupted,
-    /// A part failed.
+    /// A process failed.
     Failed,
 }
 
-/// `summary.json`.
+/// The contents of `summary.json`: how a run ended and what it counted.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
     /// How the run ended.
     pub outcome: Outcome,
-    /// The world.
+    /// The world's name, such as `procgen:bigfish`.
     pub world: String,
-    /// The agent.
+    /// The agent's name, such as `driml-ada`.
     pub agent: String,
-    /// The seed.
+    /// The seed of every generator of the run.
     pub seed: u64,
-    /// Updates that the run had behind it when it was resumed, the last time; 0 if it never was. Frames, updates,
+    /// Updates that were done when the run was resumed, the last time; 0 if it never was. Frames, updates,
     /// rows, episodes, mean return, seconds and mean k are of the whole run, all else is of what came since.
     #[serde(default)]
     pub resumed_after_updates: u64,
     /// Frames that trained: transitions stored.
     pub frames: u64,
-    /// Updates done.
+    /// Updates that the learner has done.
     pub updates: u64,
-    /// Transitions stored.
+    /// Transitions that the replay has stored.
     pub transitions_inserted: u64,
     /// Transitions that actors produced and that never arrived.
     pub transitions_lost: u64,
@@ -62,7 +62,7 @@ pub struct Summary {
     /// Of how many episodes that is: of fewer than 100 only if there were fewer. Older runs do not say.
     #[serde(default)]
     pub mean_return_of: u64,
-    /// From the start of the first part to the end of the run.
+    /// From the start of the first process to the end of the run.
     pub wall_seconds: f64,
     /// Frames over wall seconds.
     pub frames_per_second: f64,
@@ -84,6 +84,12 @@ pub struct Summary {
     /// Batches that did not reach the learner and were asked for again; older runs do not say.
     #[serde(default)]
     pub batches_retried: u64,
+    /// How often a replay server that had died was started again with what it had kept; older runs do not say.
+    #[serde(default)]
+    pub replay_servers_restarted: u32,
+    /// How often an actor that had died was started again; what it had not delivered is in no count. Older runs do not say.
+    #[serde(default)]
+    pub actors_restarted: u32,
     /// Memory that the frames in the replay took at the end, MiB.
     pub replay_frame_mib: u64,
     /// Messages refused as malformed or foreign.
@@ -103,6 +109,54 @@ pub struct Summary {
 }
 
 impl Summary {
+    /// What replay and learner counted in a run that took so many seconds and was never resumed.
+    pub(crate) fn of(
+        outcome: Outcome,
+        run: &RunSpec,
+        replay: &ReplayStatus,
+        learner: &LearnerStatus,
+        episodes: Episodes,
+        wall_seconds: f64,
+    ) -> Self {
+        let (frames, updates) = (replay.transitions_inserted, learner.updates);
+        Self {
+            outcome,
+            world: run.world.clone(),
+            agent: run.agent.clone(),
+            seed: run.seed,
+            resumed_after_updates: 0,
+            frames,
+            updates,
+            transitions_inserted: replay.transitions_inserted,
+            transitions_lost: replay.transitions_lost,
+            transitions_duplicated: replay.transitions_duplicated,
+            rows_sampled: replay.rows_sampled,
+            rows_unlearned: replay.rows_unlearned,
+            replay_ratio: replay.replay_ratio(),
+            episodes: episodes.count,
+            mean_return: episodes.mean_return.map(|it| it.mean),
+            mean_return_of: episodes.mean_return.map_or(0, |it| it.of as u64),
+            wall_seconds,
+            frames_per_second: frames as f64 / wall_seconds,
+            updates_per_second: updates as f64 / wall_seconds,
+            mean_k: replay.mean_k(),
+            k_histogram: replay.k_histogram.clone(),
+            action_histogram: replay.action_histogram.clone(),
+            weights_version: learner.weights_version,
+            weights_sha256: learner.weights_sha256.clone(),
+            chunks_retried: replay.chunks_retried,
+            batches_retried: replay.batches_retried,
+            replay_servers_restarted: 0,
+            actors_restarted: 0,
+            replay_frame_mib: replay.frame_bytes_held.div_ceil(1 << 20),
+            messages_refused: replay.messages_refused,
+            insert_ms: replay.insert_ms,
+            weights_behind_s: replay.weights_behind_s,
+            weights_behind_updates: replay.weights_behind_updates,
+            rss_mib_max: serde_json::Map::new(),
+        }
+    }
+
     /// Writes it into the run folder, whole or not at all.
     ///
     /// # Errors
@@ -145,8 +199,24 @@ impl Summary {
         Self::read(folder).is_ok_and(|it| it.outcome == Outcome::Finished)
     }
 
-    /// What a person reads at the end.
+    /// What a person may do with a finished run, a command a line.
+    pub fn next_steps(&self, run_dir: &RunFolder) -> String {
+        let run = run_dir.display();
+        let more = self.frames.saturating_mul(2);
+        format!(
+            "  driml plot {run} --out plot.png              return, losses, k and speed\n  \
+               driml evaluate --run {run}             beside a random policy\n  \
+               driml local --resume {run} --frames {more}   goes on\n"
+        )
+    }
+
+    /// What is printed at the end.
     pub fn describe(&self, run_dir: &RunFolder) -> String {
+        format!("{}\n{}\n", self.counts(), run_dir.display())
+    }
+
+    /// How the run ended and what it counted, in one line.
+    pub(crate) fn counts(&self) -> String {
         let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
         let how = if self.outcome == Outcome::Finished {
             "finished"
@@ -154,7 +224,7 @@ impl Summary {
             "interrupted"
         };
         format!(
-            "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, mean return {} over the last {} of {} episodes\n{}\n",
+            "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, mean return {} over the last {} of {} episodes",
             self.frames,
             self.updates,
             duration(Duration::from_secs_f64(self.wall_seconds)),
@@ -164,7 +234,6 @@ impl Summary {
             number(self.mean_return),
             self.mean_return_of,
             self.episodes,
-            run_dir.display()
         )
     }
 }

@@ -228,7 +228,7 @@ pub fn check(ordinal: usize) -> Result<(), crate::error::Usage> {
     }
 }
 
-/// A device as a person reads it: its name, compute capability and memory.
+/// A device as it is printed: its name, compute capability and memory.
 #[cfg(feature = "cuda")]
 pub fn name(ordinal: usize) -> String {
     described(ordinal).text

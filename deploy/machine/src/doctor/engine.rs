@@ -7,7 +7,7 @@ use super::fact::Fact;
 
 const WHAT: &str = "Procgen";
 
-/// The fact.
+/// Whether Procgen's engine is in the cache folder and loads.
 pub(super) fn fact() -> Fact {
     match Engine::locate() {
         Ok(engine) => match engine.check_loads() {

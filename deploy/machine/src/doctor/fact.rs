@@ -1,4 +1,4 @@
-//! One fact about this machine, as a line for a person and as JSON.
+//! One fact about this machine, as a line of text and as JSON.
 //! It judges nothing: who finds a fact gives it its state.
 
 use std::fmt;
@@ -17,7 +17,7 @@ pub(super) enum State {
     Missing,
 }
 
-/// One fact.
+/// What was found out about one thing that a run needs.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Fact {
     pub(super) state: State,

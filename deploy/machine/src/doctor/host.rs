@@ -1,9 +1,10 @@
-//! What every run needs of the machine: cores, vector instructions, memory, shared memory, disk.
+//! What every run needs of the machine: cores, vector instructions and what the kernels make of them, memory, shared memory, disk.
 //! The numbers are what is free now; how large a run becomes is for `plan`.
 
 use std::path::Path;
 
-use driml_protocol::shared_memory::lockable_bytes;
+use driml_model::{Precision, kernels_in_words};
+use driml_protocol::shared_memory::{self, lockable_bytes};
 use nix::sys::statvfs::statvfs;
 
 use super::fact::{Fact, State};
@@ -13,8 +14,6 @@ use crate::{resources::Machine, units::gib};
 const MEMORY_MIN: u64 = 1 << 30;
 /// Below this the replay sized by the machine holds less than a short run's frames, bytes.
 const MEMORY_ENOUGH: u64 = 4 << 30;
-/// Where memory is shared between the processes of a host.
-const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
 /// What the batches and one actor's chunks take of it, rounded up, bytes.
 const SHARED_MEMORY_ENOUGH: u64 = 256 << 20;
 /// Below this not even one checkpoint is sure to fit, bytes.
@@ -38,8 +37,9 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
     vec![
         cores(machine.cores),
         vectors(Vectors::this()),
+        kernels(),
         memory(&machine),
-        shared_memory(free(Path::new(SHARED_MEMORY_FOLDER))),
+        shared_memory(free(Path::new(shared_memory::FOLDER))),
         locked_memory(lockable_bytes()),
         disk(runs),
     ]
@@ -99,6 +99,13 @@ fn vectors(found: Option<Vectors>) -> Fact {
     }
 }
 
+/// What the network's products run on, in either precision.
+fn kernels() -> Fact {
+    let [f32, bf16] = Precision::ALL.map(kernels_in_words);
+    let text = format!("precision \"f32\": {f32}; \"bf16\": {bf16}");
+    Fact::ok("kernels", text)
+}
+
 fn memory(machine: &Machine) -> Fact {
     let (free, replay) = (machine.memory_bytes, machine.replay_bytes(0));
     let text = format!(
@@ -123,7 +130,7 @@ fn memory(machine: &Machine) -> Fact {
 }
 
 fn shared_memory(free: Result<u64, String>) -> Fact {
-    let (what, folder) = ("shared memory", SHARED_MEMORY_FOLDER);
+    let (what, folder) = ("shared memory", shared_memory::FOLDER);
     match free {
         Ok(free) if free >= SHARED_MEMORY_ENOUGH => {
             Fact::ok(what, format!("{} free in {folder}", gib(free)))

@@ -18,7 +18,7 @@ type Pinned = (&'static str, &'static str, &'static str);
 
 /// By layer; `only N:` stands before the settings of a layer's block that holds in some worlds.
 #[rustfmt::skip]
-const PINNED: [(&str, &[Pinned]); 13] = [
+const PINNED: &[(&str, &[Pinned])] = &[
     ("base", &[
         ("run.seed", "1", "ours"),
         ("run.n_step", "7", "paper"),
@@ -27,25 +27,31 @@ const PINNED: [(&str, &[Pinned]); 13] = [
         ("actor.steps_per_chunk", "16", "ours"),
         ("actor.round_transitions_max", "1024", "ours"),
         ("actor.chunks_in_flight_max", "4", "ours"),
+        ("actor.actions", r#""all""#, "paper"),
+        ("actor.precision", r#""f32""#, "ours"),
         ("actor.epsilon_start", "0.1", "paper"),
         ("actor.epsilon_end", "0.01", "paper"),
         ("actor.epsilon_decay_frames", "100000", "paper"),
         ("actor.ack_timeout_ms", "10000", "ours"),
-        ("actor.unreachable_max_ms", "60000", "ours"),
+        ("actor.unreachable_max_ms", "300000", "ours"),
         ("replay.capacity_transitions", "1000000", "paper"),
         ("replay.shards", "1", "ours"),
+        ("replay.sampling.rule", r#""uniform""#, "paper"),
         ("replay.compression", r#""none""#, "ours"),
         ("replay.replay_ratio", "8.0", "code"),
         ("replay.warmup_transitions", "1000", "paper"),
         ("replay.slack_transitions", "256", "ours"),
         ("replay.transitions_max", "200000", "ours"),
         ("transport.shared_memory", "true", "ours"),
-        ("learner.batch_rows", "256", "code"),
+        ("learner.batch_size", "256", "code"),
+        ("learner.precision", r#""f32""#, "ours"),
+        ("learner.equal_states", r#""once""#, "ours"),
         ("learner.batches_in_flight", "2", "ours"),
+        ("learner.publish_as", r#""f32""#, "ours"),
         ("learner.publish_period_updates", "8", "ours"),
         ("learner.checkpoint_period_updates", "1000", "ours"),
         ("learner.checkpoints_kept", "3", "ours"),
-        ("learner.unreachable_max_ms", "60000", "ours"),
+        ("learner.unreachable_max_ms", "300000", "ours"),
         ("learner.update.double_dqn", "false", "paper"),
         ("learner.update.tanh_clip", "20.0", "code"),
         ("learner.update.max_grad_norm", "10.0", "paper"),
@@ -75,10 +81,27 @@ const PINNED: [(&str, &[Pinned]); 13] = [
         ("world.use_backgrounds", "true", "Procgen's default"),
         ("world.center_agent", "true", "Procgen's default"),
         ("world.restrict_themes", "false", "Procgen's default"),
+        ("world.frame_side", "64", "the engine's own"),
+        ("world.grey", "false", "the engine's own"),
         ("learner.update.lambda.3t3", "0.0", "paper"),
         ("learner.update.lambda.3t4", "0.0", "paper"),
         ("learner.update.lambda.4t3", "0.0", "paper"),
         ("learner.update.lambda.4t4", "1.0", "paper"),
+    ]),
+    ("variant/exact", &[
+        ("actor.precision", r#""f32""#, "ours"),
+        ("learner.precision", r#""f32""#, "ours"),
+        ("learner.publish_as", r#""f32""#, "ours"),
+    ]),
+    ("variant/balanced", &[
+        ("actor.precision", r#""bf16""#, "prices.toml"),
+        ("learner.precision", r#""f32""#, "ours"),
+        ("learner.publish_as", r#""f16""#, "prices.toml"),
+    ]),
+    ("variant/fast", &[
+        ("actor.precision", r#""bf16""#, "prices.toml"),
+        ("learner.precision", r#""bf16""#, "prices.toml"),
+        ("learner.publish_as", r#""f16""#, "prices.toml"),
     ]),
     ("world/mspacman", &[
         ("run.frame_stack", "4", "paper"),
@@ -113,6 +136,15 @@ const PINNED: [(&str, &[Pinned]); 13] = [
         ("learner.update.lambda.3t4", "0.0", "paper"),
         ("learner.update.lambda.4t3", "0.0", "paper"),
         ("learner.update.lambda.4t4", "0.0", "paper"),
+    ]),
+    ("world/exec", &[
+        ("run.frame_stack", "4", "Mnih et al. 2015"),
+        ("world.start_timeout_ms", "120000", "ours"),
+        ("world.step_timeout_ms", "60000", "ours"),
+        ("learner.update.lambda.3t3", "0.0", "paper"),
+        ("learner.update.lambda.3t4", "0.0", ""),
+        ("learner.update.lambda.4t3", "0.0", ""),
+        ("learner.update.lambda.4t4", "1.0", "paper"),
     ]),
     ("agent/c51", &[
         ("run.horizon.rule", r#""none""#, ""),
@@ -210,8 +242,10 @@ const PINNED: [(&str, &[Pinned]); 13] = [
 const OWN: [&str; 2] = ["world/chain", "variant/smoke"];
 
 fn all_layers() -> BTreeMap<&'static str, Layer> {
-    let agents = AGENTS.into_iter().map(|agent| agent.layer);
-    let worlds = WorldName::all().map(world_layer);
+    let agents = AGENTS.iter().map(|agent| agent.layer);
+    // A command is no world's name; any one stands for all.
+    let exec = "exec:true".parse().unwrap();
+    let worlds = WorldName::all().chain([exec]).map(world_layer);
     let variants = PRESETS
         .iter()
         .flat_map(|preset| preset.layers.iter().copied());
@@ -266,7 +300,7 @@ fn every_number_has_its_source_beside_it() {
     let layers = all_layers();
     for (name, pinned) in PINNED {
         let parts: Vec<_> = layers[name].text.split("[[only]]").map(comments).collect();
-        for (key, _, source) in pinned {
+        for (key, _, source) in *pinned {
             let (part, path) = match key.strip_prefix("only ") {
                 None => (0, (*key).to_owned()),
                 Some(rest) => {

@@ -10,6 +10,7 @@ use rayon::prelude::*;
 use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::Result;
+use crate::kernels::exponentials::exp_below;
 use crate::kernels::linear::floats;
 use crate::parameters::Parameters;
 
@@ -47,6 +48,15 @@ impl C51Head {
         let active = self.kernels.relu(f4)?;
         let logits = self.kernels.linear(&active, &self.weight, &self.bias)?;
         Ok(logits.reshape(((), self.actions, self.atoms))?)
+    }
+
+    /// Of those logits the ones [B, atoms] of one action a row.
+    pub(crate) fn taken_logits(&self, f4: &Tensor, actions: &[u8]) -> Result<Tensor> {
+        let active = self.kernels.relu(f4)?;
+        let (weight, bias) = (&self.weight, &self.bias);
+        Ok(self
+            .kernels
+            .grouped_linear(&active, weight, bias, actions, self.atoms)?)
     }
 
     /// Expected returns [B, A] of logits [B, A, atoms]; no gradient flows.
@@ -97,19 +107,26 @@ impl CustomOp1 for Expectation {
     }
 }
 
+/// Largest error of an expected return beside its own last place, as a share of the support's width.
+pub const EXPECTED_RETURN_ERROR: f64 = 3e-7;
+
 /// Expectation of softmax(logits) over atoms i of equal spacing: z_0 + spacing * sum_i w_i i / sum_i w_i with w_i = exp(l_i - max l).
 ///
 /// `logits` [n, atoms]; `support` [atoms], of which the ends and the length count; `values` [n]. The sum is over positions, not
-/// over returns: an error is at most 3e-7 of the support's width beside the value's own last place, wherever the support lies, no
-/// value is beyond its ends, and no support that f32 holds overflows. A distribution with a NaN or an infinite maximum gives NaN.
+/// over returns: an error is at most [`EXPECTED_RETURN_ERROR`] of the support's width beside the value's own last place, wherever the
+/// support lies, no value is beyond its ends, and no support that f32 holds overflows. A distribution with a NaN or an infinite maximum gives NaN.
 pub(crate) fn expected_returns(logits: &[f32], support: &[f32], values: &mut [f32]) {
     let (v_min, spacing) = ends(support);
     let v_max = f64::from(support[support.len() - 1]);
+    let mut weights = vec![0.0; support.len()];
     for (value, logits) in values.iter_mut().zip(logits.chunks_exact(support.len())) {
         let max = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        for (weight, &logit) in weights.iter_mut().zip(logits) {
+            *weight = logit.into();
+        }
+        exp_below(&mut weights, max.into());
         let (mut weighted, mut total) = (0.0, 0.0);
-        for (i, logit) in (0..).zip(logits) {
-            let weight = f64::from((logit - max).exp());
+        for (i, weight) in (0..).zip(&weights) {
             weighted += weight * f64::from(i);
             total += weight;
         }
@@ -179,7 +196,8 @@ mod tests {
                         expected_returns(&logits, &support, &mut value);
                         let expected = exactly(&logits, low, high);
                         // Half of the last place of the value itself, which an f32 cannot be without.
-                        let allowed = 3e-7 * (high - low) + expected.abs() / 2f64.powi(24);
+                        let allowed =
+                            EXPECTED_RETURN_ERROR * (high - low) + expected.abs() / 2f64.powi(24);
                         let error = (f64::from(value[0]) - expected).abs();
                         assert!(
                             error <= allowed,
@@ -243,7 +261,7 @@ mod tests {
             expected_returns(&logits, &support, &mut value);
             let (low, high) = (f64::from(v_min), f64::from(v_max));
             let expected = exactly(&logits, low, high);
-            let allowed = 3e-7 * (high - low) + expected.abs() / 2f64.powi(24);
+            let allowed = EXPECTED_RETURN_ERROR * (high - low) + expected.abs() / 2f64.powi(24);
             prop_assert!((f64::from(value[0]) - expected).abs() <= allowed, "{value:?}, {expected}");
             prop_assert!((v_min..=v_max).contains(&value[0]), "{value:?}");
         }

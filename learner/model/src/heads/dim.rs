@@ -3,11 +3,12 @@
 //!
 //! A block is out(relu(hidden(x))) + skip(x). Source: Mazoure et al. 2020, appendix.
 
-use candle_core::{DType, Tensor};
+use candle_core::{D, DType, Tensor};
 
 use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
+use crate::kernels::residual::{BlockWeights, residual_block};
 use crate::parameters::Parameters;
 
 /// A residual block on features, to which an action's embedding may be joined.
@@ -45,12 +46,9 @@ impl Block {
         })
     }
 
-    /// The block without a joined input. The skip's result is the bias of `out`, so nothing is added separately.
+    /// The block on `x` [.., f].
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let with = self.kernels;
-        let hidden = with.linear_relu(x, &self.hidden_weight, &self.hidden_bias)?;
-        let skip = with.linear(x, &self.skip_weight, &self.out_bias)?;
-        Ok(with.linear(&hidden, &self.out_weight, &skip)?)
+        self.with_biases(x, &self.hidden_bias, &self.out_bias)
     }
 
     /// The block on x = [features; joined], as W x = W_features features + W_joined joined.
@@ -58,20 +56,38 @@ impl Block {
     /// `joined` [B, e] serves all locations of its row, so its products become biases of one group a row, and the tiled
     /// concatenation is never built.
     fn forward_joined(&self, features: &Tensor, joined: &Tensor, split: usize) -> Result<Tensor> {
-        let with = self.kernels;
-        let parts = |weight: &Tensor| -> Result<(Tensor, Tensor)> {
-            let joined_len = weight.dim(1)? - split;
-            Ok((
-                weight.narrow(1, 0, split)?,
-                weight.narrow(1, split, joined_len)?,
-            ))
+        let bias = |weight: &Tensor, bias: &Tensor| -> Result<Tensor> {
+            let weight = weight.narrow(1, split, weight.dim(1)? - split)?;
+            Ok(self.kernels.linear(joined, &weight, bias)?)
         };
-        let (hidden_features, hidden_joined) = parts(&self.hidden_weight)?;
-        let (skip_features, skip_joined) = parts(&self.skip_weight)?;
-        let hidden_bias = with.linear(joined, &hidden_joined, &self.hidden_bias)?;
-        let hidden = with.linear_relu(features, &hidden_features, &hidden_bias)?;
-        let skip_bias = with.linear(joined, &skip_joined, &self.out_bias)?;
-        let skip = with.linear(features, &skip_features, &skip_bias)?;
+        let hidden_bias = bias(&self.hidden_weight, &self.hidden_bias)?;
+        let skip_bias = bias(&self.skip_weight, &self.out_bias)?;
+        self.with_biases(features, &hidden_bias, &skip_bias)
+    }
+
+    /// The block on the first columns of its weights, as many as `x` [.., f] has, with biases of any number of groups.
+    fn with_biases(&self, x: &Tensor, hidden_bias: &Tensor, skip_bias: &Tensor) -> Result<Tensor> {
+        let with = self.kernels;
+        if let Kernels::Fused(precision) = with {
+            let weights = BlockWeights {
+                hidden: self.hidden_weight.clone(),
+                out: self.out_weight.clone(),
+                skip: self.skip_weight.clone(),
+            };
+            return Ok(residual_block(
+                x,
+                hidden_bias,
+                skip_bias,
+                &weights,
+                precision,
+            )?);
+        }
+        let features = x.dim(D::Minus1)?;
+        let hidden_weight = self.hidden_weight.narrow(1, 0, features)?;
+        let skip_weight = self.skip_weight.narrow(1, 0, features)?;
+        let hidden = with.linear_relu(x, &hidden_weight, hidden_bias)?;
+        // The skip's result is the bias of `out`, so nothing is added separately.
+        let skip = with.linear(x, &skip_weight, skip_bias)?;
         Ok(with.linear(&hidden, &self.out_weight, &skip)?)
     }
 }
@@ -124,11 +140,8 @@ impl ActionEmbedding {
     pub(crate) fn forward(&self, actions: &Tensor) -> Result<Tensor> {
         let one_hot = self.one_hot(actions)?;
         let block = &self.block;
-        let with = block.kernels;
-        let hidden = with.linear_relu(&one_hot, &block.hidden_weight, &block.hidden_bias)?;
         let bias = (&block.out_bias + &self.skip_bias)?;
-        let skip = with.linear(&one_hot, &block.skip_weight, &bias)?;
-        Ok(with.linear(&hidden, &block.out_weight, &skip)?)
+        block.with_biases(&one_hot, &block.hidden_bias, &bias)
     }
 
     fn one_hot(&self, actions: &Tensor) -> Result<Tensor> {

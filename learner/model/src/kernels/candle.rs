@@ -38,10 +38,74 @@ pub(crate) fn linear(x: &Tensor, w: &Tensor, b: &Tensor) -> Result<Tensor> {
     y.reshape(shape)
 }
 
+/// As `grouped::grouped_linear`: the whole layer, of which a row keeps its group.
+pub(crate) fn grouped_linear(
+    x: &Tensor,
+    w: &Tensor,
+    b: &Tensor,
+    groups: &[u8],
+    out: usize,
+) -> Result<Tensor> {
+    let rows = x.dim(0)?;
+    let groups = groups.iter().map(|&group| u32::from(group)).collect();
+    let groups = Tensor::from_vec(groups, (rows, 1, 1), x.device())?
+        .broadcast_as((rows, 1, out))?
+        .contiguous()?;
+    let all = linear(x, w, b)?.reshape((rows, (), out))?;
+    all.gather(&groups, 1)?.squeeze(1)
+}
+
 /// max(x, 0), whose gradient at exactly 0 is 0, unlike that of candle's `relu`; it keeps NaN.
 pub(crate) fn relu(x: &Tensor) -> Result<Tensor> {
     let above = x.gt(0f32)?.to_dtype(x.dtype())?.detach();
     x * above
+}
+
+/// As `dots::dot_products`: psi and phi [B, L, R] or [B, R] to [L, B, B].
+pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
+    match (psi.rank(), phi.rank()) {
+        (3, 3) => local_local_dots(psi, phi),
+        (3, _) => local_global_dots(psi, phi),
+        (_, 3) => global_local_dots(psi, phi),
+        _ => global_global_dots(psi, phi),
+    }
+}
+
+/// `batch` as a batched product takes it: the CPU's in any layout, others in one piece.
+fn as_operand(batch: Tensor) -> Result<Tensor> {
+    if batch.device().is_cpu() {
+        Ok(batch)
+    } else {
+        batch.contiguous()
+    }
+}
+
+/// `psi` [B, L, R], `phi` [B, L, R].
+fn local_local_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
+    as_operand(psi.transpose(0, 1)?)?.matmul(&as_operand(phi.permute((1, 2, 0))?)?)
+}
+
+/// `psi` [B, L, R], `phi` [B, R].
+fn local_global_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
+    let (rows, locations, rkhs) = psi.dims3()?;
+    let dots = psi.reshape((rows * locations, rkhs))?.matmul(&phi.t()?)?;
+    dots.reshape((rows, locations, rows))?
+        .transpose(0, 1)?
+        .contiguous()
+}
+
+/// `psi` [B, R], `phi` [B, L, R].
+fn global_local_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
+    let (rows, locations, rkhs) = phi.dims3()?;
+    let dots = phi.reshape((rows * locations, rkhs))?.matmul(&psi.t()?)?;
+    dots.reshape((rows, locations, rows))?
+        .permute((1, 2, 0))?
+        .contiguous()
+}
+
+/// `psi` [B, R], `phi` [B, R].
+fn global_global_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
+    psi.matmul(&phi.t()?)?.unsqueeze(0)
 }
 
 /// Images [B, H, W, in] to [B, h, w, out], without ReLU.

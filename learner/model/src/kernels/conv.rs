@@ -11,7 +11,7 @@ use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result, Shape, Tensor, b
 use rayon::prelude::*;
 
 use crate::geometry::{ConvLayer, ConvShape};
-use crate::kernels::convolution::Pixels;
+use crate::kernels::images::Pixels;
 use crate::kernels::linear::{add_in_order, cpu, floats};
 use crate::kernels::precision::Precision;
 use crate::kernels::stack::{
@@ -41,6 +41,7 @@ pub fn conv2d_relu(
 /// `images` [B, H, W, C] u8 (scaled by 1/255, no gradient) or f32. Each layer is (weight [out, in, k, k] f32, bias [out]
 /// f32, stride) and turns [B, h, w, in] into [B, (h - k) / stride + 1, (w - k) / stride + 1, out], channels last. Where an
 /// output is 0 its gradient is 0, as in PyTorch. Operands of products, and maps between layers, are rounded to `precision`.
+/// Each result of a layer and each gradient of its parameters is right to [`Precision::product_error`] of what it is the sum of.
 /// Results and gradients have the same bits whatever the number of threads.
 ///
 /// # Errors
@@ -150,6 +151,7 @@ impl<U: Unit> CustomOp2 for ConvStack<U> {
             .par_chunks_mut(TASK_IMAGES * last.map_len())
             .enumerate();
         let saved = tasks
+            .with_max_len(1)
             .map(|(task, maps)| {
                 stack_forward(self.unit, &layers, self.task_images(images, task), maps)
             })
@@ -201,6 +203,7 @@ impl<U: Unit> CustomOp2 for ConvStack<U> {
             .zip(saved.par_iter())
             .zip(grad_parts)
             .enumerate()
+            .with_max_len(1)
             .map(|(task, (((maps, grad_maps), saved), grad_images))| {
                 let images = self.task_images(image_values, task);
                 stack_backward(

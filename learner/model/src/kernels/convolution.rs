@@ -7,10 +7,12 @@
 
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
+use crate::kernels::images::{Images, Room};
 use crate::kernels::linear::{relu_gradient, relu_of};
-use crate::kernels::product::{Matrix, Panels, Threads};
+use crate::kernels::panels::{Matrix, Panels, Threads};
+use crate::kernels::rounding::write_rows;
 use crate::kernels::units::{
-    Columns, Element, LANES, Left, Mode, Unit, multiply_tile, row_tiles, tile_vecs,
+    Columns, Element, LANES, Left, Mode, Unit, multiply_tile, row_tiles, tile_vecs, vectorized,
 };
 
 impl ConvShape {
@@ -31,95 +33,30 @@ impl ConvShape {
 
     /// Weight [out, in, k, k] as [k, k, in, out]: the matrix that windows are multiplied by.
     fn pack_weight(&self, weight: &[f32]) -> Vec<f32> {
+        let (taps, inputs) = (self.kernel * self.kernel, self.channels_in);
         let mut packed = vec![0.0; weight.len()];
-        self.for_each_weight(|plain, pack| packed[pack] = weight[plain]);
+        for (row, packed) in packed.chunks_exact_mut(self.channels_out).enumerate() {
+            let at = row % inputs * taps + row / inputs;
+            let outs = weight[at..].iter().step_by(inputs * taps);
+            for (packed, &value) in packed.iter_mut().zip(outs) {
+                *packed = value;
+            }
+        }
         packed
     }
 
-    /// The inverse of `pack_weight`.
-    pub(crate) fn unpack_weight(&self, packed: &[f32]) -> Vec<f32> {
-        let mut weight = vec![0.0; packed.len()];
-        self.for_each_weight(|plain, pack| weight[plain] = packed[pack]);
-        weight
-    }
-
-    /// Calls `visit` with the index in [out, in, k, k] and the index in [k, k, in, out] of every weight.
-    fn for_each_weight(&self, mut visit: impl FnMut(usize, usize)) {
-        let taps = self.kernel * self.kernel;
-        for tap in 0..taps {
-            for channel_in in 0..self.channels_in {
-                for channel_out in 0..self.channels_out {
-                    visit(
-                        (channel_out * self.channels_in + channel_in) * taps + tap,
-                        (tap * self.channels_in + channel_in) * self.channels_out + channel_out,
-                    );
+    /// The inverse of `pack_weight`, into `weight`.
+    pub(crate) fn unpack_weight(&self, packed: &[f32], weight: &mut [f32]) {
+        let (taps, inputs) = (self.kernel * self.kernel, self.channels_in);
+        for (out, weight) in weight.chunks_exact_mut(inputs * taps).enumerate() {
+            for (channel_in, weight) in weight.chunks_exact_mut(taps).enumerate() {
+                let at = channel_in * self.channels_out + out;
+                let values = packed[at..].iter().step_by(inputs * self.channels_out);
+                for (weight, &value) in weight.iter_mut().zip(values) {
+                    *weight = value;
                 }
             }
         }
-    }
-}
-
-/// Images [n, height, width, channels_in], as they are stored.
-#[derive(Clone, Copy)]
-pub(crate) enum Pixels<'a> {
-    /// Scaled by 1/255 when read.
-    Bytes(&'a [u8]),
-    Floats(&'a [f32]),
-}
-
-impl<'a> Pixels<'a> {
-    pub(crate) fn len(&self) -> usize {
-        match self {
-            Self::Bytes(bytes) => bytes.len(),
-            Self::Floats(floats) => floats.len(),
-        }
-    }
-
-    /// The scalars `range` of all images.
-    pub(crate) fn slice(&self, range: std::ops::Range<usize>) -> Self {
-        match self {
-            Self::Bytes(bytes) => Self::Bytes(&bytes[range]),
-            Self::Floats(floats) => Self::Floats(&floats[range]),
-        }
-    }
-
-    /// The images and `PADDING` as operands, and what products with them are multiplied by.
-    pub(crate) fn operands<U: Unit>(&self, unit: U) -> (Buffer<U::Element>, f32) {
-        let mut values = Buffer::new(self.len() + PADDING);
-        values[self.len()..].fill(U::Element::default());
-        let scale = unit.vectorize(|| match self {
-            Self::Bytes(bytes) => {
-                for (value, &byte) in values.iter_mut().zip(*bytes) {
-                    *value = U::Element::of_byte(byte);
-                }
-                U::Element::BYTE_SCALE
-            }
-            Self::Floats(floats) => {
-                for (value, &float) in values.iter_mut().zip(*floats) {
-                    *value = U::Element::of(float);
-                }
-                1.0
-            }
-        });
-        (values, scale)
-    }
-}
-
-/// Scalars after the last image: where a run is odd, the last step of the last window reads one further, times 0.
-pub(crate) const PADDING: usize = 1;
-
-/// Images [n, height, width, channels_in] and `PADDING`, as operands of products.
-#[derive(Clone, Copy)]
-pub(crate) struct Images<'a, E> {
-    pub(crate) values: &'a [E],
-    /// What a product with them is multiplied by.
-    pub(crate) scale: f32,
-}
-
-impl<'a, E> Images<'a, E> {
-    /// The maps of another layer.
-    pub(crate) const fn of_maps(values: &'a [E]) -> Self {
-        Self { values, scale: 1.0 }
     }
 }
 
@@ -165,47 +102,57 @@ impl<E: Element> Convolution<E> {
     }
 }
 
-/// maps = relu(conv(images, weight) + bias), handed to `write` row by row: the index of its first scalar in maps
-/// [count, out_height, out_width, out], and [out_width, out] scalars.
-pub(crate) fn forward<U: Unit>(
+/// maps = relu(conv(images, weight) + bias), as `maps` [n, out_height, out_width, out] stores them.
+pub(crate) fn forward<U: Unit, M: Element>(
     unit: U,
     layer: &Convolution<U::Element>,
     images: Images<'_, U::Element>,
-    count: usize,
-    mut write: impl FnMut(usize, &[f32]),
+    maps: &mut [M],
 ) {
     let shape = &layer.shape;
     let (out_width, out) = (shape.out_width(), shape.channels_out);
-    let mut row = Buffer::new(out_width * out);
-    let left = Left {
-        values: images.values,
-        start: 0,
-        row_stride: shape.shift(),
-        step: U::Element::DEPTH,
-        steps: shape.run().div_ceil(U::Element::DEPTH),
-        run_stride: shape.line(),
-        runs: shape.kernel,
-    };
-    for index in 0..count * shape.out_height() {
-        let (image, y) = (index / shape.out_height(), index % shape.out_height());
-        let start = image * shape.image_len() + y * shape.stride * shape.line();
-        for (x, windows) in row_tiles::<U>(out_width, layer.forward.vecs()) {
-            let left = Left {
-                start: start + x * shape.shift(),
-                ..left
-            };
-            layer
-                .forward
-                .multiply(unit, windows, left, Mode::Replace, &mut row[x * out..]);
-        }
-        unit.vectorize(|| {
-            for location in row.chunks_exact_mut(out) {
-                for (value, bias) in location.iter_mut().zip(&layer.bias) {
-                    *value = relu_of(*value * images.scale + bias);
-                }
+    let (mut room, mut row) = (Room::new(), Buffer::new(out_width * out));
+    for (index, maps) in maps.chunks_exact_mut(shape.map_len()).enumerate() {
+        let left = Left {
+            values: images.image(unit, index, shape.image_len(), &mut room),
+            start: 0,
+            row_stride: shape.shift(),
+            step: U::Element::DEPTH,
+            steps: shape.run().div_ceil(U::Element::DEPTH),
+            run_stride: shape.line(),
+            runs: shape.kernel,
+        };
+        for (y, maps) in maps.chunks_exact_mut(out_width * out).enumerate() {
+            let start = y * shape.stride * shape.line();
+            for (x, windows) in row_tiles::<U>(out_width, layer.forward.vecs()) {
+                let left = Left {
+                    start: start + x * shape.shift(),
+                    ..left
+                };
+                layer
+                    .forward
+                    .multiply(unit, windows, left, Mode::Replace, &mut row[x * out..]);
             }
-            write(index * out_width * out, &row);
-        });
+            finish_row(unit, &mut row, &layer.bias, images.scale(), maps);
+        }
+    }
+}
+
+vectorized! {
+    /// relu(scale * row + bias) for each location of `row` [locations, out], there and rounded into `maps`.
+    fn finish_row<U, M>(
+        unit,
+        row: &'a mut [f32],
+        bias: &'a [f32],
+        scale: f32,
+        maps: &'a mut [M],
+    ) {
+        for row in row.chunks_exact_mut(bias.len()) {
+            for (value, &bias) in row.iter_mut().zip(bias) {
+                *value = relu_of(*value * scale + bias);
+            }
+        }
+        M::store(unit, row, maps);
     }
 }
 
@@ -250,19 +197,20 @@ pub(crate) fn backward<U: Unit, M: Element>(
 ) {
     let shape = &layer.shape;
     let mut masked = Masked::new::<U>(shape);
+    let (len, mut rooms) = (shape.image_len(), [Room::new(), Room::new()]);
     for (image, (maps, grad_maps)) in maps
         .chunks_exact(shape.map_len())
         .zip(grad_maps.chunks_exact(shape.map_len()))
         .enumerate()
     {
-        let pixels = image * shape.image_len()..(image + 1) * shape.image_len();
         masked.mask(unit, maps, grad_maps, grads.bias);
         masked.write_panels(unit, shape);
-        let values = &images.values[pixels.clone()];
-        weight_gradient(unit, shape, values, &masked.panels, grads.packed);
+        let steps = images.steps(unit, image, (len, shape.shift()), &mut rooms);
+        weight_gradient(unit, shape, steps, &masked.panels, grads.packed);
         if let Some(grad_images) = &mut grads.images {
             masked.write_rows(unit, shape.channels_out);
-            image_gradient(unit, layer, &masked.rows, &mut grad_images[pixels]);
+            let pixels = &mut grad_images[image * len..(image + 1) * len];
+            image_gradient(unit, layer, &masked.rows, pixels);
         }
     }
 }
@@ -296,52 +244,63 @@ impl<E: Element> Masked<E> {
         grad_maps: &[f32],
         bias: &mut [f32],
     ) {
+        mask(unit, maps, grad_maps, bias, &mut self.values);
+    }
+
+    fn write_rows<U: Unit<Element = E>>(&mut self, unit: U, out: usize) {
+        write_rows(unit, &self.values, out, &mut self.rows);
+    }
+
+    fn write_panels<U: Unit<Element = E>>(&mut self, unit: U, shape: &ConvShape) {
+        let width = tile_vecs::<U>(shape.channels_out) * LANES;
+        write_panels(unit, &self.values, *shape, width, &mut self.panels);
+    }
+}
+
+vectorized! {
+    fn mask<U, M>(
+        unit,
+        maps: &'a [M],
+        grad_maps: &'a [f32],
+        bias: &'a mut [f32],
+        masked: &'a mut [f32],
+    ) {
         let out = bias.len();
-        unit.vectorize(|| {
-            let locations = maps.chunks_exact(out).zip(grad_maps.chunks_exact(out));
-            for (masked, (maps, grads)) in self.values.chunks_exact_mut(out).zip(locations) {
-                for (((masked, bias), &map), &grad) in
-                    masked.iter_mut().zip(&mut *bias).zip(maps).zip(grads)
-                {
-                    *masked = relu_gradient(map.value(), grad);
-                    *bias += *masked;
-                }
+        let locations = maps.chunks_exact(out).zip(grad_maps.chunks_exact(out));
+        for (masked, (maps, grads)) in masked.chunks_exact_mut(out).zip(locations) {
+            for (((masked, bias), &map), &grad) in
+                masked.iter_mut().zip(&mut *bias).zip(maps).zip(grads)
+            {
+                *masked = relu_gradient(map.value(), grad);
+                *bias += *masked;
             }
-        });
+        }
     }
+}
 
-    fn write_rows<U: Unit>(&mut self, unit: U, out: usize) {
-        let rows = self.rows.chunks_exact_mut(out.next_multiple_of(E::DEPTH));
-        unit.vectorize(|| {
-            for (row, masked) in rows.zip(self.values.chunks_exact(out)) {
-                let (begin, end) = row.split_at_mut(out);
-                for (value, &masked) in begin.iter_mut().zip(masked) {
-                    *value = E::of(masked);
-                }
-                end.fill(E::default());
-            }
-        });
-    }
-
-    fn write_panels<U: Unit>(&mut self, unit: U, shape: &ConvShape) {
-        let (out, out_width) = (shape.channels_out, shape.out_width());
-        let width = tile_vecs::<U>(out) * LANES;
-        let panels = self.panels.chunks_exact_mut(panel_len::<E>(shape, width));
-        unit.vectorize(|| {
-            for (index, panel) in panels.enumerate() {
-                let cols = index * width..out.min((index + 1) * width);
-                let mut steps = panel.chunks_exact_mut(width * E::DEPTH);
-                for line in self.values.chunks_exact(out_width * out) {
-                    for windows in line.chunks(E::DEPTH * out) {
-                        let second = windows.get(out..).unwrap_or_default();
-                        let second = second.get(cols.clone()).unwrap_or_default();
-                        if let Some(step) = steps.next() {
-                            E::join(&windows[cols.clone()], second, step);
-                        }
+vectorized! {
+    fn write_panels<U>(
+        unit,
+        values: &'a [f32],
+        shape: ConvShape,
+        width: usize,
+        panels: &'a mut [U::Element],
+    ) {
+        let (out, out_width, depth) = (shape.channels_out, shape.out_width(), U::Element::DEPTH);
+        let panels = panels.chunks_exact_mut(panel_len::<U::Element>(&shape, width));
+        for (index, panel) in panels.enumerate() {
+            let cols = index * width..out.min((index + 1) * width);
+            let mut steps = panel.chunks_exact_mut(width * depth);
+            for line in values.chunks_exact(out_width * out) {
+                for windows in line.chunks(depth * out) {
+                    let second = windows.get(out..).unwrap_or_default();
+                    let second = second.get(cols.clone()).unwrap_or_default();
+                    if let Some(step) = steps.next() {
+                        U::Element::join(unit, &windows[cols.clone()], second, step);
                     }
                 }
             }
-        });
+        }
     }
 }
 
@@ -351,7 +310,7 @@ fn panel_len<E: Element>(shape: &ConvShape, width: usize) -> usize {
     steps * width * E::DEPTH
 }
 
-/// Adds one image's part of the weight's gradient: windows, transposed, times masked gradients.
+/// Adds one image's part of the weight's gradient: windows, transposed, times masked gradients. `image` is from [`Images::steps`].
 fn weight_gradient<U: Unit>(
     unit: U,
     shape: &ConvShape,
@@ -362,18 +321,12 @@ fn weight_gradient<U: Unit>(
     let (depth, out) = (U::Element::DEPTH, shape.channels_out);
     let vecs = tile_vecs::<U>(out);
     let width = vecs * LANES;
-    let pairs = (depth == 2).then(|| {
-        let mut pairs = Buffer::new(image.len() * 2);
-        unit.vectorize(|| pair_neighbours(image, shape.shift(), &mut pairs));
-        pairs
-    });
-    let values = pairs.as_deref().unwrap_or(image);
     let steps = shape.out_width().div_ceil(depth);
     for kernel_y in 0..shape.kernel {
         let rows = &mut packed[kernel_y * shape.run() * out..][..shape.run() * out];
         for (first, count) in row_tiles::<U>(shape.run(), vecs) {
             let left = Left {
-                values,
+                values: image,
                 start: (kernel_y * shape.line() + first) * depth,
                 row_stride: depth,
                 step: depth * depth * shape.shift(),
@@ -394,20 +347,6 @@ fn weight_gradient<U: Unit>(
                 multiply_tile(unit, count, left, panel, columns);
             }
         }
-    }
-}
-
-/// Pairs every scalar with the one `shift` further, or with 0 where the image ends before.
-#[inline(always)]
-fn pair_neighbours<E: Element>(values: &[E], shift: usize, pairs: &mut [E]) {
-    let later = values.get(shift..).unwrap_or_default();
-    let (both, one) = pairs.split_at_mut(later.len() * 2);
-    let (begin, end) = values.split_at(later.len());
-    for ((pair, &value), &later) in both.chunks_exact_mut(2).zip(begin).zip(later) {
-        (pair[0], pair[1]) = (value, later);
-    }
-    for (pair, &value) in one.chunks_exact_mut(2).zip(end) {
-        (pair[0], pair[1]) = (value, E::default());
     }
 }
 

@@ -1,14 +1,19 @@
-//! The fully connected layer as a candle operation with gradients, with optional ReLU, and ReLU by itself.
+//! The fully connected layer as a candle operation with gradients, with optional ReLU or on maps, and ReLU by itself.
 //! It knows no network; it runs on the CPU only.
 //!
 //! candle's own path is a matrix product and a broadcast addition, whose backward pass sums the bias on a single thread,
 //! and its ReLU passes a gradient at exactly 0, which PyTorch's does not.
 
+use std::sync::{Mutex, PoisonError};
+
 use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
 use rayon::prelude::*;
 
+use crate::gradients;
+use crate::kernels::buffer::Buffer;
+use crate::kernels::panels::{Matrix, Threads};
 use crate::kernels::precision::Precision;
-use crate::kernels::product::{Matrix, Threads, multiply};
+use crate::kernels::product::multiply;
 use crate::kernels::units::Mode;
 
 /// Rows that one task sums. Fixed, so that sums are taken in the same order whatever the number of threads.
@@ -16,16 +21,38 @@ const TASK_ROWS: usize = 256;
 /// Scalars that one task of an elementwise pass takes.
 const TASK_LEN: usize = 1 << 15;
 
+/// Scalars of a sum of vectors that one task takes.
+const SUM_LEN: usize = 1 << 12;
+
 /// y = x w^T + b, differentiable in all arguments.
 ///
 /// `x` [..., in]; `w` [out, in]; `b` [out], or [groups..., out] where each entry serves an equal share of consecutive
 /// rows of `x`. Result [..., out]. All f32. With as many groups as rows this is x w^T + b for a whole tensor b, which
-/// saves the separate addition. Operands of products are rounded to `precision`. Results and gradients have the same bits whatever the number of threads.
+/// saves the separate addition. Operands of products are rounded to `precision`: each result and gradient is right to
+/// [`Precision::product_error`]. Results and gradients have the same bits whatever the number of threads.
 ///
 /// # Errors
 /// Shapes that do not match, or other types.
 pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Result<Tensor> {
-    apply(x, w, b, false, precision)
+    apply(x, w, b, Form::Plain, precision)
+}
+
+/// [`linear`] on maps [B, height, width, channels], flattened in the order of PyTorch's weights: channel, row, column.
+///
+/// # Errors
+/// As [`linear`].
+pub(crate) fn linear_of_maps(
+    maps: &Tensor,
+    w: &Tensor,
+    b: &Tensor,
+    precision: Precision,
+) -> Result<Tensor> {
+    let (_, height, width, channels) = maps.dims4()?;
+    let form = Form::OfMaps {
+        locations: height * width,
+        channels,
+    };
+    apply(maps, w, b, form, precision)
 }
 
 /// relu(x w^T + b): [`linear`] with the ReLU fused. Where the result is 0 the gradient is 0, as in PyTorch.
@@ -33,7 +60,7 @@ pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Resul
 /// # Errors
 /// Shapes that do not match, or other types.
 pub fn linear_relu(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Result<Tensor> {
-    apply(x, w, b, true, precision)
+    apply(x, w, b, Form::WithRelu, precision)
 }
 
 /// max(x, 0), whose gradient at exactly 0 is 0, as in PyTorch.
@@ -44,11 +71,15 @@ pub fn relu(x: &Tensor) -> Result<Tensor> {
     x.contiguous()?.apply_op1(Relu)
 }
 
-fn apply(x: &Tensor, w: &Tensor, b: &Tensor, relu: bool, precision: Precision) -> Result<Tensor> {
-    let (inputs, outputs) = (
-        x.dims().last().copied().unwrap_or(0),
-        w.dims().first().copied().unwrap_or(0),
-    );
+fn apply(x: &Tensor, w: &Tensor, b: &Tensor, form: Form, precision: Precision) -> Result<Tensor> {
+    let inputs = match form {
+        Form::OfMaps {
+            locations,
+            channels,
+        } => locations * channels,
+        Form::Plain | Form::WithRelu => x.dims().last().copied().unwrap_or(0),
+    };
+    let outputs = w.dims().first().copied().unwrap_or(0);
     let fits =
         w.dims() == [outputs, inputs] && b.dims().last() == Some(&outputs) && inputs * outputs > 0;
     let (rows, groups) = (
@@ -68,21 +99,35 @@ fn apply(x: &Tensor, w: &Tensor, b: &Tensor, relu: bool, precision: Precision) -
         inputs,
         outputs,
         groups,
-        relu,
+        form,
         precision,
+        flat: Mutex::new(None),
     };
     x.contiguous()?
         .apply_op3(&w.contiguous()?, &b.contiguous()?, op)
 }
 
-#[derive(Clone, Copy)]
+/// What a layer does beside x w^T + b.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Form {
+    Plain,
+    WithRelu,
+    /// x are maps [.., locations, channels], to be flattened to [.., channels * locations].
+    OfMaps {
+        locations: usize,
+        channels: usize,
+    },
+}
+
 struct Linear {
     rows: usize,
     inputs: usize,
     outputs: usize,
     groups: usize,
-    relu: bool,
+    form: Form,
     precision: Precision,
+    /// The flattened maps: what the forward pass leaves to the backward pass.
+    flat: Mutex<Option<Buffer<f32>>>,
 }
 
 impl CustomOp3 for Linear {
@@ -99,32 +144,32 @@ impl CustomOp3 for Linear {
         b: &CpuStorage,
         b_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let x = Matrix::new(floats(x, x_layout)?, self.rows, self.inputs);
+        let x = floats(x, x_layout)?;
         let w = Matrix::new(floats(w, w_layout)?, self.outputs, self.inputs);
         let b = floats(b, b_layout)?;
-        let group_len = self.rows / self.groups * self.outputs;
-        let mut y = vec![0.0; self.rows * self.outputs];
-        y.par_chunks_mut(self.task_len())
-            .enumerate()
-            .for_each(|(task, y)| {
-                let first = task * self.task_len();
-                for (row, y) in y.chunks_exact_mut(self.outputs).enumerate() {
-                    let group = (first + row * self.outputs) / group_len;
-                    y.copy_from_slice(&b[group * self.outputs..][..self.outputs]);
-                }
-            });
-        multiply(
-            self.precision,
-            &mut y,
-            Mode::Add,
-            x,
-            w.transposed(),
-            Threads::Pool,
-        );
-        if self.relu {
-            y.par_chunks_mut(TASK_LEN).for_each(relu_in_place);
-        }
+        let mut y = rows_of_biases(b, self.outputs, self.rows / self.groups);
+        let mut multiply = |x: &[f32]| {
+            let (x, w) = (Matrix::new(x, self.rows, self.inputs), w.transposed());
+            multiply(self.precision, &mut y, Mode::Add, x, w, Threads::Pool);
+        };
         let mut dims = x_layout.dims().to_vec();
+        match self.form {
+            Form::Plain => multiply(x),
+            Form::WithRelu => {
+                multiply(x);
+                y.par_chunks_mut(TASK_LEN).for_each(relu_in_place);
+            }
+            Form::OfMaps {
+                locations,
+                channels,
+            } => {
+                let mut flat = Buffer::new(x.len());
+                transpose_each(x, locations, channels, &mut flat);
+                multiply(&flat);
+                *self.flat.lock().unwrap_or_else(PoisonError::into_inner) = Some(flat);
+                dims.truncate(2);
+            }
+        }
         if let Some(last) = dims.last_mut() {
             *last = self.outputs;
         }
@@ -139,7 +184,7 @@ impl CustomOp3 for Linear {
         y: &Tensor,
         grad_y: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let grad_y = if self.relu {
+        let grad_y = if self.form == Form::WithRelu {
             masked(&y.detach(), &grad_y.detach())?
         } else {
             grad_y.detach().contiguous()?
@@ -158,66 +203,111 @@ impl CustomOp3 for Linear {
                 self.inputs,
             );
             let mut grad_x = vec![0.0; self.rows * self.inputs];
-            multiply(
-                self.precision,
-                &mut grad_x,
-                Mode::Replace,
-                grad,
-                w,
-                Threads::Pool,
-            );
+            let multiply = |grad_x: &mut [f32]| {
+                let mode = Mode::Replace;
+                multiply(self.precision, grad_x, mode, grad, w, Threads::Pool);
+            };
+            if let Form::OfMaps {
+                locations,
+                channels,
+            } = self.form
+            {
+                let mut grad_flat = Buffer::new(grad_x.len());
+                multiply(&mut grad_flat);
+                transpose_each(&grad_flat, channels, locations, &mut grad_x);
+            } else {
+                multiply(&mut grad_x);
+            }
             Tensor::from_vec(grad_x, x.shape(), device)
         });
-        let grad_w = w.track_op().then(|| -> Result<Tensor> {
-            let x = Matrix::new(floats(cpu(&x_storage)?, x_layout)?, self.rows, self.inputs);
-            let mut grad_w = vec![0.0; self.outputs * self.inputs];
+        let flat = self.flat.lock().unwrap_or_else(PoisonError::into_inner);
+        let x_values = match &*flat {
+            Some(flat) => flat,
+            None => floats(cpu(&x_storage)?, x_layout)?,
+        };
+        let add_to_w = |sum: &mut [f32], there: bool| {
+            let mode = if there { Mode::Add } else { Mode::Replace };
+            let x = Matrix::new(x_values, self.rows, self.inputs);
             multiply(
                 self.precision,
-                &mut grad_w,
-                Mode::Replace,
+                sum,
+                mode,
                 grad.transposed(),
                 x,
                 Threads::Pool,
             );
-            Tensor::from_vec(grad_w, w.shape(), device)
-        });
-        let grad_b = b.track_op().then(|| -> Result<Tensor> {
-            if self.groups == self.rows {
-                return grad_y.reshape(b.shape());
+        };
+        let grad_w = if !w.track_op() || gradients::add_in_place(w, add_to_w) {
+            None
+        } else {
+            let mut grad_w = vec![0.0; self.outputs * self.inputs];
+            add_to_w(&mut grad_w, false);
+            Some(Tensor::from_vec(grad_w, w.shape(), device)?)
+        };
+        let add_to_b = |sum: &mut [f32], _: bool| {
+            for (sum, value) in
+                sum.iter_mut()
+                    .zip(group_sums(grad_values, self.groups, self.outputs))
+            {
+                *sum += value;
             }
-            Tensor::from_vec(self.group_sums(grad_values), b.shape(), device)
-        });
-        Ok((
-            grad_x.transpose()?,
-            grad_w.transpose()?,
-            grad_b.transpose()?,
-        ))
+        };
+        let grad_b = if !b.track_op() {
+            None
+        } else if self.groups == self.rows {
+            Some(grad_y.reshape(b.shape())?)
+        } else if gradients::add_in_place(b, add_to_b) {
+            None
+        } else {
+            let sums = group_sums(grad_values, self.groups, self.outputs);
+            Some(Tensor::from_vec(sums, b.shape(), device)?)
+        };
+        Ok((grad_x.transpose()?, grad_w, grad_b))
     }
 }
 
-impl Linear {
-    /// Scalars of a task's whole rows.
-    fn task_len(&self) -> usize {
-        (TASK_LEN / self.outputs).max(1) * self.outputs
-    }
-
-    /// Sums of each group's rows: [rows, outputs] to [groups, outputs].
-    fn group_sums(&self, grad: &[f32]) -> Vec<f32> {
-        let outputs = self.outputs;
-        if self.groups > 1 {
-            let mut sums = vec![0.0; self.groups * outputs];
-            sums.par_chunks_mut(outputs)
-                .zip(grad.par_chunks(self.rows / self.groups * outputs))
-                .for_each(|(sum, rows)| add_rows(sum, rows));
-            return sums;
-        }
-        let parts = grad.par_chunks(TASK_ROWS * outputs).map(|rows| {
-            let mut sum = vec![0.0; outputs];
-            add_rows(&mut sum, rows);
-            sum
+/// Transposes every image [rows, cols] of a batch.
+fn transpose_each(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) {
+    let len = rows * cols;
+    result
+        .par_chunks_mut(len)
+        .zip(values.par_chunks(len))
+        .with_min_len(16)
+        .for_each(|(result, values)| {
+            for (col, result) in result.chunks_exact_mut(rows).enumerate() {
+                for (to, &value) in result.iter_mut().zip(values[col..].iter().step_by(cols)) {
+                    *to = value;
+                }
+            }
         });
-        add_in_order(parts.collect(), outputs)
+}
+
+/// Sums of each group's rows: `grads` [rows, outputs] to [groups, outputs].
+pub(crate) fn group_sums(grads: &[f32], groups: usize, outputs: usize) -> Vec<f32> {
+    if groups > 1 {
+        let mut sums = vec![0.0; groups * outputs];
+        sums.par_chunks_mut(outputs)
+            .zip(grads.par_chunks(grads.len() / groups))
+            .for_each(|(sum, rows)| add_rows(sum, rows));
+        return sums;
     }
+    let parts = grads.par_chunks(TASK_ROWS * outputs).map(|rows| {
+        let mut sum = vec![0.0; outputs];
+        add_rows(&mut sum, rows);
+        sum
+    });
+    add_in_order(parts.collect(), outputs)
+}
+
+/// Rows of `biases` [groups, outputs], each `times` times: what products are added to. Written once, without zeros before them.
+pub(crate) fn rows_of_biases(biases: &[f32], outputs: usize, times: usize) -> Vec<f32> {
+    let mut y = Vec::with_capacity(biases.len() * times);
+    for bias in biases.chunks_exact(outputs) {
+        for _ in 0..times {
+            y.extend_from_slice(bias);
+        }
+    }
+    y
 }
 
 fn add_rows(sum: &mut [f32], rows: &[f32]) {
@@ -232,11 +322,16 @@ fn add_rows(sum: &mut [f32], rows: &[f32]) {
 pub(crate) fn add_in_order(parts: Vec<Vec<f32>>, len: usize) -> Vec<f32> {
     let mut parts = parts.into_iter();
     let mut sum = parts.next().unwrap_or_else(|| vec![0.0; len]);
-    for part in parts {
-        for (sum, value) in sum.iter_mut().zip(part) {
-            *sum += value;
-        }
-    }
+    let parts: Vec<_> = parts.collect();
+    sum.par_chunks_mut(SUM_LEN)
+        .enumerate()
+        .for_each(|(index, sum)| {
+            for part in &parts {
+                for (sum, value) in sum.iter_mut().zip(&part[index * SUM_LEN..]) {
+                    *sum += value;
+                }
+            }
+        });
     sum
 }
 

@@ -1,59 +1,11 @@
-//! Matrix products over slices, cut into tiles for a unit: operands rounded and packed, the output split over the rayon pool.
+//! Matrix products over slices, the output split over the rayon pool.
 //! It knows nothing of layers.
 
 use rayon::prelude::*;
 
-use crate::kernels::buffer::Buffer;
+use crate::kernels::panels::{Matrix, Panels, Rows, Threads};
 use crate::kernels::precision::Precision;
-use crate::kernels::units::{
-    Columns, Element, ForUnit, LANES, Left, Mode, Unit, multiply_tile, row_tiles, tile_vecs,
-    with_unit,
-};
-
-/// A matrix laid over a slice: its rows one after the other, or its columns if it is transposed.
-#[derive(Clone, Copy)]
-pub(crate) struct Matrix<'a> {
-    data: &'a [f32],
-    rows: usize,
-    cols: usize,
-    transposed: bool,
-}
-
-impl<'a> Matrix<'a> {
-    /// Rows one after the other, `data` [rows, cols].
-    pub(crate) fn new(data: &'a [f32], rows: usize, cols: usize) -> Self {
-        assert!(
-            data.len() == rows * cols,
-            "a {rows}x{cols} matrix over {} scalars",
-            data.len()
-        );
-        Self {
-            data,
-            rows,
-            cols,
-            transposed: false,
-        }
-    }
-
-    /// The transposed matrix over the same data.
-    pub(crate) fn transposed(self) -> Self {
-        Self {
-            data: self.data,
-            rows: self.cols,
-            cols: self.rows,
-            transposed: !self.transposed,
-        }
-    }
-}
-
-/// Who computes a product.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Threads {
-    /// The calling thread alone: for callers that already split their work.
-    Caller,
-    /// The current rayon pool, for products large enough to be worth it.
-    Pool,
-}
+use crate::kernels::units::{ForUnit, Mode, Unit, with_unit};
 
 /// Rows of the output that one task computes. Fixed, so that a product's bits do not depend on the number of threads.
 const TASK_ROWS: usize = 32;
@@ -62,7 +14,7 @@ const SPLIT_MIN: usize = 1 << 18;
 
 /// Multiplies `a` [m, k] by `b` [k, n] into `out` [m, n], rows one after the other; operands are rounded to `precision`.
 ///
-/// Each entry is summed in the order of k, in f32, whatever the number of threads.
+/// Each entry is summed in the order of k, in f32, whatever the number of threads; it is right to [`Precision::product_error`].
 ///
 /// # Panics
 /// If the shapes do not match.
@@ -117,277 +69,15 @@ fn multiply_with<U: Unit>(
     let panels = Panels::pack(unit, b, threads);
     let rows = Rows::pack(unit, a, threads);
     let task = |first: usize, out: &mut [f32]| {
-        let count = out.len() / n;
-        for tile in row_tiles::<U>(count, panels.vecs) {
-            // Panels inside: a few rows of `a` stay in the first cache while all of `b` passes.
-            let (row, tile_rows) = tile;
-            panels.multiply(
-                unit,
-                tile_rows,
-                rows.left(first + row),
-                mode,
-                &mut out[row * n..],
-            );
-        }
+        panels.multiply_rows(unit, out.len() / n, rows.left(first), mode, out);
     };
     match threads {
         Threads::Caller => task(0, out),
         Threads::Pool => out
             .par_chunks_mut(TASK_ROWS * n)
+            .with_max_len(1)
             .enumerate()
             .for_each(|(index, out)| task(index * TASK_ROWS, out)),
-    }
-}
-
-/// A right operand, cut into panels of columns, each [k / DEPTH, columns, DEPTH] with zeros where it ends before they do.
-pub(crate) struct Panels<E: Element> {
-    values: Buffer<E>,
-    steps: usize,
-    cols: usize,
-    vecs: usize,
-}
-
-impl<E: Element> Panels<E> {
-    /// The panels of `b` [k, n].
-    pub(crate) fn pack<U: Unit<Element = E>>(unit: U, b: Matrix<'_>, threads: Threads) -> Self {
-        let vecs = tile_vecs::<U>(b.cols);
-        let (steps, width) = (b.rows.div_ceil(E::DEPTH), vecs * LANES);
-        let panel_len = steps * width * E::DEPTH;
-        let mut values = Buffer::new(panel_len * b.cols.div_ceil(width));
-        let pack = |panel: usize, values: &mut [E]| {
-            unit.vectorize(|| pack_panel(b, panel * width, width, values));
-        };
-        match threads {
-            Threads::Caller => {
-                for (panel, values) in values.chunks_exact_mut(panel_len).enumerate() {
-                    pack(panel, values);
-                }
-            }
-            Threads::Pool => values
-                .par_chunks_exact_mut(panel_len)
-                .enumerate()
-                .for_each(|(panel, values)| pack(panel, values)),
-        }
-        Self {
-            values,
-            steps,
-            cols: b.cols,
-            vecs,
-        }
-    }
-
-    /// Registers in the width of a panel.
-    pub(crate) const fn vecs(&self) -> usize {
-        self.vecs
-    }
-
-    /// Multiplies `rows` rows, no more than a tile's, into `out`, whose rows are this operand's columns long.
-    pub(crate) fn multiply<U: Unit<Element = E>>(
-        &self,
-        unit: U,
-        rows: usize,
-        left: Left<'_, E>,
-        mode: Mode,
-        out: &mut [f32],
-    ) {
-        self.multiply_apart(unit, rows, left, mode, out, self.cols);
-    }
-
-    /// [`Panels::multiply`] into rows of `out` that begin `stride` scalars apart.
-    pub(crate) fn multiply_apart<U: Unit<Element = E>>(
-        &self,
-        unit: U,
-        rows: usize,
-        left: Left<'_, E>,
-        mode: Mode,
-        out: &mut [f32],
-        stride: usize,
-    ) {
-        let width = self.vecs * LANES;
-        let panels = self.values.chunks_exact(self.steps * width * E::DEPTH);
-        for (index, panel) in panels.enumerate() {
-            let first = index * width;
-            multiply_tile(
-                unit,
-                rows,
-                left,
-                panel,
-                Columns {
-                    out: &mut out[first..],
-                    stride,
-                    cols: width.min(self.cols - first),
-                    vecs: self.vecs,
-                    mode,
-                },
-            );
-        }
-    }
-}
-
-/// Packs columns `first..` of `b` as one panel of this width.
-#[inline(always)]
-fn pack_panel<E: Element>(b: Matrix<'_>, first: usize, width: usize, panel: &mut [E]) {
-    let cols = width.min(b.cols - first);
-    if b.transposed {
-        return pack_transposed(b, first, cols, width, panel);
-    }
-    let steps = panel.chunks_exact_mut(width * E::DEPTH);
-    for (step, rows) in steps.zip(b.data.chunks(b.cols * E::DEPTH)) {
-        let part = |row: usize| {
-            let row = rows.get(row * b.cols..).unwrap_or_default();
-            row.get(first..first + cols).unwrap_or_default()
-        };
-        E::join(part(0), part(1), step);
-    }
-}
-
-/// [`pack_panel`] of a matrix whose columns are its runs in memory: square blocks are turned in registers and the first cache.
-#[inline(always)]
-fn pack_transposed<E: Element>(
-    b: Matrix<'_>,
-    first: usize,
-    cols: usize,
-    width: usize,
-    panel: &mut [E],
-) {
-    let (k, depth) = (b.rows, E::DEPTH);
-    let steps = k.div_ceil(depth);
-    if cols < width {
-        panel.fill(E::default());
-    }
-    let mut block = [[E::default(); 2 * LANES]; LANES];
-    for step in (0..steps).step_by(LANES) {
-        for col in (0..cols).step_by(LANES) {
-            let (block_steps, block_cols) = (LANES.min(steps - step), LANES.min(cols - col));
-            for (row, block) in block.iter_mut().take(block_cols).enumerate() {
-                let run = &b.data[(first + col + row) * k..][step * depth..];
-                let run = &run[..(block_steps * depth).min(k - step * depth)];
-                if run.len() == LANES * depth {
-                    for (to, &from) in block.iter_mut().zip(run) {
-                        *to = E::of(from);
-                    }
-                } else {
-                    block.fill(E::default());
-                    for (to, &from) in block.iter_mut().zip(run) {
-                        *to = E::of(from);
-                    }
-                }
-            }
-            for at in 0..block_steps {
-                let to = &mut panel[((step + at) * width + col) * depth..];
-                for (to, block) in to.chunks_exact_mut(depth).zip(&block[..block_cols]) {
-                    to.copy_from_slice(&block[at * depth..(at + 1) * depth]);
-                }
-            }
-        }
-    }
-}
-
-/// A left operand as tiles read it.
-struct Rows<'a, E: Element> {
-    values: Operand<'a, E>,
-    row_stride: usize,
-    step: usize,
-    steps: usize,
-}
-
-/// Where a left operand's scalars are.
-enum Operand<'a, E: Element> {
-    InPlace(&'a [E]),
-    Packed(Buffer<E>),
-}
-
-impl<'a, E: Element> Rows<'a, E> {
-    /// The rows of `a` [m, k]: where they are if that is possible, else a rounded copy.
-    fn pack<U: Unit<Element = E>>(unit: U, a: Matrix<'a>, threads: Threads) -> Self {
-        let (m, k, depth) = (a.rows, a.cols, E::DEPTH);
-        let steps = k.div_ceil(depth);
-        let (row_stride, step) = match a.transposed {
-            false => (steps * depth, depth),
-            true => (depth, m * depth),
-        };
-        let values = if let Some(values) = E::in_place(a.data) {
-            Operand::InPlace(values)
-        } else {
-            let mut values = Buffer::new(m * steps * depth);
-            if a.transposed {
-                pack_steps(unit, a.transposed(), &mut values, threads);
-            } else {
-                pack_rows(unit, a.data, k, row_stride, &mut values, threads);
-            }
-            Operand::Packed(values)
-        };
-        Self {
-            values,
-            row_stride,
-            step,
-            steps,
-        }
-    }
-
-    fn left(&self, row: usize) -> Left<'_, E> {
-        Left {
-            values: match &self.values {
-                Operand::InPlace(values) => values,
-                Operand::Packed(values) => values,
-            },
-            start: row * self.row_stride,
-            row_stride: self.row_stride,
-            step: self.step,
-            steps: self.steps,
-            run_stride: 0,
-            runs: 1,
-        }
-    }
-}
-
-/// Scalars that one task rounds.
-const TASK_LEN: usize = 1 << 15;
-
-/// Rounds rows of `cols` scalars into rows of `stride`, with zeros after them.
-fn pack_rows<U: Unit>(
-    unit: U,
-    data: &[f32],
-    cols: usize,
-    stride: usize,
-    values: &mut [U::Element],
-    threads: Threads,
-) {
-    let rows = (TASK_LEN / stride).max(1);
-    let pack = |values: &mut [U::Element], data: &[f32]| {
-        unit.vectorize(|| {
-            for (values, row) in values.chunks_exact_mut(stride).zip(data.chunks_exact(cols)) {
-                let (values, rest) = values.split_at_mut(cols);
-                for (to, &from) in values.iter_mut().zip(row) {
-                    *to = U::Element::of(from);
-                }
-                rest.fill(U::Element::default());
-            }
-        });
-    };
-    match threads {
-        Threads::Caller => pack(values, data),
-        Threads::Pool => values
-            .par_chunks_mut(rows * stride)
-            .zip(data.par_chunks(rows * cols))
-            .for_each(|(values, data)| pack(values, data)),
-    }
-}
-
-/// Packs all columns of `b` as one panel, a share of the steps on each thread.
-fn pack_steps<U: Unit>(unit: U, b: Matrix<'_>, values: &mut [U::Element], threads: Threads) {
-    let (depth, cols) = (U::Element::DEPTH, b.cols);
-    let steps = (TASK_LEN / (cols * depth)).max(1);
-    let pack = |values: &mut [U::Element], data: &[f32]| {
-        let part = Matrix::new(data, data.len() / cols, cols);
-        unit.vectorize(|| pack_panel(part, 0, cols, values));
-    };
-    match threads {
-        Threads::Caller => pack(values, b.data),
-        Threads::Pool => values
-            .par_chunks_mut(steps * cols * depth)
-            .zip(b.data.par_chunks(steps * cols * depth))
-            .for_each(|(values, data)| pack(values, data)),
     }
 }
 

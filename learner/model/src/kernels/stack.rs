@@ -1,12 +1,11 @@
 //! A stack of convolutions over one task's images, forward and backward, on slices.
-//! It knows neither tensors nor threads; `conv` splits the batch and `im2col` computes each layer.
+//! It knows neither tensors nor threads; `conv` splits the batch and `convolution` computes each layer.
 
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::convolution::{
-    ConvGradients, Convolution, Images, PADDING, Pixels, backward, forward,
-};
-use crate::kernels::units::{Element, Unit};
+use crate::kernels::convolution::{ConvGradients, Convolution, backward, forward};
+use crate::kernels::images::{Images, PADDING, Pixels};
+use crate::kernels::units::Unit;
 
 /// The maps of all layers but the last, one layer after the other, each with `PADDING`: what forward leaves to backward.
 pub(crate) type SavedActivations<E> = Buffer<E>;
@@ -37,14 +36,17 @@ pub(crate) fn layers<U: Unit>(
 }
 
 /// Gradients as `stack_backward` sums them, with the weights back as [out, in, k, k].
-pub(crate) fn unpacked(shapes: &[ConvShape], mut sums: &[f32]) -> Vec<f32> {
-    let mut result = Vec::with_capacity(sums.len());
+pub(crate) fn unpacked(shapes: &[ConvShape], sums: &[f32]) -> Vec<f32> {
+    let mut result = vec![0.0; sums.len()];
+    let (mut sums, mut free) = (sums, &mut result[..]);
     for shape in shapes {
-        let (packed, rest) = sums.split_at(shape.weight_len());
-        let (bias, rest) = rest.split_at(shape.channels_out);
-        result.extend(shape.unpack_weight(packed));
-        result.extend_from_slice(bias);
-        sums = rest;
+        let (own, rest) = sums.split_at(shape.parameters_len());
+        let (to, free_rest) = std::mem::take(&mut free).split_at_mut(own.len());
+        let (packed, bias) = own.split_at(shape.weight_len());
+        let (weight, bias_to) = to.split_at_mut(shape.weight_len());
+        shape.unpack_weight(packed, weight);
+        bias_to.copy_from_slice(bias);
+        (sums, free) = (rest, free_rest);
     }
     result
 }
@@ -64,26 +66,16 @@ pub(crate) fn stack_forward<U: Unit>(
         .iter()
         .map(|layer| count * layer.shape.map_len() + PADDING);
     let mut saved = Buffer::new(saved_len.sum());
-    let (pixels, scale) = images.operands(unit);
-    let mut input = Images {
-        values: &pixels,
-        scale,
-    };
+    let mut input = Images::Pixels(images);
     let mut free = &mut saved[..];
     for layer in inner {
         let len = count * layer.shape.map_len();
         let (output, rest) = std::mem::take(&mut free).split_at_mut(len + PADDING);
         output[len..].fill(U::Element::default());
-        forward(unit, layer, input, count, |first, row| {
-            for (value, &map) in output[first..].iter_mut().zip(row) {
-                *value = U::Element::of(map);
-            }
-        });
-        (input, free) = (Images::of_maps(output), rest);
+        forward(unit, layer, input, &mut output[..len]);
+        (input, free) = (Images::Maps(output), rest);
     }
-    forward(unit, last, input, count, |first, row| {
-        maps[first..first + row.len()].copy_from_slice(row);
-    });
+    forward(unit, last, input, maps);
     saved
 }
 
@@ -117,7 +109,7 @@ pub(crate) fn stack_backward<U: Unit>(
         saved = earlier;
         let mut grad_input = Buffer::zeros(input_len);
         let grads = ConvGradients::cut(&mut sums_left, shape, Some(&mut grad_input));
-        let images = Images::of_maps(input);
+        let images = Images::Maps(input);
         match (output, &grad_output) {
             (Some(output), Some(grad)) => backward(unit, layer, images, output, grad, grads),
             _ => backward(unit, layer, images, maps, grad_maps, grads),
@@ -125,11 +117,8 @@ pub(crate) fn stack_backward<U: Unit>(
         output = Some(&input[..input_len]);
         grad_output = Some(grad_input);
     }
-    let (pixels, scale) = images.operands(unit);
-    let images = Images {
-        values: &pixels,
-        scale,
-    };
+    let images = Images::Pixels(images);
+    let scale = images.scale();
     let grads = ConvGradients::cut(&mut sums_left, &first.shape, grad_images.take());
     match (output, &grad_output) {
         (Some(output), Some(grad)) => backward(unit, first, images, output, grad, grads),
@@ -142,4 +131,109 @@ pub(crate) fn stack_backward<U: Unit>(
         }
     }
     sums
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::ConvLayer;
+    use crate::kernels::precision::Precision;
+    use crate::kernels::units::{ForUnit, with_every_unit};
+
+    /// Sizes that fill no register: odd runs, odd numbers of windows, channels beyond a panel.
+    fn shapes() -> Vec<ConvShape> {
+        let layers = [(5, 3, 2), (70, 4, 1), (9, 2, 1)];
+        let mut input = (17, 23, 3);
+        let shape = |(out, kernel, stride)| {
+            let layer = ConvLayer {
+                out,
+                kernel,
+                stride,
+            };
+            let shape = ConvShape::new(input, layer).unwrap();
+            input = shape.output();
+            shape
+        };
+        layers.map(shape).to_vec()
+    }
+
+    fn values(len: usize, by: usize, scale: f32) -> Vec<f32> {
+        (0..len)
+            .map(|at| ((at * by % 101) as f32 / 50.0 - 1.0) * scale)
+            .collect()
+    }
+
+    #[derive(Clone, Copy)]
+    struct Run<'a> {
+        shapes: &'a [ConvShape],
+        parameters: &'a [f32],
+        images: Pixels<'a>,
+        grad_maps: &'a [f32],
+    }
+
+    impl ForUnit for Run<'_> {
+        /// Maps, gradients of parameters and of images.
+        type Output = [Vec<f32>; 3];
+
+        fn run<U: Unit>(self, unit: U) -> [Vec<f32>; 3] {
+            let layers = layers(unit, self.shapes, self.parameters, true, true);
+            let mut maps = vec![0.0; self.grad_maps.len()];
+            let saved = stack_forward(unit, &layers, self.images, &mut maps);
+            let mut grad_images = vec![0.0; self.images.len()];
+            let grads = stack_backward(
+                unit,
+                &layers,
+                self.images,
+                &saved,
+                &maps,
+                self.grad_maps,
+                Some(&mut grad_images),
+            );
+            [maps, grads, grad_images]
+        }
+    }
+
+    #[test]
+    fn every_unit_gives_the_same_up_to_the_order_of_sums() {
+        let shapes = shapes();
+        let (first, last) = (&shapes[0], &shapes[2]);
+        let count = 3;
+        let floats = values(count * first.image_len(), 37, 1.0);
+        let bytes: Vec<u8> = (0..floats.len()).map(|at| (at * 31 % 256) as u8).collect();
+        let parameters = values(parameters_len(&shapes), 53, 0.2);
+        let grad_maps = values(count * last.map_len(), 17, 1.0);
+        for images in [Pixels::Floats(&floats), Pixels::Bytes(&bytes)] {
+            for precision in Precision::ALL {
+                let run = Run {
+                    shapes: &shapes,
+                    parameters: &parameters,
+                    images,
+                    grad_maps: &grad_maps,
+                };
+                let results = with_every_unit(precision, run);
+                let (wanted, others) = results.split_first().unwrap();
+                // A sum that lands on the other side of a bf16 moves what is computed from it by its 256th part.
+                let tolerance = match precision {
+                    Precision::F32 => 1e-5,
+                    Precision::Bf16 => 1e-2,
+                };
+                for result in others {
+                    for (got, wanted) in result.iter().zip(wanted) {
+                        let norm = |values: &mut dyn Iterator<Item = f32>| {
+                            values
+                                .map(|x| f64::from(x) * f64::from(x))
+                                .sum::<f64>()
+                                .sqrt()
+                        };
+                        let error = norm(&mut got.iter().zip(wanted).map(|(a, b)| a - b));
+                        let size = norm(&mut wanted.iter().copied());
+                        assert!(
+                            size > 0.0 && error <= tolerance * size,
+                            "{precision}: {error} of {size}"
+                        );
+                    }
+                }
+            }
+        }
+    }
 }

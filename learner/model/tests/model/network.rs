@@ -2,9 +2,11 @@
 //! Values against another framework are in `parity`.
 
 use candle_core::{DType, Device, Result, Tensor};
-use driml_model::{ConvLayer, DimHeads, Kernels, ModelConfig, ModelError, Network, Parameters};
+use driml_model::{
+    Backward, ConvLayer, DimHeads, Kernels, ModelConfig, ModelError, Network, Parameters, Precision,
+};
 
-use crate::support::{assert_close, bits, frames, parameters, rng, small, values};
+use crate::support::{assert_close, bits, frames, parameters, rng, small, values, variable};
 
 /// out(relu(hidden(x))) + skip(x) by candle's operations, x [rows, in].
 fn stock_block(parameters: &Parameters, name: &str, x: &Tensor) -> Result<Tensor> {
@@ -42,7 +44,7 @@ fn outputs_and_gradients(
     config: &ModelConfig,
     parameters: &Parameters,
     kernels: Kernels,
-) -> Result<(Vec<Tensor>, candle_core::backprop::GradStore)> {
+) -> Result<(Vec<Tensor>, Backward)> {
     let network = Network::with_kernels(config, parameters, kernels).unwrap();
     let features = network.features(&frames(config, 6, &mut rng(1))).unwrap();
     let actions = Tensor::new(&[0u32, 4, 2, 2, 1, 3], &Device::Cpu)?;
@@ -62,8 +64,7 @@ fn outputs_and_gradients(
         let weights = crate::support::floats(output.dims(), &mut rng(seed));
         total = (total + (output * weights)?.sum_all()?)?;
     }
-    let gradients = total.backward()?;
-    Ok((outputs, gradients))
+    Ok((outputs, Backward::of(&total)?))
 }
 
 #[test]
@@ -82,15 +83,16 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
     };
     for config in [odd, even] {
         let parameters = with_biases(&config);
-        let (ours, our_gradients) = outputs_and_gradients(&config, &parameters, Kernels::FUSED)?;
-        let (theirs, their_gradients) =
+        let (ours, mut our_gradients) =
+            outputs_and_gradients(&config, &parameters, Kernels::FUSED)?;
+        let (theirs, mut their_gradients) =
             outputs_and_gradients(&config, &parameters, Kernels::Candle)?;
         for (index, (ours, theirs)) in ours.iter().zip(&theirs).enumerate() {
             assert_close(&format!("output {index}"), theirs, ours, 1e-6);
         }
         for (name, var) in parameters.iter() {
-            let (ours, theirs) = (our_gradients.get(var), their_gradients.get(var));
-            assert_close(name, theirs.unwrap(), ours.unwrap(), 2e-6);
+            let (ours, theirs) = (our_gradients.remove(var)?, their_gradients.remove(var)?);
+            assert_close(name, &theirs.unwrap(), &ours.unwrap(), 2e-6);
         }
     }
     Ok(())
@@ -148,14 +150,14 @@ fn the_dim_heads_follow_their_formula_with_gradients() -> Result<()> {
         for (name, found, wanted) in pairs {
             let found = found.unwrap();
             assert_close(name, &found, &wanted, 1e-6);
-            let (found, wanted) = (
-                found.sqr()?.sum_all()?.backward()?,
+            let (mut found, wanted) = (
+                Backward::of(&found.sqr()?.sum_all()?)?,
                 wanted.sqr()?.sum_all()?.backward()?,
             );
             for (parameter, var) in parameters.iter() {
-                match (found.get(var), wanted.get(var)) {
+                match (found.remove(var)?, wanted.get(var)) {
                     (None, None) => {}
-                    (Some(found), Some(wanted)) => assert_close(parameter, found, wanted, 3e-6),
+                    (Some(found), Some(wanted)) => assert_close(parameter, &found, wanted, 3e-6),
                     _ => panic!("{name}: only one way has a gradient for {parameter}"),
                 }
             }
@@ -166,9 +168,16 @@ fn the_dim_heads_follow_their_formula_with_gradients() -> Result<()> {
 
 #[test]
 fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
+    for precision in Precision::ALL {
+        the_same_bits_for_any_number_of_threads(precision);
+    }
+}
+
+fn the_same_bits_for_any_number_of_threads(precision: Precision) {
     let config = small();
     let parameters = with_biases(&config);
-    let network = Network::new(&config, &parameters).unwrap();
+    let kernels = Kernels::Fused(precision);
+    let network = Network::with_kernels(&config, &parameters, kernels).unwrap();
     let batch = frames(&config, 61, &mut rng(2));
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new()
@@ -182,10 +191,10 @@ fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
             let loss = (logits.sqr().unwrap().sum_all().unwrap()
                 + phi3.sqr().unwrap().sum_all().unwrap())
             .unwrap();
-            let grads = loss.backward().unwrap();
+            let mut grads = Backward::of(&loss).unwrap();
             let grads = parameters
                 .iter()
-                .filter_map(|(_, var)| grads.get(var).map(bits))
+                .filter_map(|(_, var)| grads.remove(var).unwrap().as_ref().map(bits))
                 .collect::<Vec<_>>();
             (bits(&logits), grads)
         })
@@ -419,4 +428,62 @@ fn configurations_that_cannot_work_are_errors() {
     fails(|config| config.conv[0].stride = 0);
     fails(|config| config.conv[2].out = 0);
     fails(|config| (config.hidden, config.rkhs) = (65_536, 65_536));
+}
+
+#[test]
+fn gradients_that_are_summed_in_place_are_candle_s() -> Result<()> {
+    let config = small();
+    let (parameters, batch) = (with_biases(&config), frames(&config, 9, &mut rng(4)));
+    let network = Network::new(&config, &parameters).unwrap();
+    // Every parameter twice, once through each half of the batch.
+    let features = network.features(&batch).unwrap();
+    let halves = [features.narrow(0, 4)?, features.narrow(4, 5)?];
+    let losses = halves.map(|half| network.logits(&half.f4).unwrap().sqr()?.sum_all());
+    let [first, second] = losses;
+    let loss = (first? + second?)?;
+    let (wanted, mut found) = (loss.backward()?, Backward::of(&loss)?);
+    let mut compared = 0;
+    for (name, var) in parameters.iter() {
+        let gradient = found.remove(var)?;
+        assert_eq!(gradient.is_some(), wanted.get(var).is_some(), "{name}");
+        if let (Some(found), Some(wanted)) = (gradient, wanted.get(var)) {
+            assert_close(name, &found, wanted, 1e-6);
+            compared += 1;
+        }
+    }
+    assert_eq!(compared, 8 + 2, "torso and head");
+    Ok(())
+}
+
+#[test]
+fn dot_products_and_their_gradients_are_candle_s() -> Result<()> {
+    let rng = &mut rng(6);
+    let (local, global) = ([5, 3, 7], [5, 7]);
+    for (psi, phi) in [
+        (&local[..], &local[..]),
+        (&local, &global),
+        (&global, &local),
+        (&global, &global),
+    ] {
+        let (psi, phi) = (variable(psi, rng), variable(phi, rng));
+        let ours = Kernels::FUSED.dot_products(&psi, &phi)?;
+        let theirs = Kernels::Candle.dot_products(&psi, &phi)?;
+        assert_close("dots", &ours, &theirs, 1e-6);
+        let grad = crate::support::floats(ours.dims(), rng);
+        let (found, wanted) = (
+            (ours * &grad)?.sum_all()?.backward()?,
+            (theirs * &grad)?.sum_all()?.backward()?,
+        );
+        for (name, var) in [("psi", &psi), ("phi", &phi)] {
+            assert_close(
+                name,
+                found.get(var).unwrap(),
+                wanted.get(var).unwrap(),
+                1e-6,
+            );
+        }
+    }
+    let (psi, phi) = (variable(&[5, 3, 7], rng), variable(&[5, 2, 7], rng));
+    assert!(Kernels::FUSED.dot_products(&psi, &phi).is_err());
+    Ok(())
 }

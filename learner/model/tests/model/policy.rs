@@ -59,6 +59,34 @@ fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
     }
 }
 
+/// An actor leaves states out in which chance decides: the others' values must not depend on it.
+#[test]
+fn a_state_has_the_same_values_in_any_company() {
+    let config = small();
+    let weights = parameters(&config, 3).to_safetensors(|_| true).unwrap();
+    let frames = bytes(70 * config.frame_len(), &mut rng(1));
+    for precision in Precision::ALL {
+        let mut policy = PolicyNetwork::new(&config, &weights, precision).unwrap();
+        let mut all = vec![0.0; 70 * 5];
+        policy.q_values(&frames, &mut all).unwrap();
+        for step in [2, 3, 7, 69] {
+            let some: Vec<usize> = (0..70).step_by(step).collect();
+            let states: Vec<u8> = some
+                .iter()
+                .flat_map(|&at| &frames[at * config.frame_len()..][..config.frame_len()])
+                .copied()
+                .collect();
+            let mut values = vec![0.0; some.len() * 5];
+            policy.q_values(&states, &mut values).unwrap();
+            for (&at, values) in some.iter().zip(values.chunks(5)) {
+                let bits =
+                    |values: &[f32]| values.iter().map(|it| it.to_bits()).collect::<Vec<_>>();
+                assert_eq!(bits(values), bits(&all[at * 5..][..5]), "{precision}, {at}");
+            }
+        }
+    }
+}
+
 #[test]
 fn ties_go_to_the_lowest_action() {
     let config = small().without_dim();

@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use candle_core::{DType, Device, Tensor};
-use driml_model::{ModelConfig, ModelError, Parameters, PolicyNetwork, Precision};
+use driml_model::{ModelConfig, ModelError, Parameters, PolicyNetwork, Precision, StoredAs};
 
 use crate::support::{bits, bytes, parameters, rng, small, values};
 
@@ -262,4 +262,37 @@ fn corrupted_headers_never_panic() {
             drop(Parameters::load_safetensors(&config, &broken, &Device::Cpu));
         }
     }
+}
+
+#[test]
+fn half_the_bytes_act_nearly_the_same() {
+    let config = small().without_dim();
+    let parameters = parameters(&config, 1);
+    let file = |stored| parameters.to_safetensors_as(stored, |_| true).unwrap();
+    let frames = bytes(4 * config.frame_len(), &mut rng(1));
+    let values = |file: &[u8]| {
+        let mut policy = PolicyNetwork::new(&config, file, Precision::F32).unwrap();
+        let mut values = [0.0; 20];
+        policy.q_values(&frames, &mut values).unwrap();
+        values
+    };
+    let whole = values(&file(StoredAs::F32));
+    for (stored, tolerance) in [(StoredAs::F16, 2e-3), (StoredAs::Bf16, 2e-2)] {
+        let half = file(stored);
+        assert!(half.len() * 3 < file(StoredAs::F32).len() * 2, "{stored:?}");
+        let width = config.v_max - config.v_min;
+        for (whole, half) in whole.iter().zip(values(&half)) {
+            let error = (whole - half).abs();
+            assert!(error <= tolerance * width, "{stored:?}: {whole}, {half}");
+        }
+    }
+    let weight = parameters.get("head.weight").unwrap();
+    let large = (weight.ones_like().unwrap() * 1e5).unwrap();
+    weight.set(&large).unwrap();
+    let error = parameters.to_safetensors_as(StoredAs::F16, |_| true);
+    let said = error.unwrap_err().to_string();
+    assert!(
+        said.contains("head.weight") && said.contains("too large"),
+        "{said}"
+    );
 }

@@ -2,9 +2,10 @@
 //! It does not estimate: how A comes about is the learner's.
 
 use driml_protocol::{AffinityUpdate, CodecError};
+use serde::{Deserialize, Serialize};
 
 /// A[i, j]: how strongly action j is expected after action i; rows are softmaxes.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Affinity {
     version: u64,
     /// Whether the next matrix is newer whatever its version: it comes from another learner.
@@ -42,6 +43,12 @@ impl Affinity {
             self.matrix.copy_from_slice(&update.matrix);
         }
         Ok(())
+    }
+
+    /// Whether it is one for so many actions.
+    pub(crate) const fn is_for(&self, num_actions: u32) -> bool {
+        let n = num_actions as usize;
+        self.num_actions == num_actions && self.matrix.len() == n * n
     }
 
     /// Version in use; 0 is the uniform one.

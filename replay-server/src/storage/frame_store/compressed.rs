@@ -25,7 +25,7 @@ impl Block {
 }
 
 /// Frames that are unpacked together, and where they are in the log.
-pub(crate) struct Part {
+pub(crate) struct BlockPart {
     pub(crate) transitions: Range<u64>,
     place: Range<u64>,
 }
@@ -84,8 +84,16 @@ impl CompressedFrames {
         oldest
     }
 
+    /// Lets go of the blocks that end before `oldest`.
+    pub(crate) fn forget_before(&mut self, oldest: u64) {
+        while let Some(block) = self.blocks.front().filter(|it| it.end() <= oldest) {
+            self.log.release(self.place_end(block));
+            self.blocks.pop_front();
+        }
+    }
+
     /// The key of the block that holds `index`, and the part with its frame, unless that is the key.
-    pub(crate) fn parts(&self, index: u64) -> (Part, Option<Part>) {
+    pub(crate) fn parts(&self, index: u64) -> (BlockPart, Option<BlockPart>) {
         let after = self.blocks.partition_point(|block| block.first <= index);
         let block = &self.blocks[after - 1];
         let part = self.layout.part_of((index - block.first) as usize);
@@ -95,10 +103,10 @@ impl CompressedFrames {
         )
     }
 
-    fn part(&self, block: &Block, part: usize) -> Part {
+    fn part(&self, block: &Block, part: usize) -> BlockPart {
         let frames = self.layout.frames_of(part, block.frames as usize);
         let end = |part: usize| block.start + u64::from(block.part_ends[part]);
-        Part {
+        BlockPart {
             transitions: block.first + frames.start as u64..block.first + frames.end as u64,
             place: part.checked_sub(1).map_or(block.start, end)..end(part),
         }
@@ -110,7 +118,7 @@ impl CompressedFrames {
     }
 
     /// Copies a part, as it is stored, to the end of `out`.
-    pub(crate) fn copy(&self, part: &Part, out: &mut Vec<u8>) {
+    pub(crate) fn copy(&self, part: &BlockPart, out: &mut Vec<u8>) {
         self.log.copy(part.place.clone(), out);
     }
 

@@ -59,10 +59,28 @@ impl Frames {
         }
     }
 
-    /// Checks that the transitions `oldest..inserted` have their frames; panics if not. Slow: for tests.
-    pub(crate) fn check_valid(&self, oldest: u64, inserted: u64) {
+    /// The next frame, the first, is that of transition `first`.
+    pub(crate) fn start_at(&mut self, first: u64) {
         match self {
-            Self::Plain(frames) => frames.check_valid(inserted - oldest),
+            Self::Plain(frames) => frames.start_at(first),
+            // A block begins where the last ended, the first one at what `push` is told.
+            Self::Compressed(_) => {}
+        }
+    }
+
+    /// The frames before that of `oldest` are no longer wanted.
+    pub(crate) fn forget_before(&mut self, oldest: u64) {
+        match self {
+            // Their places are taken again in turn.
+            Self::Plain(_) => {}
+            Self::Compressed(frames) => frames.forget_before(oldest),
+        }
+    }
+
+    /// Checks that the transitions `oldest..inserted`, of those from `first` on, have their frames; panics if not. Slow: for tests.
+    pub(crate) fn check_valid(&self, first: u64, oldest: u64, inserted: u64) {
+        match self {
+            Self::Plain(frames) => frames.check_valid(inserted - first),
             Self::Compressed(frames) => frames.check_valid(oldest, inserted),
         }
     }

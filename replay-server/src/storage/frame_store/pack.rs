@@ -3,7 +3,7 @@
 
 use std::borrow::Cow;
 
-use driml_protocol::Chunk;
+use driml_protocol::{Chunk, CodecError};
 use lz4_flex::block::{compress_into, compress_into_with_dict, get_maximum_output_size};
 
 use super::layout::{Layout, PartEnds};
@@ -13,6 +13,8 @@ use crate::config::Compression;
 #[derive(Clone, Copy, Debug)]
 pub struct Packer {
     pub(crate) compression: Compression,
+    /// Hash of the run spec where chunks are also kept on disk, as messages.
+    pub(crate) seal_for: Option<u64>,
 }
 
 /// A chunk with its frames as the replay will keep them.
@@ -20,6 +22,8 @@ pub struct PackedChunk<'a> {
     pub(crate) chunk: Cow<'a, Chunk>,
     /// With compression: of each stream.
     packed: Vec<PackedRun>,
+    /// Where chunks are kept on disk: prefix and header of the message, or why there is no such message.
+    pub(crate) sealed: Option<Result<Vec<u8>, CodecError>>,
 }
 
 /// Consecutive frames of one stream as blocks, the first frame's first.
@@ -53,7 +57,13 @@ impl Packer {
                 .map(|run| PackedRun::new(run, Layout::new(chunk.header.frame_bytes as usize)))
                 .collect(),
         };
-        PackedChunk { chunk, packed }
+        let seal = |spec_hash| chunk.seal(spec_hash).map(|(head, _)| head);
+        let sealed = self.seal_for.map(seal);
+        PackedChunk {
+            chunk,
+            packed,
+            sealed,
+        }
     }
 }
 

@@ -1,10 +1,11 @@
-//! Frames as they came, in one buffer: number `i` since the start lies in slot `i % capacity`.
+//! Frames as they came, in one buffer: number `i` since the start lies in slot `(i - first) % capacity`.
 //! It compresses nothing and frees nothing.
 
 /// The newest `capacity` frames.
 pub(crate) struct PlainFrames {
     capacity: u64,
     frame_bytes: usize,
+    first: u64,
     /// Where the next frame goes.
     next: usize,
     /// Grows into its reservation, so that memory is taken only as transitions come.
@@ -24,9 +25,15 @@ impl PlainFrames {
         Ok(Self {
             capacity,
             frame_bytes,
+            first: 0,
             next: 0,
             bytes,
         })
+    }
+
+    /// The next frame, the first, has the number `first`.
+    pub(crate) const fn start_at(&mut self, first: u64) {
+        self.first = first;
     }
 
     /// Stores frames, over the oldest ones once the buffer is full.
@@ -46,7 +53,7 @@ impl PlainFrames {
 
     /// Frame `index`, which must be held.
     pub(crate) fn frame(&self, index: u64) -> &[u8] {
-        let at = (index % self.capacity) as usize * self.frame_bytes;
+        let at = ((index - self.first) % self.capacity) as usize * self.frame_bytes;
         &self.bytes[at..at + self.frame_bytes]
     }
 
@@ -54,11 +61,11 @@ impl PlainFrames {
         self.bytes.len() as u64
     }
 
-    pub(crate) fn check_valid(&self, held: u64) {
+    pub(crate) fn check_valid(&self, stored: u64) {
         assert_eq!(
             self.bytes_held(),
-            held * self.frame_bytes as u64,
-            "one frame a transition held"
+            stored.min(self.capacity) * self.frame_bytes as u64,
+            "one frame a transition, until they are overwritten"
         );
     }
 }

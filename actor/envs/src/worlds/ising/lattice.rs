@@ -5,6 +5,7 @@ use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::error::EnvError;
+use crate::saved;
 
 /// Neighbours of one site: up, down, left, right.
 const NEIGHBOURS: usize = 4;
@@ -113,6 +114,23 @@ impl IsingLattice {
             }
         }
         (self.energy, self.magnetisation) = self.recount();
+    }
+
+    /// Takes spins [H * W] that another lattice of these sites had.
+    ///
+    /// # Errors
+    /// Spins that are not -1 or +1 exactly where there is a site, and 0 elsewhere.
+    pub fn set_spins(&mut self, spins: &[i8]) -> Result<(), EnvError> {
+        let all = self.height * self.width;
+        let there = spins.iter().filter(|spin| spin.abs() == 1).count();
+        let fits = spins.len() == all
+            && there == self.sites.len()
+            && spins.iter().all(|spin| spin.abs() <= 1)
+            && self.sites.iter().all(|&site| spins[site as usize] != 0);
+        saved::check(fits, "a lattice")?;
+        self.spins[..all].copy_from_slice(spins);
+        (self.energy, self.magnetisation) = self.recount();
+        Ok(())
     }
 
     /// One Metropolis proposal at each site, first those with even row + column, then the odd ones; then one more at a

@@ -9,6 +9,7 @@ use super::lattice::{Boundary, IsingLattice, check_temperature};
 use crate::copies::{RngUse, check_num_envs, check_step, copy_rng};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
+use crate::saved;
 use crate::settings::WorldSettings;
 
 /// The settings of the Ising world. The paper: lattice 84, patch 42, temperature 0.4.
@@ -82,6 +83,16 @@ struct Field {
     episode_step: u32,
 }
 
+/// All of a [`Field`] that does not follow from the settings.
+#[derive(Serialize, Deserialize)]
+struct SavedField {
+    rng: ChaCha8Rng,
+    origin: (usize, usize),
+    spins: Vec<i8>,
+    frame: Vec<u8>,
+    episode_step: u32,
+}
+
 impl IsingWorld {
     /// The only action.
     pub const ACTION_NAMES: [&str; 1] = ["no-op"];
@@ -131,8 +142,8 @@ impl WorldSettings for IsingConfig {
         IsingConfig::frame_shape(self)
     }
 
-    fn action_names(&self) -> &'static [&'static str] {
-        &IsingWorld::ACTION_NAMES
+    fn action_names(&self) -> Vec<&str> {
+        IsingWorld::ACTION_NAMES.to_vec()
     }
 
     fn build(
@@ -183,9 +194,43 @@ impl Environment for IsingWorld {
         }
         Ok(())
     }
+
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        let copies: Vec<SavedField> = self.copies.iter().map(Field::saved).collect();
+        saved::encode(&copies)
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        let copies: Vec<SavedField> = saved::decode(state, self.num_envs())?;
+        let mut both = self.copies.iter_mut().zip(copies);
+        both.try_for_each(|(field, saved)| field.load(saved, &self.config))
+    }
 }
 
 impl Field {
+    fn saved(&self) -> SavedField {
+        SavedField {
+            rng: self.rng.clone(),
+            origin: self.origin,
+            spins: self.patch.spins().to_vec(),
+            frame: self.frame.clone(),
+            episode_step: self.episode_step,
+        }
+    }
+
+    fn load(&mut self, saved: SavedField, config: &IsingConfig) -> Result<(), EnvError> {
+        let (row, col) = saved.origin;
+        let origin_max = config.lattice_size - config.patch_size;
+        saved::check(row.max(col) <= origin_max, "the patch's place")?;
+        saved::check(saved.frame.len() == self.frame.len(), "a frame")?;
+        self.patch.set_spins(&saved.spins)?;
+        self.rng = saved.rng;
+        self.origin = saved.origin;
+        self.frame = saved.frame;
+        self.episode_step = saved.episode_step;
+        Ok(())
+    }
+
     fn reset(&mut self, config: &IsingConfig) {
         let origin_max = config.lattice_size - config.patch_size;
         self.origin = (

@@ -2,11 +2,12 @@
 //! It decides nothing about contacts; every ghost sees the agent where it was before the step.
 
 use rand::Rng;
+use serde::{Deserialize, Serialize};
 
 use super::maze::{DIRECTIONS, Direction, Maze, Place};
 
 /// What a ghost is at. Which one the situation asks for: `wanted`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Mode {
     /// Go on at random, turning back only where there is no other way.
     Wander,
@@ -26,7 +27,7 @@ pub(crate) struct Chance {
 }
 
 /// One ghost.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Ghost {
     pub(crate) place: Place,
     /// The last move's direction; `None` before the first.

@@ -1,6 +1,8 @@
 //! The maze of Ms. PacMan: where walls, food and starts are, what sees what, and how far it is.
 //! It knows nothing of what moves in it. The layout was drawn for this project; it is not the arcade's.
 
+use serde::{Deserialize, Serialize};
+
 /// Rows of the maze, one pixel each.
 pub(crate) const HEIGHT: usize = 21;
 /// Columns of the maze, one pixel each.
@@ -42,7 +44,7 @@ pub(crate) type Direction = u8;
 pub(crate) type Place = u16;
 
 /// What lies in an open cell.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Item {
     Nothing,
     Pellet,

@@ -14,6 +14,7 @@ mod config;
 mod ghost;
 mod maze;
 mod render;
+mod saved;
 #[cfg(test)]
 mod tests;
 
@@ -105,8 +106,8 @@ impl WorldSettings for PacmanConfig {
         PacmanConfig::frame_shape(self)
     }
 
-    fn action_names(&self) -> &'static [&'static str] {
-        &PacmanWorld::ACTION_NAMES
+    fn action_names(&self) -> Vec<&str> {
+        PacmanWorld::ACTION_NAMES.to_vec()
     }
 
     fn build(
@@ -183,6 +184,17 @@ impl Environment for PacmanWorld {
             }
         }
         Ok(())
+    }
+
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        let copies: Vec<_> = self.copies.iter().map(Game::saved).collect();
+        crate::saved::encode(&copies)
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        let copies = crate::saved::decode(state, self.num_envs())?;
+        let mut both = self.copies.iter_mut().zip(copies);
+        both.try_for_each(|(game, saved)| game.load(saved, &self.maze))
     }
 }
 

@@ -501,3 +501,46 @@ fn a_uniform_policy_earns_its_reference_return() {
         assert!((mean - reference).abs() < 5.0 * error);
     }
 }
+
+#[test]
+fn a_game_goes_on_where_it_was_saved() {
+    use crate::saved::tests::goes_on;
+
+    let overlay = IsingOverlay {
+        temperature: 2.0,
+        sweeps_per_step: 1,
+    };
+    let schedule = LethalSchedule {
+        episodes_per_task: 1,
+        order: vec![0, 1, 2, 3],
+    };
+    for (ising, lethal_schedule) in [(None, None), (Some(overlay), Some(schedule))] {
+        let config = PacmanConfig {
+            ising,
+            lethal_schedule,
+            step_limit: 40,
+            ..config()
+        };
+        let make =
+            || -> Box<dyn Environment> { Box::new(PacmanWorld::new(&config, 3, 5).unwrap()) };
+        assert!(goes_on("Ms. PacMan", 100, make) > 3);
+    }
+}
+
+#[test]
+fn a_state_that_no_game_has_is_refused() {
+    let mut world = PacmanWorld::new(&config(), 1, 5).unwrap();
+    let maze = Maze::new();
+    let fine = || PacmanWorld::new(&config(), 1, 5).unwrap().copies.remove(0);
+    let mut refuse = |what: &str, change: fn(&mut Game)| {
+        let mut wrong = fine();
+        change(&mut wrong);
+        let said = world.copies[0].load(wrong.saved(), &maze).unwrap_err();
+        assert!(said.to_string().contains(what), "{said}");
+    };
+    refuse("the agent's place", |game| game.agent = 10_000);
+    refuse("a ghost's place", |game| game.ghosts[2].heading = Some(4));
+    refuse("the food", |game| game.pellets_left += 1);
+    refuse("the food", |game| game.items.clear());
+    refuse("a frame", |game| game.background.clear());
+}

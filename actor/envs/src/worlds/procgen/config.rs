@@ -1,8 +1,12 @@
 //! The settings of the Procgen world, as a preset or a command line gives them.
 //! There are no defaults: every field affects what is learned, so a preset says each with its source.
 
-use procgen_sys::{DistributionMode, Game, Options, ProcgenError};
+use std::path::Path;
 
+use procgen_sys::{DistributionMode, Engine, FRAME_SIDE, Game, Options, ProcgenError};
+
+use super::shrink::Shrink;
+use crate::environment::FrameShape;
 use crate::error::EnvError;
 
 /// Which levels of which game, and how they look.
@@ -33,7 +37,25 @@ pub struct ProcgenConfig {
     pub center_agent: bool,
     /// Whether each kind of thing always looks the same, rather than differently from level to level.
     pub restrict_themes: bool,
+    /// Side of a frame in pixels, 8 to 64, as it is sent, kept and learned from. The engine draws 64; fewer are means over areas of its
+    /// picture. Settings of earlier versions do not have it: 64.
+    #[serde(default = "whole_side")]
+    pub frame_side: u32,
+    /// Whether frames are grey, one byte a pixel, rather than of three colours. Settings of earlier versions do not have it: not.
+    #[serde(default)]
+    pub grey: bool,
+    /// Another build of the engine's library, by the path of `libenv.so`, with its pictures in `assets` beside it or beside its
+    /// folder; none: the published one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub library: Option<String>,
 }
+
+const fn whole_side() -> u32 {
+    FRAME_SIDE as u32
+}
+
+/// The smallest side of a frame.
+const SIDE_MIN: u32 = 8;
 
 impl ProcgenConfig {
     /// Says why a world with these settings cannot be made; needs no engine.
@@ -41,7 +63,38 @@ impl ProcgenConfig {
     /// # Errors
     /// Numbers out of range, or a mode that the game does not have.
     pub fn validate(&self) -> Result<(), EnvError> {
+        if !(SIDE_MIN..=whole_side()).contains(&self.frame_side) {
+            return Err(EnvError::Config(format!(
+                "frame_side = {}; the engine draws {} pixels a side, and {SIDE_MIN} of them are the fewest; `input.height` and \
+                 `input.width` enlarge",
+                self.frame_side,
+                whole_side()
+            )));
+        }
         self.options(1, 0, 0).map(drop)
+    }
+
+    /// The engine that plays: the build that is named, or the published one, which is fetched if it is not there.
+    ///
+    /// # Errors
+    /// An engine that cannot be had.
+    pub(super) fn engine(&self, progress: &mut dyn FnMut(&str)) -> Result<Engine, EnvError> {
+        let engine = match &self.library {
+            Some(library) => Engine::other(Path::new(library)),
+            None => Engine::install(progress),
+        };
+        Ok(engine.map_err(ProcgenError::from)?)
+    }
+
+    /// The shape of a frame as it leaves the world.
+    pub(super) const fn frame_shape(&self) -> FrameShape {
+        Shrink::shape(self.frame_side as usize, self.grey)
+    }
+
+    /// What makes the engine's frames smaller or grey; none where they are wanted as they are.
+    pub(super) fn shrink(&self) -> Option<Shrink> {
+        let changed = self.grey || self.frame_side < whole_side();
+        changed.then(|| Shrink::new(self.frame_side as usize, self.grey))
     }
 
     /// The engine's settings, checked.

@@ -1,5 +1,5 @@
 //! The Procgen world: what the engine's flags mean for episodes and levels.
-//! It does not fetch or load the engine itself (`procgen-sys` does), nor enlarge or stack frames.
+//! It does not fetch or load the engine itself (`procgen-sys` does), nor enlarge or stack frames; it makes them smaller or grey on request.
 //!
 //! # Ends
 //! After a step the engine shows the next episode's first frame at once, so the terminal frame is never seen.
@@ -28,18 +28,19 @@
 //! lies in the set (sets of more than 997 levels, or all levels), the engine's own choice stays.
 
 mod config;
+mod shrink;
 #[cfg(test)]
 mod tests;
 mod visible_actions;
 
-use procgen_sys::{
-    Engine, FRAME_BYTES, FRAME_SIDE, Game, NUM_ACTIONS, ProcgenError, RESET, VecGame,
-};
+use procgen_sys::{Engine, Game, NUM_ACTIONS, ProcgenError, RESET, State, VecGame};
 
 use crate::copies::check_step;
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
+use crate::saved;
 use crate::settings::{Levels, Variants, WorldSettings};
+use shrink::Shrink;
 
 pub use config::ProcgenConfig;
 pub use visible_actions::visible_actions;
@@ -62,6 +63,10 @@ pub struct ProcgenWorld {
     actions: Vec<i32>,
     /// What keeps sequential levels in their set; `None` where the engine does so itself.
     levels: Option<LevelSet>,
+    /// The shape of a frame as it leaves this world.
+    shape: FrameShape,
+    /// What makes frames smaller or grey; `None` where they leave as the engine drew them.
+    shrink: Option<Shrink>,
 }
 
 /// The set of levels, and the spare copy of the game in which a copy that has left it is reset.
@@ -71,13 +76,6 @@ struct LevelSet {
 }
 
 impl ProcgenWorld {
-    /// The shape of one frame, in every game.
-    pub const FRAME_SHAPE: FrameShape = FrameShape {
-        height: FRAME_SIDE,
-        width: FRAME_SIDE,
-        channels: 3,
-    };
-
     /// What each action presses, by the engine's numbering. Source: `get_combos` in `procgen/env.py`.
     pub const ACTION_NAMES: [&'static str; NUM_ACTIONS] = [
         "left+down",
@@ -111,7 +109,7 @@ impl ProcgenWorld {
         threads: usize,
     ) -> Result<ProcgenWorld, EnvError> {
         config.options(num_envs, seed, threads)?;
-        let engine = Engine::install(&mut |_| {}).map_err(ProcgenError::from)?;
+        let engine = config.engine(&mut |_| {})?;
         ProcgenWorld::with_engine(&engine, config, num_envs, seed, threads)
     }
 
@@ -151,6 +149,8 @@ impl ProcgenWorld {
             time_limit_steps: config.game.time_limit_steps(config.distribution_mode),
             actions: vec![0; num_envs],
             levels,
+            shape: config.frame_shape(),
+            shrink: config.shrink(),
         })
     }
 
@@ -195,11 +195,16 @@ impl WorldSettings for ProcgenConfig {
     }
 
     fn frame_shape(&self) -> FrameShape {
-        ProcgenWorld::FRAME_SHAPE
+        ProcgenConfig::frame_shape(self)
     }
 
-    fn action_names(&self) -> &'static [&'static str] {
-        &ProcgenWorld::ACTION_NAMES
+    /// Source: the `tps` of Procgen's own `interactive.py`.
+    fn steps_per_second(&self) -> f64 {
+        15.0
+    }
+
+    fn action_names(&self) -> Vec<&str> {
+        ProcgenWorld::ACTION_NAMES.to_vec()
     }
 
     fn build(
@@ -215,11 +220,16 @@ impl WorldSettings for ProcgenConfig {
         Variants {
             key: "game",
             names: &Game::NAMES,
+            is_open: false,
         }
     }
 
-    fn variant(&self) -> Option<&'static str> {
+    fn variant(&self) -> Option<&str> {
         Some(self.game.name())
+    }
+
+    fn library(&self) -> Option<&str> {
+        self.library.as_deref()
     }
 
     fn visible_actions(&self) -> Vec<u8> {
@@ -246,14 +256,14 @@ impl WorldSettings for ProcgenConfig {
     }
 
     fn install(&self, progress: &mut dyn FnMut(&str)) -> Result<(), EnvError> {
-        Engine::install(progress).map_err(ProcgenError::from)?;
+        self.engine(progress)?;
         Ok(())
     }
 }
 
 impl Environment for ProcgenWorld {
     fn frame_shape(&self) -> FrameShape {
-        Self::FRAME_SHAPE
+        self.shape
     }
 
     fn num_actions(&self) -> usize {
@@ -267,10 +277,13 @@ impl Environment for ProcgenWorld {
     fn observe(&mut self, frames: &mut [u8]) {
         assert_eq!(
             frames.len(),
-            self.num_envs() * FRAME_BYTES,
+            self.num_envs() * self.shape.bytes(),
             "the buffer holds one frame for each copy"
         );
-        frames.copy_from_slice(self.game.frames());
+        match &self.shrink {
+            None => frames.copy_from_slice(self.game.frames()),
+            Some(shrink) => shrink.apply(self.game.frames(), frames),
+        }
     }
 
     fn step(
@@ -296,6 +309,22 @@ impl Environment for ProcgenWorld {
             {
                 levels.redraw(&mut self.game, env)?;
             }
+        }
+        Ok(())
+    }
+
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        let game = &mut self.game;
+        let copies = self.steps_taken.iter().enumerate();
+        let copies = copies.map(|(env, &steps)| Ok((steps, game.state(env)?.sealed())));
+        saved::encode(&copies.collect::<Result<Vec<_>, ProcgenError>>()?)
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        let copies: Vec<(u32, Vec<u8>)> = saved::decode(state, self.num_envs())?;
+        for (env, (steps, sealed)) in copies.into_iter().enumerate() {
+            self.game.set_state(env, &State::unsealed(&sealed)?)?;
+            self.steps_taken[env] = steps;
         }
         Ok(())
     }

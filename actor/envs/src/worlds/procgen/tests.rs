@@ -4,7 +4,7 @@
 use std::hash::{Hash, Hasher};
 use std::sync::OnceLock;
 
-use procgen_sys::{DistributionMode, Game, Options};
+use procgen_sys::{DistributionMode, FRAME_BYTES, Game, Options};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -31,6 +31,9 @@ fn config(game: Game) -> ProcgenConfig {
         use_backgrounds: true,
         center_agent: true,
         restrict_themes: false,
+        frame_side: 64,
+        grey: false,
+        library: None,
     }
 }
 
@@ -64,6 +67,81 @@ fn alone(engine: &Engine, config: &ProcgenConfig, level: i32, last_move: u8) -> 
     game.act(&[i32::from(last_move)]).unwrap();
     game.act(&[RESET]).unwrap();
     game
+}
+
+#[test]
+fn another_build_of_the_library_is_played_by_its_path() {
+    let Some(engine) = engine("another_build_of_the_library_is_played_by_its_path") else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    // As in Procgen's own tree: the pictures are beside the library's folder.
+    let library = folder.path().join("prebuilt/libenv.so");
+    std::fs::create_dir(folder.path().join("prebuilt")).unwrap();
+    std::fs::copy(engine.library(), &library).unwrap();
+    let other = |library: &std::path::Path| ProcgenConfig {
+        library: Some(library.display().to_string()),
+        ..config(Game::Coinrun)
+    };
+    let said = |library: &std::path::Path| {
+        let made = ProcgenWorld::new(&other(library), 1, 1, 0);
+        made.map(drop).unwrap_err().to_string()
+    };
+    assert!(said(&library).contains("put Procgen's folder `assets` beside it"));
+    let nowhere = folder.path().join("nowhere.so");
+    assert!(
+        said(&nowhere).contains("No such file"),
+        "{}",
+        said(&nowhere)
+    );
+    std::os::unix::fs::symlink(engine.assets(), folder.path().join("assets")).unwrap();
+
+    let mut published = ProcgenWorld::new(&config(Game::Coinrun), 2, 3, 0).unwrap();
+    let mut other = ProcgenWorld::new(&other(&library), 2, 3, 0).unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    for _ in 0..50 {
+        let actions = draw(&mut rng, 2);
+        assert_eq!(step(&mut published, &actions), step(&mut other, &actions));
+    }
+}
+
+#[test]
+fn smaller_and_grey_frames_are_the_engines_own_made_so() {
+    let Some(engine) = engine("smaller_and_grey_frames_are_the_engines_own_made_so") else {
+        return;
+    };
+    let world = |frame_side, grey| {
+        let config = ProcgenConfig {
+            frame_side,
+            grey,
+            ..config(Game::Coinrun)
+        };
+        assert_eq!(
+            config.frame_shape().bytes(),
+            (frame_side * frame_side) as usize * if grey { 1 } else { 3 }
+        );
+        ProcgenWorld::with_engine(engine, &config, 3, 7, 0).unwrap()
+    };
+    let mut whole = world(64, false);
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    let mut others = [world(32, false), world(48, true), world(64, true)];
+    for _ in 0..20 {
+        let actions = draw(&mut rng, 3);
+        let (frames, rewards, ends) = step(&mut whole, &actions);
+        for other in &mut others {
+            let (mut own_rewards, mut own_ends) = ([0.0; 3], [StepEnd::Running; 3]);
+            other
+                .step(&actions, &mut own_rewards, &mut own_ends)
+                .unwrap();
+            assert_eq!((&own_rewards[..], &own_ends[..]), (&rewards[..], &ends[..]));
+            let shape = other.frame_shape();
+            let mut seen = vec![0; 3 * shape.bytes()];
+            other.observe(&mut seen);
+            let mut expected = vec![0; seen.len()];
+            Shrink::new(shape.height, shape.channels == 1).apply(&frames, &mut expected);
+            assert_eq!(seen, expected);
+        }
+    }
 }
 
 #[test]
@@ -103,6 +181,13 @@ fn wrong_settings_are_refused_without_an_engine() {
         },
         "no effect",
     );
+    for frame_side in [0, 7, 65] {
+        let config = ProcgenConfig {
+            frame_side,
+            ..maze()
+        };
+        refused(config, &format!("frame_side = {frame_side}"));
+    }
     for (num_envs, threads, text) in [(0, 0, "0 copies"), (1, 1000, "1000 threads")] {
         let error = ProcgenWorld::new(&maze(), num_envs, 1, threads)
             .err()
@@ -472,4 +557,21 @@ fn visible_actions_are_what_the_engine_does() {
             assert!(!contradicted || !differs[a][9], "{game}: {a} and 9");
         }
     }
+}
+
+#[test]
+fn every_game_goes_on_where_it_was_saved() {
+    use crate::saved::tests::goes_on;
+
+    let Some(engine) = engine("every_game_goes_on_where_it_was_saved") else {
+        return;
+    };
+    let mut ended = 0;
+    for game in Game::ALL {
+        let config = config(game);
+        ended += goes_on(game.name(), 200, || {
+            Box::new(ProcgenWorld::with_engine(engine, &config, 2, 5, 0).unwrap())
+        });
+    }
+    assert!(ended > 16, "{ended} ends in all games");
 }

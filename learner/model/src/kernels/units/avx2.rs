@@ -11,8 +11,9 @@ use std::arch::x86_64::{
 use half::bf16;
 
 use super::{
-    LANES, Unit,
-    tile::{RawTile, Vector, compute_sizes},
+    element::Rounding,
+    unit::{LANES, Loop, RawTile, Unit},
+    vector::{Vector, compute_sizes},
 };
 
 /// Whether this processor, and the operating system, have AVX2 and fused multiplication and addition.
@@ -44,6 +45,8 @@ macro_rules! unit {
             }
         }
 
+        impl Rounding for $unit {}
+
         impl Unit for $unit {
             type Element = $element;
             const VECS_MAX: usize = 1;
@@ -58,7 +61,7 @@ macro_rules! unit {
             }
 
             #[inline(always)]
-            fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
+            fn vectorize<W: Loop>(self, work: W) {
                 // SAFETY: `here` found the instructions.
                 unsafe { vectorized(work) }
             }
@@ -70,8 +73,8 @@ unit!(Single, f32);
 unit!(Rounded, bf16);
 
 #[target_feature(enable = "avx2,fma")]
-unsafe fn vectorized<R>(work: impl FnOnce() -> R) -> R {
-    work()
+unsafe fn vectorized<W: Loop>(work: W) {
+    work.run();
 }
 
 /// Sums of 16 columns.

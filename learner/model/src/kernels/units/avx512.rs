@@ -3,17 +3,21 @@
 #![cfg(target_arch = "x86_64")]
 
 use std::arch::x86_64::{
-    __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_dpbf16_ps, _mm512_fmadd_ps, _mm512_loadu_ps,
-    _mm512_loadu_si512, _mm512_mask_storeu_ps, _mm512_maskz_loadu_ps, _mm512_set1_epi32,
-    _mm512_set1_ps, _mm512_setzero_ps,
+    __m256bh, __m256i, __m512, __m512bh, __m512i, _mm256_mask_storeu_epi16, _mm512_add_ps,
+    _mm512_cvtne2ps_pbh, _mm512_cvtneps_pbh, _mm512_dpbf16_ps, _mm512_fmadd_ps, _mm512_loadu_ps,
+    _mm512_loadu_si512, _mm512_mask_storeu_epi16, _mm512_mask_storeu_ps, _mm512_maskz_loadu_ps,
+    _mm512_permutexvar_epi16, _mm512_set1_epi32, _mm512_set1_ps, _mm512_setzero_ps,
+    _mm512_shuffle_i32x4, _mm512_storeu_si512, _mm512_unpackhi_epi32, _mm512_unpackhi_epi64,
+    _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
 };
 use std::mem::transmute;
 
 use half::bf16;
 
 use super::{
-    LANES, Unit,
-    tile::{RawTile, Vector, compute_sizes},
+    element::Rounding,
+    unit::{LANES, Loop, RawTile, Unit},
+    vector::{Vector, compute_sizes},
 };
 
 /// Whether this processor, and the operating system, have AVX-512 as server processors do.
@@ -23,11 +27,6 @@ pub(super) fn available() -> bool {
         && is_x86_feature_detected!("avx512dq")
         && is_x86_feature_detected!("avx512vl")
         && is_x86_feature_detected!("fma")
-}
-
-/// Whether it has AVX512_BF16 too.
-pub(super) fn bf16_available() -> bool {
-    is_x86_feature_detected!("avx512bf16")
 }
 
 /// f32 operands.
@@ -48,10 +47,15 @@ impl Single {
 }
 
 impl Brain {
+    /// Whether this processor has AVX512_BF16 beside AVX-512.
+    pub(super) fn available() -> bool {
+        available() && is_x86_feature_detected!("avx512bf16")
+    }
+
     /// # Panics
     /// If the processor lacks it.
     pub(super) fn here() -> Self {
-        assert!(available() && bf16_available(), "no AVX512_BF16");
+        assert!(Self::available(), "no AVX512_BF16");
         Self(())
     }
 }
@@ -61,80 +65,216 @@ const fn rows_max(vecs: usize) -> usize {
     if vecs > 2 { 6 } else { 8 }
 }
 
-macro_rules! sizes {
-    ($tile:expr, $rows:expr, $vecs:expr) => {
-        compute_sizes!(Self, $tile, $rows, $vecs;
-            1: 1 2 3 4 5 6 7 8;
-            2: 1 2 3 4 5 6 7 8;
-            4: 1 2 3 4 5 6;
-        )
+macro_rules! unit {
+    ($unit:ident, $element:ty, $features:literal) => {
+        impl Unit for $unit {
+            type Element = $element;
+            const VECS_MAX: usize = 4;
+
+            fn rows_max(vecs: usize) -> usize {
+                rows_max(vecs)
+            }
+
+            unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
+                // SAFETY: `here` found the instructions; the rest is the caller's.
+                unsafe { Self::compute_sized(tile, rows, vecs) }
+            }
+
+            #[inline(always)]
+            fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
+                // SAFETY: `here` found the instructions.
+                unsafe { transposed(block) }
+            }
+
+            #[inline(always)]
+            fn vectorize<W: Loop>(self, work: W) {
+                // SAFETY: `here` found the instructions.
+                unsafe { Self::vectorized(work) }
+            }
+        }
+
+        impl $unit {
+            #[target_feature(enable = $features)]
+            unsafe fn vectorized<W: Loop>(work: W) {
+                work.run();
+            }
+
+            #[target_feature(enable = $features)]
+            unsafe fn compute_sized(tile: &RawTile<$element>, rows: usize, vecs: usize) {
+                compute_sizes!(Self, tile, rows, vecs;
+                    1: 1 2 3 4 5 6 7 8;
+                    2: 1 2 3 4 5 6 7 8;
+                    4: 1 2 3 4 5 6;
+                )
+            }
+        }
     };
 }
 
-impl Unit for Single {
-    type Element = f32;
-    const VECS_MAX: usize = 4;
+unit!(Single, f32, "avx512f,avx512bw,avx512dq,avx512vl,fma");
+unit!(
+    Brain,
+    bf16,
+    "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma"
+);
 
-    fn rows_max(vecs: usize) -> usize {
-        rows_max(vecs)
-    }
+impl Rounding for Single {}
 
-    unsafe fn compute(self, tile: &RawTile<f32>, rows: usize, vecs: usize) {
-        // SAFETY: `here` found the instructions; the rest is the caller's.
-        unsafe { Self::compute_sized(tile, rows, vecs) }
+impl Rounding for Brain {
+    #[inline(always)]
+    fn round(self, values: &[f32], to: &mut [bf16]) {
+        // SAFETY: `here` found the instructions.
+        unsafe { rounded(values, to) }
     }
 
     #[inline(always)]
-    fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
+    fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
         // SAFETY: `here` found the instructions.
-        unsafe { vectorized(work) }
+        unsafe { rounded_pairs(first, second, pairs) }
     }
 }
 
-impl Single {
-    #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,fma")]
-    unsafe fn compute_sized(tile: &RawTile<f32>, rows: usize, vecs: usize) {
-        sizes!(tile, rows, vecs);
+/// `Rounding::round`, 32 values at a time.
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
+unsafe fn rounded(values: &[f32], to: &mut [bf16]) {
+    let to = &mut to[..values.len()];
+    let (blocks, tail) = values.as_chunks::<{ 2 * LANES }>();
+    let (to_blocks, to_tail) = to.as_chunks_mut::<{ 2 * LANES }>();
+    for (block, to) in blocks.iter().zip(to_blocks) {
+        // SAFETY: a block is two registers of f32, and what it is rounded to one of bf16.
+        unsafe {
+            let (low, high) = (
+                _mm512_loadu_ps(block.as_ptr()),
+                _mm512_loadu_ps(block[LANES..].as_ptr()),
+            );
+            let words = transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(high, low));
+            _mm512_storeu_si512(to.as_mut_ptr().cast(), words);
+        }
+    }
+    for (part, to) in tail.chunks(LANES).zip(to_tail.chunks_mut(LANES)) {
+        let mask = first_lanes(part.len());
+        // SAFETY: the mask leaves out what lies beyond the slices, which are as long as each other and at most a register.
+        unsafe {
+            let words = _mm512_cvtneps_pbh(_mm512_maskz_loadu_ps(mask, part.as_ptr()));
+            let words = transmute::<__m256bh, __m256i>(words);
+            _mm256_mask_storeu_epi16(to.as_mut_ptr().cast(), mask, words);
+        }
     }
 }
 
-impl Unit for Brain {
-    type Element = bf16;
-    const VECS_MAX: usize = 4;
-
-    fn rows_max(vecs: usize) -> usize {
-        rows_max(vecs)
+/// `Rounding::round_pairs`, 16 pairs at a time.
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
+unsafe fn rounded_pairs(first: &[f32], second: &[f32], pairs: &mut [bf16]) {
+    // Word i of a pair's register is i / 2 of the first row's words, 0 to 15, or of the second's, 16 to 31.
+    const ORDER: [u16; 2 * LANES] = {
+        let mut order = [0; 2 * LANES];
+        let mut at = 0;
+        while at < order.len() {
+            order[at] = (at / 2 + at % 2 * LANES) as u16;
+            at += 1;
+        }
+        order
+    };
+    // SAFETY: `ORDER` is the 64 bytes of a register.
+    let order = unsafe { _mm512_loadu_si512(ORDER.as_ptr().cast()) };
+    let interleaved = |first: __m512, second: __m512| {
+        // SAFETY: two names of one register of 32 bf16.
+        let words = unsafe { transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(second, first)) };
+        _mm512_permutexvar_epi16(order, words)
+    };
+    let columns = first.len().min(second.len());
+    let (first, second) = (&first[..columns], &second[..columns]);
+    let pairs = &mut pairs[..2 * columns];
+    let (first_blocks, first_tail) = first.as_chunks::<LANES>();
+    let (second_blocks, second_tail) = second.as_chunks::<LANES>();
+    let (pair_blocks, pair_tail) = pairs.as_chunks_mut::<{ 2 * LANES }>();
+    for ((pairs, first), second) in pair_blocks.iter_mut().zip(first_blocks).zip(second_blocks) {
+        // SAFETY: a block of either row is a register of f32, and its pairs one of bf16.
+        unsafe {
+            let words = interleaved(
+                _mm512_loadu_ps(first.as_ptr()),
+                _mm512_loadu_ps(second.as_ptr()),
+            );
+            _mm512_storeu_si512(pairs.as_mut_ptr().cast(), words);
+        }
     }
-
-    unsafe fn compute(self, tile: &RawTile<bf16>, rows: usize, vecs: usize) {
-        // SAFETY: `here` found the instructions; the rest is the caller's.
-        unsafe { Self::compute_sized(tile, rows, vecs) }
-    }
-
-    #[inline(always)]
-    fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
-        // SAFETY: `here` found the instructions.
-        unsafe { vectorized(work) }
+    if !first_tail.is_empty() {
+        let mask = first_lanes(first_tail.len());
+        let words_mask = ((1u64 << (2 * first_tail.len())) - 1) as u32;
+        // SAFETY: the masks leave out what lies beyond the slices, fewer than `LANES` columns of each row.
+        unsafe {
+            let words = interleaved(
+                _mm512_maskz_loadu_ps(mask, first_tail.as_ptr()),
+                _mm512_maskz_loadu_ps(mask, second_tail.as_ptr()),
+            );
+            _mm512_mask_storeu_epi16(pair_tail.as_mut_ptr().cast(), words_mask, words);
+        }
     }
 }
 
-impl Brain {
-    #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
-    unsafe fn compute_sized(tile: &RawTile<bf16>, rows: usize, vecs: usize) {
-        sizes!(tile, rows, vecs);
-    }
+/// A mask of the first `count` of 16 lanes.
+#[inline(always)]
+const fn first_lanes(count: usize) -> u16 {
+    ((1u32 << count) - 1) as u16
 }
 
+/// Transposes 16 registers of 16: pairs of 32 bits, of 64 bits, then quarters of registers twice.
+#[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,fma")]
-unsafe fn vectorized<R>(work: impl FnOnce() -> R) -> R {
-    work()
+unsafe fn transposed(block: &mut [[u32; LANES]; LANES]) {
+    // SAFETY: every row of the block is the 64 bytes of a register, read and written where it is.
+    let rows: [__m512i; LANES] =
+        std::array::from_fn(|row| unsafe { _mm512_loadu_si512(block[row].as_ptr().cast()) });
+    let pairs: [__m512i; LANES] = std::array::from_fn(|at| {
+        let (a, b) = (rows[at & !1], rows[at | 1]);
+        if at & 1 == 0 {
+            _mm512_unpacklo_epi32(a, b)
+        } else {
+            _mm512_unpackhi_epi32(a, b)
+        }
+    });
+    // Of four rows, columns 4 q + at % 4 in quarter q.
+    let fours: [__m512i; LANES] = std::array::from_fn(|at| {
+        let first = (at & !3) + (at & 2) / 2;
+        let (a, b) = (pairs[first], pairs[first + 2]);
+        if at & 1 == 0 {
+            _mm512_unpacklo_epi64(a, b)
+        } else {
+            _mm512_unpackhi_epi64(a, b)
+        }
+    });
+    let column = |at: usize| at & 3;
+    let eights: [__m512i; LANES] = std::array::from_fn(|at| {
+        // Rows 0..8 for at < 8, else 8..16; of quarters 0 and 2, or 1 and 3.
+        let first = at / 8 * 8 + column(at);
+        let (a, b) = (fours[first], fours[first + 4]);
+        if at & 4 == 0 {
+            _mm512_shuffle_i32x4::<0b10_00_10_00>(a, b)
+        } else {
+            _mm512_shuffle_i32x4::<0b11_01_11_01>(a, b)
+        }
+    });
+    for (step, row) in block.iter_mut().enumerate() {
+        let (quarter, at) = (step / 4, step & 3);
+        let from = at + (quarter & 1) * 4;
+        let (a, b) = (eights[from], eights[from + 8]);
+        let done = if quarter < 2 {
+            _mm512_shuffle_i32x4::<0b10_00_10_00>(a, b)
+        } else {
+            _mm512_shuffle_i32x4::<0b11_01_11_01>(a, b)
+        };
+        // SAFETY: as above.
+        unsafe { _mm512_storeu_si512(row.as_mut_ptr().cast(), done) };
+    }
 }
 
 /// Writes the first `count` of 16 sums.
 #[inline(always)]
 unsafe fn write(sums: __m512, at: *mut f32, count: usize, add: bool) {
     debug_assert!(count <= LANES);
-    let mask = ((1u32 << count) - 1) as u16;
+    let mask = first_lanes(count);
     // SAFETY: the lanes that the mask leaves out are neither read nor written; the caller answers for the others.
     unsafe {
         let sums = if add {

@@ -5,6 +5,29 @@ use half::bf16;
 
 use crate::kernels::buffer::Pooled;
 
+/// Columns of one register, on every unit.
+pub(crate) const LANES: usize = 16;
+
+/// Instructions that round.
+pub(crate) trait Rounding: Copy {
+    /// The nearest bf16 of each of `values`, ties to even, into the first of `to`. A subnormal may become a 0 of its sign, which is
+    /// what such a unit's products take it for.
+    #[inline(always)]
+    fn round(self, values: &[f32], to: &mut [bf16]) {
+        for (to, &value) in to.iter_mut().zip(values) {
+            *to = bf16::of(value);
+        }
+    }
+
+    /// As [`Rounding::round`], of two rows as pairs: `pairs` [columns, 2].
+    #[inline(always)]
+    fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
+        for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
+            (pair[0], pair[1]) = (bf16::of(first), bf16::of(second));
+        }
+    }
+}
+
 /// A stored scalar of an operand.
 pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     /// Neighbours along the sum that are stored together, and multiplied in one step.
@@ -16,6 +39,9 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     /// The nearest element, ties to even.
     fn of(value: f32) -> Self;
 
+    /// Stores `values` as [`Element::of`] in `to`, which is as long, with the unit's own instructions.
+    fn store<R: Rounding>(rounding: R, values: &[f32], to: &mut [Self]);
+
     /// A pixel: times [`Element::BYTE_SCALE`] it is the byte / 255.
     fn of_byte(byte: u8) -> Self;
 
@@ -24,7 +50,17 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
 
     /// Stores `DEPTH` rows that follow each other along the sum: `step` [columns, DEPTH], with 0 for what the rows do not have.
     /// `second` is for a depth of 2.
-    fn join(first: &[f32], second: &[f32], step: &mut [Self]);
+    fn join<R: Rounding>(rounding: R, first: &[f32], second: &[f32], step: &mut [Self]);
+
+    /// `LANES` steps of `values`, [`LANES`, DEPTH], each as 32 bits.
+    fn steps<R: Rounding>(rounding: R, values: &[f32], steps: &mut [u32; LANES]);
+
+    /// Pixels as [`Element::of_byte`], each with the one `shift` further if `DEPTH` is 2, or with 0 where they end before:
+    /// `steps` [pixels, DEPTH].
+    fn steps_of_bytes(bytes: &[u8], shift: usize, steps: &mut [Self]);
+
+    /// The scalars of a step, into `step` [DEPTH].
+    fn unpack(bits: u32, step: &mut [Self]);
 
     /// Scalars that need no rounding, as they are.
     fn in_place(values: &[f32]) -> Option<&[Self]>;
@@ -50,10 +86,34 @@ impl Element for f32 {
     }
 
     #[inline(always)]
-    fn join(first: &[f32], _: &[f32], step: &mut [Self]) {
+    fn store<R: Rounding>(_: R, values: &[f32], to: &mut [Self]) {
+        to.copy_from_slice(values);
+    }
+
+    #[inline(always)]
+    fn join<R: Rounding>(_: R, first: &[f32], _: &[f32], step: &mut [Self]) {
         let (begin, end) = step.split_at_mut(first.len());
         begin.copy_from_slice(first);
         end.fill(0.0);
+    }
+
+    #[inline(always)]
+    fn steps<R: Rounding>(_: R, values: &[f32], steps: &mut [u32; LANES]) {
+        for (step, value) in steps.iter_mut().zip(values) {
+            *step = value.to_bits();
+        }
+    }
+
+    #[inline(always)]
+    fn steps_of_bytes(bytes: &[u8], _: usize, steps: &mut [Self]) {
+        for (step, &byte) in steps.iter_mut().zip(bytes) {
+            *step = Self::of_byte(byte);
+        }
+    }
+
+    #[inline(always)]
+    fn unpack(bits: u32, step: &mut [Self]) {
+        step[0] = Self::from_bits(bits);
     }
 
     fn in_place(values: &[f32]) -> Option<&[Self]> {
@@ -87,18 +147,49 @@ impl Element for bf16 {
     }
 
     #[inline(always)]
-    fn join(first: &[f32], second: &[f32], step: &mut [Self]) {
+    fn store<R: Rounding>(rounding: R, values: &[f32], to: &mut [Self]) {
+        rounding.round(values, to);
+    }
+
+    #[inline(always)]
+    fn join<R: Rounding>(rounding: R, first: &[f32], second: &[f32], step: &mut [Self]) {
         let (begin, end) = step.split_at_mut(first.len() * 2);
         if second.is_empty() {
             for (pair, &first) in begin.chunks_exact_mut(2).zip(first) {
                 (pair[0], pair[1]) = (Self::of(first), Self::default());
             }
         } else {
-            for ((pair, &first), &second) in begin.chunks_exact_mut(2).zip(first).zip(second) {
-                (pair[0], pair[1]) = (Self::of(first), Self::of(second));
-            }
+            rounding.round_pairs(first, second, begin);
         }
         end.fill(Self::default());
+    }
+
+    #[inline(always)]
+    fn steps<R: Rounding>(rounding: R, values: &[f32], steps: &mut [u32; LANES]) {
+        let mut rounded = [Self::default(); 2 * LANES];
+        rounding.round(values, &mut rounded);
+        for (step, pair) in steps.iter_mut().zip(rounded.chunks_exact(2)) {
+            *step = u32::from(pair[0].to_bits()) | u32::from(pair[1].to_bits()) << 16;
+        }
+    }
+
+    #[inline(always)]
+    fn steps_of_bytes(bytes: &[u8], shift: usize, steps: &mut [Self]) {
+        let later = bytes.get(shift..).unwrap_or_default();
+        let (begin, end) = bytes.split_at(later.len());
+        let (both, one) = steps.split_at_mut(later.len() * 2);
+        for ((pair, &byte), &later) in both.chunks_exact_mut(2).zip(begin).zip(later) {
+            (pair[0], pair[1]) = (Self::of_byte(byte), Self::of_byte(later));
+        }
+        for (pair, &byte) in one.chunks_exact_mut(2).zip(end) {
+            (pair[0], pair[1]) = (Self::of_byte(byte), Self::default());
+        }
+    }
+
+    #[inline(always)]
+    fn unpack(bits: u32, step: &mut [Self]) {
+        step[0] = Self::from_bits(bits as u16);
+        step[1] = Self::from_bits((bits >> 16) as u16);
     }
 
     fn in_place(_: &[f32]) -> Option<&[Self]> {

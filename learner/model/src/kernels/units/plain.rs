@@ -3,8 +3,9 @@
 use half::bf16;
 
 use super::{
-    Element, LANES, Unit,
-    tile::{RawTile, Vector, compute_sizes},
+    element::{Element, Rounding},
+    unit::{LANES, Loop, RawTile, Unit},
+    vector::{Vector, compute_sizes},
 };
 
 /// f32 operands.
@@ -17,6 +18,8 @@ pub(super) struct Rounded;
 
 macro_rules! unit {
     ($unit:ident, $element:ty) => {
+        impl Rounding for $unit {}
+
         #[allow(unsafe_code, reason = "units work on pointers")]
         impl Unit for $unit {
             type Element = $element;
@@ -32,8 +35,8 @@ macro_rules! unit {
             }
 
             #[inline(always)]
-            fn vectorize<R>(self, work: impl FnOnce() -> R) -> R {
-                work()
+            fn vectorize<W: Loop>(self, work: W) {
+                work.run()
             }
         }
 

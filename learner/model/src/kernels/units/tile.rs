@@ -1,7 +1,10 @@
-//! One tile of a matrix product: what it reads and writes, checked once, and the loop that all vector units share.
+//! One tile of a matrix product: what it reads and writes, checked before a unit computes it.
 //! It does not cut matrices into tiles.
 
-use super::{Element, LANES, Unit};
+use super::{
+    element::Element,
+    unit::{LANES, Mode, RawTile, Unit},
+};
 
 /// The left operand of a tile: rows at a fixed distance, whose scalars along the sum lie in runs of steps.
 ///
@@ -20,7 +23,7 @@ pub(crate) struct Left<'a, E> {
     pub(crate) steps: usize,
     /// Scalars from one run to the next.
     pub(crate) run_stride: usize,
-    /// Runs.
+    /// Runs that make up a row.
     pub(crate) runs: usize,
 }
 
@@ -35,15 +38,6 @@ impl<E: Element> Left<'_, E> {
     }
 }
 
-/// What a product does to the output's old content.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Mode {
-    /// out = a b
-    Replace,
-    /// out = out + a b, row after row, so that rows of the output may overlap.
-    Add,
-}
-
 /// Where a tile's result goes.
 pub(crate) struct Columns<'a> {
     /// From the first row's first column on.
@@ -55,24 +49,6 @@ pub(crate) struct Columns<'a> {
     /// Registers of columns that are computed.
     pub(crate) vecs: usize,
     pub(crate) mode: Mode,
-}
-
-/// A tile as the units take it.
-///
-/// `left` may be read at row * row_stride + run * run_stride + step * step_len for every row, run and step, `DEPTH` scalars each;
-/// `panel` holds runs * steps * vecs * LANES * DEPTH scalars; `out` may be read and written at row * out_stride, `cols` scalars each.
-pub(crate) struct RawTile<E> {
-    pub(super) left: *const E,
-    pub(super) row_stride: usize,
-    pub(super) step: usize,
-    pub(super) steps: usize,
-    pub(super) run_stride: usize,
-    pub(super) runs: usize,
-    pub(super) panel: *const E,
-    pub(super) out: *mut f32,
-    pub(super) out_stride: usize,
-    pub(super) cols: usize,
-    pub(super) mode: Mode,
 }
 
 /// Multiplies `rows` rows of `left` by `panel` [runs * steps, vecs * LANES, DEPTH].
@@ -151,78 +127,3 @@ pub(crate) fn row_tiles<U: Unit>(
         (end > first).then(|| (first, end - first))
     })
 }
-
-/// The vector instructions that the shared loop is written in.
-#[allow(unsafe_code, reason = "instructions of one kind of processor")]
-pub(super) trait Vector: Copy {
-    type Element: Element;
-    /// Sums of `LANES` columns.
-    type Sums: Copy;
-    /// One step of `LANES` columns, or of one row.
-    type Operand: Copy;
-
-    unsafe fn zero() -> Self::Sums;
-    /// The step at this place, for all columns.
-    unsafe fn row(at: *const Self::Element) -> Self::Operand;
-    /// The steps of `LANES` neighbouring columns.
-    unsafe fn columns(at: *const Self::Element) -> Self::Operand;
-    unsafe fn mul_add(sums: Self::Sums, row: Self::Operand, columns: Self::Operand) -> Self::Sums;
-    /// Writes the first `count` sums, after adding what is there if `add`. `count` may be 0; `at` is then not looked at.
-    unsafe fn write(sums: Self::Sums, at: *mut f32, count: usize, add: bool);
-}
-
-/// The loop of every vector unit, to be compiled for its instructions.
-///
-/// # Safety
-/// The processor has the instructions of `V`; otherwise as `Unit::compute`.
-#[inline(always)]
-#[allow(unsafe_code, reason = "instructions and pointers")]
-pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
-    tile: &RawTile<V::Element>,
-) {
-    // SAFETY: every address is one that `RawTile` says may be used; the caller answers for the instructions.
-    unsafe {
-        let mut sums = [[V::zero(); VECS]; ROWS];
-        let (mut panel, mut run) = (tile.panel, tile.left);
-        for _ in 0..tile.runs {
-            let mut at = run;
-            for _ in 0..tile.steps {
-                let columns: [V::Operand; VECS] =
-                    std::array::from_fn(|v| V::columns(panel.add(v * LANES * V::Element::DEPTH)));
-                for (r, sums) in sums.iter_mut().enumerate() {
-                    let row = V::row(at.add(r * tile.row_stride));
-                    for (sums, columns) in sums.iter_mut().zip(columns) {
-                        *sums = V::mul_add(*sums, row, columns);
-                    }
-                }
-                panel = panel.add(VECS * LANES * V::Element::DEPTH);
-                // The last step of the last run may end at the end of the allocation.
-                at = at.wrapping_add(tile.step);
-            }
-            run = run.wrapping_add(tile.run_stride);
-        }
-        for (r, sums) in sums.iter().enumerate() {
-            let out = tile.out.add(r * tile.out_stride);
-            for (v, &sums) in sums.iter().enumerate() {
-                let count = tile.cols.saturating_sub(v * LANES).min(LANES);
-                V::write(
-                    sums,
-                    out.wrapping_add(v * LANES),
-                    count,
-                    tile.mode == Mode::Add,
-                );
-            }
-        }
-    }
-}
-
-/// Calls [`compute`] with the sizes as constants; the arms must be all that a unit allows.
-macro_rules! compute_sizes {
-    ($vector:ty, $tile:expr, $rows:expr, $vecs:expr; $($v:literal: $($r:literal)*;)*) => {
-        match ($vecs, $rows) {
-            $($(($v, $r) => unsafe { $crate::kernels::units::tile::compute::<$vector, $r, $v>($tile) },)*)*
-            (vecs, rows) => unreachable!("a tile of {rows} rows by {vecs} registers"),
-        }
-    };
-}
-pub(super) use compute_sizes;

@@ -1,0 +1,184 @@
+//! The bytes in which a world keeps its state, and what is checked when they come back.
+//! What is in them is each world's own; where they are kept, and that they are undamaged there, is their keeper's.
+
+use serde::{Serialize, de::DeserializeOwned};
+
+use crate::error::EnvError;
+
+/// Longest state of a world, bytes.
+const STATE_BYTES_MAX: usize = 1 << 28;
+
+/// The bytes of a world's state.
+pub(crate) fn encode<T: Serialize>(state: &T) -> Result<Vec<u8>, EnvError> {
+    bincode::serde::encode_to_vec(state, bincode::config::standard())
+        .map_err(|e| EnvError::State(e.to_string()))
+}
+
+/// The state of so many copies that [`encode`] wrote.
+pub(crate) fn decode<T: DeserializeOwned>(
+    bytes: &[u8],
+    num_envs: usize,
+) -> Result<Vec<T>, EnvError> {
+    let config = bincode::config::standard().with_limit::<STATE_BYTES_MAX>();
+    let (copies, used): (Vec<T>, usize) = bincode::serde::decode_from_slice(bytes, config)
+        .map_err(|e| EnvError::State(e.to_string()))?;
+    if used != bytes.len() {
+        let over = bytes.len() - used;
+        return Err(EnvError::State(format!("{over} bytes after its end")));
+    }
+    if copies.len() != num_envs {
+        let count = copies.len();
+        return Err(EnvError::State(format!(
+            "{count} copies, and this world has {num_envs}"
+        )));
+    }
+    Ok(copies)
+}
+
+/// An error unless `holds`: a state that this world cannot be in.
+pub(crate) fn check(holds: bool, what: &str) -> Result<(), EnvError> {
+    if holds {
+        Ok(())
+    } else {
+        Err(EnvError::State(format!("{what} is none of these settings")))
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+    use crate::{
+        Boundary, CorridorConfig, CutFrames, Environment, FewerActions, IsingConfig, StepEnd,
+        WorldConfig,
+    };
+
+    /// Copies of each world here.
+    const COPIES: usize = 3;
+
+    /// Everything that a world gives in so many steps of actions drawn from `rng`.
+    fn trajectory(
+        world: &mut dyn Environment,
+        steps: usize,
+        rng: &mut ChaCha8Rng,
+    ) -> Vec<(Vec<u8>, Vec<f32>, Vec<StepEnd>)> {
+        let (copies, bytes) = (world.num_envs(), world.frame_shape().bytes());
+        let mut seen = Vec::new();
+        for _ in 0..steps {
+            let mut frames = vec![0; copies * bytes];
+            world.observe(&mut frames);
+            let draw = |_| rng.random_range(0..world.num_actions() as u8);
+            let actions: Vec<u8> = (0..copies).map(draw).collect();
+            let (mut rewards, mut ends) = (vec![0.0; copies], vec![StepEnd::Running; copies]);
+            world.step(&actions, &mut rewards, &mut ends).unwrap();
+            seen.push((frames, rewards, ends));
+        }
+        seen
+    }
+
+    /// Checks that another world made as `make` says goes on as the first did, also when that one has gone on itself. Gives the
+    /// number of ends since it was saved.
+    pub(crate) fn goes_on(
+        name: &str,
+        steps: usize,
+        mut make: impl FnMut() -> Box<dyn Environment>,
+    ) -> usize {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let mut world = make();
+        trajectory(&mut *world, steps, &mut rng);
+        let state = world.save().unwrap();
+        let at = rng.clone();
+        let seen = trajectory(&mut *world, steps, &mut rng);
+        let ends = seen.iter().flat_map(|(.., ends)| ends);
+        let ended = ends.filter(|&&end| end != StepEnd::Running).count();
+        assert_ne!(world.save().unwrap(), state, "{name}");
+        let mut other = make();
+        // The state holds all: what the other one did before does not matter.
+        trajectory(&mut *other, 5, &mut rng);
+        other.load(&state).unwrap();
+        assert_eq!(other.save().unwrap(), state, "{name}");
+        let again = trajectory(&mut *other, steps, &mut at.clone());
+        assert!(again == seen, "{name} goes on otherwise");
+        for wrong in [&state[..state.len() - 1], &[]] {
+            assert!(make().load(wrong).is_err(), "{name}: {} bytes", wrong.len());
+        }
+        ended
+    }
+
+    fn chain(cells: usize) -> WorldConfig {
+        WorldConfig::Chain(CorridorConfig {
+            cells,
+            height: 12,
+            width: 12,
+            step_limit: 30,
+            reward_left: 0.1,
+            reward_right: 1.0,
+        })
+    }
+
+    fn ising(lattice_size: usize) -> WorldConfig {
+        WorldConfig::Ising(IsingConfig {
+            lattice_size,
+            patch_size: 5,
+            temperature: 2.0,
+            boundary: Boundary::Free,
+            sweeps_per_step: 1,
+            episode_steps: 16,
+        })
+    }
+
+    #[test]
+    fn worlds_go_on_where_they_were_saved() {
+        for (name, config) in [("chain", chain(8)), ("ising", ising(9))] {
+            assert!(goes_on(name, 60, || config.build(COPIES, 3, 0).unwrap()) > 3);
+        }
+        let part = || {
+            let cut = CutFrames::of(chain(8).build(COPIES, 3, 0).unwrap(), (6, 11)).unwrap();
+            FewerActions::of(cut, vec![1, 2]).unwrap()
+        };
+        assert!(goes_on("a part of the chain", 60, part) > 3);
+    }
+
+    #[test]
+    fn a_state_of_another_world_is_refused() {
+        let state = |config: WorldConfig, copies| config.build(copies, 3, 0).unwrap().save();
+        for (config, state) in [
+            (chain(8), state(chain(8), 2)),
+            (chain(8), state(ising(9), COPIES)),
+            (ising(9), state(ising(10), COPIES)),
+            (ising(9), state(chain(8), COPIES)),
+        ] {
+            let mut world = config.build(COPIES, 3, 0).unwrap();
+            let said = world.load(&state.unwrap()).unwrap_err().to_string();
+            assert!(said.contains("no state of this world"), "{said}");
+        }
+    }
+
+    #[test]
+    fn a_world_that_says_nothing_of_itself_cannot_be_saved() {
+        struct Silent;
+        impl Environment for Silent {
+            fn frame_shape(&self) -> crate::FrameShape {
+                crate::FrameShape {
+                    height: 1,
+                    width: 1,
+                    channels: 1,
+                }
+            }
+            fn num_actions(&self) -> usize {
+                1
+            }
+            fn num_envs(&self) -> usize {
+                1
+            }
+            fn observe(&mut self, _: &mut [u8]) {}
+            fn step(&mut self, _: &[u8], _: &mut [f32], _: &mut [StepEnd]) -> Result<(), EnvError> {
+                Ok(())
+            }
+        }
+        assert!(matches!(Silent.save(), Err(EnvError::NotSaved)));
+        assert!(matches!(Silent.load(&[]), Err(EnvError::NotSaved)));
+    }
+}

@@ -1,0 +1,328 @@
+//! A world's process: started, spoken to with a deadline on each answer, and ended with everything that it started.
+//! It does not know what is said.
+
+use std::collections::VecDeque;
+use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
+use std::os::fd::AsFd;
+use std::os::unix::process::CommandExt;
+use std::process::{Child, ChildStderr, ChildStdin, ChildStdout, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use nix::sys::signal::{Signal, killpg};
+use nix::unistd::Pid;
+use tracing::Level;
+
+use super::error::{ExecError, Fault, LastWords};
+
+const SHELL: &str = "/bin/sh";
+
+/// Waits until this process is gone, however it ended, and kills the group, itself included.
+const GUARD: &str = "read -r line; sleep 1; kill -KILL 0";
+
+/// Lines of stderr that an error repeats.
+const WORDS_MAX: usize = 12;
+
+/// Characters of such a line; more are cut off.
+const WORD_LENGTH_MAX: usize = 400;
+
+/// Bytes of a line that declares a world; a process that writes more is none.
+const LINE_MAX: usize = 64 * 1024;
+
+/// How long a process may take to end once its stdin is closed, or once it closed its stdout.
+const END_MAX: Duration = Duration::from_secs(2);
+
+/// How often it is looked whether a process that does not answer is there at all.
+const WATCH: Duration = Duration::from_millis(500);
+
+/// How often it is looked whether it ended, once it should.
+const LOOK: Duration = Duration::from_millis(5);
+
+/// How long an answer is waited for, and what a person sets to change that.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Patience {
+    pub(super) limit: Duration,
+    pub(super) setting: &'static str,
+}
+
+/// A world's process, with its guard.
+///
+/// They are a process group of their own, which the guard leads: what the command starts ends with it.
+pub(super) struct WorldProcess {
+    command: String,
+    guard: Child,
+    child: Child,
+    /// None once it was told to end.
+    to: Option<ChildStdin>,
+    from: ChildStdout,
+    words: Arc<Mutex<VecDeque<String>>>,
+    /// Closed when stderr has ended.
+    spoken: Receiver<()>,
+}
+
+impl WorldProcess {
+    /// Starts the command; what it writes to stderr is logged at `level`.
+    ///
+    /// # Errors
+    /// The operating system refuses.
+    pub(super) fn start(command: &str, level: Level) -> Result<Self, ExecError> {
+        Self::try_start(command, level).map_err(|source| ExecError {
+            command: command.into(),
+            fault: Fault::System {
+                doing: "starting it",
+                source,
+            },
+            words: LastWords::default(),
+        })
+    }
+
+    fn try_start(command: &str, level: Level) -> io::Result<Self> {
+        let mut guard = Command::new(SHELL)
+            .args(["-c", GUARD])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .process_group(0)
+            .spawn()?;
+        let group = i32::try_from(guard.id()).map_err(io::Error::other)?;
+        let started = Command::new(SHELL)
+            .args(["-c", command])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .process_group(group)
+            .spawn();
+        let mut child = match started {
+            Ok(child) => child,
+            Err(e) => {
+                guard.kill()?;
+                guard.wait()?;
+                return Err(e);
+            }
+        };
+        let pipe = "it was asked for as a pipe";
+        let (to, from) = (child.stdin.take(), child.stdout.take().expect(pipe));
+        let words = Arc::new(Mutex::new(VecDeque::new()));
+        let (speaks, spoken) = channel();
+        let log = Log {
+            stderr: child.stderr.take().expect(pipe),
+            words: Arc::clone(&words),
+            level,
+            _speaks: speaks,
+        };
+        thread::Builder::new()
+            .name("world-stderr".into())
+            .spawn(move || log.keep())?;
+        Ok(Self {
+            command: command.into(),
+            guard,
+            child,
+            to,
+            from,
+            words,
+            spoken,
+        })
+    }
+
+    /// Says something to it. Whether it has ended is found out when its answer is read: what it said before that counts.
+    ///
+    /// # Errors
+    /// The operating system refuses.
+    pub(super) fn say(&mut self, bytes: &[u8], doing: &'static str) -> Result<(), ExecError> {
+        let said = match &mut self.to {
+            Some(to) => to.write_all(bytes).and_then(|()| to.flush()),
+            None => Ok(()),
+        };
+        match said {
+            Ok(()) => Ok(()),
+            Err(e) if e.kind() == ErrorKind::BrokenPipe => Ok(()),
+            Err(source) => Err(self.fail(Fault::System { doing, source })),
+        }
+    }
+
+    /// Its next line.
+    ///
+    /// # Errors
+    /// It ended, or took too long.
+    pub(super) fn line(
+        &mut self,
+        patience: Patience,
+        doing: &'static str,
+    ) -> Result<Vec<u8>, ExecError> {
+        let deadline = Instant::now() + patience.limit;
+        let mut line = Vec::new();
+        loop {
+            // A byte at a time: what comes after the line is no part of it.
+            match self.byte_until(deadline, patience, doing)? {
+                b'\n' => return Ok(line),
+                _ if line.len() == LINE_MAX => return Ok(line),
+                byte => line.push(byte),
+            }
+        }
+    }
+
+    /// Its next byte.
+    ///
+    /// # Errors
+    /// It ended, or took too long.
+    pub(super) fn byte(
+        &mut self,
+        patience: Patience,
+        doing: &'static str,
+    ) -> Result<u8, ExecError> {
+        self.byte_until(Instant::now() + patience.limit, patience, doing)
+    }
+
+    fn byte_until(
+        &mut self,
+        deadline: Instant,
+        patience: Patience,
+        doing: &'static str,
+    ) -> Result<u8, ExecError> {
+        let mut byte = [0];
+        match self.read_until(&mut byte, deadline) {
+            Ok(0) => Err(self.ended(doing)),
+            Ok(_) => Ok(byte[0]),
+            Err(e) if e.kind() == ErrorKind::TimedOut => {
+                self.kill();
+                let Patience { limit, setting } = patience;
+                Err(self.fail(Fault::Silent {
+                    doing,
+                    limit,
+                    setting,
+                }))
+            }
+            Err(source) => Err(self.fail(Fault::System { doing, source })),
+        }
+    }
+
+    fn read_until(&mut self, bytes: &mut [u8], deadline: Instant) -> io::Result<usize> {
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            let left = PollTimeout::try_from(left.min(WATCH)).unwrap_or(PollTimeout::ZERO);
+            let mut polled = [PollFd::new(self.from.as_fd(), PollFlags::POLLIN)];
+            match poll(&mut polled, left) {
+                // What it started may hold its stdout open.
+                Ok(0) if matches!(self.child.try_wait(), Ok(Some(_))) => return Ok(0),
+                Ok(0) if Instant::now() >= deadline => return Err(ErrorKind::TimedOut.into()),
+                Ok(0) | Err(nix::errno::Errno::EINTR) => {}
+                Ok(_) => return self.from.read(bytes),
+                Err(e) => return Err(e.into()),
+            }
+        }
+    }
+
+    /// What to say of a process that is not there any more.
+    fn ended(&mut self, doing: &'static str) -> ExecError {
+        self.to = None;
+        let fault = match self.end_within(END_MAX) {
+            Some(status) => Fault::Ended {
+                doing,
+                how: in_words(status),
+            },
+            None => Fault::Closed { doing },
+        };
+        self.kill();
+        self.fail(fault)
+    }
+
+    /// What to say of this fault, with the process's last words.
+    pub(super) fn fail(&self, fault: Fault) -> ExecError {
+        if matches!(
+            fault,
+            Fault::Ended { .. } | Fault::Closed { .. } | Fault::Silent { .. }
+        ) {
+            // It is dead; its last words may be still on their way. Nobody sends anything here.
+            let _ = self.spoken.recv_timeout(END_MAX);
+        }
+        let words = self.words.lock().unwrap_or_else(PoisonError::into_inner);
+        ExecError {
+            command: self.command.clone(),
+            fault,
+            words: LastWords(words.iter().cloned().collect()),
+        }
+    }
+
+    fn end_within(&mut self, limit: Duration) -> Option<ExitStatus> {
+        let deadline = Instant::now() + limit;
+        loop {
+            match self.child.try_wait() {
+                Ok(Some(status)) => return Some(status),
+                Ok(None) if Instant::now() < deadline => thread::sleep(LOOK),
+                Ok(None) | Err(_) => return None,
+            }
+        }
+    }
+
+    /// Kills it, what it started, and the guard; waits for their end.
+    fn kill(&mut self) {
+        if let Ok(group) = i32::try_from(self.guard.id())
+            && !matches!(self.guard.try_wait(), Ok(Some(_)))
+            && let Err(e) = killpg(Pid::from_raw(group), Signal::SIGKILL)
+        {
+            tracing::debug!("killing the world `{}`: {e}", self.command);
+        }
+        for process in [&mut self.child, &mut self.guard] {
+            if let Err(e) = process.wait() {
+                tracing::debug!("waiting for the end of the world `{}`: {e}", self.command);
+            }
+        }
+    }
+}
+
+impl Drop for WorldProcess {
+    fn drop(&mut self) {
+        self.to = None;
+        self.end_within(END_MAX);
+        self.kill();
+    }
+}
+
+fn in_words(status: ExitStatus) -> String {
+    match status.code() {
+        Some(127) => "exit status 127: the shell found no such command".into(),
+        _ => status.to_string(),
+    }
+}
+
+/// Where the process's stderr goes.
+struct Log {
+    stderr: ChildStderr,
+    words: Arc<Mutex<VecDeque<String>>>,
+    level: Level,
+    /// Dropped when there is nothing more to say.
+    _speaks: Sender<()>,
+}
+
+impl Log {
+    /// Writes every line into this process's log and keeps the last.
+    fn keep(self) {
+        let mut stderr = BufReader::new(self.stderr);
+        let mut line = Vec::new();
+        loop {
+            line.clear();
+            let limit = LINE_MAX as u64;
+            match (&mut stderr).take(limit).read_until(b'\n', &mut line) {
+                Ok(0) | Err(_) => return,
+                Ok(_) => {}
+            }
+            let text = String::from_utf8_lossy(&line);
+            let text: String = text.trim_end().chars().take(WORD_LENGTH_MAX).collect();
+            if text.is_empty() {
+                continue;
+            }
+            match self.level {
+                Level::INFO => tracing::info!("world: {text}"),
+                _ => tracing::debug!("world: {text}"),
+            }
+            let mut words = self.words.lock().unwrap_or_else(PoisonError::into_inner);
+            if words.len() == WORDS_MAX {
+                words.pop_front();
+            }
+            words.push_back(text);
+        }
+    }
+}

@@ -1,0 +1,170 @@
+//! The engine's frames made smaller, or grey: fewer bytes to keep, to send and to learn from.
+//! A frame that is wanted as the engine gave it does not come here.
+
+use procgen_sys::{FRAME_BYTES, FRAME_SIDE};
+
+use crate::environment::FrameShape;
+
+/// Bytes of the engine's pixel.
+const RGB: usize = 3;
+/// Thousandths of red, green and blue in grey. Source: ITU-R BT.601, luma.
+const LUMA: [u32; RGB] = [299, 587, 114];
+const LUMA_SUM: u32 = 1000;
+
+/// Makes a frame [64, 64, 3] one of `side` x `side` pixels, in colour or grey.
+///
+/// A pixel is the mean over the area that it covers, pixels at its edges counted in proportion, rounded to the nearest number, halves
+/// up; its grey is the luma of that mean before rounding. All of it is exact in 32 bits.
+pub(super) struct Shrink {
+    side: usize,
+    grey: bool,
+    /// For each pixel along a side the first of the engine's that it covers, and how much of each, in `1 / side` of one.
+    covers: Vec<(usize, Vec<u32>)>,
+}
+
+impl Shrink {
+    /// To a side of 1 to 64 pixels.
+    pub(super) fn new(side: usize, grey: bool) -> Self {
+        assert!((1..=FRAME_SIDE).contains(&side), "a side of {side} pixels");
+        // In units of 1 / side of the engine's pixels, ours is FRAME_SIDE wide and the engine's is side wide.
+        let covers = (0..side).map(|at| {
+            let (start, end) = (at * FRAME_SIDE, (at + 1) * FRAME_SIDE);
+            let first = start / side;
+            let parts = (first..end.div_ceil(side)).map(|pixel| {
+                let overlap = end.min((pixel + 1) * side) - start.max(pixel * side);
+                overlap as u32
+            });
+            (first, parts.collect())
+        });
+        Self {
+            covers: covers.collect(),
+            side,
+            grey,
+        }
+    }
+
+    /// What it makes.
+    pub(super) const fn shape(side: usize, grey: bool) -> FrameShape {
+        FrameShape {
+            height: side,
+            width: side,
+            channels: if grey { 1 } else { RGB },
+        }
+    }
+
+    /// Writes `frames` [N, 64, 64, 3] to `out` [N, side, side, 3 or 1].
+    pub(super) fn apply(&self, frames: &[u8], out: &mut [u8]) {
+        let bytes = Self::shape(self.side, self.grey).bytes();
+        let frames = frames.chunks_exact(FRAME_BYTES);
+        for (frame, out) in frames.zip(out.chunks_exact_mut(bytes)) {
+            self.one(frame, out);
+        }
+    }
+
+    fn one(&self, frame: &[u8], out: &mut [u8]) {
+        let channels = if self.grey { 1 } else { RGB };
+        let mut pixels = out.chunks_exact_mut(channels);
+        for (top, rows) in &self.covers {
+            for (left, cols) in &self.covers {
+                // At most 255 * 64 * 64.
+                let mut sums = [0u32; RGB];
+                for (row, &high) in rows.iter().enumerate() {
+                    let line = &frame[((top + row) * FRAME_SIDE + left) * RGB..];
+                    for (pixel, &wide) in line.chunks_exact(RGB).zip(cols) {
+                        for (sum, &value) in sums.iter_mut().zip(pixel) {
+                            *sum += high * wide * u32::from(value);
+                        }
+                    }
+                }
+                let pixel = pixels.next().expect("side x side pixels");
+                let area = (FRAME_SIDE * FRAME_SIDE) as u32;
+                if self.grey {
+                    let luma: u32 = sums.iter().zip(LUMA).map(|(sum, share)| sum * share).sum();
+                    pixel[0] = rounded(luma, area * LUMA_SUM);
+                } else {
+                    for (value, sum) in pixel.iter_mut().zip(sums) {
+                        *value = rounded(sum, area);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// `sum / of` to the nearest number, halves up; it must be below 256.
+const fn rounded(sum: u32, of: u32) -> u8 {
+    ((sum + of / 2) / of) as u8
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngCore, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    fn shrunk(side: usize, grey: bool, frame: &[u8]) -> Vec<u8> {
+        let mut out = vec![0; frame.len() / FRAME_BYTES * Shrink::shape(side, grey).bytes()];
+        Shrink::new(side, grey).apply(frame, &mut out);
+        out
+    }
+
+    fn random() -> Vec<u8> {
+        let mut frame = vec![0; FRAME_BYTES];
+        ChaCha8Rng::seed_from_u64(5).fill_bytes(&mut frame);
+        frame
+    }
+
+    #[test]
+    fn a_pixel_is_the_mean_of_its_area() {
+        let frame = random();
+        for side in [1, 13, 32, 48, 63, 64] {
+            let found = shrunk(side, false, &frame);
+            // The slow way: each of the engine's pixels as side x side points, each of ours as 64 x 64.
+            let scale = 64 * side;
+            for (at, &value) in found.iter().enumerate().step_by(7) {
+                let (pixel, channel) = (at / 3, at % 3);
+                let (top, left) = (pixel / side * 64, pixel % side * 64);
+                let mut sum = 0u64;
+                for y in top..top + 64 {
+                    for x in left..left + 64 {
+                        assert!(y < scale && x < scale);
+                        sum += u64::from(frame[(y / side * 64 + x / side) * 3 + channel]);
+                    }
+                }
+                assert_eq!(
+                    u64::from(value),
+                    (sum + 2048) / 4096,
+                    "side {side}, byte {at}"
+                );
+            }
+        }
+        assert_eq!(shrunk(64, false, &frame), frame);
+    }
+
+    #[test]
+    fn grey_is_luma() {
+        for (pixel, grey) in [
+            ([255, 255, 255], 255),
+            ([255, 0, 0], 76),
+            ([0, 255, 0], 150),
+            ([0, 0, 255], 29),
+            ([0, 0, 0], 0),
+        ] {
+            let frame = pixel.repeat(FRAME_BYTES / 3);
+            for side in [64, 48, 32] {
+                assert_eq!(shrunk(side, true, &frame), vec![grey; side * side]);
+            }
+        }
+    }
+
+    #[test]
+    fn frames_of_several_copies_stay_apart() {
+        let (one, other) = (random(), vec![9; FRAME_BYTES]);
+        let both = shrunk(32, true, &[one.clone(), other.clone()].concat());
+        assert_eq!(
+            both,
+            [shrunk(32, true, &one), shrunk(32, true, &other)].concat()
+        );
+    }
+}

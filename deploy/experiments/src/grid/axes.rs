@@ -1,0 +1,159 @@
+//! The axes of a grid and its cells: every combination of the values that a command line names.
+//! What a setting means is for `driml local`, which takes each of them as it stands here.
+
+use driml_machine::error::{Usage, usage};
+
+/// Most runs of a grid; more are a slip of the keyboard.
+const RUNS_MAX: usize = 10_000;
+
+/// What is varied, or fixed if it has one value alone.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Axis {
+    /// As a column is headed: `env`, `agent`, or a setting's dotted path.
+    pub(super) name: String,
+    pub(super) values: Vec<String>,
+}
+
+/// One combination: a value of each axis, in their order.
+pub(super) type Cell = Vec<String>;
+
+impl Axis {
+    /// Values of a flag of `driml local`.
+    pub(super) fn of_flag(name: &str, values: &[String]) -> Self {
+        Self {
+            name: name.into(),
+            values: values.to_vec(),
+        }
+    }
+
+    /// Reads `KEY=VALUE,VALUE,..`. Commas within brackets, braces and quotes belong to a value.
+    ///
+    /// # Errors
+    /// No `=`, an empty or a repeated value.
+    pub(super) fn parse(text: &str) -> Result<Self, Usage> {
+        let form =
+            "--set takes table.key=value,value,.., such as learner.update.adam.lr=1e-4,2.5e-4";
+        let (name, values) = text
+            .split_once('=')
+            .ok_or_else(|| usage!("--set {text:?} has no '='; {form}"))?;
+        let values: Vec<String> = split(values)
+            .iter()
+            .map(|it| it.trim().to_owned())
+            .collect();
+        let axis = Self {
+            name: name.trim().into(),
+            values,
+        };
+        axis.check(form)?;
+        Ok(axis)
+    }
+
+    /// # Errors
+    /// An empty or a repeated value: a run that nobody meant, or the same one twice.
+    pub(super) fn check(&self, form: &str) -> Result<(), Usage> {
+        for (at, value) in self.values.iter().enumerate() {
+            if value.is_empty() {
+                return Err(usage!("{} has an empty value; {form}", self.name));
+            }
+            if self.values[..at].contains(value) {
+                return Err(usage!("{} has {value} twice; {form}", self.name));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The parts of `text` between commas that are in no bracket, brace or quote.
+fn split(text: &str) -> Vec<&str> {
+    let (mut depth, mut quote, mut start) = (0_i32, None, 0);
+    let mut parts = Vec::new();
+    for (at, letter) in text.char_indices() {
+        match (quote, letter) {
+            (Some(open), _) if letter == open => quote = None,
+            (Some(_), _) => {}
+            (None, '"' | '\'') => quote = Some(letter),
+            (None, '[' | '{') => depth += 1,
+            (None, ']' | '}') => depth -= 1,
+            (None, ',') if depth == 0 => {
+                parts.push(&text[start..at]);
+                start = at + 1;
+            }
+            _ => {}
+        }
+    }
+    parts.push(&text[start..]);
+    parts
+}
+
+/// Every combination of the axes' values; the last axis changes fastest.
+///
+/// # Errors
+/// More runs than anybody means, with so many seeds.
+pub(super) fn cells(axes: &[Axis], seeds: u32) -> Result<Vec<Cell>, Usage> {
+    let counts = axes.iter().map(|axis| axis.values.len());
+    let runs = counts.fold(seeds as usize, usize::saturating_mul);
+    if runs > RUNS_MAX {
+        return Err(usage!(
+            "{runs} runs: a grid has at most {RUNS_MAX}; vary fewer settings at a time"
+        ));
+    }
+    let mut cells = vec![Cell::new()];
+    for axis in axes {
+        let longer = |cell: &Cell, value: &String| {
+            let mut cell = cell.clone();
+            cell.push(value.clone());
+            cell
+        };
+        cells = cells
+            .iter()
+            .flat_map(|cell| axis.values.iter().map(|value| longer(cell, value)))
+            .collect();
+    }
+    Ok(cells)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn commas_part_values_unless_something_is_around_them() {
+        let values = |text: &str| Axis::parse(text).unwrap().values;
+        assert_eq!(values("a.b=1"), ["1"]);
+        assert_eq!(values("a.b=1, 2,3"), ["1", "2", "3"]);
+        assert_eq!(
+            values("model.conv=[{ out = 1, kernel = 2 }, { out = 3 }],[]"),
+            ["[{ out = 1, kernel = 2 }, { out = 3 }]", "[]"]
+        );
+        assert_eq!(values("a.b=\"x,y\",'z,'"), ["\"x,y\"", "'z,'"]);
+        for (wrong, why) in [
+            ("a.b", "has no '='"),
+            ("a.b=", "has an empty value"),
+            ("a.b=1,,2", "has an empty value"),
+            ("a.b=1,2,1", "has 1 twice"),
+        ] {
+            let said = Axis::parse(wrong).unwrap_err().to_string();
+            assert!(said.contains(why), "{wrong}: {said}");
+        }
+    }
+
+    #[test]
+    fn cells_are_all_combinations() {
+        let axes = [
+            Axis::parse("a=1,2").unwrap(),
+            Axis::parse("b=x").unwrap(),
+            Axis::parse("c=3,4").unwrap(),
+        ];
+        let expected = [
+            ["1", "x", "3"],
+            ["1", "x", "4"],
+            ["2", "x", "3"],
+            ["2", "x", "4"],
+        ];
+        assert_eq!(cells(&axes, 2).unwrap(), expected);
+        assert_eq!(cells(&[], 1).unwrap(), [Cell::new()]);
+        let many: Vec<String> = (0..200).map(|it| it.to_string()).collect();
+        let axis = Axis::of_flag("a", &many);
+        assert!(cells(&[axis.clone(), axis], 1).is_err());
+    }
+}

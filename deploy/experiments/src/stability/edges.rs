@@ -1,0 +1,167 @@
+//! Numbers from all of an f32's range, and often from where its arithmetic changes its ways; and sums for references.
+//! The property tests beside each routine have a generator of their own, so that neither hides a gap of the other.
+
+use rand::Rng;
+
+/// Ends of ranges.
+const ENDS: [f32; 11] = [
+    0.0,
+    -0.0,
+    1e-45,
+    -1e-45,
+    f32::MIN_POSITIVE,
+    f32::EPSILON,
+    1.0,
+    -1.0,
+    16_777_216.0,
+    f32::MAX,
+    f32::MIN,
+];
+
+/// A finite number: of a usual size, of any, subnormal, a neighbour of a power of two, an end of a range.
+pub(super) fn finite(rng: &mut impl Rng) -> f32 {
+    match rng.random_range(0..10) {
+        0..4 => rng.random_range(-10.0f32..10.0),
+        4..6 => {
+            // Every bit pattern is as likely but those that are not finite.
+            let bits = rng.random::<u32>();
+            f32::from_bits(if bits >> 23 & 0xff == 0xff {
+                bits ^ 0x4000_0000
+            } else {
+                bits
+            })
+        }
+        6 => f32::from_bits(rng.random::<u32>() & 0x807f_ffff),
+        7..9 => {
+            let exponent = rng.random_range(1u32..255);
+            let size =
+                f32::from_bits((exponent << 23).wrapping_add_signed(rng.random_range(-1..=1)));
+            if rng.random() { -size } else { size }
+        }
+        _ => ENDS[rng.random_range(0..ENDS.len())],
+    }
+}
+
+/// `count` finite numbers: each on its own, all of a usual size, all the same, each one of two, or of one size.
+pub(super) fn finites(count: usize, rng: &mut impl Rng) -> Vec<f32> {
+    match rng.random_range(0..6) {
+        0..2 => (0..count).map(|_| finite(rng)).collect(),
+        2 => (0..count)
+            .map(|_| rng.random_range(-10.0f32..10.0))
+            .collect(),
+        3 => vec![finite(rng); count],
+        4 => {
+            let two = [finite(rng), finite(rng)];
+            (0..count).map(|_| two[rng.random_range(0..2)]).collect()
+        }
+        _ => {
+            let size = finite(rng);
+            (0..count)
+                .map(|_| size * rng.random_range(-1.0f32..1.0))
+                .collect()
+        }
+    }
+}
+
+/// Weights of `count` atoms that sum to 1, some of them 0 or tiny.
+pub(super) fn law(count: usize, rng: &mut impl Rng) -> Vec<f32> {
+    let mut weights: Vec<f64> = (0..count)
+        .map(|_| match rng.random_range(0..3) {
+            0 => 0.0,
+            1 => rng.random::<f64>(),
+            _ => rng.random::<f64>() * 1e-30,
+        })
+        .collect();
+    weights[rng.random_range(0..count)] += 1e-3;
+    let sum: f64 = weights.iter().sum();
+    weights.iter().map(|weight| (weight / sum) as f32).collect()
+}
+
+/// A probability: usual, near 0 or 1, or at an end.
+pub(super) fn probability(rng: &mut impl Rng) -> f32 {
+    match rng.random_range(0..4) {
+        0 => rng.random(),
+        1 => finite(rng).abs().min(1.0),
+        2 => 1.0 - finite(rng).abs().min(1.0),
+        _ => [0.0, 1e-45, 1e-9, 0.5, 1.0 - f32::EPSILON / 2.0, 1.0][rng.random_range(0..6)],
+    }
+}
+
+/// The ends of a support within 1e30: usual, one step of a float wide, or any.
+pub(super) fn support(rng: &mut impl Rng) -> (f32, f32) {
+    let end = |rng: &mut _| finite(rng).clamp(-1e30, 1e30);
+    match rng.random_range(0..4) {
+        0 => (-10.0, 10.0),
+        1 => {
+            let low = end(rng);
+            if low < 1e30 {
+                (low, low.next_up())
+            } else {
+                (low.next_down(), low)
+            }
+        }
+        _ => loop {
+            let (a, b) = (end(rng), end(rng));
+            if a < b {
+                break (a, b);
+            }
+        },
+    }
+}
+
+/// The same numbers in f64.
+pub(super) fn widened(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|&x| f64::from(x)).collect()
+}
+
+/// A sum that loses nothing to cancellation but its last place. Source: Neumaier 1974.
+pub(super) fn exact_sum(terms: impl IntoIterator<Item = f64>) -> f64 {
+    let (mut sum, mut lost) = (0.0f64, 0.0);
+    for term in terms {
+        let next = sum + term;
+        lost += if sum.abs() >= term.abs() {
+            (sum - next) + term
+        } else {
+            (term - next) + sum
+        };
+        sum = next;
+    }
+    sum + lost
+}
+
+/// The first of `values`, and how many they are.
+pub(super) fn shown(values: &[f32]) -> String {
+    let first: Vec<_> = values.iter().take(4).map(|x| format!("{x:e}")).collect();
+    let more = if values.len() > 4 { ", .." } else { "" };
+    format!("[{}{more}] ({})", first.join(", "), values.len())
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    #[test]
+    fn the_generator_likes_the_edges_and_is_never_infinite() {
+        let rng = &mut ChaCha8Rng::seed_from_u64(1);
+        let values: Vec<f32> = (0..20_000).map(|_| finite(rng)).collect();
+        assert!(values.iter().all(|x| x.is_finite()));
+        let share = |wanted: fn(&f32) -> bool| {
+            values.iter().filter(|x| wanted(x)).count() as f64 / values.len() as f64
+        };
+        assert!(share(|x| x.is_subnormal()) > 0.05);
+        assert!(share(|x| x.abs() > 1e30) > 0.03);
+        assert!(share(|x| x.to_bits() & 0x7f_ffff == 0x7f_ffff) > 0.03);
+        assert!(share(|x| *x == 0.0) > 0.005);
+        for _ in 0..2_000 {
+            let (low, high) = support(rng);
+            assert!(low < high && low >= -1e30 && high <= 1e30, "{low}, {high}");
+            assert!((0.0..=1.0).contains(&probability(rng)));
+            let sum: f32 = law(7, rng).iter().sum();
+            assert!((sum - 1.0).abs() < 1e-6);
+        }
+        assert_eq!(exact_sum([1e16, 1.0, -1e16, 1e-3]), 1.001);
+    }
+}

@@ -1,0 +1,65 @@
+//! Networks that are as small as networks can be, to carry numbers through routines that work on all parameters at once.
+
+use std::collections::HashMap;
+
+use candle_core::{Device, Tensor};
+use driml_model::{ConvLayer, DimHeads, ModelConfig, Parameters, Result};
+
+/// A network of one pixel, one action and these atoms; its head's weight has `atoms` times `hidden` scalars.
+pub(super) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelConfig {
+    ModelConfig {
+        height: 1,
+        width: 1,
+        channels: 1,
+        num_actions: 1,
+        atoms,
+        v_min: support.0,
+        v_max: support.1,
+        conv: vec![ConvLayer {
+            out: 1,
+            kernel: 1,
+            stride: 1,
+        }],
+        hidden,
+        rkhs: 1,
+        action_embed: 1,
+        dim: DimHeads::NONE,
+    }
+}
+
+/// The network of least parameters: eight in all, but for the biases.
+pub(super) fn least() -> ModelConfig {
+    config(2, 1, (-1.0, 1.0))
+}
+
+/// Scalars in all parameters together.
+pub(super) fn len(config: &ModelConfig) -> usize {
+    let shapes = config.parameter_shapes();
+    shapes
+        .iter()
+        .map(|(_, shape)| shape.iter().product::<usize>())
+        .sum()
+}
+
+/// Parameters with these scalars, one tensor after the other.
+pub(super) fn parameters(config: &ModelConfig, values: &[f32]) -> Result<Parameters> {
+    let mut tensors = HashMap::new();
+    let mut rest = values;
+    for (name, shape) in config.parameter_shapes() {
+        let (first, after) = rest.split_at(shape.iter().product());
+        rest = after;
+        tensors.insert(name, Tensor::from_slice(first, shape, &Device::Cpu)?);
+    }
+    Parameters::from_tensors(config, tensors, &Device::Cpu)
+}
+
+/// The scalars of all parameters, in the order of [`parameters`].
+pub(super) fn values(config: &ModelConfig, parameters: &Parameters) -> Result<Vec<f32>> {
+    let mut values = Vec::new();
+    for (name, _) in config.parameter_shapes() {
+        if let Some(var) = parameters.get(&name) {
+            values.extend(var.flatten_all()?.to_vec1::<f32>()?);
+        }
+    }
+    Ok(values)
+}

@@ -1,0 +1,165 @@
+//! The dials: what can be turned, its levels as settings, what each is expected to buy and to cost.
+//! It measures nothing; the menu itself is `dials.toml`, the settings that all levels share in a world `worlds.toml`.
+
+use driml_envs::WorldName;
+use driml_machine::error::{Usage, nearest, usage};
+use serde::Deserialize;
+
+const DIALS: &str = include_str!("dials.toml");
+const WORLDS: &str = include_str!("worlds.toml");
+/// The agent of a dial that names none.
+const AGENT: &str = "c51";
+
+/// A dial in one world: a base and the levels that are compared with it.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Dial {
+    pub(super) name: String,
+    /// The name of the level that the settings of the world have.
+    pub(super) base: String,
+    /// What the other levels are expected to buy.
+    pub(super) buys: String,
+    /// Why they are expected to cost accuracy.
+    pub(super) costs: String,
+    /// The agent of its base.
+    #[serde(default = "agent")]
+    pub(super) agent: String,
+    /// Kinds of worlds that have it; all if it names none.
+    #[serde(default)]
+    worlds: Vec<String>,
+    pub(super) levels: Vec<Level>,
+}
+
+fn agent() -> String {
+    AGENT.into()
+}
+
+/// A level of a dial.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Level {
+    pub(super) name: String,
+    /// In the form of `--set`, over the settings of the world.
+    #[serde(default)]
+    sets: Vec<String>,
+    /// Another agent than the dial's.
+    agent: Option<String>,
+}
+
+/// One choice of all settings: what a run, of any seed, is made with.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Point {
+    /// Names its runs and pieces.
+    pub(super) key: String,
+    pub(super) agent: String,
+    /// Over the settings of the world.
+    pub(super) sets: Vec<String>,
+}
+
+impl Dial {
+    /// What its levels are compared with.
+    pub(super) fn base_point(&self) -> Point {
+        Point {
+            key: self.agent.clone(),
+            agent: self.agent.clone(),
+            sets: Vec::new(),
+        }
+    }
+
+    /// What a level of it is made with.
+    pub(super) fn point(&self, level: &Level) -> Point {
+        let agent = level.agent.as_ref().unwrap_or(&self.agent);
+        let key = match level.sets.is_empty() {
+            true => agent.clone(),
+            false => format!("{agent}-{}-{}", slug(&self.name), slug(&level.name)),
+        };
+        Point {
+            key,
+            agent: agent.clone(),
+            sets: level.sets.clone(),
+        }
+    }
+}
+
+/// A name as files have it: letters, digits, dots and single dashes.
+fn slug(name: &str) -> String {
+    let kept = |c: char| {
+        if c.is_ascii_alphanumeric() || c == '.' {
+            c
+        } else {
+            '-'
+        }
+    };
+    let parts: String = name.chars().map(kept).collect();
+    let parts = parts.split('-').filter(|part| !part.is_empty());
+    parts.collect::<Vec<_>>().join("-")
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Menu {
+    dial: Vec<Dial>,
+}
+
+/// What all runs in the worlds of one kind have.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct WorldBase {
+    kind: String,
+    /// Frames of a run.
+    pub(super) frames: u64,
+    /// In the form of `--set`.
+    pub(super) sets: Vec<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Worlds {
+    world: Vec<WorldBase>,
+}
+
+/// The dials that a world has, in the order in which they are tried.
+pub(super) fn dials(world: WorldName) -> Vec<Dial> {
+    let menu: Menu = toml::from_str(DIALS)
+        .unwrap_or_else(|e| panic!("dials.toml is built in, and a test reads it: {e}"));
+    let has =
+        |dial: &Dial| dial.worlds.is_empty() || dial.worlds.iter().any(|kind| kind == world.kind());
+    menu.dial.into_iter().filter(has).collect()
+}
+
+/// What all runs in a world have.
+///
+/// # Errors
+/// A world that nobody has found settings for with which C51 learns.
+pub(super) fn world_base(world: WorldName) -> Result<WorldBase, Usage> {
+    let worlds: Worlds = toml::from_str(WORLDS)
+        .unwrap_or_else(|e| panic!("worlds.toml is built in, and a test reads it: {e}"));
+    let kinds: Vec<_> = worlds.world.iter().map(|it| it.kind.clone()).collect();
+    let found = worlds.world.into_iter().find(|it| it.kind == world.kind());
+    found.ok_or_else(|| {
+        usage!(
+            "driml tradeoff has no settings for {world}, with which something is learned in minutes; it has some for {}",
+            kinds.join(", ")
+        )
+    })
+}
+
+/// Those of `all` that are asked for by name, in the order of the menu; all if none are.
+///
+/// # Errors
+/// A name that no dial of this world has.
+pub(super) fn chosen(all: Vec<Dial>, names: &[String]) -> Result<Vec<Dial>, Usage> {
+    if let Some(unknown) = names
+        .iter()
+        .find(|name| all.iter().all(|dial| dial.name != **name))
+    {
+        let known: Vec<_> = all.iter().map(|dial| dial.name.as_str()).collect();
+        return Err(usage!(
+            "there is no dial {unknown:?} in this world{}; --dials takes {}",
+            nearest(unknown, known.iter().copied()),
+            known.join(", ")
+        ));
+    }
+    let asked = |dial: &Dial| names.is_empty() || names.contains(&dial.name);
+    Ok(all.into_iter().filter(asked).collect())
+}

@@ -1,0 +1,459 @@
+//! The page of a trade-off: a row for each level with what it gives and what it costs, and C51 beside DIM at equal frames and at equal time.
+
+use driml_machine::units::rough_duration;
+
+use super::results::{LevelOf, Measure, PointResult, Results};
+use crate::{
+    page::{Page, Table},
+    plot::{Over, Run},
+    statistics::{Interval, Spread},
+    template::Values,
+};
+
+/// What the bench gives, as the data has it.
+pub(super) const SPEEDS: [&str; 6] = [
+    "update_seconds",
+    "rows_gain",
+    "act_seconds",
+    "act_gain",
+    "weights_bytes",
+    "frame_bytes",
+];
+/// The errors against float64, as the data has them.
+pub(super) const ERRORS: [&str; 8] = [
+    "loss_error",
+    "gradient_error",
+    "gradient_angle",
+    "q_rms_error",
+    "q_max_error",
+    "same_action_learner",
+    "same_action_actor",
+    "actor_q_rms_error",
+];
+/// The dial that turns DIM on.
+const DIM: &str = "DIM";
+
+/// The cells of [`SPEEDS`].
+pub(super) fn speed_cells(point: &PointResult) -> [String; 6] {
+    let Some(speed) = &point.speed else {
+        return [const { String::new() }; 6];
+    };
+    [
+        format!("{:.6}", speed.update_seconds),
+        format!("{:.4}", speed.rows_gain),
+        format!("{:.9}", speed.act_seconds),
+        format!("{:.4}", speed.act_gain),
+        speed.weights_bytes.to_string(),
+        speed.frame_bytes.to_string(),
+    ]
+}
+
+/// The cells of [`ERRORS`].
+pub(super) fn error_cells(point: &PointResult) -> [String; 8] {
+    let Some(it) = &point.exactness else {
+        return [const { String::new() }; 8];
+    };
+    [
+        it.loss,
+        it.gradient,
+        it.angle,
+        it.q_rms,
+        it.q_max,
+        it.same_learner,
+        it.same_actor,
+        it.actor_q_rms,
+    ]
+    .map(|number| format!("{number:.3e}"))
+}
+
+/// The page of what was run.
+pub(super) fn page(results: &Results) -> anyhow::Result<Page> {
+    let common = &results.settings.common;
+    let random = Spread::of(results.random.iter().copied());
+    let equal = equal_time(results)?;
+    let mut got: Vec<String> = results.levels.iter().map(|of| found(results, of)).collect();
+    got.extend(equal.iter().map(|it| it.in_words.clone()));
+    let mut values = Values::default();
+    values
+        .set("env", &common.env)
+        .set("preset", &common.preset)
+        .set("frames", common.frames)
+        .when("has_sets", !common.sets.is_empty())
+        .set("sets", common.sets.join(", "))
+        .set("load", load(results))
+        .items("got", got)
+        .when("some_missing", !results.missing.is_empty())
+        .set("missing", results.missing.join(", "))
+        .set("episodes", common.episodes)
+        .set("seeds", results.settings.seeds)
+        .set(
+            "random",
+            random.map_or("-".into(), |it| format!("{:.2}", it.mean)),
+        )
+        .set("gains", gains(results))
+        .set("rest", rest(results))
+        .set("errors", errors(results))
+        .set(
+            "dim",
+            if equal.is_empty() {
+                String::new()
+            } else {
+                dim_table(&equal)
+            },
+        )
+        .when("dim_is_there", !equal.is_empty())
+        .set("pareto", "pareto")
+        .set("wall", "wall")
+        .items("dials", dials(results))
+        .when("some_left_out", !results.left_out.is_empty())
+        .set("left_out", results.left_out.join("; "));
+    Ok(Page::new(
+        include_str!("page.md"),
+        values,
+        &results.command,
+        results.smoke,
+    ))
+}
+
+/// What whole runs of the bases did, so that a reader sees how long one is.
+fn load(results: &Results) -> String {
+    let mut bases: Vec<&str> = results
+        .levels
+        .iter()
+        .map(|of| of.base.key.as_str())
+        .collect();
+    bases.sort_unstable();
+    bases.dedup();
+    let each = bases.iter().filter_map(|key| {
+        let point = &results.points[*key];
+        let seconds = Spread::of(point.values(Measure::WallSeconds))?;
+        Some(format!(
+            "{key} {} ({} to {})",
+            rough_duration(seconds.mean),
+            rough_duration(seconds.min),
+            rough_duration(seconds.max)
+        ))
+    });
+    format!("A run of a base: {}.", each.collect::<Vec<_>>().join("; "))
+}
+
+/// A level in a sentence.
+fn found(results: &Results, of: &LevelOf) -> String {
+    let point = &results.points[&of.point.key];
+    let speed = point.speed.as_ref().map(|it| {
+        format!(
+            "x{:.2} rows/s alone, x{:.2} acting",
+            it.rows_gain, it.act_gain
+        )
+    });
+    let frames = results.factor(of, Measure::FramesPerSecond);
+    let frames = frames.map(|it| format!("x{it:.2} frames/s"));
+    let gains: Vec<String> = speed.into_iter().chain(frames).collect();
+    let cost = results.difference(of, Measure::Greedy).map_or_else(
+        || "no return".to_owned(),
+        |it| format!("return {}{}", signed(&it), verdict(&it)),
+    );
+    format!(
+        "{} ({}): {}; {cost}",
+        of.name(),
+        of.point.agent,
+        gains.join(", ")
+    )
+}
+
+/// What an interval of a difference says.
+fn verdict(difference: &Interval) -> &'static str {
+    match (
+        difference.ends,
+        difference.is_apart_from_zero(),
+        difference.mean > 0.0,
+    ) {
+        (None, ..) => " (one seed)",
+        (_, false, _) => ": these seeds cannot tell it from its base",
+        (_, true, true) => ": better than its base",
+        (_, true, false) => ": worse than its base",
+    }
+}
+
+fn signed(it: &Interval) -> String {
+    match it.ends {
+        None => format!("{:+.2}", it.mean),
+        Some((low, high)) => format!("{:+.2} [{low:+.2}, {high:+.2}]", it.mean),
+    }
+}
+
+fn cell<T>(value: Option<T>, text: impl Fn(T) -> String) -> String {
+    value.map_or_else(|| "-".into(), text)
+}
+
+/// Rows of levels, each dial's base first.
+fn by_level(
+    results: &Results,
+    base: impl Fn(&PointResult) -> Vec<String>,
+    level: impl Fn(&LevelOf, &PointResult) -> Vec<String>,
+) -> Vec<Vec<String>> {
+    let mut rows: Vec<Vec<String>> = Vec::new();
+    let mut last = "";
+    for of in &results.levels {
+        if of.dial.name != last {
+            last = &of.dial.name;
+            let name = format!("{} (base)", of.dial.base);
+            let head = [of.dial.name.clone(), name, of.base.agent.clone()];
+            rows.push(
+                head.into_iter()
+                    .chain(base(&results.points[&of.base.key]))
+                    .collect(),
+            );
+        }
+        let head = [
+            of.dial.name.clone(),
+            of.level.clone(),
+            of.point.agent.clone(),
+        ];
+        rows.push(
+            head.into_iter()
+                .chain(level(of, &results.points[&of.point.key]))
+                .collect(),
+        );
+    }
+    rows
+}
+
+fn table(header: &[&str], rows: Vec<Vec<String>>) -> Table {
+    Table {
+        header: header.iter().map(|&it| it.to_owned()).collect(),
+        rows,
+    }
+}
+
+fn gains(results: &Results) -> Table {
+    let greedy = |point: &PointResult| cell(point.mean(Measure::Greedy), |it| it.to_string());
+    let rows = by_level(
+        results,
+        |point| {
+            let frames = cell(point.mean(Measure::FramesPerSecond), |it| {
+                format!("{:.0}", it.mean)
+            });
+            vec!["1".into(), "1".into(), frames, greedy(point), String::new()]
+        },
+        |of, point| {
+            let speed = point.speed.as_ref();
+            vec![
+                cell(speed, |it| format!("x{:.2}", it.rows_gain)),
+                cell(speed, |it| format!("x{:.2}", it.act_gain)),
+                cell(results.factor(of, Measure::FramesPerSecond), |it| {
+                    format!("x{it:.2}")
+                }),
+                greedy(point),
+                cell(results.difference(of, Measure::Greedy), |it| signed(&it)),
+            ]
+        },
+    );
+    let header = [
+        "dial",
+        "level",
+        "agent",
+        "rows/s alone",
+        "acting",
+        "frames/s",
+        "return",
+        "difference",
+    ];
+    table(&header, rows)
+}
+
+fn rest(results: &Results) -> Table {
+    let cells = |point: &PointResult| {
+        let speed = point.speed.as_ref();
+        let mean = |measure, decimals: usize| {
+            cell(point.mean(measure), |it| format!("{:.decimals$}", it.mean))
+        };
+        vec![
+            cell(speed, |it| format!("{:.2}", 1e3 * it.update_seconds)),
+            cell(speed, |it| format!("{:.1}", 1e6 * it.act_seconds)),
+            cell(speed, |it| it.frame_bytes.to_string()),
+            cell(speed, |it| format!("{:.2}", it.weights_bytes as f64 / 1e6)),
+            mean(Measure::Memory, 0),
+            mean(Measure::WallSeconds, 0),
+            mean(Measure::Training, 2),
+            mean(Measure::Behind, 0),
+            mean(Measure::BehindSeconds, 2),
+        ]
+    };
+    let header = [
+        "dial",
+        "level",
+        "agent",
+        "update [ms]",
+        "action [us]",
+        "frame [bytes]",
+        "broadcast [MB]",
+        "memory [MiB]",
+        "run [s]",
+        "training return",
+        "weights behind [updates]",
+        "[s]",
+    ];
+    table(&header, by_level(results, cells, |_, point| cells(point)))
+}
+
+fn errors(results: &Results) -> Table {
+    let cells = |point: &PointResult| {
+        let of = point.exactness.as_ref();
+        let share = |share: f64| format!("{:.1}%", 100.0 * share);
+        vec![
+            cell(of, |it| format!("{:.1e}", it.loss)),
+            cell(of, |it| format!("{:.1e}", it.gradient)),
+            cell(of, |it| format!("{:.1e}", it.angle)),
+            cell(of, |it| format!("{:.1e}", it.q_rms)),
+            cell(of, |it| format!("{:.1e}", it.q_max)),
+            cell(of, |it| share(it.same_learner)),
+            cell(of, |it| format!("{:.1e}", it.actor_q_rms)),
+            cell(of, |it| share(it.same_actor)),
+        ]
+    };
+    let header = [
+        "dial",
+        "level",
+        "agent",
+        "loss",
+        "gradient",
+        "1 - cosine",
+        "Q, learner (rms)",
+        "(largest)",
+        "same action, learner",
+        "Q, actor (rms)",
+        "same action, actor",
+    ];
+    table(&header, by_level(results, cells, |_, point| cells(point)))
+}
+
+fn dials(results: &Results) -> Vec<String> {
+    let mut said = Vec::new();
+    let mut last = "";
+    for of in &results.levels {
+        if of.dial.name != last {
+            last = &of.dial.name;
+            let dial = &of.dial;
+            said.push(format!(
+                "{}, {} as its base: buys {}. Price: {}.",
+                dial.name, dial.base, dial.buys, dial.costs
+            ));
+        }
+    }
+    said
+}
+
+/// C51 beside an agent with DIM, seed by seed.
+struct EqualTime {
+    agent: String,
+    in_words: String,
+    row: Vec<String>,
+}
+
+/// C51 and the agents with DIM at equal frames and at equal wall-clock time: when runs of the faster of the two are done.
+fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
+    let mut all = Vec::new();
+    for of in results.levels.iter().filter(|of| of.dial.name == DIM) {
+        let base = training_curves(&results.points[&of.base.key])?;
+        let level = training_curves(&results.points[&of.point.key])?;
+        let ends = |curves: &[Vec<(f64, f64)>], of: fn(&(f64, f64)) -> f64| -> Vec<f64> {
+            curves
+                .iter()
+                .filter_map(|curve| curve.last().map(of))
+                .collect()
+        };
+        let means = [&base, &level].map(|it| Interval::of(&ends(it, |end| end.0)));
+        let [Some(one), Some(other)] = means else {
+            continue;
+        };
+        let seconds = one.mean.min(other.mean);
+        let then = |curves: &[Vec<(f64, f64)>]| -> Vec<f64> {
+            curves
+                .iter()
+                .filter_map(|curve| at(curve, seconds))
+                .collect()
+        };
+        let (of_base, of_level) = (then(&base), then(&level));
+        let frames = Interval::of_difference(&ends(&base, |end| end.1), &ends(&level, |end| end.1));
+        let time = Interval::of_difference(&of_base, &of_level);
+        let (Some(frames), Some(time)) = (frames, time) else {
+            continue;
+        };
+        let mean = |values: &[f64]| cell(Interval::of(values), |it| it.to_string());
+        let agent = of.point.agent.clone();
+        all.push(EqualTime {
+            in_words: format!(
+                "{agent} minus {}, training return: {} at equal frames, {} at equal wall-clock time ({seconds:.0} s)",
+                of.base.agent,
+                signed(&frames),
+                signed(&time),
+            ),
+            row: vec![
+                agent.clone(),
+                signed(&frames),
+                format!("{seconds:.0}"),
+                mean(&of_base),
+                mean(&of_level),
+                signed(&time),
+            ],
+            agent,
+        });
+    }
+    Ok(all)
+}
+
+/// Training return over seconds, of each run.
+fn training_curves(point: &PointResult) -> anyhow::Result<Vec<Vec<(f64, f64)>>> {
+    let each = point
+        .seeds
+        .iter()
+        .map(|it| Ok(Run::read(&it.ran.folder)?.values_over(Over::Seconds, "mean_return")?));
+    each.collect()
+}
+
+/// The value at a time: the last one before it.
+fn at(curve: &[(f64, f64)], seconds: f64) -> Option<f64> {
+    let before = curve.iter().take_while(|(x, _)| *x <= seconds).last();
+    before.map(|(_, value)| *value)
+}
+
+fn dim_table(all: &[EqualTime]) -> String {
+    let header = [
+        "agent",
+        "minus C51 at equal frames",
+        "equal time [s]",
+        "C51 then",
+        "agent then",
+        "minus C51 at equal time",
+    ];
+    let names: Vec<&str> = all.iter().map(|it| it.agent.as_str()).collect();
+    let rows = all.iter().map(|it| it.row.clone()).collect();
+    format!(
+        "C51 beside {} in training return, at equal frames and at equal wall-clock time.\n\n{}",
+        names.join(" and "),
+        table(&header, rows)
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_curve_is_read_at_a_time() {
+        let curve = [(1.0, 0.5), (2.0, 0.6), (4.0, 0.9)];
+        assert_eq!(at(&curve, 3.0), Some(0.6));
+        assert_eq!(at(&curve, 0.5), None);
+        assert_eq!(at(&curve, 9.0), Some(0.9));
+    }
+
+    #[test]
+    fn a_difference_is_put_into_words() {
+        let of = |values: &[f64]| verdict(&Interval::of(values).unwrap());
+        assert_eq!(of(&[1.0, 1.1, 1.2]), ": better than its base");
+        assert_eq!(of(&[-1.0, -1.1, -1.2]), ": worse than its base");
+        assert!(of(&[-1.0, 1.0]).contains("cannot tell"));
+        assert_eq!(of(&[1.0]), " (one seed)");
+    }
+}

@@ -1,0 +1,101 @@
+//! Data, figures and page of a trade-off.
+
+use super::{
+    figures, page,
+    results::{Measure, PointResult, Results},
+};
+use crate::session::Session;
+
+const MEASURES: [(&str, Measure); 7] = [
+    ("greedy_return", Measure::Greedy),
+    ("training_return", Measure::Training),
+    ("frames_per_second", Measure::FramesPerSecond),
+    ("wall_seconds", Measure::WallSeconds),
+    ("rss_mib", Measure::Memory),
+    ("weights_behind_updates", Measure::Behind),
+    ("weights_behind_seconds", Measure::BehindSeconds),
+];
+
+/// Writes them all.
+///
+/// # Errors
+/// A run's metrics that cannot be read, a file system that refuses.
+pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> {
+    write_runs(&session, results)?;
+    write_levels(&session, results)?;
+    session.figure("pareto", &figures::pareto(results))?;
+    session.figure("wall", &figures::wall(results)?)?;
+    session.finish(&page::page(results)?)
+}
+
+fn write_runs(session: &Session, results: &Results) -> anyhow::Result<()> {
+    let mut header = vec![
+        "point",
+        "agent",
+        "seed",
+        "updates",
+        "updates_per_second",
+        "weights_sha256",
+    ];
+    header.extend(MEASURES.map(|(name, _)| name));
+    let mut rows = Vec::new();
+    for (key, point) in &results.points {
+        for it in &point.seeds {
+            let summary = &it.ran.summary;
+            let mut row = vec![
+                key.clone(),
+                summary.agent.clone(),
+                it.seed.to_string(),
+                summary.updates.to_string(),
+                format!("{:.2}", summary.updates_per_second),
+                summary.weights_sha256.clone(),
+            ];
+            let values = MEASURES.map(|(_, measure)| it.value(measure));
+            row.extend(
+                values.map(|value| value.map_or(String::new(), |value| format!("{value:.4}"))),
+            );
+            rows.push(row);
+        }
+    }
+    session.csv("runs", &header, rows)
+}
+
+fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
+    let mut header: Vec<String> = ["dial", "level", "base", "seeds"]
+        .map(String::from)
+        .to_vec();
+    header.extend(page::SPEEDS.map(String::from));
+    header.extend(page::ERRORS.map(String::from));
+    for (name, _) in MEASURES {
+        header.extend(["", "_low", "_high"].map(|end| format!("{name}{end}")));
+        header.extend(
+            ["_minus_base", "_minus_base_low", "_minus_base_high"]
+                .map(|end| format!("{name}{end}")),
+        );
+    }
+    let rows = results.levels.iter().map(|of| {
+        let point: &PointResult = &results.points[&of.point.key];
+        let mut row = vec![
+            of.dial.name.clone(),
+            of.level.clone(),
+            of.dial.base.clone(),
+            point.seeds.len().to_string(),
+        ];
+        row.extend(page::speed_cells(point));
+        row.extend(page::error_cells(point));
+        for (_, measure) in MEASURES {
+            for found in [point.mean(measure), results.difference(of, measure)] {
+                let ends = found.and_then(|it| it.ends);
+                let numbers = [
+                    found.map(|it| it.mean),
+                    ends.map(|it| it.0),
+                    ends.map(|it| it.1),
+                ];
+                row.extend(numbers.map(|it| it.map_or(String::new(), |it| format!("{it:.4}"))));
+            }
+        }
+        row
+    });
+    let header: Vec<&str> = header.iter().map(String::as_str).collect();
+    session.csv("levels", &header, rows)
+}

@@ -1,0 +1,158 @@
+//! How fast a level learns and acts beside its dial's base, both alone in this process and in turns, so that a machine with other work
+//! on it slows both alike. What whole runs do is in their summaries.
+
+use std::time::{Duration, Instant};
+
+use driml_learner::{Agent, Compute};
+use driml_model::PolicyNetwork;
+use driml_settings::config::RunConfig;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::held::HeldBatch;
+
+/// How long is measured.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Effort {
+    /// Turns of each side, an odd number.
+    rounds: usize,
+    /// How long a turn takes, at least; a turn has one call or more.
+    turn: Duration,
+}
+
+impl Effort {
+    /// Some seconds a level; a tenth of one for the smoke length.
+    pub(super) const fn of(smoke: bool) -> Self {
+        match smoke {
+            true => Self {
+                rounds: 1,
+                turn: Duration::from_millis(20),
+            },
+            false => Self {
+                rounds: 9,
+                turn: Duration::from_millis(80),
+            },
+        }
+    }
+}
+
+/// Times of one update and one action, of a level and of its base in turns with it. Medians over the turns.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct Speed {
+    /// Seconds of an update of all rows.
+    pub(super) update_seconds: f64,
+    /// How many times as many rows a second are learned from as at the base.
+    pub(super) rows_gain: f64,
+    /// Seconds of choosing an action for one frame, among as many as an actor has copies.
+    pub(super) act_seconds: f64,
+    /// How many times as many frames a second are acted on as at the base.
+    pub(super) act_gain: f64,
+    /// Of one broadcast of the weights.
+    pub(super) weights_bytes: u64,
+    /// Of one frame as an actor sends it and the replay holds it, uncompressed.
+    pub(super) frame_bytes: u64,
+}
+
+/// What is timed.
+struct Side {
+    agent: Agent,
+    held: HeldBatch,
+    policy: PolicyNetwork,
+    /// Frames of a round of all copies of an actor.
+    frames: Vec<u8>,
+    actions: Vec<u8>,
+}
+
+impl Side {
+    fn new(config: &RunConfig) -> anyhow::Result<Self> {
+        let held = HeldBatch::play(config, None, config.learner.batch_size as usize)?;
+        let agent = Agent::new(
+            config.model.clone(),
+            config.learner.update.clone(),
+            &Compute::cpu(config.learner.precision),
+            &mut ChaCha8Rng::seed_from_u64(1),
+        )?;
+        let weights = agent.weights_as(config.learner.publish_as)?;
+        let policy = PolicyNetwork::new(&config.model, &weights, config.actor.precision)?;
+        let copies = config.actor.envs as usize;
+        let bytes = copies * config.model.frame_len();
+        Ok(Self {
+            frames: held.states_t.iter().copied().cycle().take(bytes).collect(),
+            actions: vec![0; copies],
+            agent,
+            held,
+            policy,
+        })
+    }
+
+    /// Seconds of an update, over a turn.
+    fn update(&mut self, turn: Duration) -> anyhow::Result<f64> {
+        timed(turn, || {
+            Ok(self.agent.update(&self.held.batch()).map(drop)?)
+        })
+    }
+
+    /// Seconds of an action, over a turn.
+    fn act(&mut self, turn: Duration) -> anyhow::Result<f64> {
+        let seconds = timed(turn, || {
+            Ok(self
+                .policy
+                .greedy_actions(&self.frames, &mut self.actions)?)
+        })?;
+        Ok(seconds / self.actions.len() as f64)
+    }
+}
+
+/// Mean seconds of a call, over a turn.
+fn timed(turn: Duration, mut work: impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<f64> {
+    let started = Instant::now();
+    let mut calls = 0;
+    while calls == 0 || started.elapsed() < turn {
+        work()?;
+        calls += 1;
+    }
+    Ok(started.elapsed().as_secs_f64() / f64::from(calls))
+}
+
+/// Times `level` beside `base`.
+///
+/// # Errors
+/// A world that cannot be had, an update that failed.
+pub(super) fn measure(
+    base: &RunConfig,
+    level: &RunConfig,
+    Effort { rounds, turn }: Effort,
+) -> anyhow::Result<Speed> {
+    let (mut from, mut to) = (Side::new(base)?, Side::new(level)?);
+    // Buffers are made in the first call.
+    for side in [&mut from, &mut to] {
+        side.update(Duration::ZERO)?;
+        side.act(Duration::ZERO)?;
+    }
+    let [mut updates, mut update_gains, mut acts, mut act_gains] = [const { Vec::new() }; 4];
+    for _ in 0..rounds {
+        let (one, other) = (from.update(turn)?, to.update(turn)?);
+        updates.push(other);
+        update_gains.push(one / other);
+        let (one, other) = (from.act(turn)?, to.act(turn)?);
+        acts.push(other);
+        act_gains.push(one / other);
+    }
+    let rows = to.held.rows() as f64 / from.held.rows() as f64;
+    let run = &level.run;
+    Ok(Speed {
+        update_seconds: median(&mut updates),
+        rows_gain: rows * median(&mut update_gains),
+        act_seconds: median(&mut acts),
+        act_gain: median(&mut act_gains),
+        weights_bytes: to.agent.weights_as(level.learner.publish_as)?.len() as u64,
+        frame_bytes: u64::from(run.frame_height * run.frame_width * run.frame_channels),
+    })
+}
+
+/// The middle one of an odd number of values.
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}

@@ -1,0 +1,329 @@
+//! The parts of a run in lockstep, and whose turn it is.
+//! When to save and what to show is for `mod`.
+
+use std::path::Path;
+
+use anyhow::{Context, bail};
+use driml_actor::{ActError, ActorSettings, Collector, CollectorState, Incarnation};
+use driml_envs::EnvError;
+use driml_learner::{Learner, LearnerConfig};
+use driml_machine::error::usage;
+use driml_protocol::{
+    ActorJoin, Batch, BufferPool, Goodbye, InsertReply, LearnerStatus, ReplayStatus, Weights,
+};
+use driml_replay_server::{DurableArgs, DurableReplay, Mark, Replay, Unready};
+use driml_settings::config::RunConfig;
+
+use super::saved::SavedParts;
+use crate::{console, run_folder::RunFolder};
+
+/// Every actor's incarnation: an actor of this mode has one life, and its number influences nothing.
+const INCARNATION: u64 = 1;
+/// The learner's number, which influences nothing either.
+const LEARNER: u64 = 1;
+
+/// The replay of a run, kept in its folder; with a mark, as it was there.
+fn open(
+    config: &RunConfig,
+    run_dir: &RunFolder,
+    mark: Option<Mark>,
+) -> anyhow::Result<DurableReplay> {
+    let args = DurableArgs {
+        dir: run_dir.replay(),
+        shard: 0,
+        after_updates: 0,
+        segment_bytes: None,
+        mark,
+    };
+    let batch_size = config.learner.batch_size;
+    let (replay, recovery) = DurableReplay::open(&args, &config.run, &config.replay, batch_size)?;
+    // A part of it would do for a server that goes on, but not for a run that is to be the same.
+    match recovery.warnings.first() {
+        Some(why) if mark.is_some() => Err(usage!(
+            "the run cannot go on as it was: {why}. Start it anew, in another folder"
+        )
+        .into()),
+        _ => Ok(replay),
+    }
+}
+
+/// The components of a run, which take turns.
+pub(super) struct Lockstep {
+    actors: Vec<Collector>,
+    next_actor: usize,
+    replay: DurableReplay,
+    learner: Learner,
+    status: LearnerStatus,
+    batch_size: u32,
+    steps_per_chunk: u32,
+    /// Transitions of each actor that came after the run's last.
+    unwanted: Vec<u64>,
+    /// The weights with which the actors act, and the updates after which they were published.
+    acting: Weights,
+    published: u64,
+}
+
+impl Lockstep {
+    /// The parts of a run that begins, whose replay is kept in the run's folder if a checkpoint of it could go on.
+    ///
+    /// # Errors
+    /// Settings that cannot work, a world that cannot be made, a folder that cannot be written.
+    pub(super) fn begin(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
+        let mut this = Self::in_memory(config)?;
+        if this.actor_states()?.is_none() {
+            console::line(
+                "this world's state cannot be saved: the run cannot be resumed, only repeated",
+            );
+            return Ok(this);
+        }
+        this.replay = open(config, run_dir, None)?;
+        this.join_actors()?;
+        Ok(this)
+    }
+
+    /// The parts of the run in `run_dir`, as they were at its newest checkpoint.
+    ///
+    /// # Errors
+    /// A checkpoint or a replay that is damaged or of other settings.
+    pub(super) fn resume(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
+        let saved = SavedParts::read(run_dir)?;
+        let mut this = Self::in_memory(config)?;
+        let compute = config.local.learner_device.open(config.learner.precision)?;
+        let settings = LearnerConfig::from_toml(&config.to_toml())?;
+        this.learner = Learner::resume(settings, &compute, &run_dir.checkpoints())?;
+        this.replay = open(config, run_dir, Some(saved.replay))?;
+        this.take(saved)
+            .context("going on with the parts that the checkpoint holds")?;
+        Ok(this)
+    }
+
+    /// The parts of a run that begins and is not kept.
+    ///
+    /// # Errors
+    /// Settings that cannot work, a world that cannot be made.
+    pub(super) fn in_memory(config: &RunConfig) -> anyhow::Result<Self> {
+        let text = config.to_toml();
+        let settings = ActorSettings::from_toml(&text)?;
+        let learner_config = LearnerConfig::from_toml(&text)?;
+        let batch_size = learner_config.learner.batch_size;
+        let replay = Replay::new(&config.run, &config.replay, batch_size)?;
+        let compute = config
+            .local
+            .learner_device
+            .open(learner_config.learner.precision)?;
+        let mut learner = Learner::new(learner_config, &compute)?;
+        let acting = learner.next_weights()?;
+        let status = LearnerStatus {
+            weights_version: acting.header.version,
+            weights_sha256: acting.header.sha256_hex(),
+            ..LearnerStatus::default()
+        };
+        let actor = |actor| {
+            let life = Incarnation {
+                actor,
+                id: INCARNATION,
+                after_updates: 0,
+                earlier_incarnations: 0,
+            };
+            Collector::new(
+                settings.clone(),
+                BufferPool::new(1),
+                life,
+                acting.header.version,
+                &acting.safetensors,
+            )
+        };
+        let actors = (0..config.local.actors)
+            .map(actor)
+            .collect::<Result<Vec<_>, _>>()?;
+        let mut this = Self {
+            unwanted: vec![0; actors.len()],
+            actors,
+            next_actor: 0,
+            replay: DurableReplay::in_memory(replay, 0),
+            learner,
+            status,
+            batch_size,
+            steps_per_chunk: settings.actor.steps_per_chunk,
+            acting,
+            published: 0,
+        };
+        this.join_actors()?;
+        Ok(this)
+    }
+
+    fn join_actors(&mut self) -> anyhow::Result<()> {
+        for actor in 0..self.actors.len() as u32 {
+            let join = ActorJoin {
+                actor,
+                incarnation: INCARNATION,
+            };
+            self.replay.join_actor(join).map_err(anyhow::Error::msg)?;
+        }
+        Ok(())
+    }
+
+    /// How the actors stand; none where their world cannot say.
+    fn actor_states(&mut self) -> anyhow::Result<Option<Vec<CollectorState>>> {
+        let states: Result<Vec<_>, _> = self.actors.iter_mut().map(Collector::state).collect();
+        match states {
+            Ok(states) => Ok(Some(states)),
+            Err(ActError::World(EnvError::NotSaved)) => Ok(None),
+            Err(e) => Err(e.into()),
+        }
+    }
+
+    /// Takes back what [`Lockstep::save`] kept.
+    fn take(&mut self, saved: SavedParts) -> anyhow::Result<()> {
+        let count = self.actors.len();
+        if saved.actors.len() != count || saved.unwanted.len() != count || saved.next_actor >= count
+        {
+            bail!(
+                "it holds {} actors, and this run has {count}",
+                saved.actors.len()
+            );
+        }
+        for (actor, state) in self.actors.iter_mut().zip(saved.actors) {
+            actor.set_weights(saved.acting.header.version, &saved.acting.safetensors)?;
+            actor.go_on_from(state)?;
+        }
+        let restored = self.replay.restore_priorities(saved.priorities.as_ref());
+        restored.map_err(anyhow::Error::msg)?;
+        self.next_actor = saved.next_actor;
+        self.unwanted = saved.unwanted;
+        self.status = saved.status;
+        self.acting = saved.acting;
+        self.published = saved.published;
+        Ok(())
+    }
+
+    /// Updates so far.
+    pub(super) const fn updates(&self) -> u64 {
+        self.learner.updates()
+    }
+
+    /// Transitions stored so far.
+    pub(super) fn frames(&self) -> u64 {
+        self.replay.inserted_total()
+    }
+
+    /// What replay and learner say of themselves.
+    pub(super) fn status(&self) -> (ReplayStatus, &LearnerStatus) {
+        (self.replay.status(), &self.status)
+    }
+
+    /// Writes a checkpoint into `folder`, from which the run goes on exactly as it does now.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn save(&mut self, folder: &Path) -> anyhow::Result<()> {
+        let Some(replay) = self.replay.mark()? else {
+            return Ok(self.learner.save(folder)?);
+        };
+        let actors = self.actor_states()?.context(
+            "this world's state could be saved at the run's start and cannot be saved now",
+        )?;
+        let saved = SavedParts {
+            actors,
+            next_actor: self.next_actor,
+            unwanted: self.unwanted.clone(),
+            replay,
+            priorities: self.replay.saved_priorities(),
+            status: self.status.clone(),
+            acting: self.acting.clone(),
+            published: self.published,
+        };
+        Ok(self.learner.save_with(folder, Some(&saved.to_bytes()?))?)
+    }
+
+    /// One chunk of the next actor, then every update that it allows; `false` once all updates are done.
+    pub(super) fn round(&mut self) -> anyhow::Result<bool> {
+        let id = self.next_actor;
+        self.next_actor = (id + 1) % self.actors.len();
+        let chunk = self.actors[id].collect(self.replay.inserted_total(), self.steps_per_chunk)?;
+        loop {
+            match self.replay.insert(&chunk) {
+                InsertReply::Stored { .. } => break,
+                InsertReply::Wait { .. } => match self.replay.sample_between_marks(self.batch_size)
+                {
+                    Ok(batch) => self.learn(&batch)?,
+                    Err(_) if self.replay.is_refused_by_disk() => {
+                        bail!(
+                            "the run's folder cannot be written, as the log says: make room, then go on with --resume"
+                        )
+                    }
+                    Err(unready) => bail!("actor and learner wait for each other: {unready:?}"),
+                },
+                InsertReply::Finished { .. } => {
+                    self.unwanted[id] += chunk.header.transitions() as u64;
+                    break;
+                }
+                InsertReply::OutOfOrder { expected } => {
+                    bail!(
+                        "actor {id} is at chunk {}, not {expected}",
+                        chunk.header.sequence
+                    )
+                }
+                InsertReply::Refused { why } => bail!("the replay refused a chunk: {why}"),
+            }
+        }
+        loop {
+            match self.replay.sample_between_marks(self.batch_size) {
+                Ok(batch) => self.learn(&batch)?,
+                Err(Unready::Wait(_)) => return Ok(true),
+                Err(Unready::Finished) => return Ok(false),
+                Err(Unready::Refused { why }) => bail!("the replay refuses to sample: {why}"),
+            }
+        }
+    }
+
+    fn learn(&mut self, batch: &Batch) -> anyhow::Result<()> {
+        let report = self.learner.update(batch)?;
+        let number = self.learner.updates();
+        if let Some(priorities) = batch.priority_update(LEARNER, number, &report.row_kls) {
+            let set = self.replay.set_priorities(&priorities);
+            set.map_err(anyhow::Error::msg)
+                .context("the replay refused priorities")?;
+        }
+        self.learner.note(&report, &mut self.status);
+        if let Some(affinity) = self.learner.affinity_update(LEARNER) {
+            self.replay.set_affinity(&affinity)?;
+        }
+        if self.learner.publication_is_due() {
+            self.publish()?;
+        }
+        Ok(())
+    }
+
+    fn publish(&mut self) -> anyhow::Result<()> {
+        self.acting = self.learner.next_weights()?;
+        let Weights {
+            header,
+            safetensors,
+        } = &self.acting;
+        for actor in &mut self.actors {
+            actor.set_weights(header.version, safetensors)?;
+        }
+        self.published = self.learner.updates();
+        self.status.weights_version = header.version;
+        self.status.weights_sha256 = header.sha256_hex();
+        Ok(())
+    }
+
+    /// The last weights and everyone's last word.
+    pub(super) fn end(&mut self) -> anyhow::Result<()> {
+        if self.published != self.learner.updates() {
+            self.publish()?;
+        }
+        for (id, (actor, unwanted)) in self.actors.iter().zip(&self.unwanted).enumerate() {
+            let produced = actor.produced() - unwanted;
+            self.replay.goodbye(&Goodbye {
+                actor: id as u32,
+                incarnation: INCARNATION,
+                produced,
+            });
+        }
+        self.status.finished = true;
+        Ok(())
+    }
+}

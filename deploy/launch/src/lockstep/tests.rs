@@ -1,0 +1,231 @@
+//! What a run in lockstep computes, and that one that was interrupted computes the same.
+
+use driml_machine::resources::Machine;
+use driml_settings::{
+    presets::preset,
+    resolve::{Flags, Source, resolve},
+};
+
+use super::*;
+
+fn config(world: &str, agent: &'static str, frames: u64, sets: &[&str]) -> RunConfig {
+    let machine = Machine {
+        cores: 2,
+        memory_bytes: 16 << 30,
+    };
+    let source = Source::Layers(preset("smoke").unwrap(), world.parse().unwrap(), agent);
+    let flags = Flags {
+        frames: Some(frames),
+        actors: Some(2),
+        sets: sets.iter().map(|&set| set.into()).collect(),
+        ..Flags::default()
+    };
+    resolve(&source, &flags, &machine).unwrap()
+}
+
+fn frame(config: &RunConfig) -> (u32, u32) {
+    (config.run.frame_height, config.run.frame_width)
+}
+
+fn sha256(lockstep: &Lockstep) -> String {
+    lockstep.status().1.weights_sha256.clone()
+}
+
+/// The SHA-256 of the weights after a whole run.
+fn weights(config: &RunConfig) -> String {
+    let mut lockstep = Lockstep::in_memory(config).unwrap();
+    while lockstep.round().unwrap() {}
+    lockstep.end().unwrap();
+    sha256(&lockstep)
+}
+
+/// Worlds that are made so large that a convolution leaves a border out: as it is drawn, and enlarged.
+#[test]
+fn a_border_that_no_convolution_reads_changes_no_bit() {
+    let chain = [
+        "world.height=15",
+        "world.width=17",
+        "input.height=15",
+        "input.width=17",
+    ];
+    let pacman = ["input.height=88", "input.width=90"];
+    for (world, sets, cut, whole) in [
+        ("chain", &chain[..], (14, 16), (15, 17)),
+        ("mspacman", &pacman, (20, 18), (21, 19)),
+    ] {
+        for precision in ["f32", "bf16"] {
+            let precision = [
+                format!("learner.precision={precision}"),
+                format!("actor.precision={precision}"),
+            ];
+            let sets: Vec<&str> = sets
+                .iter()
+                .copied()
+                .chain(precision.iter().map(String::as_str))
+                .collect();
+            let config = config(world, "driml-ada", 400, &sets);
+            let before = config.with_whole_frames().unwrap();
+            assert_eq!((frame(&config), frame(&before)), (cut, whole));
+            assert_eq!(weights(&config), weights(&before), "{world}, {sets:?}");
+        }
+    }
+}
+
+/// A random crop reads what no convolution of the whole frame does.
+#[test]
+fn where_states_are_augmented_frames_stay_whole() {
+    let sets = [
+        "world.height=15",
+        "world.width=17",
+        "input.height=15",
+        "input.width=17",
+    ];
+    let config = config("chain", "curl", 400, &sets);
+    assert_eq!(frame(&config), (15, 17));
+    assert_eq!((config.model.height, config.model.width), (15, 17));
+    weights(&config);
+}
+
+/// Saves after so many rounds, goes on for `lost` more, which come to nothing, and ends what goes on from there.
+fn resumed_weights(config: &RunConfig, rounds: usize, lost: usize) -> String {
+    let folder = tempfile::tempdir().unwrap();
+    let run_dir = RunFolder::new(folder.path());
+    let mut lockstep = Lockstep::begin(config, &run_dir).unwrap();
+    (0..rounds).for_each(|_| assert!(lockstep.round().unwrap()));
+    lockstep.save(&run_dir.checkpoints()).unwrap();
+    (0..lost).for_each(|_| assert!(lockstep.round().unwrap()));
+    drop(lockstep);
+    let mut lockstep = Lockstep::resume(config, &run_dir).unwrap();
+    while lockstep.round().unwrap() {}
+    lockstep.end().unwrap();
+    sha256(&lockstep)
+}
+
+/// The numbers of Rainbow.
+const PRIORITISED: &str =
+    "replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}";
+
+/// Before the first update, and late; a ring that is full by then, and one that is compressed.
+#[test]
+fn a_run_that_was_interrupted_computes_what_it_would_have() {
+    let small = ["replay.capacity_transitions=320"];
+    let packed = ["replay.compression=lz4", "replay.capacity_transitions=320"];
+    let prioritised = [PRIORITISED, "replay.capacity_transitions=320"];
+    for (world, agent, sets) in [
+        ("chain", "driml-ada", &small[..]),
+        ("mspacman", "driml-ada", &packed),
+        ("mspacman", "curl", &[]),
+        ("ising", "driml-fix", &[]),
+        ("mspacman", "driml-ada", &prioritised),
+    ] {
+        let config = config(world, agent, 800, sets);
+        let whole = weights(&config);
+        for (rounds, lost) in [(1, 3), (14, 5)] {
+            let resumed = resumed_weights(&config, rounds, lost);
+            assert_eq!(
+                resumed, whole,
+                "{world} {agent} {sets:?} after {rounds} rounds"
+            );
+        }
+    }
+}
+
+/// By which rule rows are drawn decides the weights, and a checkpoint of the one rule is none of the other.
+#[test]
+fn rows_that_are_drawn_by_priority_are_others() {
+    let uniform = config("chain", "c51", 800, &[]);
+    let prioritised = config("chain", "c51", 800, &[PRIORITISED]);
+    assert_eq!(weights(&prioritised), weights(&prioritised));
+    assert_ne!(weights(&prioritised), weights(&uniform));
+
+    let folder = tempfile::tempdir().unwrap();
+    let run_dir = RunFolder::new(folder.path());
+    let mut lockstep = Lockstep::begin(&uniform, &run_dir).unwrap();
+    (0..9).for_each(|_| assert!(lockstep.round().unwrap()));
+    lockstep.save(&run_dir.checkpoints()).unwrap();
+    drop(lockstep);
+    let error = Lockstep::resume(&prioritised, &run_dir).map(drop);
+    let why = format!("{:#}", error.unwrap_err());
+    assert!(
+        why.contains("replay.sampling is another rule than it was"),
+        "{why}"
+    );
+}
+
+/// Each resumption begins where the one before it saved.
+#[test]
+fn a_run_that_is_interrupted_again_and_again_computes_the_same() {
+    let config = config("mspacman", "driml-ada", 800, &[]);
+    let whole = weights(&config);
+    let folder = tempfile::tempdir().unwrap();
+    let run_dir = RunFolder::new(folder.path());
+    let mut lockstep = Lockstep::begin(&config, &run_dir).unwrap();
+    while lockstep.round().unwrap() {
+        lockstep.save(&run_dir.checkpoints()).unwrap();
+        drop(lockstep);
+        lockstep = Lockstep::resume(&config, &run_dir).unwrap();
+    }
+    lockstep.end().unwrap();
+    assert_eq!(sha256(&lockstep), whole);
+}
+
+/// A run that ended goes on as a longer one would have.
+#[test]
+fn a_finished_run_that_goes_on_computes_what_a_longer_one_would_have() {
+    let folder = tempfile::tempdir().unwrap();
+    let run_dir = RunFolder::new(folder.path());
+    let short = config("mspacman", "driml-ada", 512, &[]);
+    let mut lockstep = Lockstep::begin(&short, &run_dir).unwrap();
+    while lockstep.round().unwrap() {}
+    lockstep.save(&run_dir.checkpoints()).unwrap();
+    lockstep.end().unwrap();
+    drop(lockstep);
+    let long = config("mspacman", "driml-ada", 1024, &[]);
+    let mut lockstep = Lockstep::resume(&long, &run_dir).unwrap();
+    while lockstep.round().unwrap() {}
+    lockstep.end().unwrap();
+    assert_eq!(sha256(&lockstep), weights(&long));
+}
+
+#[test]
+fn what_cannot_go_on_says_why() {
+    let config = config("chain", "c51", 800, &[]);
+    let begun = || {
+        let folder = tempfile::tempdir().unwrap();
+        let run_dir = RunFolder::new(folder.path());
+        let mut lockstep = Lockstep::begin(&config, &run_dir).unwrap();
+        (0..9).for_each(|_| assert!(lockstep.round().unwrap()));
+        lockstep.save(&run_dir.checkpoints()).unwrap();
+        (folder, run_dir)
+    };
+    let said = |run_dir: &RunFolder| {
+        let error = Lockstep::resume(&config, run_dir).map(drop).unwrap_err();
+        format!("{error:#}")
+    };
+    let segments = |run_dir: &RunFolder| {
+        let files = std::fs::read_dir(run_dir.replay()).unwrap();
+        let mut paths: Vec<_> = files.map(|it| it.unwrap().path()).collect();
+        paths.retain(|path| path.extension().is_some_and(|it| it == "log"));
+        paths.sort();
+        paths
+    };
+    // The newest segment begins with the mark, the one before it has the transitions.
+    let (_folder, run_dir) = begun();
+    std::fs::remove_file(segments(&run_dir).pop().unwrap()).unwrap();
+    let why = said(&run_dir);
+    assert!(
+        why.contains("is missing or damaged: the replay cannot go back"),
+        "{why}"
+    );
+    let (_folder, run_dir) = begun();
+    std::fs::remove_file(&segments(&run_dir)[0]).unwrap();
+    let why = said(&run_dir);
+    assert!(why.contains("the run cannot go on as it was"), "{why}");
+    // A learner's own checkpoint.
+    let (_folder, run_dir) = begun();
+    std::fs::remove_dir_all(run_dir.checkpoints()).unwrap();
+    let mut unkept = Lockstep::in_memory(&config).unwrap();
+    unkept.save(&run_dir.checkpoints()).unwrap();
+    let why = said(&run_dir);
+    assert!(why.contains("is not of a run in lockstep"), "{why}");
+}

@@ -1,0 +1,95 @@
+//! The processes of a run, as far as they were started: replay servers, learner and actors.
+//! It does not know when they start or why they end.
+
+use std::time::{Duration, Instant};
+
+use anyhow::bail;
+use driml_machine::units::duration;
+
+use crate::managed_process::ManagedProcess;
+
+/// How long a process that was killed may take to end.
+const KILLED_MAX: Duration = Duration::from_secs(30);
+
+/// The processes by what they do.
+#[derive(Default)]
+pub(crate) struct Processes {
+    /// One for each shard.
+    pub(crate) replay_servers: Vec<ManagedProcess>,
+    /// The one learner.
+    pub(crate) learner: Option<ManagedProcess>,
+    /// By their numbers.
+    pub(crate) actors: Vec<ManagedProcess>,
+}
+
+impl Processes {
+    /// Replay servers, learner, actors, in this order.
+    fn all(&self) -> impl Iterator<Item = &ManagedProcess> {
+        let first = self.replay_servers.iter().chain(&self.learner);
+        first.chain(&self.actors)
+    }
+
+    /// Memory of each in MiB, in the order of [`Processes::all`]; none of one that has ended.
+    pub(crate) fn rss_mib(&mut self) -> Vec<Option<f64>> {
+        let first = self.replay_servers.iter_mut().chain(&mut self.learner);
+        let all = first.chain(&mut self.actors);
+        all.map(ManagedProcess::rss_mib).collect()
+    }
+
+    /// What to say of each whose log is not complete.
+    pub(crate) fn missing_log_lines(&self) -> Vec<String> {
+        self.all()
+            .filter_map(ManagedProcess::missing_log_lines)
+            .collect()
+    }
+
+    /// Checks that all are as they should be: running, or actors that are not needed any more.
+    ///
+    /// # Errors
+    /// The first that has ended, and its last words.
+    pub(crate) fn check_alive(&mut self) -> anyhow::Result<()> {
+        for process in self.replay_servers.iter_mut().chain(&mut self.learner) {
+            if process.end().is_some() {
+                bail!("{}", process.exit_report());
+            }
+        }
+        for actor in &mut self.actors {
+            if actor.end().is_some_and(|status| !status.success()) {
+                bail!("{}", actor.exit_report());
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left.
+pub(crate) fn stop(
+    processes: &mut [ManagedProcess],
+    ask: bool,
+    drain_max: Duration,
+    abort: &impl Fn() -> bool,
+) -> Vec<String> {
+    if ask {
+        processes.iter_mut().for_each(ManagedProcess::ask_to_stop);
+    }
+    let deadline = Instant::now() + drain_max;
+    let mut late = Vec::new();
+    for process in processes {
+        match process.wait_until(deadline, abort) {
+            Some(status) if status.success() => {}
+            Some(_) => late.push(process.exit_report()),
+            None => {
+                if !abort() {
+                    late.push(format!(
+                        "{} did not end within {} and was killed",
+                        process.name,
+                        duration(drain_max)
+                    ));
+                }
+                process.kill();
+                process.wait_until(Instant::now() + KILLED_MAX, || false);
+            }
+        }
+    }
+    late
+}

@@ -1,0 +1,207 @@
+//! The bytes of TensorBoard's event files: protobuf's wire format for the few messages that are written, and the frame of a record.
+//! By hand, as these are five small messages: `prost` brings a compiler, `tfrecord` an async runtime, and `tensorboard-rs` has stood
+//! still since 2021.
+//!
+//! Sources: `event.proto`, `summary.proto` and `record_writer.cc` of TensorFlow. Field numbers are theirs.
+
+/// What all of a file's events are read as.
+const FILE_VERSION: &str = "brain.Event:2";
+/// Protobuf's types on the wire.
+const VARINT: u8 = 0;
+const FIXED64: u8 = 1;
+const BYTES: u8 = 2;
+const FIXED32: u8 = 5;
+
+/// One thing that is shown, under its name.
+#[derive(Debug)]
+pub(super) enum Value<'a> {
+    /// A point of a curve.
+    Scalar(f32),
+    /// How often each of 0, 1, 2, ... was counted.
+    Counts(&'a [u64]),
+    /// A PNG.
+    Image {
+        width: usize,
+        height: usize,
+        png: &'a [u8],
+    },
+}
+
+/// When something was so: seconds since 1970, and the step that it is drawn over.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct At {
+    pub(super) seconds: f64,
+    pub(super) step: u64,
+}
+
+/// The record that a file begins with.
+pub(super) fn version(at: At) -> Vec<u8> {
+    let mut event = event(at);
+    bytes(&mut event, 3, FILE_VERSION.as_bytes());
+    record(&event)
+}
+
+/// A record that says that what was written before for this step or later does not count any more.
+pub(super) fn begin_anew(at: At) -> Vec<u8> {
+    const START: u64 = 1;
+    let mut session = Vec::new();
+    number(&mut session, 1, START);
+    let mut event = event(at);
+    bytes(&mut event, 7, &session);
+    record(&event)
+}
+
+/// A record of values by name.
+pub(super) fn summary(at: At, values: &[(String, Value<'_>)]) -> Vec<u8> {
+    let mut all = Vec::new();
+    for (name, value) in values {
+        let mut one = Vec::new();
+        bytes(&mut one, 1, name.as_bytes());
+        match value {
+            Value::Scalar(value) => {
+                key(&mut one, 2, FIXED32);
+                one.extend(value.to_le_bytes());
+            }
+            Value::Counts(counts) => bytes(&mut one, 5, &histogram(counts)),
+            Value::Image { width, height, png } => {
+                const RGB: u64 = 3;
+                let mut image = Vec::new();
+                for (field, value) in [(1, *height as u64), (2, *width as u64), (3, RGB)] {
+                    number(&mut image, field, value);
+                }
+                bytes(&mut image, 4, png);
+                bytes(&mut one, 4, &image);
+            }
+        }
+        bytes(&mut all, 1, &one);
+    }
+    let mut event = event(at);
+    bytes(&mut event, 5, &all);
+    record(&event)
+}
+
+/// A `HistogramProto` in which each number has a bucket of its own, from half below it to half above. Its least and largest value are
+/// those buckets' ends, as TensorBoard draws nothing beyond them.
+fn histogram(counts: &[u64]) -> Vec<u8> {
+    let total = counts.iter().map(|&n| n as f64).sum::<f64>();
+    let (mut sum, mut squares) = (0.0, 0.0);
+    for (value, &n) in counts.iter().enumerate() {
+        sum += value as f64 * n as f64;
+        squares += (value * value) as f64 * n as f64;
+    }
+    let counted = |(_, n): &(usize, &u64)| **n > 0;
+    let least = counts.iter().enumerate().find(counted);
+    let most = counts.iter().enumerate().rfind(counted);
+    let [least, most] = [(least, -0.5), (most, 0.5)]
+        .map(|(found, half)| found.map_or(0.0, |(value, _)| value as f64 + half));
+    let mut histogram = Vec::new();
+    for (field, value) in [(1, least), (2, most), (3, total), (4, sum), (5, squares)] {
+        key(&mut histogram, field, FIXED64);
+        histogram.extend(f64::to_le_bytes(value));
+    }
+    // A first, empty bucket ends where that of 0 begins.
+    let limits = (0..=counts.len()).map(|value| value as f64 - 0.5);
+    let numbers = std::iter::once(0.0).chain(counts.iter().map(|&n| n as f64));
+    bytes(&mut histogram, 6, &packed(limits));
+    bytes(&mut histogram, 7, &packed(numbers));
+    histogram
+}
+
+fn packed(values: impl Iterator<Item = f64>) -> Vec<u8> {
+    values.flat_map(f64::to_le_bytes).collect()
+}
+
+fn event(At { seconds, step }: At) -> Vec<u8> {
+    let mut event = Vec::new();
+    key(&mut event, 1, FIXED64);
+    event.extend(seconds.to_le_bytes());
+    number(&mut event, 2, step);
+    event
+}
+
+fn key(out: &mut Vec<u8>, field: u8, kind: u8) {
+    out.push(field << 3 | kind);
+}
+
+fn number(out: &mut Vec<u8>, field: u8, value: u64) {
+    key(out, field, VARINT);
+    varint(out, value);
+}
+
+fn bytes(out: &mut Vec<u8>, field: u8, value: &[u8]) {
+    key(out, field, BYTES);
+    varint(out, value.len() as u64);
+    out.extend(value);
+}
+
+/// Seven bits a byte, the lowest first; all but the last byte have the eighth.
+fn varint(out: &mut Vec<u8>, mut value: u64) {
+    while value > 0x7f {
+        out.push(value as u8 | 0x80);
+        value >>= 7;
+    }
+    out.push(value as u8);
+}
+
+/// Length, its checksum, the data, its checksum.
+fn record(data: &[u8]) -> Vec<u8> {
+    let length = (data.len() as u64).to_le_bytes();
+    let mut record = length.to_vec();
+    record.extend(masked(crc32c(&length)).to_le_bytes());
+    record.extend(data);
+    record.extend(masked(crc32c(data)).to_le_bytes());
+    record
+}
+
+/// A checksum of data that may hold checksums.
+pub(super) const fn masked(crc: u32) -> u32 {
+    crc.rotate_right(15).wrapping_add(0xa282_ead8)
+}
+
+/// CRC-32C (Castagnoli), bit by bit: records are a kilobyte a second.
+pub(super) fn crc32c(data: &[u8]) -> u32 {
+    const POLYNOMIAL: u32 = 0x82f6_3b78;
+    let mut crc = u32::MAX;
+    for &byte in data {
+        crc ^= u32::from(byte);
+        for _ in 0..8 {
+            crc = crc >> 1 ^ if crc & 1 == 1 { POLYNOMIAL } else { 0 };
+        }
+    }
+    !crc
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Source: RFC 3720, appendix B.4, and the usual check value.
+    #[test]
+    fn checksums_are_the_standard_s() {
+        assert_eq!(crc32c(b"123456789"), 0xe306_9283);
+        assert_eq!(crc32c(&[0; 32]), 0x8a91_36aa);
+        assert_eq!(crc32c(&[0xff; 32]), 0x62a8_ab43);
+    }
+
+    #[test]
+    fn a_record_is_framed_and_a_scalar_has_its_fields() {
+        let at = At {
+            seconds: 1.5,
+            step: 300,
+        };
+        let record = summary(at, &[("a/b".into(), Value::Scalar(0.25))]);
+        let length = u64::from_le_bytes(record[..8].try_into().unwrap()) as usize;
+        assert_eq!(record.len(), 8 + 4 + length + 4);
+        let data = &record[12..12 + length];
+        assert_eq!(record[8..12], masked(crc32c(&record[..8])).to_le_bytes());
+        assert_eq!(record[12 + length..], masked(crc32c(data)).to_le_bytes());
+        let mut wanted = vec![9];
+        wanted.extend(1.5f64.to_le_bytes());
+        wanted.extend([16, 0xac, 2]);
+        // summary { value { tag: "a/b" simple_value: 0.25 } }
+        wanted.extend([
+            42, 12, 10, 10, 10, 3, b'a', b'/', b'b', 21, 0, 0, 0x80, 0x3e,
+        ]);
+        assert_eq!(data, wanted);
+    }
+}

@@ -1,0 +1,290 @@
+//! TensorBoard's event file beside `metrics.csv`: every row as points of curves over frames, histograms of k and of actions, and
+//! pictures of the action affinity A. Nothing of this program reads it.
+//!
+//! A resumed run begins another file, which takes back what the one before has beyond the rows that stay; TensorBoard reads both.
+
+mod encode;
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
+};
+
+use anyhow::Context;
+use driml_figure::{Area, Ink, Picture};
+use driml_learner::AffinityEstimator;
+use driml_protocol::ReplayStatus;
+
+use self::encode::{At, Value};
+use super::{folder::RunFolder, growing_file::GrowingFile};
+
+/// How often histograms are written, and looked whether there is another A; curves are written with each row.
+const SLOW_PERIOD: Duration = Duration::from_secs(10);
+/// Pixels of one entry of A, of what stands below, and around.
+const CELL: usize = 24;
+const CAPTION: usize = 22;
+const MARGIN: usize = 8;
+
+/// The event file of a run that goes on.
+#[derive(Debug)]
+pub(super) struct Events {
+    file: GrowingFile,
+    checkpoints: PathBuf,
+    /// The column that curves are drawn over, and those that are drawn.
+    columns: Vec<String>,
+    slow_at: Option<Instant>,
+    /// Counts when histograms were written last.
+    k: Vec<u64>,
+    actions: Vec<u64>,
+    /// Updates of the checkpoint whose A was drawn last.
+    drawn: Option<u64>,
+}
+
+impl Events {
+    /// Begins a file; rows beyond `frames_kept` of a run that is resumed are taken back.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn create(
+        folder: &RunFolder,
+        columns: Vec<String>,
+        frames_kept: Option<u64>,
+    ) -> anyhow::Result<Self> {
+        let seconds = now();
+        let name = |number: u32| match number {
+            0 => format!("events.out.tfevents.{:010}.driml", seconds as u64),
+            _ => format!("events.out.tfevents.{:010}.driml.{number}", seconds as u64),
+        };
+        let mut paths = (0..).map(|number| folder.path().join(name(number)));
+        let path = paths.find(|path| !path.exists());
+        let path = path.context("naming an event file")?;
+        let mut first = encode::version(At { seconds, step: 0 });
+        if let Some(frames) = frames_kept {
+            let step = frames + 1;
+            first.extend(encode::begin_anew(At { seconds, step }));
+        }
+        Ok(Self {
+            file: GrowingFile::create(&path, &first)?,
+            checkpoints: folder.checkpoints(),
+            columns,
+            slow_at: None,
+            k: Vec::new(),
+            actions: Vec::new(),
+            drawn: None,
+        })
+    }
+
+    /// Adds a row of metrics, and from time to time and at the run's end what is not in it. A warning is returned as by
+    /// [`GrowingFile::add`].
+    pub(super) fn add(
+        &mut self,
+        row: &[String],
+        replay: &ReplayStatus,
+        is_last: bool,
+    ) -> Option<String> {
+        let at = At {
+            seconds: now(),
+            step: replay.transitions_inserted,
+        };
+        // Cells that are empty or text are no points.
+        let points = self.columns.iter().zip(row).filter_map(|(column, cell)| {
+            let value: f64 = cell.parse().ok()?;
+            let is_step = column == "frames";
+            (!is_step).then(|| (tag(column), Value::Scalar(value as f32)))
+        });
+        let said = self
+            .file
+            .add(encode::summary(at, &points.collect::<Vec<_>>()));
+        let was = self.slow_at;
+        if !is_last && was.is_some_and(|last| last.elapsed() < SLOW_PERIOD) {
+            return said;
+        }
+        self.slow_at = Some(Instant::now());
+        let mut counted = Vec::new();
+        for (name, now, before) in [
+            ("k/served", &replay.k_histogram, &mut self.k),
+            (
+                "actions/stored",
+                &replay.action_histogram,
+                &mut self.actions,
+            ),
+        ] {
+            let since = since(now, before);
+            before.clone_from(now);
+            if since.iter().any(|&n| n > 0) {
+                counted.push((name.to_owned(), since));
+            }
+        }
+        let histograms = counted
+            .iter()
+            .map(|(name, counts)| (name.clone(), Value::Counts(counts)));
+        let histograms: Vec<_> = histograms.collect();
+        let more =
+            (!histograms.is_empty()).then(|| self.file.add(encode::summary(at, &histograms)));
+        let drawn = self.affinity(at);
+        said.or(more.flatten()).or(drawn)
+    }
+
+    /// Draws A of a checkpoint that was not there before. One that cannot be read just now is tried again.
+    fn affinity(&mut self, at: At) -> Option<String> {
+        let (updates, path) = newest(&self.checkpoints)?;
+        if self.drawn.is_some_and(|drawn| drawn >= updates) {
+            return None;
+        }
+        let text = fs::read(path.join("state.json")).ok()?;
+        let mut state: serde_json::Value = serde_json::from_slice(&text).ok()?;
+        let affinity: Option<AffinityEstimator> =
+            serde_json::from_value(state["affinity"].take()).ok()?;
+        self.drawn = Some(updates);
+        let affinity = affinity?;
+        let picture = draw(affinity.num_actions(), affinity.matrix()).ok()?;
+        let (width, height) = picture.size();
+        let png = picture.png().ok()?;
+        let image = Value::Image {
+            width,
+            height,
+            png: &png,
+        };
+        self.file
+            .add(encode::summary(at, &[("affinity/A".to_owned(), image)]))
+    }
+
+    /// What is missing in the file, as [`GrowingFile::missing`] says it.
+    pub(super) fn missing(&self) -> Option<String> {
+        self.file.missing()
+    }
+}
+
+fn now() -> f64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH);
+    since.unwrap_or_default().as_secs_f64()
+}
+
+/// The name of a column's curve: TensorBoard shows those beside each other that agree up to the slash.
+fn tag(column: &str) -> String {
+    let group = match column {
+        "mean_return" | "mean_return_of" | "episodes" => "return",
+        "total_loss" | "c51_kl" | "grad_norm" | "q_mean" => "learning",
+        "mean_k" | "sd_k" => "k",
+        "frames_per_second" | "updates_per_second" => "speed",
+        "seconds" | "updates" | "replay_ratio" | "mean_age" | "weights_version"
+        | "affinity_version" | "actors" => "run",
+        _ if column.starts_with("rss_mib") => "memory",
+        // The auxiliary losses have the agents' own names.
+        _ => "learning",
+    };
+    format!("{group}/{column}")
+}
+
+/// What was counted since `before`; all of it where a counter is another one.
+fn since(now: &[u64], before: &[u64]) -> Vec<u64> {
+    let before = before.iter().copied().chain(std::iter::repeat(0));
+    let difference: Option<Vec<_>> = now
+        .iter()
+        .zip(before)
+        .map(|(now, before)| now.checked_sub(before))
+        .collect();
+    difference.unwrap_or_else(|| now.to_vec())
+}
+
+/// The newest whole checkpoint in a folder that the learner writes to just now.
+fn newest(checkpoints: &Path) -> Option<(u64, PathBuf)> {
+    let entries = fs::read_dir(checkpoints).ok()?;
+    let whole = entries.filter_map(|entry| {
+        let path = entry.ok()?.path();
+        let updates = path.file_name()?.to_str()?.strip_prefix("checkpoint-")?;
+        Some((updates.parse().ok()?, path))
+    });
+    whole.max()
+}
+
+/// A as cells, each row an action, each column the next one.
+fn draw(side: usize, matrix: &[f32]) -> anyhow::Result<Picture> {
+    let length = side * CELL;
+    let width = (length + 2 * MARGIN).max(320);
+    let mut picture = Picture::new(width, length + 2 * MARGIN + CAPTION)?;
+    let most = matrix.iter().copied().fold(f32::MIN_POSITIVE, f32::max);
+    let shares: Vec<_> = matrix.iter().map(|a| f64::from(a / most)).collect();
+    let area = Area {
+        x: MARGIN,
+        y: MARGIN,
+        width: length,
+        height: length,
+    };
+    picture.cells(area, side, &shares);
+    let caption = format!("A: row, action; column, next; light: {most:.3}");
+    let below = (MARGIN, length + MARGIN + CAPTION - 5);
+    picture.text(below, width - 2 * MARGIN, Ink::Soft, &caption);
+    Ok(picture)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_are_those_since_the_last_histogram() {
+        assert_eq!(since(&[1, 5, 2], &[1, 2]), [0, 3, 2]);
+        assert_eq!(since(&[1, 0], &[2, 0]), [1, 0], "of another server");
+    }
+
+    #[test]
+    fn every_column_has_a_group() {
+        for (column, wanted) in [
+            ("mean_return", "return/mean_return"),
+            ("dim_3t3", "learning/dim_3t3"),
+            ("rss_mib_actor_0", "memory/rss_mib_actor_0"),
+            ("replay_ratio", "run/replay_ratio"),
+        ] {
+            assert_eq!(tag(column), wanted);
+        }
+    }
+
+    /// Records are whole, in order and right by their sums, as a reader wants them.
+    #[test]
+    fn a_file_is_records_of_which_each_is_right() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        let columns = ["frames", "mean_return", "waiting"]
+            .map(String::from)
+            .to_vec();
+        let mut events = Events::create(&folder, columns.clone(), None).unwrap();
+        let replay = ReplayStatus {
+            transitions_inserted: 70,
+            k_histogram: vec![0, 4, 1],
+            ..ReplayStatus::default()
+        };
+        let row = ["70", "1.5", "nobody waits"].map(String::from);
+        assert_eq!(events.add(&row, &replay, false), None);
+        let again = Events::create(&folder, columns, Some(70)).unwrap();
+        assert_eq!(again.missing(), None);
+        let mut counts = Vec::new();
+        let mut paths: Vec<_> = fs::read_dir(root.path())
+            .unwrap()
+            .map(|it| it.unwrap().path())
+            .collect();
+        paths.sort();
+        for path in paths {
+            let text = fs::read(path).unwrap();
+            let mut rest = &text[..];
+            let mut records = 0;
+            while !rest.is_empty() {
+                let (length, after) = rest.split_at(8);
+                let (sum, after) = after.split_at(4);
+                assert_eq!(sum, encode::masked(encode::crc32c(length)).to_le_bytes());
+                let length = u64::from_le_bytes(length.try_into().unwrap()) as usize;
+                let (data, after) = after.split_at(length);
+                let (sum, after) = after.split_at(4);
+                assert_eq!(sum, encode::masked(encode::crc32c(data)).to_le_bytes());
+                (rest, records) = (after, records + 1);
+            }
+            counts.push(records);
+        }
+        assert_eq!(
+            counts,
+            [3, 2],
+            "version, curves, histogram; version, what is taken back"
+        );
+    }
+}

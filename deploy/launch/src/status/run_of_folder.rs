@@ -1,0 +1,57 @@
+//! Where the parts of the run in a folder can be asked, or what the folder says of a run that is over.
+
+use driml_machine::error::usage;
+use driml_settings::config::RunConfig;
+
+use crate::{
+    resume,
+    run_folder::{RunFolder, Summary, progress},
+};
+
+/// Whether somebody runs in a folder.
+pub enum Live {
+    /// The endpoints of its replay servers.
+    At(Vec<String>),
+    /// Nobody: how it ended and how it would go on, for a person.
+    Over(String),
+}
+
+/// Looks into the folder of a run.
+///
+/// # Errors
+/// It is no run's, or one of parts that were started by hand.
+pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
+    let config = std::fs::read_to_string(folder.config()).map_err(|e| {
+        usage!(
+            "{} is no run folder: reading {}: {e}",
+            folder.display(),
+            folder.config().display()
+        )
+    })?;
+    let endpoints = std::fs::read_to_string(folder.endpoints()).ok();
+    // Whoever runs there holds the lock.
+    if folder.lock().is_err()
+        && let Some(endpoints) = endpoints
+    {
+        return Ok(Live::At(endpoints.lines().map(str::to_owned).collect()));
+    }
+    if Summary::is_finished(folder) {
+        let summary = Summary::read(folder)?.describe(folder);
+        return Ok(Live::Over(format!("the run is over\n{summary}")));
+    }
+    let so_far = progress(folder).map_or("nothing".into(), |so_far| {
+        format!("{} frames and {} episodes", so_far.frames, so_far.episodes)
+    });
+    let config = RunConfig::parse(&folder.config().display().to_string(), &config)?;
+    let next = match resume::is_resumable(&config.world, folder) {
+        true => format!(
+            "`driml local --resume {}` goes on with it",
+            folder.display()
+        ),
+        false => "it has no checkpoint to go on from".into(),
+    };
+    Ok(Live::Over(format!(
+        "nobody runs in {}, which holds {so_far}: {next}. A run whose parts were started by hand is asked with --connect ENDPOINT\n",
+        folder.display()
+    )))
+}

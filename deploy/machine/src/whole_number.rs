@@ -1,0 +1,93 @@
+//! Whole numbers as people write them: `1000000`, `1_000_000`, `1e6`, `2.5e5`.
+//! It rounds nothing: what is not whole is no number here.
+
+use std::ops::RangeInclusive;
+
+/// Reads a whole number.
+///
+/// # Errors
+/// A text that is none, or one of 2^64 and more; what to write, for a person.
+pub fn read(text: &str) -> Result<u64, String> {
+    let none = || format!("{text:?} is no whole number; write one as 1000000, 1_000_000 or 1e6");
+    let plain = text.replace('_', "");
+    let (mantissa, exponent) = plain.split_once(['e', 'E']).unwrap_or((&plain, "0"));
+    let (whole, part) = mantissa.split_once('.').unwrap_or((mantissa, ""));
+    let part = part.trim_end_matches('0');
+    let digits = format!("{whole}{part}");
+    if digits.is_empty() || whole.is_empty() || !digits.bytes().all(|it| it.is_ascii_digit()) {
+        return Err(none());
+    }
+    let exponent: usize = exponent.parse().map_err(|_| none())?;
+    let zeros = exponent.checked_sub(part.len()).ok_or_else(none)?;
+    // No number of 64 bits has more digits.
+    let zeros = if digits.bytes().all(|it| it == b'0') {
+        0
+    } else {
+        zeros.min(20)
+    };
+    let digits = digits + &"0".repeat(zeros);
+    digits
+        .parse()
+        .map_err(|_| format!("{text} is more than {}", u64::MAX))
+}
+
+/// A flag's parser of whole numbers in `range`.
+pub fn within(
+    range: RangeInclusive<u64>,
+) -> impl Fn(&str) -> Result<u64, String> + Clone + Send + Sync + 'static {
+    move |text| {
+        let number = read(text)?;
+        if range.contains(&number) {
+            Ok(number)
+        } else {
+            Err(format!(
+                "{number} is not in {}..={}",
+                range.start(),
+                range.end()
+            ))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_read_as_they_are_written() {
+        for (text, number) in [
+            ("0", 0),
+            ("1000000", 1_000_000),
+            ("1_000_000", 1_000_000),
+            ("1e6", 1_000_000),
+            ("1E6", 1_000_000),
+            ("2.5e5", 250_000),
+            ("1.0", 1),
+            ("1.50e1", 15),
+            ("0e99", 0),
+            ("18446744073709551615", u64::MAX),
+        ] {
+            assert_eq!(read(text), Ok(number), "{text}");
+        }
+    }
+
+    #[test]
+    fn what_is_not_whole_is_refused() {
+        for text in [
+            "", "ten", "-1", "1.5", "1e-1", "1.25e1", "e6", ".5e1", "1e", "1e6x", "+", "_",
+            "1e1e1", "0x10",
+        ] {
+            let said = read(text).unwrap_err();
+            assert!(
+                said.contains("is no whole number; write one as"),
+                "{text}: {said}"
+            );
+        }
+        for text in ["18446744073709551616", "1e20", "1e99999999"] {
+            assert!(read(text).unwrap_err().contains("is more than"), "{text}");
+        }
+        let few = within(1..=10);
+        assert_eq!(few("1e1"), Ok(10));
+        assert_eq!(few("11").unwrap_err(), "11 is not in 1..=10");
+    }
+}

@@ -1,0 +1,187 @@
+"""A run's network in PyTorch: loads the newest checkpoint of a run folder, and exports what acts as ONNX.
+
+    python driml_net.py RUN                    # what the network is, and its values for a blank state
+    python driml_net.py RUN --onnx net.onnx    # the acting network: states in, expected returns out
+
+    from driml_net import load
+    network, run = load("runs/pacman")
+    q = network(states)                        # states u8 [B, H, W, C] as weights.md says; q [B, A]
+
+PyTorch is needed, and `onnx` and `onnxscript` for --onnx. Everything it must know is in the checkpoint's own metadata or, for
+checkpoints of earlier versions, in the run's config.toml. Conventions: weights.md beside this file.
+"""
+
+import argparse
+import json
+import struct
+from pathlib import Path
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+DTYPES = {"F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16}
+
+
+def read_safetensors(path):
+    """Tensors by name, as f32, and the metadata of a safetensors file; the format is 8 bytes of length, JSON, and bytes."""
+    data = Path(path).read_bytes()
+    (length,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + length])
+    metadata = header.pop("__metadata__", {})
+    tensors = {}
+    for name, entry in header.items():
+        start, end = (8 + length + offset for offset in entry["data_offsets"])
+        raw = torch.frombuffer(bytearray(data[start:end]), dtype=DTYPES[entry["dtype"]])
+        tensors[name] = raw.reshape(entry["shape"]).float()
+    return tensors, metadata
+
+
+def newest_checkpoint(run):
+    """The folder of the newest checkpoint of a run."""
+    found = sorted(path for path in Path(run, "checkpoints").glob("checkpoint-*") if path.name[11:].isdigit())
+    if not found:
+        raise SystemExit(f"{run} has no checkpoint")
+    return found[-1]
+
+
+def description(run, metadata):
+    """The tables `model`, `input` and `run` of a run: from a checkpoint's metadata, else from config.toml."""
+    if "driml" in metadata:
+        described = json.loads(metadata["driml"])
+        if described["format"] != 1:
+            raise SystemExit(f"the checkpoint's metadata is of format {described['format']}, this file reads 1")
+        return described
+    import tomllib
+
+    return tomllib.loads(Path(run, "config.toml").read_text())
+
+
+class Block(nn.Module):
+    """A DIM head: out(relu(hidden(x))) + skip(x)."""
+
+    def __init__(self, inputs, outputs, skip_bias=False):
+        super().__init__()
+        self.hidden = nn.Linear(inputs, outputs)
+        self.out = nn.Linear(outputs, outputs)
+        self.skip = nn.Linear(inputs, outputs, bias=skip_bias)
+
+    def forward(self, x):
+        return self.out(functional.relu(self.hidden(x))) + self.skip(x)
+
+
+class Network(nn.Module):
+    """Torso, C51 head and the DIM heads of a `[model]` table; parameters have the names and shapes of the checkpoint's."""
+
+    def __init__(self, model):
+        super().__init__()
+        self.actions, self.atoms = model["num_actions"], model["atoms"]
+        support = torch.linspace(model["v_min"], model["v_max"], self.atoms)
+        self.register_buffer("support", support, persistent=False)
+        self.torso = nn.ModuleDict()
+        height, width, channels = model["height"], model["width"], model["channels"]
+        for number, layer in enumerate(model["conv"], 1):
+            kernel, stride = layer["kernel"], layer["stride"]
+            self.torso[f"conv{number}"] = nn.Conv2d(channels, layer["out"], kernel, stride)
+            height, width, channels = (height - kernel) // stride + 1, (width - kernel) // stride + 1, layer["out"]
+        self.torso["fc"] = nn.Linear(channels * height * width, model["hidden"])
+        self.head = nn.Linear(model["hidden"], self.actions * self.atoms)
+        self.dim = nn.ModuleDict()
+        dim, rkhs = model["dim"], model["rkhs"]
+        embed = model["action_embed"] if dim["action"] and (dim["psi3"] or dim["psi4"]) else 0
+        if embed:
+            self.dim["action"] = Block(self.actions, embed, skip_bias=True)
+        for name, inputs in [
+            ("psi3", channels + embed),
+            ("phi3", channels),
+            ("psi4", model["hidden"] + embed),
+            ("phi4", model["hidden"]),
+        ]:
+            if dim[name]:
+                self.dim[name] = Block(inputs, rkhs)
+
+    def features(self, states):
+        """f3 [B, c, h, w] after its ReLU and f4 [B, hidden] before it, of u8 states [B, H, W, C]."""
+        maps = states.permute(0, 3, 1, 2).float() / 255
+        for name, layer in self.torso.items():
+            if name != "fc":
+                maps = functional.relu(layer(maps))
+        return maps, self.torso["fc"](maps.flatten(1))
+
+    def logits(self, states):
+        """Logits [B, A, N] of the returns at the atoms."""
+        _, f4 = self.features(states)
+        return self.head(functional.relu(f4)).view(-1, self.actions, self.atoms)
+
+    def forward(self, states):
+        """Expected returns [B, A]; the agent takes the action of the largest."""
+        return (self.logits(states).softmax(-1) * self.support).sum(-1)
+
+    def vectors(self, head, features, actions=None):
+        """Psi (psi3, psi4, with actions [B] if it was trained with them) or Phi (phi3, phi4): [B, R] of f4, [B, L, R] of f3."""
+        f3, f4 = features
+        x = f4 if head.endswith("4") else f3.flatten(2).transpose(1, 2)
+        if actions is not None and "action" in self.dim:
+            embedded = self.dim["action"](functional.one_hot(actions.long(), self.actions).float())
+            if x.dim() == 3:
+                embedded = embedded.unsqueeze(1).expand(-1, x.shape[1], -1)
+            x = torch.cat([x, embedded], -1)
+        return self.dim[head](x)
+
+
+def load(run, checkpoint=None):
+    """The network of a run's newest checkpoint (or of the one named), in evaluation mode, and the tables that describe it."""
+    folder = Path(checkpoint) if checkpoint else newest_checkpoint(run)
+    tensors, metadata = read_safetensors(folder / "online.safetensors")
+    described = description(run, metadata)
+    network = Network(described["model"])
+    network.load_state_dict(tensors)
+    return network.eval(), described
+
+
+def enlarge(frames, described):
+    """States [B, h, w, C] as frames travel, as the network takes them: nearest neighbour, then cut to what it reads."""
+    size, model, run = described["input"], described["model"], described["run"]
+    whole = size.get("frame", {"height": run["frame_height"], "width": run["frame_width"]})
+    sides = []
+    for side in ("height", "width"):
+        sides.append([(2 * at + 1) * whole[side] // (2 * size[side]) for at in range(model[side])])
+    return frames[:, sides[0]][:, :, sides[1]]
+
+
+def export(network, described, path):
+    """Writes the acting network as ONNX: `states` u8 [B, H, W, C] to `q_values` f32 [B, A], for any B."""
+    model = described["model"]
+    blank = torch.zeros(2, model["height"], model["width"], model["channels"], dtype=torch.uint8)
+    torch.onnx.export(
+        network,
+        (blank,),
+        str(path),
+        input_names=["states"],
+        output_names=["q_values"],
+        dynamic_shapes=({0: torch.export.Dim("batch")},),
+        dynamo=True,
+        external_data=False,
+    )
+
+
+def main():
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("run", type=Path, help="folder of the run")
+    arguments.add_argument("--checkpoint", type=Path, help="folder of one of its checkpoints [default: the newest]")
+    arguments.add_argument("--onnx", type=Path, metavar="FILE", help="write the acting network there")
+    given = arguments.parse_args()
+    network, described = load(given.run, given.checkpoint)
+    model = described["model"]
+    shape = (1, model["height"], model["width"], model["channels"])
+    with torch.no_grad():
+        values = network(torch.zeros(shape, dtype=torch.uint8))[0].tolist()
+    print(f"{sum(p.numel() for p in network.parameters())} parameters, states u8 {list(shape)}, {model['num_actions']} actions")
+    print("values of a blank state:", " ".join(f"{value:.6f}" for value in values))
+    if given.onnx:
+        export(network, described, given.onnx)
+        print(f"wrote {given.onnx}")
+
+
+if __name__ == "__main__":
+    main()

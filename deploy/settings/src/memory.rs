@@ -1,0 +1,135 @@
+//! How large a replay fits into the memory that is free.
+//! What actors and learner take beside it is in `driml_machine::resources`.
+
+use driml_machine::{
+    error::{Usage, usage},
+    resources::{self, Machine},
+    units::gib,
+};
+use driml_protocol::RunSpec;
+use driml_replay_server::Compression;
+use toml::Table;
+
+use crate::{
+    config::{LocalConfig, read},
+    derived::derive,
+    overrides::Override,
+};
+
+/// Makes the replay as small as the memory and says so, or refuses a size that was asked for and does not fit.
+///
+/// # Errors
+/// Actors or a replay that take more than is free; says what does fit.
+pub(crate) fn fit(
+    table: &mut Table,
+    capacity_set: bool,
+    machine: &Machine,
+) -> Result<Option<String>, Usage> {
+    let mut derived = table.clone();
+    derive(&mut derived)?;
+    let run: RunSpec = read(&derived, "run")?;
+    let replay: driml_replay_server::Config = read(&derived, "replay")?;
+    let local: LocalConfig = read(&derived, "local")?;
+    let actors = resources::actors_bytes(local.actors, &run.world);
+    if machine.beside_actors(actors) == 0 {
+        return Err(usage!(
+            "{} actors of {} take about {}, and {} are free: use fewer --actors, with more --envs each",
+            local.actors,
+            run.world,
+            gib(actors),
+            gib(machine.memory_bytes)
+        ));
+    }
+    if replay.compression != Compression::None {
+        return fit_compressed(table, &run, &replay, machine, actors);
+    }
+    let bytes_each = replay_bytes_each(&run) + sampling_bytes_each(&replay);
+    let fits = |bytes: u64| bytes / bytes_each;
+    let free = gib(machine.memory_bytes);
+    let asked = replay.capacity_transitions;
+    if capacity_set && asked > fits(machine.replay_bytes_max(actors)) {
+        return Err(usage!(
+            "replay.capacity_transitions = {asked} needs {}, and {free} are free: --set replay.capacity_transitions={}",
+            gib(asked.saturating_mul(bytes_each)),
+            fits(machine.replay_bytes(actors))
+        ));
+    }
+    let capacity = fits(machine.replay_bytes(actors));
+    if capacity_set || asked <= capacity {
+        return Ok(None);
+    }
+    Override::parse(&format!("replay.capacity_transitions={capacity}"))?.apply(table)?;
+    // A replay that holds the whole run anyway is as good as a larger one.
+    let is_smaller_than_the_run = replay
+        .transitions_max
+        .is_none_or(|frames| frames > capacity);
+    Ok(is_smaller_than_the_run.then(|| {
+        format!(
+            "the replay holds the newest {capacity} transitions instead of {asked}: {free} of memory are free, and it takes half, or what actors and learner leave"
+        )
+    }))
+}
+
+/// Bounds the bytes of a compressed replay, as it is not known beforehand how well its frames compress.
+///
+/// Half the free memory is taken, or what the settings allow; nothing is bounded where even frames that do not compress fit.
+fn fit_compressed(
+    table: &mut Table,
+    run: &RunSpec,
+    replay: &driml_replay_server::Config,
+    machine: &Machine,
+    actors: u64,
+) -> Result<Option<String>, Usage> {
+    let free = gib(machine.memory_bytes);
+    let asked = replay.capacity_transitions;
+    let fields_each = COMPRESSED_FIELDS_BYTES + sampling_bytes_each(replay);
+    let fields = asked.saturating_mul(fields_each);
+    let frames = asked.saturating_mul(run.frame_bytes() as u64);
+    let bytes = machine.replay_bytes(actors).saturating_sub(fields);
+    if fields > machine.replay_bytes(actors) / 2 {
+        return Err(usage!(
+            "replay.capacity_transitions = {asked} needs {} beside the frames, and {free} are free: --set replay.capacity_transitions={}",
+            gib(fields),
+            machine.replay_bytes(actors) / 2 / fields_each
+        ));
+    }
+    match replay.compressed_bytes_max {
+        Some(max) if max.min(frames) > machine.replay_bytes_max(actors) => Err(usage!(
+            "replay.compressed_bytes_max = {max} is {}, and {free} are free: --set replay.compressed_bytes_max={bytes}",
+            gib(max)
+        )),
+        Some(_) => Ok(None),
+        None if frames <= bytes => Ok(None),
+        None => {
+            Override::parse(&format!("replay.compressed_bytes_max={bytes}"))?.apply(table)?;
+            let run_frames = replay.transitions_max.unwrap_or(u64::MAX);
+            let is_smaller_than_the_run =
+                run_frames.saturating_mul(run.frame_bytes() as u64) > bytes;
+            Ok(is_smaller_than_the_run.then(|| {
+                format!(
+                    "compressed frames may take {}, as {free} of memory are free; if they compress badly, the replay holds fewer than {asked} transitions",
+                    gib(bytes)
+                )
+            }))
+        }
+    }
+}
+
+/// Bytes that one transition takes in the replay: its frame and its small fields.
+pub const fn replay_bytes_each(run: &RunSpec) -> u64 {
+    run.frame_bytes() as u64 + 32
+}
+
+/// Bytes that the rule by which rows are drawn takes a transition: of a tree of sums, which is as wide as the next power of two, 32 at
+/// most, and 16 at least.
+const fn sampling_bytes_each(replay: &driml_replay_server::Config) -> u64 {
+    if replay.sampling.is_prioritised() {
+        32
+    } else {
+        0
+    }
+}
+
+/// Bytes that one transition takes at most in a compressed replay, beside its frame: its small fields, and its share of the
+/// list of blocks if each holds one frame.
+pub const COMPRESSED_FIELDS_BYTES: u64 = 128;

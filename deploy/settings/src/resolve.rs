@@ -1,0 +1,207 @@
+//! From presets or a file, flags and `--set` to the settings of a run.
+//! It fills in no number but those that follow from others and those that the machine decides.
+
+use clap::{
+    Args,
+    builder::{PossibleValue, PossibleValuesParser, TypedValueParser},
+};
+use driml_envs::WorldName;
+use driml_machine::{
+    error::{Usage, usage},
+    resources::Machine,
+    whole_number,
+};
+use driml_replay_server::ReproducedBug;
+use toml::{Table, Value};
+
+use crate::{
+    config::{RunConfig, parts_read},
+    derived::{self, derive},
+    memory,
+    overrides::Override,
+    presets::{self, Preset},
+    renamed,
+};
+
+/// Where the settings come from before flags are applied.
+#[derive(Clone, Debug)]
+pub enum Source {
+    /// Layers: preset, world, agent.
+    Layers(&'static Preset, WorldName, &'static str),
+    /// A file that driml wrote: its name and text.
+    File(String, String),
+}
+
+/// Flags over the source; `--set` applies after the others.
+#[derive(Clone, Debug, Default, Args)]
+pub struct Flags {
+    /// Actor processes [default: by cores]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub actors: Option<u32>,
+    /// Replay servers among which the actors and the memory are spread [default: 1]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub replay_shards: Option<u32>,
+    /// Copies of the world in each actor [default: 16]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub envs: Option<u32>,
+    /// Frames of the whole run; it ends when they are in and their updates done
+    #[arg(long, value_name = "N", value_parser = whole_number::within(1..=i64::MAX as u64))]
+    pub frames: Option<u64>,
+    /// Seed of every generator of the run
+    #[arg(long, value_name = "S", value_parser = whole_number::within(0..=i64::MAX as u64))]
+    pub seed: Option<u64>,
+    /// Train with a known bug of the paper's published code, to see what it does
+    #[arg(long, value_name = "BUG", value_parser = reproduced_bugs())]
+    pub reproduce_bug: Option<ReproducedBug>,
+    /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+}
+
+/// The bugs by their names, with what they are for `--help`.
+fn reproduced_bugs() -> impl TypedValueParser<Value = ReproducedBug> {
+    let named = |bug: ReproducedBug| {
+        let about = match bug {
+            ReproducedBug::BootstrapFromNextState => {
+                "n-step returns that bootstrap from s_{t+1}, with the end of an episode seen at step t alone"
+            }
+        };
+        PossibleValue::new(bug.name()).help(about)
+    };
+    PossibleValuesParser::new(ReproducedBug::ALL.map(named)).map(|name| {
+        let known = ReproducedBug::ALL
+            .into_iter()
+            .find(|bug| bug.name() == name);
+        known.expect("clap lets no other name pass")
+    })
+}
+
+/// Resolves the settings of a run: source, flags, `--set`, what the machine decides, what follows from the rest.
+///
+/// # Errors
+/// The first setting that is unknown, of the wrong type, out of range, or at odds with another.
+pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunConfig, Usage> {
+    let mut table = match source {
+        Source::Layers(preset, world, agent) => {
+            let mut table = presets::layers(preset, *world, presets::agent(agent)?)?;
+            derived::name(&mut table, &world.to_string(), agent);
+            derived::cut_frames(&mut table);
+            if let Some(command) = world.command() {
+                // How long it is waited for is needed at once.
+                for text in &flags.sets {
+                    let one = Override::parse(text)?;
+                    if one.path.starts_with("world.") {
+                        one.apply(&mut table)?;
+                    }
+                }
+                derived::declare(&mut table, command)?;
+            }
+            table
+        }
+        Source::File(name, text) => {
+            let mut read: Table = text
+                .parse()
+                .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
+            renamed::update(&mut read);
+            derived::complete(&mut read);
+            derived::check(&read).map_err(|e| usage!("{name}: {e}"))?;
+            read
+        }
+    };
+    let sized_by_machine = matches!(source, Source::Layers(..));
+    if sized_by_machine {
+        fill(&mut table, "local", "actors", machine.actors());
+        fill(
+            &mut table,
+            "local",
+            "learner_threads",
+            machine.learner_threads(),
+        );
+        fill(&mut table, "local", "learner_device", "cpu");
+        fill(&mut table, "actor", "envs", machine.envs());
+        fill(&mut table, "actor", "world_threads", 0);
+    }
+    let by_flag = [
+        ("local.actors", flags.actors.map(u64::from)),
+        ("actor.envs", flags.envs.map(u64::from)),
+        ("replay.transitions_max", flags.frames),
+        ("replay.shards", flags.replay_shards.map(u64::from)),
+        ("run.seed", flags.seed),
+    ];
+    for (path, value) in by_flag {
+        if let Some(value) = value {
+            Override::parse(&format!("{path}={value}"))?.apply(&mut table)?;
+        }
+    }
+    set_reproduced_bug(&mut table, flags.reproduce_bug)?;
+    let capacity_set = set(&mut table, &flags.sets)? || !sized_by_machine;
+    let note = memory::fit(&mut table, capacity_set, machine)?;
+    derive(&mut table)?;
+    let mut config = RunConfig::from_table(&table).map_err(|e| match source {
+        Source::File(name, _) if flags.sets.is_empty() => usage!("{name}: {e}"),
+        _ => e,
+    })?;
+    config.notes.extend(note);
+    if let Source::Layers(preset, ..) = source
+        && preset.is_priced
+    {
+        let given_up = presets::prices::given_up(&table).into_iter();
+        config
+            .notes
+            .extend(given_up.map(|it| format!("{} gives up {it}", preset.name)));
+    }
+    Ok(config)
+}
+
+/// Sets the bug to train with; refuses settings that have one without the flag.
+fn set_reproduced_bug(table: &mut Table, asked: Option<ReproducedBug>) -> Result<(), Usage> {
+    let Some(replay) = table.get_mut("replay").and_then(Value::as_table_mut) else {
+        return Ok(());
+    };
+    if let (Some(found), None) = (replay.get("reproduced_bug"), asked) {
+        return Err(usage!(
+            "replay.reproduced_bug = {found}: these settings train with a known bug; add --reproduce-bug {} if that is meant",
+            found.as_str().unwrap_or("BUG")
+        ));
+    }
+    if let Some(bug) = asked {
+        let name = Value::try_from(bug).map_err(|e| usage!("--reproduce-bug as TOML: {e}"))?;
+        replay.insert("reproduced_bug".into(), name);
+    }
+    Ok(())
+}
+
+/// Applies every `--set`; returns whether the replay's capacity was among them.
+fn set(table: &mut Table, sets: &[String]) -> Result<bool, Usage> {
+    let mut capacity_set = false;
+    for text in sets {
+        let one = Override::parse(text)?;
+        renamed::refuse(&one.path)?;
+        derived::refuse(&one.path)?;
+        capacity_set |= one.path == "replay.capacity_transitions";
+        let mut tried = table.clone();
+        let new = one.apply(&mut tried)?;
+        // A key that was not there may be an optional one. The type of its table decides.
+        if new {
+            let mut derived = tried.clone();
+            let read = derive(&mut derived).and_then(|()| parts_read(&derived));
+            if read.is_err_and(|e| e.0.contains("unknown field")) {
+                return Err(one.unknown(table));
+            }
+        }
+        *table = tried;
+    }
+    Ok(capacity_set)
+}
+
+fn fill(table: &mut Table, name: &str, key: &str, value: impl Into<Value>) {
+    let inner = table
+        .entry(name)
+        .or_insert_with(|| Value::Table(Table::new()));
+    if let Some(inner) = inner.as_table_mut() {
+        inner.entry(key).or_insert(value.into());
+    }
+}
+
+#[cfg(test)]
+mod tests;

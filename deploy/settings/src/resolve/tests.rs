@@ -1,0 +1,527 @@
+//! Presets, flags, `--set` and files: what they resolve to, and what is said of those that cannot work.
+//! The texts of single `--set`s are tested beside `overrides`.
+
+use driml_envs::WorldConfig;
+use driml_protocol::{Horizon, Sampling};
+use expect_test::expect;
+
+use super::*;
+use crate::presets::{AGENTS, PRESETS};
+
+const MACHINE: Machine = Machine {
+    cores: 2,
+    memory_bytes: 16 << 30,
+};
+
+fn source(preset: &str, world: &str, agent: &str) -> Source {
+    let agent = presets::agent(agent).unwrap();
+    Source::Layers(
+        presets::preset(preset).unwrap(),
+        world.parse().unwrap(),
+        agent.name,
+    )
+}
+
+fn sets(sets: &[&str]) -> Flags {
+    Flags {
+        sets: sets.iter().map(|&set| set.into()).collect(),
+        ..Flags::default()
+    }
+}
+
+fn with(world: &str, agent: &str, set: &[&str]) -> Result<RunConfig, String> {
+    resolve(&source("paper", world, agent), &sets(set), &MACHINE).map_err(|e| e.to_string())
+}
+
+#[test]
+fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
+    let mut resolved = 0;
+    for preset in PRESETS {
+        for world in WorldName::all() {
+            for agent in AGENTS {
+                let source = Source::Layers(preset, world, agent.name);
+                let config = match resolve(&source, &Flags::default(), &MACHINE) {
+                    Err(e) if e.0.contains("take --preset paper") => continue,
+                    other => other
+                        .unwrap_or_else(|e| panic!("{} {world} {}: {e}", preset.name, agent.name)),
+                };
+                let text = config.to_toml();
+                let file = Source::File("config.toml".into(), text.clone());
+                let again = resolve(&file, &Flags::default(), &MACHINE).unwrap();
+                assert_eq!(again.run.hash(), config.run.hash());
+                assert_eq!(again.to_toml(), text);
+                let mut read = RunConfig::parse("config.toml", &text).unwrap();
+                assert_eq!(read.to_toml(), text);
+                read.notes.clone_from(&config.notes);
+                assert_eq!(read, config);
+                driml_actor::ActorSettings::from_toml(&text).unwrap();
+                resolved += 1;
+            }
+        }
+    }
+    // Five presets are for all worlds, two for Procgen's games.
+    let all = WorldName::all().count();
+    let games = WorldName::all()
+        .filter(|world| world.kind() == "procgen")
+        .count();
+    assert_eq!(resolved, (5 * all + 2 * games) * AGENTS.len());
+}
+
+#[test]
+fn the_default_run_is_the_papers() {
+    let config = with("procgen:bigfish", "driml-ada", &[]).unwrap();
+    expect![[r#"
+        [actor]
+        ack_timeout_ms = 10000
+        actions = "all"
+        chunks_in_flight_max = 4
+        envs = 16
+        epsilon_decay_frames = 100000
+        epsilon_end = 0.01
+        epsilon_start = 0.1
+        precision = "f32"
+        round_transitions_max = 1024
+        steps_per_chunk = 16
+        unreachable_max_ms = 300000
+        world_threads = 0
+    "#]]
+    .assert_eq(&format!(
+        "[actor]\n{}",
+        config.to_toml().parse::<Table>().unwrap()["actor"]
+            .as_table()
+            .unwrap()
+    ));
+    assert_eq!(config.model.dim.psi4, config.model.dim.phi4);
+    assert_eq!(
+        (config.model.dim.psi3, config.model.dim.action),
+        (false, true)
+    );
+    // 199_000 transitions after the warm-up at 8 rows each, in batches of 256.
+    assert_eq!(config.updates(), 6_218);
+}
+
+/// Frames are recorded and sent as far as the network reads them; settings of earlier versions have them whole, and stay as they are.
+#[test]
+fn frames_are_cut_where_nothing_reads_them() {
+    let sizes = |config: &RunConfig| {
+        let (run, model) = (&config.run, &config.model);
+        let frame = (run.frame_height, run.frame_width);
+        (frame, (model.height, model.width))
+    };
+    let cut = with("procgen:bigfish", "driml-ada", &[]).unwrap();
+    assert_eq!(sizes(&cut), ((60, 60), (60, 60)));
+    let large = source("paper-observation", "procgen:bigfish", "driml-ada");
+    let large = resolve(&large, &sets(&[]), &MACHINE).unwrap();
+    assert_eq!(sizes(&large), ((62, 61), (100, 76)));
+    let pacman = with("mspacman", "driml-ada", &[]).unwrap();
+    assert_eq!(sizes(&pacman), ((21, 19), (84, 84)));
+    // A random crop reads all of a state.
+    let augmented = with("procgen:bigfish", "curl", &[]).unwrap();
+    assert_eq!(sizes(&augmented), ((64, 64), (64, 64)));
+
+    let old = cut.with_whole_frames().unwrap();
+    assert_eq!(sizes(&old), ((64, 64), (64, 64)));
+    assert_eq!(old.run.seed, cut.run.seed);
+    let text = old.to_toml();
+    assert!(!text.contains("[input.frame]"), "{text}");
+    assert_eq!(RunConfig::parse("old.toml", &text).unwrap(), old);
+    let file = Source::File("old.toml".into(), text);
+    let again = resolve(&file, &sets(&["run.seed=7"]), &MACHINE).unwrap();
+    assert_eq!((sizes(&again), again.run.seed), (sizes(&old), 7));
+    let file = Source::File("new.toml".into(), cut.to_toml());
+    let again = resolve(
+        &file,
+        &sets(&["input.height=104", "input.width=80"]),
+        &MACHINE,
+    )
+    .unwrap();
+    assert_eq!(sizes(&again), sizes(&large));
+    let wrong = cut
+        .to_toml()
+        .replace("frame_height = 60", "frame_height = 64");
+    expect!["wrong.toml: run.frame_height = 64, but it follows from the world and what model.conv reads and is 60; correct the one or the other"]
+        .assert_eq(&RunConfig::parse("wrong.toml", &wrong).unwrap_err().to_string());
+    expect!["input.frame cannot be set by hand: it follows from the world"]
+        .assert_eq(&with("chain", "c51", &["input.frame.height=3"]).unwrap_err());
+}
+
+/// Everything that has an entry for each action follows from which actions there are.
+#[test]
+fn an_agent_may_choose_among_the_actions_that_differ_alone() {
+    let visible = "actor.actions=visible";
+    for (world, count) in [
+        ("procgen:plunder", 4),
+        ("procgen:maze", 5),
+        ("procgen:coinrun", 9),
+        ("procgen:starpilot", 15),
+        ("mspacman", 5),
+        ("chain", 3),
+    ] {
+        let config = with(world, "driml-ada", &[visible]).unwrap();
+        assert_eq!(config.run.num_actions, count, "{world}");
+        assert_eq!(config.model.num_actions, count as usize);
+        assert_eq!(config.action_names().len(), count as usize);
+        let read = RunConfig::parse("config.toml", &config.to_toml()).unwrap();
+        assert_eq!(read, config);
+        let both = [visible, "learner.affinity.alphabet=visible"];
+        let merged = with(world, "driml-ada", &both).unwrap();
+        assert_eq!(
+            merged.learner.affinity.visible.unwrap().len(),
+            count as usize
+        );
+        let all = with(world, "driml-ada", &[]).unwrap();
+        assert_eq!(all.run.num_actions as usize, all.world.num_actions());
+        // Settings of earlier versions say nothing of it.
+        let old = all.to_toml().replace("actions = \"all\"\n", "");
+        assert_eq!(RunConfig::parse("old.toml", &old).unwrap(), all);
+    }
+    let names = with("procgen:plunder", "c51", &[visible]).unwrap();
+    assert_eq!(names.action_names(), ["left", "no-op", "right", "d"]);
+}
+
+#[test]
+fn what_nobody_uses_is_not_there() {
+    let config = with("mspacman", "c51", &[]).unwrap();
+    assert_eq!(config.run.horizon, Horizon::None);
+    assert_eq!(config.model.dim, driml_model::DimHeads::NONE);
+    assert_eq!(config.learner.affinity.learned, None);
+    let curl = with("mspacman", "curl", &[]).unwrap();
+    assert_eq!(curl.run.horizon, Horizon::None);
+    let heads = driml_model::DimHeads {
+        psi4: true,
+        ..driml_model::DimHeads::NONE
+    };
+    assert_eq!(curl.model.dim, heads);
+    assert!(!with("mspacman", "cpc", &[]).unwrap().model.dim.action);
+    // Nothing to tell apart in a world with a single action.
+    assert!(!with("ising", "driml-fix", &[]).unwrap().model.dim.action);
+}
+
+#[test]
+fn settings_that_cannot_work_are_answered_with_what_to_do() {
+    let said = |agent: &str, set: &str| with("procgen:bigfish", agent, &[set]).unwrap_err();
+    expect![[r#"there is no setting "learner.update.adam.learning_rate"; [learner.update.adam] has beta1, beta2, eps, lr"#]].assert_eq(&said("driml-ada", "learner.update.adam.learning_rate=1"));
+    expect![[r#"there is no setting "learner.adam.lr" (did you mean "learner.update.adam.lr"?); [learner] has affinity, batch_size, batches_in_flight, checkpoint_period_updates, checkpoints_kept, equal_states, precision, publish_as, publish_period_updates, unreachable_max_ms, update"#]].assert_eq(&said("driml-ada", "learner.adam.lr=1e-4"));
+    expect![[r#"there is no setting "world.num_level" (did you mean "world.num_levels"?); [world] has center_agent, distribution_mode, frame_side, grey, num_levels, paint_vel_info, restrict_themes, start_level, use_backgrounds, use_sequential_levels"#]].assert_eq(&said("driml-ada", "world.num_level=5"));
+    expect![
+        "model.height cannot be set by hand: it follows from input.height and what model.conv reads"
+    ]
+    .assert_eq(&said("driml-ada", "model.height=84"));
+    expect!["model.dim cannot be set by hand: it follows from learner.update"]
+        .assert_eq(&said("driml-ada", "model.dim.psi3=true"));
+    expect!["run.gamma = 1.5 cannot work: a discount lies between 0 and 1"]
+        .assert_eq(&said("driml-ada", "run.gamma=1.5"));
+    expect!["run.horizon = 0 cannot work: k lies between 1 and 1000"]
+        .assert_eq(&said("driml-ada", "run.horizon={rule=\"fixed\",k=0}"));
+    expect!["in the settings' [run] table: unknown variant `always`, expected one of `none`, `fixed`, `uniform`, `nhg`, `all`, in `horizon.rule`"].assert_eq(&said("driml-ada", "run.horizon.rule=always"));
+    expect!["learner.update cannot work: objective = dim, but all lambdas are 0: set one above 0, or take the agent c51"].assert_eq(&said("driml-ada", "learner.update.lambda.4t4=0"));
+    expect!["learner.update cannot work: objective = none computes no auxiliary loss, but lambda.4t4 is above 0: set it to 0, or take another agent"].assert_eq(&said("c51", "learner.update.lambda.4t4=1"));
+    expect!["run.horizon follows the action affinity, which nobody estimates: --set learner.affinity.estimator=learned"].assert_eq(&said("driml-ada", "learner.affinity.estimator=none"));
+    expect!["learner.affinity.alphabet = (missing) cannot work: the chosen estimator needs it: start from a preset"].assert_eq(&said("driml-fix", "learner.affinity.estimator=exact"));
+    expect!["replay.replay_ratio = 0 cannot work: rows per transition must be a number above 0"]
+        .assert_eq(&said("driml-ada", "replay.replay_ratio=0"));
+    expect!["500 frames are no more than the warm-up of 1000: ask for more --frames, or --set replay.warmup_transitions=50"].assert_eq(&said("driml-ada", "replay.transitions_max=500"));
+    expect!["in the settings' [world] table: invalid value: integer `-1`, expected u32"]
+        .assert_eq(&said("driml-ada", "world.num_levels=-1"));
+    expect!["learner.update cannot work: adam.lr = 0.0 is not within 1e-30 and 1e38: that cannot work; start from a preset"]
+        .assert_eq(&said("driml-ada", "learner.update.adam.lr=0"));
+    expect!["in the settings' [learner] table: unknown variant `f16`, expected `f32` or `bf16`, in `precision`"]
+        .assert_eq(&said("driml-ada", "learner.precision=f16"));
+    let gpu = ["learner.precision=bf16", "local.learner_device=cuda"];
+    expect![[
+        r#"cuda:0 computes in f32 alone: set learner.precision = "f32", or compute bf16 on the CPU"#
+    ]]
+    .assert_eq(&with("procgen:bigfish", "driml-ada", &gpu).unwrap_err());
+    expect!["replay.capacity_transitions = 100000000000 needs 1008808.6 GiB, and 16.0 GiB are free: --set replay.capacity_transitions=793014"].assert_eq(&said(
+        "driml-ada",
+        "replay.capacity_transitions=100000000000",
+    ));
+}
+
+#[test]
+fn agents_and_what_their_objectives_need() {
+    let said = |agent: &str, set: &[&str]| with("procgen:bigfish", agent, set).unwrap_err();
+    expect![[r#"run.horizon serves one later state a row, but learner.update.objective = none looks at no later state: --set 'run.horizon={rule="none"}', or take another --agent"#]].assert_eq(&said("c51", &["run.horizon={rule=\"fixed\",k=1}"]));
+    expect![[r#"run.horizon serves no later state a row, but learner.update.objective = dim looks at one later state: --set 'run.horizon={rule="fixed",k=1}', or take another --agent"#]].assert_eq(&said("driml-fix", &["run.horizon={rule=\"none\"}"]));
+    expect![[r#"run.horizon serves 5 later states a row, but learner.update.objective = dim looks at one later state: --set 'run.horizon={rule="fixed",k=1}', or take another --agent"#]].assert_eq(&said("driml-noact", &["run.horizon={rule=\"all\",k_max=5}"]));
+    expect![[r#"run.horizon serves no later state a row, but learner.update.objective = cpc looks at one or more later states: --set 'run.horizon={rule="all",k_max=5}', or take another --agent"#]].assert_eq(&said("cpc", &["run.horizon={rule=\"none\"}"]));
+    expect!["run.horizon = 33 cannot work: a row carries at most 32 positives"]
+        .assert_eq(&said("cpc", &["run.horizon.k_max=33"]));
+    expect!["learner.augment = (missing) cannot work: CURL compares two augmentations of a state: take the agent curl, or set all of learner.augment"].assert_eq(&said(
+        "c51",
+        &["learner.update.objective=curl", "learner.update.lambda.4t4=1"],
+    ));
+    expect!["learner.augment.hue = 0.6 cannot work: it must lie between 0 and 0.5, half a turn either way"]
+        .assert_eq(&said("curl", &["learner.augment.hue=0.6"]));
+    expect!["in the settings' [learner.update] table: unknown variant `clear`, expected one of `none`, `dim`, `cpc`, `curl`, in `objective`"].assert_eq(&said("curl", &["learner.update.objective=clear"]));
+    let five = with("procgen:heist", "driml-noact", &["run.horizon.k=5"]).unwrap();
+    assert_eq!(five.run.horizon, Horizon::Fixed { k: 5 });
+    assert!(!five.model.dim.action && five.model.dim.psi4);
+    // Any agent that looks at later states can augment.
+    let augment =
+        "learner.augment={crop_side=0.9,brightness=0.1,contrast=0.0,saturation=0,hue=0.2}";
+    let augmented = with("procgen:heist", "driml-noact", &[augment]).unwrap();
+    assert_eq!(augmented.learner.augment.unwrap().crop_side, 0.9);
+}
+
+#[test]
+fn optional_settings_can_be_set_though_no_preset_has_them() {
+    let ising = "world.ising={temperature=0.4,sweeps_per_step=1}";
+    let config = with("mspacman", "c51", &[ising]).unwrap();
+    assert!(matches!(config.world, WorldConfig::MsPacman(world) if world.ising.is_some()));
+    let map = with(
+        "procgen:maze",
+        "driml-ada",
+        &["learner.affinity.alphabet=visible"],
+    )
+    .unwrap();
+    assert_eq!(map.learner.affinity.visible.unwrap()[..3], [1, 1, 1]);
+}
+
+#[test]
+fn a_ladder_of_epsilons_is_for_the_actors_of_the_run() {
+    let ladder = "actor.epsilon_ladder={base=0.4,alpha=7}";
+    let of = |sets: &[&str]| with("mspacman", "c51", sets).map(|it| it.actor.epsilon_ladder);
+    assert_eq!(of(&[]).unwrap(), None);
+    let actors = |sets: &[&str]| of(sets).unwrap().unwrap().actors;
+    assert_eq!(actors(&[ladder, "local.actors=3"]), 3);
+    assert_eq!(actors(&["local.actors=3", ladder]), 3);
+    // For actors that are started by hand.
+    assert_eq!(actors(&[ladder, "actor.epsilon_ladder.actors=64"]), 64);
+    expect!["actor.epsilon_ladder.actors = 1 cannot work: a ladder is for 2 to 65536 actors: give --actors, or set it where actors are started by hand"]
+        .assert_eq(&of(&[ladder, "local.actors=1"]).unwrap_err());
+    expect!["actor.epsilon_ladder.base = 4 cannot work: the first actor's probability lies between 0 and 1, without the two"]
+        .assert_eq(&of(&["actor.epsilon_ladder={base=4.0,alpha=7.0}", "local.actors=2"]).unwrap_err());
+    expect!["in the settings' [actor] table: missing field `alpha`, in `epsilon_ladder`"]
+        .assert_eq(&of(&["actor.epsilon_ladder={base=0.4}", "local.actors=2"]).unwrap_err());
+    expect![[r#"there is no setting "actor.epsilon_ladder.rungs"; [actor] has ack_timeout_ms, actions, chunks_in_flight_max, envs, epsilon_decay_frames, epsilon_end, epsilon_start, precision, round_transitions_max, steps_per_chunk, unreachable_max_ms, world_threads"#]]
+        .assert_eq(&of(&["actor.epsilon_ladder.rungs=3"]).unwrap_err());
+}
+
+#[test]
+fn a_file_at_odds_with_itself_is_refused() {
+    let text = with("mspacman", "c51", &[]).unwrap().to_toml();
+    let said = |text: String| {
+        resolve(
+            &Source::File("x.toml".into(), text),
+            &Flags::default(),
+            &MACHINE,
+        )
+        .unwrap_err()
+        .to_string()
+    };
+    expect!["x.toml: run.num_actions = 6, but it follows from the world and actor.actions and is 5; correct the one or the other"].assert_eq(&said(text.replace("num_actions = 5", "num_actions = 6")));
+    expect![
+        "x.toml: the settings lack input.height, a whole number: use a config.toml that driml wrote"
+    ]
+    .assert_eq(&said(text.replace("[input]", "[inputs]")));
+    expect!["x.toml: in the settings' [world] table: unknown field `boost_steps`, expected one of `cells`, `height`, `width`, `step_limit`, `reward_left`, `reward_right`"].assert_eq(&said(
+        text.replace("world = \"mspacman\"", "world = \"chain\""),
+    ));
+    expect![
+        "x.toml is not TOML: unquoted keys cannot be empty, expected letters, numbers, `-`, `_`"
+    ]
+    .assert_eq(&said("= 3".into()));
+    expect!["x.toml: the settings lack run.world, a word: use a config.toml that driml wrote"]
+        .assert_eq(&said(String::new()));
+    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `actions`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
+}
+
+#[test]
+fn settings_from_before_there_were_objectives_are_read() {
+    for (world, agent) in [
+        ("mspacman", "c51"),
+        ("mspacman", "driml-ada"),
+        ("ising", "driml-fix"),
+    ] {
+        let new = with(world, agent, &[]).unwrap();
+        let text = new.to_toml();
+        let without = |line: &&str| {
+            !line.starts_with("objective =") && !line.starts_with("condition_on_action =")
+        };
+        let old: Vec<_> = text.lines().filter(without).collect();
+        assert_eq!(old.len() + 2, text.lines().count());
+        let read = RunConfig::parse("old.toml", &old.join("\n")).unwrap();
+        assert_eq!(
+            (read.learner.update.objective, &read.model),
+            (new.learner.update.objective, &new.model)
+        );
+        assert_eq!(read.run.hash(), new.run.hash());
+    }
+}
+
+#[test]
+fn settings_with_names_of_before_are_read_and_set_by_the_names_of_today() {
+    let new = with("chain", "c51", &[]).unwrap();
+    let old = new.to_toml().replace("batch_size", "batch_rows");
+    assert_ne!(old, new.to_toml());
+    let read = RunConfig::parse("old.toml", &old).unwrap();
+    assert_eq!(read.to_toml(), new.to_toml());
+    let source = Source::File("old.toml".into(), old.clone());
+    let resolved = resolve(&source, &Flags::default(), &MACHINE).unwrap();
+    assert_eq!(resolved.to_toml(), new.to_toml());
+
+    expect!["learner.batch_rows is called learner.batch_size now"]
+        .assert_eq(&with("chain", "c51", &["learner.batch_rows=64"]).unwrap_err());
+    let both = old.replace("batch_rows = 64", "batch_rows = 64\nbatch_size = 64");
+    let said = RunConfig::parse("both.toml", &both)
+        .unwrap_err()
+        .to_string();
+    assert!(said.contains("unknown field `batch_rows`"), "{said}");
+}
+
+#[test]
+fn flags_come_before_set_and_both_before_the_machine() {
+    let flags = Flags {
+        replay_shards: None,
+        frames: Some(7_000),
+        seed: Some(5),
+        reproduce_bug: None,
+        actors: Some(3),
+        envs: Some(2),
+        sets: vec!["run.seed=6".into()],
+    };
+    let config = resolve(&source("paper", "chain", "c51"), &flags, &MACHINE).unwrap();
+    assert_eq!(
+        (
+            config.frames(),
+            config.run.seed,
+            config.local.actors,
+            config.actor.envs
+        ),
+        (7_000, 6, 3, 2)
+    );
+}
+
+#[test]
+fn the_replay_fits_the_memory_and_says_so() {
+    let flags = Flags {
+        frames: Some(50_000_000),
+        ..Flags::default()
+    };
+    let small = Machine {
+        cores: 2,
+        memory_bytes: 8 << 30,
+    };
+    let config = resolve(
+        &source("paper", "procgen:bigfish", "driml-fix"),
+        &flags,
+        &small,
+    )
+    .unwrap();
+    expect!["the replay holds the newest 348617 transitions instead of 1000000: 8.0 GiB of memory are free, and it takes half, or what actors and learner leave"].assert_eq(&config.notes.join("\n"));
+    assert!(config.replay.capacity_transitions < 400_000);
+    let large = Machine {
+        cores: 2,
+        memory_bytes: 64 << 30,
+    };
+    let config = resolve(
+        &source("paper", "procgen:heist", "driml-fix"),
+        &flags,
+        &large,
+    )
+    .unwrap();
+    assert_eq!(
+        (config.replay.capacity_transitions, config.notes.len()),
+        (1_000_000, 0)
+    );
+}
+
+#[test]
+fn a_compressed_replay_is_bounded_in_bytes_instead() {
+    let lz4 = "replay.compression=lz4";
+    let million = "replay.transitions_max=1000000";
+    let config = with("procgen:bigfish", "c51", &[lz4, million]).unwrap();
+    let replay = &config.replay;
+    assert_eq!(
+        (replay.capacity_transitions, replay.compressed_bytes_max),
+        (1_000_000, Some((8 << 30) - 128_000_000))
+    );
+    expect!["compressed frames may take 7.9 GiB, as 16.0 GiB of memory are free; if they compress badly, the replay holds fewer than 1000000 transitions"].assert_eq(&config.notes.join("\n"));
+    // What fits without compressing at all needs no bound.
+    let capacity = "replay.capacity_transitions=100000";
+    let config = with("procgen:bigfish", "c51", &[lz4, capacity]).unwrap();
+    assert_eq!(config.replay.compressed_bytes_max, None);
+    let two_million = "replay.capacity_transitions=2000000";
+    let said = |set: &str| with("procgen:bigfish", "c51", &[lz4, two_million, set]).unwrap_err();
+    expect!["replay.compressed_bytes_max = 100000000000 is 93.1 GiB, and 16.0 GiB are free: --set replay.compressed_bytes_max=8333934592"].assert_eq(&said("replay.compressed_bytes_max=100000000000"));
+    expect!["replay.capacity_transitions = 100000000000 needs 11920.9 GiB beside the frames, and 16.0 GiB are free: --set replay.capacity_transitions=33554432"].assert_eq(&said("replay.capacity_transitions=100000000000"));
+    expect!["replay.compressed_bytes_max = 1000 cannot work: one sample spans 8 transitions, which may not compress; use at least 3232128"].assert_eq(&said("replay.compressed_bytes_max=1000"));
+    expect!["in the settings' [replay] table: unknown variant `zip`, expected `none` or `lz4`, in `compression`"]
+        .assert_eq(&said("replay.compression=zip"));
+}
+
+#[test]
+fn a_known_bug_is_trained_with_only_where_it_is_asked_for() {
+    let plain = with("chain", "c51", &[]).unwrap();
+    assert_eq!(plain.replay.reproduced_bug, None);
+    expect![
+        "replay.reproduced_bug cannot be set by hand: it is a known bug to train with, and chosen by --reproduce-bug"
+    ]
+    .assert_eq(&with("chain", "c51", &["replay.reproduced_bug=bootstrap-from-next-state"]).unwrap_err());
+    let asked = Flags {
+        reproduce_bug: Some(ReproducedBug::BootstrapFromNextState),
+        ..Flags::default()
+    };
+    let faulty = resolve(&source("paper", "chain", "c51"), &asked, &MACHINE).unwrap();
+    assert_eq!(faulty.replay.reproduced_bug, asked.reproduce_bug);
+    assert!(faulty.notes.iter().any(|note| note.contains("known bug")));
+
+    // Nor does a file bring it in by itself.
+    let file = Source::File("faulty.toml".into(), faulty.to_toml());
+    let said = resolve(&file, &Flags::default(), &MACHINE)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        said.contains("add --reproduce-bug bootstrap-from-next-state if that is meant"),
+        "{said}"
+    );
+    assert!(resolve(&file, &asked, &MACHINE).is_ok());
+    let old = faulty.to_toml().replace("reproduced_bug", "study");
+    let old = RunConfig::parse("old.toml", &old).unwrap();
+    assert_eq!(old.replay, faulty.replay);
+    // What was trained with it can still be looked at.
+    assert!(RunConfig::parse("faulty.toml", &faulty.to_toml()).is_ok());
+}
+
+#[test]
+fn rows_are_drawn_by_the_rule_that_is_set() {
+    let rule = |numbers: &str| format!("replay.sampling={{rule=\"prioritised\"{numbers}}}");
+    let all = rule(",alpha=0.5,beta_start=0.4,beta_end=1.0");
+    let config = with("chain", "c51", &[]).unwrap();
+    assert_eq!(config.replay.sampling, Sampling::Uniform);
+    // Rainbow's numbers; beta rises over the whole run.
+    let flags = Flags {
+        frames: Some(33_000),
+        ..sets(&[&all])
+    };
+    let config = resolve(&source("paper", "chain", "c51"), &flags, &MACHINE).unwrap();
+    let updates = (33_000 - config.replay.warmup_transitions) as f64 * config.replay.replay_ratio
+        / f64::from(config.learner.batch_size);
+    let expected = Sampling::Prioritised {
+        alpha: 0.5,
+        beta_start: 0.4,
+        beta_end: 1.0,
+        beta_updates: updates as u64,
+    };
+    assert_eq!(config.replay.sampling, expected);
+    let text = config.to_toml();
+    assert_eq!(RunConfig::parse("it", &text).unwrap().to_toml(), text);
+    let learner = driml_learner::LearnerConfig::from_toml(&text).unwrap();
+    assert_eq!(learner.sampling, expected);
+    // The hash of what all parts agree on is that of every other rule: checkpoints stay good.
+    assert_eq!(config.run, with("chain", "c51", &[]).unwrap().run);
+
+    let said = |sets: &[&str]| with("chain", "c51", sets).unwrap_err();
+    expect!["replay.sampling.alpha = 1.5 cannot work: it lies between 0 and 1"]
+        .assert_eq(&said(&[&rule(",alpha=1.5,beta_start=0.4,beta_end=1.0")]));
+    expect!["replay.sampling.beta_end = 0.3 cannot work: beta rises: use at least beta_start"]
+        .assert_eq(&said(&[&rule(",alpha=0.5,beta_start=0.4,beta_end=0.3")]));
+    expect!["in the settings' [replay] table: missing field `beta_end`, in `sampling`"]
+        .assert_eq(&said(&[&rule(",alpha=0.5,beta_start=0.4")]));
+    expect!["in the settings' [replay] table: unknown variant `greedy`, expected `uniform` or `prioritised`, in `sampling.rule`"].assert_eq(&said(&["replay.sampling={rule=\"greedy\"}"]));
+    expect![[r#"there is no setting "replay.sampling.alpha" (did you mean "replay.sampling.rule"?); [replay.sampling] has rule"#]].assert_eq(&said(&["replay.sampling.alpha=0.5"]));
+    let none = all.replace("}", ",beta_updates=0}");
+    expect!["replay.sampling.beta_updates = 0 cannot work: beta rises over at least one update"]
+        .assert_eq(&said(&[&none]));
+}

@@ -1,0 +1,146 @@
+//! `driml evaluate`: whole episodes with a run's newest checkpoint, and a random policy's beside them; a film of them on request.
+
+mod recording;
+mod report;
+mod tile;
+
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::Args;
+use driml_figure::Film;
+use driml_launch::{
+    console::print,
+    evaluate::{self, Levels, Player, Which, Who, levels, mean_and_deviation},
+    run_folder::{RunFolder, sweep},
+};
+use driml_machine::error::{EXIT_INTERRUPTED, usage};
+use driml_protocol::Shutdown;
+
+use self::recording::{RecordArgs, Recording};
+
+#[derive(Debug, Args)]
+pub(crate) struct EvaluateArgs {
+    /// Folder of the run
+    #[arg(value_name = "RUN", required_unless_present = "run")]
+    pub(crate) folder: Option<PathBuf>,
+    /// The same
+    #[arg(long, value_name = "DIR", conflicts_with = "folder")]
+    pub(crate) run: Option<PathBuf>,
+    /// Whole episodes to play
+    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub(crate) episodes: u32,
+    /// Which levels to play
+    #[arg(long, value_enum, default_value_t = Levels::Train)]
+    pub(crate) levels: Levels,
+    /// Seed of the worlds and of exploration
+    #[arg(long, value_name = "S", default_value_t = 0)]
+    pub(crate) seed: u64,
+    /// Play with the checkpoint after so many updates, or with the "best" of those that were played and kept
+    #[arg(long, value_name = "UPDATES", default_value = "newest")]
+    pub(crate) checkpoint: Which,
+    /// Add the agent's mean return to the run's evaluations.csv, and keep the checkpoint as the run's best if it earned most
+    #[arg(long, conflicts_with_all = ["levels", "returns", "json", "record"])]
+    pub(crate) keep: bool,
+    /// Write every episode's return into this file, as CSV: who played, number of the episode, return
+    #[arg(long, value_name = "FILE")]
+    pub(crate) returns: Option<PathBuf>,
+    /// Print one JSON object instead of lines for people
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) film: RecordArgs,
+    /// End when the process that started this one, which has this number, ends
+    #[arg(long, value_name = "PID", hide = true, requires = "keep")]
+    pub(crate) exit_with_parent: Option<u32>,
+}
+
+/// Plays, and prints mean and standard deviation.
+///
+/// # Errors
+/// A folder that is no run's, a damaged checkpoint, levels that the world does not have, a film that cannot be written.
+pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
+    if let Some(path) = &args.film.record {
+        Film::check_name(path).map_err(|e| usage!("--record: {e}"))?;
+    }
+    let folder = args.folder.as_ref().or(args.run.as_ref());
+    let folder = folder.expect("clap asks for one of the two");
+    let folder = RunFolder::new(folder);
+    if args.keep {
+        end_when_asked(folder.clone(), args.exit_with_parent)?;
+        let (earned, is_best) = evaluate::keep(&folder, args.checkpoint, args.episodes, args.seed)?;
+        let best = if is_best { ", the most so far" } else { "" };
+        return print(&format!("{}{best}\n", earned.describe()));
+    }
+    let player = Player::load_at(&folder, args.checkpoint)?;
+    // Before an hour of playing.
+    let table = args.returns.as_deref().map(report::Table::begin);
+    let mut table = table.transpose()?;
+    let world = levels(&player.config.world, args.levels)?;
+    let mut film = Recording::begin(&args.film, &player, args.episodes)?;
+    let spec = &player.config.run;
+    let which = match args.levels {
+        Levels::Train => "as trained on",
+        Levels::TrainSingle => "on the levels trained on, one an episode",
+        Levels::Unseen => "on unseen levels",
+    };
+    let said = |text: &str| if args.json { Ok(()) } else { print(text) };
+    said(&format!(
+        "{} {which}, {} episodes each, weights after {} updates, seed {}\n",
+        spec.world, args.episodes, player.updates, args.seed
+    ))?;
+    let returns = player.play_watched(
+        Who::Agent,
+        &world,
+        args.episodes as usize,
+        args.seed,
+        &mut |step| {
+            if let Some(film) = &mut film {
+                film.see(step);
+            }
+        },
+    );
+    let returns = match (returns, film) {
+        (Ok(returns), None) => returns,
+        (Ok(returns), Some(film)) => {
+            said(&film.finish()?)?;
+            returns
+        }
+        (Err(e), film) => {
+            if let Some(film) = film {
+                film.discard();
+            }
+            return Err(e);
+        }
+    };
+    said(&describe(&spec.agent, &returns))?;
+    let random = player.play(Who::Random, &world, args.episodes as usize, args.seed)?;
+    said(&describe("random", &random))?;
+    let played = [(spec.agent.as_str(), returns), ("random", random)];
+    if let Some(table) = &mut table {
+        table.finish(&played)?;
+    }
+    if args.json {
+        print(&report::json(&player, args.levels, args.seed, &played)?)?;
+    }
+    Ok(())
+}
+
+/// Ends this process when it is asked to or nobody waits for it any more, and leaves nothing half.
+fn end_when_asked(folder: RunFolder, parent: Option<u32>) -> anyhow::Result<()> {
+    let shutdown = Shutdown::on_signals(parent).context("listening for signals")?;
+    std::thread::Builder::new()
+        .name("end".into())
+        .spawn(move || {
+            shutdown.wait();
+            sweep(&folder);
+            std::process::exit(i32::from(EXIT_INTERRUPTED));
+        })
+        .context("starting a thread")?;
+    Ok(())
+}
+
+fn describe(name: &str, returns: &[f64]) -> String {
+    let (mean, deviation) = mean_and_deviation(returns);
+    format!("{name:12} mean return {mean:8.3}, standard deviation {deviation:.3}\n")
+}

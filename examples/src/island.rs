@@ -1,0 +1,170 @@
+//! A world of one's own: an island with a treasure on it, at another place in each episode.
+
+use driml_envs::{EnvError, Environment, FrameShape, StepEnd, WorldSettings};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::Deserialize;
+
+/// Pixels a side of a field.
+const FIELD: usize = 2;
+
+/// What each action adds to row and column.
+const MOVES: [(isize, isize); 4] = [(-1, 0), (1, 0), (0, -1), (0, 1)];
+
+/// The settings of an island, the table `[world]`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct IslandConfig {
+    /// Fields a side, 2 to 32.
+    side: usize,
+    /// Env steps after which an episode is cut off, at least 1.
+    step_limit: u32,
+    /// What the treasure earns.
+    reward: f32,
+}
+
+impl WorldSettings for IslandConfig {
+    fn validate(&self) -> Result<(), EnvError> {
+        if !(2..=32).contains(&self.side) || self.step_limit == 0 || !self.reward.is_finite() {
+            return Err(EnvError::Config(format!(
+                "an island has 2 to 32 fields a side, a step limit and a finite reward, got {self:?}"
+            )));
+        }
+        Ok(())
+    }
+
+    fn frame_shape(&self) -> FrameShape {
+        FrameShape {
+            height: self.side * FIELD,
+            width: self.side * FIELD,
+            channels: 1,
+        }
+    }
+
+    fn action_names(&self) -> Vec<&str> {
+        vec!["up", "down", "left", "right"]
+    }
+
+    fn build(
+        &self,
+        num_envs: usize,
+        seed: u64,
+        _threads: usize,
+    ) -> Result<Box<dyn Environment>, EnvError> {
+        self.validate()?;
+        let copies = (0..num_envs).map(|copy| Island::new(seed, copy, self.side));
+        Ok(Box::new(Islands {
+            side: self.side,
+            step_limit: self.step_limit,
+            reward: self.reward,
+            shape: self.frame_shape(),
+            copies: copies.collect(),
+        }))
+    }
+}
+
+/// One copy: where its agent and its treasure are.
+struct Island {
+    rng: ChaCha8Rng,
+    agent: (usize, usize),
+    treasure: (usize, usize),
+    steps: u32,
+}
+
+impl Island {
+    /// A copy depends on the seed and its own number alone, so that it is the same whatever the others are.
+    fn new(seed: u64, copy: usize, side: usize) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        rng.set_stream(copy as u64);
+        let mut island = Self {
+            rng,
+            agent: (0, 0),
+            treasure: (0, 0),
+            steps: 0,
+        };
+        island.begin(side);
+        island
+    }
+
+    fn begin(&mut self, side: usize) {
+        let mut place = || {
+            let (row, column) = (0..side, 0..side);
+            (self.rng.random_range(row), self.rng.random_range(column))
+        };
+        (self.agent, self.treasure) = (place(), place());
+        if self.agent == self.treasure {
+            self.treasure.0 = (self.agent.0 + 1) % side;
+        }
+        self.steps = 0;
+    }
+}
+
+struct Islands {
+    side: usize,
+    step_limit: u32,
+    reward: f32,
+    shape: FrameShape,
+    copies: Vec<Island>,
+}
+
+impl Environment for Islands {
+    fn frame_shape(&self) -> FrameShape {
+        self.shape
+    }
+
+    fn num_actions(&self) -> usize {
+        MOVES.len()
+    }
+
+    fn num_envs(&self) -> usize {
+        self.copies.len()
+    }
+
+    fn observe(&mut self, frames: &mut [u8]) {
+        frames.fill(0);
+        let width = self.shape.width;
+        let frames = frames.chunks_exact_mut(self.shape.bytes());
+        for (frame, copy) in frames.zip(&self.copies) {
+            for ((row, column), shade) in [(copy.treasure, 128), (copy.agent, 255)] {
+                for row in frame.chunks_exact_mut(width).skip(row * FIELD).take(FIELD) {
+                    row[column * FIELD..][..FIELD].fill(shade);
+                }
+            }
+        }
+    }
+
+    fn step(
+        &mut self,
+        actions: &[u8],
+        rewards: &mut [f32],
+        ends: &mut [StepEnd],
+    ) -> Result<(), EnvError> {
+        let last = self.side - 1;
+        for (env, (copy, &action)) in self.copies.iter_mut().zip(actions).enumerate() {
+            let Some((down, right)) = MOVES.get(usize::from(action)) else {
+                return Err(EnvError::ActionOutOfRange {
+                    env,
+                    action,
+                    num_actions: MOVES.len(),
+                });
+            };
+            let (row, column) = copy.agent;
+            copy.agent = (
+                row.saturating_add_signed(*down).min(last),
+                column.saturating_add_signed(*right).min(last),
+            );
+            copy.steps += 1;
+            (rewards[env], ends[env]) = if copy.agent == copy.treasure {
+                (self.reward, StepEnd::Terminal)
+            } else if copy.steps >= self.step_limit {
+                (0.0, StepEnd::TimedOut)
+            } else {
+                (0.0, StepEnd::Running)
+            };
+            if ends[env] != StepEnd::Running {
+                copy.begin(self.side);
+            }
+        }
+        Ok(())
+    }
+}

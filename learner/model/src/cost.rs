@@ -1,0 +1,222 @@
+//! What a network costs, layer by layer: scalars of parameters, and the arithmetic of one state forward and backward.
+//! It counts matrix products alone: activations and losses are a few operations a scalar, and Adam's step is a dozen a parameter.
+
+use safetensors::tensor::TensorView;
+
+use crate::config::ModelConfig;
+use crate::error::Result;
+use crate::stored::StoredAs;
+
+/// What one layer costs. Arithmetic is multiplications and additions, each counted as one.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LayerCost {
+    /// Its name, such as `torso.conv1`: that of its parameters without `.weight` and `.bias`.
+    pub name: String,
+    /// Scalars of its weight and bias.
+    pub parameters: u64,
+    /// One state forward, at every location where the layer is applied.
+    pub forward: u64,
+    /// One state backward: the weight's gradient, and the input's where a layer before it needs one.
+    pub backward: u64,
+}
+
+impl LayerCost {
+    /// One state forward and backward.
+    pub const fn learning(&self) -> u64 {
+        self.forward + self.backward
+    }
+
+    /// Whether it is of the part of the network with this name, such as `torso` or `dim.psi4`.
+    pub fn is_of(&self, part: &str) -> bool {
+        let rest = self.name.strip_prefix(part);
+        rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+    }
+}
+
+impl ModelConfig {
+    /// What each layer that this configuration has costs, in the order of [`ModelConfig::parameter_shapes`]. Meaningful for a valid
+    /// configuration.
+    pub fn layer_costs(&self) -> Vec<LayerCost> {
+        let convolutions = self.conv_shapes();
+        let (height, width, channels) = self.local_shape();
+        let layers = self.layers().into_iter().enumerate();
+        let costs = layers.map(|(index, layer)| {
+            let weight_len = layer.weight.iter().product::<usize>();
+            let outputs = layer.weight[0];
+            let is_of = |part: &str| layer.name.starts_with(part);
+            // Products of each location, and those of what is joined to all locations of a state.
+            let products = if let Some(shape) = convolutions.get(index) {
+                shape.locations() * weight_len
+            } else if is_of("dim.psi3.") || is_of("dim.phi3.") {
+                let joined = layer.weight[1].saturating_sub(channels) * outputs;
+                let features = weight_len - joined;
+                // `out` follows on `hidden`, which is as wide as rkhs and has nothing joined to it.
+                if is_of("dim.psi3.out") || is_of("dim.phi3.out") {
+                    height * width * weight_len
+                } else {
+                    height * width * features + joined
+                }
+            } else {
+                weight_len
+            };
+            // What is made of bytes, or of an action's number, sends no gradient on.
+            let is_first = index == 0 || is_of("dim.action.hidden") || is_of("dim.action.skip");
+            let forward = 2 * products as u64;
+            LayerCost {
+                forward,
+                backward: if is_first { forward } else { 2 * forward },
+                parameters: (weight_len + if layer.bias { outputs } else { 0 }) as u64,
+                name: layer.name,
+            }
+        });
+        costs.collect()
+    }
+
+    /// Bytes of a safetensors file of all parameters that this configuration has, names and shapes included.
+    ///
+    /// # Errors
+    /// A failing serialisation.
+    pub fn weights_bytes(&self, stored: StoredAs) -> Result<usize> {
+        let shapes = self.parameter_shapes();
+        let scalars = |shape: &[usize]| shape.iter().product::<usize>() * stored.bytes();
+        let largest = shapes.iter().map(|(_, shape)| scalars(shape)).max();
+        let zeros = vec![0; largest.unwrap_or(0)];
+        let mut views = Vec::with_capacity(shapes.len());
+        for (name, shape) in &shapes {
+            let values = &zeros[..scalars(shape)];
+            views.push((
+                name,
+                TensorView::new(stored.dtype(), shape.clone(), values)?,
+            ));
+        }
+        Ok(safetensors::serialize(views, None)?.len())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::Device;
+    use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
+
+    use super::*;
+    use crate::config::DimHeads;
+    use crate::geometry::ConvLayer;
+    use crate::parameters::Parameters;
+
+    /// 8 x 8 x 1, a map of 3 x 3 x 4, then 2 x 2 x 5; every head.
+    fn every_head() -> ModelConfig {
+        let conv = |out, kernel, stride| ConvLayer {
+            out,
+            kernel,
+            stride,
+        };
+        ModelConfig {
+            height: 8,
+            width: 8,
+            channels: 1,
+            num_actions: 3,
+            atoms: 6,
+            v_min: -1.0,
+            v_max: 1.0,
+            conv: vec![conv(4, 4, 2), conv(5, 2, 1)],
+            hidden: 7,
+            rkhs: 8,
+            action_embed: 2,
+            dim: DimHeads {
+                psi3: true,
+                phi3: true,
+                psi4: true,
+                phi4: true,
+                action: true,
+            },
+        }
+    }
+
+    #[test]
+    fn a_small_network_is_counted_as_by_hand() {
+        let counted = every_head().layer_costs();
+        // Multiplications of one state forward.
+        let by_hand = [
+            ("torso.conv1", 9 * 4 * 16),
+            ("torso.conv2", 4 * 5 * 16),
+            ("torso.fc", 7 * 20),
+            ("head", 18 * 7),
+            ("dim.action.hidden", 2 * 3),
+            ("dim.action.out", 2 * 2),
+            ("dim.action.skip", 2 * 3),
+            ("dim.psi3.hidden", 4 * 5 * 8 + 2 * 8),
+            ("dim.psi3.out", 4 * 8 * 8),
+            ("dim.psi3.skip", 4 * 5 * 8 + 2 * 8),
+            ("dim.phi3.hidden", 4 * 5 * 8),
+            ("dim.phi3.out", 4 * 8 * 8),
+            ("dim.phi3.skip", 4 * 5 * 8),
+            ("dim.psi4.hidden", 9 * 8),
+            ("dim.psi4.out", 8 * 8),
+            ("dim.psi4.skip", 9 * 8),
+            ("dim.phi4.hidden", 7 * 8),
+            ("dim.phi4.out", 8 * 8),
+            ("dim.phi4.skip", 7 * 8),
+        ];
+        assert_eq!(counted.len(), by_hand.len());
+        for (layer, (name, products)) in counted.iter().zip(by_hand) {
+            assert_eq!((layer.name.as_str(), layer.forward), (name, 2 * products));
+            let inputs_gradient = !["torso.conv1", "dim.action.hidden", "dim.action.skip"]
+                .contains(&layer.name.as_str());
+            let backward = layer.forward * (1 + u64::from(inputs_gradient));
+            assert_eq!(layer.backward, backward, "{name}");
+        }
+        assert!(counted[4].is_of("dim.action") && counted[4].is_of("dim"));
+        assert!(counted[3].is_of("head") && !counted[4].is_of("dim.act"));
+    }
+
+    /// Mnih et al.'s network on 84 x 84 x 4: maps of 20 x 20, 9 x 9 and 7 x 7.
+    #[test]
+    fn a_known_network_is_counted() {
+        let conv = |out, kernel, stride| ConvLayer {
+            out,
+            kernel,
+            stride,
+        };
+        let model = ModelConfig {
+            height: 84,
+            width: 84,
+            channels: 4,
+            conv: vec![conv(32, 8, 4), conv(64, 4, 2), conv(64, 3, 1)],
+            hidden: 512,
+            ..every_head().without_dim()
+        };
+        let forward = model.layer_costs().into_iter().map(|layer| layer.forward);
+        let by_hand = [
+            20 * 20 * 32 * 4 * 64,
+            9 * 9 * 64 * 32 * 16,
+            7 * 7 * 64 * 64 * 9,
+            3136 * 512,
+            512 * 18,
+        ];
+        assert!(forward.eq(by_hand.map(|products| 2 * products)));
+    }
+
+    #[test]
+    fn the_parameters_are_those_that_are_built() {
+        let every = every_head();
+        for config in [every.without_dim(), every] {
+            let rng = &mut ChaCha8Rng::seed_from_u64(1);
+            let built = Parameters::init(&config, rng, &Device::Cpu).unwrap();
+            for layer in config.layer_costs() {
+                let of_layer = built.iter().filter(|(name, _)| {
+                    let layer_name = name.rsplit_once('.').map(|(layer, _)| layer);
+                    layer_name == Some(&layer.name)
+                });
+                let scalars: usize = of_layer.map(|(_, var)| var.elem_count()).sum();
+                assert_eq!(layer.parameters, scalars as u64, "{}", layer.name);
+            }
+            let all: usize = built.iter().map(|(_, var)| var.elem_count()).sum();
+            let counted: u64 = config.layer_costs().iter().map(|it| it.parameters).sum();
+            assert_eq!(all as u64, counted);
+            for stored in [StoredAs::F32, StoredAs::F16, StoredAs::Bf16] {
+                let file = built.to_safetensors_as(stored, |_| true).unwrap();
+                assert_eq!(config.weights_bytes(stored).unwrap(), file.len());
+            }
+        }
+    }
+}

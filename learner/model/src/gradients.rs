@@ -1,0 +1,88 @@
+//! The backward pass of a loss, with the gradients of weights summed where they are made.
+//! It computes no gradient itself and takes no step.
+//!
+//! candle adds every gradient, also a weight's only one, to fresh zeros on a single thread. Layers that know this sink add theirs
+//! in place instead, with their products.
+
+use std::cell::RefCell;
+use std::collections::HashMap;
+
+use candle_core::{Result, Tensor, TensorId, Var, backprop::GradStore};
+
+type Sums = HashMap<TensorId, Vec<f32>>;
+
+thread_local! {
+    /// The sums of the backward pass that runs on this thread, if it is one of [`Backward::of`].
+    ///
+    /// A thread of the pool that waits for its products may take up another learner's whole update: a pass that begins here
+    /// therefore puts the sums of the one below it aside and gives them back, and nobody holds the cell while others may run.
+    static SUMS: RefCell<Option<Sums>> = const { RefCell::new(None) };
+}
+
+/// Gives the pass below its sums back, also when this one panics.
+struct PassBelow(Option<Sums>);
+
+impl Drop for PassBelow {
+    fn drop(&mut self) {
+        SUMS.set(self.0.take());
+    }
+}
+
+/// The gradients of one loss.
+#[derive(Debug)]
+pub struct Backward {
+    store: GradStore,
+    sums: Sums,
+}
+
+impl Backward {
+    /// Runs the backward pass of `loss`, a scalar.
+    ///
+    /// # Errors
+    /// An operation without a gradient, or one that failed.
+    pub fn of(loss: &Tensor) -> Result<Self> {
+        let _below = PassBelow(SUMS.replace(Some(Sums::new())));
+        let store = loss.backward();
+        let sums = SUMS.take().unwrap_or_default();
+        Ok(Self {
+            store: store?,
+            sums,
+        })
+    }
+
+    /// Takes out the gradient of `var`, in its shape; `None` if the loss does not depend on it.
+    ///
+    /// # Errors
+    /// A failing copy of a gradient that is not contiguous.
+    pub fn remove(&mut self, var: &Var) -> Result<Option<Tensor>> {
+        let sum = self.sums.remove(&var.id());
+        let sum = sum.map(|sum| Tensor::from_vec(sum, var.shape(), var.device()));
+        // candle leaves some gradients tied to the pass they come from; moments made of them would keep every pass.
+        let stored = self.store.remove(var);
+        let stored = stored.map(|gradient| gradient.contiguous()).transpose()?;
+        match (sum.transpose()?, stored.map(|gradient| gradient.detach())) {
+            (Some(sum), Some(stored)) => (sum + stored).map(Some),
+            (one, other) => Ok(one.or(other)),
+        }
+    }
+}
+
+/// Adds to the gradient of `parameter` in place, if that is a variable and the backward pass is one of [`Backward::of`]; says whether.
+///
+/// `add` gets the sum, in the parameter's layout, and whether it holds anything yet; if not, it may overwrite it.
+pub(crate) fn add_in_place(parameter: &Tensor, add: impl FnOnce(&mut [f32], bool)) -> bool {
+    if !parameter.is_variable() {
+        return false;
+    }
+    let kept = SUMS.with_borrow_mut(|sums| Some(sums.as_mut()?.remove(&parameter.id())));
+    let Some(kept) = kept else { return false };
+    let there = kept.is_some();
+    let mut sum = kept.unwrap_or_else(|| vec![0.0; parameter.elem_count()]);
+    add(&mut sum, there);
+    SUMS.with_borrow_mut(|sums| {
+        if let Some(sums) = sums {
+            sums.insert(parameter.id(), sum);
+        }
+    });
+    true
+}

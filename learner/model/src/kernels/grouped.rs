@@ -1,0 +1,320 @@
+//! A fully connected layer of which each row wants one group of outputs: the C51 head for the action that a row took.
+//! It knows no network; it runs on the CPU only.
+//!
+//! All other outputs would be computed to be dropped, and their gradients are exactly 0. Rows of one group are put beside each
+//! other, so that each group is a product of its own; sums are taken in the order in which the whole layer takes them.
+
+use std::sync::{Mutex, PoisonError};
+
+use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use rayon::prelude::*;
+
+use crate::gradients;
+use crate::kernels::buffer::Buffer;
+use crate::kernels::linear::{cpu, floats};
+use crate::kernels::panels::{Matrix, Threads};
+use crate::kernels::precision::Precision;
+use crate::kernels::product::multiply;
+use crate::kernels::units::Mode;
+
+/// y_r = x_r w_g^T + b_g with g = `groups[r]`, differentiable in `x`, and in `w` and `b` if they are variables.
+///
+/// `x` [rows, in]; `w` [groups * out, in]; `b` [groups * out]; result [rows, out]. All f32; operands of products are rounded to
+/// `precision`. Results have the bits that [`super::linear::linear`] gives, whatever the number of threads.
+///
+/// # Errors
+/// Shapes that do not match, other types, or a group that `w` does not have.
+pub(crate) fn grouped_linear(
+    x: &Tensor,
+    w: &Tensor,
+    b: &Tensor,
+    groups: &[u8],
+    out: usize,
+    precision: Precision,
+) -> Result<Tensor> {
+    let ((rows, inputs), count) = (x.dims2()?, b.elem_count() / out.max(1));
+    let fits = w.dims() == [count * out, inputs] && b.dims() == [count * out];
+    let known = groups.iter().all(|&group| usize::from(group) < count);
+    if !fits || rows != groups.len() || !known || inputs * out == 0 {
+        bail!(
+            "layer of x {:?} with weight {:?}, bias {:?} and {out} outputs for each of {} rows' groups",
+            x.shape(),
+            w.shape(),
+            b.shape(),
+            groups.len()
+        );
+    }
+    let mut order: Vec<usize> = (0..rows).collect();
+    order.sort_by_key(|&row| groups[row]);
+    let parts = order
+        .chunk_by(|&a, &b| groups[a] == groups[b])
+        .map(|rows| (usize::from(groups[rows[0]]), rows.len()))
+        .collect();
+    let op = Grouped {
+        order,
+        parts,
+        inputs,
+        out,
+        precision,
+        sorted: Mutex::new(None),
+    };
+    x.contiguous()?
+        .apply_op3(&w.contiguous()?, &b.contiguous()?, op)
+}
+
+struct Grouped {
+    /// Rows by group, and within a group in their order.
+    order: Vec<usize>,
+    /// The groups that occur, ascending, and how many rows each has.
+    parts: Vec<(usize, usize)>,
+    inputs: usize,
+    out: usize,
+    precision: Precision,
+    /// x in that order: what the forward pass leaves to the backward pass.
+    sorted: Mutex<Option<Buffer<f32>>>,
+}
+
+impl Grouped {
+    /// Rows of `values` by group.
+    fn sort(&self, values: &[f32]) -> Buffer<f32> {
+        let mut sorted = Buffer::new(values.len());
+        let len = values.len() / self.order.len();
+        let rows = sorted.par_chunks_exact_mut(len).zip(&self.order);
+        rows.with_min_len(16)
+            .for_each(|(to, &row)| to.copy_from_slice(&values[row * len..][..len]));
+        sorted
+    }
+
+    /// The inverse of `sort`.
+    fn unsort(&self, sorted: &[f32]) -> Vec<f32> {
+        let mut values = vec![0.0; sorted.len()];
+        let len = sorted.len() / self.order.len();
+        for (from, &row) in sorted.chunks_exact(len).zip(&self.order) {
+            values[row * len..][..len].copy_from_slice(from);
+        }
+        values
+    }
+
+    /// Calls `each` with every group that occurs and its rows of `values`, all rows of `len` scalars, on the pool.
+    fn for_each_part(
+        &self,
+        mut values: &mut [f32],
+        len: usize,
+        each: impl Fn(usize, std::ops::Range<usize>, &mut [f32]) + Sync,
+    ) {
+        let mut first = 0;
+        let mut tasks = Vec::with_capacity(self.parts.len());
+        for &(group, rows) in &self.parts {
+            let (own, rest) = std::mem::take(&mut values).split_at_mut(rows * len);
+            tasks.push((group, first..first + rows, own));
+            (values, first) = (rest, first + rows);
+        }
+        tasks
+            .into_par_iter()
+            .for_each(|(group, rows, values)| each(group, rows, values));
+    }
+
+    /// A group's rows of a sorted matrix.
+    fn rows<'a>(sorted: &'a [f32], rows: &std::ops::Range<usize>, len: usize) -> Matrix<'a> {
+        Matrix::new(&sorted[rows.start * len..rows.end * len], rows.len(), len)
+    }
+
+    /// A group's weight [out, in].
+    fn weight<'a>(&self, w: &'a [f32], group: usize) -> Matrix<'a> {
+        let len = self.out * self.inputs;
+        Matrix::new(&w[group * len..][..len], self.out, self.inputs)
+    }
+
+    /// Adds the gradient of the weight to `sum`, which holds nothing yet unless it is `there`.
+    fn add_to_weight(&self, sum: &mut [f32], there: bool, grad: &[f32], x: &[f32]) {
+        let mode = if there { Mode::Add } else { Mode::Replace };
+        let mut starts = vec![None; sum.len() / (self.out * self.inputs)];
+        let mut first = 0;
+        for &(group, rows) in &self.parts {
+            starts[group] = Some(first..first + rows);
+            first += rows;
+        }
+        sum.par_chunks_exact_mut(self.out * self.inputs)
+            .zip(starts)
+            .for_each(|(sum, rows)| match rows {
+                Some(rows) => {
+                    let grad = Self::rows(grad, &rows, self.out).transposed();
+                    let x = Self::rows(x, &rows, self.inputs);
+                    multiply(self.precision, sum, mode, grad, x, Threads::Pool);
+                }
+                None if !there => sum.fill(0.0),
+                None => {}
+            });
+    }
+
+    /// Adds the gradient of the bias to `sum`.
+    fn add_to_bias(&self, sum: &mut [f32], grad: &[f32]) {
+        let mut rows = grad.chunks_exact(self.out);
+        for &(group, count) in &self.parts {
+            let sum = &mut sum[group * self.out..][..self.out];
+            for row in rows.by_ref().take(count) {
+                for (sum, value) in sum.iter_mut().zip(row) {
+                    *sum += value;
+                }
+            }
+        }
+    }
+}
+
+impl CustomOp3 for Grouped {
+    fn name(&self) -> &'static str {
+        "grouped-linear"
+    }
+
+    fn cpu_fwd(
+        &self,
+        x: &CpuStorage,
+        x_layout: &Layout,
+        w: &CpuStorage,
+        w_layout: &Layout,
+        b: &CpuStorage,
+        b_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let x = self.sort(floats(x, x_layout)?);
+        let (w, b) = (floats(w, w_layout)?, floats(b, b_layout)?);
+        let mut y = Buffer::new(self.order.len() * self.out);
+        self.for_each_part(&mut y, self.out, |group, rows, y| {
+            for row in y.chunks_exact_mut(self.out) {
+                row.copy_from_slice(&b[group * self.out..][..self.out]);
+            }
+            let (x, w) = (Self::rows(&x, &rows, self.inputs), self.weight(w, group));
+            multiply(
+                self.precision,
+                y,
+                Mode::Add,
+                x,
+                w.transposed(),
+                Threads::Pool,
+            );
+        });
+        *self.sorted.lock().unwrap_or_else(PoisonError::into_inner) = Some(x);
+        Ok((
+            CpuStorage::F32(self.unsort(&y)),
+            (self.order.len(), self.out).into(),
+        ))
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        w: &Tensor,
+        b: &Tensor,
+        _y: &Tensor,
+        grad_y: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let grad_y = grad_y.detach().contiguous()?;
+        let (grad_storage, grad_layout) = grad_y.storage_and_layout();
+        let grad = self.sort(floats(cpu(&grad_storage)?, grad_layout)?);
+        let sorted = self.sorted.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(sorted) = &*sorted else {
+            bail!("the backward pass of a grouped layer comes after its forward pass");
+        };
+
+        let grad_x = x.track_op().then(|| -> Result<Tensor> {
+            let (storage, layout) = w.storage_and_layout();
+            let w = floats(cpu(&storage)?, layout)?;
+            let mut grad_x = Buffer::new(self.order.len() * self.inputs);
+            self.for_each_part(&mut grad_x, self.inputs, |group, rows, grad_x| {
+                let (grad, w) = (Self::rows(&grad, &rows, self.out), self.weight(w, group));
+                multiply(
+                    self.precision,
+                    grad_x,
+                    Mode::Replace,
+                    grad,
+                    w,
+                    Threads::Pool,
+                );
+            });
+            Tensor::from_vec(self.unsort(&grad_x), x.shape(), x.device())
+        });
+        let to_weight = |sum: &mut [f32], there| self.add_to_weight(sum, there, &grad, sorted);
+        let to_bias = |sum: &mut [f32], _| self.add_to_bias(sum, &grad);
+        for (parameter, done) in [
+            (w, !w.is_variable() || gradients::add_in_place(w, to_weight)),
+            (b, !b.is_variable() || gradients::add_in_place(b, to_bias)),
+        ] {
+            if !done || (parameter.track_op() && !parameter.is_variable()) {
+                bail!(
+                    "a grouped layer's parameters are variables, and its backward pass is one of Backward::of"
+                );
+            }
+        }
+        Ok((grad_x.transpose()?, None, None))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::{Device, Var};
+
+    use super::*;
+    use crate::gradients::Backward;
+    use crate::kernels::linear::linear;
+
+    /// What the whole layer gives, of which all but one group a row is dropped.
+    #[test]
+    fn it_is_the_whole_layer_s_output_and_gradient_for_each_row_s_group() -> Result<()> {
+        const GROUPS: usize = 5;
+        for (rows, inputs, out) in [(1, 3, 2), (37, 33, 7), (90, 64, 51)] {
+            let values = |len: usize, by: usize| -> Vec<f32> {
+                (0..len)
+                    .map(|i| ((i * by + 3) % 89) as f32 / 40.0 - 1.0)
+                    .collect()
+            };
+            let wide = GROUPS * out;
+            let x = Var::from_vec(values(rows * inputs, 7), (rows, inputs), &Device::Cpu)?;
+            let w = Var::from_vec(values(wide * inputs, 11), (wide, inputs), &Device::Cpu)?;
+            let b = Var::from_vec(values(wide, 5), wide, &Device::Cpu)?;
+            let slope = Tensor::from_vec(values(rows * out, 13), (rows, out), &Device::Cpu)?;
+            // Group 3 never occurs, group 0 in most rows.
+            let groups: Vec<u8> = (0..rows).map(|row| [0, 4, 0, 1, 0, 2][row % 6]).collect();
+            for precision in Precision::ALL {
+                let of_groups = grouped_linear(&x, &w, &b, &groups, out, precision)?;
+                let all = linear(&x, &w, &b, precision)?.reshape((rows, GROUPS, out))?;
+                let taken: Vec<u32> = groups.iter().map(|&group| group.into()).collect();
+                let taken = Tensor::from_vec(taken, (rows, 1, 1), &Device::Cpu)?
+                    .broadcast_as((rows, 1, out))?
+                    .contiguous()?;
+                let of_all = all.gather(&taken, 1)?.squeeze(1)?;
+                let mut gradients = Vec::new();
+                for y in [&of_groups, &of_all] {
+                    let mut backward = Backward::of(&(y * &slope)?.sum_all()?)?;
+                    for var in [&x, &w, &b] {
+                        let gradient = backward.remove(var)?.expect("a gradient");
+                        gradients.push(gradient.flatten_all()?.to_vec1::<f32>()?);
+                    }
+                }
+                let (y, wanted) = (of_groups.to_vec2::<f32>()?, of_all.to_vec2::<f32>()?);
+                assert_eq!(y, wanted, "{precision}: the same bits");
+                for (got, wanted) in gradients[..3].iter().zip(&gradients[3..]) {
+                    for (got, wanted) in got.iter().zip(wanted) {
+                        assert!((got - wanted).abs() < 1e-4, "{precision}: {got}, {wanted}");
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    #[test]
+    fn a_group_that_is_not_there_is_refused() -> Result<()> {
+        let x = Tensor::zeros((2, 3), candle_core::DType::F32, &Device::Cpu)?;
+        let w = Tensor::zeros((4, 3), candle_core::DType::F32, &Device::Cpu)?;
+        let b = Tensor::zeros(4, candle_core::DType::F32, &Device::Cpu)?;
+        assert!(grouped_linear(&x, &w, &b, &[0, 1], 2, Precision::F32).is_ok());
+        for (groups, out) in [
+            (&[0, 2][..], 2),
+            (&[0][..], 2),
+            (&[0, 0][..], 3),
+            (&[0, 0], 0),
+        ] {
+            assert!(grouped_linear(&x, &w, &b, groups, out, Precision::F32).is_err());
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,338 @@
+//! Operands of products, rounded and laid out as tiles read them: right ones in panels, left ones in rows.
+//! It splits no output.
+
+use rayon::prelude::*;
+
+use crate::kernels::buffer::Buffer;
+use crate::kernels::rounding::write_rows;
+use crate::kernels::units::{
+    Columns, Element, LANES, Left, Mode, Unit, multiply_tile, row_tiles, tile_vecs, vectorized,
+};
+
+/// A matrix laid over a slice: its rows one after the other, or its columns if it is transposed.
+#[derive(Clone, Copy)]
+pub(crate) struct Matrix<'a> {
+    data: &'a [f32],
+    pub(super) rows: usize,
+    pub(super) cols: usize,
+    transposed: bool,
+}
+
+impl<'a> Matrix<'a> {
+    /// Rows one after the other, `data` [rows, cols].
+    pub(crate) fn new(data: &'a [f32], rows: usize, cols: usize) -> Self {
+        assert!(
+            data.len() == rows * cols,
+            "a {rows}x{cols} matrix over {} scalars",
+            data.len()
+        );
+        Self {
+            data,
+            rows,
+            cols,
+            transposed: false,
+        }
+    }
+
+    /// The transposed matrix over the same data.
+    pub(crate) fn transposed(self) -> Self {
+        Self {
+            data: self.data,
+            rows: self.cols,
+            cols: self.rows,
+            transposed: !self.transposed,
+        }
+    }
+}
+
+/// Who computes a product.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Threads {
+    /// The calling thread alone: for callers that already split their work.
+    Caller,
+    /// The current rayon pool, for products large enough to be worth it.
+    Pool,
+}
+
+/// Steps of a panel that are multiplied by all rows of a task before the next: 32 KiB of the widest panel.
+const STEPS_IN_CACHE: usize = 128;
+
+/// A right operand, cut into panels of columns, each [k / DEPTH, columns, DEPTH] with zeros where it ends before they do.
+pub(crate) struct Panels<E: Element> {
+    values: Buffer<E>,
+    steps: usize,
+    cols: usize,
+    vecs: usize,
+}
+
+impl<E: Element> Panels<E> {
+    /// The panels of `b` [k, n].
+    pub(crate) fn pack<U: Unit<Element = E>>(unit: U, b: Matrix<'_>, threads: Threads) -> Self {
+        let vecs = tile_vecs::<U>(b.cols);
+        let (steps, width) = (b.rows.div_ceil(E::DEPTH), vecs * LANES);
+        let panel_len = steps * width * E::DEPTH;
+        let mut values = Buffer::new(panel_len * b.cols.div_ceil(width));
+        let pack = |panel: usize, values: &mut [E]| {
+            pack_panel(unit, b, panel * width, width, values);
+        };
+        match threads {
+            Threads::Caller => {
+                for (panel, values) in values.chunks_exact_mut(panel_len).enumerate() {
+                    pack(panel, values);
+                }
+            }
+            Threads::Pool => values
+                .par_chunks_exact_mut(panel_len)
+                .with_max_len(1)
+                .enumerate()
+                .for_each(|(panel, values)| pack(panel, values)),
+        }
+        Self {
+            values,
+            steps,
+            cols: b.cols,
+            vecs,
+        }
+    }
+
+    /// Registers in the width of a panel.
+    pub(crate) const fn vecs(&self) -> usize {
+        self.vecs
+    }
+
+    /// Multiplies `rows` rows, no more than a tile's, into `out`, whose rows are this operand's columns long.
+    pub(crate) fn multiply<U: Unit<Element = E>>(
+        &self,
+        unit: U,
+        rows: usize,
+        left: Left<'_, E>,
+        mode: Mode,
+        out: &mut [f32],
+    ) {
+        self.multiply_apart(unit, rows, left, mode, out, self.cols);
+    }
+
+    /// Multiplies any number of rows of one run into `out`, whose rows are this operand's columns long.
+    ///
+    /// A block of a panel stays in the first cache while all rows pass it.
+    pub(crate) fn multiply_rows<U: Unit<Element = E>>(
+        &self,
+        unit: U,
+        rows: usize,
+        left: Left<'_, E>,
+        mode: Mode,
+        out: &mut [f32],
+    ) {
+        let width = self.vecs * LANES;
+        let panels = self.values.chunks_exact(self.steps * width * E::DEPTH);
+        for (index, panel) in panels.enumerate() {
+            let first = index * width;
+            let blocks = panel.chunks(STEPS_IN_CACHE * width * E::DEPTH);
+            for (block, panel) in blocks.enumerate() {
+                let mode = if block == 0 { mode } else { Mode::Add };
+                let start = left.start + block * STEPS_IN_CACHE * left.step;
+                let steps = panel.len() / (width * E::DEPTH);
+                for (row, count) in row_tiles::<U>(rows, self.vecs) {
+                    let left = Left {
+                        start: start + row * left.row_stride,
+                        steps,
+                        ..left
+                    };
+                    let columns = Columns {
+                        out: &mut out[row * self.cols + first..],
+                        stride: self.cols,
+                        cols: width.min(self.cols - first),
+                        vecs: self.vecs,
+                        mode,
+                    };
+                    multiply_tile(unit, count, left, panel, columns);
+                }
+            }
+        }
+    }
+
+    /// [`Panels::multiply`] into rows of `out` that begin `stride` scalars apart.
+    pub(crate) fn multiply_apart<U: Unit<Element = E>>(
+        &self,
+        unit: U,
+        rows: usize,
+        left: Left<'_, E>,
+        mode: Mode,
+        out: &mut [f32],
+        stride: usize,
+    ) {
+        let width = self.vecs * LANES;
+        let panels = self.values.chunks_exact(self.steps * width * E::DEPTH);
+        for (index, panel) in panels.enumerate() {
+            let first = index * width;
+            multiply_tile(
+                unit,
+                rows,
+                left,
+                panel,
+                Columns {
+                    out: &mut out[first..],
+                    stride,
+                    cols: width.min(self.cols - first),
+                    vecs: self.vecs,
+                    mode,
+                },
+            );
+        }
+    }
+}
+
+vectorized! {
+    /// Packs columns `first..` of `b` as one panel of this width.
+    fn pack_panel<U>(
+        unit,
+        b: Matrix<'a>,
+        first: usize,
+        width: usize,
+        panel: &'a mut [U::Element],
+    ) {
+        if b.transposed {
+            return pack_transposed(unit, b, first, width, panel);
+        }
+        let (cols, depth) = (width.min(b.cols - first), U::Element::DEPTH);
+        let steps = panel.chunks_exact_mut(width * depth);
+        for (step, rows) in steps.zip(b.data.chunks(b.cols * depth)) {
+            let part = |row: usize| {
+                let row = rows.get(row * b.cols..).unwrap_or_default();
+                row.get(first..first + cols).unwrap_or_default()
+            };
+            U::Element::join(unit, part(0), part(1), step);
+        }
+    }
+}
+
+/// [`pack_panel`] of a matrix whose columns are its runs in memory: square blocks of steps are transposed in registers.
+#[inline(always)]
+fn pack_transposed<U: Unit>(
+    unit: U,
+    b: Matrix<'_>,
+    first: usize,
+    width: usize,
+    panel: &mut [U::Element],
+) {
+    let (k, depth) = (b.rows, U::Element::DEPTH);
+    let (steps, cols) = (k.div_ceil(depth), width.min(b.cols - first));
+    let columns = &b.data[first * k..(first + cols) * k];
+    for step in (0..steps).step_by(LANES) {
+        let run = step * depth..k.min((step + LANES) * depth);
+        for col in (0..width).step_by(LANES) {
+            let mut block = [[0; LANES]; LANES];
+            let block_columns = columns.chunks_exact(k).skip(col).take(LANES);
+            for (block, column) in block.iter_mut().zip(block_columns) {
+                U::Element::steps(unit, &column[run.clone()], block);
+            }
+            unit.transpose(&mut block);
+            for (at, block) in block.iter().enumerate().take(steps - step) {
+                let to = &mut panel[((step + at) * width + col) * depth..][..LANES * depth];
+                for (to, &bits) in to.chunks_exact_mut(depth).zip(block) {
+                    U::Element::unpack(bits, to);
+                }
+            }
+        }
+    }
+}
+
+/// A left operand as tiles read it.
+pub(crate) struct Rows<'a, E: Element> {
+    values: Operand<'a, E>,
+    row_stride: usize,
+    step: usize,
+    steps: usize,
+}
+
+/// Where a left operand's scalars are.
+enum Operand<'a, E: Element> {
+    InPlace(&'a [E]),
+    Packed(Buffer<E>),
+}
+
+impl<'a, E: Element> Rows<'a, E> {
+    /// The rows of `a` [m, k]: where they are if that is possible, else a rounded copy.
+    pub(crate) fn pack<U: Unit<Element = E>>(unit: U, a: Matrix<'a>, threads: Threads) -> Self {
+        let (m, k, depth) = (a.rows, a.cols, E::DEPTH);
+        let steps = k.div_ceil(depth);
+        let (row_stride, step) = match a.transposed {
+            false => (steps * depth, depth),
+            true => (depth, m * depth),
+        };
+        let values = if let Some(values) = E::in_place(a.data) {
+            Operand::InPlace(values)
+        } else {
+            let mut values = Buffer::new(m * steps * depth);
+            if a.transposed {
+                pack_steps(unit, a.transposed(), &mut values, threads);
+            } else {
+                pack_rows(unit, a.data, k, row_stride, &mut values, threads);
+            }
+            Operand::Packed(values)
+        };
+        Self {
+            values,
+            row_stride,
+            step,
+            steps,
+        }
+    }
+
+    pub(crate) fn left(&self, row: usize) -> Left<'_, E> {
+        Left {
+            values: match &self.values {
+                Operand::InPlace(values) => values,
+                Operand::Packed(values) => values,
+            },
+            start: row * self.row_stride,
+            row_stride: self.row_stride,
+            step: self.step,
+            steps: self.steps,
+            run_stride: 0,
+            runs: 1,
+        }
+    }
+}
+
+/// Scalars that one task rounds.
+const TASK_LEN: usize = 1 << 15;
+
+/// Rounds rows of `cols` scalars into rows of `stride`, with zeros after them.
+fn pack_rows<U: Unit>(
+    unit: U,
+    data: &[f32],
+    cols: usize,
+    stride: usize,
+    values: &mut [U::Element],
+    threads: Threads,
+) {
+    let rows = (TASK_LEN / stride).max(1);
+    let pack = |values: &mut [U::Element], data: &[f32]| {
+        write_rows(unit, data, cols, values);
+    };
+    match threads {
+        Threads::Caller => pack(values, data),
+        Threads::Pool => values
+            .par_chunks_mut(rows * stride)
+            .zip(data.par_chunks(rows * cols))
+            .for_each(|(values, data)| pack(values, data)),
+    }
+}
+
+/// Packs all columns of `b` as one panel, a share of the steps on each thread.
+fn pack_steps<U: Unit>(unit: U, b: Matrix<'_>, values: &mut [U::Element], threads: Threads) {
+    let (depth, cols) = (U::Element::DEPTH, b.cols);
+    let steps = (TASK_LEN / (cols * depth)).max(1);
+    let pack = |values: &mut [U::Element], data: &[f32]| {
+        let part = Matrix::new(data, data.len() / cols, cols);
+        pack_panel(unit, part, 0, cols, values);
+    };
+    match threads {
+        Threads::Caller => pack(values, b.data),
+        Threads::Pool => values
+            .par_chunks_mut(steps * cols * depth)
+            .zip(b.data.par_chunks(steps * cols * depth))
+            .for_each(|(values, data)| pack(values, data)),
+    }
+}

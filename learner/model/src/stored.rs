@@ -1,0 +1,144 @@
+//! The scalars of a weights file: f32, or half of it for weights that travel often.
+//! It knows no parameter by name.
+
+use half::{bf16, f16};
+use safetensors::tensor::Dtype;
+use serde::{Deserialize, Serialize};
+
+/// What the scalars of a weights file are stored as. Rounding is to nearest, ties to even.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum StoredAs {
+    /// As they are, 4 bytes each.
+    #[default]
+    F32,
+    /// 11 bits of significand, up to 65,504, 2 bytes each.
+    F16,
+    /// 8 bits of significand, up to 3.4e38, 2 bytes each.
+    Bf16,
+}
+
+impl StoredAs {
+    /// Largest error of a stored scalar, as a share of it, or of the least normal number of the type if that is larger.
+    pub const fn error(self) -> f64 {
+        match self {
+            Self::F32 => 0.0,
+            // 2^-11 and 2^-8.
+            Self::F16 => 1.0 / 2048.0,
+            Self::Bf16 => 1.0 / 256.0,
+        }
+    }
+
+    /// The least number that keeps all of its digits. Below it there are steps of a fixed size: twice [`StoredAs::error`] of it.
+    pub const fn least_normal(self) -> f32 {
+        match self {
+            Self::F32 | Self::Bf16 => f32::MIN_POSITIVE,
+            // 2^-14.
+            Self::F16 => 1.0 / 16384.0,
+        }
+    }
+
+    /// The largest number; one that is larger is refused, though it might round to it.
+    pub const fn largest(self) -> f32 {
+        match self {
+            Self::F32 => f32::MAX,
+            Self::F16 => 65_504.0,
+            // 2^128 - 2^120.
+            Self::Bf16 => f32::from_bits(0x7f7f_0000),
+        }
+    }
+
+    /// The type's name in a safetensors file.
+    pub(crate) const fn dtype(self) -> Dtype {
+        match self {
+            Self::F32 => Dtype::F32,
+            Self::F16 => Dtype::F16,
+            Self::Bf16 => Dtype::BF16,
+        }
+    }
+
+    /// Bytes of one scalar.
+    pub const fn bytes(self) -> usize {
+        match self {
+            Self::F32 => 4,
+            Self::F16 | Self::Bf16 => 2,
+        }
+    }
+
+    /// Little-endian bytes of `values`; the index of the first that is too large for the type, which would be infinite.
+    pub(crate) fn encode(self, values: &[f32]) -> Result<Vec<u8>, usize> {
+        let largest = self.largest();
+        if let Some(at) = values.iter().position(|value| value.abs() > largest) {
+            return Err(at);
+        }
+        Ok(match self {
+            Self::F32 => values
+                .iter()
+                .flat_map(|value| value.to_le_bytes())
+                .collect(),
+            Self::F16 => {
+                let halves = values.iter().map(|&value| f16::from_f32(value));
+                halves.flat_map(f16::to_le_bytes).collect()
+            }
+            Self::Bf16 => {
+                let halves = values.iter().map(|&value| bf16::from_f32(value));
+                halves.flat_map(bf16::to_le_bytes).collect()
+            }
+        })
+    }
+}
+
+/// The scalars of a tensor of this type; `None` if it is none of [`StoredAs`].
+pub(crate) fn decode(dtype: Dtype, bytes: &[u8]) -> Option<Vec<f32>> {
+    let halves = |value: fn([u8; 2]) -> f32| {
+        let (halves, _) = bytes.as_chunks::<2>();
+        halves.iter().map(|&bytes| value(bytes)).collect()
+    };
+    match dtype {
+        Dtype::F32 => {
+            let (scalars, _) = bytes.as_chunks::<4>();
+            Some(
+                scalars
+                    .iter()
+                    .map(|&bytes| f32::from_le_bytes(bytes))
+                    .collect(),
+            )
+        }
+        Dtype::F16 => Some(halves(|bytes| f16::from_le_bytes(bytes).to_f32())),
+        Dtype::BF16 => Some(halves(|bytes| bf16::from_le_bytes(bytes).to_f32())),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_type_is_read_back_rounded_to_nearest() {
+        let values = [0.0f32, -1.0, 0.1, 1.0 / 3.0, 60_000.0, -1e-6];
+        assert_eq!(StoredAs::F16.largest(), f16::MAX.to_f32());
+        assert_eq!(StoredAs::Bf16.largest(), bf16::MAX.to_f32());
+        assert_eq!(StoredAs::F16.least_normal(), f16::MIN_POSITIVE.to_f32());
+        for stored in [StoredAs::F32, StoredAs::F16, StoredAs::Bf16] {
+            let bytes = stored.encode(&values).unwrap();
+            let read = decode(stored.dtype(), &bytes).unwrap();
+            for (value, read) in values.iter().zip(read) {
+                let error = f64::from((value - read).abs());
+                let size = value.abs().max(stored.least_normal());
+                assert!(
+                    error <= stored.error() * f64::from(size),
+                    "{stored:?}: {value}, {read}"
+                );
+            }
+        }
+        assert_eq!(decode(Dtype::F64, &[0; 8]), None);
+    }
+
+    #[test]
+    fn what_would_be_infinite_is_refused() {
+        assert_eq!(StoredAs::F16.encode(&[1.0, 65_519.0]), Err(1));
+        assert_eq!(StoredAs::Bf16.encode(&[f32::MAX]), Err(0));
+        assert!(StoredAs::F32.encode(&[f32::MAX]).is_ok());
+    }
+}

@@ -1,0 +1,91 @@
+//! The files of one checkpoint, and what `state.json` holds.
+
+use std::collections::BTreeMap;
+
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::affinity::AffinityEstimator;
+
+/// 2: CURL's key encoder has a file of its own. All else is as in 1.
+pub(super) const FORMAT: u32 = 2;
+/// The online network.
+pub(super) const ONLINE: &str = "online.safetensors";
+/// The target network.
+pub(super) const TARGET: &str = "target.safetensors";
+/// CURL's key encoder; there for that objective alone.
+pub(super) const KEY: &str = "key.safetensors";
+/// Adam's moments.
+pub(super) const OPTIMIZER: &str = "optimizer.safetensors";
+/// What whoever drives the learner keeps with it; there if it keeps something.
+pub(super) const COMPANION: &str = "companion.bin";
+/// A [`StateFile`].
+pub(super) const STATE: &str = "state.json";
+/// The SHA-256 of [`STATE`], which has those of the other files.
+pub(super) const STATE_SUM: &str = "state.json.sha256";
+/// Largest count in a state: no run comes near it, and what is added to counts cannot overflow.
+const COUNT_MAX: u64 = 1 << 53;
+
+/// The contents of `state.json`: all of a checkpoint that is not a tensor.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct StateFile {
+    pub(super) format: u32,
+    pub(super) run_spec_hash: String,
+    pub(super) updates: u64,
+    pub(super) adam_step: u64,
+    pub(super) weights_version: u64,
+    pub(super) rng: ChaCha8Rng,
+    pub(super) affinity: Option<AffinityEstimator>,
+    /// SHA-256 of the other files, by name.
+    pub(super) sha256: BTreeMap<String, String>,
+}
+
+/// Reads a `state.json` and throws it away: for whoever tries what such a file may hold.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn check_state(text: &[u8]) -> Result<(), String> {
+    StateFile::read(text).map(drop)
+}
+
+impl StateFile {
+    /// Reads the file's text and checks what it holds.
+    pub(super) fn read(text: &[u8]) -> Result<Self, String> {
+        let state: Self = serde_json::from_slice(text).map_err(|e| e.to_string())?;
+        if !(1..=FORMAT).contains(&state.format) {
+            let format = state.format;
+            return Err(format!("its format is {format}, not 1 to {FORMAT}"));
+        }
+        state.check_valid()?;
+        Ok(state)
+    }
+
+    /// Checks what its types do not hold: a file may be right by its sum and still not be one that a learner wrote.
+    fn check_valid(&self) -> Result<(), String> {
+        for (name, count) in [
+            ("updates", self.updates),
+            ("adam_step", self.adam_step),
+            ("weights_version", self.weights_version),
+        ] {
+            if count > COUNT_MAX {
+                return Err(format!("{name} is {count}, more than {COUNT_MAX}"));
+            }
+        }
+        let valid = self.affinity.as_ref().map(AffinityEstimator::check_valid);
+        valid.transpose().map_err(|why| why.to_string())?;
+        Ok(())
+    }
+}
+
+pub(super) fn sha256_of(bytes: &[u8]) -> String {
+    Sha256::digest(bytes)
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect()
+}
+
+pub(super) fn hex_of(hash: u64) -> String {
+    format!("{hash:016x}")
+}

@@ -1,0 +1,138 @@
+//! The folder that holds a run's checkpoints: which there are, who may save there, and files that survive a crash.
+//! It does not know what is in a checkpoint.
+
+use std::{
+    fs::{self, File},
+    io::{self, Write},
+    path::{Path, PathBuf},
+};
+
+use driml_protocol::lock_file;
+
+use super::error::{CheckpointError, io_error};
+
+/// The folder in a run's folder in which its checkpoints lie.
+pub const FOLDER: &str = "checkpoints";
+/// What the name of a checkpoint begins with; the number of its update follows.
+pub(super) const PREFIX: &str = "checkpoint-";
+const LOCK: &str = ".lock";
+/// What follows the name of a checkpoint while one of the same update takes its place.
+const REPLACED: &str = ".replaced.tmp";
+
+/// Keeps other learners from saving in `folder`, which is made, as long as the file is held.
+///
+/// # Errors
+/// Another learner saves there, or the file system refuses.
+pub fn lock(folder: &Path) -> Result<File, CheckpointError> {
+    fs::create_dir_all(folder).map_err(io_error("create", folder))?;
+    let path = folder.join(LOCK);
+    let lock = lock_file::create(&path, "let no other learner save there");
+    let lock = lock.map_err(io_error("create", &path))?;
+    lock.ok_or_else(|| CheckpointError::InUse(folder.to_owned()))
+}
+
+/// The checkpoints in `folder`, oldest first, as (updates, path). A folder that does not exist has none.
+///
+/// # Errors
+/// A folder that cannot be read.
+pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
+    let entries = match fs::read_dir(folder) {
+        Ok(entries) => entries,
+        Err(why) if why.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(why) => return Err(io_error("read", folder)(why)),
+    };
+    let mut all = Vec::new();
+    for entry in entries {
+        let path = entry.map_err(io_error("read", folder))?.path();
+        let name = path
+            .file_name()
+            .and_then(|name| name.to_str())
+            .unwrap_or_default();
+        let Some(rest) = name.strip_prefix(PREFIX) else {
+            continue;
+        };
+        // One that is being replaced counts as long as the new one does not have its name.
+        let replaced = rest.strip_suffix(REPLACED).map(|rest| {
+            let is_replaced = folder.join(format!("{PREFIX}{rest}")).exists();
+            (rest, is_replaced)
+        });
+        let (number, is_replaced) = replaced.unwrap_or((rest, false));
+        match number.parse::<u64>() {
+            Ok(updates) if !is_replaced => all.push((updates, path)),
+            _ => {
+                tracing::warn!(path = %path.display(), "left from an unfinished save; not a checkpoint")
+            }
+        }
+    }
+    all.sort();
+    Ok(all)
+}
+
+/// Gives a whole checkpoint its name. One of the same update, as at a stop right after a periodic save, gives way to it: between
+/// the two renames it is known by its other name.
+pub(super) fn put_in_place(aside: &Path, path: &Path) -> Result<(), CheckpointError> {
+    let folder = path.parent().unwrap_or(Path::new("."));
+    let mut older = path.as_os_str().to_owned();
+    older.push(REPLACED);
+    let older = PathBuf::from(older);
+    if path.exists() {
+        fs::rename(path, &older).map_err(io_error("move", path))?;
+    }
+    fs::rename(aside, path).map_err(io_error("move", aside))?;
+    sync(folder)?;
+    remove_if_there(&older)
+}
+
+/// Removes what saves that were cut off have left, and gives a checkpoint that was to be replaced its name back.
+pub(super) fn tidy(folder: &Path) -> Result<(), CheckpointError> {
+    for entry in fs::read_dir(folder).map_err(io_error("read", folder))? {
+        let path = entry.map_err(io_error("read", folder))?.path();
+        let name = path.file_name().and_then(|name| name.to_str());
+        let Some(name) = name.filter(|it| it.starts_with(PREFIX) && it.ends_with(".tmp")) else {
+            continue;
+        };
+        match name.strip_suffix(REPLACED).map(|name| folder.join(name)) {
+            Some(place) if !place.exists() => {
+                fs::rename(&path, place).map_err(io_error("move", &path))?;
+            }
+            _ => remove_if_there(&path)?,
+        }
+    }
+    Ok(())
+}
+
+pub(super) fn read(path: &Path) -> Result<Vec<u8>, CheckpointError> {
+    fs::read(path).map_err(|why| match why.kind() {
+        io::ErrorKind::NotFound => CheckpointError::Damaged {
+            file: path.to_owned(),
+            why: "it is missing".to_owned(),
+        },
+        _ => io_error("read", path)(why),
+    })
+}
+
+/// Writes a file aside, flushes it to disk and gives it its name.
+pub(super) fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
+    let mut aside = path.as_os_str().to_owned();
+    aside.push(".tmp");
+    let aside = PathBuf::from(aside);
+    let mut file = File::create(&aside).map_err(io_error("create", &aside))?;
+    file.write_all(bytes)
+        .and_then(|()| file.sync_all())
+        .map_err(io_error("write", &aside))?;
+    fs::rename(&aside, path).map_err(io_error("move", &aside))
+}
+
+/// Flushes a folder's own entries to disk.
+pub(super) fn sync(folder: &Path) -> Result<(), CheckpointError> {
+    File::open(folder)
+        .and_then(|folder| folder.sync_all())
+        .map_err(io_error("flush", folder))
+}
+
+pub(super) fn remove_if_there(folder: &Path) -> Result<(), CheckpointError> {
+    match fs::remove_dir_all(folder) {
+        Err(why) if why.kind() != io::ErrorKind::NotFound => Err(io_error("remove", folder)(why)),
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,140 @@
+//! Reading a checkpoint back, whole or not at all.
+
+use std::path::Path;
+
+use candle_core::Device;
+use driml_model::{Compute, Encoder, ModelConfig, Parameters};
+use rand_chacha::ChaCha8Rng;
+
+use super::{
+    contents::{
+        COMPANION, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of, sha256_of,
+    },
+    error::{CheckpointError, damaged},
+    folder::{list, read},
+};
+use crate::{
+    affinity::AffinityEstimator,
+    agent::{Agent, NetworkParameters},
+    settings::LearnerSettings,
+};
+
+/// What a checkpoint gave.
+#[derive(Debug)]
+pub struct Restored {
+    /// Networks, optimiser, count of updates.
+    pub agent: Agent,
+    /// The affinity estimate, if the run had one.
+    pub affinity: Option<AffinityEstimator>,
+    /// The generator behind augmentation and affinity.
+    pub rng: ChaCha8Rng,
+    /// Newest version of the weights that had been published.
+    pub weights_version: u64,
+}
+
+/// Loads the newest checkpoint in `folder` onto the device of `compute`; `None` if there is none. A damaged one is an error, not skipped.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_latest(
+    folder: &Path,
+    model: &ModelConfig,
+    settings: &LearnerSettings,
+    compute: &Compute,
+    run_spec_hash: u64,
+) -> Result<Option<Restored>, CheckpointError> {
+    match list(folder)?.last() {
+        Some((_, path)) => load(path, model, settings, compute, run_spec_hash).map(Some),
+        None => Ok(None),
+    }
+}
+
+/// Loads one checkpoint onto the device of `compute`, whichever it was saved from.
+///
+/// # Errors
+/// A file that is missing or is not what was written, a run of another specification, a network of other sizes.
+pub fn load(
+    path: &Path,
+    model: &ModelConfig,
+    settings: &LearnerSettings,
+    compute: &Compute,
+    run_spec_hash: u64,
+) -> Result<Restored, CheckpointError> {
+    let state = read_state(path)?;
+    let expected = hex_of(run_spec_hash);
+    if state.run_spec_hash != expected {
+        let (folder, found) = (path.to_owned(), state.run_spec_hash);
+        return Err(CheckpointError::OtherRun {
+            folder,
+            found,
+            expected,
+        });
+    }
+    let has_key = settings.auxiliary()?.key_tau().is_some();
+    if state.format == 1 && has_key {
+        return Err(CheckpointError::WithoutKeyEncoder(path.to_owned()));
+    }
+    let tensors = |name: &str| read_file(path, &state, name);
+    let parameters = |model: &ModelConfig, part: fn(&str) -> bool, name: &str| {
+        let loaded = Parameters::load_part(model, part, &tensors(name)?, &compute.device);
+        loaded.map_err(|why| damaged(path, name, why.to_string()))
+    };
+    let key = has_key.then(|| parameters(model, Encoder::has, KEY));
+    let networks = NetworkParameters {
+        online: parameters(model, |_| true, ONLINE)?,
+        target: parameters(&model.without_dim(), |_| true, TARGET)?,
+        key: key.transpose()?,
+    };
+    let moments = candle_core::safetensors::load_buffer(&tensors(OPTIMIZER)?, &Device::Cpu)
+        .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
+    let (model, settings) = (model.clone(), settings.clone());
+    let mut agent = Agent::from_parameters(model, settings, compute, networks)?;
+    agent
+        .restore_progress(state.updates, state.adam_step, moments)
+        .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
+    Ok(Restored {
+        agent,
+        affinity: state.affinity,
+        rng: state.rng,
+        weights_version: state.weights_version,
+    })
+}
+
+/// What whoever drove the learner kept with the checkpoint at `path`; none if it kept nothing.
+///
+/// # Errors
+/// A file that is missing or is not what was written.
+pub fn companion(path: &Path) -> Result<Option<Vec<u8>>, CheckpointError> {
+    let state = read_state(path)?;
+    let there = state.sha256.contains_key(COMPANION);
+    there
+        .then(|| read_file(path, &state, COMPANION))
+        .transpose()
+}
+
+fn read_state(path: &Path) -> Result<StateFile, CheckpointError> {
+    let text = read(&path.join(STATE))?;
+    let sum = read(&path.join(STATE_SUM))?;
+    if !sum.starts_with(sha256_of(&text).as_bytes()) {
+        return Err(damaged(
+            path,
+            STATE,
+            format!("its SHA-256 is not the one in {STATE_SUM}"),
+        ));
+    }
+    StateFile::read(&text).map_err(|why| damaged(path, STATE, why))
+}
+
+/// The bytes of one of its other files.
+fn read_file(path: &Path, state: &StateFile, name: &str) -> Result<Vec<u8>, CheckpointError> {
+    let bytes = read(&path.join(name))?;
+    if state.sha256.get(name) == Some(&sha256_of(&bytes)) {
+        return Ok(bytes);
+    }
+    let length = bytes.len();
+    Err(damaged(
+        path,
+        name,
+        format!("the SHA-256 of its {length} bytes is not the one in {STATE}"),
+    ))
+}

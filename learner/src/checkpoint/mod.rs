@@ -1,0 +1,16 @@
+//! Checkpoints: all of a learner's state in one folder, from which a run resumes bit for bit.
+//! It does not decide when to save, and never falls back to an older checkpoint by itself.
+
+mod contents;
+mod description;
+mod error;
+mod folder;
+mod load;
+mod save;
+
+pub use contents::check_state;
+pub use description::describe;
+pub use error::CheckpointError;
+pub use folder::{FOLDER, list, lock};
+pub use load::{Restored, companion, load, load_latest};
+pub use save::{RunState, save};

@@ -1,0 +1,127 @@
+//! Writing a checkpoint: each file whole, then the folder, then its name.
+
+use std::{
+    collections::BTreeMap,
+    fs,
+    path::{Path, PathBuf},
+};
+
+use driml_model::Parameters;
+use rand_chacha::ChaCha8Rng;
+
+use super::{
+    contents::{
+        COMPANION, FORMAT, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of,
+        sha256_of,
+    },
+    description,
+    error::{CheckpointError, io_error},
+    folder::{PREFIX, list, put_in_place, remove_if_there, sync, tidy, write_durably},
+};
+use crate::{affinity::AffinityEstimator, agent::Agent, error::UpdateError};
+
+/// What a checkpoint holds, borrowed for saving.
+#[derive(Clone, Copy, Debug)]
+pub struct RunState<'a> {
+    /// Networks, optimiser, count of updates.
+    pub agent: &'a Agent,
+    /// The affinity estimate, if the run has one.
+    pub affinity: Option<&'a AffinityEstimator>,
+    /// The generator behind augmentation and affinity.
+    pub rng: &'a ChaCha8Rng,
+    /// Newest version of the weights that was published.
+    pub weights_version: u64,
+    /// Hash of the run's specification.
+    pub run_spec_hash: u64,
+    /// What [`describe`](super::describe) says, for the networks' metadata.
+    pub description: &'a str,
+    /// What whoever drives the learner keeps with it.
+    pub companion: Option<&'a [u8]>,
+}
+
+/// Writes `folder/checkpoint-<updates>` and removes all but the newest `keep` checkpoints.
+///
+/// Every file is written aside, flushed to disk and renamed; so is the folder: a crash at any moment leaves the older
+/// checkpoints whole and at most a `.tmp` folder, which the next save removes.
+///
+/// # Errors
+/// A state that is not finite, or a failing file system, such as a full disk; nothing older has then been removed, and nothing
+/// of the new one is left.
+pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf, CheckpointError> {
+    if keep == 0 {
+        return Err(CheckpointError::KeepNone);
+    }
+    fs::create_dir_all(folder).map_err(io_error("create", folder))?;
+    tidy(folder)?;
+    let name = format!("{PREFIX}{:012}", state.agent.updates());
+    let (path, aside) = (folder.join(&name), folder.join(format!("{name}.tmp")));
+    let saved = write(&aside, state).and_then(|()| put_in_place(&aside, &path));
+    if let Err(error) = saved {
+        // It would keep a full disk full.
+        if let Err(e) = remove_if_there(&aside) {
+            tracing::warn!("a checkpoint was not saved, and a part of it stays: {e}");
+        }
+        return Err(error);
+    }
+    let all = list(folder)?;
+    for (_, old) in &all[..all.len().saturating_sub(keep)] {
+        fs::remove_dir_all(old).map_err(io_error("remove", old))?;
+    }
+    Ok(path)
+}
+
+/// Writes a checkpoint's files into the folder `aside`, which is made.
+fn write(aside: &Path, state: &RunState<'_>) -> Result<(), CheckpointError> {
+    let agent = state.agent;
+    let mut files = tensor_files(agent, state.description).map_err(CheckpointError::Unsound)?;
+    files.extend(state.companion.map(|bytes| (COMPANION, bytes.to_vec())));
+    fs::create_dir(aside).map_err(io_error("create", aside))?;
+    let mut sha256 = BTreeMap::new();
+    for (name, bytes) in files {
+        write_durably(&aside.join(name), &bytes)?;
+        sha256.insert(name.to_owned(), sha256_of(&bytes));
+    }
+    let file = StateFile {
+        format: FORMAT,
+        run_spec_hash: hex_of(state.run_spec_hash),
+        updates: agent.updates(),
+        adam_step: agent.adam.step_count(),
+        weights_version: state.weights_version,
+        rng: state.rng.clone(),
+        affinity: state.affinity.cloned(),
+        sha256,
+    };
+    let text = serde_json::to_vec_pretty(&file).map_err(|why| CheckpointError::Io {
+        what: "encode",
+        path: aside.join(STATE),
+        why: why.into(),
+    })?;
+    write_durably(&aside.join(STATE), &text)?;
+    // As `sha256sum --check` reads it.
+    write_durably(
+        &aside.join(STATE_SUM),
+        format!("{}  {STATE}\n", sha256_of(&text)).as_bytes(),
+    )?;
+    sync(aside)
+}
+
+/// The files of tensors and their names, all finite.
+fn tensor_files(
+    agent: &Agent,
+    description: &str,
+) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
+    let everything = |parameters: &Parameters| {
+        parameters.to_described_safetensors(description::KEY, description)
+    };
+    let moments = agent.adam.to_tensors()?;
+    let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from)?;
+    let mut files = vec![
+        (ONLINE, everything(agent.online())?),
+        (TARGET, everything(agent.target())?),
+        (OPTIMIZER, moments),
+    ];
+    if let Some(key) = agent.key() {
+        files.push((KEY, everything(key)?));
+    }
+    Ok(files)
+}

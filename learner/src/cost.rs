@@ -1,0 +1,230 @@
+//! What one update computes, part by part, counted from the network's layers and what the auxiliary loss passes through them.
+//! It measures nothing; how fast a machine does it is for `driml bench learner`.
+
+use driml_model::{LayerCost, ModelConfig};
+
+use crate::{auxiliary::loss::Passes, config::Config};
+
+/// How an update uses its networks, and for how many rows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct UpdateShape {
+    /// Rows, B.
+    pub rows: u64,
+    /// Whether the C51 head gives s_t's distributions for every action; the loss reads that of the action taken alone.
+    pub every_action: bool,
+    /// Whether the online network chooses the action in s_{t+n}.
+    pub double_dqn: bool,
+    /// What the auxiliary loss needs.
+    pub passes: Passes,
+}
+
+impl UpdateShape {
+    /// That of a learner with these settings, where the replay server serves `positives` later states a row. Meaningful for
+    /// settings that can work.
+    pub fn of(learner: &Config, positives: usize) -> Self {
+        let passes = learner.update.auxiliary().map_or_else(
+            |_| Passes::default(),
+            |loss| loss.passes(positives, learner.augment.is_some()),
+        );
+        Self {
+            rows: learner.batch_size.into(),
+            every_action: false,
+            double_dqn: learner.update.double_dqn,
+            passes,
+        }
+    }
+}
+
+/// Multiplications and additions of one update, each counted as one: matrix products alone, of all rows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct UpdateCost {
+    /// s_t through the torso, forward and backward.
+    pub online: u64,
+    /// s_t through the C51 head, forward and backward.
+    pub head: u64,
+    /// s_{t+n} through the target network, forward; rows that do not bootstrap are left out of it, and counted here.
+    pub target: u64,
+    /// s_{t+n} through the online network, forward, to choose an action.
+    pub double_dqn: u64,
+    /// States beyond s_t through the torso, forward and backward: augmented ones and positives.
+    pub states: u64,
+    /// States through the key encoder, forward.
+    pub keys: u64,
+    /// The auxiliary heads, forward and backward.
+    pub heads: u64,
+    /// Dot products of all pairs of rows, and their gradients.
+    pub scores: u64,
+}
+
+impl UpdateCost {
+    /// What an update of `shape` costs with a network of `model`.
+    pub fn of(model: &ModelConfig, shape: &UpdateShape) -> Self {
+        let layers = model.layer_costs();
+        let sum = |parts: &[&str], cost: fn(&LayerCost) -> u64| -> u64 {
+            let of_parts = |layer: &&LayerCost| parts.iter().any(|part| layer.is_of(part));
+            layers.iter().filter(of_parts).map(cost).sum()
+        };
+        let forward = |parts: &[&str]| sum(parts, |layer| layer.forward);
+        let learning = |parts: &[&str]| sum(parts, LayerCost::learning);
+        let UpdateShape {
+            rows,
+            every_action,
+            double_dqn,
+            passes,
+        } = *shape;
+        let actions = if every_action {
+            1
+        } else {
+            model.num_actions as u64
+        };
+        let (height, width, _) = model.local_shape();
+        let matrices = passes.local_scores * (height * width) as u64 + passes.global_scores;
+        // Forward, and the gradients of both sides; a key has none.
+        let products = if passes.keys > 0 { 2 } else { 3 };
+        let value = forward(&["torso", "head"]);
+        Self {
+            online: rows * learning(&["torso"]),
+            head: rows * learning(&["head"]) / actions,
+            target: rows * value,
+            double_dqn: rows * value * u64::from(double_dqn),
+            states: rows * passes.states * learning(&["torso"]),
+            keys: rows * passes.keys * forward(&["torso", "dim.psi4"]),
+            heads: rows
+                * (passes.psi * learning(&["dim.psi3", "dim.psi4", "dim.action"])
+                    + passes.phi * learning(&["dim.phi3", "dim.phi4"])),
+            scores: 2 * products * matrices * rows * rows * model.rkhs as u64,
+        }
+    }
+
+    /// All parts together.
+    pub const fn total(&self) -> u64 {
+        let Self {
+            online,
+            head,
+            target,
+            double_dqn,
+            states,
+            keys,
+            heads,
+            scores,
+        } = *self;
+        online + head + target + double_dqn + states + keys + heads + scores
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_model::{ConvLayer, DimHeads};
+
+    use super::*;
+    use crate::auxiliary::settings::Lambda;
+
+    /// 6 x 6 x 1, a map of 2 x 2 x 3, f4 of 5; rkhs 4, 2 actions of 3 atoms.
+    fn model(dim: DimHeads) -> ModelConfig {
+        ModelConfig {
+            height: 6,
+            width: 6,
+            channels: 1,
+            num_actions: 2,
+            atoms: 3,
+            v_min: -1.0,
+            v_max: 1.0,
+            conv: vec![ConvLayer {
+                out: 3,
+                kernel: 4,
+                stride: 2,
+            }],
+            hidden: 5,
+            rkhs: 4,
+            action_embed: 2,
+            dim,
+        }
+    }
+
+    #[test]
+    fn an_update_of_a_small_network_is_counted_as_by_hand() {
+        let (conv, fc, head) = (2 * 4 * 3 * 16, 2 * 12 * 5, 2 * 5 * 6);
+        let value = conv + fc + head;
+        let c51 = UpdateShape {
+            rows: 10,
+            every_action: false,
+            double_dqn: false,
+            passes: Passes::default(),
+        };
+        let plain = UpdateCost {
+            // The image needs no gradient.
+            online: 10 * (2 * conv + 3 * fc),
+            // One of the two actions.
+            head: 10 * 3 * head / 2,
+            target: 10 * value,
+            ..UpdateCost::default()
+        };
+        assert_eq!(UpdateCost::of(&model(DimHeads::NONE), &c51), plain);
+
+        let lambda = Lambda {
+            l3t3: 1.0,
+            l4t4: 1.0,
+            ..Lambda::NONE
+        };
+        let passes = Passes::of_pairs(lambda, 2, true);
+        let dim = UpdateShape {
+            every_action: true,
+            double_dqn: true,
+            passes,
+            ..c51
+        };
+        // Forward; psi is given features and the action's embedding, once for all four locations.
+        let action = (2 * 2 * 2, 2 * (2 * 2 + 2 * 2));
+        let psi3 = 2 * (2 * (4 * 3 * 4 + 2 * 4) + 4 * 4 * 4);
+        let phi3 = 2 * (2 * (4 * 3 * 4) + 4 * 4 * 4);
+        let psi4 = 2 * (2 * (5 * 4 + 2 * 4) + 4 * 4);
+        let phi4 = 2 * (2 * (5 * 4) + 4 * 4);
+        let expected = UpdateCost {
+            head: 10 * 3 * head,
+            double_dqn: 10 * value,
+            // Two positives and the augmented s_t.
+            states: 10 * 3 * (2 * conv + 3 * fc),
+            heads: 10 * (3 * (action.0 + psi3 + psi4) + 2 * action.1 + 2 * 3 * (phi3 + phi4)),
+            // Two positives, at four locations and of the global features.
+            scores: 3 * 2 * 2 * (4 + 1) * 10 * 10 * 4,
+            ..plain
+        };
+        let found = UpdateCost::of(&model(lambda.dim_heads(true)), &dim);
+        assert_eq!(found, expected);
+        assert_eq!(
+            found.total(),
+            expected.online
+                + expected.head
+                + expected.target
+                + expected.double_dqn
+                + expected.states
+                + expected.heads
+                + expected.scores
+        );
+    }
+
+    #[test]
+    fn a_key_is_encoded_forward_alone() {
+        let heads = DimHeads {
+            psi4: true,
+            ..DimHeads::NONE
+        };
+        let shape = UpdateShape {
+            rows: 10,
+            every_action: false,
+            double_dqn: false,
+            passes: Passes {
+                states: 1,
+                keys: 1,
+                psi: 1,
+                global_scores: 1,
+                ..Passes::default()
+            },
+        };
+        let psi4 = 2 * (2 * 5 * 4 + 4 * 4);
+        let found = UpdateCost::of(&model(heads), &shape);
+        assert_eq!(found.keys, 10 * (2 * 4 * 3 * 16 + 2 * 12 * 5 + psi4));
+        assert_eq!(found.heads, 10 * 3 * psi4);
+        assert_eq!(found.scores, 2 * 2 * 10 * 10 * 4);
+    }
+}

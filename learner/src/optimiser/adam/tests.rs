@@ -1,0 +1,141 @@
+//! Adam by itself: steps beyond the finite numbers, dead moments, and float64 beside it.
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::edges::any_finite;
+
+const SETTINGS: AdamSettings = AdamSettings {
+    lr: 1.0,
+    beta1: 0.9,
+    beta2: 0.999,
+    eps: 1e-8,
+};
+
+#[test]
+fn moments_of_a_gradient_that_is_gone_end_at_zero() {
+    let (mut p, mut m, mut v) = (vec![1.0f32; 9], vec![0.0; 9], vec![0.0; 9]);
+    // The last element's gradient stays.
+    let mut g = vec![1e-3f32; 9];
+    let mut updates = 0;
+    let mut run = |g: &[f32], count: u64| {
+        for _ in 0..count {
+            updates += 1;
+            let rule = Rule::new(SETTINGS, updates, 1.0);
+            assert!(rule.apply(&mut p, g, &mut m, &mut v));
+        }
+        (m.clone(), v.clone())
+    };
+    run(&g, 10);
+    g[..8].fill(0.0);
+    let (m, v) = run(&g, 2_000);
+    assert_eq!(m[..8], [0.0; 8], "0.9^2000 of what it was");
+    assert!((m[8] / 1e-3 - 1.0).abs() < 1e-5 && v[0] > f32::MIN_POSITIVE);
+    let (_, v) = run(&g, 75_000);
+    assert_eq!(v[..8], [0.0; 8], "0.999^77000 of what it was");
+    assert!((v[8] / 1e-6 - 1.0).abs() < 1e-3);
+}
+
+/// Whether a step is fine at this parameter and gradient, in the last of that many `elements`.
+fn fine(settings: AdamSettings, elements: usize, parameter: f32, gradient: f32) -> bool {
+    let rule = Rule::new(settings, 1, 1.0);
+    let (mut p, mut g) = (vec![0.5; elements], vec![0.1; elements]);
+    (p[elements - 1], g[elements - 1]) = (parameter, gradient);
+    let (mut m, mut v) = (vec![0.0; elements], vec![0.0; elements]);
+    rule.apply(&mut p, &g, &mut m, &mut v)
+}
+
+#[test]
+fn a_step_beyond_the_finite_numbers_is_noticed_wherever_it_is() {
+    for elements in [1, 2, 7, 16, 33] {
+        assert!(fine(SETTINGS, elements, 3e38, 1.0));
+        let far = AdamSettings {
+            lr: 1e37,
+            ..SETTINGS
+        };
+        assert!(fine(far, elements, 3e38, 1.0), "towards 0");
+        assert!(
+            !fine(far, elements, 3.4e38, -1.0),
+            "past the largest number"
+        );
+        assert!(!fine(SETTINGS, elements, f32::NAN, 1.0));
+        assert!(!fine(SETTINGS, elements, f32::NEG_INFINITY, 1.0));
+        // The square of the gradient is not finite: the parameter would stand still for good.
+        assert!(!fine(SETTINGS, elements, 0.0, 1e30));
+    }
+}
+
+/// Moments of a gradient that never ends, and of one whose sign and size go on changing.
+#[test]
+fn ten_million_steps_leave_the_moments_right() {
+    let AdamSettings { beta1, beta2, .. } = SETTINGS;
+    let gradient = |t: u64| [0.02f32, 1e-3 * ((t % 17) as f32 - 8.0)];
+    let (mut p, mut m, mut v) = ([0f32; 2], [0f32; 2], [0f32; 2]);
+    let (mut m_exact, mut v_exact) = ([0f64; 2], [0f64; 2]);
+    for t in 1..=10_000_000 {
+        let g = gradient(t);
+        assert!(Rule::new(SETTINGS, t, 1.0).apply(&mut p, &g, &mut m, &mut v));
+        for ((m, v), g) in m_exact.iter_mut().zip(&mut v_exact).zip(g.map(f64::from)) {
+            *m = beta1 * *m + (1.0 - beta1) * g;
+            *v = beta2 * *v + (1.0 - beta2) * g * g;
+        }
+    }
+    for i in 0..2 {
+        let (m_off, v_off) = (
+            f64::from(m[i]) / m_exact[i] - 1.0,
+            f64::from(v[i]) / v_exact[i] - 1.0,
+        );
+        assert!(
+            m_off.abs() < moment_error(beta1) && v_off.abs() < moment_error(beta2).min(5e-5),
+            "{i}: {m_off:e}, {v_off:e}"
+        );
+    }
+}
+
+/// The same steps in float64 on one parameter that starts at 0; where it goes, and how far in all.
+fn in_f64(settings: AdamSettings, gradients: &[f64]) -> (f64, f64) {
+    let AdamSettings {
+        lr,
+        beta1,
+        beta2,
+        eps,
+    } = settings;
+    let (mut p, mut way, mut m, mut v) = (0.0, 0.0, 0.0, 0.0);
+    for (t, g) in (1..).zip(gradients) {
+        m = beta1 * m + (1.0 - beta1) * g;
+        v = beta2 * v + (1.0 - beta2) * g * g;
+        let root = (v / (1.0 - beta2.powi(t))).sqrt();
+        let step: f64 = lr / (1.0 - beta1.powi(t)) * m / (root + eps);
+        p -= step;
+        way += step.abs();
+    }
+    (p, way)
+}
+
+proptest! {
+    /// Gradients of any size up to the largest `max_grad_norm`, zeros and subnormal ones among them.
+    #[test]
+    fn steps_are_those_of_float64(
+        gradients in prop::collection::vec(
+            prop_oneof![Just(0.0f32), any_finite().prop_map(|g| g.clamp(-1e15, 1e15))],
+            1..120,
+        ),
+        repeats in any::<bool>(),
+        lr in prop::sample::select(vec![1e-30, 1e-4, 1.0]),
+        (beta1, beta2) in prop::sample::select(vec![(0.0, 0.0), (0.0, 0.9), (0.9, 0.99), (0.9, 0.999), (0.5, 0.99999)]),
+        eps in prop::sample::select(vec![1e-15, 1e-8, 3.9e-5, 1.0, 1e30]),
+    ) {
+        let settings = AdamSettings { lr, beta1, beta2, eps };
+        settings.validate().unwrap();
+        let gradients: Vec<f32> = if repeats { vec![gradients[0]; gradients.len()] } else { gradients };
+        let (mut p, mut m, mut v) = ([0f32], [0f32], [0f32]);
+        for (step, g) in (1..).zip(&gradients) {
+            prop_assert!(Rule::new(settings, step, 1.0).apply(&mut p, &[*g], &mut m, &mut v));
+        }
+        let gradients: Vec<f64> = gradients.iter().map(|&g| g.into()).collect();
+        let (expected, way) = in_f64(settings, &gradients);
+        let error = (f64::from(p[0]) - expected).abs();
+        let floor = gradients.len() as f64 * step_floor(way, eps);
+        prop_assert!(error <= STEP_ERROR * way + floor, "{:e}, {expected:e} on a way of {way:e}", p[0]);
+    }
+}

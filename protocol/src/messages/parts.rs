@@ -1,0 +1,86 @@
+//! Who takes part in a run and how each is, as a replay server knows it: for `driml status`.
+//! Counts and rates are in `status`; this is about who is there, who waits and who was last heard when.
+
+use serde::{Deserialize, Serialize};
+use zenoh::qos::Priority;
+
+use super::{report::Warning, status::Waiting};
+use crate::wire::message::{Keyed, Kind, Message};
+
+/// Parts of which the last warning is passed on: those whose is newest.
+pub const WARNINGS_MAX: usize = 64;
+
+/// Which part of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub enum PartName {
+    /// The learner.
+    Learner,
+    /// The actor of this number.
+    Actor(u32),
+}
+
+impl std::fmt::Display for PartName {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Learner => f.write_str("learner"),
+            Self::Actor(actor) => write!(f, "actor-{actor}"),
+        }
+    }
+}
+
+/// What a replay server knows of one part.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PartStatus {
+    /// Which part.
+    pub who: PartName,
+    /// Whether it is connected.
+    pub connected: bool,
+    /// Seconds for which it has been connected, or gone.
+    pub since_s: f64,
+    /// How often it has joined the run.
+    pub lives: u32,
+    /// Seconds since its last chunk, or request for a batch; none before the first.
+    pub heard_s: Option<f64>,
+    /// Seconds for which its chunk, or request, has been waiting at the rate limiter; none if none waits.
+    pub held_s: Option<f64>,
+    /// An actor's: the version of the weights that acted in its last chunk.
+    pub weights_version: Option<u64>,
+    /// What it says that it does, for how many seconds, and how many seconds ago it said so; none if it has said nothing.
+    pub doing: Option<(String, f64, f64)>,
+    /// The last warning in its log, where it is among the newest of all parts.
+    pub last_warning: Option<Warning>,
+}
+
+/// A replay server's account of itself and of all parts that have joined it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PartsStatus {
+    /// Seconds since it started.
+    pub up_s: f64,
+    /// Who waits at the rate limiter now.
+    pub waiting: Waiting,
+    /// For how many seconds.
+    pub waiting_s: f64,
+    /// Requests for a batch that wait.
+    pub requests_waiting: u32,
+    /// Chunks that wait.
+    pub chunks_waiting: u32,
+    /// Their bytes in memory.
+    pub chunk_bytes_waiting: u64,
+    /// Version of the newest weights; 0 before the first.
+    pub weights_version: u64,
+    /// Their age, seconds; none before the first.
+    pub weights_age_s: Option<f64>,
+    /// The last warning in the replay server's own log.
+    pub last_warning: Option<Warning>,
+    /// The learner, then the actors by number.
+    pub parts: Vec<PartStatus>,
+}
+
+impl Message for PartsStatus {
+    const KIND: Kind = Kind::PartsStatus;
+}
+
+impl Keyed for PartsStatus {
+    const KEY: &'static str = "status/parts";
+    const PRIORITY: Priority = Priority::InteractiveHigh;
+}

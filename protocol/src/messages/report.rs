@@ -1,0 +1,178 @@
+//! What an actor or the learner says of itself every few seconds: what it does and the last thing it warned of.
+//! Nothing depends on it but what a person is told.
+
+use serde::{Deserialize, Serialize};
+
+use super::done::Done;
+use crate::wire::{
+    error::CodecError,
+    keys::Alive,
+    message::{Keyed, Kind, Message, Request, no_payload},
+};
+
+/// Bytes of what a part does, in words.
+const DOING_MAX: usize = 80;
+/// Bytes of a warning that is passed on.
+const WARNING_MAX: usize = 400;
+
+/// One life of a part, by the number that nobody knows but itself and the replay server.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Life {
+    /// Of an actor.
+    Actor {
+        /// The actor's number in the run.
+        actor: u32,
+        /// This life's.
+        incarnation: u64,
+    },
+    /// Of a learner.
+    Learner(u64),
+}
+
+impl Life {
+    /// How others see that it is connected.
+    pub fn alive(self) -> Alive {
+        match self {
+            Self::Actor { actor, incarnation } => Alive::actor(actor, incarnation),
+            Self::Learner(learner) => Alive::learner(learner),
+        }
+    }
+}
+
+/// A part's account of itself.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Report {
+    /// Whose it is.
+    pub who: Life,
+    /// What it does, such as `plays`; at most 80 bytes.
+    pub doing: String,
+    /// For how long, seconds.
+    pub since_s: f64,
+    /// The last warning or error in its log.
+    pub last_warning: Option<Warning>,
+    /// Its part in the run is done: the learner has learned from every batch, and has saved.
+    pub finished: bool,
+}
+
+/// A line of a part's log.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Warning {
+    /// The line, cut to 400 bytes.
+    pub text: String,
+    /// Its age, seconds.
+    pub age_s: f64,
+}
+
+impl Warning {
+    /// One of this age, cut to what may be sent.
+    pub fn new(text: &str, age_s: f64) -> Self {
+        Self {
+            text: cut(text, WARNING_MAX),
+            age_s,
+        }
+    }
+}
+
+impl Report {
+    /// Cut to what may be sent.
+    pub fn new(who: Life, doing: &str, since_s: f64, last_warning: Option<Warning>) -> Self {
+        Self {
+            who,
+            doing: cut(doing, DOING_MAX),
+            since_s,
+            last_warning,
+            finished: false,
+        }
+    }
+}
+
+/// The beginning of `text`, at most `bytes_max` of it.
+fn cut(text: &str, bytes_max: usize) -> String {
+    let mut end = text.len().min(bytes_max);
+    while !text.is_char_boundary(end) {
+        end -= 1;
+    }
+    text[..end].to_owned()
+}
+
+impl Message for Report {
+    const KIND: Kind = Kind::Report;
+
+    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+        let warning = self.last_warning.as_ref();
+        let too_long = self.doing.len() > DOING_MAX
+            || warning.is_some_and(|warning| warning.text.len() > WARNING_MAX);
+        if too_long {
+            return Err(CodecError::Header(format!(
+                "a report of more than {DOING_MAX} bytes, or a warning of more than {WARNING_MAX}"
+            )));
+        }
+        let times = [self.since_s, warning.map_or(0.0, |warning| warning.age_s)];
+        if times.iter().any(|it| !it.is_finite() || *it < 0.0) {
+            return Err(CodecError::Header(format!(
+                "a report of {times:?} seconds ago"
+            )));
+        }
+        no_payload(payload)
+    }
+
+    fn actor(&self) -> Option<u32> {
+        match self.who {
+            Life::Actor { actor, .. } => Some(actor),
+            Life::Learner(_) => None,
+        }
+    }
+}
+
+impl Keyed for Report {
+    const KEY: &'static str = "report";
+    const BY_ACTOR: bool = true;
+}
+
+impl Request for Report {
+    type Reply = Done;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texts_are_cut_between_characters() {
+        assert_eq!(cut("grün", 3), "gr");
+        assert_eq!(cut("grün", 4), "grü");
+        assert_eq!(cut("", 4), "");
+    }
+
+    #[test]
+    fn what_is_too_long_or_no_time_is_refused() {
+        let report = |doing: &str, since_s, warning: Option<(&str, f64)>| Report {
+            who: Life::Learner(1),
+            doing: doing.into(),
+            since_s,
+            last_warning: warning.map(|(text, age_s)| Warning {
+                text: text.into(),
+                age_s,
+            }),
+            finished: false,
+        };
+        let long = "x".repeat(401);
+        assert!(
+            report("plays", 1.0, Some(("lost", 2.0)))
+                .validate(&[])
+                .is_ok()
+        );
+        for bad in [
+            report(&long, 1.0, None),
+            report("plays", f64::NAN, None),
+            report("plays", -1.0, None),
+            report("plays", 1.0, Some((&long, 0.0))),
+            report("plays", 1.0, Some(("x", f64::INFINITY))),
+        ] {
+            assert!(bad.validate(&[]).is_err(), "{bad:?}");
+        }
+        assert!(report("plays", 1.0, None).validate(&[1]).is_err());
+        let cut = Report::new(Life::Learner(1), &long, 0.0, Some(Warning::new(&long, 0.0)));
+        assert!(cut.validate(&[]).is_ok());
+    }
+}

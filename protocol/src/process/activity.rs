@@ -1,0 +1,53 @@
+//! What a process is doing, and since when, in words: for whoever asks why nothing happens.
+//! It is told, it does not look.
+
+use std::{
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+/// What a process is doing now. Clones are the same.
+#[derive(Clone, Debug)]
+pub struct Activity(Arc<Mutex<(String, Instant)>>);
+
+impl Activity {
+    /// It begins with `doing`, such as `plays` or `waits for a batch`.
+    pub fn new(doing: &str) -> Self {
+        Self(Arc::new(Mutex::new((doing.to_owned(), Instant::now()))))
+    }
+
+    fn now(&self) -> MutexGuard<'_, (String, Instant)> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// From now on it does this; what it does already goes on.
+    pub fn begin(&self, doing: &str) {
+        let mut now = self.now();
+        if now.0 != doing {
+            *now = (doing.to_owned(), Instant::now());
+        }
+    }
+
+    /// What it does, and for how long.
+    pub fn get(&self) -> (String, Duration) {
+        let now = self.now();
+        (now.0.clone(), now.1.elapsed())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_goes_on_is_not_begun_again() {
+        let activity = Activity::new("plays");
+        std::thread::sleep(Duration::from_millis(20));
+        activity.begin("plays");
+        assert!(activity.get().1 >= Duration::from_millis(20));
+        activity.clone().begin("waits");
+        let (doing, since) = activity.get();
+        assert_eq!(doing, "waits");
+        assert!(since < Duration::from_millis(20));
+    }
+}

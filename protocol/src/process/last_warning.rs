@@ -1,0 +1,20 @@
+//! The last warning or error of this process, for whoever asks how it is.
+//! The log hands it over; where a log line goes besides is not known here.
+
+use std::{
+    sync::{Mutex, PoisonError},
+    time::{Duration, Instant},
+};
+
+static LAST: Mutex<Option<(String, Instant)>> = Mutex::new(None);
+
+/// Keeps a warning in the place of the one before.
+pub fn note(text: String) {
+    *LAST.lock().unwrap_or_else(PoisonError::into_inner) = Some((text, Instant::now()));
+}
+
+/// The last one and its age; none if there was none.
+pub fn get() -> Option<(String, Duration)> {
+    let last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
+    last.as_ref().map(|(text, at)| (text.clone(), at.elapsed()))
+}

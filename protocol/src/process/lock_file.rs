@@ -1,0 +1,58 @@
+//! Files whose lock says that something is in use. The lock ends with the last process that has the file open, however it ends.
+//! It does not wait: how long, and what is said meanwhile, is the caller's.
+
+use std::{
+    fs::{File, TryLockError},
+    io,
+    path::Path,
+};
+
+/// Creates `path` and locks it; `None` where another process holds it.
+///
+/// Not every file system of a cluster has locks. There the file counts as locked, and a warning ends with `advice`.
+///
+/// # Errors
+/// A file that cannot be created; the error names no path.
+pub fn create(path: &Path, advice: &str) -> io::Result<Option<File>> {
+    let file = File::create(path)?;
+    match try_lock(&file) {
+        Ok(true) => Ok(Some(file)),
+        Ok(false) => Ok(None),
+        Err(e) => {
+            tracing::warn!("{} cannot be locked: {e}; {advice}", path.display());
+            Ok(Some(file))
+        }
+    }
+}
+
+/// Locks `file`; `false` where another process holds it.
+///
+/// # Errors
+/// A file system without locks.
+pub fn try_lock(file: &File) -> io::Result<bool> {
+    match file.try_lock() {
+        Ok(()) => Ok(true),
+        Err(TryLockError::WouldBlock) => Ok(false),
+        Err(TryLockError::Error(e)) => Err(e),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_is_locked_once_until_its_last_holder_lets_go() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(".lock");
+        let lock = create(&path, "").unwrap().unwrap();
+        assert!(create(&path, "").unwrap().is_none());
+        assert!(!try_lock(&File::open(&path).unwrap()).unwrap());
+        let copy = lock.try_clone().unwrap();
+        drop(lock);
+        assert!(create(&path, "").unwrap().is_none());
+        drop(copy);
+        assert!(create(&path, "").unwrap().is_some());
+        assert!(create(&folder.path().join("nowhere/.lock"), "").is_err());
+    }
+}

@@ -1,0 +1,228 @@
+//! What each role may do, as rules for zenoh's access control at the replay server: everything else is denied.
+//! A message is let in by its sender's common name and its key alone; what it says is checked by whoever answers it.
+
+use super::role::{ACTORS_MAX, Role};
+use crate::{
+    messages::{
+        affinity::AffinityUpdate,
+        batch_request::BatchRequest,
+        chunk::ChunkHeader,
+        goodbye::Goodbye,
+        hello::Hello,
+        insert_reply::Claim,
+        join::{ActorJoin, LearnerJoin},
+        parts::PartsStatus,
+        priorities::PriorityUpdate,
+        report::Report,
+        status::{LearnerStatus, ReplayStatus},
+        weights::{WeightsRequest, WeightsUpload, WeightsVersion},
+    },
+    wire::keys::Keys,
+};
+
+/// What a role may do; everything else it may not.
+struct Grant {
+    role: Role,
+    /// Keys at which it asks.
+    asks: Vec<String>,
+    /// Keys at which it answers.
+    answers: Vec<String>,
+    /// Keys at which it hears announcements.
+    hears: Vec<String>,
+    /// Keys of its liveliness tokens.
+    lives: Vec<String>,
+}
+
+/// What a role may do in the run whose keys these are; nothing for a replay server, which connects to nobody.
+fn grant(keys: &Keys, role: Role) -> Grant {
+    let (mut asks, mut answers) = (vec![keys.of::<Hello>()], Vec::new());
+    let (mut hears, mut lives) = (Vec::new(), Vec::new());
+    match role {
+        Role::Actor(actor) => {
+            asks.extend([
+                keys.of_actor::<ActorJoin>(actor),
+                keys.of_actor::<ChunkHeader>(actor),
+                keys.of_actor::<Claim>(actor),
+                keys.of_actor::<Goodbye>(actor),
+                keys.of_actor::<Report>(actor),
+                keys.of::<WeightsRequest>(),
+            ]);
+            hears.push(keys.of::<WeightsVersion>());
+            lives.push(keys.lives_of_actor(actor));
+        }
+        Role::Learner => {
+            asks.extend([
+                keys.of::<LearnerJoin>(),
+                keys.of::<BatchRequest>(),
+                keys.of::<AffinityUpdate>(),
+                keys.of::<PriorityUpdate>(),
+                keys.of::<WeightsUpload>(),
+                keys.of_learner::<Report>(),
+            ]);
+            answers.push(keys.of::<LearnerStatus>());
+            lives.push(keys.lives_of_learner());
+        }
+        Role::Observer => {
+            asks.extend([
+                keys.of::<ReplayStatus>(),
+                keys.of::<PartsStatus>(),
+                keys.of::<LearnerStatus>(),
+            ]);
+        }
+        Role::ReplayServer => asks.clear(),
+    }
+    Grant {
+        role,
+        asks,
+        answers,
+        hears,
+        lives,
+    }
+}
+
+/// Rules, subjects and policies as zenoh has them.
+#[derive(Default)]
+struct Lists {
+    rules: Vec<String>,
+    subjects: Vec<String>,
+    policies: Vec<String>,
+}
+
+impl Lists {
+    fn add(&mut self, grant: &Grant) {
+        let name = grant.role.to_string();
+        let mut rules = Vec::new();
+        for (what, flow, messages, keys) in [
+            ("asks", "ingress", r#""query""#, &grant.asks),
+            ("is-answered", "egress", r#""reply""#, &grant.asks),
+            (
+                "answers",
+                "ingress",
+                r#""declare_queryable", "reply""#,
+                &grant.answers,
+            ),
+            ("is-asked", "egress", r#""query""#, &grant.answers),
+            (
+                "listens",
+                "ingress",
+                r#""declare_subscriber""#,
+                &grant.hears,
+            ),
+            ("hears", "egress", r#""put""#, &grant.hears),
+            ("lives", "ingress", r#""liveliness_token""#, &grant.lives),
+        ] {
+            if keys.is_empty() {
+                continue;
+            }
+            let id = format!("\"{name}-{what}\"");
+            self.rules.push(format!(
+                "{{ id: {id}, permission: \"allow\", flows: [\"{flow}\"], messages: [{messages}], key_exprs: [{}] }}",
+                quoted(keys)
+            ));
+            rules.push(id);
+        }
+        self.subjects.push(format!(
+            "{{ id: \"{name}\", cert_common_names: [\"{name}\"], link_protocols: [\"quic\"] }}"
+        ));
+        self.policies.push(format!(
+            "{{ rules: [{}], subjects: [\"{name}\"] }}",
+            rules.join(", ")
+        ));
+    }
+
+    /// Who comes through a unix socket of this machine: its folder's permissions are the guard.
+    fn add_unix_sockets(&mut self) {
+        let all = "\"put\", \"delete\", \"declare_subscriber\", \"query\", \"reply\", \"declare_queryable\", \"liveliness_token\", \
+                   \"liveliness_query\", \"declare_liveliness_subscriber\"";
+        self.rules.push(format!(
+            "{{ id: \"all\", permission: \"allow\", flows: [\"ingress\", \"egress\"], messages: [{all}], key_exprs: [\"**\"] }}"
+        ));
+        let subject = "{ id: \"this-machine\", link_protocols: [\"unixsock-stream\"] }";
+        self.subjects.push(subject.into());
+        let policy = "{ rules: [\"all\"], subjects: [\"this-machine\"] }";
+        self.policies.push(policy.into());
+    }
+}
+
+fn quoted(keys: &[String]) -> String {
+    let quoted: Vec<_> = keys.iter().map(|key| format!("\"{key}\"")).collect();
+    quoted.join(", ")
+}
+
+/// The whole of zenoh's `access_control`, JSON5, for the replay server of the run whose keys these are.
+pub(crate) fn rules(keys: &Keys) -> String {
+    let mut lists = Lists::default();
+    let actors = (0..ACTORS_MAX).map(Role::Actor);
+    for role in actors.chain([Role::Learner, Role::Observer]) {
+        lists.add(&grant(keys, role));
+    }
+    lists.add_unix_sockets();
+    format!(
+        "{{ enabled: true, default_permission: \"deny\", rules: [{}], subjects: [{}], policies: [{}] }}",
+        lists.rules.join(", "),
+        lists.subjects.join(", "),
+        lists.policies.join(", ")
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every key at which a role may do anything.
+    fn all(grant: &Grant) -> Vec<&str> {
+        let lists = [&grant.asks, &grant.answers, &grant.hears, &grant.lives];
+        lists.into_iter().flatten().map(String::as_str).collect()
+    }
+
+    #[test]
+    fn each_role_has_the_least_it_needs() {
+        let keys = Keys::new("d").unwrap();
+        let of = |role| grant(&keys, role);
+        assert_eq!(
+            all(&of(Role::Actor(3))),
+            [
+                "d/hello",
+                "d/join/actor/3",
+                "d/ingest/3",
+                "d/claim/3",
+                "d/goodbye/3",
+                "d/report/3",
+                "d/weights",
+                "d/weights-version",
+                "d/alive/actor/3/*",
+            ]
+        );
+        assert_eq!(
+            all(&of(Role::Learner)),
+            [
+                "d/hello",
+                "d/join/learner",
+                "d/batch",
+                "d/affinity",
+                "d/priorities",
+                "d/weights-upload",
+                "d/report/learner",
+                "d/status/learner",
+                "d/alive/learner/*",
+            ]
+        );
+        assert_eq!(
+            all(&of(Role::Observer)),
+            [
+                "d/hello",
+                "d/status/replay",
+                "d/status/parts",
+                "d/status/learner",
+            ]
+        );
+        assert!(all(&of(Role::ReplayServer)).is_empty());
+    }
+
+    #[test]
+    fn zenoh_takes_the_rules() {
+        let mut config = zenoh::Config::default();
+        let rules = rules(&Keys::new("a/b").unwrap());
+        config.insert_json5("access_control", &rules).unwrap();
+    }
+}

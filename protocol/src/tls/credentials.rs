@@ -1,0 +1,266 @@
+//! The files of one part in a folder of certificates, read and checked before anything is sent.
+//! What the other side shows is for `handshake`.
+
+use std::{
+    fs, io,
+    os::unix::fs::PermissionsExt,
+    path::{Path, PathBuf},
+    time::{Duration, SystemTime, UNIX_EPOCH},
+};
+
+use rustls::{
+    CertificateError, RootCertStore,
+    client::verify_server_cert_signed_by_trust_anchor,
+    crypto::{CryptoProvider, ring},
+    pki_types::{CertificateDer, PrivateKeyDer, UnixTime, pem::PemObject},
+    server::{ParsedCertificate, WebPkiClientVerifier},
+    sign::CertifiedKey,
+};
+use x509_parser::prelude::{FromDer, X509Certificate};
+
+use super::{
+    role::{ACTORS_MAX, Role},
+    sentences::TlsError,
+};
+
+/// A certificate that expires sooner is warned of at the start.
+const EXPIRES_SOON: Duration = Duration::from_secs(14 * 24 * 3600);
+
+/// The authority's certificate in a folder.
+pub fn authority_path(folder: &Path) -> PathBuf {
+    folder.join("ca.pem")
+}
+
+/// What a part shows and whom it trusts. Nobody has them but by [`Credentials::read`], so they are good.
+#[derive(Debug)]
+pub struct Credentials {
+    role: Role,
+    authority: PathBuf,
+    certificate: PathBuf,
+    key: PathBuf,
+    /// Until when the certificate is good, seconds since 1970.
+    expires: i64,
+    pub(super) roots: RootCertStore,
+    pub(super) chain: Vec<CertificateDer<'static>>,
+    pub(super) secret: PrivateKeyDer<'static>,
+}
+
+impl Credentials {
+    /// Reads `ca.pem`, `ROLE.pem` and `ROLE.key` in `folder`, and checks that they belong to this role and to each other.
+    ///
+    /// # Errors
+    /// A file that is missing, unreadable, of another role, authority or key, expired or not valid yet; what to do.
+    pub fn read(folder: &Path, role: Role) -> Result<Self, TlsError> {
+        match role {
+            Role::Actor(number) if number >= ACTORS_MAX => {
+                return Err(TlsError::Number { number });
+            }
+            _ => {}
+        }
+        let file = |ending| folder.join(format!("{role}.{ending}"));
+        let (authority, certificate, key) = (authority_path(folder), file("pem"), file("key"));
+        let authorities = certificates(&authority, role)?;
+        let chain = certificates(&certificate, role)?;
+        let secret = PrivateKeyDer::from_pem_slice(&read(&key, role)?).map_err(|_| {
+            let (path, what) = (key.clone(), "private key");
+            TlsError::NotPem { path, what }
+        })?;
+        warn_if_open(&key);
+
+        let own = parsed(&chain[0], &certificate)?;
+        let names: Vec<_> = own
+            .subject()
+            .iter_common_name()
+            .map(|name| name.as_str().unwrap_or_default().to_owned())
+            .collect();
+        if names != [role.to_string()] {
+            return Err(TlsError::OtherRole {
+                path: certificate,
+                have: names.join(", "),
+                role,
+            });
+        }
+        check_dates(&own, &certificate, role)?;
+        let expires = own.validity().not_after.timestamp();
+        let mut roots = RootCertStore::empty();
+        for one in authorities {
+            check_dates(&parsed(&one, &authority)?, &authority, role)?;
+            roots.add(one).map_err(|_| not_pem(&authority))?;
+        }
+        check_signed(&roots, &chain, role).map_err(|why| TlsError::OtherAuthority {
+            path: certificate.clone(),
+            authority: authority.clone(),
+            why,
+        })?;
+        let other_key = || TlsError::OtherKey {
+            key: key.clone(),
+            certificate: certificate.clone(),
+            role,
+        };
+        let signer = provider().key_provider.load_private_key(secret.clone_key());
+        let signer = signer.map_err(|_| not_pem(&key))?;
+        let pair = CertifiedKey::new(chain.clone(), signer);
+        pair.keys_match().map_err(|_| other_key())?;
+        Ok(Self {
+            role,
+            authority,
+            certificate,
+            key,
+            expires,
+            roots,
+            chain,
+            secret,
+        })
+    }
+
+    /// What this part is.
+    pub const fn role(&self) -> Role {
+        self.role
+    }
+
+    /// The authority's certificate.
+    pub(super) fn authority_path(&self) -> &Path {
+        &self.authority
+    }
+
+    /// The certificate's file.
+    pub fn certificate_path(&self) -> &Path {
+        &self.certificate
+    }
+
+    /// How long the certificate is still good.
+    pub fn expires_in(&self) -> Duration {
+        let left = self.expires.saturating_sub(now().as_secs() as i64);
+        Duration::from_secs(u64::try_from(left).unwrap_or(0))
+    }
+
+    /// Warns if the certificate expires soon: whoever has an expired one is cut off in the middle of a run.
+    pub(crate) fn warn_if_it_expires_soon(&self) {
+        let left = self.expires_in();
+        if left < EXPIRES_SOON {
+            tracing::warn!(
+                "{} expires in {} hours, and this part is cut off then: remove it and its key, let deploy/certs.sh make new ones, and \
+                 start this part again",
+                self.certificate.display(),
+                left.as_secs() / 3600
+            );
+        }
+    }
+
+    /// zenoh's settings for TLS, JSON5.
+    pub(crate) fn zenoh_settings(&self) -> String {
+        let paths = [
+            ("root_ca_certificate", &self.authority),
+            ("listen_certificate", &self.certificate),
+            ("listen_private_key", &self.key),
+            ("connect_certificate", &self.certificate),
+            ("connect_private_key", &self.key),
+        ];
+        let paths = paths.map(|(name, path)| format!("{name}: {:?}", path.display().to_string()));
+        format!(
+            "{{ {}, enable_mtls: true, verify_name_on_connect: true, close_link_on_expiration: true }}",
+            paths.join(", ")
+        )
+    }
+}
+
+/// The provider of algorithms that zenoh uses too.
+pub(super) fn provider() -> CryptoProvider {
+    ring::default_provider()
+}
+
+fn now() -> Duration {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH);
+    now.unwrap_or_default()
+}
+
+fn read(path: &Path, role: Role) -> Result<Vec<u8>, TlsError> {
+    let path_of = || path.to_owned();
+    fs::read(path).map_err(|why| match why.kind() {
+        io::ErrorKind::NotFound => TlsError::Missing {
+            path: path_of(),
+            role,
+        },
+        _ => TlsError::Unreadable {
+            path: path_of(),
+            why,
+        },
+    })
+}
+
+fn not_pem(path: &Path) -> TlsError {
+    let what = match path.extension() {
+        Some(ending) if ending == "key" => "private key",
+        _ => "certificate",
+    };
+    let path = path.to_owned();
+    TlsError::NotPem { path, what }
+}
+
+/// The certificates in a file, at least one.
+fn certificates(path: &Path, role: Role) -> Result<Vec<CertificateDer<'static>>, TlsError> {
+    let bytes = read(path, role)?;
+    let found: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&bytes).collect();
+    match found {
+        Ok(found) if !found.is_empty() => Ok(found),
+        _ => Err(not_pem(path)),
+    }
+}
+
+fn parsed<'a>(der: &'a CertificateDer<'_>, path: &Path) -> Result<X509Certificate<'a>, TlsError> {
+    let parsed = X509Certificate::from_der(der);
+    parsed.map(|(_, it)| it).map_err(|_| not_pem(path))
+}
+
+fn check_dates(certificate: &X509Certificate<'_>, path: &Path, role: Role) -> Result<(), TlsError> {
+    let (validity, now) = (certificate.validity(), now().as_secs() as i64);
+    let path = path.to_owned();
+    if now > validity.not_after.timestamp() {
+        let when = validity.not_after.to_string();
+        return Err(TlsError::Expired { path, when, role });
+    }
+    if now < validity.not_before.timestamp() {
+        let when = validity.not_before.to_string();
+        return Err(TlsError::NotYet { path, when });
+    }
+    Ok(())
+}
+
+/// Checks that the authority signed the first of `chain`, for the side on which `role` uses it.
+fn check_signed(
+    roots: &RootCertStore,
+    chain: &[CertificateDer<'static>],
+    role: Role,
+) -> Result<(), String> {
+    let in_words = |e: rustls::Error| match e {
+        rustls::Error::InvalidCertificate(
+            CertificateError::InvalidPurpose | CertificateError::InvalidPurposeContext { .. },
+        ) => "it is made for the other side of a connection".into(),
+        e => e.to_string(),
+    };
+    let (own, others) = (&chain[0], &chain[1..]);
+    let (provider, now) = (provider(), UnixTime::now());
+    if role == Role::ReplayServer {
+        let algorithms = provider.signature_verification_algorithms.all;
+        let own = ParsedCertificate::try_from(own).map_err(in_words)?;
+        return verify_server_cert_signed_by_trust_anchor(&own, roots, others, now, algorithms)
+            .map_err(in_words);
+    }
+    let verifier =
+        WebPkiClientVerifier::builder_with_provider(roots.clone().into(), provider.into())
+            .build()
+            .map_err(|e| e.to_string())?;
+    let verified = verifier.verify_client_cert(own, others, now);
+    verified.map(drop).map_err(in_words)
+}
+
+/// Whoever can read a key can play its part.
+fn warn_if_open(key: &Path) {
+    let mode = fs::metadata(key).map(|it| it.permissions().mode());
+    if mode.is_ok_and(|mode| mode & 0o077 != 0) {
+        let key = key.display();
+        tracing::warn!(
+            "{key} can be read by other users of this machine, who could play this part: chmod 600 {key}"
+        );
+    }
+}

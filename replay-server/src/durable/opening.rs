@@ -1,0 +1,159 @@
+//! Opening the folder of a replay: what is there is taken up, and a log goes on or begins.
+//! Reading it back is for `recovery`.
+
+use std::{
+    path::{Path, PathBuf},
+    time::{Duration, Instant},
+};
+
+use driml_protocol::{RunSpec, TRANSITION_BYTES};
+
+use super::{
+    error::DurableError,
+    folder::LogFolder,
+    journal::{Journal, Limits, Place},
+    recovery::{Recovered, find_id, go_back, recover},
+    replay::{DurableReplay, Log, Marked},
+    segment::{DurableState, FORMAT, LogId, Mark},
+};
+use crate::{
+    config::{Config, SEGMENT_BYTES_MIN},
+    replay::Replay,
+};
+
+/// How often the log is flushed unless the settings say so.
+const FSYNC_DEFAULT: Duration = Duration::from_secs(1);
+/// Largest segment unless its size is given: small enough that little is kept beyond what the ring holds.
+const SEGMENT_BYTES_MAX: u64 = 1 << 26;
+/// Segments that the ring, or the disk budget, is to span at least.
+const SEGMENTS: u64 = 16;
+
+/// Where a replay is kept, and which part of the run it is.
+#[derive(Clone, Debug)]
+pub struct DurableArgs {
+    /// The folder, for this replay alone.
+    pub dir: PathBuf,
+    /// Which of the replay's shards it is.
+    pub shard: u32,
+    /// Updates of the learner after which the run goes on; 0 starts it.
+    pub after_updates: u64,
+    /// Size from which a segment is followed by another, if not what suits the ring.
+    pub segment_bytes: Option<u64>,
+    /// Go back to this mark: what the log says after it is removed.
+    pub mark: Option<Mark>,
+}
+
+/// What was found in the folder.
+#[derive(Clone, Debug, Default)]
+pub struct Recovery {
+    /// There was a replay.
+    pub found: bool,
+    /// Bytes of the log that were read.
+    pub bytes: u64,
+    /// How long that took.
+    pub took: Duration,
+    /// Damage, and what came of it: sentences for a person.
+    pub warnings: Vec<String>,
+}
+
+impl DurableReplay {
+    /// The replay of a run that is kept in a folder: as it was, if it was kept there before, else an empty one.
+    ///
+    /// # Errors
+    /// Settings that cannot work; a folder that cannot be written, is in use, or holds the replay of another run. Damage is no
+    /// error: what is left is used, and what was lost is said.
+    pub fn open(
+        args: &DurableArgs,
+        spec: &RunSpec,
+        config: &Config,
+        batch_size: u32,
+    ) -> Result<(Self, Recovery), DurableError> {
+        let started = Instant::now();
+        let mut replay = Replay::shard(spec, config, batch_size, args.shard)?;
+        let folder = LogFolder::open(&args.dir)?;
+        let ours = LogId {
+            format: FORMAT,
+            identity: rand::random(),
+            spec_hash: spec.hash(),
+            shard: (args.shard, config.shards),
+        };
+        let known = match folder.read_id()? {
+            Some(id) => Some(id),
+            None => find_id(&folder)?,
+        };
+        let id = known.unwrap_or(ours);
+        folder.check(&id, &ours)?;
+        if let Some(mark) = args.mark {
+            go_back(&folder, mark)?;
+        }
+        let found = match known {
+            Some(id) => recover(&folder, id, spec.num_actions, &mut replay, args.mark)?,
+            None => None,
+        };
+        let mut recovery = Recovery::default();
+        let (found, is_new) = match found {
+            Some(found) => (found, false),
+            None => {
+                let next = folder.first_number()?;
+                (Recovered::nothing(next, args.after_updates), true)
+            }
+        };
+        if is_new {
+            folder.write_id(&id)?;
+            if args.after_updates > 0 {
+                replay = replay.resumed_at(args.after_updates, args.shard);
+            }
+        }
+        recovery.found = !is_new;
+        recovery.bytes = found.bytes;
+        recovery.warnings = found.warnings;
+        let state = DurableState {
+            replay: replay.snapshot(),
+            learner: found.learner,
+            after_updates: found.after_updates,
+        };
+        let fsync = config.fsync_ms.map_or(FSYNC_DEFAULT, Duration::from_millis);
+        let journal = Journal::begin(
+            Place {
+                folder: args.dir.clone(),
+                id,
+                number: found.number,
+                ordinal: found.ordinal,
+            },
+            &found.segments,
+            limits(args, spec, config),
+            fsync,
+            state,
+        )?;
+        let oldest_row = replay.oldest_row();
+        let marked = args.mark.map(|mark| Marked { mark, oldest_row });
+        let log = Log::new(journal, id.spec_hash, folder).marked(marked);
+        let mut this = Self::with_log(replay, log, found.learner, found.after_updates);
+        this.catch_up(args.after_updates, batch_size, config.shards);
+        this.tidy();
+        recovery.took = started.elapsed();
+        Ok((this, recovery))
+    }
+}
+
+/// How large a segment is, and what all may take.
+fn limits(args: &DurableArgs, spec: &RunSpec, config: &Config) -> Limits {
+    let shards = u64::from(config.shards);
+    let disk_bytes_max = config.disk_bytes_max.map(|max| max / shards);
+    let row_bytes = spec.frame_bytes() as u64 + TRANSITION_BYTES as u64;
+    let ring = (config.capacity_transitions / shards).saturating_mul(row_bytes);
+    let all = disk_bytes_max.map_or(ring, |max| max.min(ring));
+    let fitting = (all / SEGMENTS).clamp(SEGMENT_BYTES_MIN, SEGMENT_BYTES_MAX);
+    Limits {
+        segment_bytes: args.segment_bytes.unwrap_or(fitting),
+        disk_bytes_max,
+    }
+}
+
+/// The folder of shard `shard` of `shards` in a run's `--replay-dir`.
+pub(crate) fn shard_dir(dir: &Path, shard: u32, shards: u32) -> PathBuf {
+    match shards {
+        1 => dir.to_owned(),
+        _ => dir.join(format!("shard-{shard}")),
+    }
+}

@@ -1,0 +1,187 @@
+//! The bytes of the log: records one after the other, each with its number, its length and a checksum.
+//! What a record means is for `event` and `segment`; where a segment ends is for `recovery`.
+//!
+//! A record is a head of 32 bytes, little-endian, and a body:
+//! magic u32, kind u32, ordinal u64, length of the body u64, bytes of the body that the checksum covers u32, crc32 u32.
+//! The checksum covers the head before it too. Of a chunk, whose body is the message as it came, it covers the message's head; the
+//! message has a checksum of its own over all of it.
+
+use std::{
+    fs::File,
+    io::{self, BufReader, Read},
+    path::Path,
+};
+
+use driml_protocol::BufferPool;
+
+/// Bytes before the body.
+pub(super) const HEAD_BYTES: usize = 32;
+const MAGIC: u32 = u32::from_le_bytes(*b"DRL1");
+/// Longest body: a message's, and some.
+const BODY_BYTES_MAX: u64 = (1 << 29) + (1 << 21);
+/// Bytes read at once.
+const READ_BYTES: usize = 1 << 18;
+
+/// What a record is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub(super) enum RecordKind {
+    /// The first of a segment: which one it is, and the replay's state where it begins.
+    Segment = 1,
+    /// An event.
+    Event = 2,
+    /// A chunk that was stored.
+    Chunk = 3,
+    /// The last of a segment that another one follows.
+    Closed = 4,
+}
+
+impl RecordKind {
+    const fn of(number: u32) -> Option<Self> {
+        Some(match number {
+            1 => Self::Segment,
+            2 => Self::Event,
+            3 => Self::Chunk,
+            4 => Self::Closed,
+            _ => return None,
+        })
+    }
+}
+
+/// Head of a record whose body is `checked` and then `rest` more bytes.
+pub(super) fn head(kind: RecordKind, ordinal: u64, checked: &[u8], rest: usize) -> Vec<u8> {
+    let length = (checked.len() + rest) as u64;
+    let mut head = Vec::with_capacity(HEAD_BYTES + checked.len());
+    head.extend_from_slice(&MAGIC.to_le_bytes());
+    head.extend_from_slice(&(kind as u32).to_le_bytes());
+    head.extend_from_slice(&ordinal.to_le_bytes());
+    head.extend_from_slice(&length.to_le_bytes());
+    head.extend_from_slice(&(checked.len() as u32).to_le_bytes());
+    let mut sum = crc32fast::Hasher::new();
+    sum.update(&head);
+    sum.update(checked);
+    head.extend_from_slice(&sum.finalize().to_le_bytes());
+    head.extend_from_slice(checked);
+    head
+}
+
+/// A record that was read.
+#[derive(Debug)]
+pub(super) struct Record<'a> {
+    pub(super) kind: RecordKind,
+    pub(super) ordinal: u64,
+    pub(super) body: &'a [u8],
+}
+
+/// Why no record follows.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Broken {
+    /// The last record was not written whole.
+    Torn,
+    /// Bytes that are no record, with others after them.
+    Damaged,
+}
+
+/// Reads a segment's records from the first on.
+pub(super) struct RecordReader {
+    file: BufReader<File>,
+    /// Bytes of the file.
+    length: u64,
+    /// Where the next record begins.
+    at: u64,
+    body: Vec<u8>,
+}
+
+impl RecordReader {
+    pub(super) fn open(path: &Path) -> io::Result<Self> {
+        let file = File::open(path)?;
+        let length = file.metadata()?.len();
+        Ok(Self {
+            file: BufReader::with_capacity(READ_BYTES, file),
+            length,
+            at: 0,
+            body: Vec::new(),
+        })
+    }
+
+    /// The last record that was read does not count: nothing is read after it.
+    pub(super) const fn go_back_to(&mut self, at: u64) {
+        self.at = at;
+    }
+
+    /// Where the last record that was read ends.
+    pub(super) const fn at(&self) -> u64 {
+        self.at
+    }
+
+    /// Bytes of the file.
+    pub(super) const fn length(&self) -> u64 {
+        self.length
+    }
+
+    /// The next record; `None` at the end of the file.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn next(&mut self) -> io::Result<Option<Result<Record<'_>, Broken>>> {
+        let left = self.length - self.at;
+        if left == 0 {
+            return Ok(None);
+        }
+        let mut head = [0; HEAD_BYTES];
+        if left < HEAD_BYTES as u64 {
+            return Ok(Some(Err(Broken::Torn)));
+        }
+        self.file.read_exact(&mut head)?;
+        let number =
+            |at: usize| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
+        let long = |at: usize| u64::from(number(at)) | u64::from(number(at + 4)) << 32;
+        let (ordinal, body_bytes, checked) = (long(8), long(16), u64::from(number(24)));
+        let kind = RecordKind::of(number(4));
+        let sane = number(0) == MAGIC && body_bytes <= BODY_BYTES_MAX && checked <= body_bytes;
+        let Some(kind) = kind.filter(|_| sane) else {
+            // A machine that lost its power leaves zeros where it had not written yet.
+            let zeros = head.iter().all(|&byte| byte == 0) && self.rest_is_zero()?;
+            return Ok(Some(Err(if zeros {
+                Broken::Torn
+            } else {
+                Broken::Damaged
+            })));
+        };
+        if left - (HEAD_BYTES as u64) < body_bytes {
+            return Ok(Some(Err(Broken::Torn)));
+        }
+        self.body.resize(body_bytes as usize, 0);
+        self.file.read_exact(&mut self.body)?;
+        let mut sum = crc32fast::Hasher::new();
+        sum.update(&head[..HEAD_BYTES - 4]);
+        sum.update(&self.body[..checked as usize]);
+        let end = self.at + HEAD_BYTES as u64 + body_bytes;
+        if sum.finalize() != number(28) {
+            let last = end == self.length || self.rest_is_zero()?;
+            return Ok(Some(Err(if last { Broken::Torn } else { Broken::Damaged })));
+        }
+        self.at = end;
+        Ok(Some(Ok(Record {
+            kind,
+            ordinal,
+            body: &self.body,
+        })))
+    }
+
+    fn rest_is_zero(&mut self) -> io::Result<bool> {
+        let mut bytes = [0; 4096];
+        loop {
+            match self.file.read(&mut bytes)? {
+                0 => return Ok(true),
+                read if bytes[..read].iter().any(|&byte| byte != 0) => return Ok(false),
+                _ => {}
+            }
+        }
+    }
+}
+
+/// Memory for chunks that are read, used again and again.
+pub(super) fn pool() -> BufferPool {
+    BufferPool::new(2)
+}

@@ -1,0 +1,170 @@
+//! Flushes the log to the disk once a period, on a thread of its own.
+//! What the process has written survives its death without this; what the machine has flushed survives a power cut too.
+
+use std::{
+    fs::File,
+    io,
+    sync::{
+        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread::JoinHandle,
+    time::Duration,
+};
+
+use driml_protocol::{Seldom, fault};
+
+/// Segments that wait to be flushed; with one more they are flushed before anything else is written.
+const OPEN_MAX: usize = 32;
+
+/// What the thread flushes next.
+#[derive(Default)]
+struct Files {
+    /// The segment that is written, and older ones that are not flushed yet, by their numbers.
+    open: Vec<(u64, Arc<File>)>,
+    /// The folder, if a file was made or removed.
+    folder: Option<Arc<File>>,
+    stop: bool,
+}
+
+#[derive(Default)]
+struct Shared {
+    files: Mutex<Files>,
+    wake: Condvar,
+    dirty: AtomicBool,
+}
+
+impl Shared {
+    fn files(&self) -> MutexGuard<'_, Files> {
+        self.files.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The thread; dropping this flushes once more and ends it.
+pub(super) struct Syncer {
+    shared: Arc<Shared>,
+    folder: Arc<File>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Syncer {
+    /// Flushes every `period`, or, where that is zero, whenever [`Syncer::written`] is called.
+    pub(super) fn start(folder: File, period: Duration) -> io::Result<Self> {
+        let shared = Arc::<Shared>::default();
+        let mut thread = None;
+        if !period.is_zero() {
+            let shared = shared.clone();
+            let work = move || work(&shared, period);
+            thread = Some(
+                std::thread::Builder::new()
+                    .name("replay-fsync".into())
+                    .spawn(work)?,
+            );
+        }
+        Ok(Self {
+            shared,
+            folder: Arc::new(folder),
+            thread,
+        })
+    }
+
+    /// Segment `number` is written from now on, and was made just now.
+    pub(super) fn opened(&self, number: u64, file: Arc<File>) {
+        let mut files = self.shared.files();
+        files.open.push((number, file));
+        files.folder = Some(self.folder.clone());
+        let too_many = files.open.len() > OPEN_MAX;
+        drop(files);
+        self.shared.dirty.store(true, Ordering::Release);
+        if too_many {
+            self.flush();
+        }
+    }
+
+    /// Segment `number` is gone: nobody needs it on the disk.
+    pub(super) fn removed(&self, number: u64) {
+        self.shared.files().open.retain(|(open, _)| *open != number);
+    }
+
+    /// Something was written to the newest file.
+    ///
+    /// # Errors
+    /// Where each write is flushed: the disk refuses.
+    pub(super) fn written(&self) -> io::Result<()> {
+        self.shared.dirty.store(true, Ordering::Release);
+        match self.thread {
+            Some(_) => Ok(()),
+            None => flush(&self.shared),
+        }
+    }
+}
+
+impl Syncer {
+    /// Flushes now.
+    ///
+    /// # Errors
+    /// The disk refuses.
+    pub(super) fn flushed(&self) -> io::Result<()> {
+        flush(&self.shared)
+    }
+
+    /// Flushes now; a disk that refuses is a warning.
+    pub(super) fn flush(&self) {
+        if let Err(e) = self.flushed() {
+            tracing::warn!("the replay's log was not flushed at the end: {e}");
+        }
+    }
+}
+
+impl Drop for Syncer {
+    fn drop(&mut self) {
+        self.shared.files().stop = true;
+        self.shared.wake.notify_all();
+        match self.thread.take().map(JoinHandle::join) {
+            None | Some(Ok(())) => {}
+            Some(Err(_)) => tracing::error!("the thread that flushes the replay's log panicked"),
+        }
+        self.flush();
+    }
+}
+
+fn work(shared: &Shared, period: Duration) {
+    let mut said = Seldom::default();
+    loop {
+        let files = shared.files();
+        let (files, _) = shared
+            .wake
+            .wait_timeout_while(files, period, |files| !files.stop)
+            .unwrap_or_else(PoisonError::into_inner);
+        if files.stop {
+            return;
+        }
+        drop(files);
+        fault::point("replay-fsync");
+        if let Err(e) = flush(shared)
+            && let Some(more) = said.due()
+        {
+            tracing::error!(
+                "the replay's log was not flushed, a power cut may lose what was stored since: {e}{more}"
+            );
+        }
+    }
+}
+
+/// Flushes what was written since the last time.
+fn flush(shared: &Shared) -> io::Result<()> {
+    if !shared.dirty.swap(false, Ordering::AcqRel) {
+        return Ok(());
+    }
+    let mut files = shared.files();
+    let open = files.open.clone();
+    let folder = files.folder.take();
+    // Older ones are not written any more.
+    let older = files.open.len().saturating_sub(1);
+    files.open.drain(..older);
+    drop(files);
+    for (_, file) in &open {
+        file.sync_data()?;
+    }
+    folder.map_or(Ok(()), |folder| folder.sync_all())
+}

@@ -1,0 +1,337 @@
+//! What is known of each part beyond its counts: whether it is there, since when, when it was last heard, what it says it does.
+//! It decides nothing: it is what a person is told.
+
+use std::{
+    collections::{BTreeMap, HashSet},
+    mem::discriminant,
+    time::Instant,
+};
+
+use driml_protocol::{
+    Alive, PartName, PartStatus, Report, WARNINGS_MAX, Waiting, Warning, last_warning,
+};
+
+/// The accounts of all parts that have joined.
+pub(super) struct Accounts {
+    started: Instant,
+    waiting: (Waiting, Instant),
+    weights_at: Option<Instant>,
+    parts: BTreeMap<PartName, Account>,
+}
+
+/// Of one part, over all its lives.
+struct Account {
+    /// Its newest life.
+    alive: Alive,
+    lives: u32,
+    is_connected: bool,
+    /// When it was connected, or went.
+    changed: Instant,
+    heard: Option<Instant>,
+    weights_version: Option<u64>,
+    report: Option<(Report, Instant)>,
+}
+
+/// Which part it is, whatever its life.
+const fn name(who: Alive) -> PartName {
+    match who {
+        Alive::Actor { actor, .. } => PartName::Actor(actor),
+        Alive::Learner { .. } => PartName::Learner,
+    }
+}
+
+impl Accounts {
+    pub(super) fn new(now: Instant) -> Self {
+        Self {
+            started: now,
+            waiting: (Waiting::Nobody, now),
+            weights_at: None,
+            parts: BTreeMap::new(),
+        }
+    }
+
+    /// A part takes part. One that asks again has joined once.
+    pub(super) fn joined(&mut self, who: Alive, is_connected: bool, now: Instant) {
+        let earlier = self.parts.get(&name(who));
+        if earlier.is_some_and(|account| account.alive == who) {
+            return;
+        }
+        let account = Account {
+            alive: who,
+            lives: earlier.map_or(0, |account| account.lives) + 1,
+            is_connected,
+            changed: now,
+            heard: None,
+            weights_version: None,
+            report: None,
+        };
+        self.parts.insert(name(who), account);
+    }
+
+    /// How often actors have joined, all together.
+    pub(super) fn actor_lives(&self) -> u32 {
+        let actors = self.parts.iter();
+        let actors = actors.filter(|(who, _)| **who != PartName::Learner);
+        actors.map(|(_, account)| account.lives).sum()
+    }
+
+    /// The account of this life, if it takes part.
+    fn of(&mut self, who: Alive) -> Option<&mut Account> {
+        let account = self.parts.get_mut(&name(who))?;
+        (account.alive == who).then_some(account)
+    }
+
+    /// A part is connected, or no longer.
+    pub(super) fn note_connected(&mut self, who: Alive, is_connected: bool, now: Instant) {
+        if let Some(account) = self.of(who)
+            && account.is_connected != is_connected
+        {
+            (account.is_connected, account.changed) = (is_connected, now);
+        }
+    }
+
+    /// A chunk came from an actor, in which weights of this version acted; or a request from the learner.
+    pub(super) fn heard(&mut self, who: Alive, weights_version: Option<u64>, now: Instant) {
+        if let Some(account) = self.of(who) {
+            account.heard = Some(now);
+            account.weights_version = weights_version.or(account.weights_version);
+        }
+    }
+
+    /// A part says what it does; `false` if it does not take part.
+    pub(super) fn reported(&mut self, mut report: Report, now: Instant) -> bool {
+        let Some(account) = self.of(report.who.alive()) else {
+            return false;
+        };
+        // One that was under way meanwhile does not undo it.
+        report.finished |= account.report.as_ref().is_some_and(|(it, _)| it.finished);
+        account.report = Some((report, now));
+        true
+    }
+
+    /// Who waits at the limiter now.
+    pub(super) fn note_waiting(&mut self, waiting: Waiting, now: Instant) {
+        if discriminant(&self.waiting.0) != discriminant(&waiting) {
+            self.waiting.1 = now;
+        }
+        self.waiting.0 = waiting;
+    }
+
+    pub(super) fn weights_came(&mut self, now: Instant) {
+        self.weights_at = Some(now);
+    }
+
+    /// Who waits at the limiter, and for how many seconds.
+    pub(super) fn waiting(&self, now: Instant) -> (Waiting, f64) {
+        (self.waiting.0, seconds(now, self.waiting.1))
+    }
+
+    /// Seconds since the server started, and since the newest weights came.
+    pub(super) fn ages(&self, now: Instant) -> (f64, Option<f64>) {
+        let weights = self.weights_at.map(|at| seconds(now, at));
+        (seconds(now, self.started), weights)
+    }
+
+    /// Whether the learner said that it has learned from every batch, and has saved.
+    pub(super) fn is_over(&self) -> bool {
+        let learner = self.parts.get(&PartName::Learner);
+        let report = learner.and_then(|account| account.report.as_ref());
+        report.is_some_and(|(report, _)| report.finished)
+    }
+
+    /// Parts that are connected.
+    pub(super) fn connected(&self) -> usize {
+        let accounts = self.parts.values();
+        accounts.filter(|account| account.is_connected).count()
+    }
+
+    /// Which part the run cannot go on without and does not have, for a person; `finished` says whether all transitions are in.
+    pub(super) fn missing(&self, finished: bool) -> Option<&'static str> {
+        let of = |learner: bool| {
+            let parts = self.parts.iter();
+            parts.filter(move |(who, _)| (**who == PartName::Learner) == learner)
+        };
+        let is_there = |learner| of(learner).any(|(_, account)| account.is_connected);
+        let has_joined = |learner| of(learner).next().is_some();
+        if !is_there(true) {
+            return Some(match has_joined(true) {
+                true => "the learner is gone",
+                false => "no learner has joined yet",
+            });
+        }
+        (!finished && !is_there(false)).then(|| match has_joined(false) {
+            true => "all actors are gone",
+            false => "no actor has joined yet",
+        })
+    }
+
+    /// All parts; `held_since` says since when a part's chunk or request has been waiting.
+    pub(super) fn parts(
+        &self,
+        now: Instant,
+        held_since: impl Fn(PartName) -> Option<Instant>,
+    ) -> Vec<PartStatus> {
+        let age = |(&who, account): (_, &Account)| Some((account.warning_age(now)?, who));
+        let mut ages: Vec<(f64, PartName)> = self.parts.iter().filter_map(age).collect();
+        ages.sort_by(|(one, _), (other, _)| one.total_cmp(other));
+        let newest: HashSet<_> = ages.iter().take(WARNINGS_MAX).map(|(_, who)| who).collect();
+        let part = |(&who, account): (&PartName, &Account)| {
+            let report = account.report.as_ref();
+            PartStatus {
+                who,
+                connected: account.is_connected,
+                since_s: seconds(now, account.changed),
+                lives: account.lives,
+                heard_s: account.heard.map(|at| seconds(now, at)),
+                held_s: held_since(who).map(|at| seconds(now, at)),
+                weights_version: account.weights_version,
+                doing: report.map(|(report, at)| {
+                    let said = seconds(now, *at);
+                    (report.doing.clone(), report.since_s + said, said)
+                }),
+                last_warning: report
+                    .filter(|_| newest.contains(&who))
+                    .and_then(|(report, at)| {
+                        let warning = report.last_warning.as_ref()?;
+                        Some(Warning::new(
+                            &warning.text,
+                            warning.age_s + seconds(now, *at),
+                        ))
+                    }),
+            }
+        };
+        self.parts.iter().map(part).collect()
+    }
+}
+
+impl Account {
+    fn warning_age(&self, now: Instant) -> Option<f64> {
+        let (report, at) = self.report.as_ref()?;
+        Some(report.last_warning.as_ref()?.age_s + seconds(now, *at))
+    }
+}
+
+/// The last warning of this process.
+pub(super) fn own_warning() -> Option<Warning> {
+    last_warning::get().map(|(text, age)| Warning::new(&text, age.as_secs_f64()))
+}
+
+fn seconds(now: Instant, since: Instant) -> f64 {
+    now.saturating_duration_since(since).as_secs_f64()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use driml_protocol::Life;
+
+    use super::*;
+
+    fn actor(incarnation: u64) -> Alive {
+        Alive::actor(3, incarnation)
+    }
+
+    #[test]
+    fn an_account_is_of_the_newest_life() {
+        let start = Instant::now();
+        let at = |seconds| start + Duration::from_secs(seconds);
+        let mut accounts = Accounts::new(start);
+        accounts.note_connected(actor(1), true, at(1));
+        assert!(
+            accounts.parts(at(1), |_| None).is_empty(),
+            "who has not joined has no account"
+        );
+        accounts.joined(actor(1), true, at(2));
+        accounts.joined(actor(1), true, at(5));
+        accounts.heard(actor(1), Some(7), at(6));
+        accounts.heard(actor(9), Some(8), at(7));
+        let report = |incarnation| {
+            let warning = Some(Warning::new("late", 1.0));
+            let who = Life::Actor {
+                actor: 3,
+                incarnation,
+            };
+            Report::new(who, "plays", 2.0, warning)
+        };
+        assert!(accounts.reported(report(1), at(8)));
+        assert!(!accounts.reported(report(9), at(8)));
+        accounts.note_connected(actor(1), false, at(10));
+        accounts.note_connected(actor(1), false, at(11));
+        let expected = PartStatus {
+            who: PartName::Actor(3),
+            connected: false,
+            since_s: 2.0,
+            lives: 1,
+            heard_s: Some(6.0),
+            held_s: Some(1.0),
+            weights_version: Some(7),
+            doing: Some(("plays".into(), 6.0, 4.0)),
+            last_warning: Some(Warning::new("late", 5.0)),
+        };
+        assert_eq!(accounts.parts(at(12), |_| Some(at(11))), [expected]);
+
+        accounts.joined(actor(2), true, at(20));
+        accounts.joined(Alive::learner(1), true, at(20));
+        assert_eq!(accounts.actor_lives(), 2);
+        let again = &accounts.parts(at(21), |_| None)[1];
+        assert_eq!(
+            (again.lives, again.connected, again.heard_s),
+            (2, true, None)
+        );
+    }
+
+    #[test]
+    fn what_is_missing_is_named() {
+        let now = Instant::now();
+        let mut accounts = Accounts::new(now);
+        assert_eq!(accounts.missing(false), Some("no learner has joined yet"));
+        let learner = Alive::learner(5);
+        accounts.joined(learner, true, now);
+        assert_eq!(accounts.missing(false), Some("no actor has joined yet"));
+        assert_eq!(accounts.missing(true), None);
+        accounts.joined(actor(1), true, now);
+        assert_eq!(accounts.missing(false), None);
+        accounts.note_connected(actor(1), false, now);
+        assert_eq!(accounts.missing(false), Some("all actors are gone"));
+        accounts.note_connected(learner, false, now);
+        assert_eq!(accounts.missing(true), Some("the learner is gone"));
+    }
+
+    #[test]
+    fn waiting_has_a_beginning() {
+        let start = Instant::now();
+        let at = |seconds| start + Duration::from_secs(seconds);
+        let warm_up = |have| Waiting::WarmUp { have, need: 100 };
+        let mut accounts = Accounts::new(start);
+        accounts.note_waiting(warm_up(1), at(1));
+        accounts.note_waiting(warm_up(50), at(4));
+        assert_eq!(accounts.waiting(at(5)), (warm_up(50), 4.0));
+        accounts.note_waiting(Waiting::ActorsWaitForLearner, at(6));
+        assert_eq!(
+            accounts.waiting(at(6)),
+            (Waiting::ActorsWaitForLearner, 0.0)
+        );
+    }
+
+    #[test]
+    fn of_very_many_parts_only_the_newest_warnings_are_passed_on() {
+        let now = Instant::now();
+        let mut accounts = Accounts::new(now);
+        for actor in 0..200 {
+            let who = Life::Actor {
+                actor,
+                incarnation: 1,
+            };
+            accounts.joined(who.alive(), true, now);
+            // The higher the number the newer, and many of one age.
+            let age = f64::from((200 - actor) / 50);
+            let report = Report::new(who, "plays", 0.0, Some(Warning::new("w", age)));
+            assert!(accounts.reported(report, now));
+        }
+        let parts = accounts.parts(now, |_| None);
+        let passed = parts.iter().filter(|part| part.last_warning.is_some());
+        assert_eq!(passed.count(), WARNINGS_MAX);
+        assert!(parts[199].last_warning.is_some() && parts[0].last_warning.is_none());
+    }
+}

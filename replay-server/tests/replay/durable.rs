@@ -1,0 +1,507 @@
+//! A replay that is kept on disk, stopped at any record and at any byte of its last write: what comes back is what was there.
+//! What damage costs is in `durable_damage`.
+
+use std::{
+    borrow::Cow,
+    fs,
+    path::{Path, PathBuf},
+};
+
+use driml_protocol::{
+    ActorJoin, AffinityUpdate, Buffer, ChunkHeader, Goodbye, Horizon, InsertReply, RequestId,
+    RunSpec,
+};
+use driml_replay_server::{
+    Compression, Config, DurableArgs, DurableError, DurableReplay, Recovery, Unready,
+};
+use proptest::prelude::*;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::{
+    batches::check_batch,
+    history::{History, spec, unlimited},
+};
+
+/// Rows of a batch.
+pub(crate) const ROWS: u32 = 4;
+/// Bytes of a record before its body, and where the body's length is.
+const HEAD_BYTES: u64 = 32;
+const LENGTH_AT: usize = 16;
+
+/// A replay in a folder, everything that was stored in it, and those that talk to it.
+pub(crate) struct Life {
+    pub(crate) args: DurableArgs,
+    pub(crate) config: Config,
+    pub(crate) replay: DurableReplay,
+    pub(crate) history: History,
+    pub(crate) rng: ChaCha8Rng,
+    /// By their numbers: incarnation, next chunk, transitions produced.
+    actors: Vec<(u64, u64, u64)>,
+    requests: Vec<RequestId>,
+    versions: u64,
+}
+
+pub(crate) fn test_spec() -> RunSpec {
+    spec(3, 2, 2, Horizon::Nhg { k_max: 3 })
+}
+
+pub(crate) fn open(
+    args: &DurableArgs,
+    config: &Config,
+) -> Result<(DurableReplay, Recovery), DurableError> {
+    DurableReplay::open(args, &test_spec(), config, ROWS)
+}
+
+/// A replay of this capacity that is kept in `dir`, in segments of about `segment_bytes`.
+pub(crate) fn args(dir: &Path, segment_bytes: u64) -> DurableArgs {
+    DurableArgs {
+        dir: dir.to_owned(),
+        shard: 0,
+        after_updates: 0,
+        segment_bytes: Some(segment_bytes),
+        mark: None,
+    }
+}
+
+/// The segments in a folder, by number.
+pub(crate) fn segments(dir: &Path) -> Vec<PathBuf> {
+    let mut all: Vec<_> = fs::read_dir(dir)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|it| it == "log"))
+        .collect();
+    all.sort();
+    all
+}
+
+/// Copies all files of a folder into another.
+pub(crate) fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    for entry in fs::read_dir(from).unwrap() {
+        let path = entry.unwrap().path();
+        fs::copy(&path, to.join(path.file_name().unwrap())).unwrap();
+    }
+}
+
+pub(crate) fn state(replay: &DurableReplay) -> Vec<u8> {
+    replay.state_bytes().unwrap()
+}
+
+impl Life {
+    pub(crate) fn begin(dir: &Path, config: Config, segment_bytes: u64, seed: u64) -> Self {
+        let args = args(dir, segment_bytes);
+        let (mut replay, recovery) = open(&args, &config).unwrap();
+        assert!(!recovery.found);
+        for actor in 0..2 {
+            let join = ActorJoin {
+                actor,
+                incarnation: 1,
+            };
+            replay.join_actor(join).unwrap();
+        }
+        replay.learner_starts(77, 0).unwrap();
+        let mut history = History::new(&test_spec(), config.capacity_transitions);
+        // What compresses badly may leave earlier than the reference thinks.
+        history.ends = true;
+        Self {
+            args,
+            config,
+            replay,
+            history,
+            rng: ChaCha8Rng::seed_from_u64(seed),
+            actors: vec![(1, 0, 0); 2],
+            requests: (0..3).map(RequestId::first).collect(),
+            versions: 0,
+        }
+    }
+
+    /// The next chunk of an actor.
+    pub(crate) fn store(&mut self, actor: usize) {
+        let (incarnation, sequence, produced) = self.actors[actor];
+        let header = ChunkHeader {
+            actor: actor as u32,
+            incarnation,
+            sequence,
+            first_transition: produced,
+            weights_version: self.rng.random_range(0..9),
+            leaving: false,
+            streams: 2,
+            steps: self.rng.random_range(1..6),
+            frame_bytes: test_spec().frame_bytes() as u32,
+        };
+        let chunk = self.history.next_chunk(header, 0, &mut self.rng);
+        let packed = self.replay.packer().pack(Cow::Borrowed(&chunk));
+        let reply = self.replay.insert_packed(&packed);
+        assert!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
+        self.actors[actor] = (
+            incarnation,
+            sequence + 1,
+            produced + header.transitions() as u64,
+        );
+    }
+
+    /// A batch for a request of a client, or why there is none.
+    pub(crate) fn draw(&mut self, client: usize) -> Option<driml_protocol::Batch> {
+        let id = self.requests[client];
+        self.replay
+            .draw_for(id, ROWS, Buffer::zeroed)
+            .ok()
+            .map(|it| it.unpack())
+    }
+
+    /// Something happens.
+    pub(crate) fn act(&mut self) {
+        match self.rng.random_range(0..20) {
+            0..9 => {
+                let actor = self.rng.random_range(0..2);
+                self.store(actor);
+            }
+            9..16 => {
+                let client = self.rng.random_range(0..3);
+                let id = &mut self.requests[client];
+                // One that did not arrive is asked for again.
+                *id = if self.rng.random_bool(0.3) {
+                    id.again()
+                } else {
+                    id.next()
+                };
+                let held_by_number = self.config.compressed_bytes_max.is_none()
+                    && self.config.disk_bytes_max.is_none();
+                if let Some(batch) = self.draw(client)
+                    && held_by_number
+                {
+                    check_batch(&batch, &self.history);
+                }
+            }
+            16 => {
+                self.versions += 1;
+                let matrix = (0..25)
+                    .map(|at| if at % 5 == 0 { 0.6 } else { 0.1 })
+                    .collect();
+                let update = AffinityUpdate {
+                    num_actions: 5,
+                    learner: 77,
+                    version: self.versions,
+                    matrix,
+                };
+                self.replay.set_affinity(&update).unwrap();
+            }
+            17 => {
+                let actor = self.rng.random_range(0..2);
+                let (incarnation, _, produced) = self.actors[actor];
+                self.replay.goodbye(&Goodbye {
+                    actor: actor as u32,
+                    incarnation,
+                    produced,
+                });
+                self.actors[actor] = (incarnation + 1, 0, 0);
+                let join = ActorJoin {
+                    actor: actor as u32,
+                    incarnation: incarnation + 1,
+                };
+                self.replay.join_actor(join).unwrap();
+            }
+            18 => {
+                let served = self.replay.tally().rows_sampled;
+                self.replay
+                    .learner_starts(self.rng.random(), served - served.min(3))
+                    .unwrap();
+            }
+            _ => {
+                // One that nobody can answer yet, or ever.
+                let id = RequestId::first(9);
+                let _ = self.replay.draw_for(id, 1, Buffer::zeroed);
+            }
+        }
+    }
+}
+
+/// The end of the record that begins at byte `at` of a segment.
+fn record_end(bytes: &[u8], at: u64) -> u64 {
+    let length = &bytes[at as usize + LENGTH_AT..][..8];
+    at + HEAD_BYTES + u64::from_le_bytes(length.try_into().unwrap())
+}
+
+/// Both serve the same batches from now on, bit for bit, and store the same.
+fn check_same_future(mut one: Life, mut other: DurableReplay) {
+    let packer = other.packer();
+    for round in 0..12 {
+        let id = RequestId::first(1000 + round % 3 + 3 * (round / 5));
+        let drawn = one
+            .replay
+            .draw_for(id, ROWS, Buffer::zeroed)
+            .map(|it| it.unpack());
+        let again = other
+            .draw_for(id, ROWS, Buffer::zeroed)
+            .map(|it| it.unpack());
+        assert_eq!(drawn, again);
+        if round % 4 == 3 {
+            let (incarnation, sequence, produced) = one.actors[0];
+            let header = ChunkHeader {
+                actor: 0,
+                incarnation,
+                sequence,
+                first_transition: produced,
+                weights_version: 1,
+                leaving: false,
+                streams: 2,
+                steps: 3,
+                frame_bytes: test_spec().frame_bytes() as u32,
+            };
+            let chunk = one.history.next_chunk(header, 0, &mut one.rng);
+            let packed = packer.pack(Cow::Borrowed(&chunk));
+            assert_eq!(
+                one.replay.insert_packed(&packed),
+                other.insert_packed(&packed)
+            );
+            one.actors[0] = (incarnation, sequence + 1, produced + 6);
+        }
+    }
+    assert_eq!(state(&one.replay), state(&other));
+    other.check_valid();
+}
+
+fn configs() -> impl Strategy<Value = Config> {
+    let capacity = 20u64..200;
+    (capacity, any::<bool>(), any::<bool>(), 0u64..3).prop_map(|(capacity, lz4, tight, bounded)| {
+        let mut config = unlimited(capacity);
+        if lz4 {
+            config.compression = Compression::Lz4;
+        }
+        if tight {
+            (config.replay_ratio, config.slack_transitions) = (2.0, 1 << 40);
+        }
+        config.disk_bytes_max = (bounded == 0).then_some(4 << 20);
+        config.fsync_ms = (bounded == 1).then_some(0);
+        config
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 48, ..ProptestConfig::default() })]
+
+    #[test]
+    fn what_comes_back_is_what_was_there_at_the_last_whole_record(
+        seed in any::<u64>(), config in configs(), segment_bytes in 500u64..20_000, actions in 1u32..120, cut in any::<u64>()
+    ) {
+        let root = tempfile::tempdir().unwrap();
+        let mut life = Life::begin(&root.path().join("living"), config, segment_bytes, seed);
+        for _ in 0..actions {
+            life.act();
+        }
+        let (before, known) = (state(&life.replay), segments(&life.args.dir));
+        let newest = known.last().unwrap().clone();
+        let length = fs::metadata(&newest).unwrap().len();
+        life.act();
+        let after = state(&life.replay);
+        life.replay.check_valid();
+
+        // The process dies now: all is there.
+        let dead = root.path().join("dead");
+        copy(&life.args.dir, &dead);
+        let (replay, recovery) = open(&args(&dead, segment_bytes), &life.config).unwrap();
+        prop_assert!(recovery.found && recovery.warnings.is_empty(), "{:?}", recovery.warnings);
+        prop_assert_eq!(state(&replay), after.clone());
+        replay.check_valid();
+        drop(replay);
+
+        // It had died while it wrote the last record, at any byte of it.
+        let torn = root.path().join("torn");
+        copy(&life.args.dir, &torn);
+        let path = torn.join(newest.file_name().unwrap());
+        if path.exists() && fs::metadata(&path).unwrap().len() > length {
+            let bytes = fs::read(&path).unwrap();
+            let end = record_end(&bytes, length);
+            let cut = length + cut % (end - length);
+            fs::write(&path, &bytes[..cut as usize]).unwrap();
+            for later in segments(&torn) {
+                if later > path {
+                    fs::remove_file(later).unwrap();
+                }
+            }
+            // What was removed with the rows of this write was not yet.
+            for older in &known {
+                let kept = torn.join(older.file_name().unwrap());
+                prop_assume!(kept.exists());
+            }
+            let (replay, recovery) = open(&args(&torn, segment_bytes), &life.config).unwrap();
+            prop_assert!(recovery.warnings.is_empty(), "{:?}", recovery.warnings);
+            prop_assert_eq!(state(&replay), before);
+            replay.check_valid();
+        }
+
+        // The living one and the one that came back have the same future; it comes back from the start after a start, too.
+        let again = root.path().join("again");
+        copy(&dead, &again);
+        let (replay, _) = open(&args(&again, segment_bytes), &life.config).unwrap();
+        check_same_future(life, replay);
+    }
+}
+
+/// A chunk whose answer died with the server is recognised, and a batch whose answer did is taken back.
+#[test]
+fn retries_are_recognised_after_a_restart() {
+    let root = tempfile::tempdir().unwrap();
+    let mut life = Life::begin(root.path(), unlimited(1000), 4000, 5);
+    for _ in 0..20 {
+        life.store(0);
+    }
+    let header = ChunkHeader {
+        actor: 0,
+        incarnation: 1,
+        sequence: 19,
+        first_transition: 0,
+        weights_version: 0,
+        leaving: false,
+        streams: 2,
+        steps: 3,
+        frame_bytes: test_spec().frame_bytes() as u32,
+    };
+    let id = life.requests[0];
+    assert!(life.draw(0).is_some());
+    let served = life.replay.status();
+    let Life {
+        args,
+        config,
+        replay,
+        ..
+    } = life;
+    drop(replay);
+
+    let (mut replay, recovery) = open(&args, &config).unwrap();
+    assert!(recovery.found);
+    assert_eq!(replay.learner(), Some(77));
+    let chunk = driml_protocol::Chunk::zeroed(header);
+    let packed = replay.packer().pack(Cow::Borrowed(&chunk));
+    let reply = replay.insert_packed(&packed);
+    let inserted_total = served.transitions_inserted;
+    assert_eq!(
+        reply,
+        InsertReply::Stored {
+            inserted_total,
+            actors: 0,
+            waited: false
+        }
+    );
+    // The same attempt is a copy that was on its way; the learner's next one is the one that counts.
+    let copy = replay.draw_for(id, ROWS, Buffer::zeroed);
+    assert!(matches!(copy, Err(Unready::Wait(_))));
+    assert_eq!(replay.status().rows_sampled, served.rows_sampled);
+    assert!(replay.draw_for(id.again(), ROWS, Buffer::zeroed).is_ok());
+    let status = replay.status();
+    assert_eq!(
+        (status.rows_sampled, status.batches_retried),
+        (served.rows_sampled, 1)
+    );
+    assert_eq!(status.transitions_inserted, served.transitions_inserted);
+}
+
+#[test]
+fn segments_go_with_their_transitions_and_the_budget_is_kept() {
+    let root = tempfile::tempdir().unwrap();
+    let config = unlimited(100);
+    let mut life = Life::begin(&root.path().join("ring"), config, 2_000, 5);
+    for _ in 0..600 {
+        life.store(0);
+    }
+    // 100 transitions of 36 + 6 bytes each are held, and the newest segments are not full.
+    assert!(
+        life.replay.log_bytes() < 20_000,
+        "{}",
+        life.replay.log_bytes()
+    );
+    let on_disk: u64 = segments(&life.args.dir)
+        .iter()
+        .map(|it| fs::metadata(it).unwrap().len())
+        .sum();
+    assert_eq!(on_disk, life.replay.log_bytes());
+
+    // A ring that is larger than the budget: the oldest leave it too.
+    let mut config = unlimited(1_000_000);
+    config.disk_bytes_max = Some(4 << 20);
+    let mut life = Life::begin(&root.path().join("budget"), config, 200_000, 5);
+    while life.history.inserted < 150_000 {
+        life.store(1);
+        assert!(
+            life.replay.log_bytes() <= 4 << 20,
+            "{}",
+            life.replay.log_bytes()
+        );
+    }
+    let status = life.replay.status();
+    assert!(
+        (40_000..100_000).contains(&status.transitions_held),
+        "{status:?}"
+    );
+    life.replay.check_valid();
+    assert!(life.draw(0).is_some());
+    let Life {
+        args,
+        config,
+        replay,
+        ..
+    } = life;
+    let before = state(&replay);
+    drop(replay);
+    let (replay, _) = open(&args, &config).unwrap();
+    assert_eq!(state(&replay), before);
+    assert_eq!(replay.status().transitions_held, status.transitions_held);
+}
+
+#[test]
+fn a_resumed_run_goes_on_with_what_was_kept() {
+    let root = tempfile::tempdir().unwrap();
+    let mut config = unlimited(1000);
+    (config.replay_ratio, config.warmup_transitions) = (4.0, 10);
+    let mut life = Life::begin(root.path(), config, 4000, 5);
+    while life.history.inserted < 100 {
+        life.store(0);
+    }
+    let mut batches = 0;
+    while life.draw(0).is_some() {
+        life.requests[0] = life.requests[0].next();
+        batches += 1;
+    }
+    assert!(batches > 80);
+    let Life {
+        mut args,
+        config,
+        replay,
+        ..
+    } = life;
+    let before = replay.status();
+    drop(replay);
+
+    // The learner saved after 50 updates: the rows beyond them are served again.
+    args.after_updates = 50;
+    let (mut replay, _) = open(&args, &config).unwrap();
+    assert_eq!(replay.after_updates(), 0, "the replay is of the whole run");
+    replay.learner_starts(78, 50 * u64::from(ROWS)).unwrap();
+    let status = replay.status();
+    assert_eq!(status.transitions_inserted, before.transitions_inserted);
+    assert_eq!(status.rows_sampled, 50 * u64::from(ROWS));
+    drop(replay);
+
+    // It knows of more than the log does, whose end went with the machine's power.
+    args.after_updates = 70;
+    let (mut replay, _) = open(&args, &config).unwrap();
+    replay.learner_starts(79, 70 * u64::from(ROWS)).unwrap();
+    assert_eq!(replay.status().rows_sampled, 70 * u64::from(ROWS));
+    replay.check_valid();
+    drop(replay);
+
+    // One that was begun by a run that was resumed without a replay counts from there.
+    args.dir = root.path().join("fresh");
+    let (replay, _) = open(&args, &config).unwrap();
+    assert_eq!(
+        (replay.after_updates(), replay.tally().rows_sampled),
+        (70, 280)
+    );
+    drop(replay);
+    let (replay, _) = open(&args, &config).unwrap();
+    assert_eq!(
+        (replay.after_updates(), replay.tally().rows_sampled),
+        (70, 280)
+    );
+}

@@ -1,0 +1,404 @@
+//! A log with bits flipped, files missing or foreign: it is said, the rest is used, and rows of batches are right all the same.
+
+use std::{
+    borrow::Cow,
+    fs,
+    path::{Path, PathBuf},
+};
+
+use driml_protocol::{Buffer, Chunk, ChunkHeader, InsertReply, RequestId};
+use driml_replay_server::{Config, DurableArgs, DurableReplay, Recovery};
+
+use proptest::prelude::*;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::{
+    batches::{check_batch, check_rows},
+    durable::{Life, ROWS, args, open, segments, state, test_spec},
+    history::{History, unlimited},
+};
+
+/// A log of a dozen segments of some transitions each, and what is in it.
+struct Kept {
+    _root: tempfile::TempDir,
+    args: DurableArgs,
+    config: Config,
+    history: History,
+    state: Vec<u8>,
+    produced: u64,
+}
+
+impl Kept {
+    fn new(capacity: u64) -> Self {
+        let root = tempfile::tempdir().unwrap();
+        let mut life = Life::begin(&root.path().join("log"), unlimited(capacity), 4_000, 3);
+        // Until the newest has some, too.
+        let (mut newest, mut in_newest) = (None, 0);
+        while life.history.inserted < 800 || in_newest < 5 {
+            life.store(0);
+            life.draw(0);
+            let last = segments(&life.args.dir).pop();
+            in_newest = if last == newest { in_newest + 1 } else { 0 };
+            newest = last;
+        }
+        let Life {
+            args,
+            config,
+            replay,
+            history,
+            ..
+        } = life;
+        let state = state(&replay);
+        Self {
+            _root: root,
+            args,
+            config,
+            produced: history.inserted,
+            history,
+            state,
+        }
+    }
+
+    fn segments(&self) -> Vec<PathBuf> {
+        segments(&self.args.dir)
+    }
+
+    fn open(&self) -> (DurableReplay, Recovery) {
+        open(&self.args, &self.config).unwrap()
+    }
+
+    /// Checks batches of what came back, which holds `held` transitions or more: nothing of what is gone is in them.
+    fn check(&self, replay: &mut DurableReplay) {
+        replay.check_valid();
+        for client in 0..200 {
+            let drawn = replay.draw_for(RequestId::first(1_000 + client), ROWS, Buffer::zeroed);
+            let mut batch = drawn.unwrap().unpack();
+            assert!(batch.header.held <= self.history.inserted);
+            batch.header.held = self.history.inserted - self.history.oldest();
+            check_batch(&batch, &self.history);
+        }
+    }
+}
+
+fn flip(path: &Path, at: impl FnOnce(usize) -> usize) {
+    let mut bytes = fs::read(path).unwrap();
+    let at = at(bytes.len());
+    bytes[at] ^= 4;
+    fs::write(path, bytes).unwrap();
+}
+
+/// Damage of any kind at any place: a bit, a range, a cut, a missing file, one in the place of another.
+fn damage(dir: &Path, rng: &mut ChaCha8Rng) {
+    let all = segments(dir);
+    let path = &all[rng.random_range(0..all.len())];
+    let mut bytes = fs::read(path).unwrap();
+    let at = rng.random_range(0..bytes.len().max(1));
+    match rng.random_range(0..6) {
+        0 => return fs::remove_file(path).unwrap(),
+        1 => bytes.truncate(at),
+        2 => bytes[at..].fill(0),
+        3 => {
+            let end = bytes.len().min(at + rng.random_range(1..600));
+            rng.fill(&mut bytes[at..end]);
+        }
+        4 => bytes = fs::read(&all[rng.random_range(0..all.len())]).unwrap(),
+        _ => bytes[at] ^= 1 << rng.random_range(0..8),
+    }
+    fs::write(path, bytes).unwrap();
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
+
+    /// Whatever happens to the files, the server starts or says why not; what it serves is right, and it comes back once more.
+    #[test]
+    fn whatever_is_damaged_what_is_served_is_right(seed in any::<u64>(), damages in 1usize..5, capacity in 300u64..2_000) {
+        let mut kept = Kept::new(capacity);
+        // Where the end was cut off, older ones are held.
+        kept.history.capacity = u64::MAX;
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        for _ in 0..damages {
+            if !kept.segments().is_empty() {
+                damage(&kept.args.dir, &mut rng);
+            }
+        }
+        let Ok((mut replay, _)) = open(&kept.args, &kept.config) else {
+            return Ok(());
+        };
+        replay.check_valid();
+        let status = replay.status();
+        prop_assert!(status.transitions_inserted <= kept.history.inserted);
+        for client in 0..20 {
+            let drawn = replay.draw_for(RequestId::first(1_000 + client), ROWS, Buffer::zeroed);
+            // There may be nothing left.
+            let Ok(batch) = drawn else { break };
+            check_rows(&batch.unpack(), &kept.history);
+        }
+        let before = state(&replay);
+        drop(replay);
+        let (replay, _) = kept.open();
+        prop_assert_eq!(state(&replay), before);
+    }
+}
+
+fn said(recovery: &Recovery, words: &str) -> bool {
+    recovery.warnings.iter().any(|it| it.contains(words))
+}
+
+#[test]
+fn a_flipped_bit_costs_its_segment_alone() {
+    let kept = Kept::new(10_000);
+    let segments = kept.segments();
+    flip(&segments[5], |length| length * 2 / 3);
+    let (mut replay, recovery) = kept.open();
+    assert!(said(&recovery, "is damaged at byte"), "{recovery:?}");
+    assert!(said(&recovery, "are gone"), "{recovery:?}");
+    let status = replay.status();
+    assert_eq!(status.transitions_inserted, kept.history.inserted);
+    assert_eq!(status.transitions_lost, 0);
+    // All counts are those of before.
+    kept.check(&mut replay);
+    // The next chunk of the actor is the next.
+    drop(replay);
+    let (_, recovery) = kept.open();
+    assert!(
+        said(&recovery, "are gone"),
+        "as long as they would be held: {recovery:?}"
+    );
+}
+
+#[test]
+fn a_damaged_beginning_costs_its_segment_and_it_is_set_aside() {
+    let kept = Kept::new(10_000);
+    let segments = kept.segments();
+    flip(&segments[4], |_| 40);
+    let (mut replay, recovery) = kept.open();
+    assert!(said(&recovery, "its beginning is damaged"), "{recovery:?}");
+    assert!(segments[4].with_extension("unusable").exists());
+    assert_eq!(replay.status().transitions_inserted, kept.history.inserted);
+    kept.check(&mut replay);
+}
+
+#[test]
+fn missing_segments_are_said_wherever_they_are() {
+    let kept = Kept::new(10_000);
+    let all = kept.segments();
+    fs::remove_file(&all[7]).unwrap();
+    let (mut replay, recovery) = kept.open();
+    assert!(
+        said(&recovery, "are gone") && said(&recovery, "missing"),
+        "{recovery:?}"
+    );
+    assert_eq!(replay.status().transitions_inserted, kept.history.inserted);
+    kept.check(&mut replay);
+
+    let kept = Kept::new(10_000);
+    let all = kept.segments();
+    fs::remove_file(&all[0]).unwrap();
+    fs::remove_file(&all[1]).unwrap();
+    let (mut replay, recovery) = kept.open();
+    assert!(
+        said(&recovery, "the oldest segments are missing"),
+        "{recovery:?}"
+    );
+    assert_eq!(state(&replay).len(), kept.state.len());
+    kept.check(&mut replay);
+
+    let kept = Kept::new(10_000);
+    let all = kept.segments();
+    fs::remove_file(all.last().unwrap()).unwrap();
+    let (replay, recovery) = kept.open();
+    assert!(
+        said(&recovery, "is missing: the replay is what it was"),
+        "{recovery:?}"
+    );
+    assert!(replay.status().transitions_inserted < kept.history.inserted);
+    replay.check_valid();
+
+    // None is missing where the oldest were removed with their transitions.
+    let kept = Kept::new(100);
+    let (mut replay, recovery) = kept.open();
+    assert_eq!(recovery.warnings, [""; 0]);
+    assert_eq!(state(&replay), kept.state);
+    kept.check(&mut replay);
+}
+
+/// What was acknowledged and is lost never comes again: the actor, which goes on, is taken at its word, and the loss is counted.
+#[test]
+fn after_a_loss_an_actor_goes_on_and_the_loss_is_counted() {
+    let kept = Kept::new(10_000);
+    let newest = kept.segments().pop().unwrap();
+    flip(&newest, |length| length * 3 / 4);
+    let (mut replay, recovery) = kept.open();
+    assert!(said(&recovery, "are cut off"), "{recovery:?}");
+    let before = replay.status();
+    let lost = kept.history.inserted - before.transitions_inserted;
+    assert!(lost > 0);
+    let header = |sequence| ChunkHeader {
+        actor: 0,
+        incarnation: 1,
+        sequence,
+        first_transition: kept.produced,
+        weights_version: 0,
+        leaving: false,
+        streams: 2,
+        steps: 4,
+        frame_bytes: test_spec().frame_bytes() as u32,
+    };
+    // Far beyond what came back.
+    let sequence = 10_000;
+    let mut insert = |sequence| {
+        let chunk = Chunk::zeroed(header(sequence));
+        let packed = replay.packer().pack(Cow::Borrowed(&chunk));
+        replay.insert_packed(&packed)
+    };
+    // One that overtook the one before it is told so; an actor that then sends the same again has nothing older.
+    assert!(matches!(
+        insert(sequence + 1),
+        InsertReply::OutOfOrder { .. }
+    ));
+    assert!(matches!(insert(sequence), InsertReply::OutOfOrder { .. }));
+    assert!(matches!(insert(sequence), InsertReply::Stored { .. }));
+    assert!(
+        matches!(insert(sequence), InsertReply::Stored { .. }),
+        "a retry"
+    );
+    let status = replay.status();
+    assert_eq!(status.transitions_inserted, before.transitions_inserted + 8);
+    assert_eq!(
+        (status.transitions_lost, status.transitions_duplicated),
+        (lost, 0)
+    );
+    replay.check_valid();
+    let after = state(&replay);
+    drop(replay);
+    let (replay, recovery) = kept.open();
+    assert_eq!(recovery.warnings, [""; 0]);
+    assert_eq!(state(&replay), after);
+}
+
+#[test]
+fn a_power_cut_that_leaves_zeros_is_a_torn_write() {
+    let kept = Kept::new(10_000);
+    let newest = kept.segments().pop().unwrap();
+    let mut bytes = fs::read(&newest).unwrap();
+    bytes.extend_from_slice(&[0; 5_000]);
+    fs::write(&newest, &bytes).unwrap();
+    let (replay, recovery) = kept.open();
+    assert_eq!(recovery.warnings, [""; 0]);
+    assert_eq!(state(&replay), kept.state);
+    assert!(fs::metadata(&newest).unwrap().len() < bytes.len() as u64);
+    drop(replay);
+    // A segment that was just begun.
+    let next = kept.segments().pop().unwrap();
+    let next = next.with_file_name("segment-000000000999.log");
+    fs::write(&next, &bytes[..20]).unwrap();
+    let (replay, recovery) = kept.open();
+    assert_eq!(recovery.warnings, [""; 0]);
+    assert_eq!(state(&replay), kept.state);
+}
+
+#[test]
+fn what_is_not_of_this_log_is_left_alone() {
+    let (kept, other) = (Kept::new(10_000), Kept::new(10_000));
+    let foreign = kept.args.dir.join("segment-000000000500.log");
+    fs::copy(&other.segments()[3], &foreign).unwrap();
+    let (replay, recovery) = kept.open();
+    assert!(
+        said(&recovery, "segment-000000000500.log is not of this log"),
+        "{recovery:?}"
+    );
+    assert_eq!(state(&replay), kept.state);
+    assert!(foreign.exists());
+    drop(replay);
+    fs::remove_file(&foreign).unwrap();
+
+    // Its own one, under another's name.
+    fs::copy(
+        &kept.segments()[3],
+        kept.args.dir.join("segment-000000000600.log"),
+    )
+    .unwrap();
+    let (replay, recovery) = kept.open();
+    assert!(
+        said(&recovery, "is not the segment that belongs here"),
+        "{recovery:?}"
+    );
+    assert_eq!(state(&replay), kept.state);
+    drop(replay);
+
+    // Who it is is known from the segments, too.
+    fs::remove_file(kept.args.dir.join("log.toml")).unwrap();
+    let (replay, recovery) = kept.open();
+    assert_eq!(recovery.warnings, [""; 0]);
+    assert_eq!(state(&replay), kept.state);
+}
+
+#[test]
+fn a_folder_is_one_servers_and_one_runs() {
+    let kept = Kept::new(10_000);
+    let error = |args: &DurableArgs, config: &Config| {
+        let opened = open(args, config).map(|_| ());
+        opened.unwrap_err().to_string()
+    };
+    let (replay, _) = kept.open();
+    let said = error(&kept.args, &kept.config);
+    assert!(
+        said.contains("another replay server keeps its replay in"),
+        "{said}"
+    );
+    drop(replay);
+
+    let mut shard = kept.args.clone();
+    shard.shard = 1;
+    let shards = Config {
+        shards: 2,
+        ..kept.config.clone()
+    };
+    let said = error(&shard, &shards);
+    assert!(
+        said.contains("holds the replay of another run (shard 0 of 1; this is shard 1 of 2)"),
+        "{said}"
+    );
+
+    let mut other = test_spec();
+    other.seed += 1;
+    let opened = DurableReplay::open(&kept.args, &other, &kept.config, ROWS).map(|_| ());
+    let said = opened.unwrap_err().to_string();
+    assert!(said.contains("its run spec has the hash"), "{said}");
+
+    let file = kept.args.dir.join("log.toml");
+    let no_folder = args(&file, 1000);
+    assert!(
+        error(&no_folder, &kept.config)
+            .contains("needs a folder with room that this process may write")
+    );
+
+    let text = fs::read_to_string(&file).unwrap();
+    fs::write(&file, text.replace("format = 1", "format = 2")).unwrap();
+    let said = error(&kept.args, &kept.config);
+    assert!(
+        said.contains("a replay of format 2, this version reads 1"),
+        "{said}"
+    );
+}
+
+/// Other settings of the same run: what is held follows them.
+#[test]
+fn a_run_may_go_on_with_another_capacity() {
+    let kept = Kept::new(10_000);
+    for capacity in [100, 50_000] {
+        let config = unlimited(capacity);
+        let (mut replay, recovery) = open(&kept.args, &config).unwrap();
+        assert_eq!(recovery.warnings, [""; 0]);
+        let held = replay.status().transitions_held;
+        assert!(held <= capacity && held > 80, "{held}");
+        replay.check_valid();
+        assert!(
+            replay
+                .draw_for(RequestId::first(capacity), ROWS, Buffer::zeroed)
+                .is_ok()
+        );
+    }
+}

@@ -1,0 +1,189 @@
+//! Well-formed messages in any order and with any numbers, to the core of a replay server: none breaks what it holds.
+
+use driml_protocol::{
+    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon, InsertReply,
+    RequestId, RunSpec, Sampling, Tally, TimeoutRule,
+};
+use driml_replay_server::{Compression, Config, Replay};
+
+/// Messages of one try.
+const MESSAGES_MAX: usize = 64;
+
+/// The bytes that are left, as numbers.
+struct Numbers<'a>(&'a [u8]);
+
+impl Numbers<'_> {
+    fn byte(&mut self) -> Option<u8> {
+        let (&first, rest) = self.0.split_first()?;
+        self.0 = rest;
+        Some(first)
+    }
+
+    /// Small ones most of the time, and those at the edges.
+    fn count(&mut self) -> Option<u64> {
+        Some(match self.byte()? {
+            small @ 0..=199 => u64::from(small % 16),
+            edge @ 200..=239 => {
+                [1 << 31, 1 << 32, 1 << 48, 1 << 60, u64::MAX - 1, u64::MAX][usize::from(edge) % 6]
+            }
+            _ => {
+                let (bytes, rest) = self.0.split_first_chunk()?;
+                self.0 = rest;
+                u64::from_le_bytes(*bytes)
+            }
+        })
+    }
+
+    fn actor(&mut self) -> Option<u32> {
+        Some(match self.byte()? {
+            255 => u32::MAX,
+            byte => u32::from(byte % 3),
+        })
+    }
+}
+
+fn spec() -> RunSpec {
+    RunSpec {
+        world: "counter".into(),
+        agent: "driml-ada".into(),
+        seed: 1,
+        frame_height: 1,
+        frame_width: 1,
+        frame_channels: 2,
+        frame_stack: 2,
+        num_actions: 3,
+        n_step: 2,
+        gamma: 0.99,
+        horizon: Horizon::Nhg { k_max: 3 },
+        timeout: TimeoutRule::Bootstrap,
+    }
+}
+
+fn config(shards: u32) -> Config {
+    Config {
+        capacity_transitions: 64 * u64::from(shards),
+        shards,
+        compression: Compression::None,
+        compressed_bytes_max: None,
+        sampling: Sampling::Uniform,
+        disk_bytes_max: None,
+        fsync_ms: None,
+        replay_ratio: 2.0,
+        warmup_transitions: 8,
+        slack_transitions: 16,
+        transitions_max: (shards == 1).then_some(4096),
+        reproduced_bug: None,
+    }
+}
+
+/// Sends the messages that the bytes say, one after the other.
+pub(crate) fn replay(bytes: &[u8]) {
+    let mut numbers = Numbers(bytes);
+    let Some(shards) = numbers.byte().map(|byte| 1 + u32::from(byte % 2)) else {
+        return;
+    };
+    let mut replay = Replay::new(&spec(), &config(shards), 4).unwrap();
+    for _ in 0..MESSAGES_MAX {
+        if message(&mut replay, &mut numbers).is_none() {
+            break;
+        }
+    }
+    replay.check_valid();
+    let status = replay.status();
+    assert!(status.transitions_held <= status.transitions_inserted);
+}
+
+fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
+    match numbers.byte()? % 8 {
+        0 => {
+            let (actor, incarnation) = (numbers.actor()?, numbers.count()?);
+            let _ = replay.join_actor(ActorJoin { actor, incarnation });
+        }
+        1 | 2 => {
+            let stored = replay.inserted_total();
+            let chunk = chunk(numbers)?;
+            let reply = replay.insert(&chunk);
+            if matches!(reply, InsertReply::Refused { .. }) {
+                assert_eq!(replay.inserted_total(), stored);
+            }
+        }
+        3 => {
+            let goodbye = Goodbye {
+                actor: numbers.actor()?,
+                incarnation: numbers.count()?,
+                produced: numbers.count()?,
+            };
+            replay.goodbye(&goodbye);
+        }
+        4 => {
+            let claim = Claim {
+                actor: numbers.actor()?,
+                incarnation: numbers.count()?,
+                sequence: numbers.count()?,
+                leaving: numbers.byte()? % 2 == 0,
+            };
+            let _ = replay.claim(&claim);
+        }
+        5 => {
+            let id = RequestId {
+                client_id: numbers.count()?,
+                number: numbers.count()?,
+                attempt: numbers.count()?,
+            };
+            // The service lets nobody have more rows than the run's batches have.
+            let rows = numbers.count()?.min(64) as u32;
+            let drawn = replay.draw_for(id, rows, driml_protocol::Buffer::zeroed);
+            if let Ok(batch) = drawn {
+                assert_eq!(batch.unpack().rows(), rows as usize);
+            }
+        }
+        6 => {
+            let affinity = AffinityUpdate {
+                learner: 1,
+                version: numbers.count()?,
+                num_actions: 3,
+                matrix: (0..9)
+                    .map(|_| numbers.byte().map(|byte| f32::from(byte) / 250.0))
+                    .collect::<Option<_>>()?,
+            };
+            let _ = replay.set_affinity(&affinity);
+        }
+        _ => {
+            if numbers.byte()? % 2 == 0 {
+                let _ = replay.learner_starts(numbers.count()?);
+            } else {
+                let tally = Tally {
+                    inserted: numbers.count()?,
+                    rows_sampled: numbers.count()?,
+                };
+                let _ = replay.set_other_shards(tally);
+            }
+        }
+    }
+    Some(())
+}
+
+fn chunk(numbers: &mut Numbers<'_>) -> Option<Chunk> {
+    let header = ChunkHeader {
+        actor: numbers.actor()?,
+        incarnation: numbers.count()?,
+        sequence: numbers.count()?,
+        first_transition: numbers.count()?,
+        weights_version: numbers.count()?,
+        leaving: numbers.byte()? % 4 == 0,
+        streams: u32::from(numbers.byte()? % 4),
+        steps: u32::from(numbers.byte()? % 8),
+        frame_bytes: 2,
+    };
+    let mut chunk = Chunk::zeroed(header);
+    for row in 0..header.transitions() {
+        let (action, end, reward) = (numbers.byte()?, numbers.byte()?, numbers.byte()?);
+        let reward = if reward == 255 {
+            f32::MAX
+        } else {
+            f32::from(reward)
+        };
+        chunk.set(row, action % 3, reward, End::from_byte(end % 4)?);
+    }
+    Some(chunk)
+}

@@ -1,0 +1,168 @@
+//! A bounded run of every decoder over changed seeds, in CI: the same functions that the fuzz targets call.
+//! `DRIML_DECODER_RUNS=N` makes N executions of each instead.
+
+#![allow(clippy::unwrap_used, reason = "these are tests")]
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
+
+use driml_decoders::{ALL, forged, samples};
+use rand::{Rng, SeedableRng, seq::IndexedRandom};
+use rand_chacha::ChaCha8Rng;
+
+/// Executions of each decoder in CI.
+const RUNS: u64 = 20_000;
+/// Bytes beyond which a changed seed is cut.
+const BYTES_MAX: usize = 1 << 14;
+
+fn folder(decoder: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("fuzz/corpus")
+        .join(decoder)
+}
+
+fn seeds(decoder: &str) -> Vec<Vec<u8>> {
+    let mut files: Vec<_> = fs::read_dir(folder(decoder))
+        .unwrap_or_else(|e| panic!("{decoder} has no seeds: {e}"))
+        .map(|entry| entry.unwrap().path())
+        .collect();
+    files.sort();
+    assert!(!files.is_empty(), "{decoder} has no seeds");
+    files.iter().map(|file| fs::read(file).unwrap()).collect()
+}
+
+/// Changes some bytes, as a fuzzer does.
+fn change(bytes: &mut Vec<u8>, seeds: &[Vec<u8>], rng: &mut ChaCha8Rng) {
+    const EDGES: [u64; 8] = [0, 1, 250, 251, 1 << 31, 1 << 60, u64::MAX - 1, u64::MAX];
+    for _ in 0..rng.random_range(1..5) {
+        let at = rng.random_range(0..=bytes.len());
+        let length = rng.random_range(0..=(bytes.len() - at).min(16));
+        match rng.random_range(0..8) {
+            0 if at < bytes.len() => bytes[at] ^= 1 << rng.random_range(0..8),
+            1 if at < bytes.len() => bytes[at] = rng.random(),
+            2 => drop(bytes.drain(at..at + length)),
+            3 => {
+                let copy = bytes[at..at + length].to_vec();
+                bytes.splice(at..at, copy);
+            }
+            4 => {
+                let edge = EDGES.choose(rng).unwrap().to_le_bytes();
+                let width = [1, 2, 4, 8].choose(rng).copied().unwrap();
+                bytes.splice(at..(at + length).min(bytes.len()), edge[..width].to_vec());
+            }
+            5 => {
+                // bincode's own marks of longer numbers.
+                let mark = rng.random_range(251..=254);
+                bytes.splice(at..at, [mark, 255, 255, 255, 255, 255, 255, 255, 255]);
+            }
+            6 => {
+                let other = seeds.choose(rng).unwrap();
+                let from = rng.random_range(0..=other.len());
+                bytes.truncate(at);
+                bytes.extend_from_slice(&other[from..]);
+            }
+            _ => bytes.truncate(at),
+        }
+    }
+    bytes.truncate(BYTES_MAX);
+}
+
+fn run(name: &str) {
+    let runs = std::env::var("DRIML_DECODER_RUNS").ok();
+    let runs = runs.map_or(RUNS, |it| it.parse().expect("a number of executions"));
+    let (_, decoder) = ALL.iter().find(|(it, _)| *it == name).unwrap();
+    let seeds = seeds(name);
+    seeds.iter().for_each(|seed| decoder(seed));
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    for number in 0..runs {
+        let mut bytes = seeds.choose(&mut rng).unwrap().clone();
+        change(&mut bytes, &seeds, &mut rng);
+        let ran = Said {
+            name,
+            number,
+            bytes: &bytes,
+        };
+        decoder(ran.bytes);
+        std::mem::forget(ran);
+    }
+}
+
+/// Says which bytes were tried when a decoder panics with them.
+struct Said<'a> {
+    name: &'a str,
+    number: u64,
+    bytes: &'a [u8],
+}
+
+impl Drop for Said<'_> {
+    fn drop(&mut self) {
+        let Self {
+            name,
+            number,
+            bytes,
+        } = self;
+        let file = std::env::temp_dir().join(format!("driml-decoder-{name}-{number}"));
+        // The panic is what fails the test; where its bytes are is a help alone.
+        let _ = fs::write(&file, bytes);
+        driml_decoders_said(&format!("{name}, execution {number}: {}", file.display()));
+    }
+}
+
+fn driml_decoders_said(text: &str) {
+    use std::io::Write;
+    let _ = writeln!(std::io::stderr(), "{text}");
+}
+
+#[test]
+fn wire() {
+    run("wire");
+}
+
+#[test]
+fn messages() {
+    run("messages");
+}
+
+#[test]
+fn replay() {
+    run("replay");
+}
+
+#[test]
+fn state() {
+    run("state");
+}
+
+#[test]
+fn config() {
+    run("config");
+}
+
+/// Each decoder has a target and seeds, and the seeds of messages are today's: `UPDATE_CORPUS=1` writes them.
+#[test]
+fn every_decoder_has_a_target_and_seeds() {
+    let fuzz = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz");
+    let manifest = fs::read_to_string(fuzz.join("Cargo.toml")).unwrap();
+    for (name, _) in ALL {
+        let target = format!("fuzz_targets/{name}.rs");
+        assert!(manifest.contains(&target), "{name} has no target");
+        assert!(fuzz.join(&target).exists(), "{target}");
+    }
+    for (number, sample) in samples().iter().enumerate() {
+        for (decoder, bytes) in [("wire", sample.clone()), ("messages", forged(sample))] {
+            let file = folder(decoder).join(format!("sample-{number:02}"));
+            if std::env::var_os("UPDATE_CORPUS").is_some() {
+                fs::create_dir_all(folder(decoder)).unwrap();
+                fs::write(&file, &bytes).unwrap();
+            }
+            let stored = fs::read(&file).unwrap_or_default();
+            assert!(
+                stored == bytes,
+                "{} is not today's: UPDATE_CORPUS=1 writes it",
+                file.display()
+            );
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! Certificates for tests: made by `deploy/certs.sh`, and spoiled with openssl in the ways in which they can be wrong.
+//! It starts no process of the program.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use crate::skipped::skip;
+
+/// A folder for `--tls-dir`, with everything in it.
+#[derive(Debug)]
+pub struct Certificates {
+    folder: PathBuf,
+}
+
+/// When a certificate is good.
+#[derive(Clone, Copy, Debug)]
+pub enum Valid {
+    /// No longer.
+    UntilYesterday,
+    /// Not before the year 2090.
+    From2090,
+}
+
+/// Whether `test`, which needs openssl, is to be skipped; a line on stderr then names it.
+pub fn skipped_without_openssl(test: &str) -> bool {
+    let is_there = Command::new("openssl").arg("version").output().is_ok();
+    if !is_there {
+        skip(test, "openssl is not there");
+    }
+    !is_there
+}
+
+fn run(command: &mut Command) -> String {
+    let output = command.output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{command:?}: {said}");
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+impl Certificates {
+    /// Calls `deploy/certs.sh` for a folder, which may be there; `args` are split at blanks.
+    pub fn make(folder: PathBuf, args: &str) -> Self {
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/certs.sh");
+        run(Command::new(script)
+            .arg(&folder)
+            .args(args.split_whitespace()));
+        Self { folder }
+    }
+
+    /// The folder.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// A file in it.
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.folder.join(name)
+    }
+
+    /// The same files in another folder, to be spoiled there.
+    pub fn copy(&self, to: PathBuf) -> Self {
+        fs::create_dir(&to).unwrap();
+        for entry in fs::read_dir(&self.folder).unwrap() {
+            let entry = entry.unwrap();
+            fs::copy(entry.path(), to.join(entry.file_name())).unwrap();
+        }
+        Self { folder: to }
+    }
+
+    /// Puts the files of one role in the place of another's.
+    pub fn pass_off(&self, role: &str, as_role: &str) {
+        for ending in ["pem", "key"] {
+            let file = |role| self.path(&format!("{role}.{ending}"));
+            fs::copy(file(role), file(as_role)).unwrap();
+        }
+    }
+
+    /// Signs the certificate of `role` anew, valid at another time.
+    pub fn sign_again(&self, role: &str, valid: Valid) {
+        let old = run(Command::new("openssl")
+            .args([
+                "x509",
+                "-noout",
+                "-ext",
+                "extendedKeyUsage,subjectAltName",
+                "-in",
+            ])
+            .arg(self.path(&format!("{role}.pem"))));
+        let usage = match old.contains("Server") {
+            true => "extendedKeyUsage=serverAuth\nsubjectAltName=IP:127.0.0.1",
+            false => "extendedKeyUsage=clientAuth",
+        };
+        let (start, end) = match valid {
+            Valid::UntilYesterday => ("20200101000000Z", "20200201000000Z"),
+            Valid::From2090 => ("20900101000000Z", "20910101000000Z"),
+        };
+        let config = format!(
+            "[ca]\ndefault_ca=a\n[a]\nnew_certs_dir=.\ndatabase=index\nrand_serial=yes\ndefault_md=sha256\npolicy=p\nunique_subject=no\n\
+             x509_extensions=e\n[p]\ncommonName=supplied\n[e]\nbasicConstraints=critical,CA:FALSE\n{usage}\n"
+        );
+        fs::write(self.path("config"), config).unwrap();
+        fs::write(self.path("index"), "").unwrap();
+        let openssl = |args: String| {
+            let mut command = Command::new("openssl");
+            run(command
+                .current_dir(&self.folder)
+                .args(args.split_whitespace()))
+        };
+        openssl(format!(
+            "req -new -key {role}.key -subj /CN={role} -out request"
+        ));
+        openssl(format!(
+            "ca -batch -notext -config config -cert ca.pem -keyfile ca.key -in request -out {role}.pem -startdate {start} -enddate {end}"
+        ));
+    }
+}

@@ -1,0 +1,158 @@
+//! Machines of their own on one: network namespaces with addresses, each on a link of its own to a router in the middle.
+//! It needs the right to make them, and changes nothing of the host's own network.
+
+use std::{
+    process::{Command, Output},
+    sync::atomic::{AtomicU32, Ordering},
+};
+
+use crate::skipped::skip;
+
+/// Namespaces joined by a router. Dropping it removes them; what runs in one is to have ended before.
+#[derive(Debug)]
+pub struct Network {
+    name: String,
+    machines: Vec<String>,
+}
+
+/// Runs `ip` with these words.
+fn ip(words: &str) -> Result<(), String> {
+    let said = Command::new("ip").args(words.split_whitespace()).output();
+    check(words, said)
+}
+
+fn check(what: &str, said: std::io::Result<Output>) -> Result<(), String> {
+    let said = said.map_err(|e| format!("{what}: {e}"))?;
+    match said.status.success() {
+        true => Ok(()),
+        false => Err(format!(
+            "{what}: {}",
+            String::from_utf8_lossy(&said.stderr).trim()
+        )),
+    }
+}
+
+impl Network {
+    /// A network of these machines; none, and the `test` is skipped by name, where this process may not make one.
+    pub fn new(test: &str, machines: &[&str]) -> Option<Self> {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
+        let network = Self {
+            // Short, as the name of a device may have 15 characters.
+            name: format!("d{}n{count}", std::process::id()),
+            machines: machines.iter().map(|&it| it.to_owned()).collect(),
+        };
+        match network.build() {
+            Ok(()) => Some(network),
+            Err(why) => {
+                skip(test, &format!("no network namespaces: {why}"));
+                None
+            }
+        }
+    }
+
+    fn build(&self) -> Result<(), String> {
+        let router = self.router();
+        ip(&format!("netns add {router}"))?;
+        ip(&format!("-n {router} link set lo up"))?;
+        let forward = format!("netns exec {router} sysctl -qw net.ipv4.ip_forward=1");
+        ip(&forward)?;
+        for (number, machine) in self.machines.iter().enumerate() {
+            let namespace = self.namespace(machine);
+            let (inner, outer) = (format!("{}i{number}", self.name), self.device(machine));
+            ip(&format!("netns add {namespace}"))?;
+            ip(&format!("-n {namespace} link set lo up"))?;
+            ip(&format!(
+                "link add {inner} netns {namespace} type veth peer name {outer} netns {router}"
+            ))?;
+            ip(&format!(
+                "-n {namespace} addr add 10.77.{number}.2/24 dev {inner}"
+            ))?;
+            ip(&format!(
+                "-n {router} addr add 10.77.{number}.1/24 dev {outer}"
+            ))?;
+            ip(&format!("-n {namespace} link set {inner} up"))?;
+            ip(&format!("-n {router} link set {outer} up"))?;
+            ip(&format!(
+                "-n {namespace} route add default via 10.77.{number}.1"
+            ))?;
+        }
+        Ok(())
+    }
+
+    fn number(&self, machine: &str) -> usize {
+        let found = self.machines.iter().position(|it| it == machine);
+        found.unwrap_or_else(|| panic!("there is no machine {machine}"))
+    }
+
+    fn namespace(&self, machine: &str) -> String {
+        format!("{}-{machine}", self.name)
+    }
+
+    fn router(&self) -> String {
+        format!("{}-router", self.name)
+    }
+
+    /// The router's end of a machine's link.
+    fn device(&self, machine: &str) -> String {
+        format!("{}o{}", self.name, self.number(machine))
+    }
+
+    /// A machine's address.
+    pub fn address(&self, machine: &str) -> String {
+        format!("10.77.{}.2", self.number(machine))
+    }
+
+    /// The words before a command that is to run on a machine.
+    pub fn on(&self, machine: &str) -> Vec<String> {
+        let words = ["ip", "netns", "exec", &self.namespace(machine)];
+        words.map(str::to_owned).to_vec()
+    }
+
+    /// The words before a command that is to run on the router, from which every machine can be reached.
+    pub fn on_router(&self) -> Vec<String> {
+        ["ip", "netns", "exec", &self.router()]
+            .map(str::to_owned)
+            .to_vec()
+    }
+
+    /// Pulls a machine's cable: what is on its way is lost, and nobody hears of it.
+    pub fn cut(&self, machine: &str) {
+        self.set(machine, "down");
+    }
+
+    /// Puts it back.
+    pub fn mend(&self, machine: &str) {
+        self.set(machine, "up");
+    }
+
+    fn set(&self, machine: &str, state: &str) {
+        let (router, device) = (self.router(), self.device(machine));
+        ip(&format!("-n {router} link set {device} {state}")).unwrap();
+    }
+
+    /// Lets no more than so many kbit/s through to a machine and from it; false where the kernel cannot.
+    pub fn narrow(&self, machine: &str, kbit: u32) -> bool {
+        let inner = format!("{}i{}", self.name, self.number(machine));
+        let ends = [
+            (self.router(), self.device(machine)),
+            (self.namespace(machine), inner),
+        ];
+        ends.iter().all(|(namespace, device)| {
+            let words = format!(
+                "netns exec {namespace} tc qdisc replace dev {device} root tbf rate {kbit}kbit burst 16kb latency 200ms"
+            );
+            ip(&words).is_ok()
+        })
+    }
+}
+
+impl Drop for Network {
+    fn drop(&mut self) {
+        let machines = self.machines.iter().map(|it| self.namespace(it));
+        for namespace in machines.chain([self.router()]) {
+            // One that was not made yet is no loss.
+            let _ = ip(&format!("netns del {namespace}"));
+        }
+    }
+}

@@ -1,0 +1,47 @@
+//! A Python that has what a test needs, if there is one. It installs nothing.
+
+use std::process::{Command, Stdio};
+
+use crate::skipped::skip;
+
+/// The variable that names the Python to take; without it `python3` is tried.
+const VARIABLE: &str = "DRIML_TEST_PYTHON";
+
+/// A Python that finds all these modules; none, and a line on stderr that names `test`, if there is no such.
+pub fn python_with(test: &str, modules: &[&str]) -> Option<String> {
+    let python = std::env::var(VARIABLE).unwrap_or_else(|_| "python3".into());
+    let find = "import importlib.util, sys; sys.exit(any(importlib.util.find_spec(m) is None for m in sys.argv[1:]))";
+    let found = Command::new(&python)
+        .args(["-c", find])
+        .args(modules)
+        .stderr(Stdio::null())
+        .status();
+    if found.is_ok_and(|status| status.success()) {
+        return Some(python);
+    }
+    skip(
+        test,
+        &format!(
+            "{python} has not all of {}: name one that has with {VARIABLE}",
+            modules.join(", ")
+        ),
+    );
+    None
+}
+
+/// What a Python prints when it runs `script` with `args`.
+///
+/// # Panics
+/// If it fails, with what it said.
+pub fn run(python: &str, script: &[&str], args: &[&str]) -> String {
+    let output = Command::new(python)
+        .args(script)
+        .args(args)
+        // Nothing is left beside the scripts.
+        .env("PYTHONDONTWRITEBYTECODE", "1")
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{script:?} {args:?}: {said}");
+    String::from_utf8(output.stdout).unwrap()
+}

@@ -1,0 +1,241 @@
+//! Worlds of a user's own: a process that the actor starts, through all parts of a run; and what is said when it fails.
+//! What passes between an actor and such a process is tested beside the worlds.
+
+use std::{fs, path::Path};
+
+use driml_tests::{Process, TestSystem, skip, skipped_offline, wait_for};
+use nix::sys::signal::Signal;
+
+use crate::system;
+
+/// What a world with frames of 12 x 12 needs beside the preset `smoke`.
+const SMALL: &str =
+    "--preset smoke --set run.frame_stack=2 --set model.conv=[{out=8,kernel=4,stride=2}]";
+
+/// A file of this repository.
+fn file(name: &str) -> String {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    root.join(name).display().to_string()
+}
+
+/// The world whose every frame says which one it is; it needs `python3` and nothing else.
+fn numbered(fault: &str) -> String {
+    format!(
+        "exec:exec python3 {} {fault}",
+        file("tests/worlds/numbered.py")
+    )
+}
+
+/// Starts the program with a world whose name has blanks.
+fn start(system: &TestSystem, args: &str, env: &str) -> Process {
+    let mut command = system.command(args);
+    command.args(["--env", env]);
+    Process::start(format!("{args} --env {env:?}"), command)
+}
+
+#[test]
+fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
+    let system = system();
+    let env = numbered("");
+    let flags = format!("{SMALL} --agent driml-ada --frames 1280");
+    start(
+        &system,
+        &format!("local {flags} --actors 2 --run-dir run"),
+        &env,
+    )
+    .wait()
+    .expect_code(0);
+    let run = system.run_folder("run");
+    let summary = run.check_finished();
+    assert_eq!(summary.frames, 1280);
+    // Every third to sixth step of a copy ends an episode.
+    assert!(summary.episodes > 200, "{summary:#?}");
+    let config = run.config();
+    assert_eq!(config["run"]["world"].as_str(), Some(env.as_str()));
+    assert_eq!(config["world"]["actions"].as_array().unwrap().len(), 3);
+    assert!(run.log("actor-0").contains("a line on stdout does no harm"));
+
+    let lockstep = |args: &str, name: &str| {
+        let args = format!("local --lockstep {args} --run-dir {name}");
+        let process = if name == "first" {
+            start(&system, &args, &env)
+        } else {
+            system.start(&args)
+        };
+        process.wait().expect_code(0);
+        system.run_folder(name).check_finished().weights_sha256
+    };
+    let first = lockstep(&flags, "first");
+    assert_eq!(first, lockstep("--config first/config.toml", "again"));
+    let ended = system.run("evaluate --run run --episodes 8").expect_code(0);
+    // Each episode ends with 1000, and what comes before is 2 a step at most.
+    let agent = ended.stdout.lines().nth(1).unwrap();
+    assert!(agent.contains("mean return 10"), "{agent}");
+    assert_eq!(system.survivors(), []);
+}
+
+#[test]
+fn a_world_that_fails_ends_the_run_with_a_sentence() {
+    for (fault, limit, sentence) in [
+        ("raise 20", "", "the dragon got out"),
+        ("kill 20", "", "ended in the middle of a step (signal: 9"),
+        (
+            "hang 20",
+            "--set world.step_timeout_ms=1500",
+            "has not answered for 1.5 s in the middle of a step",
+        ),
+    ] {
+        let system = system();
+        let args = format!("local {SMALL} {limit} --agent c51 --frames 100000 --run-dir run");
+        start(&system, &args, &numbered(fault))
+            .wait()
+            .expect_code(1)
+            .expect_said(sentence);
+        assert_eq!(system.survivors(), [], "{fault}");
+    }
+}
+
+#[test]
+fn a_command_that_is_no_world_is_refused_before_anything_starts() {
+    let system = system();
+    let refused = |env: &str, sentence: &str| {
+        let args = format!("local {SMALL} --run-dir run");
+        start(&system, &args, env)
+            .wait()
+            .expect_code(64)
+            .expect_said(sentence);
+        assert!(!system.path("run").exists());
+    };
+    refused("exec:no-such-command", "the shell found no such command");
+    refused("exec:echo hello", "does not declare itself as a world");
+    refused("exec:", "exec:COMMAND");
+    refused(
+        &numbered("raise 1; exit 3").replace("exec python3", "true; :"),
+        "ended before it declared itself",
+    );
+    assert_eq!(system.survivors(), []);
+}
+
+#[test]
+fn an_actor_starts_no_command_that_nobody_on_its_machine_has_named() {
+    let system = system();
+    let flags = format!(
+        "replay-server --listen {} {SMALL} --agent c51 --frames 100000000 --exit-with-parent {}",
+        system.endpoint(),
+        std::process::id()
+    );
+    let server = start(&system, &flags, &numbered(""));
+    let learner = system.start_learner("run");
+    system
+        .start_actor(0)
+        .wait()
+        .expect_code(1)
+        .expect_said("an actor starts none because a replay server says so")
+        .expect_said("--env \"exec:exec python3 ");
+    let actor = format!(
+        "actor --connect {} --exit-with-parent {}",
+        system.endpoint(),
+        std::process::id()
+    );
+    start(&system, &actor, "chain")
+        .wait()
+        .expect_code(1)
+        .expect_said("and not chain");
+    // The same world by another command, as another machine may have it; it will hang.
+    let hanging = start(&system, &format!("{actor} --id 1"), &numbered("hang 50"));
+    let client = system.connect();
+    client.wait_for_replay("the actor", |replay| replay.actors == 1);
+    wait_for("the world's hanging", || {
+        hanging.stderr().contains("sleeping").then_some(())
+    });
+    // A process that hears nothing does not outlive its actor, however that ends.
+    let worlds = || {
+        let is_world = |word: &String| word.ends_with("numbered.py");
+        let all = system.survivors().into_iter();
+        all.filter(|it| it.args.iter().any(is_world)).count()
+    };
+    assert_eq!(worlds(), 1);
+    hanging.signal(Signal::SIGKILL);
+    hanging.wait();
+    wait_for("the world's end", || (worlds() == 0).then_some(()));
+    drop(client);
+    learner.stop().expect_code(0);
+    server.stop().expect_code(0);
+    wait_for("the end of all", || {
+        system.survivors().is_empty().then_some(())
+    });
+}
+
+/// A Python with Gymnasium and ALE, installed once into cargo's folder for tests; `None`, and a line that says so, where pip cannot.
+fn gymnasium(test: &str) -> Option<String> {
+    if skipped_offline(test) {
+        return None;
+    }
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("gymnasium");
+    let python = folder.join("bin/python").display().to_string();
+    let ready = folder.join("ready");
+    fs::create_dir_all(&folder).unwrap();
+    let lock = fs::File::create(folder.join("lock")).unwrap();
+    lock.lock().unwrap();
+    if !ready.exists() {
+        let requirements = file("deploy/python/requirements.txt");
+        let script = format!(
+            "python3 -m venv {0} && {0}/bin/pip install --quiet --disable-pip-version-check -r {requirements}",
+            folder.display()
+        );
+        let output = std::process::Command::new("sh")
+            .args(["-c", &script])
+            .output()
+            .unwrap();
+        if !output.status.success() {
+            let said = String::from_utf8_lossy(&output.stderr);
+            skip(test, said.lines().last().unwrap_or("no pip"));
+            return None;
+        }
+        fs::write(&ready, "").unwrap();
+    }
+    Some(python)
+}
+
+#[test]
+fn atari_by_gymnasium_trains() {
+    let Some(python) = gymnasium("own_worlds::atari_by_gymnasium_trains") else {
+        return;
+    };
+    let system = system();
+    let env = format!(
+        "exec:{python} {} ALE/Pong-v5 --atari",
+        file("deploy/python/driml_env.py")
+    );
+    start(
+        &system,
+        "local --preset smoke --agent c51 --frames 480 --run-dir run",
+        &env,
+    )
+    .wait()
+    .expect_code(0);
+    let run = system.run_folder("run");
+    assert_eq!(run.check_finished().frames, 480);
+    let config = run.config();
+    let names = config["world"]["actions"].as_array().unwrap();
+    assert_eq!((names.len(), names[0].as_str()), (6, Some("NOOP")));
+    for side in ["height", "width"] {
+        assert_eq!(config["world"][side].as_integer(), Some(84));
+    }
+    assert_eq!(config["world"]["channels"].as_integer(), Some(1));
+    assert_eq!(system.survivors(), []);
+}
+
+/// The adapter's own test, which needs Gymnasium: every way in which vectors begin anew, seeds, shapes, and what is refused.
+#[test]
+fn the_adapter_keeps_gymnasium_s_episodes() {
+    let Some(python) = gymnasium("own_worlds::the_adapter_keeps_gymnasium_s_episodes") else {
+        return;
+    };
+    let output = std::process::Command::new(python)
+        .arg(file("tests/worlds/check_adapter.py"))
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+}

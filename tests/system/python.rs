@@ -1,0 +1,194 @@
+//! What others read of a run, with their own programs: `deploy/python` against the numbers that driml computes itself.
+//! Each test is skipped, by name, where no Python has what it needs.
+
+use std::fs;
+
+use driml_envs::{CorridorWorld, IsingWorld, PacmanWorld, ProcgenWorld};
+use driml_learner::{Agent, Compute, checkpoint, insight::Insight};
+use driml_settings::config::RunConfig;
+use driml_tests::{
+    TestSystem, note,
+    python::{python_with, run},
+};
+use rand::{RngCore, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::{repo_rules::root, system};
+
+/// Largest difference of a value, and of a probability, between PyTorch and driml, both in f32.
+const VALUE_OFF: f64 = 2e-5;
+const PROBABILITY_OFF: f64 = 2e-6;
+/// States that are compared.
+const STATES: usize = 16;
+
+/// Prints values and probabilities of the states in a file, as JSON.
+const ASK: &str = "
+import json, sys
+sys.path.insert(0, sys.argv[1])
+import torch
+from driml_net import load
+network, described = load(sys.argv[2])
+model = described['model']
+states = torch.frombuffer(bytearray(open(sys.argv[3], 'rb').read()), dtype=torch.uint8)
+states = states.reshape(-1, model['height'], model['width'], model['channels'])
+with torch.no_grad():
+    values, logits = network(states), network.logits(states)
+print(json.dumps([values.flatten().tolist(), logits.softmax(-1).flatten().tolist()]))
+";
+
+/// Prints values by ONNX's own runtime.
+const ASK_ONNX: &str = "
+import json, sys
+import numpy, onnxruntime
+session = onnxruntime.InferenceSession(sys.argv[1], providers=['CPUExecutionProvider'])
+shape = [int(it) for it in sys.argv[3].split(',')]
+states = numpy.fromfile(sys.argv[2], dtype=numpy.uint8).reshape(shape)
+print(json.dumps(session.run(['q_values'], {'states': states})[0].flatten().tolist()))
+";
+
+/// A run of each kind of network: with all heads of local and global DIM and enlarged stacks, and C51 alone.
+const RUNS: [&str; 2] = [
+    "--env mspacman --agent driml-ada --preset smoke --frames 320",
+    "--env chain --agent c51 --preset smoke --frames 320",
+];
+
+/// A run, what its network is, and random states in a file beside it.
+fn trained(system: &TestSystem, flags: &str) -> (Agent, Vec<u8>) {
+    let _ = fs::remove_dir_all(system.path("run"));
+    system
+        .run(&format!("local --lockstep {flags} --run-dir run"))
+        .expect_code(0);
+    let text = fs::read_to_string(system.path("run/config.toml")).unwrap();
+    let config = RunConfig::parse("config.toml", &text).unwrap();
+    let folder = system.path("run/checkpoints");
+    let (model, update) = (&config.model, &config.learner.update);
+    let restored =
+        checkpoint::load_latest(&folder, model, update, &Compute::CPU, config.run.hash());
+    let mut states = vec![0; STATES * model.frame_len()];
+    ChaCha8Rng::seed_from_u64(1).fill_bytes(&mut states);
+    fs::write(system.path("states"), &states).unwrap();
+    (restored.unwrap().unwrap().agent, states)
+}
+
+fn largest_difference(ours: &[f32], theirs: &serde_json::Value) -> f64 {
+    let theirs = theirs.as_array().unwrap();
+    assert_eq!(ours.len(), theirs.len());
+    let off = ours.iter().zip(theirs);
+    let off = off.map(|(&a, b)| (f64::from(a) - b.as_f64().unwrap()).abs());
+    off.fold(0.0, f64::max)
+}
+
+#[test]
+fn pytorch_computes_what_driml_does() {
+    let Some(python) = python_with("python::pytorch_computes_what_driml_does", &["torch"]) else {
+        return;
+    };
+    let system = system();
+    let scripts = root().join("deploy/python");
+    for flags in RUNS {
+        let (agent, states) = trained(&system, flags);
+        let seen = Insight::of(&agent, Compute::CPU)
+            .unwrap()
+            .look(&states)
+            .unwrap();
+        let path = |name: &str| system.path(name).display().to_string();
+        let args = [
+            &scripts.display().to_string(),
+            &path("run"),
+            &path("states"),
+        ];
+        let args = args.map(String::as_str);
+        let ask = || -> serde_json::Value {
+            serde_json::from_str(&run(&python, &["-c", ASK], &args)).unwrap()
+        };
+        let theirs = ask();
+        let value = largest_difference(&seen.q_values, &theirs[0]);
+        let probability = largest_difference(&seen.probabilities, &theirs[1]);
+        note(&format!(
+            "{flags}: values {value:.1e}, probabilities {probability:.1e}"
+        ));
+        assert!(value < VALUE_OFF, "{flags}: {value}");
+        assert!(probability < PROBABILITY_OFF, "{flags}: {probability}");
+        // A checkpoint of an earlier version has no metadata; config.toml says the same.
+        let newest = system.run_folder("run").checkpoints().pop().unwrap();
+        let bare = agent.online().to_safetensors(|_| true).unwrap();
+        fs::write(newest.join("online.safetensors"), bare).unwrap();
+        assert_eq!(ask(), theirs);
+    }
+}
+
+#[test]
+fn onnx_runtime_computes_what_driml_does() {
+    let modules = ["torch", "onnx", "onnxscript", "onnxruntime"];
+    let Some(python) = python_with("python::onnx_runtime_computes_what_driml_does", &modules)
+    else {
+        return;
+    };
+    let system = system();
+    let script = root()
+        .join("deploy/python/driml_net.py")
+        .display()
+        .to_string();
+    let path = |name: &str| system.path(name).display().to_string();
+    for flags in RUNS {
+        let (agent, states) = trained(&system, flags);
+        let seen = Insight::of(&agent, Compute::CPU)
+            .unwrap()
+            .look(&states)
+            .unwrap();
+        let (net, folder) = (path("net.onnx"), path("run"));
+        let said = run(&python, &[&script], &[&folder, "--onnx", &net]);
+        assert!(said.contains("wrote"), "{said}");
+        let model = agent.model();
+        let shape = format!("-1,{},{},{}", model.height, model.width, model.channels);
+        let answer = run(&python, &["-c", ASK_ONNX], &[&net, &path("states"), &shape]);
+        let off = largest_difference(&seen.q_values, &serde_json::from_str(&answer).unwrap());
+        note(&format!("{flags}: ONNX values {off:.1e}"));
+        assert!(off < VALUE_OFF, "{flags}: {off}");
+    }
+}
+
+#[test]
+fn the_page_has_the_actions_in_their_order() {
+    let page = fs::read_to_string(root().join("deploy/python/weights.md")).unwrap();
+    for (world, names) in [
+        ("chain", &CorridorWorld::ACTION_NAMES[..]),
+        ("mspacman", &PacmanWorld::ACTION_NAMES),
+        ("ising", &IsingWorld::ACTION_NAMES),
+        ("procgen:GAME", &ProcgenWorld::ACTION_NAMES),
+    ] {
+        let line = format!("| `{world}` | {} |", names.join(", "));
+        assert!(page.lines().any(|it| it == line), "{line}");
+    }
+}
+
+#[test]
+fn optuna_searches() {
+    let Some(python) = python_with("optuna_searches", &["optuna"]) else {
+        return;
+    };
+    let system = system();
+    let script = root().join("deploy/python/optuna_search.py");
+    let out = system.path("search");
+    let search = || {
+        let flags = "--trials 1 --seeds 2 --agent c51 --frames 2000";
+        let mut args: Vec<_> = flags.split(' ').collect();
+        args.extend([
+            "--driml",
+            env!("CARGO_BIN_EXE_driml-under-test"),
+            "--out",
+            out.to_str().unwrap(),
+        ]);
+        run(&python, &[script.to_str().unwrap()], &args)
+    };
+    let said = search();
+    assert!(
+        said.contains("best: ") && said.contains("replay_ratio"),
+        "{said}"
+    );
+    // It goes on: the second trial is number 1.
+    search();
+    for trial in ["trial0-seed1", "trial0-seed2", "trial1-seed2"] {
+        assert!(out.join(trial).join("summary.json").exists(), "{trial}");
+    }
+}

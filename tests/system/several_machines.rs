@@ -1,0 +1,274 @@
+//! A run whose parts are on machines of their own, joined by a router: cables that are pulled, links that are narrow.
+//! Machines are network namespaces; without the right to make them the tests are skipped by name.
+
+use std::{
+    thread::sleep,
+    time::{Duration, Instant},
+};
+
+use driml_tests::{Network, Process, TestSystem, note, skip, wait_for};
+use nix::sys::signal::Signal;
+use rand::{Rng, SeedableRng, rngs::StdRng};
+use serde_json::Value;
+
+use crate::system;
+
+/// What the preset `smoke` says.
+const WARMUP: u64 = 200;
+const ROWS: u64 = 16;
+
+/// A run of parts that were started by hand, each on a machine of its own. Its replay is kept on disk.
+struct Run {
+    system: TestSystem,
+    network: Network,
+    flags: String,
+    ratio: u64,
+    server: Option<Process>,
+    learner: Option<Process>,
+    actors: Vec<Option<Process>>,
+}
+
+const MACHINES: [&str; 5] = ["server", "learner", "actor0", "actor1", "actor2"];
+
+impl Run {
+    /// None, and the test is skipped, where there can be no such network.
+    fn start(test: &str, actors: usize, frames: u64, ratio: u64) -> Option<Self> {
+        let network = Network::new(test, &MACHINES[..2 + actors])?;
+        let flags = format!(
+            "--env chain --preset smoke --agent driml-ada --frames {frames} --set replay.replay_ratio={ratio}"
+        );
+        let mut run = Self {
+            system: system(),
+            network,
+            flags,
+            ratio,
+            server: None,
+            learner: None,
+            actors: Vec::new(),
+        };
+        run.actors.resize_with(actors, || None);
+        (0..2 + actors).for_each(|machine| run.start_on(machine));
+        Some(run)
+    }
+
+    fn endpoint(&self) -> String {
+        format!("tcp/{}:7447", self.network.address("server"))
+    }
+
+    /// The process on a machine.
+    fn on(&mut self, machine: usize) -> &mut Option<Process> {
+        match machine {
+            0 => &mut self.server,
+            1 => &mut self.learner,
+            _ => &mut self.actors[machine - 2],
+        }
+    }
+
+    fn start_on(&mut self, machine: usize) {
+        let endpoint = self.endpoint();
+        let args = match machine {
+            0 => format!(
+                "replay-server --stay --listen {endpoint} --insecure-network --replay-dir replay {}",
+                self.flags
+            ),
+            1 => format!("learner --stay --connect {endpoint} --run-dir run"),
+            _ => format!("actor --connect {endpoint} --id {}", machine - 2),
+        };
+        let words = self.network.on(MACHINES[machine]);
+        let part = self.system.start_part_after(&words, &args);
+        *self.on(machine) = Some(part);
+    }
+
+    /// What the run says of itself, asked from the router; none while nobody answers.
+    fn status(&self) -> Option<Value> {
+        let args = format!("status --json --connect {}", self.endpoint());
+        let ended = self.system.run_after(&self.network.on_router(), &args);
+        let status: Value = serde_json::from_str(ended.stdout.lines().next()?).unwrap();
+        status["servers"][0]["replay"].is_object().then_some(status)
+    }
+
+    fn inserted(&self) -> u64 {
+        wait_for("an answer", || self.status())["replay"]["transitions_inserted"]
+            .as_u64()
+            .unwrap()
+    }
+
+    fn wait_for_frames(&self, frames: u64) {
+        wait_for(&format!("{frames} frames"), || {
+            (self.inserted() >= frames).then_some(())
+        });
+    }
+
+    /// Waits for the end of the run, which must be as if nothing had happened.
+    fn check_end(mut self, patience: Duration) {
+        let deadline = Instant::now() + patience;
+        let status = loop {
+            let is_over = |status: &Value| {
+                status["replay"]["finished"] == true && status["learner"]["finished"] == true
+            };
+            match self.status().filter(is_over) {
+                Some(status) => break status,
+                None => assert!(
+                    Instant::now() < deadline,
+                    "no end within {patience:?}: {:#?}",
+                    self.status()
+                ),
+            }
+            sleep(Duration::from_millis(500));
+        };
+        let count = |of: &str, what: &str| status[of][what].as_u64().unwrap();
+        let inserted = count("replay", "transitions_inserted");
+        let planned = (inserted - WARMUP) * self.ratio / ROWS;
+        assert_eq!(count("learner", "updates"), planned);
+        assert_eq!(count("replay", "rows_sampled"), planned * ROWS);
+        for what in [
+            "transitions_lost",
+            "transitions_duplicated",
+            "messages_refused",
+        ] {
+            assert_eq!(count("replay", what), 0, "{what}");
+        }
+        for actor in self.actors.drain(..).flatten() {
+            actor.wait().expect_code(0);
+        }
+        let learner = self.learner.take().unwrap();
+        learner.stop().expect_code(0);
+        self.server.take().unwrap().stop().expect_code(0);
+        assert_eq!(self.system.survivors(), []);
+    }
+}
+
+/// An actor's cable is out for longer than a session's lease, the learner's and the server's meanwhile too. The others go on while
+/// they can.
+#[test]
+fn cut_cables_heal_by_themselves() {
+    let name = "cut_cables_heal_by_themselves";
+    let Some(run) = Run::start(name, 2, 60_000, 8) else {
+        return;
+    };
+    run.wait_for_frames(2_000);
+    run.network.cut("actor0");
+    let before = run.inserted();
+    run.wait_for_frames(before + 2_000);
+    sleep(Duration::from_secs(10));
+    run.network.cut("learner");
+    sleep(Duration::from_secs(15));
+    run.network.mend("learner");
+    sleep(Duration::from_secs(10));
+    run.network.mend("actor0");
+    run.network.cut("server");
+    sleep(Duration::from_secs(12));
+    run.network.mend("server");
+    run.check_end(Duration::from_secs(120));
+}
+
+/// One actor behind 256 kbit/s: the others are as fast as they were, and it takes part.
+#[test]
+fn a_narrow_link_slows_nobody_else() {
+    let name = "a_narrow_link_slows_nobody_else";
+    let Some(run) = Run::start(name, 2, 30_000, 8) else {
+        return;
+    };
+    if !run.network.narrow("actor0", 256) {
+        return skip(name, "tc knows no tbf");
+    }
+    run.wait_for_frames(20_000);
+    let status = wait_for("an answer", || run.status());
+    let parts = status["servers"][0]["parts"]["parts"].as_array().unwrap();
+    for actor in &parts[1..] {
+        assert!(actor["heard_s"].as_f64().unwrap() < 10.0, "{actor}");
+    }
+    run.check_end(Duration::from_secs(120));
+}
+
+/// Each part is cut off for 30 s, then for 90 s. By hand: it takes seven minutes.
+#[test]
+#[ignore = "seven minutes: cargo nextest run --workspace --run-ignored only -E 'test(cut_off_for_long)'"]
+fn each_part_is_cut_off_for_long() {
+    let name = "each_part_is_cut_off_for_long";
+    let Some(run) = Run::start(name, 2, 400_000, 8) else {
+        return;
+    };
+    run.wait_for_frames(2_000);
+    for seconds in [30, 90] {
+        for machine in ["actor0", "learner", "server"] {
+            run.network.cut(machine);
+            sleep(Duration::from_secs(seconds));
+            run.network.mend(machine);
+            let before = run.inserted();
+            run.wait_for_frames(before + 1_000);
+        }
+    }
+    run.check_end(Duration::from_secs(600));
+}
+
+/// Kills, freezes, cuts and restarts at random, from the seed in DRIML_FAULTS_SEED (1 if there is none), DRIML_FAULTS of them (200).
+#[test]
+#[ignore = "a quarter of an hour: cargo nextest run --workspace --run-ignored only -E 'test(random_faults)'"]
+fn random_faults_lose_nothing() {
+    let name = "random_faults_lose_nothing";
+    let number = |name: &str, usual: u64| {
+        let text = std::env::var(name);
+        text.map_or(usual, |text| text.parse().expect("a number"))
+    };
+    let (seed, faults) = (number("DRIML_FAULTS_SEED", 1), number("DRIML_FAULTS", 200));
+    // The replay ratio makes the learner the slower side, so that the run lasts as long as the faults.
+    let Some(mut run) = Run::start(name, 3, 600 * faults, 64) else {
+        return;
+    };
+    run.wait_for_frames(500);
+    let mut rng = StdRng::seed_from_u64(seed);
+    let mut tried = [0; 4];
+    for fault in 0..faults {
+        let machine = rng.random_range(0..MACHINES.len());
+        let pause = Duration::from_millis(rng.random_range(100..3_000));
+        let kind = rng.random_range(0..4);
+        tried[kind] += 1;
+        let what = ["kill", "freeze", "cut", "restart"][kind];
+        note(&format!(
+            "fault {fault}: {what} {} for {pause:?}",
+            MACHINES[machine]
+        ));
+        match kind {
+            0 | 3 => {
+                let Some(part) = run.on(machine).take() else {
+                    continue;
+                };
+                let signal = if kind == 0 {
+                    Signal::SIGKILL
+                } else {
+                    Signal::SIGTERM
+                };
+                part.signal(signal);
+                part.wait();
+                sleep(pause);
+                run.start_on(machine);
+            }
+            1 => {
+                let signal = |run: &mut Run, signal| {
+                    if let Some(part) = run.on(machine) {
+                        part.signal(signal);
+                    }
+                };
+                signal(&mut run, Signal::SIGSTOP);
+                sleep(pause);
+                signal(&mut run, Signal::SIGCONT);
+            }
+            _ => {
+                run.network.cut(MACHINES[machine]);
+                sleep(pause);
+                run.network.mend(MACHINES[machine]);
+            }
+        }
+        sleep(Duration::from_millis(rng.random_range(0..1_500)));
+    }
+    note(&format!(
+        "seed {seed}: kills, freezes, cuts, restarts {tried:?}"
+    ));
+    let status = wait_for("an answer", || run.status());
+    assert_eq!(
+        status["replay"]["finished"], false,
+        "faults after the end prove nothing"
+    );
+    run.check_end(Duration::from_secs(900));
+}

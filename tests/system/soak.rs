@@ -1,0 +1,117 @@
+//! A long run at a closed limiter, with actors that join, leave and die all the time: nothing of it grows.
+//! By hand; it lasts as long as `DRIML_SOAK_MINUTES` says, an hour if there is none.
+
+use std::{
+    fs,
+    thread::sleep,
+    time::{Duration, Instant},
+};
+
+use driml_tests::{Process, TestSystem, note};
+use nix::sys::signal::Signal;
+use rand::{Rng, SeedableRng, rngs::StdRng};
+
+use crate::system;
+
+const ACTORS: usize = 32;
+/// Time before the first look: buffers fill, and as many actors have come and gone as may send through shared memory.
+const WARM: Duration = Duration::from_secs(300);
+
+/// What a process holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Held {
+    rss_kib: u64,
+    descriptors: usize,
+    threads: u64,
+}
+
+fn held(system: &TestSystem, part: &str) -> Held {
+    let pid = system.find_part(part).pid;
+    let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+    let number = |name: &str| -> u64 {
+        let line = status.lines().find(|line| line.starts_with(name)).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse().unwrap()
+    };
+    Held {
+        rss_kib: number("VmRSS:"),
+        descriptors: fs::read_dir(format!("/proc/{pid}/fd")).unwrap().count(),
+        threads: number("Threads:"),
+    }
+}
+
+/// Segments of shared memory on this machine, other runs' too.
+fn segments() -> usize {
+    fs::read_dir("/dev/shm").unwrap().count()
+}
+
+#[test]
+#[ignore = "an hour: cargo nextest run --workspace --run-ignored only -E 'test(soak)' --no-capture"]
+fn nothing_grows() {
+    let minutes = std::env::var("DRIML_SOAK_MINUTES");
+    let minutes: u64 = minutes.map_or(60, |text| text.parse().expect("a number of minutes"));
+    let end = Instant::now() + Duration::from_secs(60 * minutes);
+    let system = system();
+    let flags = "--env chain --preset smoke --agent driml-ada --frames 100000000 --set replay.replay_ratio=512";
+    let server = system.start_replay_server(flags);
+    let learner = system.start_learner("run");
+    let client = system.connect();
+    let mut actors: Vec<Option<Process>> = Vec::new();
+    actors.resize_with(ACTORS, || None);
+    let mut rng = StdRng::seed_from_u64(1);
+    let (mut deaths, mut ends, mut looks) = (0, 0, Vec::new());
+    let (mut next_look, started) = (Instant::now() + WARM, Instant::now());
+    while Instant::now() < end {
+        let id = rng.random_range(0..ACTORS);
+        match actors[id].take() {
+            None => actors[id] = Some(system.start_actor(id as u32)),
+            Some(actor) if rng.random_bool(0.5) => {
+                actor.signal(Signal::SIGKILL);
+                actor.wait();
+                deaths += 1;
+            }
+            Some(actor) => {
+                actor.stop().expect_code(0);
+                ends += 1;
+            }
+        }
+        sleep(Duration::from_millis(rng.random_range(50..1_000)));
+        if Instant::now() > next_look {
+            next_look += Duration::from_secs(60);
+            let look = (
+                held(&system, "replay-server"),
+                held(&system, "learner"),
+                segments(),
+            );
+            note(&format!("after {:?}: {look:?}", started.elapsed()));
+            looks.push(look);
+        }
+    }
+    let replay = client.replay().unwrap();
+    note(&format!(
+        "{} transitions, {} rows, {deaths} actors killed, {ends} ended",
+        replay.transitions_inserted, replay.rows_sampled
+    ));
+    assert_eq!(
+        (replay.transitions_lost, replay.transitions_duplicated),
+        (0, 0)
+    );
+    let (first, last) = (looks[0], looks[looks.len() - 1]);
+    for (before, after) in [(first.0, last.0), (first.1, last.1)] {
+        // A tenth and 8 MiB: the allocator's pools fill unevenly.
+        let most = before.rss_kib * 11 / 10 + 8 * 1024;
+        assert!(after.rss_kib < most, "{before:?}, then {after:?}");
+        assert!(
+            after.descriptors <= before.descriptors + 2 * ACTORS
+                && after.threads <= before.threads + 4,
+            "{before:?}, then {after:?}"
+        );
+    }
+    assert!(last.2 <= first.2 + 3 * ACTORS, "{first:?}, then {last:?}");
+    drop(client);
+    actors.into_iter().flatten().for_each(|actor| {
+        actor.stop().expect_code(0);
+    });
+    learner.stop().expect_code(0);
+    server.stop().expect_code(0);
+    assert_eq!(system.survivors(), []);
+}

@@ -1,0 +1,128 @@
+//! `driml status`: what a person is told of a run in which somebody is missing, gone, frozen or done.
+//! The parts' own words while they wait are here too.
+
+use driml_protocol::session::{self, Endpoints};
+use driml_tests::{Ended, TestSystem, wait_for};
+use nix::sys::signal::Signal;
+
+use crate::{LONG, system};
+
+fn status(system: &TestSystem) -> String {
+    let ended = system.run(&format!("status --connect {}", system.endpoint()));
+    ended.expect_code(0).stdout
+}
+
+/// Asks until the answer holds all of `words`.
+fn wait_for_status(system: &TestSystem, words: &[&str]) -> String {
+    wait_for(&format!("{words:?} in the status"), || {
+        let said = status(system);
+        words.iter().all(|it| said.contains(it)).then_some(said)
+    })
+}
+
+#[test]
+fn whoever_is_missing_is_named_with_what_to_do() {
+    let system = system();
+    let endpoint = system.endpoint();
+    let mut server = system.start_replay_server(&format!("--agent c51 {LONG}"));
+    let _client = system.connect();
+    let said = status(&system);
+    assert!(said.contains("chain, c51: frames 0/"), "{said}");
+    let learn =
+        format!("no learner has joined: start `driml learner --connect {endpoint} --run-dir DIR`");
+    assert!(said.contains(&learn), "{said}");
+    let act = format!("no actor has joined: start `driml actor --connect {endpoint} --id N`");
+    assert!(said.contains(&act), "{said}");
+    // It says so itself.
+    server.wait_for_stderr("no learner has joined yet, waiting since");
+
+    let mut learner = system.start_learner("run");
+    wait_for_status(&system, &["learner        there for", "warm-up 0/", &act]);
+    learner.wait_for_stderr("waiting for a batch since 10 s: warm-up 0/");
+    server.wait_for_stderr("no actor has joined yet, waiting since");
+
+    let actors = [system.start_actor(0), system.start_actor(5)];
+    let words = ["actor-0 ", "actor-5 ", "learns since", "nothing is missing"];
+    let said = wait_for_status(&system, &words);
+    assert!(!said.contains("GONE"), "{said}");
+
+    actors[1].signal(Signal::SIGKILL);
+    let again = format!("`driml actor --connect {endpoint} --id 5`");
+    wait_for_status(
+        &system,
+        &["actor-5        GONE for", "the others go on", &again],
+    );
+    learner.signal(Signal::SIGKILL);
+    wait_for_status(
+        &system,
+        &[
+            "learner        GONE for",
+            "goes on from its newest checkpoint",
+        ],
+    );
+
+    let ended = system.run(&format!("status --connect {endpoint} --json"));
+    let answer: serde_json::Value = serde_json::from_str(&ended.expect_code(0).stdout).unwrap();
+    let parts = &answer["servers"][0]["parts"]["parts"];
+    assert_eq!(parts[0]["who"], "Learner");
+    assert_eq!(parts[0]["connected"], false);
+    assert_eq!(parts[2]["who"]["Actor"], 5);
+    assert_eq!(answer["to_go_on"].as_array().unwrap().len(), 2);
+
+    // A server that stands still is no riddle either: it is said within seconds.
+    server.signal(Signal::SIGSTOP);
+    let ended = system.run(&format!("status --connect {endpoint}"));
+    server.signal(Signal::SIGCONT);
+    assert_eq!(ended.code, Some(1), "{}{}", ended.stdout, ended.stderr);
+    ended.expect_said("endpoint");
+}
+
+#[test]
+fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
+    let system = system();
+    let process = system.start(&format!(
+        "local --agent c51 {LONG} --actors 2 --run-dir run"
+    ));
+    let live =
+        |ended: Ended| (ended.code == Some(0) && ended.stdout.contains("learns")).then_some(());
+    wait_for("a status of the living run", || {
+        live(system.run("status --run run"))
+    });
+    process.signal(Signal::SIGINT);
+    process.wait().expect_code(130);
+    let ended = system.run("status --run run").expect_code(0);
+    assert!(
+        ended.stdout.contains("nobody runs in run, which holds")
+            && ended
+                .stdout
+                .contains("`driml local --resume run` goes on with it"),
+        "{}",
+        ended.stdout
+    );
+    system
+        .run("status --run nowhere")
+        .expect_code(64)
+        .expect_said("nowhere is no run folder");
+}
+
+#[test]
+fn the_wrong_place_is_told_from_an_empty_one() {
+    let system = system();
+    let endpoint = system.endpoint();
+    system
+        .run(&format!("status --connect {endpoint}"))
+        .expect_code(1)
+        .expect_said("nobody listens on");
+    // A zenoh router that is none of ours.
+    let _other = session::open(&Endpoints {
+        listen: vec![endpoint.clone()],
+        connect: Vec::new(),
+    })
+    .unwrap();
+    system
+        .run(&format!("status --connect {endpoint}"))
+        .expect_code(64)
+        .expect_said("somebody listens on")
+        .expect_said("but it is no replay server with the namespace \"driml\"");
+    system.run("status").expect_code(64);
+}

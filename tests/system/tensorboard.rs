@@ -1,0 +1,130 @@
+//! `driml local --tensorboard`: event files as TensorBoard itself reads them, beside the rows of `metrics.csv`.
+//! That records are whole and right by their sums is tested where they are written.
+
+use std::{collections::BTreeMap, fs};
+
+use driml_tests::{
+    TestSystem,
+    python::{python_with, run},
+};
+use serde_json::Value;
+
+use crate::system;
+
+/// Prints what TensorBoard finds in a folder: points of curves, histograms, sizes of pictures.
+const READ: &str = "
+import json, sys
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+events = EventAccumulator(sys.argv[1], size_guidance={'scalars': 0, 'histograms': 0, 'images': 0}).Reload()
+tags = events.Tags()
+histograms = {tag: [[it.step, it.histogram_value.num, it.histogram_value.sum] for it in events.Histograms(tag)] for tag in tags['histograms']}
+pictures = {tag: [[it.step, it.width, it.height, it.encoded_image_string[:4].hex()] for it in events.Images(tag)] for tag in tags['images']}
+print(json.dumps({
+    'scalars': {tag: [[it.step, it.value] for it in events.Scalars(tag)] for tag in tags['scalars']},
+    'histograms': histograms,
+    'images': pictures,
+}))
+";
+
+/// The columns of `metrics.csv`, empty cells left out: frames and value.
+fn columns(system: &TestSystem) -> BTreeMap<String, Vec<(u64, f64)>> {
+    let text = fs::read_to_string(system.path("run/metrics.csv")).unwrap();
+    let mut rows = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
+    let header = rows.next().unwrap();
+    let mut columns = BTreeMap::<_, Vec<_>>::new();
+    for row in rows {
+        let frames: u64 = row[1].parse().unwrap();
+        for (name, cell) in header.iter().zip(&row) {
+            if let Ok(value) = cell.parse() {
+                columns
+                    .entry((*name).to_owned())
+                    .or_default()
+                    .push((frames, value));
+            }
+        }
+    }
+    columns.remove("frames");
+    columns
+}
+
+fn read(python: &str, system: &TestSystem) -> Value {
+    let folder = system.path("run").display().to_string();
+    serde_json::from_str(&run(python, &["-c", READ], &[&folder])).unwrap()
+}
+
+/// Every number of the rows is a point of the curve of its name, and there is no other.
+fn check_points(read: &Value, columns: &BTreeMap<String, Vec<(u64, f64)>>) {
+    let curves = read["scalars"].as_object().unwrap();
+    let names: Vec<_> = curves
+        .keys()
+        .map(|tag| tag.split_once('/').unwrap().1)
+        .collect();
+    assert_eq!(names.len(), columns.len(), "{names:?}");
+    for (tag, points) in curves {
+        let rows = &columns[tag.split_once('/').unwrap().1];
+        let points = points.as_array().unwrap();
+        assert_eq!(points.len(), rows.len(), "{tag}");
+        for (point, (frames, value)) in points.iter().zip(rows) {
+            assert_eq!(point[0].as_u64().unwrap(), *frames, "{tag}");
+            let off = (point[1].as_f64().unwrap() - value).abs();
+            assert!(off <= 1e-6 * value.abs(), "{tag}: {point}, {value}");
+        }
+    }
+}
+
+#[test]
+fn tensorboard_reads_what_a_run_recorded_and_goes_on_recording() {
+    let test = "tensorboard::tensorboard_reads_what_a_run_recorded_and_goes_on_recording";
+    let Some(python) = python_with(test, &["tensorboard"]) else {
+        return;
+    };
+    let system = system();
+    let flags = "local --lockstep --env mspacman --agent driml-ada --preset smoke --frames 320 --tensorboard --run-dir run";
+    system.run(flags).expect_code(0);
+    let summary = system.run_folder("run").check_finished();
+    let first = read(&python, &system);
+    check_points(&first, &columns(&system));
+    let counted = |tag: &str| -> u64 {
+        let all = first["histograms"][tag].as_array().unwrap();
+        all.iter().map(|it| it[1].as_f64().unwrap() as u64).sum()
+    };
+    assert_eq!(counted("k/served"), summary.k_histogram.iter().sum::<u64>());
+    assert_eq!(counted("actions/stored"), summary.frames);
+    let picture = first["images"]["affinity/A"]
+        .as_array()
+        .unwrap()
+        .last()
+        .unwrap();
+    assert_eq!(picture[3], "89504e47", "a PNG");
+    assert!(picture[1].as_u64().unwrap() >= 5 * 24);
+
+    system.run("local --resume run --frames 480").expect_code(0);
+    let second = read(&python, &system);
+    let columns = columns(&system);
+    check_points(&second, &columns);
+    assert_eq!(columns["mean_age"].last().unwrap().0, 480);
+    let files = fs::read_dir(system.path("run")).unwrap();
+    let files = files.filter(|it| {
+        it.as_ref()
+            .unwrap()
+            .file_name()
+            .to_string_lossy()
+            .contains("tfevents")
+    });
+    assert_eq!(files.count(), 2, "a file for each time it was started");
+}
+
+#[test]
+fn without_the_flag_there_are_no_events() {
+    let system = system();
+    system
+        .run("local --lockstep --env chain --agent c51 --preset smoke --frames 256 --run-dir run")
+        .expect_code(0);
+    let mut files = fs::read_dir(system.path("run")).unwrap();
+    assert!(!files.any(|it| {
+        it.unwrap()
+            .file_name()
+            .to_string_lossy()
+            .contains("tfevents")
+    }));
+}

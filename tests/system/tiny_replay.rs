@@ -1,0 +1,67 @@
+//! A real replay of tiny frames, for tests that play the replay server themselves.
+
+use driml_protocol::{ActorJoin, Chunk, ChunkHeader, Horizon, RunSpec, Sampling, TimeoutRule};
+use driml_replay_server::{Compression, Config, Replay};
+
+/// Frames of 4 x 4 bytes that are not stacked.
+pub(crate) fn spec(agent: &str, horizon: Horizon) -> RunSpec {
+    RunSpec {
+        world: "chain".into(),
+        agent: agent.into(),
+        seed: 1,
+        frame_height: 4,
+        frame_width: 4,
+        frame_channels: 1,
+        frame_stack: 1,
+        num_actions: 3,
+        n_step: 1,
+        gamma: 0.99,
+        horizon,
+        timeout: TimeoutRule::Terminal,
+    }
+}
+
+/// One shard of `transitions`, each sampled once; as many may come before any is sampled.
+pub(crate) fn config(transitions: u64) -> Config {
+    Config {
+        capacity_transitions: transitions,
+        shards: 1,
+        compression: Compression::None,
+        compressed_bytes_max: None,
+        sampling: Sampling::Uniform,
+        disk_bytes_max: None,
+        fsync_ms: None,
+        replay_ratio: 1.0,
+        warmup_transitions: 0,
+        slack_transitions: transitions,
+        transitions_max: None,
+        reproduced_bug: None,
+    }
+}
+
+/// The incarnation of every actor.
+const INCARNATION: u64 = 1;
+
+/// Lets an actor take part.
+pub(crate) fn join(replay: &mut Replay, actor: u32) {
+    let join = ActorJoin {
+        actor,
+        incarnation: INCARNATION,
+    };
+    replay.join_actor(join).unwrap();
+}
+
+/// An actor's chunk of `steps` steps of one copy of the world, all zeroes; the ones before it were as long.
+pub(crate) fn chunk(spec: &RunSpec, actor: u32, sequence: u64, steps: u32) -> Chunk {
+    Chunk::zeroed(ChunkHeader {
+        actor,
+        incarnation: INCARNATION,
+        sequence,
+        first_transition: sequence * u64::from(steps),
+        weights_version: 1,
+        leaving: false,
+        streams: 1,
+        steps,
+        frame_bytes: spec.frame_bytes() as u32,
+    })
+}

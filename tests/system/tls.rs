@@ -1,0 +1,414 @@
+//! Mutual TLS in QUIC: a run over it, and everybody who is not let in, each refused with a sentence on the side that has `--tls-dir`.
+//! What each role may do is in `roles`.
+
+use std::{
+    net::UdpSocket,
+    time::{Duration, Instant},
+};
+
+use driml_protocol::{
+    Keys,
+    session::{self, Endpoints},
+    tls::{Credentials, Role},
+};
+use driml_tests::{
+    Certificates, Client, Process, TestSystem, Valid, skipped_without_openssl, wait_for,
+};
+use zenoh::{Session, Wait};
+
+use crate::{LONG, SHORT, system};
+
+/// How soon a refusal is said, on a busy machine too.
+const SECONDS: Duration = Duration::from_secs(30);
+
+/// A system whose parts talk over TLS.
+pub(crate) struct TlsSystem {
+    pub(crate) system: TestSystem,
+    pub(crate) good: Certificates,
+    pub(crate) endpoint: String,
+}
+
+impl TlsSystem {
+    /// With certificates for some actors; none where there is no openssl, and then `test` is skipped by name.
+    pub(crate) fn new(test: &str) -> Option<Self> {
+        if skipped_without_openssl(test) {
+            return None;
+        }
+        let system = system();
+        let good = Certificates::make(system.path("tls"), "--actors 3");
+        Some(Self {
+            system,
+            good,
+            endpoint: format!("quic/127.0.0.1:{}", free_port()),
+        })
+    }
+
+    pub(crate) fn start_server(&self, flags: &str) -> Process {
+        let mut server = self.system.start_part(&format!(
+            "replay-server --stay --listen {} --tls-dir tls {flags}",
+            self.endpoint
+        ));
+        server.wait_for_stderr("replay server listens");
+        server
+    }
+
+    /// Starts an actor or a learner with the certificates in `folder`.
+    pub(crate) fn start(&self, part: &str, folder: &str) -> Process {
+        let endpoint = &self.endpoint;
+        let part = format!("{part} --connect {endpoint} --tls-dir {folder}");
+        self.system.start_part(&part)
+    }
+
+    /// A client with the certificate of `role`, as this program opens its sessions.
+    pub(crate) fn client(&self, role: Role) -> Client {
+        let credentials = Credentials::read(self.good.folder(), role).unwrap();
+        let endpoints = Endpoints {
+            listen: Vec::new(),
+            connect: vec![self.endpoint.clone()],
+        };
+        let keys = Keys::new("driml").unwrap();
+        let session = session::open_as(
+            &endpoints,
+            &keys,
+            Some(&credentials),
+            session::SMALL_MESSAGE_BYTES_MAX,
+        )
+        .unwrap();
+        Client::over(session)
+    }
+
+    /// A stranger in the place of a replay server, once the port of the one before is free.
+    fn listen_raw(&self, certificates: &Certificates, role: &str) -> Session {
+        let listen = format!("[{:?}]", self.endpoint);
+        let own = raw_tls("listen", certificates, Some(role));
+        wait_for("a port that is free again", || {
+            let settings = [
+                ("mode", "\"router\"".into()),
+                ("listen/endpoints", listen.clone()),
+                ("transport/link/tls", own.clone()),
+            ];
+            open_raw(&settings).ok()
+        })
+    }
+
+    /// A part that is refused says so within seconds, and ends with this code.
+    fn refused(&self, part: &str, folder: &str, code: i32, words: &str) {
+        let started = Instant::now();
+        let ended = self.start(part, folder).wait();
+        let took = started.elapsed();
+        ended.expect_code(code).expect_said(words);
+        assert!(took < SECONDS, "{words}: after {took:?}");
+    }
+}
+
+/// A port of this machine that nobody has.
+fn free_port() -> u16 {
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    socket.local_addr().unwrap().port()
+}
+
+/// Opens a session with zenoh alone, without any check of ours; as a client it gives up soon.
+fn open_raw(settings: &[(&str, String)]) -> zenoh::Result<Session> {
+    let mut config = zenoh::Config::default();
+    for (key, value) in [
+        ("mode", "\"client\"".to_owned()),
+        ("scouting/multicast/enabled", "false".into()),
+        ("connect/timeout_ms", "1500".into()),
+        ("connect/exit_on_failure", "true".into()),
+    ]
+    .iter()
+    .chain(settings)
+    {
+        config.insert_json5(key, value).unwrap();
+    }
+    zenoh::open(config).wait()
+}
+
+/// zenoh's settings for one side of a connection, `connect` or `listen`.
+fn raw_tls(side: &str, certificates: &Certificates, role: Option<&str>) -> String {
+    let file = |name: &str| format!("{:?}", certificates.path(name).display().to_string());
+    let own = role.map_or(String::new(), |role| {
+        format!(
+            ", enable_mtls: true, {side}_certificate: {}, {side}_private_key: {}",
+            file(&format!("{role}.pem")),
+            file(&format!("{role}.key"))
+        )
+    });
+    format!("{{ root_ca_certificate: {}{own} }}", file("ca.pem"))
+}
+
+#[test]
+fn a_run_over_tls() {
+    let Some(tls) = TlsSystem::new("a_run_over_tls") else {
+        return;
+    };
+    let server = tls.start_server(&format!("--agent driml-ada {SHORT}"));
+    let observer = tls.client(Role::Observer);
+    let learner = tls.start("learner --stay --run-dir run", "tls");
+    let actors = [
+        tls.start("actor --id 0", "tls"),
+        tls.start("actor --id 2", "tls"),
+    ];
+    for actor in actors {
+        actor.wait().expect_code(0).expect_said("leaves: ");
+    }
+    observer.wait_for_learner("the learner's last update", |learner| learner.finished);
+    let replay = observer.replay().unwrap();
+    assert_eq!(
+        (replay.transitions_inserted, replay.rows_sampled),
+        (1280, 8640)
+    );
+    assert_eq!(
+        (replay.transitions_lost, replay.transitions_duplicated),
+        (0, 0)
+    );
+    // Nobody asked for more than its role has.
+    assert_eq!(
+        (replay.messages_refused, replay.connections_refused),
+        (0, 0)
+    );
+    assert!(
+        replay.affinity_version > 0,
+        "the learner's affinity arrived"
+    );
+    learner
+        .stop()
+        .expect_code(0)
+        .expect_said("finished after 540");
+    drop(observer);
+    server.stop().expect_code(0);
+}
+
+/// Its parts meet at a unix socket, and one more comes from outside.
+#[test]
+fn a_launched_run_with_an_actor_from_outside() {
+    let Some(tls) = TlsSystem::new("a_launched_run_with_an_actor_from_outside") else {
+        return;
+    };
+    let run = tls.system.start(&format!(
+        "local --agent c51 {LONG} --listen {} --tls-dir tls --run-dir run",
+        tls.endpoint
+    ));
+    let mut outside = tls.start("actor --id 2", "tls");
+    outside.wait_for_stderr("actor 2 steps");
+    let observer = tls.client(Role::Observer);
+    observer.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
+    outside.stop().expect_code(0).expect_said("leaves: ");
+    drop(observer);
+    run.stop().expect_code(130);
+    tls.system.run_folder("run").check("interrupted");
+}
+
+/// Files that are wrong are named before anything is sent.
+#[test]
+fn own_files_that_cannot_be_used() {
+    let Some(tls) = TlsSystem::new("own_files_that_cannot_be_used") else {
+        return;
+    };
+    let spoiled = |name: &str| tls.good.copy(tls.system.path(name));
+    let (actor, learner) = ("actor --id 0", "learner --run-dir run");
+    tls.refused(
+        "actor --id 9",
+        "tls",
+        64,
+        "tls/actor-9.pem is not there: a part with the role actor-9 needs ca.pem, actor-9.pem \
+                 and actor-9.key; `deploy/certs.sh tls --actors 10` makes them",
+    );
+    tls.refused(
+        "actor --id 1024",
+        "tls",
+        64,
+        "actors have the numbers 0 to 1023",
+    );
+    tls.refused(actor, "nowhere", 64, "nowhere/ca.pem is not there");
+
+    spoiled("role").pass_off("learner", "actor-0");
+    tls.refused(
+        actor,
+        "role",
+        64,
+        "role/actor-0.pem is the certificate of \"learner\", not of \"actor-0\"",
+    );
+    spoiled("number").pass_off("actor-1", "actor-0");
+    tls.refused(
+        actor,
+        "number",
+        64,
+        "is the certificate of \"actor-1\", not of \"actor-0\"",
+    );
+    std::fs::copy(
+        tls.good.path("actor-1.key"),
+        spoiled("key").path("actor-0.key"),
+    )
+    .unwrap();
+    tls.refused(
+        actor,
+        "key",
+        64,
+        "key/actor-0.key is not the key of key/actor-0.pem",
+    );
+    std::fs::write(spoiled("garbage").path("learner.key"), "no key").unwrap();
+    tls.refused(
+        learner,
+        "garbage",
+        64,
+        "garbage/learner.key holds no private key in PEM",
+    );
+
+    spoiled("old").sign_again("learner", Valid::UntilYesterday);
+    tls.refused(learner, "old", 64, "old/learner.pem expired at");
+    spoiled("new").sign_again("learner", Valid::From2090);
+    tls.refused(learner, "new", 64, "new/learner.pem is valid only from");
+    let foreign = Certificates::make(tls.system.path("foreign"), "");
+    std::fs::copy(foreign.path("ca.pem"), spoiled("mixed").path("ca.pem")).unwrap();
+    tls.refused(
+        learner,
+        "mixed",
+        64,
+        "mixed/learner.pem was not signed by the authority of mixed/ca.pem",
+    );
+    assert!(!tls.system.path("run").exists(), "nothing was begun");
+
+    let server = "replay-server --listen quic/127.0.0.1:1 --tls-dir old --env chain --agent c51";
+    std::fs::remove_file(tls.system.path("old/replay-server.pem")).unwrap();
+    let ended = tls.system.run(server);
+    ended
+        .expect_code(64)
+        .expect_said("old/replay-server.pem is not there");
+    let server = server.replace("quic/127.0.0.1", "tcp/127.0.0.1");
+    tls.system
+        .run(&server)
+        .expect_code(64)
+        .expect_said("it is quic/127.0.0.1:1");
+    let without = "actor --connect quic/127.0.0.1:1";
+    tls.system
+        .run(without)
+        .expect_code(64)
+        .expect_said("add --tls-dir DIR");
+}
+
+/// A replay server lets nobody in whose certificate is not good, says why, and counts; those that are let in go on.
+#[test]
+fn strangers_at_a_replay_server() {
+    let Some(tls) = TlsSystem::new("strangers_at_a_replay_server") else {
+        return;
+    };
+    let mut server = tls.start_server(&format!("--agent c51 {LONG}"));
+    let observer = tls.client(Role::Observer);
+    let foreign = Certificates::make(tls.system.path("foreign"), "");
+    std::fs::copy(tls.good.path("ca.pem"), foreign.path("ca.pem")).unwrap();
+    let old = tls.good.copy(tls.system.path("old"));
+    old.sign_again("learner", Valid::UntilYesterday);
+    let new = tls.good.copy(tls.system.path("new"));
+    new.sign_again("learner", Valid::From2090);
+    for (stranger, why) in [
+        ((&tls.good, None), "it has no certificate"),
+        (
+            (&foreign, Some("learner")),
+            "its certificate is of another authority",
+        ),
+        ((&old, Some("learner")), "its certificate has expired"),
+        ((&new, Some("learner")), "its certificate is not valid yet"),
+        (
+            (&tls.good, Some("replay-server")),
+            "its certificate is a replay server's",
+        ),
+    ] {
+        let before = observer.replay().unwrap().connections_refused;
+        let (certificates, role) = stranger;
+        let opened = open_raw(&[
+            ("connect/endpoints", format!("[{:?}]", tls.endpoint)),
+            ("transport/link/tls", raw_tls("connect", certificates, role)),
+        ]);
+        assert!(opened.is_err(), "{why}");
+        server.wait_for_stderr(&format!("a connection was refused: {why}"));
+        let counted = |it: &driml_protocol::ReplayStatus| it.connections_refused > before;
+        observer.wait_for_replay(why, counted);
+    }
+    // Without QUIC, at whose port nobody listens.
+    let plain = tls.endpoint.replace("quic/", "tcp/");
+    let started = Instant::now();
+    let actor = tls.system.run(&format!("actor --connect {plain}"));
+    actor
+        .expect_code(1)
+        .expect_said("One with --tls-dir is reached with quic/HOST:PORT");
+    assert!(started.elapsed() < SECONDS);
+
+    // Who is let in is not disturbed.
+    let learner = tls.start("learner --stay --run-dir run", "tls");
+    let actor = tls.start("actor --id 1", "tls");
+    observer.wait_for_learner("some updates", |learner| learner.updates > 10);
+    actor.stop().expect_code(0);
+    learner.stop().expect_code(0);
+}
+
+/// A part does not follow whoever listens where its replay server should.
+#[test]
+fn strangers_in_the_place_of_a_replay_server() {
+    let Some(tls) = TlsSystem::new("strangers_in_the_place_of_a_replay_server") else {
+        return;
+    };
+    let spoiled = |name: &str| tls.good.copy(tls.system.path(name));
+    let old = spoiled("old");
+    old.sign_again("replay-server", Valid::UntilYesterday);
+    let new = spoiled("new");
+    new.sign_again("replay-server", Valid::From2090);
+    let foreign = Certificates::make(tls.system.path("foreign"), "");
+    let named = spoiled("named");
+    for ending in ["pem", "key"] {
+        std::fs::remove_file(named.path(&format!("replay-server.{ending}"))).unwrap();
+    }
+    let named = Certificates::make(named.folder().to_owned(), "--host node7.example");
+    for (certificates, role, why) in [
+        (
+            &foreign,
+            "replay-server",
+            "its certificate is not from the authority of tls/ca.pem",
+        ),
+        (&old, "replay-server", "its certificate has expired"),
+        (&new, "replay-server", "its certificate is not valid yet"),
+        (
+            &named,
+            "replay-server",
+            "its certificate is not for 127.0.0.1",
+        ),
+        (&tls.good, "learner", "whoever listens on"),
+    ] {
+        let listening = tls.listen_raw(certificates, role);
+        tls.refused("actor --id 0", "tls", 1, why);
+        listening.close().wait().unwrap();
+    }
+    // The other side is the one that refuses: it knows another authority.
+    std::fs::copy(
+        tls.good.path("replay-server.pem"),
+        foreign.path("replay-server.pem"),
+    )
+    .unwrap();
+    std::fs::copy(
+        tls.good.path("replay-server.key"),
+        foreign.path("replay-server.key"),
+    )
+    .unwrap();
+    let listening = tls.listen_raw(&foreign, "replay-server");
+    tls.refused(
+        "learner --run-dir run",
+        "tls",
+        1,
+        "refuses tls/learner.pem: its ca.pem is of another authority",
+    );
+    listening.close().wait().unwrap();
+
+    let plain = tls.endpoint.replace("quic/", "tcp/");
+    let listening = open_raw(&[
+        ("mode", "\"router\"".into()),
+        ("listen/endpoints", format!("[{plain:?}]")),
+    ])
+    .unwrap();
+    tls.refused("actor --id 0", "tls", 1, "it does not speak QUIC");
+    listening.close().wait().unwrap();
+    let nobody = wait_for("nobody who listens", || {
+        let actor = tls.start("actor --id 0", "tls").wait();
+        Some(actor)
+    });
+    nobody.expect_code(1).expect_said("nobody listens on");
+}

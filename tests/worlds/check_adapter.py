@@ -1,0 +1,97 @@
+"""Checks driml_env.py's adapter with an environment of which every observation says which one it is. Needs Gymnasium."""
+
+import os, sys
+
+sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "../../deploy/python"))
+import driml_env
+import gymnasium
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+
+STEPS = (3, 4)  # Of episodes in turn: the first kind terminates, the second is truncated.
+
+
+class Numbered(gymnasium.Env):
+    """Observations [seed, episode, step, action] in a frame of 2 x 2; the reward is the step."""
+
+    observation_space = gymnasium.spaces.Box(0, 255, (2, 2), np.uint8)
+    action_space = gymnasium.spaces.Discrete(3, start=5)
+
+    def __init__(self):
+        self.episode, self.seed = -1, 0
+
+    def observation(self, action):
+        return np.array([[self.seed, self.episode], [self.step_number, action]], np.uint8)
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed is not None:
+            self.seed = seed
+        self.episode, self.step_number = self.episode + 1, 0
+        return self.observation(0), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        self.step_number += 1
+        kind = self.episode % 2
+        over = self.step_number == STEPS[kind]
+        return self.observation(action), self.step_number, over and kind == 0, over and kind == 1, {}
+
+
+class ChannelsFirst(Numbered):
+    observation_space = gymnasium.spaces.Box(0, 255, (3, 32, 20), np.uint8)
+
+    def observation(self, action):
+        return np.arange(3 * 32 * 20, dtype=np.uint32).reshape(3, 32, 20).astype(np.uint8)
+
+
+def check_episodes(world):
+    assert (world.height, world.width, world.channels, world.actions) == (2, 2, 1, ["0", "1", "2"])
+    copies = 2
+    frames = bytes(world.reset([11, 12]))
+    episode = step = action = 0
+    for number in range(50):
+        expected = [[seed, episode, step, action] for seed in (11, 12)]
+        assert list(frames) == sum(expected, []), (number, list(frames), expected)
+        rewards, ends, frames = world.step(bytes([number % 3] * copies))
+        frames, step, action = bytes(frames), step + 1, 5 + number % 3
+        over = step == STEPS[episode % 2]
+        assert list(rewards) == [step] * copies, (number, rewards)
+        end = (driml_env.TIMED_OUT if episode % 2 else driml_env.TERMINAL) if over else driml_env.RUNNING
+        assert bytes(ends) == bytes([end] * copies), (number, ends)
+        if over:  # The frame is the first of the next episode, in the same step.
+            episode, step, action = episode + 1, 0, 0
+
+
+def check_refused(word, make):
+    try:
+        driml_env.Gymnasium(make, 2)
+    except SystemExit as said:
+        assert word in str(said), said
+    else:
+        raise AssertionError(f"{word!r} was not said")
+
+
+def vector(mode, kind=SyncVectorEnv):
+    return lambda copies: kind([Numbered] * copies, autoreset_mode=mode)
+
+
+def with_spaces(**spaces):
+    return lambda: type("Other", (Numbered,), spaces)()
+
+
+if __name__ == "__main__":
+    check_episodes(driml_env.Gymnasium(lambda: Numbered(), 2))
+    check_episodes(driml_env.Gymnasium(lambda: Numbered(), 2, workers=True))
+    check_episodes(driml_env.Gymnasium(vector(AutoresetMode.SAME_STEP), 2))
+    check_episodes(driml_env.Gymnasium(vector(AutoresetMode.DISABLED), 2))
+    check_episodes(driml_env.Gymnasium(vector(AutoresetMode.SAME_STEP, AsyncVectorEnv), 2))
+    check_refused("SAME_STEP", vector(AutoresetMode.NEXT_STEP))
+    check_refused("has 3 copies where 2", lambda copies: SyncVectorEnv([Numbered] * 3, autoreset_mode=AutoresetMode.SAME_STEP))
+    floats, nine = gymnasium.spaces.Box(0, 1, (4,), np.float32), gymnasium.spaces.Box(0, 1, (9,), np.float32)
+    check_refused("learns from frames", with_spaces(observation_space=floats))
+    check_refused("Discrete", with_spaces(action_space=nine))
+    world = driml_env.Gymnasium(lambda: ChannelsFirst(), 2)
+    assert (world.height, world.width, world.channels) == (32, 20, 3)
+    frames = np.frombuffer(bytes(world.reset([1, 2])), np.uint8).reshape(2, 32, 20, 3)
+    assert (frames[1] == np.moveaxis(ChannelsFirst().observation(0), 0, -1)).all()
