@@ -46,6 +46,7 @@ pub use messages::{
     batch_rows::{BatchStatesMut, RowScalars},
     chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES, transitions_max},
     done::Done,
+    episodes::{EPISODES_MAX, EndedEpisode, EpisodesReply, EpisodesRequest, Played},
     goodbye::Goodbye,
     hello::Hello,
     insert_reply::{Claim, InsertReply},

@@ -6,11 +6,12 @@ use std::fmt::Debug;
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, BufferPool,
-    Chunk, ChunkHeader, Claim, CodecError, Done, End, Goodbye, Hello, Horizon, InsertReply,
-    JoinReply, Kind, LearnerJoin, LearnerStatus, Life, Message, NO_ACTION, Origin,
-    PROTOCOL_VERSION, PartName, PartStatus, PartsStatus, PriorityPart, PriorityUpdate,
-    ReplayStatus, Report, RequestId, Returns, RowScalars, RunSpec, Tally, TimeoutRule, Waiting,
-    Warning, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
+    Chunk, ChunkHeader, Claim, CodecError, Done, EPISODES_MAX, End, EndedEpisode, EpisodesReply,
+    EpisodesRequest, Goodbye, Hello, Horizon, InsertReply, JoinReply, Kind, LearnerJoin,
+    LearnerStatus, Life, Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus,
+    PartsStatus, Played, PriorityPart, PriorityUpdate, ReplayStatus, Report, RequestId, Returns,
+    RowScalars, RunSpec, Tally, TimeoutRule, Waiting, Warning, WeightsHeader, WeightsReply,
+    WeightsRequest, WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -182,6 +183,57 @@ fn parts_status() -> PartsStatus {
     }
 }
 
+/// An episode of which all was seen, and one of which a part was lost.
+fn episodes() -> EpisodesReply {
+    let whole = EndedEpisode {
+        frames: 1 << 20,
+        actor: 3,
+        copy: 15,
+        played: Some(Played {
+            episode_return: 2.5,
+            steps: 99,
+        }),
+    };
+    EpisodesReply {
+        ended: 9,
+        before: 7,
+        episodes: vec![
+            whole,
+            EndedEpisode {
+                played: None,
+                ..whole
+            },
+        ],
+    }
+}
+
+#[test]
+fn episodes_that_did_not_end_are_refused() {
+    let fewer = EpisodesReply {
+        ended: 8,
+        ..episodes()
+    };
+    let bytes = codec::encode(SPEC, &fewer, &[]).unwrap();
+    let refused = codec::decode::<EpisodesReply>(&bytes, Some(SPEC)).unwrap_err();
+    assert!(matches!(refused, CodecError::Header(_)), "{refused}");
+    // The longest answer is one that can be sent.
+    let most = EndedEpisode {
+        frames: u64::MAX,
+        actor: u32::MAX,
+        copy: u32::MAX,
+        played: Some(Played {
+            episode_return: f64::MAX,
+            steps: u64::MAX,
+        }),
+    };
+    let longest = EpisodesReply {
+        ended: u64::MAX,
+        before: u64::MAX - EPISODES_MAX as u64,
+        episodes: vec![most; EPISODES_MAX],
+    };
+    assert!(codec::encode(SPEC, &longest, &[]).is_ok());
+}
+
 fn priority_update() -> PriorityUpdate {
     PriorityUpdate {
         learner: 5,
@@ -321,6 +373,8 @@ fn samples() -> Vec<Sample> {
             Some(Warning::new("a chunk was refused", 3.0)),
         )),
         Sample::of(&parts_status()),
+        Sample::of(&EpisodesRequest { since: 7 }),
+        Sample::of(&episodes()),
     ]);
     let with_payload = [
         (

@@ -21,7 +21,7 @@ pub use certificates::{Certificates, Valid, skipped_without_openssl};
 pub use client::Client;
 pub use network::Network;
 pub use process::{Ended, Process};
-pub use run_folder::{RunFolder, Summary};
+pub use run_folder::{EpisodeRow, RunFolder, Summary};
 pub use skipped::{note, skip, skipped_offline};
 pub use system::{Survivor, TestSystem};
 pub use waiting::{DEADLINE, wait_for};

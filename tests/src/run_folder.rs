@@ -45,6 +45,22 @@ pub struct Summary {
     pub messages_refused: u64,
 }
 
+/// A row of `episodes.csv`.
+#[derive(Clone, Debug, PartialEq)]
+#[allow(
+    missing_docs,
+    reason = "the names are those of the file, which the launcher documents"
+)]
+pub struct EpisodeRow {
+    pub seconds: Option<f64>,
+    pub frames: u64,
+    pub episode: u64,
+    pub actor: u64,
+    pub copy: u64,
+    pub episode_return: Option<f64>,
+    pub length: Option<u64>,
+}
+
 /// A run's folder.
 #[derive(Clone, Debug)]
 pub struct RunFolder {
@@ -102,38 +118,52 @@ impl RunFolder {
         row.split(',').nth(2)?.parse().ok()
     }
 
-    /// The rows of `returns.csv`: frames, episode, return.
-    pub fn returns(&self) -> Vec<(u64, u64, f64)> {
-        let text = self.text("returns.csv");
+    /// The rows of `episodes.csv`.
+    pub fn episodes(&self) -> Vec<EpisodeRow> {
+        let text = self.text("episodes.csv");
         let row = |line: &str| {
             let cells: Vec<_> = line.split(',').collect();
-            let [frames, episode, value] = cells[..] else {
-                panic!("{line:?} is no row of returns");
+            let [seconds, frames, episode, actor, copy, value, length] = cells[..] else {
+                panic!("{line:?} is no row of episodes");
             };
             let count = |cell: &str| cell.parse().unwrap();
-            (count(frames), count(episode), value.parse().unwrap())
+            EpisodeRow {
+                seconds: seconds.parse().ok(),
+                frames: count(frames),
+                episode: count(episode),
+                actor: count(actor),
+                copy: count(copy),
+                episode_return: (!value.is_empty()).then(|| value.parse().unwrap()),
+                length: (!length.is_empty()).then(|| count(length)),
+            }
         };
         text.lines().skip(1).map(row).collect()
     }
 
-    /// Checks that the mean return is of the last 100 episodes, or of all if there were fewer, by the returns' own file.
+    /// Checks that every episode has a row, and that the mean return is of the last 100 episodes, or of all if there were fewer.
     #[track_caller]
-    fn check_returns(&self, summary: &Summary) {
-        let rows = self.returns();
+    fn check_episodes(&self, summary: &Summary) {
+        let rows = self.episodes();
         assert!(
-            rows.is_sorted_by(|a, b| a.0 <= b.0 && a.1 < b.1),
+            rows.is_sorted_by(|a, b| a.frames <= b.frames && a.episode < b.episode),
+            "{rows:?}"
+        );
+        assert!(
+            rows.iter().all(|it| it.frames <= summary.frames),
             "{rows:?}"
         );
         assert_eq!(summary.mean_return_of, summary.episodes.min(100));
         let newest = &rows[rows.len() - summary.mean_return_of as usize..];
-        let sum: f64 = newest.iter().map(|(.., value)| value).sum();
+        let returns = newest.iter().filter_map(|it| it.episode_return);
+        let sum: f64 = returns.sum();
         let mean = (!newest.is_empty()).then(|| sum / newest.len() as f64);
         match (mean, summary.mean_return) {
             (Some(want), Some(have)) => assert!((want - have).abs() < 1e-9, "{want} {have}"),
             (want, have) => assert_eq!(want, have),
         }
-        let last = rows.last().map_or(0, |row| row.1);
+        let last = rows.last().map_or(0, |row| row.episode);
         assert_eq!(last, summary.episodes, "episodes have their numbers");
+        assert_eq!(rows.len() as u64, summary.episodes, "each has a row");
     }
 
     /// A part's log.
@@ -207,7 +237,7 @@ impl RunFolder {
             "{said}"
         );
 
-        self.check_returns(&summary);
+        self.check_episodes(&summary);
 
         let (header, rows) = self.metrics();
         assert!(

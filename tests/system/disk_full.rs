@@ -93,7 +93,7 @@ fn a_run_goes_on_while_the_disk_is_full() {
     let mut process = started(&system);
     let filler = disk.fill();
     process.wait_for_stderr("metrics.csv cannot be written: No space left");
-    process.wait_for_stderr("returns.csv cannot be written: No space left");
+    process.wait_for_stderr("episodes.csv cannot be written: No space left");
     let client = system.connect();
     let then = client.learner().unwrap().updates;
     client.wait_for_learner("more updates", |learner| learner.updates > then + 200);

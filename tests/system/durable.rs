@@ -395,9 +395,12 @@ fn a_resumed_run_goes_on_with_its_replay() {
         summary.episodes > before.episodes && summary.mean_return_of == 100,
         "{summary:#?}"
     );
-    let returns = run.returns();
-    assert!(returns.is_sorted_by(|a, b| a.1 < b.1), "each return once");
-    assert_eq!(returns.last().unwrap().1, summary.episodes);
+    let episodes = run.episodes();
+    assert!(
+        episodes.is_sorted_by(|a, b| a.episode < b.episode),
+        "each once"
+    );
+    assert_eq!(episodes.last().unwrap().episode, summary.episodes);
     let log = run.log("replay-server");
     assert!(
         log.contains("goes on with the replay in run/replay"),

@@ -1,9 +1,15 @@
 //! `driml local` with a process for each part: what a run leaves behind, in every world that needs nothing installed.
 //! How runs end badly is in `failures`.
 
-use std::net::{Ipv4Addr, TcpListener};
+use std::{
+    collections::BTreeSet,
+    net::{Ipv4Addr, TcpListener},
+};
 
-use crate::{SHORT, system};
+use driml_tests::wait_for;
+use nix::sys::signal::Signal;
+
+use crate::{LONG, SHORT, system};
 
 #[test]
 fn c51_leaves_a_whole_run_folder() {
@@ -102,6 +108,33 @@ fn driml_ada_with_two_actors_over_tcp() {
         "0",
         "the learner's affinity reached the replay server"
     );
+}
+
+/// `driml local --listen` lets actors of other machines play, in the same run folder.
+#[test]
+fn an_actor_from_elsewhere_plays_in_a_launched_run() {
+    let system = system();
+    let endpoint = free_tcp_endpoint();
+    let run = system.start(&format!(
+        "local --agent c51 {LONG} --listen {endpoint} --run-dir run"
+    ));
+    // It is the replay server of the run in which all parts meet.
+    system.find_part("learner");
+    let mut outside = system.start_part(&format!("actor --connect {endpoint} --id 5"));
+    outside.wait_for_stderr("actor 5 steps 4 copies");
+    wait_for("an episode that it played", || {
+        let rows = std::fs::read_to_string(system.path("run/episodes.csv")).ok()?;
+        let mut rows = rows.lines();
+        rows.any(|row| row.split(',').nth(3) == Some("5"))
+            .then_some(())
+    });
+    outside.stop().expect_code(0).expect_said("actor 5 leaves");
+    run.signal(Signal::SIGINT);
+    run.wait().expect_code(130);
+    let run = system.run_folder("run");
+    run.check("interrupted");
+    let actors: BTreeSet<_> = run.episodes().iter().map(|it| it.actor).collect();
+    assert_eq!(actors, BTreeSet::from([0, 5]));
 }
 
 /// An endpoint that nobody listens on, at a loopback address of this process's own so that nobody takes it meanwhile.

@@ -14,6 +14,7 @@ use driml_protocol::{
 use driml_tests::{
     Certificates, Client, Process, TestSystem, Valid, skipped_without_openssl, wait_for,
 };
+use nix::sys::signal::Signal;
 use zenoh::{Session, Wait};
 
 use crate::{LONG, SHORT, system};
@@ -193,6 +194,20 @@ fn a_launched_run_with_an_actor_from_outside() {
     outside.wait_for_stderr("actor 2 steps");
     let observer = tls.client(Role::Observer);
     observer.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
+    // Who only looks gets all that is recorded, episodes too.
+    let mut watched = tls.system.start(&format!(
+        "watch --connect {} --tls-dir tls --run-dir seen",
+        tls.endpoint
+    ));
+    let rows = || std::fs::read_to_string(tls.system.path("seen/episodes.csv")).ok();
+    wait_for("episodes of both actors", || {
+        let rows = rows()?;
+        let is_there = |actor: &str| rows.lines().any(|row| row.split(',').nth(3) == Some(actor));
+        (is_there("0") && is_there("2")).then_some(())
+    });
+    watched.signal(Signal::SIGINT);
+    watched.wait_for_stderr("the run goes on without being watched");
+    watched.wait().expect_code(130);
     outside.stop().expect_code(0).expect_said("leaves: ");
     drop(observer);
     run.stop().expect_code(130);

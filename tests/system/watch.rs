@@ -1,7 +1,10 @@
 //! `driml watch`: what is shown and recorded of runs that others have started, and that looking on disturbs nobody.
 //! What `driml status` says of a run is in `status`.
 
-use std::{collections::BTreeMap, fs};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fs,
+};
 
 use driml_tests::{
     Process, TestSystem,
@@ -57,6 +60,14 @@ fn a_run_of_parts_by_hand_leaves_the_folder_of_a_launched_one() {
     let watched = system.run_folder("run");
     let summary = watched.check_finished();
     assert_eq!((summary.frames, summary.updates), (1280, 540));
+    // Who played each episode, and that all of each was seen: what is missing to all frames is still being played.
+    let episodes = watched.episodes();
+    let who: BTreeSet<_> = episodes.iter().map(|it| (it.actor, it.copy)).collect();
+    let expected = (0..2).flat_map(|actor| (0..4).map(move |copy| (actor, copy)));
+    assert_eq!(who, expected.collect());
+    let played: u64 = episodes.iter().map(|it| it.length.unwrap()).sum();
+    assert!(played <= 1280, "{played}");
+    assert!(episodes.iter().all(|it| it.seconds.is_some()));
 
     // The columns are those of a launched run with these settings.
     system

@@ -415,9 +415,9 @@ impl Launch<'_> {
             // Until the learner has answered, too.
             learner.updates = learner.updates.max(self.resume_point.updates);
             let rss = self.processes.rss_mib();
-            for line in recorder.record(&statuses.shards, &learner, &rss) {
-                self.screen.line(&line);
-            }
+            let mut said = recorder.hear_episodes(&statuses.shards, &statuses.episodes.take());
+            said.extend(recorder.record(&statuses.shards, &learner, &rss));
+            said.iter().for_each(|line| self.screen.line(line));
             let notes: Vec<_> = ["replay server", "learner"]
                 .into_iter()
                 .zip(heard)
@@ -532,8 +532,11 @@ impl Launch<'_> {
         recorder: &mut RunRecorder,
         outcome: Outcome,
     ) -> (Summary, anyhow::Result<()>) {
-        let (shards, replay, learner) = match &self.statuses {
-            Some(it) => (&it.shards[..], it.replay.clone(), it.learner.clone()),
+        let (shards, replay, learner) = match &mut self.statuses {
+            Some(it) => {
+                recorder.hear_episodes(&it.shards, &it.episodes.take());
+                (&it.shards[..], it.replay.clone(), it.learner.clone())
+            }
             None => Default::default(),
         };
         recorder.record(shards, &learner, &[]);

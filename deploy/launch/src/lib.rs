@@ -22,6 +22,7 @@
 
 mod connect;
 pub mod console;
+mod ended_episodes;
 pub mod endpoint;
 pub mod evaluate;
 mod evaluator;

@@ -4,8 +4,10 @@
 use std::time::Duration;
 
 use anyhow::Context;
-use driml_protocol::{Keys, LearnerStatus, ReplayStatus, RunClient};
+use driml_protocol::{EpisodesRequest, Keys, LearnerStatus, ReplayStatus, RunClient};
 use zenoh::{Session, Wait};
+
+use crate::ended_episodes::EndedEpisodes;
 
 /// How long an answer may take; a process that is busy answers the next time.
 const ANSWER_MAX: Duration = Duration::from_secs(2);
@@ -20,6 +22,8 @@ pub struct Statuses {
     pub replay: ReplayStatus,
     /// The learner's last answer.
     pub learner: LearnerStatus,
+    /// Episodes that ended and were not taken yet.
+    pub(crate) episodes: EndedEpisodes,
 }
 
 impl Statuses {
@@ -31,10 +35,11 @@ impl Statuses {
             shards: Vec::new(),
             replay: ReplayStatus::default(),
             learner: LearnerStatus::default(),
+            episodes: EndedEpisodes::default(),
         }
     }
 
-    /// Asks the replay servers.
+    /// Asks the replay servers how they are, and for the episodes that ended.
     ///
     /// # Errors
     /// No answer in time, or one that is not of this run.
@@ -43,6 +48,10 @@ impl Statuses {
         let shards = answers.collect::<Result<Vec<_>, _>>()?;
         self.replay = ReplayStatus::merged(&shards);
         self.shards = shards;
+        for (shard, (client, status)) in self.clients.iter().zip(&self.shards).enumerate() {
+            let ask = |since| client.ask(&EpisodesRequest { since }, ANSWER_MAX);
+            self.episodes.fetch(shard, status.episodes, ask)?;
+        }
         Ok(())
     }
 

@@ -8,6 +8,7 @@ pub(crate) mod batch_request;
 pub(crate) mod batch_rows;
 pub(crate) mod chunk;
 pub(crate) mod done;
+pub(crate) mod episodes;
 pub(crate) mod goodbye;
 pub(crate) mod hello;
 pub(crate) mod insert_reply;

@@ -7,6 +7,7 @@ use crate::{
         affinity::AffinityUpdate,
         batch_request::BatchRequest,
         chunk::ChunkHeader,
+        episodes::EpisodesRequest,
         goodbye::Goodbye,
         hello::Hello,
         insert_reply::Claim,
@@ -67,6 +68,7 @@ fn grant(keys: &Keys, role: Role) -> Grant {
                 keys.of::<ReplayStatus>(),
                 keys.of::<PartsStatus>(),
                 keys.of::<LearnerStatus>(),
+                keys.of::<EpisodesRequest>(),
             ]);
         }
         Role::ReplayServer => asks.clear(),
@@ -214,6 +216,7 @@ mod tests {
                 "d/status/replay",
                 "d/status/parts",
                 "d/status/learner",
+                "d/episodes",
             ]
         );
         assert!(all(&of(Role::ReplayServer)).is_empty());

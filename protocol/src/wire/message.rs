@@ -100,4 +100,8 @@ pub enum Kind {
     PartsStatus = 20,
     /// Priorities of the rows of a batch, learner to replay server.
     Priorities = 21,
+    /// A request for the episodes that ended.
+    EpisodesRequest = 22,
+    /// Episodes that ended.
+    EpisodesReply = 23,
 }

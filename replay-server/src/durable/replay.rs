@@ -438,6 +438,11 @@ impl DurableReplay {
         self.replay.note_refused_message();
     }
 
+    /// [`Replay::note_recorded`].
+    pub fn note_recorded(&mut self, episodes: u64) {
+        self.replay.note_recorded(episodes);
+    }
+
     /// [`Replay::note_learner_waited`].
     pub fn note_learner_waited(&mut self, seconds: f64) {
         self.replay.note_learner_waited(seconds);

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::replay::snapshot::Snapshot;
 
 /// Form of the log; one of another form is refused.
-pub(super) const FORMAT: u32 = 1;
+pub(super) const FORMAT: u32 = 2;
 const PREFIX: &str = "segment-";
 const SUFFIX: &str = ".log";
 

@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use driml_protocol::{ActorJoin, ChunkHeader, Claim, Goodbye};
+use driml_protocol::{ActorJoin, ChunkHeader, Claim, Goodbye, Played};
 use serde::{Deserialize, Serialize};
 
 use crate::storage::ring::Link;
@@ -20,8 +20,8 @@ const PAST_INCARNATIONS_MAX: usize = 64;
 pub(crate) struct Stream {
     /// How its next transition hangs together with the last.
     pub(crate) link: Link,
-    /// Undiscounted return of the episode so far; none if a part of the episode was lost.
-    pub(crate) episode_return: Option<f64>,
+    /// The episode so far; none if a part of it was lost.
+    pub(crate) episode: Option<Played>,
 }
 
 /// What is counted of one life of an actor.
@@ -284,14 +284,14 @@ impl Actors {
         if header.sequence == 0 || actor.streams.is_empty() {
             let start = || Stream {
                 link: Link::EpisodeStart,
-                episode_return: Some(0.0),
+                episode: Some(Played::default()),
             };
             actor.streams.resize_with(header.streams as usize, start);
         }
         if difference != Difference::default() {
             actor.streams.fill_with(|| Stream {
                 link: Link::Lost,
-                episode_return: None,
+                episode: None,
             });
         }
         actor.expected = header.sequence + 1;

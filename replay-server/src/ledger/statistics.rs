@@ -3,8 +3,13 @@
 
 use std::collections::VecDeque;
 
-use driml_protocol::{RETURNS_OF, Returns};
+use driml_protocol::{EPISODES_MAX, EndedEpisode, EpisodesReply, RETURNS_OF, Returns};
 use serde::{Deserialize, Serialize};
+
+/// Ended episodes that are kept for whoever asks for them; of more the oldest are let go.
+const EPISODES_KEPT_MAX: usize = 4 * EPISODES_MAX;
+/// The same in what a log keeps of a moment, where somebody records them: those for which he has not asked yet.
+const EPISODES_LOGGED_MAX: usize = 1_024;
 
 /// What the status reports beside the ring's and the limiter's own counts.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -19,6 +24,11 @@ pub(crate) struct Statistics {
     /// Messages by which an actor's own count differed.
     pub(crate) differences: u64,
     pub(crate) episodes: u64,
+    /// The newest of them.
+    newest: VecDeque<EndedEpisode>,
+    /// How many whoever records them had when he asked last; none if nobody has asked.
+    #[serde(skip)]
+    recorded: Option<u64>,
     returns_known: u64,
     returns: VecDeque<f64>,
     pub(crate) k_histogram: Vec<u64>,
@@ -61,16 +71,49 @@ impl Statistics {
         }
     }
 
-    /// Counts an episode that ended, with its undiscounted return if all of it was seen.
-    pub(crate) fn episode_ended(&mut self, episode_return: Option<f64>) {
+    /// Counts an episode that ended; its return counts if all of it was seen.
+    pub(crate) fn episode_ended(&mut self, episode: EndedEpisode) {
         self.episodes += 1;
-        if let Some(episode_return) = episode_return {
+        if self.newest.len() == EPISODES_KEPT_MAX {
+            self.newest.pop_front();
+        }
+        self.newest.push_back(episode);
+        if let Some(played) = episode.played {
             self.returns_known += 1;
             if self.returns.len() == RETURNS_OF {
                 self.returns.pop_front();
             }
-            self.returns.push_back(episode_return);
+            self.returns.push_back(played.episode_return);
         }
+    }
+
+    /// Episodes that ended after the first `since`: the oldest that are still kept, as many as fit into one answer.
+    pub(crate) fn episodes_since(&self, since: u64) -> EpisodesReply {
+        let kept = self.newest.len() as u64;
+        let before = since.clamp(self.episodes - kept, self.episodes);
+        let skipped = (before + kept - self.episodes) as usize;
+        let episodes = self.newest.iter().skip(skipped).take(EPISODES_MAX);
+        EpisodesReply {
+            ended: self.episodes,
+            before,
+            episodes: episodes.copied().collect(),
+        }
+    }
+
+    /// Somebody has the first so many of them.
+    pub(crate) fn note_recorded(&mut self, episodes: u64) {
+        self.recorded = Some(episodes.min(self.episodes));
+    }
+
+    /// What a log keeps of a moment.
+    pub(crate) fn logged(&self) -> Self {
+        let mut logged = self.clone();
+        let unrecorded = logged.recorded.take().map_or(0, |it| self.episodes - it);
+        let kept = EPISODES_LOGGED_MAX.min(unrecorded as usize);
+        logged
+            .newest
+            .drain(..logged.newest.len().saturating_sub(kept));
+        logged
     }
 
     /// Returns of the last [`RETURNS_OF`] episodes.
@@ -78,6 +121,63 @@ impl Statistics {
         Returns {
             known: self.returns_known,
             newest: self.returns.iter().copied().collect(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_protocol::Played;
+
+    use super::*;
+
+    fn ended(n: u64) -> EndedEpisode {
+        EndedEpisode {
+            frames: n,
+            actor: 0,
+            copy: 0,
+            played: Some(Played::default()),
+        }
+    }
+
+    #[test]
+    fn episodes_are_handed_out_once_and_in_order_and_the_oldest_are_let_go() {
+        let mut statistics = Statistics::new(1, 1);
+        assert_eq!(statistics.episodes_since(0), EpisodesReply::default());
+        for n in 0..EPISODES_MAX as u64 + 5 {
+            statistics.episode_ended(ended(n));
+        }
+        let first = statistics.episodes_since(0);
+        assert_eq!((first.before, first.episodes.len()), (0, EPISODES_MAX));
+        let second = statistics.episodes_since(first.up_to());
+        let frames: Vec<_> = second.episodes.iter().map(|it| it.frames).collect();
+        let most = EPISODES_MAX as u64;
+        assert_eq!(frames, [most, most + 1, most + 2, most + 3, most + 4]);
+        assert_eq!(second.up_to(), second.ended);
+        assert!(
+            statistics
+                .episodes_since(second.up_to())
+                .episodes
+                .is_empty()
+        );
+        // Whoever knows of more knows another server's.
+        assert_eq!(statistics.episodes_since(u64::MAX).before, most + 5);
+
+        for n in most + 5..EPISODES_KEPT_MAX as u64 + 7 {
+            statistics.episode_ended(ended(n));
+        }
+        let late = statistics.episodes_since(0);
+        assert_eq!((late.before, late.episodes[0].frames), (7, 7));
+        assert_eq!(statistics.episodes, EPISODES_KEPT_MAX as u64 + 7);
+        for (recorded, logged) in [
+            (None, 0),
+            (Some(9), EPISODES_LOGGED_MAX),
+            (Some(statistics.episodes - 3), 3),
+        ] {
+            statistics.recorded = recorded;
+            let reply = statistics.logged().episodes_since(0);
+            assert_eq!(reply.up_to(), statistics.episodes);
+            assert_eq!(reply.episodes.len(), logged);
         }
     }
 }

@@ -3,7 +3,9 @@
 
 use std::borrow::Cow;
 
-use driml_protocol::{ActorJoin, Chunk, ChunkHeader, Claim, Goodbye, InsertReply};
+use driml_protocol::{
+    ActorJoin, Chunk, ChunkHeader, Claim, EndedEpisode, Goodbye, InsertReply, Played,
+};
 
 use super::Replay;
 use crate::{
@@ -185,25 +187,35 @@ impl Replay {
         let header = chunk.header;
         let (streams, difference) = self.actors.accept(&header);
         let steps = header.steps as usize;
-        for ((number, stream), frames) in streams.iter_mut().enumerate().zip(packed.runs()) {
+        // In all shards, as far as heard.
+        let frames = self
+            .limiter
+            .inserted_total()
+            .saturating_add(header.transitions() as u64);
+        for ((number, stream), run) in streams.iter_mut().enumerate().zip(packed.runs()) {
             let rows = number * steps..(number + 1) * steps;
             let step = |row| {
                 let (action, reward) = (chunk.actions()[row], chunk.reward(row));
                 Step::new(action, reward, chunk.end(row), header.weights_version)
             };
             let (link, first) = (stream.link, self.ring.inserted());
-            stream.link = self.ring.push_run(frames, rows.clone().map(step), link);
+            stream.link = self.ring.push_run(run, rows.clone().map(step), link);
             if let Some(priorities) = &mut self.priorities {
                 priorities.stored(&self.ring, &self.episodes, first, link);
             }
             for step in rows.map(step) {
                 self.statistics.action_histogram[usize::from(step.action)] += 1;
-                stream.episode_return = stream
-                    .episode_return
-                    .map(|sum| sum + f64::from(step.reward));
+                if let Some(episode) = &mut stream.episode {
+                    episode.episode_return += f64::from(step.reward);
+                    episode.steps += 1;
+                }
                 if step.end.is_episode_end() {
-                    self.statistics
-                        .episode_ended(stream.episode_return.replace(0.0));
+                    self.statistics.episode_ended(EndedEpisode {
+                        frames,
+                        actor: header.actor,
+                        copy: number as u32,
+                        played: stream.episode.replace(Played::default()),
+                    });
                 }
             }
         }

@@ -51,7 +51,7 @@ impl Replay {
             other_shards: self.limiter.other_shards(),
             affinity: self.affinity.clone(),
             rng: self.rng.clone(),
-            statistics: self.statistics.clone(),
+            statistics: self.statistics.logged(),
             starving: self.starving,
             are_listed: self.anchors.are_listed(&self.ring),
         }

@@ -1,7 +1,7 @@
 //! What the replay says of itself, and what the service around it tells it to count.
 //! It reads no clock: whoever measures a time passes it in.
 
-use driml_protocol::{ReplayStatus, Tally, Waiting};
+use driml_protocol::{EpisodesReply, ReplayStatus, Tally, Waiting};
 
 use super::Replay;
 
@@ -87,6 +87,16 @@ impl Replay {
             affinity_version: self.affinity.version(),
             finished: self.limiter.all_in(),
         }
+    }
+
+    /// Episodes that ended after the first `since`, at most as many as one answer holds.
+    pub fn episodes_since(&self, since: u64) -> EpisodesReply {
+        self.statistics.episodes_since(since)
+    }
+
+    /// Somebody has recorded the first so many episodes that ended.
+    pub fn note_recorded(&mut self, episodes: u64) {
+        self.statistics.note_recorded(episodes);
     }
 
     /// Checks the ring and the counts; panics at the first that is wrong. Slow: for tests.

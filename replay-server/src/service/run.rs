@@ -300,6 +300,7 @@ impl<'a> Answers<'a> {
         this.answer("report", 1, limits.small, Service::report)?;
         this.offer("status", 1, Service::status)?;
         this.offer("parts", 1, Service::parts)?;
+        this.answer("episodes", 1, limits.small, Service::episodes)?;
         Ok(this)
     }
 

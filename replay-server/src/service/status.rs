@@ -4,8 +4,8 @@
 use std::time::{Duration, Instant};
 
 use driml_protocol::{
-    AffinityUpdate, Done, Goodbye, Incoming, PartName, PartsStatus, PriorityUpdate, ReplayStatus,
-    Report, Responder,
+    AffinityUpdate, Done, EpisodesRequest, Goodbye, Incoming, PartName, PartsStatus,
+    PriorityUpdate, ReplayStatus, Report, Responder,
 };
 
 use super::{accounts::own_warning, server::Service};
@@ -165,6 +165,16 @@ impl Service {
             if connected == 0 || since.elapsed() > FAREWELL_MAX {
                 return tracing::info!("the run is over, and {connected} parts are left");
             }
+        }
+    }
+
+    pub(super) fn episodes(&self, incoming: Incoming<EpisodesRequest>) {
+        if let Some(request) = self.read(&incoming) {
+            let mut state = self.state();
+            state.replay.note_recorded(request.since);
+            let reply = state.replay.episodes_since(request.since);
+            drop(state);
+            incoming.into_responder().reply(&reply);
         }
     }
 

@@ -376,10 +376,10 @@ fn a_folder_is_one_servers_and_one_runs() {
     );
 
     let text = fs::read_to_string(&file).unwrap();
-    fs::write(&file, text.replace("format = 1", "format = 2")).unwrap();
+    fs::write(&file, text.replace("format = 2", "format = 3")).unwrap();
     let said = error(&kept.args, &kept.config);
     assert!(
-        said.contains("a replay of format 2, this version reads 1"),
+        said.contains("a replay of format 3, this version reads 2"),
         "{said}"
     );
 }

@@ -4,11 +4,11 @@ use std::fmt::Debug;
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, BufferPool,
-    Chunk, ChunkHeader, Claim, CodecError, Done, End, Goodbye, Hello, InsertReply, JoinReply, Kind,
-    LearnerJoin, LearnerStatus, Life, Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName,
-    PartStatus, PartsStatus, PriorityUpdate, ReplayStatus, Report, RequestId, Returns, RowScalars,
-    Tally, Waiting, Warning, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
-    WeightsVersion, codec,
+    Chunk, ChunkHeader, Claim, CodecError, Done, End, EndedEpisode, EpisodesReply, EpisodesRequest,
+    Goodbye, Hello, InsertReply, JoinReply, Kind, LearnerJoin, LearnerStatus, Life, Message,
+    NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus, PartsStatus, Played, PriorityUpdate,
+    ReplayStatus, Report, RequestId, Returns, RowScalars, Tally, Waiting, Warning, WeightsHeader,
+    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec,
 };
 
 /// The hash of the run that these messages are of.
@@ -72,7 +72,7 @@ fn read_batch(bytes: &[u8]) {
 }
 
 /// Every kind of message and how it is read.
-const KINDS: [(Kind, Read); 21] = [
+const KINDS: [(Kind, Read); 23] = [
     (Kind::Chunk, read_chunk),
     (Kind::InsertReply, read::<InsertReply>),
     (Kind::BatchRequest, read::<BatchRequest>),
@@ -93,6 +93,8 @@ const KINDS: [(Kind, Read); 21] = [
     (Kind::WeightsRequest, read::<WeightsRequest>),
     (Kind::Report, read::<Report>),
     (Kind::PartsStatus, read::<PartsStatus>),
+    (Kind::EpisodesRequest, read::<EpisodesRequest>),
+    (Kind::EpisodesReply, read::<EpisodesReply>),
     (Kind::Priorities, read::<PriorityUpdate>),
 ];
 
@@ -282,6 +284,15 @@ pub fn samples() -> Vec<Vec<u8>> {
         last_warning: None,
         parts: vec![part],
     };
+    let episode = EndedEpisode {
+        frames: 1 << 20,
+        actor: 3,
+        copy: 15,
+        played: Some(Played {
+            episode_return: 2.5,
+            steps: 99,
+        }),
+    };
     vec![
         sealed_chunk,
         of(InsertReply::Stored {
@@ -344,6 +355,12 @@ pub fn samples() -> Vec<Vec<u8>> {
             Some(Warning::new("a chunk was refused", 3.0)),
         )),
         of(parts),
+        of(EpisodesRequest { since: 7 }),
+        of(EpisodesReply {
+            ended: 9,
+            before: 7,
+            episodes: vec![episode],
+        }),
         of(WeightsRequest::NewerThan(3)),
         of(WeightsRequest::Piece {
             version: 3,

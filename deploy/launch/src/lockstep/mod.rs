@@ -8,15 +8,19 @@ mod saved;
 #[cfg(test)]
 mod tests;
 
-use std::time::{Duration, Instant};
+use std::{
+    convert::Infallible,
+    time::{Duration, Instant},
+};
 
 use anyhow::Context;
 use driml_machine::error::Interrupted;
-use driml_protocol::Shutdown;
+use driml_protocol::{ReplayStatus, Shutdown};
 use driml_settings::config::{EvaluationConfig, RunConfig};
 
 use crate::{
     console::{self, Screen, print},
+    ended_episodes::EndedEpisodes,
     evaluate::{self, Which},
     live_view::{Display, TEMPLATE},
     resume,
@@ -65,6 +69,7 @@ pub fn run(
     let mut row = lockstep.frames() / row_frames;
     let folder = run_dir.checkpoints();
 
+    let mut episodes = EndedEpisodes::default();
     let mut outcome = Outcome::Finished;
     let mut saved = resumed.map(|point| point.updates);
     // A round may take several updates.
@@ -79,7 +84,9 @@ pub fn run(
         if show || lockstep.frames() / row_frames > row {
             row = lockstep.frames() / row_frames;
             let (replay, status) = lockstep.status();
-            let said = recorder.record(std::slice::from_ref(&replay), status, &[]);
+            let status = &status.clone();
+            let mut said = hear_episodes(&mut recorder, &mut episodes, &mut lockstep, &replay);
+            said.extend(recorder.record(std::slice::from_ref(&replay), status, &[]));
             said.iter().for_each(|line| screen.line(line));
             if show {
                 shown = Instant::now();
@@ -101,6 +108,8 @@ pub fn run(
         evaluations.play(lockstep.updates(), true, &screen)?;
     }
     let (replay, status) = lockstep.status();
+    let status = &status.clone();
+    hear_episodes(&mut recorder, &mut episodes, &mut lockstep, &replay);
     recorder.record(std::slice::from_ref(&replay), status, &[]);
     let missing = recorder.missing();
     missing.iter().for_each(|line| console::line(line));
@@ -113,6 +122,19 @@ pub fn run(
     } else {
         print(&summary.next_steps(run_dir))
     }
+}
+
+/// Records the episodes that ended by this `status`. Returns warnings.
+fn hear_episodes(
+    recorder: &mut RunRecorder,
+    episodes: &mut EndedEpisodes,
+    lockstep: &mut Lockstep,
+    status: &ReplayStatus,
+) -> Vec<String> {
+    let ask = |since| Ok::<_, Infallible>(lockstep.episodes_since(since));
+    let Ok(()) = episodes.fetch(0, status.episodes, ask);
+    lockstep.note_recorded(status.episodes);
+    recorder.hear_episodes(std::slice::from_ref(status), &episodes.take())
 }
 
 /// Plays checkpoints between rounds, if they are to be played.

@@ -9,7 +9,8 @@ use driml_envs::EnvError;
 use driml_learner::{Learner, LearnerConfig};
 use driml_machine::error::usage;
 use driml_protocol::{
-    ActorJoin, Batch, BufferPool, Goodbye, InsertReply, LearnerStatus, ReplayStatus, Weights,
+    ActorJoin, Batch, BufferPool, EpisodesReply, Goodbye, InsertReply, LearnerStatus, ReplayStatus,
+    Weights,
 };
 use driml_replay_server::{DurableArgs, DurableReplay, Mark, Replay, Unready};
 use driml_settings::config::RunConfig;
@@ -210,6 +211,16 @@ impl Lockstep {
     /// What replay and learner say of themselves.
     pub(super) fn status(&self) -> (ReplayStatus, &LearnerStatus) {
         (self.replay.status(), &self.status)
+    }
+
+    /// Episodes that ended after the first `since`.
+    pub(super) fn episodes_since(&self, since: u64) -> EpisodesReply {
+        self.replay.episodes_since(since)
+    }
+
+    /// The first so many episodes are recorded.
+    pub(super) fn note_recorded(&mut self, episodes: u64) {
+        self.replay.note_recorded(episodes);
     }
 
     /// Writes a checkpoint into `folder`, from which the run goes on exactly as it does now.

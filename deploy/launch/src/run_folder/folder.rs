@@ -42,9 +42,9 @@ impl RunFolder {
         self.path.join("metrics.csv")
     }
 
-    /// The return of each training episode.
-    pub fn returns(&self) -> PathBuf {
-        self.path.join("returns.csv")
+    /// A row for each training episode: when it ended, who played it, its return and length.
+    pub fn episodes(&self) -> PathBuf {
+        self.path.join("episodes.csv")
     }
 
     /// How the run ended and what it counted, JSON; it is there once the run has ended.

@@ -31,16 +31,29 @@ impl GrowingCsv {
     /// # Panics
     /// If a row cannot be made into text, which takes no file.
     pub(super) fn add(&mut self, row: impl IntoIterator<Item = String>) -> Option<String> {
-        let mut csv = csv::Writer::from_writer(Vec::new());
-        let row: Vec<_> = row.into_iter().collect();
-        csv.write_record(row).expect("a row in memory");
-        self.0.add(csv.into_inner().expect("a row in memory"))
+        self.0.add(text(row))
+    }
+
+    /// [`Self::add`] of several rows, in one write.
+    ///
+    /// # Panics
+    /// As [`Self::add`].
+    pub(super) fn add_all<const N: usize>(&mut self, rows: Vec<[String; N]>) -> Option<String> {
+        self.0.add_all(rows.into_iter().map(text))
     }
 
     /// What is missing in the file, as [`GrowingFile::missing`] says it.
     pub(super) fn missing(&self) -> Option<String> {
         self.0.missing()
     }
+}
+
+/// A row's bytes.
+fn text(row: impl IntoIterator<Item = String>) -> Vec<u8> {
+    let mut csv = csv::Writer::from_writer(Vec::new());
+    let row: Vec<_> = row.into_iter().collect();
+    csv.write_record(row).expect("a row in memory");
+    csv.into_inner().expect("a row in memory")
 }
 
 #[cfg(test)]

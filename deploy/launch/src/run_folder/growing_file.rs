@@ -11,8 +11,9 @@ use std::{
 use anyhow::Context;
 use driml_protocol::whole_file;
 
-/// Rows that are kept in memory while they cannot be written; of more the oldest are lost. Some hours of metrics.
-const WAITING_MAX: usize = 10_000;
+/// Rows that are kept in memory while they cannot be written; of more the oldest are lost. A day of metrics, minutes of the episodes
+/// of a world whose episodes take milliseconds.
+const WAITING_MAX: usize = 100_000;
 
 /// The file and what is not in it yet.
 #[derive(Debug)]
@@ -53,11 +54,15 @@ impl GrowingFile {
 
     /// Adds a row, after those that wait. A warning is returned the first time that a row has to wait.
     pub(super) fn add(&mut self, row: Vec<u8>) -> Option<String> {
-        self.waiting.push_back(row);
-        if self.waiting.len() > WAITING_MAX {
-            self.waiting.pop_front();
-            self.lost += 1;
-        }
+        self.add_all([row])
+    }
+
+    /// [`Self::add`] of several rows, in one write.
+    pub(super) fn add_all(&mut self, rows: impl IntoIterator<Item = Vec<u8>>) -> Option<String> {
+        self.waiting.extend(rows);
+        let more = self.waiting.len().saturating_sub(WAITING_MAX);
+        self.waiting.drain(..more);
+        self.lost += more as u64;
         let error = self.write().err()?;
         let said = self.failed.is_none().then(|| {
             format!(

@@ -11,7 +11,7 @@ use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{LearnerStatus, ReplayStatus};
 
-use super::{columns::Columns, folder::RunFolder, resume_point::ResumePoint, returns::Episodes};
+use super::{columns::Columns, episodes::Episodes, folder::RunFolder, resume_point::ResumePoint};
 
 /// Bytes at the end of the file in which its last row lies.
 const LAST_ROW_BYTES: u64 = 4096;

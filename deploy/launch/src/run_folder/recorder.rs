@@ -1,4 +1,4 @@
-//! What is written into the run folder while a run goes on: settings, metrics, returns, events on request, and the summary at its end.
+//! What is written into the run folder while a run goes on: settings, metrics, episodes, events on request, and the summary at its end.
 //! It reads no status from anywhere: its caller hands them over.
 
 use std::{
@@ -7,16 +7,16 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_protocol::{LearnerStatus, ReplayStatus, RunSpec};
+use driml_protocol::{EpisodesReply, LearnerStatus, ReplayStatus, RunSpec};
 
 use super::{
     columns::Columns,
+    episodes::{Episodes, TrainingEpisodes},
     events::Events,
     folder::RunFolder,
     growing_csv::GrowingCsv,
     metrics::{Moment, header, rows_up_to},
     resume_point::ResumePoint,
-    returns::{Episodes, TrainingReturns},
     summary::{Outcome, Summary},
 };
 use crate::rates::Rates;
@@ -43,7 +43,9 @@ pub struct RunRecorder {
     metrics: GrowingCsv,
     header: Vec<String>,
     events: Option<Events>,
-    returns: TrainingReturns,
+    episodes: TrainingEpisodes,
+    /// The next episodes that are heard had ended before.
+    is_late: bool,
     losses: &'static [&'static str],
     processes: Vec<String>,
     rss_max: Vec<Option<f64>>,
@@ -69,14 +71,14 @@ impl RunRecorder {
         let lock = folder.lock()?;
         folder.write_config(config_toml)?;
         let rows = none(header(losses, processes));
-        let returns = TrainingReturns::create(folder)?;
+        let episodes = TrainingEpisodes::create(folder)?;
         Self::begin(
             folder,
             losses,
             processes,
             lock,
             rows,
-            returns,
+            episodes,
             ResumePoint::default(),
         )
     }
@@ -101,10 +103,19 @@ impl RunRecorder {
             _ => rows_up_to(&folder.metrics(), head, resume_point, frames_max)?,
         };
         let is_known = resume_point.replay_is_kept;
-        let returns = TrainingReturns::go_on(folder, rows.last("frames").unwrap_or(0), is_known)?;
+        let frames = rows.last("frames").unwrap_or(0);
+        let episodes = TrainingEpisodes::go_on(folder, frames, is_known)?;
         Summary::remove(folder)?;
         folder.write_config(config_toml)?;
-        Self::begin(folder, losses, processes, lock, rows, returns, resume_point)
+        Self::begin(
+            folder,
+            losses,
+            processes,
+            lock,
+            rows,
+            episodes,
+            resume_point,
+        )
     }
 
     fn begin(
@@ -113,7 +124,7 @@ impl RunRecorder {
         processes: &[String],
         lock: File,
         rows: Columns,
-        returns: TrainingReturns,
+        episodes: TrainingEpisodes,
         resume_point: ResumePoint,
     ) -> anyhow::Result<Self> {
         // A replay that was kept knows of all the run's episodes and k.
@@ -134,7 +145,8 @@ impl RunRecorder {
             metrics: GrowingCsv::create(&folder.metrics(), &rows.header, &rows.rows)?,
             header: rows.header,
             events: None,
-            returns,
+            episodes,
+            is_late: false,
             losses,
             processes: processes.to_vec(),
             rss_max: vec![None; processes.len()],
@@ -156,8 +168,9 @@ impl RunRecorder {
         Ok(())
     }
 
-    /// The run has been going on for at least so many seconds.
+    /// The run has been going on for at least so many seconds, in which nobody recorded it.
     pub(crate) fn count_seconds_from(&mut self, seconds: f64) {
+        self.is_late = true;
         self.seconds_before = self.seconds_before.max(seconds);
     }
 
@@ -180,8 +193,19 @@ impl RunRecorder {
         self.seconds_before + self.started.elapsed().as_secs_f64()
     }
 
-    /// Takes the state of the run: adds a row of metrics, in a resumed run once it is further than its last row, and the returns
-    /// of the episodes that ended. `shards` are the replay servers' own accounts; `rss_mib` is in the order of the processes given at
+    /// Takes the episodes that `ended` since the last time, each answer with its shard; `shards` are the replay servers' own accounts.
+    /// Warnings are returned as by [`Self::record`], which is to follow.
+    pub fn hear_episodes(
+        &mut self,
+        shards: &[ReplayStatus],
+        ended: &[(usize, EpisodesReply)],
+    ) -> Vec<String> {
+        let seconds = (!std::mem::take(&mut self.is_late)).then(|| self.seconds());
+        self.episodes.hear(shards, ended, seconds)
+    }
+
+    /// Takes the state of the run: adds a row of metrics, in a resumed run once it is further than its last row.
+    /// `shards` are the replay servers' own accounts; `rss_mib` is in the order of the processes given at
     /// the start, none for one that ended.
     ///
     /// A disk that is full does not end the run: a warning is returned the first time, and [`Self::missing`] says
@@ -198,11 +222,10 @@ impl RunRecorder {
         for (max, now) in self.rss_max.iter_mut().zip(rss_mib) {
             *max = now.map_or(*max, |now| Some(max.map_or(now, |max: f64| max.max(now))));
         }
-        let said = self.returns.hear(shards);
         let (frames, updates) = (replay.transitions_inserted, learner.updates);
         let resumed = self.resume_point.updates > 0;
         if resumed && (updates <= self.resume_point.updates || frames < self.frames_before) {
-            return said.into_iter().collect();
+            return Vec::new();
         }
         let processes = 0..self.processes.len();
         let moment = Moment {
@@ -221,21 +244,22 @@ impl RunRecorder {
         let events = self.events.as_mut();
         let drawn = events.and_then(|events| events.add(&row, replay, learner.finished));
         let written = self.metrics.add(row);
-        said.into_iter().chain(written).chain(drawn).collect()
+        written.into_iter().chain(drawn).collect()
     }
 
     /// What to say about rows that could not be written up to now.
     pub fn missing(&self) -> Vec<String> {
         let events = self.events.as_ref().and_then(Events::missing);
-        let missing = [self.metrics.missing(), self.returns.missing(), events];
-        missing.into_iter().flatten().collect()
+        let mut missing = self.episodes.missing();
+        missing.extend([self.metrics.missing(), events].into_iter().flatten());
+        missing
     }
 
     /// The whole run's episodes.
     pub fn episodes(&self, replay: &ReplayStatus) -> Episodes {
         Episodes {
             count: self.episodes_before + replay.episodes,
-            mean_return: self.returns.mean(),
+            mean_return: self.episodes.mean(),
         }
     }
 

@@ -1,6 +1,6 @@
 //! The run folder's files: what a run leaves, and what a resumed one goes on with.
 
-use driml_protocol::{Horizon, Returns, RunSpec, TimeoutRule, Waiting};
+use driml_protocol::{EndedEpisode, Horizon, Played, Returns, RunSpec, TimeoutRule, Waiting};
 use expect_test::expect;
 
 use super::*;
@@ -63,12 +63,30 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
     .unwrap();
     let (replay, learner) = statuses();
     let nothing = ReplayStatus::default();
-    let mut record = |replay: &ReplayStatus, learner: &LearnerStatus, rss: &[Option<f64>]| {
-        let said = recorder.record(std::slice::from_ref(replay), learner, rss);
-        assert!(said.is_empty(), "{said:?}");
+    let said = recorder.record(&[nothing], &LearnerStatus::default(), &[]);
+    assert!(said.is_empty(), "{said:?}");
+    let episode = EndedEpisode {
+        frames: 2_000,
+        actor: 0,
+        copy: 0,
+        played: Some(Played {
+            episode_return: 0.5,
+            steps: 9,
+        }),
     };
-    record(&nothing, &LearnerStatus::default(), &[]);
-    record(&replay, &learner, &[Some(12.34), None]);
+    let ended = EpisodesReply {
+        ended: 7,
+        before: 0,
+        episodes: vec![episode; 7],
+    };
+    let said = recorder.hear_episodes(std::slice::from_ref(&replay), &[(0, ended)]);
+    assert!(said.is_empty(), "{said:?}");
+    let said = recorder.record(
+        std::slice::from_ref(&replay),
+        &learner,
+        &[Some(12.34), None],
+    );
+    assert!(said.is_empty(), "{said:?}");
     assert!(recorder.missing().is_empty());
     let summary = recorder.summarise(Outcome::Finished, &spec(), &replay, &learner);
     summary.write(&run).unwrap();

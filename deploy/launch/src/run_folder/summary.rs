@@ -8,7 +8,7 @@ use driml_machine::units::duration;
 use driml_protocol::{LearnerStatus, Quantiles, ReplayStatus, RunSpec, whole_file};
 use serde::{Deserialize, Serialize};
 
-use super::{folder::RunFolder, returns::Episodes};
+use super::{episodes::Episodes, folder::RunFolder};
 
 /// How a run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{
-    CodecError, Hello, Keyed, Keys, LearnerStatus, PartsStatus, ReplayStatus, RunClient, codec,
-    reach,
+    CodecError, EpisodesReply, EpisodesRequest, Hello, Keyed, Keys, LearnerStatus, PartsStatus,
+    ReplayStatus, RunClient, codec, reach,
     session::{self, Endpoints, SMALL_MESSAGE_BYTES_MAX, SessionError},
     tls::Credentials,
 };
@@ -18,7 +18,7 @@ use super::{
     numbers::Numbers,
     snapshot::{ServerAnswer, Snapshot},
 };
-use crate::rates::Rates;
+use crate::{ended_episodes::EndedEpisodes, rates::Rates};
 
 /// How long an answer may take.
 const ANSWER_MAX: Duration = Duration::from_secs(3);
@@ -32,6 +32,8 @@ pub struct Connection {
     /// Each with its endpoint.
     servers: Vec<(String, RunClient)>,
     rates: Rates,
+    /// Episodes that ended and were not taken yet.
+    episodes: EndedEpisodes,
 }
 
 impl Connection {
@@ -94,7 +96,23 @@ impl Connection {
             after_updates,
             servers,
             rates: Rates::default(),
+            episodes: EndedEpisodes::default(),
         })
+    }
+
+    /// The episodes that ended by the last answers and were not fetched before, each answer with its shard. What a server does not
+    /// answer now comes the next time.
+    pub(crate) fn fetch_episodes(
+        &mut self,
+        shards: &[ReplayStatus],
+    ) -> Vec<(usize, EpisodesReply)> {
+        for (shard, ((_, client), status)) in self.servers.iter().zip(shards).enumerate() {
+            let ask = |since| client.ask(&EpisodesRequest { since }, ANSWER_MAX);
+            if let Err(e) = self.episodes.fetch(shard, status.episodes, ask) {
+                tracing::debug!("episodes of shard {shard}: {e}");
+            }
+        }
+        self.episodes.take()
     }
 
     /// Leaves the run.

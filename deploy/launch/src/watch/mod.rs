@@ -2,10 +2,11 @@
 //! It asks and never tells: the run goes on whether or not it is watched.
 
 mod folder;
+mod outputs;
 mod prometheus;
 mod watched;
 
-use std::{path::PathBuf, time::Duration};
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use driml_machine::error::{Interrupted, usage};
@@ -13,9 +14,10 @@ use driml_machine::error::{Interrupted, usage};
 use crate::{
     console,
     interrupts::Interrupts,
-    run_folder::{Outcome, RunFolder},
+    run_folder::Outcome,
     status::{self, Connection},
 };
+pub use outputs::Outputs;
 use prometheus::PrometheusFile;
 use watched::Watched;
 
@@ -23,17 +25,6 @@ use watched::Watched;
 const POLL: Duration = Duration::from_secs(1);
 /// The same once all frames are in: the learner's last word is not to be missed, as its process may end soon after.
 const LAST_POLL: Duration = Duration::from_millis(200);
-
-/// What is left of a run that is watched.
-#[derive(Clone, Debug, Default)]
-pub struct Outputs {
-    /// Where settings, metrics and summary go; none to only look.
-    pub run_dir: Option<RunFolder>,
-    /// Write TensorBoard's events there, too.
-    pub tensorboard: bool,
-    /// Where the numbers go in Prometheus' text format, at each answer.
-    pub prometheus: Option<PathBuf>,
-}
 
 /// Asks a run once, as `driml status` does, and prints what it is told; on request as JSON.
 ///
@@ -67,7 +58,7 @@ pub fn run(mut connection: Connection, outputs: &Outputs) -> anyhow::Result<()> 
     }
     let mut watched = Watched::new(&connection, &snapshot, outputs)?;
     let ended = loop {
-        match watched.take(&snapshot) {
+        match watched.take(&snapshot, &mut connection) {
             Ok(false) => {}
             Ok(true) => break Ok(Outcome::Finished),
             Err(e) => break Err(e),

@@ -5,12 +5,12 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use driml_machine::units::duration;
-use driml_protocol::{LearnerStatus, ReplayStatus};
+use driml_protocol::{LearnerStatus, ReplayStatus, Waiting};
 use driml_settings::config::RunConfig;
 
 use super::{
-    Outputs,
     folder::{self, Found},
+    outputs::Outputs,
 };
 use crate::{
     console::{self, Screen},
@@ -21,6 +21,8 @@ use crate::{
 
 /// How long replay servers that said that all is sampled may be silent before they have ended.
 const FAREWELL_MAX: Duration = Duration::from_secs(5);
+/// Seconds for which a run goes on at the most, as far as its clock is shown: ten years.
+const UP_MAX: f64 = 315_360_000.0;
 /// Actors of which nothing is heard that are named.
 const SILENT_NAMED: usize = 4;
 
@@ -82,7 +84,11 @@ impl Watched {
             replay_is_kept: true,
         };
         let start = Instant::now();
-        let up = Duration::try_from_secs_f64(up_s).unwrap_or_default();
+        let up = Duration::try_from_secs_f64(up_s.min(UP_MAX)).unwrap_or_default();
+        if let Some(bar) = screen.bar() {
+            // The view's clock is the run's. All copies of a bar are one.
+            drop(bar.clone().with_elapsed(up));
+        }
         Ok(Self {
             display: Display::new(screen.clone(), config.frames(), config.updates(), now),
             config,
@@ -102,7 +108,11 @@ impl Watched {
     ///
     /// # Errors
     /// Nobody of the run is there any more, or another one is.
-    pub(super) fn take(&mut self, snapshot: &Snapshot) -> anyhow::Result<bool> {
+    pub(super) fn take(
+        &mut self,
+        snapshot: &Snapshot,
+        connection: &mut Connection,
+    ) -> anyhow::Result<bool> {
         if let Some(other) = snapshot.servers.iter().find(|it| it.is_another_run) {
             bail!(
                 "a run with other settings has taken the place of this one on {}: watch it anew, with another --run-dir",
@@ -123,7 +133,7 @@ impl Watched {
         // Until the learner of a resumed run has answered, too.
         self.learner.updates = self.learner.updates.max(self.after_updates);
         if answered {
-            self.record();
+            self.record(connection);
         }
         let notes = self.notes(snapshot);
         let episodes = self.episodes();
@@ -137,13 +147,14 @@ impl Watched {
         self.screen.line(line);
     }
 
-    fn record(&mut self) {
+    fn record(&mut self, connection: &mut Connection) {
         let Some(recorder) = &mut self.recorder else {
             return;
         };
-        for line in recorder.record(&self.shards, &self.learner, &[]) {
-            self.screen.line(&line);
-        }
+        let ended = connection.fetch_episodes(&self.shards);
+        let mut said = recorder.hear_episodes(&self.shards, &ended);
+        said.extend(recorder.record(&self.shards, &self.learner, &[]));
+        said.iter().for_each(|line| self.screen.line(line));
     }
 
     /// Who does not answer, and for how long.
@@ -170,15 +181,15 @@ impl Watched {
         self.replay.finished
     }
 
-    fn is_over(&self) -> anyhow::Result<bool> {
+    fn is_over(&mut self) -> anyhow::Result<bool> {
         if self.replay.finished && self.learner.finished {
             return Ok(true);
         }
         let silent = self.replay_heard.elapsed();
-        let rows = u64::from(self.config.learner.batch_size);
-        let all_learned = self.learner.updates.saturating_mul(rows) >= self.replay.rows_sampled;
-        // Its launcher may have ended the learner before it was asked again.
-        if silent > FAREWELL_MAX && self.replay.finished && all_learned {
+        // They end by themselves once the learner has saved. Its last word may have gone to somebody else who asked, or it was ended
+        // by its launcher before it was asked again.
+        if silent > FAREWELL_MAX && self.replay.waiting == Waiting::Finished {
+            self.learn_all_that_was_served();
             return Ok(true);
         }
         let silent_max = Duration::from_millis(self.config.learner.unreachable_max_ms);
@@ -189,6 +200,22 @@ impl Watched {
             );
         }
         Ok(false)
+    }
+
+    /// Counts the updates of which the learner did not tell any more.
+    fn learn_all_that_was_served(&mut self) {
+        let updates = self.replay.rows_sampled / u64::from(self.config.learner.batch_size);
+        if self.learner.updates >= updates {
+            return;
+        }
+        self.screen.line(
+            "the learner's last word was not heard: its updates are those whose batches were served, its losses and weights those before",
+        );
+        self.learner.updates = updates;
+        if let Some(recorder) = &mut self.recorder {
+            let said = recorder.record(&self.shards, &self.learner, &[]);
+            said.iter().for_each(|line| self.screen.line(line));
+        }
     }
 
     fn episodes(&self) -> Episodes {

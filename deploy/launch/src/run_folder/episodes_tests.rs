@@ -1,0 +1,183 @@
+//! The table of episodes: each has one row, of every shard, over resumptions and where the server has let some go.
+
+use super::*;
+
+/// A shard in which so many episodes have ended, and those after the first `heard` of them; their returns are their numbers from
+/// `first`.
+struct Shard {
+    frames: u64,
+    ended: u64,
+    heard: u64,
+    first: u64,
+}
+
+impl Shard {
+    const fn of(frames: u64, heard: u64, ended: u64, first: u64) -> Self {
+        Self {
+            frames,
+            ended,
+            heard,
+            first,
+        }
+    }
+
+    fn status(&self) -> ReplayStatus {
+        ReplayStatus {
+            transitions_inserted: self.frames,
+            episodes: self.ended,
+            ..ReplayStatus::default()
+        }
+    }
+
+    fn reply(&self) -> EpisodesReply {
+        let episode = |n| EndedEpisode {
+            frames: self.frames,
+            actor: 4,
+            copy: 2,
+            played: Some(Played {
+                episode_return: (self.first + n) as f64,
+                steps: 9,
+            }),
+        };
+        EpisodesReply {
+            ended: self.ended,
+            before: self.heard,
+            episodes: (self.heard..self.ended).map(episode).collect(),
+        }
+    }
+}
+
+fn hear(episodes: &mut TrainingEpisodes, shards: &[Shard]) -> Vec<String> {
+    let statuses: Vec<_> = shards.iter().map(Shard::status).collect();
+    let replies = shards.iter().map(Shard::reply).enumerate();
+    let replies: Vec<_> = replies.filter(|it| !it.1.episodes.is_empty()).collect();
+    episodes.hear(&statuses, &replies, Some(1.5))
+}
+
+fn rows(folder: &RunFolder) -> Vec<String> {
+    let text = fs::read_to_string(folder.episodes()).unwrap();
+    text.lines().skip(1).map(str::to_owned).collect()
+}
+
+#[test]
+fn every_episode_is_taken_once_from_every_shard() {
+    let root = tempfile::tempdir().unwrap();
+    let folder = RunFolder::new(root.path());
+    let mut episodes = TrainingEpisodes::create(&folder).unwrap();
+    assert_eq!(episodes.mean(), None);
+    hear(
+        &mut episodes,
+        &[Shard::of(10, 0, 1, 0), Shard::of(5, 0, 0, 50)],
+    );
+    hear(
+        &mut episodes,
+        &[Shard::of(20, 1, 3, 0), Shard::of(5, 0, 1, 50)],
+    );
+    // An answer that came twice.
+    hear(
+        &mut episodes,
+        &[Shard::of(20, 1, 3, 0), Shard::of(5, 0, 1, 50)],
+    );
+    assert_eq!(
+        rows(&folder),
+        [
+            "1.500,10,1,4,2,0,9",
+            "1.500,20,2,4,2,1,9",
+            "1.500,20,3,4,2,2,9",
+            "1.500,20,4,4,2,50,9"
+        ]
+    );
+    let mean = MeanReturn {
+        mean: 53.0 / 4.0,
+        of: 4,
+    };
+    assert_eq!(episodes.mean(), Some(mean));
+    assert!(episodes.missing().is_empty());
+}
+
+#[test]
+fn what_the_server_has_let_go_is_counted_and_said() {
+    let root = tempfile::tempdir().unwrap();
+    let folder = RunFolder::new(root.path());
+    let mut episodes = TrainingEpisodes::create(&folder).unwrap();
+    hear(&mut episodes, &[Shard::of(10, 0, 5, 0)]);
+    let said = hear(&mut episodes, &[Shard::of(90, 155, 255, 0)]);
+    assert!(
+        said[0].starts_with("150 episodes have no row in episodes.csv"),
+        "{said:?}"
+    );
+    assert!(episodes.missing()[0].starts_with("150 episodes have no row"));
+    let mean = MeanReturn {
+        mean: (155.0 + 254.0) / 2.0,
+        of: 100,
+    };
+    assert_eq!(episodes.mean(), Some(mean));
+    let rows = rows(&folder);
+    assert_eq!(rows.len(), 105);
+    // 150 of them are in no row, but they have numbers.
+    assert_eq!(
+        [&rows[5], &rows[104]],
+        ["1.500,90,156,4,2,155,9", "1.500,90,255,4,2,254,9"]
+    );
+}
+
+#[test]
+fn an_episode_of_which_a_part_was_lost_has_a_row_and_no_return() {
+    let root = tempfile::tempdir().unwrap();
+    let folder = RunFolder::new(root.path());
+    let mut episodes = TrainingEpisodes::create(&folder).unwrap();
+    let shard = Shard::of(10, 0, 1, 0);
+    let mut reply = shard.reply();
+    reply.episodes[0].played = None;
+    episodes.hear(&[shard.status()], &[(0, reply)], None);
+    assert_eq!(rows(&folder), [",10,1,4,2,,"]);
+    assert_eq!(episodes.mean(), None);
+    drop(episodes);
+    let episodes = TrainingEpisodes::go_on(&folder, 10, true).unwrap();
+    assert_eq!((episodes.mean(), episodes.episode), (None, 1));
+}
+
+#[test]
+fn a_run_that_goes_on_has_the_episodes_before() {
+    let root = tempfile::tempdir().unwrap();
+    let folder = RunFolder::new(root.path());
+    let mut episodes = TrainingEpisodes::create(&folder).unwrap();
+    hear(&mut episodes, &[Shard::of(1_000, 0, 60, 0)]);
+    hear(&mut episodes, &[Shard::of(2_000, 60, 70, 0)]);
+    // What came after the checkpoint does not count, nor what was cut off.
+    hear(&mut episodes, &[Shard::of(3_000, 70, 90, 0)]);
+    let path = folder.episodes();
+    let text = fs::read_to_string(&path).unwrap();
+    fs::write(&path, text + "1.5,3000,91").unwrap();
+
+    let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, false).unwrap();
+    assert_eq!(episodes.mean().unwrap(), MeanReturn { mean: 34.5, of: 70 });
+    // Another server, which counts from the start; the replay fills again.
+    hear(&mut episodes, &[Shard::of(1_500, 0, 40, 1_000)]);
+    let expected: f64 = (10..70).chain(1_000..1_040).map(f64::from).sum();
+    assert_eq!(
+        episodes.mean().unwrap(),
+        MeanReturn {
+            mean: expected / 100.0,
+            of: 100
+        }
+    );
+    assert_eq!(rows(&folder).last().unwrap(), "1.500,2000,110,4,2,1039,9");
+
+    // A server that knows of those before, and of four more; it hands out all that it keeps.
+    let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, true).unwrap();
+    hear(&mut episodes, &[Shard::of(2_600, 0, 114, 0)]);
+    hear(&mut episodes, &[Shard::of(2_600, 114, 115, 0)]);
+    let text = rows(&folder);
+    assert_eq!(text[text.len() - 5], "1.500,2600,111,4,2,110,9");
+    assert_eq!(text.last().unwrap(), "1.500,2600,115,4,2,114,9");
+
+    fs::remove_file(&path).unwrap();
+    assert_eq!(
+        TrainingEpisodes::go_on(&folder, 9, false).unwrap().mean(),
+        None
+    );
+    fs::write(&path, "a,b,c\n1,x,3\n").unwrap();
+    let said = TrainingEpisodes::go_on(&folder, 9, false).unwrap_err();
+    assert!(said.to_string().contains("is no row of episodes"), "{said}");
+}

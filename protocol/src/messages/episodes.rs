@@ -1,0 +1,89 @@
+//! The episodes that ended, one by one, for whoever keeps a record of the run.
+//! Means over the newest of them are in `status`.
+
+use serde::{Deserialize, Serialize};
+use zenoh::qos::Priority;
+
+use crate::wire::{
+    error::CodecError,
+    message::{Keyed, Kind, Message, Request, no_payload},
+};
+
+/// Most episodes in one answer; those after it are asked for again. With the longest numbers it takes half of what a header may.
+pub const EPISODES_MAX: usize = 8_192;
+
+/// Asks for the episodes that ended after the first `since`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EpisodesRequest {
+    /// Episodes that the asker knows of already.
+    pub since: u64,
+}
+
+impl Message for EpisodesRequest {
+    const KIND: Kind = Kind::EpisodesRequest;
+}
+
+impl Keyed for EpisodesRequest {
+    const KEY: &'static str = "episodes";
+    const PRIORITY: Priority = Priority::InteractiveHigh;
+}
+
+impl Request for EpisodesRequest {
+    type Reply = EpisodesReply;
+}
+
+/// An episode that ended: by the rules of the world, or by its step limit.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EndedEpisode {
+    /// Transitions that the run had stored with the chunk that held its end.
+    pub frames: u64,
+    /// The actor that played it.
+    pub actor: u32,
+    /// The copy of the actor's world in which it was played, from 0.
+    pub copy: u32,
+    /// What all of it earned; none if a part of it was lost.
+    pub played: Option<Played>,
+}
+
+/// What is known of an episode of which all was seen, up to some step.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Played {
+    /// Undiscounted return.
+    pub episode_return: f64,
+    /// Steps.
+    pub steps: u64,
+}
+
+/// Episodes in the order in which their ends were stored.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct EpisodesReply {
+    /// How many ended in all. Fewer than the asker knows of: this replay server counts anew.
+    pub ended: u64,
+    /// How many ended before the first of these. More than were asked for: those between are not kept any more.
+    pub before: u64,
+    /// At most [`EPISODES_MAX`].
+    pub episodes: Vec<EndedEpisode>,
+}
+
+impl EpisodesReply {
+    /// How many ended up to the last of these.
+    pub const fn up_to(&self) -> u64 {
+        self.before.saturating_add(self.episodes.len() as u64)
+    }
+}
+
+impl Message for EpisodesReply {
+    const KIND: Kind = Kind::EpisodesReply;
+
+    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+        if self.up_to() > self.ended || self.episodes.len() > EPISODES_MAX {
+            return Err(CodecError::Header(format!(
+                "{} episodes after {}, where {} ended",
+                self.episodes.len(),
+                self.before,
+                self.ended
+            )));
+        }
+        no_payload(payload)
+    }
+}
