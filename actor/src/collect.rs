@@ -200,7 +200,9 @@ impl Collector {
 #[cfg(test)]
 mod tests {
     use driml_envs::{CorridorConfig, WorldConfig};
-    use driml_model::{Compute, ConvLayer, DimHeads, InputSize, ModelConfig, Parameters};
+    use driml_model::{
+        Compute, ConvLayer, DimHeads, HeadConfig, InputSize, ModelConfig, Parameters,
+    };
     use driml_protocol::{Horizon, TimeoutRule, config::TransportConfig};
 
     use super::*;
@@ -261,6 +263,7 @@ mod tests {
                 rkhs: 4,
                 action_embed: 4,
                 dim: DimHeads::NONE,
+                head: HeadConfig::PLAIN,
             },
             actor: Config {
                 actions: driml_envs::ActionSet::All,

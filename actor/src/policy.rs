@@ -140,7 +140,7 @@ impl Policy for NetworkPolicy {
 
 #[cfg(test)]
 mod tests {
-    use driml_model::{Compute, ConvLayer, DimHeads, Parameters};
+    use driml_model::{Compute, ConvLayer, DimHeads, HeadConfig, Parameters};
     use rand::SeedableRng;
 
     use super::*;
@@ -170,6 +170,7 @@ mod tests {
             rkhs: 4,
             action_embed: 4,
             dim: DimHeads::NONE,
+            head: HeadConfig::PLAIN,
         };
         let rng = &mut ChaCha8Rng::seed_from_u64(seed);
         let weights = Parameters::init(&model, rng, &Compute::CPU.device).unwrap();

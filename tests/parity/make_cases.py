@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Makes the parity cases of the agents that came after the first five files: no_action, cpc*, curl*.
+"""Makes the parity cases of what came after the first five files: no_action, cpc*, curl*, dueling.
 
 Needs PyTorch and safetensors; nothing in the project needs either. Everything is float64 and automatic differentiation, and
 written from the formulas in README.md, not from the learner's code.
@@ -33,6 +33,11 @@ def block(p, name, x):
     return out + F.linear(x, p[f"{name}.skip.weight"], p.get(f"{name}.skip.bias"))
 
 
+def linear(p, name, x):
+    """A linear layer of the C51 head."""
+    return F.linear(x, p[f"{name}.weight"], p[f"{name}.bias"])
+
+
 def features(p, config, frames):
     """f3 [B, locations, channels] and f4 [B, hidden] of bytes [B, H, W, C]."""
     x = frames.double().permute(0, 3, 1, 2) / 255
@@ -44,8 +49,12 @@ def features(p, config, frames):
 
 def distribution(p, config, f4):
     """Logarithms of the return distributions [B, actions, atoms]."""
-    logits = F.linear(F.relu(f4), p["head.weight"], p["head.bias"])
-    return F.log_softmax(logits.view(len(f4), config["actions"], config["atoms"]), 2)
+    sizes = (len(f4), config["actions"], config["atoms"])
+    if not config.get("head", {}).get("dueling"):
+        return F.log_softmax(linear(p, "head", F.relu(f4)).view(sizes), 2)
+    advantage = linear(p, "head.advantage", F.relu(f4)).view(sizes)
+    value = linear(p, "head.value", F.relu(f4))[:, None]
+    return F.log_softmax(value + advantage - advantage.mean(1, keepdim=True), 2)
 
 
 def embedded(p, config, action):
@@ -199,7 +208,12 @@ def shapes(config, heads, action):
         layer(f"torso.conv{i}", [out, channels, kernel, kernel])
         height, width, channels = (height - kernel) // stride + 1, (width - kernel) // stride + 1, out
     layer("torso.fc", [model["hidden"], height * width * channels])
-    layer("head", [config["actions"] * config["atoms"], model["hidden"]])
+    outputs = config["actions"] * config["atoms"]
+    if config.get("head", {}).get("dueling"):
+        layer("head.value", [config["atoms"], model["hidden"]])
+        layer("head.advantage", [outputs, model["hidden"]])
+    else:
+        layer("head", [outputs, model["hidden"]])
     if action:
         residual("dim.action", config["actions"], model["action_embed"], True)
     for head in heads:
@@ -290,6 +304,10 @@ CASES = {
     "curl_clipped": dict(
         seed=15, rows=9, height=44, width=36, objective="curl", lambdas=[0.0, 0.0, 0.0, 0.5], heads=["psi4"],
         double_dqn=True, max_grad_norm=0.25, tanh_clip=5.0, key_tau=0.3,
+    ),
+    "dueling": dict(
+        seed=16, rows=8, height=36, width=44, objective="dim", lambdas=[0.5, 0.0, 0.0, 1.0], action=True,
+        double_dqn=True, head={"dueling": True},
     ),
 }  # fmt: skip
 

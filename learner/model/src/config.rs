@@ -5,6 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{ModelError, Result};
 use crate::geometry::{ConvLayer, ConvShape};
+pub(crate) use crate::heads::config::HeadConfig;
+use crate::heads::streams::{ADVANTAGE, HEAD, VALUE};
 use crate::init::InitialLaw;
 
 /// Largest size of any one dimension; a configuration beyond it is rejected.
@@ -44,6 +46,9 @@ pub struct ModelConfig {
     pub action_embed: usize,
     /// Which DIM heads exist.
     pub dim: DimHeads,
+    /// How the C51 head is made. Settings of earlier versions do not have it: one linear layer.
+    #[serde(default, skip_serializing_if = "HeadConfig::is_plain")]
+    pub head: HeadConfig,
 }
 
 /// Which DIM heads exist. Nothing is built that no lambda needs.
@@ -249,12 +254,16 @@ impl ModelConfig {
             .saturating_mul(local_width)
             .saturating_mul(local_channels);
         layer("torso.fc", vec![self.hidden, flat], true, Orthogonal);
-        layer(
-            "head",
-            vec![self.num_actions.saturating_mul(self.atoms), self.hidden],
-            true,
-            Uniform,
-        );
+        let mut of_f4 = |name: &str, outputs: usize| {
+            layer(name, vec![outputs, self.hidden], true, Uniform);
+        };
+        let outputs = self.num_actions.saturating_mul(self.atoms);
+        if self.head.dueling {
+            of_f4(VALUE, self.atoms);
+            of_f4(ADVANTAGE, outputs);
+        } else {
+            of_f4(HEAD, outputs);
+        }
 
         // A residual block; its skip matrix starts orthogonal whatever the law of its two other layers.
         let mut block =

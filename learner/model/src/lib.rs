@@ -7,14 +7,14 @@
 //!
 //! ```
 //! use candle_core::{Device, Tensor};
-//! use driml_model::{ConvLayer, DimHeads, ModelConfig, Network, Parameters};
+//! use driml_model::{HeadConfig, ConvLayer, DimHeads, ModelConfig, Network, Parameters};
 //! use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 //!
 //! let no_heads = DimHeads { psi3: false, phi3: false, psi4: false, phi4: false, action: false };
 //! let config = ModelConfig {
 //!     height: 8, width: 8, channels: 1, num_actions: 3, atoms: 5, v_min: -1.0, v_max: 1.0,
 //!     conv: vec![ConvLayer { out: 4, kernel: 4, stride: 2 }],
-//!     hidden: 8, rkhs: 8, action_embed: 2, dim: no_heads,
+//!     hidden: 8, rkhs: 8, action_embed: 2, dim: no_heads, head: HeadConfig::PLAIN,
 //! };
 //! let rng = &mut ChaCha8Rng::seed_from_u64(1);
 //! let parameters = Parameters::init(&config, rng, &Device::Cpu)?;
@@ -52,6 +52,7 @@ pub use error::{ModelError, Result};
 pub use geometry::{ConvLayer, ConvShape, reach};
 pub use gradients::Backward;
 pub use heads::c51::EXPECTED_RETURN_ERROR;
+pub use heads::config::HeadConfig;
 pub use input::{Enlarge, FrameSize, InputRead, InputSize};
 pub use kernels::conv::{conv_stack, conv2d_relu};
 pub use kernels::exponentials::{exp_below, soft_clip};

@@ -11,6 +11,7 @@ use rayon::prelude::*;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
 use crate::heads::c51::expected_returns;
+use crate::heads::streams::{ADVANTAGE, HEAD, VALUE, duel};
 use crate::kernels::buffer::Buffer;
 use crate::kernels::convolution::{Convolution, forward};
 use crate::kernels::images::{Images, PADDING, Pixels};
@@ -190,8 +191,24 @@ impl<U: Unit> UnitWeights<U> {
         let fc_weight = transposed(&take("torso.fc.weight"), config.hidden, column);
         let fc = Dense::new(unit, &fc_weight, take("torso.fc.bias"));
         let outputs = config.num_actions * config.atoms;
-        let head_weight = transposed(&take("head.weight"), outputs, |input| input);
-        let head = Dense::new(unit, &head_weight, take("head.bias"));
+        let mut layer = |name: &str, outputs: usize| {
+            let weight = take(&format!("{name}.weight"));
+            let weight = transposed(&weight, outputs, |input| input);
+            (weight, take(&format!("{name}.bias")))
+        };
+        let (head_weight, head_bias) = if config.head.dueling {
+            let (value, value_bias) = layer(VALUE, config.atoms);
+            let (mut weight, mut bias) = layer(ADVANTAGE, outputs);
+            let inputs = value.chunks_exact(config.atoms);
+            for (value, weight) in inputs.zip(weight.chunks_exact_mut(outputs)) {
+                duel(value, weight);
+            }
+            duel(&value_bias, &mut bias);
+            (weight, bias)
+        } else {
+            layer(HEAD, outputs)
+        };
+        let head = Dense::new(unit, &head_weight, head_bias);
         Ok(Self {
             unit,
             convolutions,

@@ -9,7 +9,7 @@ use std::{
 };
 
 use candle_core::{DType, Device, Tensor};
-use driml_model::{ConvLayer, DimHeads, ModelConfig};
+use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig};
 use driml_protocol::NO_ACTION;
 use safetensors::SafeTensors;
 use serde::Deserialize;
@@ -86,6 +86,9 @@ struct Config {
     /// Pace of the key encoder; not there for an objective without one.
     key_tau: Option<f64>,
     model: Sizes,
+    /// Not there: one linear layer.
+    #[serde(default)]
+    head: HeadConfig,
 }
 
 #[derive(Debug, Deserialize)]
@@ -243,6 +246,7 @@ impl Case {
             v_min,
             v_max,
             model,
+            head,
             ..
         } = &self.config;
         let conv = |&(out, kernel, stride): &(usize, usize, usize)| ConvLayer {
@@ -263,6 +267,7 @@ impl Case {
             rkhs: model.rkhs,
             action_embed: model.action_embed,
             dim,
+            head: *head,
         }
     }
 

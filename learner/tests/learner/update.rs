@@ -10,7 +10,9 @@ use driml_protocol::NO_ACTION;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::made_up::{ALL_DIM, CANDLE, NO_DIM, Rows, agent, agent_on, model, settings};
+use crate::made_up::{
+    ALL_DIM, CANDLE, DUELING, NO_DIM, Rows, agent, agent_on, agent_with, model, settings,
+};
 
 type Values = HashMap<String, Vec<f32>>;
 
@@ -54,9 +56,7 @@ fn changed(agent: &Agent, change: impl Fn(&str, &mut [f32])) -> Agent {
 
 #[test]
 fn the_gradient_is_the_slope_of_the_total_in_every_part() {
-    let (agent, rows) = (agent(ALL_DIM, 1), Rows::random(9, 2));
-    let evaluation = agent.evaluate(&rows.batch()).unwrap();
-    for part in [
+    let every = [
         "torso.conv1",
         "torso.conv2",
         "torso.fc",
@@ -66,7 +66,17 @@ fn the_gradient_is_the_slope_of_the_total_in_every_part() {
         "dim.phi3",
         "dim.psi4",
         "dim.phi4",
-    ] {
+    ];
+    is_the_slope(&agent(ALL_DIM, 1), &every);
+    let dueling = agent_with(DUELING, settings(ALL_DIM), 1);
+    is_the_slope(&dueling, &["torso.fc", "head.value", "head.advantage"]);
+}
+
+/// Whether the gradient is the slope of the total in each of these parts of the network.
+fn is_the_slope(agent: &Agent, parts: &[&str]) {
+    let rows = Rows::random(9, 2);
+    let evaluation = agent.evaluate(&rows.batch()).unwrap();
+    for part in parts {
         let mut direction = Values::new();
         for (name, _) in agent
             .online()
@@ -87,7 +97,7 @@ fn the_gradient_is_the_slope_of_the_total_in_every_part() {
         assert!(norm > 1e-5, "{part} has a gradient of {norm}");
         let step = 2e-3;
         let total = |by: f64| {
-            let moved = changed(&agent, |name, values| {
+            let moved = changed(agent, |name, values| {
                 if let Some(gradient) = direction.get(name) {
                     values
                         .iter_mut()

@@ -6,7 +6,9 @@ use driml_model::{
     Backward, ConvLayer, DimHeads, Kernels, ModelConfig, ModelError, Network, Parameters, Precision,
 };
 
-use crate::support::{assert_close, bits, frames, parameters, rng, small, values, variable};
+use crate::support::{
+    DUELING, assert_close, bits, frames, parameters, rng, small, small_with, values, variable,
+};
 
 /// out(relu(hidden(x))) + skip(x) by candle's operations, x [rows, in].
 fn stock_block(parameters: &Parameters, name: &str, x: &Tensor) -> Result<Tensor> {
@@ -81,7 +83,7 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
             .to_vec(),
         ..small()
     };
-    for config in [odd, even] {
+    for config in [odd, even, small_with(DUELING)] {
         let parameters = with_biases(&config);
         let (ours, mut our_gradients) =
             outputs_and_gradients(&config, &parameters, Kernels::FUSED)?;
@@ -169,16 +171,17 @@ fn the_dim_heads_follow_their_formula_with_gradients() -> Result<()> {
 #[test]
 fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
     for precision in Precision::ALL {
-        the_same_bits_for_any_number_of_threads(precision);
+        the_same_bits_for_any_number_of_threads(precision, &small());
+        the_same_bits_for_any_number_of_threads(precision, &small_with(DUELING));
     }
 }
 
-fn the_same_bits_for_any_number_of_threads(precision: Precision) {
-    let config = small();
-    let parameters = with_biases(&config);
+fn the_same_bits_for_any_number_of_threads(precision: Precision, config: &ModelConfig) {
+    let head = if config.head.dueling { 4 } else { 2 };
+    let parameters = with_biases(config);
     let kernels = Kernels::Fused(precision);
-    let network = Network::with_kernels(&config, &parameters, kernels).unwrap();
-    let batch = frames(&config, 61, &mut rng(2));
+    let network = Network::with_kernels(config, &parameters, kernels).unwrap();
+    let batch = frames(config, 61, &mut rng(2));
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
@@ -200,10 +203,42 @@ fn the_same_bits_for_any_number_of_threads(precision: Precision) {
         })
     };
     let one = run(1);
-    assert_eq!(one.1.len(), 8 + 2 + 5, "torso, head, phi3");
+    assert_eq!(one.1.len(), 8 + head + 5, "torso, head, phi3");
     for threads in [2, 3] {
         assert!(run(threads) == one, "{threads} threads");
     }
+}
+
+/// Logits as the paper writes them, V + A - mean_a A after two products, and the same of one action a row.
+#[test]
+fn a_dueling_head_is_the_sum_of_its_streams() -> Result<()> {
+    let config = small_with(DUELING);
+    let parameters = with_biases(&config);
+    let network = Network::new(&config, &parameters).unwrap();
+    let f4 = crate::support::floats(&[6, config.hidden], &mut rng(4));
+    let stream = |name: &str, outputs: &[usize]| -> Result<Tensor> {
+        let weight = parameters.get(&format!("{name}.weight")).unwrap();
+        let bias = parameters.get(&format!("{name}.bias")).unwrap();
+        let outputs = [&[6], outputs].concat();
+        let y = f4.relu()?.matmul(&weight.t()?)?.broadcast_add(bias)?;
+        y.reshape(outputs)
+    };
+    let value = stream("head.value", &[1, 11])?;
+    let advantage = stream("head.advantage", &[5, 11])?;
+    let centred = advantage.broadcast_sub(&advantage.mean_keepdim(1)?)?;
+    let wanted = centred.broadcast_add(&value)?;
+    let found = network.logits(&f4).unwrap();
+    assert_close("logits", &found, &wanted, 1e-6);
+    let taken = [4u8, 0, 3, 3, 1, 2];
+    let found = values(&network.taken_logits(&f4, &taken).unwrap());
+    let wanted = values(&wanted);
+    for (row, action) in taken.into_iter().enumerate() {
+        let wanted = &wanted[(row * 5 + usize::from(action)) * 11..][..11];
+        for (found, wanted) in found[row * 11..].iter().zip(wanted) {
+            assert!((found - wanted).abs() < 1e-5, "{found} and {wanted}");
+        }
+    }
+    Ok(())
 }
 
 #[test]

@@ -2,13 +2,18 @@
 //! Loading broken weights is tested with the weights.
 
 use candle_core::{Device, Tensor};
-use driml_model::{ModelConfig, ModelError, Network, PolicyNetwork, Precision};
+use driml_model::{HeadConfig, ModelConfig, ModelError, Network, PolicyNetwork, Precision};
 
-use crate::support::{bytes, parameters, rng, small};
+use crate::support::{DUELING, bytes, parameters, rng, small, small_with};
 
 #[test]
 fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
-    let config = small();
+    for head in [HeadConfig::PLAIN, DUELING] {
+        it_agrees_with_the_network(small_with(head));
+    }
+}
+
+fn it_agrees_with_the_network(config: ModelConfig) {
     let parameters = parameters(&config, 3);
     let network = Network::new(&config, &parameters).unwrap();
     let mut policy = PolicyNetwork::new(

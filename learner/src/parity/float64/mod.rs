@@ -251,6 +251,7 @@ mod tests {
         for name in [
             "all_four",
             "c51_only",
+            "dueling",
             "double_dqn_clipped",
             "global_global",
             "masked_positives",

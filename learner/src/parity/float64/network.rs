@@ -72,8 +72,17 @@ impl<'a> Net<'a> {
     /// Logits [B, A, N].
     pub(super) fn logits(&self, f4: &Tensor) -> candle_core::Result<Tensor> {
         let (actions, atoms) = (self.model.num_actions, self.model.atoms);
-        self.linear("head", &f4.relu()?)?
-            .reshape(((), actions, atoms))
+        let active = f4.relu()?;
+        if !self.model.head.dueling {
+            return self.linear("head", &active)?.reshape(((), actions, atoms));
+        }
+        let advantage = self
+            .linear("head.advantage", &active)?
+            .reshape(((), actions, atoms))?;
+        let value = self.linear("head.value", &active)?.unsqueeze(1)?;
+        advantage
+            .broadcast_sub(&advantage.mean_keepdim(1)?)?
+            .broadcast_add(&value)
     }
 
     /// Values [B, A] of `logits` [B, A, N].
