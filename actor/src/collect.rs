@@ -126,7 +126,8 @@ impl Collector {
             settings.input.enlarge(sent, &settings.model)?,
             safetensors,
             settings.actor.precision,
-        )?;
+        )?
+        .with_noise();
         Ok(Self {
             acting: Acting::new(world, spec.frame_stack as usize, rng)?,
             recorder: ChunkRecorder::new(

@@ -8,6 +8,7 @@ use crate::geometry::{ConvLayer, ConvShape};
 pub(crate) use crate::heads::config::HeadConfig;
 use crate::heads::streams::{ADVANTAGE, HEAD, VALUE};
 use crate::init::InitialLaw;
+use crate::layers::LayerShape;
 
 /// Largest size of any one dimension; a configuration beyond it is rejected.
 const DIMENSION_MAX: usize = 1 << 16;
@@ -88,7 +89,7 @@ impl ModelConfig {
     ///
     /// # Errors
     /// [`ModelError::Config`] names the field: a size of 0 or above 65,536, a kernel larger than its input, a parameter
-    /// of more than 2^28 scalars, more than 255 actions, fewer than 2 atoms, `v_min` not below `v_max`, one of them beyond 1e30, no
+    /// of more than 2^28 scalars, more than 255 actions, fewer than 2 atoms, a `head.noisy_sigma` out of its range, `v_min` not below `v_max`, one of them beyond 1e30, no
     /// convolution.
     pub fn validate(&self) -> Result<()> {
         let fail = |what: String| Err(ModelError::Config(what));
@@ -129,6 +130,7 @@ impl ModelConfig {
                 self.v_min, self.v_max
             ));
         }
+        self.head.validate()?;
         if self.conv.is_empty() {
             return fail("conv is empty, at least one convolution is needed".to_owned());
         }
@@ -215,15 +217,17 @@ impl ModelConfig {
     /// weights are drawn, so the torso's and the head's do not depend on which DIM heads exist.
     pub fn parameter_shapes(&self) -> Vec<(String, Vec<usize>)> {
         let layers = self.layers().into_iter();
-        layers
-            .flat_map(|layer| {
-                let bias = (layer.bias_name(), vec![layer.weight[0]]);
-                let bias = layer.bias.then_some(bias);
-                [(layer.weight_name(), layer.weight)]
-                    .into_iter()
-                    .chain(bias)
-            })
-            .collect()
+        layers.flat_map(|layer| layer.parameters()).collect()
+    }
+
+    /// Names and outputs of the C51 head's layers, all of which take f4: the value's and the advantage's of a dueling head, else one.
+    pub(crate) fn head_layers(&self) -> Vec<(&'static str, usize)> {
+        let outputs = self.num_actions.saturating_mul(self.atoms);
+        if self.head.dueling {
+            vec![(VALUE, self.atoms), (ADVANTAGE, outputs)]
+        } else {
+            vec![(HEAD, outputs)]
+        }
     }
 
     /// All layers in the order of [`ModelConfig::parameter_shapes`].
@@ -236,6 +240,7 @@ impl ModelConfig {
                 weight,
                 bias,
                 initial,
+                noisy_sigma: self.head.noisy_sigma.filter(|_| name.starts_with(HEAD)),
             });
         };
 
@@ -254,15 +259,9 @@ impl ModelConfig {
             .saturating_mul(local_width)
             .saturating_mul(local_channels);
         layer("torso.fc", vec![self.hidden, flat], true, Orthogonal);
-        let mut of_f4 = |name: &str, outputs: usize| {
+        // The means of noisy layers too, as Fortunato et al. 2018 draw them.
+        for (name, outputs) in self.head_layers() {
             layer(name, vec![outputs, self.hidden], true, Uniform);
-        };
-        let outputs = self.num_actions.saturating_mul(self.atoms);
-        if self.head.dueling {
-            of_f4(VALUE, self.atoms);
-            of_f4(ADVANTAGE, outputs);
-        } else {
-            of_f4(HEAD, outputs);
         }
 
         // A residual block; its skip matrix starts orthogonal whatever the law of its two other layers.
@@ -304,27 +303,5 @@ impl ModelConfig {
             }
         }
         layers
-    }
-}
-
-/// A layer's name, the shapes of its parameters, and how they are drawn at the start of a run.
-///
-/// Source of the laws: the paper authors' code. A C51 head that starts orthogonal too gives first Q values twice as large,
-/// and with a target network that moves once in 312 updates these outlive 100,000 frames.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct LayerShape {
-    pub(crate) name: String,
-    pub(crate) weight: Vec<usize>,
-    pub(crate) bias: bool,
-    pub(crate) initial: InitialLaw,
-}
-
-impl LayerShape {
-    pub(crate) fn weight_name(&self) -> String {
-        format!("{}.weight", self.name)
-    }
-
-    pub(crate) fn bias_name(&self) -> String {
-        format!("{}.bias", self.name)
     }
 }

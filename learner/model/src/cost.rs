@@ -44,6 +44,10 @@ impl ModelConfig {
         let costs = layers.map(|(index, layer)| {
             let weight_len = layer.weight.iter().product::<usize>();
             let outputs = layer.weight[0];
+            let scalars = |of: &[(String, Vec<usize>)]| -> u64 {
+                let each = of.iter().map(|(_, shape)| shape.iter().product::<usize>());
+                each.sum::<usize>() as u64
+            };
             let is_of = |part: &str| layer.name.starts_with(part);
             // Products of each location, and those of what is joined to all locations of a state.
             let products = if layer.name == VALUE {
@@ -69,7 +73,7 @@ impl ModelConfig {
             LayerCost {
                 forward,
                 backward: if is_first { forward } else { 2 * forward },
-                parameters: (weight_len + if layer.bias { outputs } else { 0 }) as u64,
+                parameters: scalars(&layer.parameters()),
                 name: layer.name,
             }
         });
@@ -230,7 +234,9 @@ mod tests {
         let every = every_head();
         let mut dueling = every.without_dim();
         dueling.head.dueling = true;
-        for config in [dueling, every.without_dim(), every] {
+        let mut noisy = dueling.clone();
+        noisy.head.noisy_sigma = Some(0.5);
+        for config in [dueling, noisy, every.without_dim(), every] {
             let rng = &mut ChaCha8Rng::seed_from_u64(1);
             let built = Parameters::init(&config, rng, &Device::Cpu).unwrap();
             for layer in config.layer_costs() {

@@ -2,8 +2,10 @@
 //! It has never heard of processes, replay or worlds, and it computes no loss.
 //!
 //! The learner differentiates through [`Network`]; an actor uses [`PolicyNetwork`], which runs the same kernels without
-//! a graph. [`Parameters`] hold the weights under PyTorch's names and shapes. Start at [`ModelConfig`], which fixes every
-//! shape, and at [`Network::features`]:
+//! a graph. The C51 head may be a dueling one, and noisy ([`HeadConfig`]): whatever it is made of, it amounts to one linear
+//! layer, so nothing after it knows. Noise is given from outside ([`HeadNoise`]); without it the means serve.
+//! [`Parameters`] hold the weights under PyTorch's names and shapes. Start at [`ModelConfig`], which fixes every shape, and
+//! at [`Network::features`]:
 //!
 //! ```
 //! use candle_core::{Device, Tensor};
@@ -38,6 +40,7 @@ mod heads;
 mod init;
 mod input;
 mod kernels;
+mod layers;
 mod network;
 mod parameters;
 mod policy;
@@ -53,6 +56,7 @@ pub use geometry::{ConvLayer, ConvShape, reach};
 pub use gradients::Backward;
 pub use heads::c51::EXPECTED_RETURN_ERROR;
 pub use heads::config::HeadConfig;
+pub use heads::noise::HeadNoise;
 pub use input::{Enlarge, FrameSize, InputRead, InputSize};
 pub use kernels::conv::{conv_stack, conv2d_relu};
 pub use kernels::exponentials::{exp_below, soft_clip};

@@ -9,7 +9,7 @@ use std::{
 };
 
 use candle_core::{DType, Device, Tensor};
-use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig};
+use driml_model::{ConvLayer, DimHeads, HeadConfig, HeadNoise, ModelConfig};
 use driml_protocol::NO_ACTION;
 use safetensors::SafeTensors;
 use serde::Deserialize;
@@ -18,6 +18,7 @@ use crate::{
     auxiliary::{Objective, dim::DIM, positives::Positives, settings::Lambda},
     batch::Batch,
     error::UpdateError,
+    noise::UpdateNoise,
     optimiser::adam::AdamSettings,
     settings::LearnerSettings,
 };
@@ -269,6 +270,22 @@ impl Case {
             dim,
             head: *head,
         }
+    }
+
+    /// The noise that the case gives for noisy layers, made of its normal numbers.
+    pub(super) fn noise(&self, model: &ModelConfig) -> Result<UpdateNoise, ParityError> {
+        let of = |who: &str| {
+            HeadNoise::of_normals(model, |layer, side, len| {
+                let name = format!("noise.{who}.{layer}.{side}");
+                let tensor = self.input(&name, DType::F32, &[len])?;
+                Ok::<_, ParityError>(tensor.to_dtype(DType::F64)?.to_vec1()?)
+            })
+        };
+        Ok(UpdateNoise {
+            online: of("online")?,
+            choice: of("choice")?,
+            target: of("target")?,
+        })
     }
 
     pub(super) fn batch(&self) -> Batch<'_> {

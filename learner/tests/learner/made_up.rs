@@ -94,7 +94,20 @@ pub(crate) fn agent_with(head: HeadConfig, settings: LearnerSettings, seed: u64)
     Agent::new(model, settings, &Compute::CPU, rng).unwrap()
 }
 
-pub(crate) const DUELING: HeadConfig = HeadConfig { dueling: true };
+pub(crate) const DUELING: HeadConfig = HeadConfig {
+    dueling: true,
+    noisy_sigma: None,
+};
+pub(crate) const NOISY: HeadConfig = HeadConfig {
+    dueling: false,
+    noisy_sigma: Some(0.5),
+};
+
+/// Rainbow's.
+pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
+    dueling: true,
+    noisy_sigma: Some(0.5),
+};
 
 /// The operations of a GPU, on the CPU.
 pub(crate) const CANDLE: Compute = Compute {

@@ -10,6 +10,7 @@ use rayon::prelude::*;
 use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::Result;
+use crate::heads::noise::HeadNoise;
 use crate::heads::streams::{LinearLayer, Streams};
 use crate::kernels::exponentials::exp_below;
 use crate::kernels::linear::floats;
@@ -42,18 +43,23 @@ impl C51Head {
         })
     }
 
-    /// Logits [B, A, atoms] of f4 [B, hidden] before its ReLU.
-    pub(crate) fn logits(&self, f4: &Tensor) -> Result<Tensor> {
+    /// Logits [B, A, atoms] of f4 [B, hidden] before its ReLU; a noisy layer without noise is its mean.
+    pub(crate) fn logits(&self, f4: &Tensor, noise: Option<&HeadNoise>) -> Result<Tensor> {
         let active = self.kernels.relu(f4)?;
-        let layer = self.streams.layer()?;
+        let layer = self.streams.layer(noise)?;
         let logits = self.kernels.linear(&active, &layer.weight, &layer.bias)?;
         Ok(logits.reshape(((), self.actions, self.atoms))?)
     }
 
     /// Of those logits the ones [B, atoms] of one action a row.
-    pub(crate) fn taken_logits(&self, f4: &Tensor, actions: &[u8]) -> Result<Tensor> {
+    pub(crate) fn taken_logits(
+        &self,
+        f4: &Tensor,
+        actions: &[u8],
+        noise: Option<&HeadNoise>,
+    ) -> Result<Tensor> {
         let active = self.kernels.relu(f4)?;
-        let LinearLayer { weight, bias } = self.streams.layer()?;
+        let LinearLayer { weight, bias } = self.streams.layer(noise)?;
         Ok(self
             .kernels
             .grouped_linear(&active, &weight, &bias, actions, self.atoms)?)

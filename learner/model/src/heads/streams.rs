@@ -2,13 +2,14 @@
 //! It applies no layer.
 //!
 //! Both streams of a dueling head are linear in the same relu(f4), so V + A - mean_a A is a linear layer too, whose weight is made of
-//! theirs in the same way. It is made once a pass, whatever the number of rows, and from there on a dueling head costs what a plain
-//! one does: of the actions taken alone if that is all that is asked for.
+//! theirs in the same way; and a noisy layer is mu + sigma * eps before it is anything. The layer is made once a pass, whatever the
+//! number of rows, and from there on any head costs what a plain one does: of the actions taken alone if that is all that is asked for.
 
 use candle_core::{D, Tensor};
 
 use crate::config::ModelConfig;
-use crate::error::Result;
+use crate::error::{ModelError, Result};
+use crate::heads::noise::HeadNoise;
 use crate::parameters::Parameters;
 
 /// Name of the head, and of its streams if it is a dueling one.
@@ -16,63 +17,97 @@ pub(crate) const HEAD: &str = "head";
 pub(crate) const VALUE: &str = "head.value";
 pub(crate) const ADVANTAGE: &str = "head.advantage";
 
-/// Weight [A * N, in] and bias [A * N] of a linear layer.
+/// Weight [out, in] and bias [out] of a linear layer.
 #[derive(Clone, Debug)]
 pub(crate) struct LinearLayer {
     pub(crate) weight: Tensor,
     pub(crate) bias: Tensor,
 }
 
-/// The head's parameters.
+/// A layer of the head: what it is without noise, and what scales its noise if it is a noisy one.
 #[derive(Debug)]
-pub(crate) enum Streams {
-    One(LinearLayer),
-    Dueling {
-        /// Of N outputs.
-        value: LinearLayer,
-        /// Of A * N outputs.
-        advantage: LinearLayer,
-        atoms: usize,
-    },
+struct HeadLayer {
+    mean: LinearLayer,
+    sigma: Option<LinearLayer>,
+}
+
+impl HeadLayer {
+    fn new(name: &str, config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
+        let layer = |end: &str| -> Result<LinearLayer> {
+            Ok(LinearLayer {
+                weight: parameters.tensor(name, &format!("weight{end}"))?,
+                bias: parameters.tensor(name, &format!("bias{end}"))?,
+            })
+        };
+        Ok(if config.head.noisy_sigma.is_some() {
+            Self {
+                mean: layer("_mu")?,
+                sigma: Some(layer("_sigma")?),
+            }
+        } else {
+            Self {
+                mean: layer("")?,
+                sigma: None,
+            }
+        })
+    }
+
+    /// mu + sigma * eps, of the noise of the head's layer with this number; mu without noise.
+    fn with_noise(&self, noise: Option<&HeadNoise>, number: usize) -> Result<LinearLayer> {
+        let (Some(noise), Some(sigma)) = (noise, &self.sigma) else {
+            if noise.is_some() {
+                let what = "noise for a head without noisy layers";
+                return Err(ModelError::Input(what.to_owned()));
+            }
+            return Ok(self.mean.clone());
+        };
+        let (weight, bias) = noise.of_parameters(number);
+        let add = |mean: &Tensor, sigma: &Tensor, noise: &[f64]| -> Result<Tensor> {
+            let noise: Vec<f32> = noise.iter().map(|&it| it as f32).collect();
+            let noise = Tensor::from_vec(noise, sigma.dims(), sigma.device())?;
+            Ok((mean + (sigma * noise)?)?)
+        };
+        Ok(LinearLayer {
+            weight: add(&self.mean.weight, &sigma.weight, &weight)?,
+            bias: add(&self.mean.bias, &sigma.bias, &bias)?,
+        })
+    }
+}
+
+/// The head's layers.
+#[derive(Debug)]
+pub(crate) struct Streams {
+    /// Of N outputs; there in a dueling head.
+    value: Option<HeadLayer>,
+    /// Of A * N outputs: the advantage's of a dueling head, else the whole head.
+    actions: HeadLayer,
+    atoms: usize,
 }
 
 impl Streams {
     pub(crate) fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
-        let layer = |name: &str| -> Result<LinearLayer> {
-            Ok(LinearLayer {
-                weight: parameters.tensor(name, "weight")?,
-                bias: parameters.tensor(name, "bias")?,
-            })
-        };
-        Ok(if config.head.dueling {
-            Self::Dueling {
-                value: layer(VALUE)?,
-                advantage: layer(ADVANTAGE)?,
-                atoms: config.atoms,
-            }
-        } else {
-            Self::One(layer(HEAD)?)
+        let layer = |name: &str| HeadLayer::new(name, config, parameters);
+        let dueling = config.head.dueling;
+        Ok(Self {
+            value: dueling.then(|| layer(VALUE)).transpose()?,
+            actions: layer(if dueling { ADVANTAGE } else { HEAD })?,
+            atoms: config.atoms,
         })
     }
 
-    /// The layer that they amount to; of a plain head its own, whose parameters then are variables.
-    pub(crate) fn layer(&self) -> Result<LinearLayer> {
-        match self {
-            Self::One(layer) => Ok(layer.clone()),
-            Self::Dueling {
-                value,
-                advantage,
-                atoms,
-            } => Ok(LinearLayer {
-                weight: dueling(&value.weight, &advantage.weight, *atoms)?,
-                bias: dueling(
-                    &value.bias.unsqueeze(1)?,
-                    &advantage.bias.unsqueeze(1)?,
-                    *atoms,
-                )?
-                .squeeze(D::Minus1)?,
-            }),
-        }
+    /// The layer of A * N outputs that they amount to with this noise, or without; of a plain head its own, whose parameters then are
+    /// variables.
+    pub(crate) fn layer(&self, noise: Option<&HeadNoise>) -> Result<LinearLayer> {
+        let Some(value) = &self.value else {
+            return self.actions.with_noise(noise, 0);
+        };
+        let value = value.with_noise(noise, 0)?;
+        let advantage = self.actions.with_noise(noise, 1)?;
+        let (v, a) = (value.bias.unsqueeze(1)?, advantage.bias.unsqueeze(1)?);
+        Ok(LinearLayer {
+            weight: dueling(&value.weight, &advantage.weight, self.atoms)?,
+            bias: dueling(&v, &a, self.atoms)?.squeeze(D::Minus1)?,
+        })
     }
 }
 
@@ -86,24 +121,4 @@ fn dueling(value: &Tensor, advantage: &Tensor, atoms: usize) -> candle_core::Res
     by_action
         .broadcast_add(&shared.unsqueeze(0)?)?
         .reshape((outputs, inputs))
-}
-
-/// The same for one input of weights [in, out], or for a bias: `value` [N], `advantage` [A * N], which becomes the result.
-pub(crate) fn duel(value: &[f32], advantage: &mut [f32]) {
-    let atoms = value.len();
-    let mut shared = vec![0.0; atoms];
-    for action in advantage.chunks_exact(atoms) {
-        for (sum, a) in shared.iter_mut().zip(action) {
-            *sum += a;
-        }
-    }
-    let actions = (advantage.len() / atoms) as f32;
-    for (shared, v) in shared.iter_mut().zip(value) {
-        *shared = v - *shared / actions;
-    }
-    for action in advantage.chunks_exact_mut(atoms) {
-        for (a, shared) in action.iter_mut().zip(&shared) {
-            *a += shared;
-        }
-    }
 }

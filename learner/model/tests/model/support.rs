@@ -115,7 +115,20 @@ pub(crate) fn small_with(head: HeadConfig) -> ModelConfig {
     ModelConfig { head, ..small() }
 }
 
-pub(crate) const DUELING: HeadConfig = HeadConfig { dueling: true };
+pub(crate) const DUELING: HeadConfig = HeadConfig {
+    dueling: true,
+    noisy_sigma: None,
+};
+pub(crate) const NOISY: HeadConfig = HeadConfig {
+    dueling: false,
+    noisy_sigma: Some(0.5),
+};
+
+/// Rainbow's.
+pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
+    dueling: true,
+    noisy_sigma: Some(0.5),
+};
 
 pub(crate) fn parameters(config: &ModelConfig, seed: u64) -> Parameters {
     Parameters::init(config, &mut rng(seed), &Device::Cpu).unwrap()
