@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::{ModelError, Result};
 use crate::geometry::{ConvLayer, ConvShape};
 pub(crate) use crate::heads::config::HeadConfig;
-use crate::heads::streams::{ADVANTAGE, HEAD, VALUE};
+use crate::heads::config::{ADVANTAGE, HEAD, VALUE};
 use crate::init::InitialLaw;
 use crate::layers::LayerShape;
 

@@ -5,7 +5,7 @@ use safetensors::tensor::TensorView;
 
 use crate::config::ModelConfig;
 use crate::error::Result;
-use crate::heads::streams::VALUE;
+use crate::heads::config::VALUE;
 use crate::stored::StoredAs;
 
 /// What one layer costs. Arithmetic is multiplications and additions, each counted as one.

@@ -5,6 +5,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{ModelError, Result};
 
+/// Name of the head, and of its streams if it is a dueling one.
+pub(crate) const HEAD: &str = "head";
+pub(crate) const VALUE: &str = "head.value";
+pub(crate) const ADVANTAGE: &str = "head.advantage";
+
 /// Largest sigma_0; a configuration beyond it is rejected.
 const NOISY_SIGMA_MAX: f64 = 100.0;
 

@@ -9,13 +9,9 @@ use candle_core::{D, Tensor};
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
+use crate::heads::config::{ADVANTAGE, HEAD, VALUE};
 use crate::heads::noise::HeadNoise;
 use crate::parameters::Parameters;
-
-/// Name of the head, and of its streams if it is a dueling one.
-pub(crate) const HEAD: &str = "head";
-pub(crate) const VALUE: &str = "head.value";
-pub(crate) const ADVANTAGE: &str = "head.advantage";
 
 /// Weight [out, in] and bias [out] of a linear layer.
 #[derive(Clone, Debug)]
