@@ -1,6 +1,6 @@
 //! The list of commands. Each has its flags and its code in a file of `commands`, or in the crate that it is named for.
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use driml_bench::flags::BenchCommand;
 use driml_experiments::{
     flags::{ExperimentCommand, GridArgs, TradeoffArgs},
@@ -9,6 +9,7 @@ use driml_experiments::{
 
 use crate::commands::{
     actor::{self, ActorArgs},
+    completions::{self, CompletionsArgs, ManArgs},
     doctor::{self, DoctorArgs},
     evaluate::{self, EvaluateArgs},
     inspect::{self, InspectArgs},
@@ -19,6 +20,7 @@ use crate::commands::{
     replay_server::{self, ReplayServerArgs},
     status::{self, StatusArgs},
     train::{self, TrainArgs},
+    watch::{self, WatchArgs},
 };
 
 /// Deep Reinforcement and InfoMax Learning: actors, a replay server and a learner.
@@ -42,6 +44,8 @@ pub(crate) enum Command {
     Learner(LearnerArgs),
     /// Who takes part in a run, who waits for whom and since when, and what it would take to go on
     Status(StatusArgs),
+    /// Show how a run goes, wherever its parts are and whoever started them, and record it in a folder
+    Watch(WatchArgs),
     /// Play whole episodes with a run's newest weights, beside a random policy
     Evaluate(EvaluateArgs),
     /// What a world and an agent build, compute and send, what it would be if everything were on, and why
@@ -67,6 +71,10 @@ pub(crate) enum Command {
     /// Procgen's engine
     #[command(subcommand)]
     Procgen(ProcgenCommand),
+    /// Print what a shell needs to complete driml's commands, such as `driml completions bash > driml.bash`
+    Completions(CompletionsArgs),
+    /// Write driml's manual pages, such as `driml man share/man/man1`
+    Man(ManArgs),
 }
 
 impl Command {
@@ -86,6 +94,7 @@ impl Command {
             Self::ReplayServer(args) => replay_server::run(args),
             Self::Learner(args) => learner::run(args),
             Self::Status(args) => status::run(&args),
+            Self::Watch(args) => watch::run(&args),
             Self::Evaluate(args) => evaluate::run(&args),
             Self::Inspect(args) => inspect::run(&args),
             Self::Parity(args) => parity::run(&args),
@@ -97,14 +106,14 @@ impl Command {
             Self::Presets(args) => presets::run(&args),
             Self::Doctor(args) => doctor::run(&args),
             Self::Procgen(command) => procgen::run(&command),
+            Self::Completions(args) => completions::completions(&args, Cli::command()),
+            Self::Man(args) => completions::man(&args, Cli::command()),
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
-
     use super::*;
 
     #[test]

@@ -260,3 +260,73 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
         "{table}"
     );
 }
+
+#[test]
+fn an_actors_number_from_the_environment() {
+    let id = |id: &str, value: &str| {
+        let output = Command::new(env!("CARGO_BIN_EXE_driml"))
+            .args(["actor", "--connect", "tcp/127.0.0.1:1", "--id", id])
+            .env("RANK_OF_A_TEST", value)
+            .output()
+            .unwrap();
+        assert_eq!(output.status.code(), Some(64));
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let said = id("env:NO_SUCH_RANK", "");
+    assert!(
+        said.contains("the environment has no NO_SUCH_RANK"),
+        "{said}"
+    );
+    let said = id("env:RANK_OF_A_TEST", "x3");
+    assert!(said.contains("RANK_OF_A_TEST is \"x3\""), "{said}");
+    let said = id("first", "");
+    assert!(
+        said.contains("a whole number from 0, or env:NAME"),
+        "{said}"
+    );
+    // The number is read: its certificate is what is missing then.
+    let output = Command::new(env!("CARGO_BIN_EXE_driml"))
+        .args([
+            "actor",
+            "--connect",
+            "quic/127.0.0.1:1",
+            "--tls-dir",
+            "/nonexistent",
+        ])
+        .args(["--id", "env:RANK_OF_A_TEST"])
+        .env("RANK_OF_A_TEST", "17")
+        .output()
+        .unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("actor-17"), "{said}");
+}
+
+#[test]
+fn completions_and_pages() {
+    for (shell, part) in [
+        ("bash", "complete -F"),
+        ("zsh", "#compdef driml"),
+        ("fish", "complete -c driml"),
+    ] {
+        let output = driml(&["completions", shell]);
+        assert!(output.status.success());
+        let script = String::from_utf8(output.stdout).unwrap();
+        assert!(
+            script.contains(part) && script.contains("evaluate-every"),
+            "{script}"
+        );
+    }
+    assert!(usage(&["completions", "tcsh"]).contains("bash"));
+    let root = tempfile::tempdir().unwrap();
+    let out = root.path().join("man1");
+    let output = driml(&["man", out.to_str().unwrap()]);
+    assert!(output.status.success());
+    let page = std::fs::read_to_string(out.join("driml-train.1")).unwrap();
+    assert!(page.contains("\\-\\-frames"), "{page}");
+    let (code, said) = said(&["man", "/proc/none/man1"]);
+    assert_eq!(code, 1);
+    assert!(
+        said.contains("writing pages into /proc/none/man1"),
+        "{said}"
+    );
+}

@@ -126,6 +126,7 @@ fn updates(criterion: &mut Criterion) {
             next_action: &action,
             n_step_return: &n_step_return,
             bootstrap_discount: &[0.93; ROWS],
+            importance_weight: None,
             positive_valid: match positives {
                 CPC => &valid,
                 _ => &[1; ROWS][..positives * ROWS],

@@ -16,7 +16,7 @@ use crate::{
     batch::Batch,
     error::UpdateError,
     losses::{
-        c51::{kl_loss, softmax},
+        c51::{kl_loss, row_kls, softmax},
         projection::project,
     },
     noise::UpdateNoise,
@@ -33,8 +33,10 @@ use crate::{
 /// What one update did: the numbers of a row of metrics.
 #[derive(Clone, Debug, PartialEq)]
 pub struct UpdateReport {
-    /// Mean KL divergence of the prediction from the projected target, in nats.
+    /// Mean KL divergence of the prediction from the projected target, in nats; of weighted rows the mean of weight times divergence.
     pub c51_kl: f32,
+    /// Of weighted rows, each one's divergence [B] before its weight, in nats; else empty, and not computed.
+    pub row_kls: Vec<f32>,
     /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
     pub losses: Vec<(&'static str, f32)>,
     /// `c51_kl + sum of weight * loss`.
@@ -48,8 +50,10 @@ pub struct UpdateReport {
 /// The losses of a batch and all that led to them, before any step is taken.
 #[derive(Debug)]
 pub struct Evaluation {
-    /// Mean KL divergence, in nats.
+    /// Mean KL divergence, in nats; of weighted rows the mean of weight times divergence.
     pub c51_kl: f32,
+    /// Of weighted rows, each one's divergence [B] before its weight, in nats; else empty, and not computed.
+    pub row_kls: Vec<f32>,
     /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
     pub losses: Vec<(&'static str, f32)>,
     /// `c51_kl + sum of weight * loss`.
@@ -249,6 +253,7 @@ impl Agent {
         let q_sum: f32 = flat(&self.online_network.q_values(&taken)?)?.iter().sum();
         Ok(UpdateReport {
             c51_kl: evaluation.c51_kl,
+            row_kls: evaluation.row_kls,
             losses: evaluation.losses,
             total: evaluation.total,
             grad_norm,
@@ -305,6 +310,7 @@ impl Agent {
         let kl = kl_loss(
             &taken_logits,
             target_projection.clone(),
+            batch.importance_weight.map(<[f32]>::to_vec),
             self.compute.kernels,
         )?;
         let auxiliary = self.auxiliary.losses(&LossInputs {
@@ -326,11 +332,20 @@ impl Agent {
         for WeightedLoss { name, loss, .. } in &auxiliary {
             losses.push((*name, finite(name, loss)?));
         }
+        let taken_logits = taken_logits.detach();
+        let row_kls = match batch.importance_weight {
+            None => Vec::new(),
+            Some(_) => {
+                let kls = row_kls(&flat(&taken_logits)?, &target_projection, self.model.atoms);
+                kls.into_iter().map(|kl| kl as f32).collect()
+            }
+        };
         Ok(Evaluation {
             c51_kl,
+            row_kls,
             losses,
             total: finite("the total loss", &total)?,
-            taken_logits: taken_logits.detach(),
+            taken_logits,
             next_greedy_action,
             target_projection,
             gradients,

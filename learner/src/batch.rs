@@ -33,6 +33,9 @@ pub struct Batch<'a> {
     pub bootstrap_discount: &'a [f32],
     /// 0 where the row has no such positive [P, B].
     pub positive_valid: &'a [u8],
+    /// What each row's C51 loss is multiplied by [B], from 0 on, where rows were not drawn equally likely. The auxiliary losses are
+    /// not weighted: they compare a batch's rows with one another, and none is the mean of a loss a row.
+    pub importance_weight: Option<&'a [f32]>,
 }
 
 impl<'a> Batch<'a> {
@@ -63,6 +66,11 @@ impl<'a> Batch<'a> {
             ("n_step_return", self.n_step_return.len(), 1),
             ("bootstrap_discount", self.bootstrap_discount.len(), 1),
             ("positive_valid", self.positive_valid.len(), positives),
+            (
+                "importance_weight",
+                self.importance_weight.map_or(rows, <[f32]>::len),
+                1,
+            ),
         ] {
             if length != rows * row_length {
                 return fault(format!(
@@ -86,6 +94,11 @@ impl<'a> Batch<'a> {
                     "{name} has {length} values, not {all} states of {state_bytes}, nor the {there} that its rows have"
                 ));
             }
+        }
+        let bad = |weight: &f32| !(weight.is_finite() && *weight >= 0.0);
+        let weights = self.importance_weight.unwrap_or_default();
+        if let Some(row) = weights.iter().position(bad) {
+            return fault(format!("row {row} has the weight {}", weights[row]));
         }
         let known = |action: u8| usize::from(action) < model.num_actions;
         for row in 0..rows {

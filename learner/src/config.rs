@@ -3,7 +3,7 @@
 
 use driml_model::{InputSize, ModelConfig, Precision, StoredAs};
 use driml_protocol::{
-    RunSpec, RunSpecError,
+    RunSpec, RunSpecError, Sampling,
     config::{Settings, TransportConfig},
 };
 use rand_chacha::ChaCha8Rng;
@@ -271,6 +271,15 @@ pub struct LearnerConfig {
     pub learner: Config,
     /// How messages travel: the `[transport]` table.
     pub transport: TransportConfig,
+    /// By which rule rows are drawn: `sampling` of the `[replay]` table.
+    pub sampling: Sampling,
+}
+
+/// What a learner reads of the `[replay]` table.
+#[derive(Deserialize)]
+struct ReplayTable {
+    #[serde(default)]
+    sampling: Sampling,
 }
 
 impl LearnerConfig {
@@ -286,6 +295,7 @@ impl LearnerConfig {
             input: settings.table("input")?,
             learner: settings.table("learner")?,
             transport: settings.table("transport")?,
+            sampling: settings.table::<ReplayTable>("replay")?.sampling,
         };
         this.spec.validate()?;
         this.model.validate()?;

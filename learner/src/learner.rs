@@ -18,6 +18,7 @@ use crate::{
     checkpoint::{self, CheckpointError, RunState},
     config::{ConfigError, LearnerConfig},
     error::UpdateError,
+    importance::importance_weights,
 };
 
 /// What the seed of noisy layers' noise is drawn for.
@@ -209,6 +210,9 @@ impl Learner {
             (anchors, states_k) = (Some(seen_t.as_slice()), seen_k);
         }
         let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
+        let beta = self.config.sampling.beta(self.agent.updates());
+        let weights = batch.probabilities();
+        let weights = weights.map(|probabilities| importance_weights(&probabilities, beta));
         let batch = Batch {
             rows: batch.rows(),
             states_t,
@@ -221,6 +225,7 @@ impl Learner {
             n_step_return: &returns,
             bootstrap_discount: &discounts,
             positive_valid: valid,
+            importance_weight: weights.as_deref(),
         };
         self.agent.check(&batch)?;
         let mut affinity = self.affinity.clone();

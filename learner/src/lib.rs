@@ -29,6 +29,7 @@
 //!     n_step_return: &[0.5, -0.5],
 //!     bootstrap_discount: &[0.9, 0.0],
 //!     positive_valid: &[1, 1],
+//!     importance_weight: None,
 //! })?;
 //! assert_eq!(report.losses[0].0, "dim_4t4");
 //! assert!(report.total.is_finite() && agent.updates() == 1);
@@ -57,6 +58,7 @@ pub mod cost;
 #[cfg(test)]
 mod edges;
 mod error;
+mod importance;
 pub mod insight;
 mod learner;
 pub mod losses;

@@ -98,7 +98,14 @@ fn say_waiting(started: Instant, e: &SessionError, said: &mut Seldom) {
     let since = started.elapsed();
     if since > SILENT_MAX && said.due().is_some() {
         let (since, max) = (since.as_secs(), SERVER_MAX.as_secs());
-        tracing::info!("waiting for the replay server since {since} s, for {max} s at most: {e}");
+        // Whoever listens there may be a router between the parts, to which the replay server has yet to connect.
+        let why = match e {
+            SessionError::Nobody { key } => format!(
+                "somebody listens there, and nobody answers at {key}: is it the replay server of this run, with the same --namespace?"
+            ),
+            other => other.to_string(),
+        };
+        tracing::info!("waiting for the replay server since {since} s, for {max} s at most: {why}");
     }
 }
 

@@ -32,8 +32,10 @@ pub mod tls;
 mod messages;
 mod process;
 mod query_workers;
+pub mod reach;
 pub mod reporter;
 mod run_spec;
+mod sampling;
 mod wire;
 
 pub use client::{Announcer, PendingReply, RunClient, Sealed};
@@ -49,6 +51,7 @@ pub use messages::{
     insert_reply::{Claim, InsertReply},
     join::{ActorJoin, JoinReply, LearnerJoin},
     parts::{PartName, PartStatus, PartsStatus, WARNINGS_MAX},
+    priorities::{Origin, PriorityPart, PriorityUpdate},
     report::{Life, Report, Warning},
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
     tally::Tally,
@@ -66,6 +69,7 @@ pub use process::{
 };
 pub use query_workers::{Incoming, QueryWorkers, Responder};
 pub use run_spec::{Horizon, POSITIVES_MAX, RunSpec, RunSpecError, TimeoutRule};
+pub use sampling::{Sampling, SamplingError};
 pub use wire::{
     buffers::{Buffer, BufferPool},
     codec::{self, PROTOCOL_VERSION},

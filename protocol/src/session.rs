@@ -13,6 +13,7 @@ use zenoh::{
 };
 
 use crate::{
+    reach::{self, Unreachable},
     tls::{self, Credentials, Role, TlsError},
     wire::{error::CodecError, keys::Keys},
 };
@@ -40,10 +41,23 @@ pub enum SessionError {
         /// What zenoh said.
         why: String,
     },
-    /// Nobody listens where the session was to connect.
+    /// Nothing accepts connections where the session was to connect.
+    #[error(transparent)]
+    Unreachable(#[from] Unreachable),
+    /// Something listens, and does not speak as the parts of a run do.
     #[error(
-        "nobody listens on {}, after {} s: is the replay server running, and is the endpoint right? One with --tls-dir is reached with \
-         quic/HOST:PORT, which is UDP, and --tls-dir",
+        "something listens on {} that is no part of driml ({what}): is the endpoint right? If it is, its process may stand still",
+        .connect.join(", ")
+    )]
+    NotDriml {
+        /// Endpoints to connect to.
+        connect: Vec<String>,
+        /// What it says, or that it says nothing.
+        what: String,
+    },
+    /// Nobody listens where the session was to connect, as far as can be told over UDP.
+    #[error(
+        "nobody listens on {}, after {} s: is the replay server running, with --tls-dir, and is the endpoint right? Its port is one of UDP",
         .connect.join(", "), CONNECT_MAX.as_secs()
     )]
     NobodyListens {
@@ -104,6 +118,8 @@ const NOBODY_LISTENS: &str = "Unable to connect to any of";
 const STALLED_MAX: Duration = Duration::from_secs(8);
 /// How long a client tries to connect.
 const CONNECT_MAX: Duration = Duration::from_secs(10);
+/// How long a first try may take to find that those who listen understand; then it is looked who they are.
+const UNDERSTOOD_MAX: Duration = Duration::from_millis(2500);
 /// Longest message accepted from a peer, bytes, where a part does not know its run's sizes yet.
 pub const MESSAGE_BYTES_MAX: usize = 1 << 29;
 /// The same for whoever receives settings, status and pieces of weights alone.
@@ -134,6 +150,7 @@ pub fn open_as(
     };
     credentials.warn_if_it_expires_soon();
     for endpoint in endpoints.connect.iter().filter(|it| is_quic(it)) {
+        reach::look(endpoint)?;
         if !tls::check(endpoint, credentials, CONNECT_MAX)? {
             let connect = vec![endpoint.clone()];
             return Err(SessionError::NobodyListens { connect });
@@ -180,15 +197,10 @@ fn open_with(
     let router = !endpoints.listen.is_empty();
     let max = message_bytes_max.to_string();
     let stalled_us = STALLED_MAX.as_micros().to_string();
-    let connect_ms = CONNECT_MAX.as_millis().to_string();
     let settings: &[(&str, &str)] = &[
         ("mode", if router { "\"router\"" } else { "\"client\"" }),
         ("listen/endpoints", &list(&endpoints.listen)),
         ("connect/endpoints", &list(&endpoints.connect)),
-        (
-            "connect/timeout_ms",
-            if router { "-1" } else { &connect_ms },
-        ),
         (
             "connect/exit_on_failure",
             if router { "false" } else { "true" },
@@ -218,10 +230,13 @@ fn open_with(
             "false",
         ),
     ];
-    let open_with = |shared_memory: &str| {
+    let open_within = |shared_memory: &str, connect_ms: &str| {
         let mut config = zenoh::Config::default();
         let more = more.iter().map(|(key, value)| (*key, value.as_str()));
-        let last = [("transport/shared_memory/enabled", shared_memory)];
+        let last = [
+            ("connect/timeout_ms", connect_ms),
+            ("transport/shared_memory/enabled", shared_memory),
+        ];
         for (key, value) in settings.iter().copied().chain(more).chain(last) {
             config
                 .insert_json5(key, value)
@@ -229,14 +244,40 @@ fn open_with(
         }
         zenoh::open(config).wait().map_err(|e| e.to_string())
     };
-    open_with("true").or_else(|why| {
-        // Without shared memory nobody would be there either.
-        if why.contains(NOBODY_LISTENS) {
-            let connect = endpoints.connect.clone();
-            return Err(SessionError::NobodyListens { connect });
+    let open = |connect_ms: &str| {
+        open_within("true", connect_ms).or_else(|why| {
+            // Without shared memory nobody would be there either.
+            if why.contains(NOBODY_LISTENS) {
+                return Err(why);
+            }
+            tracing::debug!("trying again without shared memory: {why}");
+            open_within("false", connect_ms)
+        })
+    };
+    if router {
+        return open("-1").map_err(fail);
+    }
+    reach::wait_for_any(&endpoints.connect, CONNECT_MAX)?;
+    let not_driml = |what: String| SessionError::NotDriml {
+        connect: endpoints.connect.clone(),
+        what,
+    };
+    let milliseconds = |it: Duration| it.as_millis().to_string();
+    let why = match open(&milliseconds(UNDERSTOOD_MAX)) {
+        Err(why) if why.contains(NOBODY_LISTENS) => why,
+        opened => return opened.map_err(fail),
+    };
+    // A part of the run may be slow on a busy machine, and then it says nothing; somebody else may say who it is.
+    let mut listening = endpoints.connect.iter();
+    if let Some(words) = listening.find_map(|it| reach::what_listens(it)) {
+        return Err(not_driml(format!("it says {words:?}")));
+    }
+    tracing::debug!("trying again: {why}");
+    open(&milliseconds(CONNECT_MAX.saturating_sub(UNDERSTOOD_MAX))).map_err(|why| {
+        match why.contains(NOBODY_LISTENS) {
+            true => not_driml("it says nothing that could be understood".into()),
+            false => fail(why),
         }
-        tracing::debug!("trying again without shared memory: {why}");
-        open_with("false").map_err(fail)
     })
 }
 

@@ -7,10 +7,10 @@ use std::fmt::Debug;
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, BufferPool,
     Chunk, ChunkHeader, Claim, CodecError, Done, End, Goodbye, Hello, Horizon, InsertReply,
-    JoinReply, Kind, LearnerJoin, LearnerStatus, Life, Message, NO_ACTION, PROTOCOL_VERSION,
-    PartName, PartStatus, PartsStatus, ReplayStatus, Report, RequestId, Returns, RowScalars,
-    RunSpec, Tally, TimeoutRule, Waiting, Warning, WeightsHeader, WeightsReply, WeightsRequest,
-    WeightsUpload, WeightsVersion,
+    JoinReply, Kind, LearnerJoin, LearnerStatus, Life, Message, NO_ACTION, Origin,
+    PROTOCOL_VERSION, PartName, PartStatus, PartsStatus, PriorityPart, PriorityUpdate,
+    ReplayStatus, Report, RequestId, Returns, RowScalars, RunSpec, Tally, TimeoutRule, Waiting,
+    Warning, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -48,11 +48,10 @@ fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
 }
 
 fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
-    match codec::decode::<BatchReply>(bytes, Some(SPEC))? {
-        (BatchReply::Batch(header), payload) => {
-            Batch::from_payload(header, payload.to_vec().into()).map(|_| ())
-        }
-        _ => Ok(()),
+    let (reply, payload) = codec::decode::<BatchReply>(bytes, Some(SPEC))?;
+    match reply.header() {
+        Some(header) => Batch::from_payload(header, payload.to_vec().into()).map(|_| ()),
+        None => Ok(()),
     }
 }
 
@@ -80,8 +79,25 @@ fn chunk() -> Chunk {
     chunk
 }
 
-/// Of its rows the first does not bootstrap, the second has no positive and ends its episode.
 fn batch() -> Batch {
+    batch_from(None)
+}
+
+/// Its rows drawn by priority.
+fn prioritised_batch() -> Batch {
+    let mut batch = batch_from(Some(ORIGIN));
+    let draws = [(1 << 40, 0.5), (7, 1.0), (u64::MAX, 1e-30)];
+    batch.set_draws(draws.into_iter());
+    batch
+}
+
+const ORIGIN: Origin = Origin {
+    shard: 2,
+    incarnation: u64::MAX,
+};
+
+/// Of its rows the first does not bootstrap, the second has no positive and ends its episode.
+fn batch_from(origin: Option<Origin>) -> Batch {
     let header = BatchHeader {
         rows: 3,
         positives: 1,
@@ -95,6 +111,7 @@ fn batch() -> Batch {
         held: 9,
         mean_age: 12.5,
         weights_versions: (8, 2),
+        origin,
     };
     let rows = [(4, 0.0, 2), (NO_ACTION, 0.0, 0), (6, 0.5, 300)];
     let scalars = |(row, (next_action, bootstrap_discount, k)): (u8, _)| RowScalars {
@@ -128,7 +145,7 @@ fn join((mut head, payload): (Vec<u8>, impl AsRef<[u8]>)) -> Vec<u8> {
 /// A batch as it travels.
 fn sealed(batch: Batch) -> Vec<u8> {
     let (header, payload) = batch.into_payload();
-    codec::encode(SPEC, &BatchReply::Batch(header), &payload).unwrap()
+    codec::encode(SPEC, &BatchReply::of(header), &payload).unwrap()
 }
 
 fn weights() -> Vec<u8> {
@@ -161,6 +178,18 @@ fn parts_status() -> PartsStatus {
             weights_version: Some(3),
             doing: Some(("plays".into(), 5.0, 1.0)),
             last_warning: Some(Warning::new("late", 9.0)),
+        }],
+    }
+}
+
+fn priority_update() -> PriorityUpdate {
+    PriorityUpdate {
+        learner: 5,
+        number: 9,
+        parts: vec![PriorityPart {
+            origin: ORIGIN,
+            transitions: vec![0, u64::MAX],
+            priorities: vec![0.0, 2.5],
         }],
     }
 }
@@ -251,6 +280,7 @@ fn samples() -> Vec<Sample> {
             other_shards: Some(Tally::default()),
         }),
         Sample::of(&affinity),
+        Sample::of(&priority_update()),
         Sample::of(&WeightsVersion { version: 9 }),
         Sample::of(&goodbye),
         Sample::of(&ReplayStatus::default()),
@@ -300,6 +330,12 @@ fn samples() -> Vec<Sample> {
             read_chunk as fn(&[u8]) -> _,
         ),
         ("batch", Kind::BatchReply, sealed(batch()), read_batch),
+        (
+            "batch drawn by priority",
+            Kind::BatchReply,
+            sealed(prioritised_batch()),
+            read_batch,
+        ),
         ("weights", Kind::WeightsUpload, weights(), read_weights),
     ];
     samples.extend(with_payload.map(|(name, kind, bytes, read)| Sample {
@@ -410,6 +446,93 @@ fn pieces_are_received_as_the_whole_is() {
     }
 }
 
+/// What a uniform run sends has no byte of what priorities need.
+#[test]
+fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
+    let (plain, prioritised) = (batch(), prioritised_batch());
+    let more = prioritised.header.payload_bytes() - plain.header.payload_bytes();
+    assert_eq!((more, plain.probabilities()), (3 * 12, None));
+    let sent = [sealed(plain.clone()), sealed(prioritised.clone())].map(|bytes| bytes.len());
+    // The origin: a byte of the shard, nine of the incarnation.
+    assert_eq!(sent[1] - sent[0], 3 * 12 + 10);
+    assert_eq!(plain.priority_update(5, 9, &[0.0; 3]), None);
+
+    let bytes = sealed(prioritised.clone());
+    let (reply, payload) = codec::decode::<BatchReply>(&bytes, Some(SPEC)).unwrap();
+    assert!(matches!(reply, BatchReply::Prioritised(_, ORIGIN)));
+    let mut back = Batch::from_payload(reply.header().unwrap(), payload.to_vec().into()).unwrap();
+    assert_eq!(back, prioritised);
+    assert_eq!(back.probabilities().unwrap(), [0.5, 1.0, 1e-30]);
+    assert_eq!(
+        (back.actions(), back.ks()),
+        (&[0, 1, 2][..], &[2, 0, 255][..])
+    );
+    let update = back.priority_update(5, 9, &[1.0, 2.0, 3.0]).unwrap();
+    let part = |origin, transitions: &[u64], priorities: &[f32]| PriorityPart {
+        origin,
+        transitions: transitions.to_vec(),
+        priorities: priorities.to_vec(),
+    };
+    let own = [1 << 40, 7, u64::MAX];
+    assert_eq!((update.learner, update.number, update.rows()), (5, 9, 3));
+    assert_eq!(update.parts, [part(ORIGIN, &own, &[1.0, 2.0, 3.0])]);
+
+    // Of two shards, the second of which gives three rows of four.
+    let other = Origin {
+        shard: 0,
+        incarnation: 3,
+    };
+    let mut second = batch_from(Some(other));
+    second.set_draws([(10, 0.5), (11, 0.25), (12, 0.25)].into_iter());
+    back.scale_probabilities(0.25);
+    second.scale_probabilities(0.75);
+    let parts = [back, second];
+    let whole = Batch::merged_header(&parts).unwrap();
+    let merged = Batch::merge(&parts, Buffer::zeroed(whole.payload_bytes()));
+    assert_eq!(
+        merged.probabilities().unwrap(),
+        [0.125, 0.25, 2.5e-31, 0.375, 0.1875, 0.1875]
+    );
+    let found = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0];
+    let update = merged.priority_update(5, 9, &found).unwrap();
+    let expected = [
+        part(ORIGIN, &own, &found[..3]),
+        part(other, &[10, 11, 12], &found[3..]),
+    ];
+    assert_eq!(update.parts, expected);
+    let mixed = [merged, plain];
+    assert_eq!(Batch::merged_header(&mixed), None);
+}
+
+#[test]
+fn draws_and_priorities_that_cannot_be_are_refused() {
+    for chance in [0.0, -0.5, 1.5, f32::NAN, f32::INFINITY] {
+        let mut batch = prioritised_batch();
+        batch.set_draws([(1, 0.5), (2, chance), (3, 0.5)].into_iter());
+        let refused = read_batch(&sealed(batch)).unwrap_err().to_string();
+        assert!(
+            refused.contains("was drawn with the probability"),
+            "{refused}"
+        );
+    }
+    for priority in [-1.0, -1e-30, f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let mut update = priority_update();
+        update.parts[0].priorities[1] = priority;
+        let bytes = codec::encode(SPEC, &update, &[]).unwrap();
+        let refused = codec::decode::<PriorityUpdate>(&bytes, Some(SPEC)).unwrap_err();
+        let said = refused.to_string();
+        assert!(said.contains("no number from 0 on"), "{said}");
+    }
+    let mut update = priority_update();
+    update.parts[0].priorities.pop();
+    let bytes = codec::encode(SPEC, &update, &[]).unwrap();
+    let refused = codec::decode::<PriorityUpdate>(&bytes, Some(SPEC)).unwrap_err();
+    assert!(
+        refused.to_string().contains("1 priorities of 2"),
+        "{refused}"
+    );
+}
+
 #[test]
 fn parts_are_merged_row_by_row() {
     let header = |mean_age, versions| BatchHeader {
@@ -425,6 +548,7 @@ fn parts_are_merged_row_by_row() {
         held: 5,
         mean_age,
         weights_versions: versions,
+        origin: None,
     };
     // Rows from `first` on, which have fewer positives and bootstraps, the higher their number.
     let part = |header: BatchHeader, values: std::ops::Range<u8>| {

@@ -6,7 +6,7 @@ use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
+    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
 };
 use driml_replay_server::{Compression, Config, Replay};
 use rand::{Rng, RngCore, SeedableRng};
@@ -66,6 +66,7 @@ fn filled(frame_stack: u32) -> (Replay, Chunk) {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
+        sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
         reproduced_bug: None,

@@ -2,7 +2,8 @@
 //! It does not hold the rules of the return or of k: those are the run spec's, shared by every part.
 
 use driml_protocol::{
-    BatchHeader, RunSpec, RunSpecError, TRANSITION_BYTES, codec::PAYLOAD_BYTES_MAX,
+    BatchHeader, RunSpec, RunSpecError, Sampling, SamplingError, TRANSITION_BYTES,
+    codec::PAYLOAD_BYTES_MAX,
 };
 use serde::{Deserialize, Serialize};
 
@@ -55,6 +56,9 @@ pub struct Config {
     /// Replay servers among which the capacity and the actors are spread; the learner draws from each in proportion to what it
     /// holds.
     pub shards: u32,
+    /// By which rule rows are drawn. Settings of earlier versions do not have it: uniformly.
+    #[serde(default)]
+    pub sampling: Sampling,
     /// How frames are kept in memory; batches do not depend on it.
     #[serde(default)]
     pub compression: Compression,
@@ -102,6 +106,13 @@ pub enum ConfigError {
     RunSpec(#[from] RunSpecError),
 }
 
+impl From<SamplingError> for ConfigError {
+    fn from(SamplingError { key, value, why }: SamplingError) -> Self {
+        let why = why.into();
+        Self::Key { key, value, why }
+    }
+}
+
 /// Environment steps that must follow an anchor in its stream, unless its episode ends before: max(n_step, k_max).
 pub(crate) const fn reach(spec: &RunSpec) -> u32 {
     let k_max = spec.horizon.k_max();
@@ -131,7 +142,8 @@ impl Config {
                 "rows per transition must be a number above 0".into(),
             );
         }
-        let rows_max = rows_max(spec);
+        self.sampling.validate()?;
+        let rows_max = rows_max(spec, &self.sampling);
         if batch_size == 0 || batch_size > rows_max {
             let why = format!("a batch of this run has 1 to {rows_max} rows");
             return bad("learner.batch_size", batch_size.to_string(), why);
@@ -240,7 +252,9 @@ fn disk_bytes_least(spec: &RunSpec, config: &Config) -> u64 {
 }
 
 /// Most rows of one batch of this run, so that it stays below the codec's limit; larger requests are refused.
-pub(crate) fn rows_max(spec: &RunSpec) -> u32 {
-    let row_bytes = BatchHeader::of(spec, 1).payload_bytes();
+pub(crate) fn rows_max(spec: &RunSpec, sampling: &Sampling) -> u32 {
+    let row_bytes = BatchHeader::of(spec, 1)
+        .sampled_by(sampling)
+        .payload_bytes();
     u32::try_from(PAYLOAD_BYTES_MAX / row_bytes).unwrap_or(u32::MAX)
 }

@@ -4,9 +4,16 @@
 //! Start at [`run`], a whole replay server process, or at [`Replay`], the same without network, clock and threads: chunks go in,
 //! batches come out. [`RateLimiter`] says which side has to wait, [`horizon`] how far ahead a positive lies.
 //!
+//! Which transitions are drawn is a setting, `replay.sampling`: each that can be an anchor equally likely (`{ rule = "uniform" }`), or in
+//! proportion to the C51 loss that it had when it was learned from last, to the power of alpha (`{ rule = "prioritised", alpha,
+//! beta_start, beta_end, beta_updates }`, [`Sampling`](driml_protocol::Sampling)). Then a batch says of each row which transition it is
+//! and how likely it was, the learner weights the row's loss by that, and [`Replay::set_priorities`] takes what it found. Losses come back
+//! while later batches are on their way, so a draw knows those of a few updates before. Of several shards each gives rows in
+//! proportion to what it holds, and priorities count within it: the learner's weights are by the chance that a row had in all.
+//!
 //! ```
 //! use driml_protocol::{
-//!     ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
+//!     ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
 //! };
 //! use driml_replay_server::{Compression, Config, Replay};
 //!
@@ -27,6 +34,7 @@
 //! let config = Config {
 //!     capacity_transitions: 1000,
 //!     shards: 1,
+//!     sampling: Sampling::Uniform,
 //!     compression: Compression::None,
 //!     compressed_bytes_max: None,
 //!     disk_bytes_max: None,
@@ -85,6 +93,7 @@ pub use sampling::{
     assemble::{RETURN_ERROR, return_sum_error},
     horizon,
     packed_batch::PackedBatch,
+    prioritised::{PRIORITY_MIN, PriorityCounts, SavedPriorities},
 };
 pub use service::{RunArgs, run};
 pub use storage::frame_store::{PackedChunk, Packer};

@@ -21,7 +21,7 @@ use driml_envs::{
     DistributionMode, Environment, Game, ProcgenConfig, ProcgenEngine, ProcgenWorld, StepEnd,
 };
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
+    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
 };
 use driml_replay_server::{Compression, Config, Replay};
 use rand::{Rng, SeedableRng};
@@ -55,6 +55,7 @@ fn replay(compression: Compression, frame_stack: u32) -> Replay {
         shards: 1,
         compression,
         compressed_bytes_max: None,
+        sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
         reproduced_bug: None,

@@ -1,6 +1,5 @@
 #!/usr/bin/env python3
-"""Makes the parity cases of what came after the first five files: no_action, cpc*, curl*, dueling,
-noisy*.
+"""Makes the parity cases of what came after the first five files: no_action, cpc*, curl*, dueling, noisy*, weighted_rows.
 
 Needs PyTorch and safetensors; nothing in the project needs either. Everything is float64 and automatic differentiation, and
 written from the formulas in README.md, not from the learner's code.
@@ -175,12 +174,16 @@ def update(case, config):
         # Values are those that are acted on in evaluation: without noise.
         expect["q_values_t"] = distribution(online, config, f4).exp() @ atoms
     log_probs = distribution(online, config, features(online, config, case["input.frames_t"])[1], noise["online"])
-    kl = (torch.xlogy(goal, goal) - goal * log_probs[rows, case["input.action"]]).sum(1).mean()
+    row_kl = (torch.xlogy(goal, goal) - goal * log_probs[rows, case["input.action"]]).sum(1)
+    weight = case.get("input.importance_weight")
+    kl = row_kl.mean() if weight is None else (weight.double() * row_kl).mean()
     losses = auxiliary_losses(online, key, config, case)
     total = kl + sum(config["lambda"][pair] * loss for pair, loss in losses.items() if config["lambda"][pair] > 0)
 
     expect["next_action"] = greedy
     expect["target_projection"] = goal
+    if weight is not None:
+        expect["row_kl"] = row_kl.detach()
     expect["loss.c51_kl"] = kl.detach().view(1)
     expect["loss.total"] = total.detach().view(1)
     for pair, loss in losses.items():
@@ -258,7 +261,7 @@ def parameters(config, heads, action, generator, scale):
     return made
 
 
-def make(seed, rows, height, width, objective, lambdas, positives=1, action=False, heads=None, scale=1.5, **settings):
+def make(seed, rows, height, width, objective, lambdas, positives=1, action=False, heads=None, scale=1.5, beta=None, **settings):
     """One case: inputs, parameters, and what the update of them gives."""
     g = torch.Generator().manual_seed(seed)
     config = {
@@ -315,6 +318,10 @@ def make(seed, rows, height, width, objective, lambdas, positives=1, action=Fals
             for name, outputs in head_layers(config).items():
                 case[f"noise.{who}.{name}.in"] = torch.randn(config["model"]["hidden"], generator=g)
                 case[f"noise.{who}.{name}.out"] = torch.randn(outputs, generator=g)
+    if beta is not None:
+        # As of rows drawn by priority: (N P)^-beta over the batch's largest.
+        chance = torch.rand(rows, generator=g).double() ** 4 + 1e-4
+        case["input.importance_weight"] = ((chance.min() / chance) ** beta).float()
     return case, config
 
 
@@ -346,6 +353,9 @@ CASES = {
     "noisy_dueling": dict(
         seed=20, rows=8, height=36, width=44, objective="none", lambdas=[0.0, 0.0, 0.0, 0.0], double_dqn=True,
         head={"dueling": True, "noisy_sigma": 0.5},
+    ),
+    "weighted_rows": dict(
+        seed=16, rows=8, height=36, width=44, objective="dim", lambdas=[0.0, 0.0, 0.0, 1.0], action=True, beta=0.4,
     ),
 }  # fmt: skip
 

@@ -99,7 +99,7 @@ fn learn(run: &RunClient, learner: u64) -> u64 {
     loop {
         id = id.again();
         match ask(id) {
-            Ok((BatchReply::Batch(header), payload)) => {
+            Ok((BatchReply::Batch(header) | BatchReply::Prioritised(header, _), payload)) => {
                 Batch::from_payload(header, payload).unwrap();
                 batches += 1;
                 id = id.next();

@@ -106,6 +106,85 @@ fn it_plays_any_checkpoint_that_is_there() {
         .expect_said("no checkpoint after 7 updates; it has those after");
 }
 
+/// Checkpoints of a run of processes, and of one in lockstep, are played as it goes on; the best is kept.
+#[test]
+fn it_plays_checkpoints_while_the_run_goes_on() {
+    let system = system();
+    for (name, lockstep, rows_min) in [("processes", "", 1), ("lockstep", "--lockstep", 5)] {
+        let flags = "--agent c51 --evaluate-every 100 --evaluate-episodes 4";
+        let ended = system
+            .run(&format!(
+                "local {SHORT} {flags} {lockstep} --run-dir {name}"
+            ))
+            .expect_code(0);
+        assert!(ended.stderr.contains("evaluated after"), "{}", ended.stderr);
+        let folder = system.run_folder(name);
+        let table = fs::read_to_string(folder.path().join("evaluations.csv")).unwrap();
+        let mut lines = table.lines();
+        assert_eq!(
+            lines.next(),
+            Some("seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd")
+        );
+        let rows: Vec<Vec<f64>> = lines
+            .map(|row| row.split(',').map(|it| it.parse().unwrap()).collect())
+            .collect();
+        assert!(rows.len() >= rows_min, "{table}");
+        let last = rows.last().unwrap();
+        assert_eq!(last[2], 540.0, "the last checkpoint is played: {table}");
+        assert!(
+            rows.is_sorted_by(|a, b| a[2] < b[2] && a[1] <= b[1]),
+            "{table}"
+        );
+        let most = rows.iter().map(|row| row[4]).fold(f64::MIN, f64::max);
+        let best = rows.iter().find(|row| row[4] == most).unwrap();
+        // Played again with the same seed, the best earns the same.
+        let again = system
+            .run(&format!("evaluate {name} --checkpoint best --episodes 4"))
+            .expect_code(0);
+        assert!(
+            again
+                .stdout
+                .contains(&format!("weights after {} updates", best[2]))
+                && again.stdout.contains(&format!("mean return {most:8.3}")),
+            "{}{table}",
+            again.stdout
+        );
+        system
+            .run(&format!(
+                "plot {name} --column evaluated_return --out {name}.svg"
+            ))
+            .expect_code(0);
+    }
+}
+
+#[test]
+fn an_evaluation_can_be_kept_by_hand() {
+    let system = with_run();
+    system
+        .run("evaluate run --checkpoint best")
+        .expect_code(64)
+        .expect_said("run has no best checkpoint");
+    let keep = "evaluate run --keep --episodes 3";
+    let said = system.run(keep).expect_code(0).stdout;
+    assert!(
+        said.ends_with("over 3 episodes, the most so far\n"),
+        "{said}"
+    );
+    system
+        .run("evaluate run --checkpoint best --episodes 1")
+        .expect_code(0);
+    system
+        .run("evaluate run --checkpoint bset")
+        .expect_code(64)
+        .expect_said("the updates of a checkpoint");
+    system
+        .run(&format!(
+            "local {SHORT} --evaluate-every 150 --set learner.checkpoint_period_updates=100"
+        ))
+        .expect_code(64)
+        .expect_said("local.evaluation.every_updates = 150: checkpoints are played");
+}
+
 #[test]
 fn a_folder_that_is_no_run_s() {
     let system = system();

@@ -5,14 +5,14 @@ use std::{fs, time::Duration};
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Alive, BatchReply, BatchRequest, Chunk, ChunkHeader, Claim,
-    CodecError, Goodbye, InsertReply, JoinReply, LearnerJoin, Message, ReplayStatus, RequestId,
-    Tally, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec,
-    session,
+    CodecError, Goodbye, InsertReply, JoinReply, LearnerJoin, Message, Origin, PriorityPart,
+    PriorityUpdate, ReplayStatus, RequestId, Tally, WeightsHeader, WeightsReply, WeightsRequest,
+    WeightsUpload, WeightsVersion, codec, session,
 };
 use driml_tests::{Client, Process, TestSystem};
 use zenoh::{Wait, qos::Priority};
 
-use crate::{launched, system};
+use crate::{LONG, PRIORITISED, launched, system};
 
 /// Nobody's numbers.
 const LIFE: u64 = 77;
@@ -297,6 +297,53 @@ fn of_batches_and_affinity() {
             sealed(client, &affinity),
         );
     }
+    lied.counted(&before, 7);
+    lied.goes_on();
+}
+
+/// Of a run that draws by them, and of one that does not and has no place for them.
+#[test]
+fn of_priorities() {
+    let lie = |learner, transition, priority| PriorityUpdate {
+        learner,
+        number: u64::MAX,
+        parts: vec![PriorityPart {
+            origin: Origin::default(),
+            transitions: vec![transition],
+            priorities: vec![priority],
+        }],
+    };
+    let uniform = lied();
+    let (client, before) = (&uniform.client, uniform.status());
+    let key = client.keys.of::<PriorityUpdate>();
+    uniform.unanswered(&key, sealed(client, &lie(LEARNER, 1, 1.0)));
+    uniform.counted(&before, 0);
+    drop(uniform);
+
+    let system = system();
+    let run = system.start(&format!(
+        "local --agent driml-ada {LONG} {PRIORITISED} --listen {} --run-dir run",
+        system.endpoint()
+    ));
+    let client = system.connect();
+    client.wait_for_learner("some updates", |learner| learner.updates > 20);
+    let lied = Lied {
+        client,
+        run,
+        system,
+    };
+    let (client, before) = (&lied.client, lied.status());
+    for priority in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0] {
+        lied.unanswered(&key, sealed(client, &lie(LEARNER, 1, priority)));
+    }
+    let log = || fs::read_to_string(lied.system.path("run/logs/replay-server.log")).unwrap();
+    assert!(log().contains("which is no number from 0 on"), "{}", log());
+    lied.unanswered(&key, sealed(client, &lie(LEARNER, u64::MAX, 1.0)));
+    lied.unanswered(&key, sealed(client, &lie(LEARNER, 1, f32::MAX)));
+    let mut long = lie(LEARNER, 1, 1.0);
+    long.parts[0].transitions.resize(100_000, 1);
+    long.parts[0].priorities.resize(100_000, 1.0);
+    lied.unanswered(&key, sealed(client, &long));
     lied.counted(&before, 7);
     lied.goes_on();
 }

@@ -68,7 +68,7 @@ fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
         Ok(_) if drawn.fetch_add(1, Ordering::Relaxed).is_multiple_of(LOSES) => return,
         Ok(draft) => {
             let (header, payload) = draft.unpack().into_payload();
-            codec::encode(hash, &BatchReply::Batch(header), &payload).unwrap()
+            codec::encode(hash, &BatchReply::of(header), &payload).unwrap()
         }
         Err(unready) => codec::encode(hash, &BatchReply::from(unready), &[]).unwrap(),
     };

@@ -25,6 +25,7 @@ mod own_worlds;
 mod pages;
 mod panics;
 mod parity;
+mod prioritised;
 mod procgen;
 mod python;
 mod repo_rules;
@@ -37,6 +38,8 @@ mod successors;
 mod tensorboard;
 mod tiny_replay;
 mod tls;
+mod watch;
+mod wrong_place;
 
 use driml_tests::{Process, TestSystem};
 
@@ -52,6 +55,10 @@ const SHORT: &str = "--env chain --preset smoke --frames 1280 --set replay.repla
 
 /// A run on the chain that nobody waits for: it is ended from outside, long before its last frame.
 const LONG: &str = "--env chain --preset smoke --frames 100000000 --set replay.replay_ratio=8";
+
+/// Rows drawn by priority, with Rainbow's numbers.
+const PRIORITISED: &str =
+    "--set replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}";
 
 /// A launched run of `driml-ada` that has learned more than so many `updates`.
 fn launched(system: &TestSystem, updates: u64) -> Process {

@@ -163,3 +163,34 @@ fn the_page_has_the_actions_in_their_order() {
         assert!(page.lines().any(|it| it == line), "{line}");
     }
 }
+
+#[test]
+fn optuna_searches() {
+    let Some(python) = python_with("optuna_searches", &["optuna"]) else {
+        return;
+    };
+    let system = system();
+    let script = root().join("deploy/python/optuna_search.py");
+    let out = system.path("search");
+    let search = || {
+        let flags = "--trials 1 --seeds 2 --agent c51 --frames 2000";
+        let mut args: Vec<_> = flags.split(' ').collect();
+        args.extend([
+            "--driml",
+            env!("CARGO_BIN_EXE_driml-under-test"),
+            "--out",
+            out.to_str().unwrap(),
+        ]);
+        run(&python, &[script.to_str().unwrap()], &args)
+    };
+    let said = search();
+    assert!(
+        said.contains("best: ") && said.contains("replay_ratio"),
+        "{said}"
+    );
+    // It goes on: the second trial is number 1.
+    search();
+    for trial in ["trial0-seed1", "trial0-seed2", "trial1-seed2"] {
+        assert!(out.join(trial).join("summary.json").exists(), "{trial}");
+    }
+}

@@ -1,6 +1,6 @@
 //! A real replay of tiny frames, for tests that play the replay server themselves.
 
-use driml_protocol::{ActorJoin, Chunk, ChunkHeader, Horizon, RunSpec, TimeoutRule};
+use driml_protocol::{ActorJoin, Chunk, ChunkHeader, Horizon, RunSpec, Sampling, TimeoutRule};
 use driml_replay_server::{Compression, Config, Replay};
 
 /// Frames of 4 x 4 bytes that are not stacked.
@@ -28,6 +28,7 @@ pub(crate) fn config(transitions: u64) -> Config {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
+        sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
         replay_ratio: 1.0,

@@ -99,15 +99,14 @@ pub struct BenchReplayArgs {
     /// takes to read it back
     #[arg(long, value_name = "DIR")]
     pub(crate) replay_dir: Option<PathBuf>,
-    /// With it: transitions that are held and read back, of 10.8 kB each
-    #[arg(
-        long,
-        value_name = "N",
-        default_value_t = 20_000,
-        requires = "replay_dir"
-    )]
+    /// Instead: rows drawn uniformly and by priority, without a wire
+    #[arg(long, conflicts_with_all = ["replay_dir", "tls_dir"])]
+    pub(crate) sampling: bool,
+    /// With --replay-dir: transitions that are held and read back, of 10.8 kB each. With --sampling: transitions that are held, of 96
+    /// bytes each
+    #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = whole_number::within(1_000..=100_000_000))]
     pub(crate) held: u64,
-    /// With it: rounds of both
+    /// With --replay-dir: rounds of both
     #[arg(long, value_name = "N", default_value_t = 3, requires = "replay_dir")]
     pub(crate) rounds: u32,
     /// Instead: over TCP and over QUIC, with the certificates of replay-server, observer, learner and actors 1 to 5 in this folder

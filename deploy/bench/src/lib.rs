@@ -38,6 +38,7 @@ mod played;
 mod policy;
 mod recording;
 mod replay;
+mod sampling;
 mod scale;
 mod settings;
 mod system;
@@ -97,6 +98,10 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
         }
         BenchCommand::Policy(flags) => alone(Component::Policy, flags, cpu, Instead::No),
         BenchCommand::Replay(args) => match (&args.replay_dir, &args.tls_dir) {
+            _ if args.sampling => {
+                let figures = sampling::measure(&Effort::new(&args.flags), args.held)?;
+                measurements::report("sampling", &figures, machine, &args.flags)
+            }
             (Some(dir), _) => {
                 let figures = durable::measure(args, dir)?;
                 measurements::report("durable replay", &figures, machine, &args.flags)

@@ -3,7 +3,7 @@
 
 use super::{
     canvas::{Anchor, Canvas, Point, Rect, Stroke, TextStyle, titled},
-    colours::{Colour, GRID, INK, INK_SOFT, series_colour},
+    colours::{Colour, GRID, INK, INK_SOFT, SERIES_COLOURS, series_colour},
     font::{self, Weight},
     ticks,
 };
@@ -148,12 +148,16 @@ pub struct Series {
 }
 
 impl Series {
-    /// A line in the colour of this index.
+    /// A line in the colour of this index, dashed where the colours come again.
     pub fn line(name: &str, index: usize, points: Vec<(f64, f64)>) -> Self {
         Self {
             name: name.to_owned(),
             colour: series_colour(index),
-            mark: Mark::Line,
+            mark: if (index / SERIES_COLOURS).is_multiple_of(2) {
+                Mark::Line
+            } else {
+                Mark::Dashed
+            },
             points,
             band: Vec::new(),
         }

@@ -45,8 +45,10 @@ pub(super) const OUTLINE: Colour = Colour::new(213, 94, 0);
 /// A cell of a heat map without a value.
 pub(super) const NO_VALUE: Colour = Colour::new(220, 222, 226);
 
+/// How many series there are before a colour comes again.
+pub(crate) const SERIES_COLOURS: usize = 7;
 /// Colours of series. Source: Okabe and Ito 2008, without the yellow, which is faint on white.
-const SERIES: [Colour; 7] = [
+const SERIES: [Colour; SERIES_COLOURS] = [
     Colour::new(0, 114, 178),
     Colour::new(213, 94, 0),
     Colour::new(0, 158, 115),

@@ -1,7 +1,10 @@
 //! Whole episodes with a run's newest checkpoint, and a random policy's beside them.
 //! It trains nothing and changes nothing in the run folder.
 
-use std::path::PathBuf;
+use std::{
+    path::{Path, PathBuf},
+    str::FromStr,
+};
 
 use anyhow::Context;
 use clap::ValueEnum;
@@ -11,13 +14,16 @@ use driml_learner::{
     Agent, Compute, UpdateError, checkpoint,
     insight::{Insight, Seen},
 };
-use driml_machine::error::{Usage, usage};
+use driml_machine::{
+    error::{Usage, usage},
+    whole_number,
+};
 use driml_model::Enlarge;
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::run_folder::RunFolder;
+use crate::run_folder::{Candidate, Evaluated, RunFolder};
 
 /// Probability of a random action. Source: section 2 of the project's specification, after rlpyt.
 const EPSILON: f64 = 0.001;
@@ -37,6 +43,33 @@ pub enum Levels {
     TrainSingle,
     /// Others of the same game, each an episode of its own (Procgen)
     Unseen,
+}
+
+/// Which checkpoint of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Which {
+    /// The newest.
+    Newest,
+    /// The one after so many updates.
+    After(u64),
+    /// The one that earned most when checkpoints were played.
+    Best,
+}
+
+impl FromStr for Which {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "best" => Ok(Self::Best),
+            "newest" => Ok(Self::Newest),
+            _ => whole_number::within(1..=u64::MAX)(text)
+                .map(Self::After)
+                .map_err(|e| {
+                    format!("{e}: give the updates of a checkpoint, \"best\" or \"newest\"")
+                }),
+        }
+    }
 }
 
 /// Who chooses the actions.
@@ -65,25 +98,21 @@ impl Player {
     /// # Errors
     /// A folder that is no run's or has no checkpoint, a damaged checkpoint.
     pub fn load(folder: &RunFolder) -> anyhow::Result<Self> {
-        Self::load_at(folder, None)
+        Self::load_at(folder, Which::Newest)
     }
 
-    /// Reads the checkpoint after so many updates in a run's folder; the newest if it is not said.
+    /// Reads one of the checkpoints in a run's folder.
     ///
     /// # Errors
     /// A folder that is no run's or does not have that checkpoint, a damaged checkpoint.
-    pub fn load_at(folder: &RunFolder, updates: Option<u64>) -> anyhow::Result<Self> {
-        let path = folder.config();
-        let text = std::fs::read_to_string(&path).map_err(|e| {
-            usage!(
-                "{} is not the folder of a run: reading {}: {e}",
-                folder.display(),
-                path.display()
-            )
-        })?;
-        let config = RunConfig::parse(&path.display().to_string(), &text)?;
+    pub fn load_at(folder: &RunFolder, which: Which) -> anyhow::Result<Self> {
+        let config = config_of(folder)?;
+        Self::read(config, &checkpoint_at(folder, which)?)
+    }
+
+    fn read(config: RunConfig, checkpoint: &Path) -> anyhow::Result<Self> {
         let restored = checkpoint::load(
-            &checkpoint_at(folder, updates)?,
+            checkpoint,
             &config.model,
             &config.learner.update,
             &Compute::CPU,
@@ -142,7 +171,6 @@ impl Player {
         seed: u64,
         watch: &mut dyn FnMut(&Step<'_>),
     ) -> anyhow::Result<Vec<f64>> {
-        let spec = &self.config.run;
         let mut policy: Box<dyn Policy> = match who {
             Who::Agent => Box::new(NetworkPolicy::new(
                 &self.config.model,
@@ -150,21 +178,9 @@ impl Player {
                 &self.weights,
                 self.config.actor.precision,
             )?),
-            Who::Random => Box::new(RandomPolicy::new(u8::try_from(spec.num_actions)?)),
+            Who::Random => Box::new(random_policy(&self.config)?),
         };
-        let copies = Self::copies(episodes);
-        let actions = world.actions(self.config.actor.actions);
-        let fewer = FewerActions::of(world.build(copies, seed, 0)?, actions)?;
-        let rounds = episodes.div_ceil(copies) as u64;
-        let evaluation = Evaluation {
-            frame_stack: spec.frame_stack as usize,
-            epsilon: EPSILON,
-            episodes,
-            steps_max: rounds * STEPS_A_ROUND_MAX,
-        };
-        let (world, rng) = (CutFrames::of(fewer, self.sent())?, policy_rng(seed));
-        episode_returns(world, policy.as_mut(), evaluation, rng, watch)
-            .with_context(|| format!("playing {}", spec.world))
+        play_with(&self.config, policy.as_mut(), world, episodes, seed, watch)
     }
 
     /// Copies of the world that play so many episodes.
@@ -184,20 +200,114 @@ impl Player {
         })
     }
 
-    /// Rows and columns of a frame as it travels.
-    fn sent(&self) -> (usize, usize) {
-        let spec = &self.config.run;
-        (spec.frame_height as usize, spec.frame_width as usize)
-    }
-
     fn enlarge(&self) -> anyhow::Result<Option<Enlarge>> {
         let config = &self.config;
-        Ok(config.input.enlarge(self.sent(), &config.model)?)
+        Ok(config.input.enlarge(sent(config), &config.model)?)
     }
 }
 
-/// The folder of the checkpoint after so many updates, or of the newest.
-fn checkpoint_at(folder: &RunFolder, updates: Option<u64>) -> anyhow::Result<PathBuf> {
+/// Returns of whole episodes of a random policy in a run's world, on the levels trained on. It needs no checkpoint.
+///
+/// # Errors
+/// The world failed, or episodes do not end.
+pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow::Result<Vec<f64>> {
+    let world = levels(&config.world, Levels::Train)?;
+    let mut policy = random_policy(config)?;
+    play_with(config, &mut policy, &world, episodes, seed, &mut |_| ())
+}
+
+fn random_policy(config: &RunConfig) -> anyhow::Result<RandomPolicy> {
+    Ok(RandomPolicy::new(u8::try_from(config.run.num_actions)?))
+}
+
+fn play_with(
+    config: &RunConfig,
+    policy: &mut dyn Policy,
+    world: &WorldConfig,
+    episodes: usize,
+    seed: u64,
+    watch: &mut dyn FnMut(&Step<'_>),
+) -> anyhow::Result<Vec<f64>> {
+    let spec = &config.run;
+    let copies = Player::copies(episodes);
+    let actions = world.actions(config.actor.actions);
+    let fewer = FewerActions::of(world.build(copies, seed, 0)?, actions)?;
+    let rounds = episodes.div_ceil(copies) as u64;
+    let evaluation = Evaluation {
+        frame_stack: spec.frame_stack as usize,
+        epsilon: EPSILON,
+        episodes,
+        steps_max: rounds * STEPS_A_ROUND_MAX,
+    };
+    let (world, rng) = (CutFrames::of(fewer, sent(config))?, policy_rng(seed));
+    episode_returns(world, policy, evaluation, rng, watch)
+        .with_context(|| format!("playing {}", spec.world))
+}
+
+/// Rows and columns of a frame as it travels.
+const fn sent(config: &RunConfig) -> (usize, usize) {
+    let spec = &config.run;
+    (spec.frame_height as usize, spec.frame_width as usize)
+}
+
+/// Plays a checkpoint of a run on the levels trained on, adds what it earned to the run's table, and keeps it where it earned
+/// more than all before. Says what it earned, and whether it is the best.
+///
+/// # Errors
+/// As [`Player::load_at`] and [`Player::play`], and a file system that refuses.
+pub fn keep(
+    folder: &RunFolder,
+    which: Which,
+    episodes: u32,
+    seed: u64,
+) -> anyhow::Result<(Evaluated, bool)> {
+    let config = config_of(folder)?;
+    let path = checkpoint_at(folder, which)?;
+    let candidate = Candidate::hold(folder, &path)?;
+    let player = Player::read(config, &path)?;
+    let world = levels(&player.config.world, Levels::Train)?;
+    let returns = player.play(Who::Agent, &world, episodes as usize, seed)?;
+    let earned = Evaluated::at(
+        folder,
+        player.updates,
+        episodes,
+        mean_and_deviation(&returns),
+    );
+    let is_best = candidate.judge(folder, &earned)?;
+    Ok((earned, is_best))
+}
+
+/// The settings of the run in `folder`.
+fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
+    let path = folder.config();
+    let text = std::fs::read_to_string(&path).map_err(|e| {
+        usage!(
+            "{} is not the folder of a run: reading {}: {e}",
+            folder.display(),
+            path.display()
+        )
+    })?;
+    Ok(RunConfig::parse(&path.display().to_string(), &text)?)
+}
+
+/// The folder of a checkpoint.
+fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<PathBuf> {
+    let updates = match which {
+        Which::Newest => None,
+        Which::After(updates) => Some(updates),
+        Which::Best => {
+            let mut best = checkpoint::list(&folder.best())?;
+            let (_, path) = best.pop().ok_or_else(|| {
+                usage!(
+                    "{} has no best checkpoint: none was played while it trained. Train with --evaluate-every UPDATES, or judge those \
+                     that are there with `driml evaluate {} --checkpoint UPDATES --keep`",
+                    folder.display(),
+                    folder.display()
+                )
+            })?;
+            return Ok(path);
+        }
+    };
     let mut all = checkpoint::list(&folder.checkpoints())?;
     let Some((newest, _)) = all.last() else {
         return Err(usage!(

@@ -19,8 +19,9 @@ use crate::{
     connect::connect,
     console::{self, Screen, print},
     endpoint::NAMESPACE,
+    evaluator::Evaluator,
     interrupts::Interrupts,
-    live_view::{Display, TEMPLATE},
+    live_view::{Display, TEMPLATE, silence},
     managed_process::{ManagedProcess, Surroundings},
     meeting::Meeting,
     processes::{Processes, stop},
@@ -77,13 +78,7 @@ pub fn run(
 ) -> anyhow::Result<()> {
     let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
     let servers = server_names(config.replay.shards);
-    let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
-    let names: Vec<_> = servers
-        .iter()
-        .cloned()
-        .chain(["learner".into()])
-        .chain(actors)
-        .collect();
+    let names = process_names(config);
     let (text, losses) = (config.to_toml(), config.learner.update.objective.losses());
     let mut recorder = match resumed {
         Some(resume_point) => RunRecorder::go_on(
@@ -100,6 +95,10 @@ pub fn run(
         recorder.write_events(run_dir)?;
     }
     let resume_point = resumed.unwrap_or_default();
+    let evaluator = config.local.evaluation;
+    let evaluator = evaluator
+        .map(|it| Evaluator::new(it, run_dir))
+        .transpose()?;
     let meeting = Meeting::create()?;
     let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
     if let (Some(listen), None) = (&outside.listen, &outside.tls_dir) {
@@ -125,6 +124,7 @@ pub fn run(
         display,
         interrupts,
         processes: Processes::default(),
+        evaluator,
         restarts: 0,
         actor_restarts: 0,
         statuses: None,
@@ -141,6 +141,12 @@ pub fn run(
         _ => Outcome::Failed,
     };
     let (summary, written) = launch.conclude(&mut recorder, outcome);
+    // Whoever interrupts a run, or whose run failed, does not wait for it.
+    if let Some(mut evaluator) = launch.evaluator.take()
+        && outcome == Outcome::Finished
+    {
+        evaluator.finish(&launch.screen, &|| launch.interrupts.count() > 0);
+    }
     // Nobody is there any more who could be asked; where this file is left, the lock tells.
     if let Err(e) = std::fs::remove_file(run_dir.endpoints()) {
         tracing::debug!("removing {}: {e}", run_dir.endpoints().display());
@@ -182,6 +188,8 @@ struct Launch<'a> {
     display: Display,
     interrupts: Interrupts,
     processes: Processes,
+    /// Plays the checkpoints, if they are to be.
+    evaluator: Option<Evaluator>,
     /// How often a replay server that had died was started again.
     restarts: u32,
     /// How often an actor was.
@@ -191,6 +199,15 @@ struct Launch<'a> {
 
 fn words(args: &[&str]) -> Vec<String> {
     args.iter().map(|&arg| arg.to_owned()).collect()
+}
+
+/// The processes of a run that is started on one machine: replay servers, learner, actors.
+pub(crate) fn process_names(config: &RunConfig) -> Vec<String> {
+    let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
+    let others = ["learner".into()].into_iter().chain(actors);
+    let mut names = server_names(config.replay.shards);
+    names.extend(others);
+    names
 }
 
 /// `replay-server`, or one for each of several shards.
@@ -401,8 +418,16 @@ impl Launch<'_> {
             for line in recorder.record(&statuses.shards, &learner, &rss) {
                 self.screen.line(&line);
             }
+            let notes: Vec<_> = ["replay server", "learner"]
+                .into_iter()
+                .zip(heard)
+                .filter_map(|(part, heard)| silence(part, heard))
+                .collect();
             self.display
-                .show(&replay, &learner, recorder.episodes(&replay));
+                .show(&replay, &learner, recorder.episodes(&replay), &notes);
+            if let Some(evaluator) = &mut self.evaluator {
+                evaluator.look(&self.screen);
+            }
             if replay.finished && learner.finished {
                 return Ok(Outcome::Finished);
             }

@@ -14,6 +14,8 @@ use crate::{
 
 /// How often a line is written where there is no terminal.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
+/// How long a part may be silent before it is said.
+const SILENT_MAX: Duration = Duration::from_secs(10);
 /// The progress display: how far, then two lines of numbers.
 pub const TEMPLATE: &str = "{bar:40} {percent:>3}%  {elapsed_precise}\n{msg}";
 
@@ -54,12 +56,21 @@ impl Display {
         }
     }
 
-    /// Shows the state of the run.
-    pub fn show(&mut self, replay: &ReplayStatus, learner: &LearnerStatus, episodes: Episodes) {
+    /// Shows the state of the run, and `notes` under it, such as who does not answer.
+    pub fn show(
+        &mut self,
+        replay: &ReplayStatus,
+        learner: &LearnerStatus,
+        episodes: Episodes,
+        notes: &[String],
+    ) {
         let now = Instant::now();
         self.rates
             .add(now, replay.transitions_inserted, learner.updates);
-        let texts = self.text(replay, learner, episodes);
+        let mut texts = self.text(replay, learner, episodes).to_vec();
+        if !notes.is_empty() {
+            texts.push(notes.join("; "));
+        }
         match self.screen.bar() {
             Some(bar) => {
                 bar.set_position(replay.transitions_inserted.min(self.frames_max));
@@ -118,6 +129,12 @@ impl Display {
             ),
         ]
     }
+}
+
+/// What to say of a part that was heard so long ago; nothing of one that was heard just now.
+pub(crate) fn silence(part: &str, heard: Instant) -> Option<String> {
+    let silent = heard.elapsed();
+    (silent >= SILENT_MAX).then(|| format!("{part}: no answer for {}", duration(silent)))
 }
 
 /// Who waits for whom, and how many actors do.

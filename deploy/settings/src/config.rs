@@ -33,6 +33,41 @@ pub struct LocalConfig {
     /// Whether events for TensorBoard are written beside the metrics, about a kilobyte a second.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub tensorboard: bool,
+    /// When checkpoints are played while the run goes on; none if they are not.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub evaluation: Option<EvaluationConfig>,
+}
+
+/// Whole episodes with checkpoints of a run that goes on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EvaluationConfig {
+    /// Updates from one to the next; if that is less than one takes, some are left out. A multiple of
+    /// `learner.checkpoint_period_updates`.
+    pub every_updates: u64,
+    /// Episodes of each, 1 to 1,000,000.
+    pub episodes: u32,
+}
+
+impl EvaluationConfig {
+    fn validate(&self, checkpoint_period_updates: u64) -> Result<(), Usage> {
+        let Self {
+            every_updates,
+            episodes,
+        } = *self;
+        if every_updates == 0 || !every_updates.is_multiple_of(checkpoint_period_updates) {
+            return Err(usage!(
+                "local.evaluation.every_updates = {every_updates}: checkpoints are played, and there is one every \
+                 {checkpoint_period_updates} updates; take a multiple of that, or --set learner.checkpoint_period_updates"
+            ));
+        }
+        if !(1..=1_000_000).contains(&episodes) {
+            return Err(usage!(
+                "local.evaluation.episodes = {episodes}: an evaluation has 1 to 1,000,000 episodes"
+            ));
+        }
+        Ok(())
+    }
 }
 
 /// The resolved settings of a run. TOML is what they come from and travel as; between, there is this form alone.
@@ -233,6 +268,9 @@ impl RunConfig {
                 "local.learner_threads = {}: a learner has 1 to 1024 threads",
                 self.local.learner_threads
             ));
+        }
+        if let Some(evaluation) = &self.local.evaluation {
+            evaluation.validate(self.learner.checkpoint_period_updates)?;
         }
         self.local
             .learner_device

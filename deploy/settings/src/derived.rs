@@ -189,6 +189,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     }
     visible_actions(table, &config, set);
     ladder(table);
+    beta_updates(table);
     Ok(())
 }
 
@@ -200,6 +201,30 @@ fn ladder(table: &mut Table) {
         && let Some(actors) = find(table, "local.actors").cloned()
     {
         put(table, "actor.epsilon_ladder.actors", actors);
+    }
+}
+
+/// Fills in over how many updates beta rises, where rows are drawn by priority and it is not set: those of the whole run.
+fn beta_updates(table: &mut Table) {
+    const PATH: &str = "replay.sampling.beta_updates";
+    let rule = find(table, "replay.sampling.rule").and_then(Value::as_str);
+    if rule != Some("prioritised") || find(table, PATH).is_some() {
+        return;
+    }
+    let number = |path| {
+        let value = find(table, path)?;
+        let whole = value.as_integer().map(|whole| whole as f64);
+        value.as_float().or(whole)
+    };
+    let updates = || {
+        let transitions = number("replay.transitions_max")? - number("replay.warmup_transitions")?;
+        let rows = transitions * number("replay.replay_ratio")?;
+        Some(rows / number("learner.batch_size")?)
+    };
+    // What is missing, or no number above 0, its own check says.
+    if let Some(updates) = updates().filter(|updates| updates.is_finite() && *updates > 0.0) {
+        let whole = (updates as i64).max(1);
+        put(table, PATH, Value::Integer(whole));
     }
 }
 

@@ -43,7 +43,7 @@ pub(crate) fn fit(
     if replay.compression != Compression::None {
         return fit_compressed(table, &run, &replay, machine, actors);
     }
-    let bytes_each = replay_bytes_each(&run);
+    let bytes_each = replay_bytes_each(&run) + sampling_bytes_each(&replay);
     let fits = |bytes: u64| bytes / bytes_each;
     let free = gib(machine.memory_bytes);
     let asked = replay.capacity_transitions;
@@ -82,14 +82,15 @@ fn fit_compressed(
 ) -> Result<Option<String>, Usage> {
     let free = gib(machine.memory_bytes);
     let asked = replay.capacity_transitions;
-    let fields = asked.saturating_mul(COMPRESSED_FIELDS_BYTES);
+    let fields_each = COMPRESSED_FIELDS_BYTES + sampling_bytes_each(replay);
+    let fields = asked.saturating_mul(fields_each);
     let frames = asked.saturating_mul(run.frame_bytes() as u64);
     let bytes = machine.replay_bytes(actors).saturating_sub(fields);
     if fields > machine.replay_bytes(actors) / 2 {
         return Err(usage!(
             "replay.capacity_transitions = {asked} needs {} beside the frames, and {free} are free: --set replay.capacity_transitions={}",
             gib(fields),
-            machine.replay_bytes(actors) / 2 / COMPRESSED_FIELDS_BYTES
+            machine.replay_bytes(actors) / 2 / fields_each
         ));
     }
     match replay.compressed_bytes_max {
@@ -117,6 +118,16 @@ fn fit_compressed(
 /// Bytes that one transition takes in the replay: its frame and its small fields.
 pub const fn replay_bytes_each(run: &RunSpec) -> u64 {
     run.frame_bytes() as u64 + 32
+}
+
+/// Bytes that the rule by which rows are drawn takes a transition: of a tree of sums, which is as wide as the next power of two, 32 at
+/// most, and 16 at least.
+const fn sampling_bytes_each(replay: &driml_replay_server::Config) -> u64 {
+    if replay.sampling.is_prioritised() {
+        32
+    } else {
+        0
+    }
 }
 
 /// Bytes that one transition takes at most in a compressed replay, beside its frame: its small fields, and its share of the

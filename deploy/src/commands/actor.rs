@@ -13,8 +13,9 @@ pub(crate) struct ActorArgs {
     /// Endpoint of the replay server, such as quic/10.0.0.1:7447; may be given several times
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) connect: Vec<String>,
-    /// Which actor this is; unique in the run
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    /// Which actor this is; unique in the run. env:NAME takes it from the environment, such as env:SLURM_PROCID or
+    /// env:JOB_COMPLETION_INDEX
+    #[arg(long, value_name = "N", default_value = "0", value_parser = actor_id)]
     pub(crate) id: u32,
     /// Copies of the world [default: as the run's settings say]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
@@ -27,6 +28,23 @@ pub(crate) struct ActorArgs {
     pub(crate) tls: TlsFlags,
     #[command(flatten)]
     pub(crate) join: JoinFlags,
+}
+
+/// An actor's number, given as such or by the name of the variable that holds it.
+fn actor_id(text: &str) -> Result<u32, String> {
+    let Some(name) = text.strip_prefix("env:") else {
+        return text.parse().map_err(|_| {
+            "give a whole number from 0, or env:NAME for one that the environment holds".into()
+        });
+    };
+    match std::env::var(name) {
+        Ok(value) => value.trim().parse().map_err(|_| {
+            format!("the environment's {name} is {value:?}, and no number of an actor")
+        }),
+        Err(_) => Err(format!(
+            "the environment has no {name}: whoever starts this process has to set it"
+        )),
+    }
 }
 
 /// Plays until the run ends.

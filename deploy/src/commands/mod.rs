@@ -1,6 +1,7 @@
 //! One file a command: its flags and what it does with them.
 
 pub(crate) mod actor;
+pub(crate) mod completions;
 pub(crate) mod doctor;
 pub(crate) mod evaluate;
 pub(crate) mod inspect;
@@ -11,5 +12,6 @@ pub(crate) mod procgen;
 pub(crate) mod replay_server;
 pub(crate) mod status;
 pub(crate) mod train;
+pub(crate) mod watch;
 
 mod join;

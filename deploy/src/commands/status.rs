@@ -50,5 +50,5 @@ pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<()> {
         },
     };
     let mut connection = Connection::open(&endpoints, &args.namespace, credentials.as_deref())?;
-    status::run(&mut connection, args.watch, args.json)
+    status::run(&mut connection, args.watch, args.json).map(drop)
 }

@@ -15,6 +15,7 @@ use driml_machine::{
     device::ready_for,
     error::{Usage, usage},
     resources::Machine,
+    whole_number,
 };
 use driml_protocol::{RunSpec, session, tls::Role};
 use driml_settings::{
@@ -59,6 +60,14 @@ pub(crate) struct TrainArgs {
     /// Write events for TensorBoard too, in the run folder: `tensorboard --logdir RUN`
     #[arg(long)]
     pub(crate) tensorboard: bool,
+    /// Play the newest checkpoint every so many updates, in a process of its own beside the run (which takes a core meanwhile), and
+    /// keep the best: evaluations.csv, `driml evaluate RUN --checkpoint best`
+    #[arg(long, value_name = "UPDATES", value_parser = whole_number::within(1..=u64::MAX))]
+    pub(crate) evaluate_every: Option<u64>,
+    /// Whole episodes of each of these evaluations
+    #[arg(long, value_name = "N", default_value_t = 20, requires = "evaluate_every",
+          value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub(crate) evaluate_episodes: u32,
     /// All parts in one process in a fixed order: the same seed gives the same weights, also if the run is interrupted and resumed
     #[arg(long, conflicts_with = "listen")]
     pub(crate) lockstep: bool,
@@ -92,6 +101,14 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     }
     if args.tensorboard {
         args.run.over.sets.push("local.tensorboard=true".into());
+    }
+    if let Some(every) = args.evaluate_every {
+        let (sets, episodes) = (&mut args.run.over.sets, args.evaluate_episodes);
+        // Before what the user sets: checkpoints may be more frequent.
+        sets.insert(0, format!("learner.checkpoint_period_updates={every}"));
+        sets.push(format!(
+            "local.evaluation={{every_updates={every},episodes={episodes}}}"
+        ));
     }
     let (config, from, resume_point) = match &args.resume {
         Some(folder) => {

@@ -57,6 +57,55 @@ pub fn kl(logits: &[f32], target: &[f32], atoms: usize, gradient: &mut [f32]) ->
     total / rows as f64
 }
 
+/// [`kl`] of each row by itself: `KL(target || softmax(logits))` [B], in nats, right to [`KL_ERROR`]. What is below 0 by rounding is 0.
+///
+/// # Panics
+/// As [`kl`].
+pub fn row_kls(logits: &[f32], target: &[f32], atoms: usize) -> Vec<f64> {
+    let rows = logits.chunks_exact(atoms).zip(target.chunks_exact(atoms));
+    let row = |(logits, target)| kl(logits, target, atoms, &mut vec![0.0; atoms]).max(0.0);
+    rows.map(row).collect()
+}
+
+/// [`kl`] with each row's divergence, and its slopes, times its weight: `1/B * sum_b weight_b KL_b`.
+///
+/// `weights` [B], finite and not negative; all else as there.
+/// Source: Schaul et al. 2016, Prioritized Experience Replay, algorithm 1, line 12.
+///
+/// # Panics
+/// As [`kl`], and if there is not a weight a row.
+pub fn weighted_kl(
+    logits: &[f32],
+    target: &[f32],
+    weights: &[f32],
+    atoms: usize,
+    gradient: &mut [f32],
+) -> f64 {
+    let rows = weights.len();
+    assert_eq!(logits.len(), rows * atoms, "a weight a row");
+    assert_eq!(logits.len(), target.len(), "logits and target [B, N]");
+    assert_eq!(
+        logits.len(),
+        gradient.len(),
+        "the gradient has the shape of the logits"
+    );
+    let mut total = 0.0;
+    for (((logits, target), gradient), &weight) in logits
+        .chunks_exact(atoms)
+        .zip(target.chunks_exact(atoms))
+        .zip(gradient.chunks_exact_mut(atoms))
+        .zip(weights)
+    {
+        // Of a single row the mean is the row's.
+        total += f64::from(weight) * kl(logits, target, atoms, gradient);
+        let share = f64::from(weight) / rows as f64;
+        gradient
+            .iter_mut()
+            .for_each(|slope| *slope = (f64::from(*slope) * share) as f32);
+    }
+    total / rows as f64
+}
+
 /// `ln softmax` of a row that is not empty, in f64.
 ///
 /// The largest logit and the logarithm of the sum stay apart: their sum would lose the smaller of the two, and with it the law,
@@ -92,11 +141,16 @@ pub fn softmax(row: &[f32], out: &mut [f32]) {
     }
 }
 
-/// [`kl`] as a candle operation: `logits` [B, N] to a scalar.
+/// [`kl`], or with `weights` [`weighted_kl`], as a candle operation: `logits` [B, N] to a scalar.
 ///
 /// # Errors
-/// Logits that are not [B, N] f32 of as many values as `target`.
-pub fn kl_loss(logits: &Tensor, target: Vec<f32>, kernels: Kernels) -> Result<Tensor> {
+/// Logits that are not [B, N] f32 of as many values as `target`, or not of as many rows as there are weights.
+pub fn kl_loss(
+    logits: &Tensor,
+    target: Vec<f32>,
+    weights: Option<Vec<f32>>,
+    kernels: Kernels,
+) -> Result<Tensor> {
     let (rows, atoms) = logits.dims2()?;
     if target.len() != rows * atoms {
         bail!(
@@ -104,12 +158,22 @@ pub fn kl_loss(logits: &Tensor, target: Vec<f32>, kernels: Kernels) -> Result<Te
             target.len()
         );
     }
-    if kernels == Kernels::Candle {
-        return candle::kl_loss(logits, target);
+    if let Some(weights) = &weights
+        && weights.len() != rows
+    {
+        bail!("logits of {rows} rows meet {} weights", weights.len());
     }
-    scalar_op("c51-kl", logits, move |logits, gradient| {
-        kl(logits, &target, atoms, gradient)
-    })
+    if kernels == Kernels::Candle {
+        return candle::kl_loss(logits, target, weights);
+    }
+    match weights {
+        None => scalar_op("c51-kl", logits, move |logits, gradient| {
+            kl(logits, &target, atoms, gradient)
+        }),
+        Some(weights) => scalar_op("c51-weighted-kl", logits, move |logits, gradient| {
+            weighted_kl(logits, &target, &weights, atoms, gradient)
+        }),
+    }
 }
 
 #[cfg(test)]
@@ -144,6 +208,53 @@ mod tests {
                 gradient[i]
             );
         }
+    }
+
+    #[test]
+    fn a_row_s_weight_is_that_of_its_loss_and_of_its_slopes() -> Result<()> {
+        let weights = [0.25f32, 1.0];
+        let rows = row_kls(&LOGITS, &TARGET, ATOMS);
+        let weighted = (0.25 * rows[0] + rows[1]) / 2.0;
+        let (mut gradient, mut plain) = ([0f32; 6], [0f32; 6]);
+        let loss = weighted_kl(&LOGITS, &TARGET, &weights, ATOMS, &mut gradient);
+        assert!((loss - weighted).abs() < 1e-14);
+        let unweighted = kl(&LOGITS, &TARGET, ATOMS, &mut plain);
+        assert!((unweighted - (rows[0] + rows[1]) / 2.0).abs() < 1e-14);
+        for (i, (slope, plain)) in gradient.iter().zip(plain).enumerate() {
+            let expected = f64::from(plain) * f64::from(weights[i / ATOMS]);
+            assert!((f64::from(*slope) - expected).abs() < 1e-8, "logit {i}");
+        }
+        // Finite differences.
+        let mut scratch = [0f32; 6];
+        for i in 0..LOGITS.len() {
+            let mut shifted = |by: f32| {
+                let mut logits = LOGITS;
+                logits[i] += by;
+                let loss = weighted_kl(&logits, &TARGET, &weights, ATOMS, &mut scratch);
+                (loss, f64::from(logits[i]))
+            };
+            let ((high, x_high), (low, x_low)) = (shifted(1e-3), shifted(-1e-3));
+            let slope = (high - low) / (x_high - x_low);
+            assert!((slope - f64::from(gradient[i])).abs() < 1e-6, "logit {i}");
+        }
+        for kernels in [Kernels::FUSED, Kernels::Candle] {
+            let logits = Var::from_slice(&LOGITS, (2, ATOMS), &Device::Cpu)?;
+            let loss = kl_loss(&logits, TARGET.to_vec(), Some(weights.to_vec()), kernels)?;
+            let error = f64::from(loss.to_scalar::<f32>()?) - weighted;
+            assert!(error.abs() < 1e-6, "{kernels:?}: {error}");
+            let grads = loss.backward()?;
+            let got = grads.get(&logits).expect("a gradient").flatten_all()?;
+            for (got, expected) in got.to_vec1::<f32>()?.iter().zip(gradient) {
+                assert!(
+                    (got - expected).abs() < 1e-6,
+                    "{kernels:?}: {got}, {expected}"
+                );
+            }
+        }
+        let logits = Var::from_slice(&LOGITS, (2, ATOMS), &Device::Cpu)?;
+        let one = Some(vec![1.0]);
+        assert!(kl_loss(&logits, TARGET.to_vec(), one, Kernels::FUSED).is_err());
+        Ok(())
     }
 
     #[test]
@@ -197,7 +308,7 @@ mod tests {
     #[test]
     fn the_operation_gives_the_function() -> Result<()> {
         let logits = Var::from_slice(&LOGITS, (2, ATOMS), &Device::Cpu)?;
-        let loss = kl_loss(&logits, TARGET.to_vec(), Kernels::FUSED)?;
+        let loss = kl_loss(&logits, TARGET.to_vec(), None, Kernels::FUSED)?;
         let grads = loss.affine(3.0, 0.0)?.backward()?;
         let mut gradient = [0f32; 6];
         let expected = kl(&LOGITS, &TARGET, ATOMS, &mut gradient);
@@ -216,7 +327,7 @@ mod tests {
         for scale in [1.0, 1e4] {
             let logits = LOGITS.map(|logit| logit * scale);
             let var = Var::from_slice(&logits, (2, ATOMS), &Device::Cpu)?;
-            let loss = kl_loss(&var, TARGET.to_vec(), Kernels::Candle)?;
+            let loss = kl_loss(&var, TARGET.to_vec(), None, Kernels::Candle)?;
             let mut gradient = [0f32; 6];
             let expected = kl(&logits, &TARGET, ATOMS, &mut gradient);
             let error = f64::from(loss.to_scalar::<f32>()?) - expected;

@@ -7,16 +7,22 @@ use candle_nn::ops::log_softmax;
 use super::scores::Scores;
 
 /// As [`super::c51::kl_loss`].
-pub(super) fn kl_loss(logits: &Tensor, target: Vec<f32>) -> Result<Tensor> {
+pub(super) fn kl_loss(
+    logits: &Tensor,
+    target: Vec<f32>,
+    weights: Option<Vec<f32>>,
+) -> Result<Tensor> {
     let (rows, atoms) = logits.dims2()?;
     let device = logits.device();
     let ln = |&p: &f32| if p > 0.0 { p.ln() } else { 0.0 };
     let ln_target = Tensor::from_vec(target.iter().map(ln).collect(), (rows, atoms), device)?;
     let target = Tensor::from_vec(target, (rows, atoms), device)?;
     let surprise = (ln_target - log_softmax(logits, D::Minus1)?)?;
-    (target * surprise)?
-        .sum_all()?
-        .affine(1.0 / rows as f64, 0.0)
+    let mut entries = (target * surprise)?;
+    if let Some(weights) = weights {
+        entries = entries.broadcast_mul(&Tensor::from_vec(weights, (rows, 1), device)?)?;
+    }
+    entries.sum_all()?.affine(1.0 / rows as f64, 0.0)
 }
 
 /// As [`super::info_nce::info_nce_loss`]. Beyond about 8 times the clip the slope of a score is 0 here: `1 - tanh^2` in f32.

@@ -120,6 +120,8 @@ pub(super) struct Case {
     n_step_return: Vec<f32>,
     bootstrap_discount: Vec<f32>,
     positive_valid: Vec<u8>,
+    /// Not there: the rows are not weighted.
+    importance_weight: Option<Vec<f32>>,
     tensors: BTreeMap<String, Tensor>,
     /// Expectations that were asked for.
     used: RefCell<BTreeSet<String>>,
@@ -176,6 +178,7 @@ impl Case {
             n_step_return: Vec::new(),
             bootstrap_discount: Vec::new(),
             positive_valid: Vec::new(),
+            importance_weight: None,
             used: RefCell::default(),
             config,
             settings,
@@ -236,6 +239,11 @@ impl Case {
         self.bootstrap_discount = self
             .input("input.bootstrap_discount", DType::F32, &[rows])?
             .to_vec1()?;
+        let name = "input.importance_weight";
+        if self.tensors.contains_key(name) {
+            let weights = self.input(name, DType::F32, &[rows])?.to_vec1()?;
+            self.importance_weight = Some(weights);
+        }
         Ok(())
     }
 
@@ -302,6 +310,7 @@ impl Case {
             n_step_return: &self.n_step_return,
             bootstrap_discount: &self.bootstrap_discount,
             positive_valid: &self.positive_valid,
+            importance_weight: self.importance_weight.as_deref(),
         }
     }
 

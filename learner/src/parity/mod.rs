@@ -149,6 +149,14 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
         .fold(0.0, nan_or_larger);
     lines.push(line("target_projection", error, allowed.projection));
 
+    if !evaluation.row_kls.is_empty() {
+        let expected = case.expected("row_kl", &[rows])?;
+        let error = largest(&widened(&evaluation.row_kls), &expected);
+        let most = expected.iter().copied().fold(0.0, f64::max);
+        let tolerance = (allowed.loss * most).max(allowed.least_loss);
+        lines.push(line("row_kl", error, tolerance));
+    }
+
     let mut loss_line = |name: &str, got: f32, saturated: bool| -> Result<(), ParityError> {
         let expected = case.expected(name, &[1])?[0];
         let relative = if saturated {

@@ -159,6 +159,8 @@ struct PartialBatch {
     counts: Vec<Count>,
     /// Rows that are still to come from each shard.
     pending: Vec<u32>,
+    /// The chance with which each row was given to each shard.
+    shares: Vec<f64>,
     /// The request for a part that each shard gets next.
     ids: Vec<RequestId>,
     parts: Vec<Batch>,
@@ -169,6 +171,7 @@ impl PartialBatch {
         Self {
             counts: vec![Count::default(); shards],
             pending: vec![0; shards],
+            shares: vec![0.0; shards],
             ids: vec![RequestId::first(rand::random()); shards],
             parts: Vec::new(),
         }
@@ -248,12 +251,16 @@ impl Fetcher {
         let PartialBatch {
             counts,
             pending,
+            shares,
             ids,
             parts,
         } = &mut *partial;
         if parts.is_empty() && pending.iter().all(|&rows| rows == 0) {
             match shards::split(self.requests.rows, counts, &mut self.rng) {
-                Some(split) => *pending = split,
+                Some(split) => {
+                    *pending = split;
+                    *shares = shards::shares(counts);
+                }
                 None => {
                     self.shutdown.wait_timeout(LOOK_AGAIN);
                     return self.recount(counts).map(|()| None);
@@ -279,10 +286,18 @@ impl Fetcher {
             };
             ids[shard] = ids[shard].next();
             match answer {
-                Answer::Batch(part) => {
-                    let BatchHeader { tally, held, .. } = part.header;
+                Answer::Batch(mut part) => {
+                    let BatchHeader {
+                        tally,
+                        held,
+                        origin,
+                        ..
+                    } = part.header;
                     counts[shard] = Count { tally, held };
                     pending[shard] = 0;
+                    if origin.is_some() {
+                        part.scale_probabilities(shares[shard] as f32);
+                    }
                     parts.push(part);
                 }
                 Answer::Wait => {}
@@ -357,10 +372,11 @@ impl Fetcher {
             }
         })?;
         Ok(match reply {
-            BatchReply::Batch(header) => {
+            BatchReply::Batch(_) | BatchReply::Prioritised(..) => {
                 if shared_memory {
                     self.trust.worked();
                 }
+                let header = reply.header().expect("a batch has a header");
                 Answer::Batch(Batch::from_payload(header, payload)?)
             }
             BatchReply::Wait(waiting) => {

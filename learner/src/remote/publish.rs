@@ -1,7 +1,9 @@
-//! What the learner publishes: each version of its weights and of its affinity to the replay server, its status on request.
+//! What the learner publishes: each version of its weights and of its affinity to the replay server, priorities of the rows that it was
+//! served, its status on request.
 //! No update waits for any of it.
 
 use std::{
+    collections::VecDeque,
     sync::{
         Arc, Condvar, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicBool, Ordering},
@@ -10,13 +12,18 @@ use std::{
 };
 
 use driml_protocol::{
-    AffinityUpdate, CodecError, Done, LearnerStatus, QueryWorkers, Request, Responder, RunClient,
-    Sealed, Seldom, Shutdown, Weights, WeightsUpload, fault,
+    AffinityUpdate, CodecError, Done, LearnerStatus, PriorityUpdate, QueryWorkers, Request,
+    Responder, RunClient, Sampling, Sealed, Seldom, Shutdown, Weights, WeightsUpload, fault,
 };
 use zenoh::query::Queryable;
 
 /// One delivery of the affinity matrix.
 const AFFINITY_TIMEOUT: Duration = Duration::from_secs(5);
+/// One delivery of priorities.
+const PRIORITIES_TIMEOUT: Duration = Duration::from_secs(5);
+/// Updates whose priorities may wait to be sent. More than batches can be on their way: a replay server that answers to the one
+/// answers to the other. Beyond it the oldest are given up: their transitions keep the priorities that they have.
+const PRIORITIES_MAX: usize = 128;
 /// One delivery of weights.
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(10);
 /// Pause between two tries.
@@ -31,42 +38,51 @@ pub(crate) struct Outlets {
     heard: Arc<AtomicBool>,
     weights: Arc<Newest<Weights>>,
     affinity: Arc<Newest<AffinityUpdate>>,
+    priorities: Arc<Newest<PriorityUpdate>>,
     _queryables: Vec<Queryable<()>>,
 }
 
-/// A slot that keeps the newest of its kind until it is sent.
+/// Keeps the newest of its kind until they are sent, the oldest first.
 struct Newest<T> {
-    slot: Mutex<Option<T>>,
+    waiting: Mutex<VecDeque<T>>,
+    most: usize,
     filled: Condvar,
 }
 
-impl<T> Default for Newest<T> {
-    fn default() -> Self {
-        Self {
-            slot: Mutex::default(),
-            filled: Condvar::new(),
-        }
-    }
-}
-
 impl<T> Newest<T> {
+    /// At most so many.
+    fn of(most: usize) -> Arc<Self> {
+        Arc::new(Self {
+            waiting: Mutex::default(),
+            most,
+            filled: Condvar::new(),
+        })
+    }
+
+    /// In place of the oldest, where there is no room.
     fn put(&self, value: T) {
-        *lock(&self.slot) = Some(value);
+        let mut waiting = lock(&self.waiting);
+        if waiting.len() == self.most {
+            waiting.pop_front();
+        }
+        waiting.push_back(value);
+        drop(waiting);
         self.filled.notify_one();
     }
 
-    /// Takes what is there, waiting for it for a while.
+    /// Takes the oldest that is there, waiting for one for a while.
     fn take(&self) -> Option<T> {
-        let slot = lock(&self.slot);
-        let (mut slot, _) = self
+        let waiting = lock(&self.waiting);
+        let (mut waiting, _) = self
             .filled
-            .wait_timeout_while(slot, TICK, |slot| slot.is_none())
+            .wait_timeout_while(waiting, TICK, |waiting| waiting.is_empty())
             .unwrap_or_else(PoisonError::into_inner);
-        slot.take()
+        waiting.pop_front()
     }
 
-    fn is_filled(&self) -> bool {
-        lock(&self.slot).is_some()
+    /// Whether the next one that comes takes the place of another.
+    fn is_full(&self) -> bool {
+        lock(&self.waiting).len() == self.most
     }
 }
 
@@ -80,6 +96,7 @@ impl Outlets {
         clients: &[RunClient],
         spec_hash: u64,
         learner: u64,
+        sampling: &Sampling,
         shutdown: &Shutdown,
     ) -> anyhow::Result<Self> {
         let status: Arc<Mutex<LearnerStatus>> = Arc::default();
@@ -102,8 +119,9 @@ impl Outlets {
             learner,
             status,
             heard,
-            weights: Arc::default(),
-            affinity: Arc::default(),
+            weights: Newest::of(1),
+            affinity: Newest::of(1),
+            priorities: Newest::of(PRIORITIES_MAX),
             _queryables: queryables,
         };
         let to_all = |what, timeout| Sender {
@@ -125,6 +143,12 @@ impl Outlets {
         affinity.start(this.affinity.clone(), move |update| {
             Sealed::new(update, spec_hash)
         })?;
+        if sampling.is_prioritised() {
+            let priorities = to_all("priorities", PRIORITIES_TIMEOUT);
+            priorities.start(this.priorities.clone(), move |update| {
+                Sealed::new(update, spec_hash)
+            })?;
+        }
         Ok(this)
     }
 
@@ -146,6 +170,11 @@ impl Outlets {
     /// Hands over the newest affinity; one that was not sent yet is replaced.
     pub(crate) fn send_affinity(&self, update: AffinityUpdate) {
         self.affinity.put(update);
+    }
+
+    /// Hands over the priorities of an update's rows. They are sent in order, each until every shard has said that it has it.
+    pub(crate) fn send_priorities(&self, update: PriorityUpdate) {
+        self.priorities.put(update);
     }
 
     /// Waits until somebody has asked for the status since the learner finished, or for `wait_max`.
@@ -185,7 +214,7 @@ impl Sender {
                 fault::point(&name);
                 let Some(value) = newest.take() else { continue };
                 match message(&value) {
-                    Ok(message) => self.send_to_all(&message, || newest.is_filled()),
+                    Ok(message) => self.send_to_all(&message, || newest.is_full()),
                     Err(e) => tracing::error!("the {} cannot be sent: {e}", self.what),
                 }
             }

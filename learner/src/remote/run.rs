@@ -73,12 +73,16 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         unreachable_max: Duration::from_millis(config.learner.unreachable_max_ms),
     };
     if requests.shared_memory
-        && let Err(why) =
-            shared_memory::check_lockable(BatchHeader::of(&config.spec, rows).pool_bytes())
+        && let Err(why) = shared_memory::check_lockable(
+            BatchHeader::of(&config.spec, rows)
+                .sampled_by(&config.sampling)
+                .pool_bytes(),
+        )
     {
         tracing::warn!("batches come through sockets, which is slower: {why}");
         requests.shared_memory = false;
     }
+    let sampling = config.sampling;
     let mut learner = Learner::resume(config, &compute, &folder)?;
     let updates = learner.updates();
     let after_updates = shards.after_updates;
@@ -104,7 +108,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     };
     learner.publish_above(membership.weights_version);
     keep_settings(&args.run_dir, &shards.config_toml)?;
-    let outlets = Outlets::open(&clients, spec_hash, requests.learner, shutdown)?;
+    let outlets = Outlets::open(&clients, spec_hash, requests.learner, &sampling, shutdown)?;
     outlets.publish(learner.next_weights()?);
     if updates > 0 {
         outlets.with_status(|status| status.updates = updates);
@@ -192,6 +196,11 @@ fn learn(
         said_next = SILENT_MAX;
         let started = Instant::now();
         let report = learner.update(&batch)?;
+        // Numbered by updates, which no life of the learner counts backwards.
+        let (by, number) = (outlets.learner(), learner.updates());
+        if let Some(priorities) = batch.priority_update(by, number, &report.row_kls) {
+            outlets.send_priorities(priorities);
+        }
         if let Some(affinity) = learner.affinity_update(outlets.learner()) {
             outlets.send_affinity(affinity);
         }

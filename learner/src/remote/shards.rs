@@ -206,6 +206,13 @@ pub(crate) fn split(rows: u32, counts: &[Count], rng: &mut impl Rng) -> Option<V
     Some(split)
 }
 
+/// The chance that [`split`] gives a row to each shard.
+pub(crate) fn shares(counts: &[Count]) -> Vec<f64> {
+    let total: u64 = counts.iter().map(|count| count.held).sum();
+    let shares = counts.iter().map(|count| count.held as f64 / total as f64);
+    shares.collect()
+}
+
 /// What all shards but `this` will have counted once each has given its `pending` rows.
 pub(crate) fn other_shards(counts: &[Count], pending: &[u32], this: usize) -> Tally {
     let others = counts.iter().zip(pending).enumerate();

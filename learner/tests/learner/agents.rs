@@ -9,7 +9,7 @@ use driml_learner::{
 };
 use driml_model::{Compute, DimHeads, InputSize, ModelConfig, Parameters};
 use driml_protocol::{
-    Batch as WireBatch, BatchHeader, Buffer, Horizon, RowScalars, RunSpec, TimeoutRule,
+    Batch as WireBatch, BatchHeader, Buffer, Horizon, RowScalars, RunSpec, Sampling, TimeoutRule,
     config::TransportConfig,
 };
 use rand::{Rng, SeedableRng};
@@ -496,6 +496,7 @@ fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConf
                 exact: None,
             },
         },
+        sampling: Sampling::Uniform,
         transport: TransportConfig {
             shared_memory: false,
         },
@@ -701,4 +702,66 @@ fn augmentation_and_objective_belong_together() {
             ..DimHeads::NONE
         }
     );
+}
+
+/// The chance of each row weights its C51 loss, at the beta of the update's number; nothing else, and the row's own loss comes back.
+#[test]
+fn rows_drawn_by_priority_are_weighted_and_answered() {
+    let uniform = config(DIM, None);
+    let sampling = Sampling::Prioritised {
+        alpha: 0.5,
+        beta_start: 0.5,
+        beta_end: 1.0,
+        beta_updates: 1,
+    };
+    let config = LearnerConfig {
+        sampling,
+        ..uniform.clone()
+    };
+    let chances = [0.5f32, 0.25, 0.125, 0.1, 0.5, 1.0];
+    let drawn = |chances: &[f32]| {
+        let plain = served(&config, 1);
+        let header = BatchHeader::of(&config.spec, 6).sampled_by(&sampling);
+        let header = BatchHeader {
+            origin: header.origin,
+            ..plain.header
+        };
+        let (_, payload) = plain.into_payload();
+        let mut more = Buffer::zeroed(header.payload_bytes());
+        more[..payload.len()].copy_from_slice(&payload);
+        for (row, chance) in chances.iter().enumerate() {
+            let at = payload.len() + 6 * 8 + row * 4;
+            more[at..at + 4].copy_from_slice(&chance.to_le_bytes());
+        }
+        WireBatch::from_payload(header, more).unwrap()
+    };
+    let learner = |config: &LearnerConfig| Learner::new(config.clone(), &Compute::CPU).unwrap();
+    let plain = learner(&uniform).update(&served(&uniform, 1)).unwrap();
+    assert!(plain.row_kls.is_empty());
+
+    // Equal chances are a weight of 1 each.
+    let mut equal = learner(&config);
+    let report = equal.update(&drawn(&[0.25; 6])).unwrap();
+    assert_eq!(report.losses, plain.losses);
+    assert!((report.c51_kl - plain.c51_kl).abs() < 1e-6 * plain.c51_kl);
+    assert!((report.grad_norm - plain.grad_norm).abs() < 1e-5 * plain.grad_norm);
+
+    let mut learner = learner(&config);
+    for beta in [0.5, 1.0, 1.0] {
+        let report = learner.update(&drawn(&chances)).unwrap();
+        let weighted = chances.iter().zip(&report.row_kls).map(|(chance, kl)| {
+            let weight = (0.1 / f64::from(*chance)).powf(beta);
+            weight * f64::from(*kl)
+        });
+        let mean = weighted.sum::<f64>() / 6.0;
+        let error = f64::from(report.c51_kl) - mean;
+        assert!(error.abs() < 1e-6 * mean, "beta {beta}: {error} of {mean}");
+        let dim: f32 = report.losses.iter().map(|it| it.1).sum();
+        assert!(
+            (report.total - report.c51_kl - dim).abs() < 1e-5,
+            "DIM is as it is"
+        );
+    }
+    let rows = report.row_kls.iter().map(|kl| f64::from(*kl)).sum::<f64>();
+    assert!((rows / 6.0 - f64::from(plain.c51_kl)).abs() < 1e-6 * f64::from(plain.c51_kl));
 }

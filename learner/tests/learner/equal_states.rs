@@ -73,6 +73,7 @@ fn gradients(evaluation: &Evaluation, agent: &Agent) -> Vec<(String, Vec<f32>)> 
 fn forward(it: &Evaluation) -> (Vec<f32>, Vec<f32>, Vec<u8>, Vec<f32>) {
     let mut losses = vec![it.c51_kl, it.total];
     losses.extend(it.losses.iter().map(|(_, loss)| loss));
+    losses.extend(&it.row_kls);
     let logits = it.taken_logits.flatten_all().unwrap().to_vec1().unwrap();
     (
         losses,
@@ -95,14 +96,17 @@ fn leaving_repeats_out_changes_no_result_and_sums_gradients_in_another_order_alo
             (CPC, ALL_DIM),
             (CURL, curl_lambda),
         ] {
-            for (repeat, double_dqn) in [
-                (Repeat::Nowhere, false),
-                (Repeat::Later, true),
-                (Repeat::Everywhere, false),
-                (Repeat::Everywhere, true),
+            for (repeat, double_dqn, is_weighted) in [
+                (Repeat::Nowhere, false, false),
+                (Repeat::Later, true, true),
+                (Repeat::Everywhere, false, false),
+                (Repeat::Everywhere, false, true),
+                (Repeat::Everywhere, true, false),
             ] {
                 let rows = rows(repeat);
                 let mut batch = rows.batch();
+                let weights: Vec<f32> = (1..=batch.rows).map(|row| 1.0 / row as f32).collect();
+                batch.importance_weight = is_weighted.then_some(&weights);
                 if objective == CURL {
                     batch.anchors = Some(&rows.frames[1]);
                     batch.states_k = &rows.frames[2];

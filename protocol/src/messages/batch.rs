@@ -6,11 +6,13 @@ use serde::{Deserialize, Serialize};
 use super::{
     batch_layout::{BatchLayout, Column},
     batch_rows::{BatchStatesMut, RowScalars},
+    priorities::{Origin, PriorityPart, PriorityUpdate},
     status::Waiting,
     tally::Tally,
 };
 use crate::{
     run_spec::RunSpec,
+    sampling::Sampling,
     wire::{
         buffers::Buffer,
         error::CodecError,
@@ -46,6 +48,10 @@ pub struct BatchHeader {
     pub mean_age: f64,
     /// Version of the newest weights that chose an action of this batch, and of the oldest.
     pub weights_versions: (u64, u64),
+    /// Who drew the rows, where they are drawn by priority; it travels as [`BatchReply::Prioritised`], and other batches have no
+    /// byte of it.
+    #[serde(skip)]
+    pub origin: Option<Origin>,
 }
 
 impl BatchHeader {
@@ -62,6 +68,16 @@ impl BatchHeader {
             held: 0,
             mean_age: 0.0,
             weights_versions: (0, u64::MAX),
+            origin: None,
+        }
+    }
+
+    /// The same where rows are drawn by this rule.
+    #[must_use]
+    pub fn sampled_by(self, sampling: &Sampling) -> Self {
+        Self {
+            origin: sampling.is_prioritised().then(Origin::default),
+            ..self
         }
     }
 
@@ -87,6 +103,7 @@ impl BatchHeader {
             state_bytes: self.state_bytes as usize,
             states_k: self.states_k as usize,
             states_n: self.states_n as usize,
+            is_prioritised: self.origin.is_some(),
         }
     }
 
@@ -113,6 +130,13 @@ impl BatchHeader {
                 counted.0, counted.1, self.states_k, self.states_n
             )));
         }
+        let (chances, _) = payload[layout.range(Column::Probability)].as_chunks();
+        let mut chances = chances.iter().map(|&chance| f32::from_le_bytes(chance));
+        if let Some(chance) = chances.find(|chance| !(*chance > 0.0 && *chance <= 1.0)) {
+            return Err(CodecError::Header(format!(
+                "a row that was drawn with the probability {chance}"
+            )));
+        }
         Ok(())
     }
 }
@@ -131,15 +155,39 @@ pub enum BatchReply {
         /// The replay server's reason, a sentence.
         why: String,
     },
+    /// The payload that follows is a batch whose rows were drawn by priority, and who drew them.
+    Prioritised(BatchHeader, Origin),
+}
+
+impl BatchReply {
+    /// The reply with a batch of this header.
+    pub const fn of(header: BatchHeader) -> Self {
+        match header.origin {
+            None => Self::Batch(header),
+            Some(origin) => Self::Prioritised(header, origin),
+        }
+    }
+
+    /// The header of the batch, if it is one.
+    pub const fn header(&self) -> Option<BatchHeader> {
+        match *self {
+            Self::Batch(header) => Some(header),
+            Self::Prioritised(header, origin) => Some(BatchHeader {
+                origin: Some(origin),
+                ..header
+            }),
+            Self::Wait(_) | Self::Finished | Self::Refused { .. } => None,
+        }
+    }
 }
 
 impl Message for BatchReply {
     const KIND: Kind = Kind::BatchReply;
 
     fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
-        match self {
-            Self::Batch(header) => header.check_payload(payload),
-            Self::Wait(_) | Self::Finished | Self::Refused { .. } => no_payload(payload),
+        match self.header() {
+            Some(header) => header.check_payload(payload),
+            None => no_payload(payload),
         }
     }
 }
@@ -148,12 +196,15 @@ impl Message for BatchReply {
 ///
 /// Buffer, one after the other: states_t [B, state bytes]; states_k of the positives that rows have, in the order of [P, B];
 /// states_n of the rows that bootstrap; then B rows each: n-step return f32, bootstrap discount f32 (little-endian); action, next action,
-/// positive valid [P, B], k [P, B] (u8). No state travels that a row does not have.
+/// positive valid [P, B], k [P, B] (u8). Where rows are drawn by priority, then: transition u64, probability f32. No state travels
+/// that a row does not have.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Batch {
     /// What it says of itself.
     pub header: BatchHeader,
     payload: Buffer,
+    /// Of a merged batch, who drew its rows by priority: so many at a time.
+    origins: Vec<(Origin, usize)>,
 }
 
 impl Batch {
@@ -184,7 +235,11 @@ impl Batch {
     /// A batch in memory that may hold anything.
     fn in_memory(header: BatchHeader, payload: Buffer) -> Self {
         assert_eq!(payload.len(), header.payload_bytes(), "memory for a batch");
-        Self { header, payload }
+        Self {
+            header,
+            payload,
+            origins: Vec::new(),
+        }
     }
 
     /// The rows of all `parts`, one part after the other, in memory that may hold anything; as many bytes as
@@ -209,6 +264,8 @@ impl Batch {
                 }
             }
         }
+        let origin = |part: &Self| Some((part.header.origin?, part.rows()));
+        merged.origins = parts.iter().filter_map(origin).collect();
         merged
     }
 
@@ -245,9 +302,12 @@ impl Batch {
             held,
             mean_age,
             weights_versions: (newest, oldest),
+            origin,
         } in parts.iter().map(|part| part.header)
         {
-            if (positives, state_bytes) != (merged.positives, merged.state_bytes) {
+            if (positives, state_bytes) != (merged.positives, merged.state_bytes)
+                || origin.is_some() != merged.origin.is_some()
+            {
                 return None;
             }
             merged.rows += rows;
@@ -327,12 +387,89 @@ impl Batch {
         self.column(Column::K)
     }
 
+    /// The chance with which each row was drawn [B], where rows are drawn by priority.
+    pub fn probabilities(&self) -> Option<Vec<f32>> {
+        self.header.origin?;
+        Some(self.column_f32(Column::Probability))
+    }
+
+    /// The transition of each row [B], by its number since the start of the replay that drew it; none where rows are drawn uniformly.
+    fn transitions(&self) -> Vec<u64> {
+        let (values, _) = self.column(Column::Transition).as_chunks();
+        values.iter().copied().map(u64::from_le_bytes).collect()
+    }
+
+    /// Writes of each row which transition it is, and the chance with which it was drawn.
+    ///
+    /// # Panics
+    /// If these are not as many as the rows, or the rows are drawn uniformly.
+    pub fn set_draws(&mut self, draws: impl ExactSizeIterator<Item = (u64, f32)>) {
+        assert!(self.header.origin.is_some(), "rows drawn by priority");
+        assert_eq!(draws.len(), self.rows(), "a draw a row");
+        let layout = self.header.layout();
+        for (row, (transition, probability)) in draws.enumerate() {
+            let mut put = |column, bytes: &[u8]| {
+                let column = &mut self.payload[layout.range(column)];
+                column[row * bytes.len()..][..bytes.len()].copy_from_slice(bytes);
+            };
+            put(Column::Transition, &transition.to_le_bytes());
+            put(Column::Probability, &probability.to_le_bytes());
+        }
+    }
+
+    /// Makes the chance of each row `share` of what it was: that its replay server was chosen.
+    ///
+    /// # Panics
+    /// As [`Batch::set_draws`].
+    pub fn scale_probabilities(&mut self, share: f32) {
+        let chances = self.probabilities().expect("rows drawn by priority");
+        let scaled = chances.into_iter().map(|chance| chance * share);
+        let draws: Vec<_> = self.transitions().into_iter().zip(scaled).collect();
+        self.set_draws(draws.into_iter());
+    }
+
+    /// What `learner` says back of rows that were drawn by priority: update `number`, with the `priorities` [B]; none where rows
+    /// are drawn uniformly.
+    ///
+    /// # Panics
+    /// If these are not as many as the rows.
+    pub fn priority_update(
+        &self,
+        learner: u64,
+        number: u64,
+        priorities: &[f32],
+    ) -> Option<PriorityUpdate> {
+        let whole = [(self.header.origin?, self.rows())];
+        assert_eq!(priorities.len(), self.rows(), "a priority a row");
+        let origins = match self.origins.as_slice() {
+            [] => &whole[..],
+            origins => origins,
+        };
+        let (mut transitions, mut priorities) = (&self.transitions()[..], priorities);
+        let part = |&(origin, rows): &(Origin, usize)| {
+            let (own, rest) = transitions.split_at(rows);
+            transitions = rest;
+            let (found, rest) = priorities.split_at(rows);
+            priorities = rest;
+            PriorityPart {
+                origin,
+                transitions: own.to_vec(),
+                priorities: found.to_vec(),
+            }
+        };
+        Some(PriorityUpdate {
+            learner,
+            number,
+            parts: origins.iter().map(part).collect(),
+        })
+    }
+
     /// The places of all states that the rows have.
     pub fn states_mut(&mut self) -> BatchStatesMut<'_> {
         BatchStatesMut::new(self.header.layout(), &mut self.payload)
     }
 
-    /// Header and payload, to travel as a [`BatchReply::Batch`].
+    /// Header and payload, to travel as [`BatchReply::of`] the header.
     pub fn into_payload(self) -> (BatchHeader, Buffer) {
         (self.header, self.payload)
     }
@@ -343,6 +480,6 @@ impl Batch {
     /// Buffer of another length, or rows that say otherwise.
     pub fn from_payload(header: BatchHeader, payload: Buffer) -> Result<Self, CodecError> {
         header.check_payload(&payload)?;
-        Ok(Self { header, payload })
+        Ok(Self::in_memory(header, payload))
     }
 }

@@ -25,11 +25,15 @@ pub(super) enum Column {
     PositiveValid,
     /// k of each positive.
     K,
+    /// The transition's number since the start of the replay, u64; where rows are drawn by priority.
+    Transition,
+    /// The chance with which the row was drawn, f32; where rows are drawn by priority.
+    Probability,
 }
 
 impl Column {
     /// All of them, in their order.
-    pub(super) const ALL: [Self; 9] = [
+    pub(super) const ALL: [Self; 11] = [
         Self::StatesT,
         Self::StatesK,
         Self::StatesN,
@@ -39,6 +43,8 @@ impl Column {
         Self::NextAction,
         Self::PositiveValid,
         Self::K,
+        Self::Transition,
+        Self::Probability,
     ];
 
     /// Whether it has a value for each positive of a row.
@@ -46,18 +52,24 @@ impl Column {
         matches!(self, Self::StatesK | Self::PositiveValid | Self::K)
     }
 
+    /// Whether it is there only where rows are drawn by priority.
+    const fn is_of_priorities(self) -> bool {
+        matches!(self, Self::Transition | Self::Probability)
+    }
+
     /// Bytes of a value that is no state.
     const fn scalar_bytes(self) -> usize {
         match self {
             Self::StatesT | Self::StatesK | Self::StatesN => 0,
-            Self::NStepReturn | Self::BootstrapDiscount => size_of::<f32>(),
+            Self::NStepReturn | Self::BootstrapDiscount | Self::Probability => size_of::<f32>(),
+            Self::Transition => size_of::<u64>(),
             Self::Action | Self::NextAction | Self::PositiveValid | Self::K => size_of::<u8>(),
         }
     }
 }
 
-/// Bytes of all scalars of a row itself, or of one of its positives.
-const fn scalar_bytes(per_positive: bool) -> usize {
+/// Bytes of all scalars of a row itself, or of one of its positives; of those that every row has, or of those of priorities.
+const fn scalar_bytes(per_positive: bool, of_priorities: bool) -> usize {
     let (mut bytes, mut at) = (0, 0);
     while at < Column::ALL.len() {
         let column = Column::ALL[at];
@@ -65,7 +77,7 @@ const fn scalar_bytes(per_positive: bool) -> usize {
             column as usize == at,
             "the order of ALL is that of the columns"
         );
-        if column.is_per_positive() == per_positive {
+        if column.is_per_positive() == per_positive && column.is_of_priorities() == of_priorities {
             bytes += column.scalar_bytes();
         }
         at += 1;
@@ -73,9 +85,11 @@ const fn scalar_bytes(per_positive: bool) -> usize {
     bytes
 }
 
-const ROW_SCALAR_BYTES: usize = scalar_bytes(false);
-const POSITIVE_SCALAR_BYTES: usize = scalar_bytes(true);
-const _: () = assert!(ROW_SCALAR_BYTES == 10 && POSITIVE_SCALAR_BYTES == 2);
+const ROW_SCALAR_BYTES: usize = scalar_bytes(false, false);
+const POSITIVE_SCALAR_BYTES: usize = scalar_bytes(true, false);
+const PRIORITY_SCALAR_BYTES: usize = scalar_bytes(false, true);
+const _: () =
+    assert!(ROW_SCALAR_BYTES == 10 && POSITIVE_SCALAR_BYTES == 2 && PRIORITY_SCALAR_BYTES == 12);
 
 /// The shape of a batch, from which the place of every value follows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -90,6 +104,8 @@ pub(super) struct BatchLayout {
     pub(super) states_k: usize,
     /// States s_{t+n} that are there, at most one for each row.
     pub(super) states_n: usize,
+    /// Whether rows say which transition they are and how likely they were.
+    pub(super) is_prioritised: bool,
 }
 
 impl BatchLayout {
@@ -102,7 +118,12 @@ impl BatchLayout {
         let states = self.rows.checked_add(self.states_k)?;
         let states = states.checked_add(self.states_n)?;
         let states = states.checked_mul(self.state_bytes)?;
-        let of_rows = self.rows.checked_mul(ROW_SCALAR_BYTES)?;
+        let of_priorities = if self.is_prioritised {
+            PRIORITY_SCALAR_BYTES
+        } else {
+            0
+        };
+        let of_rows = self.rows.checked_mul(ROW_SCALAR_BYTES + of_priorities)?;
         let of_positives = positives.checked_mul(POSITIVE_SCALAR_BYTES)?;
         states.checked_add(of_rows)?.checked_add(of_positives)
     }
@@ -135,6 +156,7 @@ impl BatchLayout {
             Column::StatesT => self.rows * self.state_bytes,
             Column::StatesK => self.states_k * self.state_bytes,
             Column::StatesN => self.states_n * self.state_bytes,
+            _ if column.is_of_priorities() && !self.is_prioritised => 0,
             _ => self.rows * self.values_a_row(column) * column.scalar_bytes(),
         }
     }
@@ -165,6 +187,7 @@ mod tests {
                 state_bytes,
                 states_k,
                 states_n,
+                is_prioritised: rows % 2 == 0,
             };
             let mut end = 0;
             for column in Column::ALL {
@@ -180,8 +203,14 @@ mod tests {
             state_bytes: 1,
             states_k: 4,
             states_n: 2,
+            is_prioritised: false,
         };
         assert_eq!(small.bytes(), Some(2 * (3 + 1 + 10 + 2 * 2)));
+        let prioritised = BatchLayout {
+            is_prioritised: true,
+            ..small
+        };
+        assert_eq!(prioritised.bytes(), Some(2 * (3 + 1 + 10 + 2 * 2 + 12)));
         for wrong in [
             BatchLayout {
                 rows: usize::MAX,

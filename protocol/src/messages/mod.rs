@@ -13,6 +13,7 @@ pub(crate) mod hello;
 pub(crate) mod insert_reply;
 pub(crate) mod join;
 pub(crate) mod parts;
+pub(crate) mod priorities;
 pub(crate) mod report;
 pub(crate) mod status;
 pub(crate) mod tally;

@@ -12,6 +12,7 @@ use crate::{
         insert_reply::Claim,
         join::{ActorJoin, LearnerJoin},
         parts::PartsStatus,
+        priorities::PriorityUpdate,
         report::Report,
         status::{LearnerStatus, ReplayStatus},
         weights::{WeightsRequest, WeightsUpload, WeightsVersion},
@@ -54,6 +55,7 @@ fn grant(keys: &Keys, role: Role) -> Grant {
                 keys.of::<LearnerJoin>(),
                 keys.of::<BatchRequest>(),
                 keys.of::<AffinityUpdate>(),
+                keys.of::<PriorityUpdate>(),
                 keys.of::<WeightsUpload>(),
                 keys.of_learner::<Report>(),
             ]);
@@ -198,6 +200,7 @@ mod tests {
                 "d/join/learner",
                 "d/batch",
                 "d/affinity",
+                "d/priorities",
                 "d/weights-upload",
                 "d/report/learner",
                 "d/status/learner",

@@ -98,4 +98,6 @@ pub enum Kind {
     Report = 19,
     /// The replay server's account of who takes part.
     PartsStatus = 20,
+    /// Priorities of the rows of a batch, learner to replay server.
+    Priorities = 21,
 }

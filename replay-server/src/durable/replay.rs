@@ -5,7 +5,7 @@ use std::{borrow::Cow, collections::VecDeque, ops::Deref};
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, Buffer, Chunk, Claim, CodecError, Goodbye, InsertReply,
-    RequestId, Tally, codec,
+    PriorityUpdate, RequestId, Tally, codec,
 };
 
 use super::{
@@ -19,7 +19,7 @@ use crate::{
         Replay, Unready,
         events::{Drawn, Event},
     },
-    sampling::packed_batch::PackedBatch,
+    sampling::{packed_batch::PackedBatch, prioritised::SavedPriorities},
     storage::frame_store::{PackedChunk, Packer},
 };
 
@@ -111,6 +111,13 @@ impl DurableReplay {
             after_updates,
             log: Some(log),
         }
+    }
+
+    /// [`Replay::with_incarnation`].
+    #[must_use]
+    pub fn with_incarnation(mut self, incarnation: u64) -> Self {
+        self.replay = self.replay.with_incarnation(incarnation);
+        self
     }
 
     /// Counts the rows of a checkpoint after `updates` as served, if the log does not know of them: the disk lost their records.
@@ -394,6 +401,22 @@ impl DurableReplay {
         self.replay.set_affinity(update)?;
         self.log_event(|| Event::Affinity(update.clone()));
         Ok(())
+    }
+
+    /// [`Replay::set_priorities`]. The log knows nothing of priorities: after a recovery each transition has the highest one.
+    ///
+    /// # Errors
+    /// Those of the replay's own function.
+    pub fn set_priorities(&mut self, update: &PriorityUpdate) -> Result<(), String> {
+        self.replay.set_priorities(update)
+    }
+
+    /// [`Replay::restore_priorities`].
+    ///
+    /// # Errors
+    /// Those of the replay's own function.
+    pub fn restore_priorities(&mut self, saved: Option<&SavedPriorities>) -> Result<(), String> {
+        self.replay.restore_priorities(saved)
     }
 
     /// [`Replay::set_other_shards`].

@@ -78,6 +78,7 @@ impl Replay {
     /// Lets go of the transitions before `oldest`.
     pub(crate) fn forget_before(&mut self, oldest: u64) {
         self.ring.forget_before(oldest);
+        self.forget_priorities();
     }
 
     /// Rows count as served that the learner has learned from.

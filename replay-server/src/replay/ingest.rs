@@ -191,9 +191,11 @@ impl Replay {
                 let (action, reward) = (chunk.actions()[row], chunk.reward(row));
                 Step::new(action, reward, chunk.end(row), header.weights_version)
             };
-            stream.link = self
-                .ring
-                .push_run(frames, rows.clone().map(step), stream.link);
+            let (link, first) = (stream.link, self.ring.inserted());
+            stream.link = self.ring.push_run(frames, rows.clone().map(step), link);
+            if let Some(priorities) = &mut self.priorities {
+                priorities.stored(&self.ring, &self.episodes, first, link);
+            }
             for step in rows.map(step) {
                 self.statistics.action_histogram[usize::from(step.action)] += 1;
                 stream.episode_return = stream

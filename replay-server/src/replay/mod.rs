@@ -3,16 +3,17 @@
 
 pub(crate) mod events;
 mod ingest;
+mod priorities;
 mod sample;
 pub(crate) mod snapshot;
 mod status;
 
-use driml_protocol::{BatchReply, RunSpec, Tally, Waiting};
+use driml_protocol::{BatchReply, Origin, RunSpec, Sampling, Tally, Waiting};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    config::{Config, ConfigError, SHARDS_MAX},
+    config::{Config, ConfigError, SHARDS_MAX, reach},
     ledger::{actors::Actors, requests::Requests, statistics::Statistics},
     rate_limiter::RateLimiter,
     sampling::{
@@ -20,6 +21,7 @@ use crate::{
         assemble::Assembler,
         episodes::{Episodes, Window},
         horizon::Affinity,
+        prioritised::Priorities,
     },
     storage::{frame_store::Frames, ring::Ring},
 };
@@ -64,6 +66,10 @@ pub struct Replay {
     limiter: RateLimiter,
     episodes: Episodes,
     anchors: Anchors,
+    /// Where rows are drawn by priority.
+    priorities: Option<Priorities>,
+    /// Who draws, as batches say it that are drawn by priority.
+    origin: Origin,
     window: Window,
     assembler: Assembler,
     affinity: Affinity,
@@ -109,7 +115,7 @@ impl Replay {
         let bytes_max = config.compressed_bytes_max.map(|bytes| bytes / shards);
         let frames = Frames::new(config.compression, capacity, frame_bytes, bytes_max);
         let ring = frames.and_then(|frames| Ring::new(capacity, frames));
-        let ring = ring.map_err(|bytes| {
+        let refused = |bytes| {
             let why =
                 format!("the system does not grant the {bytes} bytes that this takes; hold fewer");
             ConfigError::Key {
@@ -117,7 +123,15 @@ impl Replay {
                 value: config.capacity_transitions.to_string(),
                 why,
             }
-        })?;
+        };
+        let ring = ring.map_err(refused)?;
+        let priorities = match config.sampling {
+            Sampling::Uniform => None,
+            Sampling::Prioritised { alpha, .. } => {
+                let made = Priorities::new(alpha, capacity, reach(spec));
+                Some(made.map_err(refused)?)
+            }
+        };
         let mut rng = ChaCha8Rng::seed_from_u64(spec.seed);
         rng.set_stream(RNG_STREAM + u64::from(shard));
         Ok(Self {
@@ -136,6 +150,11 @@ impl Replay {
             ),
             episodes: Episodes::new(spec),
             anchors: Anchors::default(),
+            priorities,
+            origin: Origin {
+                shard,
+                incarnation: 0,
+            },
             window: Window::default(),
             assembler: Assembler::new(spec, config.reproduced_bug),
             affinity: Affinity::uniform(spec.num_actions),

@@ -9,7 +9,10 @@ use super::{Replay, Unready};
 use crate::{
     config,
     ledger::requests::{Dedup, Requests},
-    sampling::packed_batch::{PackedBatch, PackedStates},
+    sampling::{
+        assemble::RowStates,
+        packed_batch::{PackedBatch, PackedStates},
+    },
 };
 
 /// How far the version of an affinity matrix may be ahead of the rows served, of which a replay that was started anew may not
@@ -45,7 +48,7 @@ impl Replay {
         self.draw(rows).map(PackedBatch::unpack)
     }
 
-    /// A batch of `rows` rows, anchors uniform over the valid ones and drawn with replacement, or why there is none. With
+    /// A batch of `rows` rows, anchors drawn with replacement by the rule of `replay.sampling`, or why there is none. With
     /// compression its frames are left to be unpacked, which needs the replay no more.
     ///
     /// # Errors
@@ -63,7 +66,8 @@ impl Replay {
         rows: u32,
         memory: impl FnOnce(usize) -> Buffer,
     ) -> Result<PackedBatch, Unready> {
-        let rows_max = config::rows_max(&self.spec).min(self.limiter.rows_max());
+        let rows_max = config::rows_max(&self.spec, &self.config.sampling);
+        let rows_max = rows_max.min(self.limiter.rows_max());
         if rows == 0 || rows > rows_max {
             self.statistics.messages_refused += 1;
             let why = format!(
@@ -82,10 +86,7 @@ impl Replay {
         let mut ks = Vec::with_capacity(rows as usize);
         let mut age_total = 0;
         for _ in 0..rows {
-            if !self
-                .anchors
-                .draw(&self.ring, &self.episodes, &mut self.rng, &mut self.window)
-            {
+            if !self.draw_anchor() {
                 return Err(self.no_anchor());
             }
             let row = self
@@ -105,6 +106,12 @@ impl Replay {
         header.tally = self.limiter.tally();
         let (scalars, states): (Vec<_>, Vec<_>) = drawn.into_iter().unzip();
         let mut batch = Batch::of_rows(header, &scalars, memory);
+        if let Some(priorities) = &self.priorities {
+            // All by the masses that are there now: to find that one was no anchor any more makes the others more likely.
+            let chance = |index| (priorities.chance(index) as f32).clamp(f32::MIN_POSITIVE, 1.0);
+            let drawn = states.iter().map(RowStates::anchor);
+            batch.set_draws(drawn.map(|index| (index, chance(index))));
+        }
         let pixel_bytes = self.spec.frame_channels as usize;
         let mut packed = PackedStates::new(self.spec.frame_bytes(), pixel_bytes);
         let mut places = batch.states_mut();
@@ -113,6 +120,16 @@ impl Replay {
         }
         self.starving = false;
         Ok(PackedBatch { batch, packed, ks })
+    }
+
+    /// Leaves the window of an anchor in `self.window`; false if there is none.
+    fn draw_anchor(&mut self) -> bool {
+        let (ring, episodes) = (&self.ring, &self.episodes);
+        let (rng, window) = (&mut self.rng, &mut self.window);
+        match &mut self.priorities {
+            None => self.anchors.draw(ring, episodes, rng, window),
+            Some(priorities) => priorities.draw(ring, episodes, rng, window),
+        }
     }
 
     /// [`Replay::draw_in`] for request `id`. What an earlier attempt at this request was given did not arrive: from now on it
@@ -154,6 +171,7 @@ impl Replay {
         BatchHeader {
             tally: self.limiter.tally(),
             held: self.ring.inserted() - self.ring.oldest(),
+            origin: self.priorities.is_some().then_some(self.origin),
             ..BatchHeader::of(&self.spec, rows)
         }
     }

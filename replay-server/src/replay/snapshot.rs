@@ -95,7 +95,7 @@ impl Replay {
             self.push_gone(gap);
             actors.cut_streams(stored);
         }
-        self.ring.forget_before(oldest);
+        self.forget_before(oldest);
         actors.note_restored();
         self.quiet = true;
         self.limiter = self.limiter.clone().resumed_at(tally, other_shards);

@@ -92,6 +92,9 @@ impl Replay {
     /// Checks the ring and the counts; panics at the first that is wrong. Slow: for tests.
     pub fn check_valid(&self) {
         self.ring.check_valid();
+        if let Some(priorities) = &self.priorities {
+            priorities.check_valid(&self.ring, &self.episodes);
+        }
         let stored: u64 = self.statistics.action_histogram.iter().sum();
         assert_eq!(
             stored,

@@ -27,6 +27,11 @@ pub(crate) struct RowStates {
 }
 
 impl RowStates {
+    /// The transition of s_t.
+    pub(crate) const fn anchor(&self) -> u64 {
+        self.t
+    }
+
     /// k, of several positives the furthest, 0 without any.
     pub(crate) fn k(&self) -> u32 {
         match self.positives {

@@ -65,8 +65,12 @@ impl Episodes {
                 None => return false,
             }
         }
-        let timed_out =
-            window.step(0).end == End::TimedOut && self.timeout == TimeoutRule::Bootstrap;
+        self.is_whole(ring, t)
+    }
+
+    /// Whether the held transition `t` has all but the steps that follow it: its stack's frames, and a return.
+    pub(crate) fn is_whole(&self, ring: &Ring, t: u64) -> bool {
+        let timed_out = ring.step(t).end == End::TimedOut && self.timeout == TimeoutRule::Bootstrap;
         !timed_out && self.stack_is_held(ring, t)
     }
 

@@ -6,3 +6,5 @@ pub(crate) mod assemble;
 pub(crate) mod episodes;
 pub mod horizon;
 pub(crate) mod packed_batch;
+pub(crate) mod prioritised;
+pub(crate) mod sum_tree;

@@ -114,7 +114,7 @@ fn give_batch(responder: Responder<BatchReply>, drawn: Result<PackedBatch, Unrea
     match drawn {
         Ok(draft) => {
             let (header, payload) = draft.unpack().into_payload();
-            responder.reply_with(&BatchReply::Batch(header), payload.freeze());
+            responder.reply_with(&BatchReply::of(header), payload.freeze());
         }
         Err(unready) => responder.reply(&unready.into()),
     }

@@ -7,6 +7,9 @@ use driml_protocol::{RunSpec, TRANSITION_BYTES, config::Settings, transitions_ma
 /// What stands before a payload: the prefix and the header.
 const HEAD_BYTES_MAX: usize = 1 << 12;
 
+/// Bytes of a row's number and priority.
+const PRIORITY_BYTES_MAX: usize = 9 + 4;
+
 /// Bytes of the longest message of each kind.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Limits {
@@ -16,6 +19,8 @@ pub(super) struct Limits {
     pub(super) weights: usize,
     /// An affinity matrix, which is its header.
     pub(super) affinity: usize,
+    /// Priorities of a batch's rows, which are their header.
+    pub(super) priorities: usize,
     /// Whatever has no payload.
     pub(super) small: usize,
     /// Rows of a batch.
@@ -39,6 +44,7 @@ impl Limits {
         let transition_bytes = (spec.frame_bytes() + TRANSITION_BYTES) as u64;
         let chunk = usize::try_from(transitions.saturating_mul(transition_bytes))?;
         let actions = spec.num_actions as usize;
+        let batch_rows = number(settings, "learner", "batch_size")?;
         Ok(Self {
             chunk: chunk.saturating_add(HEAD_BYTES_MAX),
             // Room for a learner that writes the same numbers at greater length.
@@ -46,14 +52,16 @@ impl Limits {
                 .saturating_mul(2)
                 .saturating_add(HEAD_BYTES_MAX),
             affinity: 4 * actions * actions + HEAD_BYTES_MAX,
+            priorities: PRIORITY_BYTES_MAX * batch_rows as usize + 2 * HEAD_BYTES_MAX,
             small: HEAD_BYTES_MAX,
-            batch_rows: number(settings, "learner", "batch_size")?,
+            batch_rows,
         })
     }
 
     /// The longest of all.
     pub(super) fn largest(&self) -> usize {
-        self.chunk.max(self.weights).max(self.affinity)
+        let learned = self.weights.max(self.affinity).max(self.priorities);
+        self.chunk.max(learned)
     }
 }
 

@@ -32,6 +32,7 @@ use crate::{
     config::Config,
     durable::{DurableArgs, DurableReplay, shard_dir},
     replay::Replay,
+    sampling::prioritised::PriorityCounts,
 };
 
 /// Threads that make batches: one assembles while another's reply is being sent.
@@ -84,6 +85,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let config: Config = settings.table("replay")?;
     let batch_size = number(&settings, "learner", "batch_size")?;
     let ack_timeout = Duration::from_millis(number(&settings, "actor", "ack_timeout_ms")?.into());
+    // Of this process alone: priorities of rows that an earlier one drew are not taken for those of others.
+    let incarnation = rand::random();
     let (replay, weights) = match &args.dir {
         Some(dir) => open_durable(&args, dir, &spec, &config, batch_size)?,
         None => {
@@ -95,8 +98,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             (replay, WeightsStore::default())
         }
     };
+    let replay = replay.with_incarnation(incarnation);
     let transport: TransportConfig = settings.table("transport")?;
-    let batch = BatchHeader::of(&spec, batch_size);
+    let batch = BatchHeader::of(&spec, batch_size).sampled_by(&config.sampling);
     let pool = if transport.shared_memory {
         BufferPool::shared(SPARE_MAX, POOL_BATCHES, batch.payload_bytes())
     } else {
@@ -181,7 +185,19 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     drop(queryables);
     let closed = client.session().close().wait();
     join_within(threads, THREADS_END_MAX);
-    service.state().replay.flush();
+    let mut state = service.state();
+    state.replay.flush();
+    if let Some(PriorityCounts {
+        set,
+        gone,
+        repeated,
+    }) = state.replay.priority_counts()
+    {
+        tracing::info!(
+            "priorities of {set} rows were set, {gone} came too late for their transition, {repeated} came twice"
+        );
+    }
+    drop(state);
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
@@ -216,6 +232,11 @@ fn open_durable(
             recovery.bytes >> 20,
             recovery.took.as_secs_f64()
         );
+        if replay.priority_counts().is_some() {
+            tracing::info!(
+                "priorities are not kept on disk: each transition has the highest one until it is learned from"
+            );
+        }
     } else {
         tracing::info!("keeps the replay in {}", dir.display());
     }
@@ -262,6 +283,9 @@ impl<'a> Answers<'a> {
         this.answer("claim", 1, limits.small, Service::claim)?;
         this.answer("request", 1, limits.small, Service::request)?;
         this.answer("affinity", 1, limits.affinity, Service::affinity)?;
+        if service.state().replay.priority_counts().is_some() {
+            this.answer("priorities", 1, limits.priorities, Service::priorities)?;
+        }
         this.offer("hello", 1, Service::hello)?;
         this.answer("join-actor", 1, limits.small, Service::join_actor)?;
         this.answer("join-learner", 1, limits.small, Service::join_learner)?;

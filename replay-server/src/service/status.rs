@@ -4,7 +4,8 @@
 use std::time::{Duration, Instant};
 
 use driml_protocol::{
-    AffinityUpdate, Done, Goodbye, Incoming, PartName, PartsStatus, ReplayStatus, Report, Responder,
+    AffinityUpdate, Done, Goodbye, Incoming, PartName, PartsStatus, PriorityUpdate, ReplayStatus,
+    Report, Responder,
 };
 
 use super::{accounts::own_warning, server::Service};
@@ -56,6 +57,33 @@ impl Service {
         drop(state);
         if is_ready {
             incoming.into_responder().reply(&Done);
+        }
+    }
+
+    pub(super) fn priorities(&self, incoming: Incoming<PriorityUpdate>) {
+        let Some(update) = self.read(&incoming) else {
+            return;
+        };
+        let mut state = self.state();
+        let allowed = state.check_learner(update.learner);
+        let allowed = allowed.and_then(|()| self.check_priorities(update.rows()));
+        let set = allowed.and_then(|()| state.replay.set_priorities(&update));
+        if let Err(why) = set {
+            state.replay.note_refused_message();
+            let line = format!("priorities were refused: {why}");
+            return state.say("priorities", &line);
+        }
+        drop(state);
+        incoming.into_responder().reply(&Done);
+    }
+
+    /// Priorities are those of a batch's rows.
+    fn check_priorities(&self, rows: usize) -> Result<(), String> {
+        match self.limits.batch_rows as usize {
+            most if rows <= most => Ok(()),
+            most => Err(format!(
+                "of {rows} rows; a batch of this run has {most} (learner.batch_size)"
+            )),
         }
     }
 

@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use driml_protocol::{ChunkHeader, Horizon, InsertReply, Waiting};
+use driml_protocol::{ChunkHeader, Horizon, InsertReply, Sampling, Waiting};
 use driml_replay_server::{Compression, Config, Replay, Unready};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -110,6 +110,7 @@ fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
+        sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
         reproduced_bug: None,

@@ -1,7 +1,7 @@
 //! Settings that cannot work are refused, by key, with what to do.
 //! It does not test the effects of settings.
 
-use driml_protocol::{Horizon, RunSpec};
+use driml_protocol::{Horizon, RunSpec, Sampling};
 use driml_replay_server::{Compression, Config, ConfigError, Replay};
 
 use crate::history::spec;
@@ -12,6 +12,7 @@ fn good() -> Config {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
+        sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
         reproduced_bug: None,

@@ -6,6 +6,7 @@ use driml_replay_server::{Config, DurableArgs, DurableError, DurableReplay, Mark
 use crate::{
     durable::{Life, ROWS, copy, open, segments, state},
     history::unlimited,
+    priorities::prioritised,
 };
 
 /// What is drawn next, of which the log learns nothing.
@@ -104,4 +105,58 @@ fn a_replay_in_memory_has_no_marks() {
         driml_replay_server::Replay::new(&crate::durable::test_spec(), &unlimited(60), ROWS);
     let mut replay = DurableReplay::in_memory(replay.unwrap(), 0);
     assert_eq!(replay.mark().unwrap(), None);
+}
+
+/// What is drawn next by priority, and learned from.
+fn next_learned(replay: &mut DurableReplay) -> Vec<driml_protocol::Batch> {
+    let learned = |_| {
+        let batch = replay.sample_between_marks(ROWS).unwrap();
+        let found: Vec<f32> = batch.states_t().iter().map(|&byte| byte.into()).collect();
+        let update =
+            batch.priority_update(77, replay.tally().rows_sampled, &found[..ROWS as usize]);
+        replay.set_priorities(&update.unwrap()).unwrap();
+        batch
+    };
+    (0..5).map(learned).collect()
+}
+
+/// The log has no priorities: kept beside a mark they come back with it, and without them every anchor is as likely as another.
+#[test]
+fn priorities_come_back_where_they_were_kept_beside_a_mark() {
+    for seed in 0..8 {
+        let folder = tempfile::tempdir().unwrap();
+        let config = prioritised(60, 0.5);
+        let mut life = Life::begin(folder.path(), config, 600, seed);
+        for _ in 0..30 {
+            life.act();
+        }
+        for _ in 0..12 {
+            life.store(0);
+            next_learned(&mut life.replay);
+            life.store(1);
+        }
+        let mark = life.replay.mark().unwrap().unwrap();
+        let kept = life.replay.saved_priorities();
+        let draws = next_learned(&mut life.replay);
+        let Life {
+            args,
+            config,
+            replay,
+            ..
+        } = life;
+        drop(replay);
+        let mut replay = at(&args, &config, mark).unwrap();
+        replay.check_valid();
+        let batch = replay.sample_between_marks(ROWS).unwrap();
+        let chances = batch.probabilities().unwrap();
+        assert!(
+            chances.iter().all(|&chance| chance == chances[0]),
+            "{chances:?}"
+        );
+        drop(replay);
+        let mut replay = at(&args, &config, mark).unwrap();
+        replay.restore_priorities(kept.as_ref()).unwrap();
+        replay.check_valid();
+        assert!(next_learned(&mut replay) == draws, "seed {seed}");
+    }
 }

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use driml_protocol::{Chunk, ChunkHeader, End, Horizon, NO_ACTION, RunSpec, TimeoutRule};
+use driml_protocol::{Chunk, ChunkHeader, End, Horizon, NO_ACTION, RunSpec, Sampling, TimeoutRule};
 use driml_replay_server::{Compression, Config, ReproducedBug};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -72,6 +72,7 @@ pub(crate) fn unlimited(capacity_transitions: u64) -> Config {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
+        sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
         reproduced_bug: None,

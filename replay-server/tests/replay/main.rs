@@ -13,5 +13,6 @@ mod exactly_once;
 mod history;
 mod horizon;
 mod law;
+mod priorities;
 mod rate_limiter;
 mod resume;

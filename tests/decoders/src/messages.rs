@@ -5,9 +5,10 @@ use std::fmt::Debug;
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, BufferPool,
     Chunk, ChunkHeader, Claim, CodecError, Done, End, Goodbye, Hello, InsertReply, JoinReply, Kind,
-    LearnerJoin, LearnerStatus, Life, Message, NO_ACTION, PROTOCOL_VERSION, PartName, PartStatus,
-    PartsStatus, ReplayStatus, Report, RequestId, Returns, RowScalars, Tally, Waiting, Warning,
-    WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec,
+    LearnerJoin, LearnerStatus, Life, Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName,
+    PartStatus, PartsStatus, PriorityUpdate, ReplayStatus, Report, RequestId, Returns, RowScalars,
+    Tally, Waiting, Warning, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
+    WeightsVersion, codec,
 };
 
 /// The hash of the run that these messages are of.
@@ -55,7 +56,8 @@ fn read_chunk(bytes: &[u8]) {
 
 fn read_batch(bytes: &[u8]) {
     read::<BatchReply>(bytes);
-    if let Ok((BatchReply::Batch(header), payload)) = codec::decode(bytes, Some(SPEC)) {
+    let reply = codec::decode::<BatchReply>(bytes, Some(SPEC)).ok();
+    if let Some((header, payload)) = reply.and_then(|it| Some((it.0.header()?, it.1))) {
         // Its counts of states may not be those of its rows.
         let Ok(batch) = Batch::from_payload(header, payload.to_vec().into()) else {
             return;
@@ -63,11 +65,14 @@ fn read_batch(bytes: &[u8]) {
         assert_eq!(batch.n_step_returns().len(), batch.rows());
         let states = header.states_k as usize * header.state_bytes as usize;
         assert_eq!(batch.states_k().len(), states);
+        let found = vec![0.5; batch.rows()];
+        let update = batch.priority_update(1, 1, &found);
+        assert_eq!(update.is_some(), batch.probabilities().is_some());
     }
 }
 
 /// Every kind of message and how it is read.
-const KINDS: [(Kind, Read); 20] = [
+const KINDS: [(Kind, Read); 21] = [
     (Kind::Chunk, read_chunk),
     (Kind::InsertReply, read::<InsertReply>),
     (Kind::BatchRequest, read::<BatchRequest>),
@@ -88,6 +93,7 @@ const KINDS: [(Kind, Read); 20] = [
     (Kind::WeightsRequest, read::<WeightsRequest>),
     (Kind::Report, read::<Report>),
     (Kind::PartsStatus, read::<PartsStatus>),
+    (Kind::Priorities, read::<PriorityUpdate>),
 ];
 
 fn read_affinity(bytes: &[u8]) {
@@ -183,6 +189,7 @@ pub fn samples() -> Vec<Vec<u8>> {
         held: 9,
         mean_age: 12.5,
         weights_versions: (8, 2),
+        origin: None,
     };
     let row = |(action, positives, bootstrap_discount)| RowScalars {
         action,
@@ -194,6 +201,15 @@ pub fn samples() -> Vec<Vec<u8>> {
     };
     let rows = [(0, 1, 0.0), (NO_ACTION, 0, 0.0), (6, 1, 0.5)].map(row);
     let memory = |bytes| Buffer::from(vec![7; bytes]);
+    let mut prioritised = header;
+    prioritised.origin = Some(Origin {
+        shard: 1,
+        incarnation: 1 << 40,
+    });
+    let mut prioritised = Batch::of_rows(prioritised, &rows, memory);
+    prioritised.set_draws([(5, 0.5), (1 << 40, 0.25), (7, 1e-9)].into_iter());
+    let priorities = prioritised.priority_update(5, 9, &[0.0, 1.5, 3e38]);
+    let (prioritised, draws) = prioritised.into_payload();
     let (header, payload) = Batch::of_rows(header, &rows, memory).into_payload();
     let weights = WeightsHeader::new(4, 312, b"weights");
     let upload = WeightsUpload {
@@ -333,5 +349,7 @@ pub fn samples() -> Vec<Vec<u8>> {
             version: 3,
             offset: 1 << 18,
         }),
+        codec::encode(SPEC, &BatchReply::of(prioritised), &draws).unwrap(),
+        of(priorities.unwrap()),
     ]
 }

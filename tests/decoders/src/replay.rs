@@ -2,7 +2,7 @@
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon, InsertReply,
-    RequestId, RunSpec, Tally, TimeoutRule,
+    RequestId, RunSpec, Sampling, Tally, TimeoutRule,
 };
 use driml_replay_server::{Compression, Config, Replay};
 
@@ -65,6 +65,7 @@ fn config(shards: u32) -> Config {
         shards,
         compression: Compression::None,
         compressed_bytes_max: None,
+        sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
         replay_ratio: 2.0,

@@ -5,17 +5,22 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use driml_machine::whole_number;
 
+pub use super::runs::Over;
+
 /// What `driml plot` takes.
 #[derive(Debug, Args)]
 pub struct PlotArgs {
-    /// Folders of runs; those that differ in their seed alone become one line with a band
+    /// Folders of runs; those that differ in their seed alone become one line with a band, and what is no run's folder is left out
     #[arg(value_name = "RUN", required = true)]
     pub(crate) runs: Vec<PathBuf>,
     /// Column of metrics.csv, one chart each; may be given several times [default: return, losses, k, speed]
     #[arg(long, value_name = "COLUMN")]
     pub(crate) column: Vec<String>,
-    /// Draw the mean over this many frames before each point
-    #[arg(long, value_name = "FRAMES", value_parser = whole_number::within(1..=u64::MAX))]
+    /// What the curves are drawn over
+    #[arg(long, value_name = "AXIS", value_enum, default_value_t = Over::Frames)]
+    pub(crate) x: Over,
+    /// Draw the mean over so many frames (or what else --x says) before each point
+    #[arg(long, value_name = "N", value_parser = whole_number::within(1..=u64::MAX))]
     pub(crate) smooth: Option<u64>,
     /// What the band over several seeds shows
     #[arg(long, value_enum, default_value_t = Band::Range)]
@@ -23,8 +28,12 @@ pub struct PlotArgs {
     /// One line a run, whatever its settings
     #[arg(long)]
     pub(crate) separate: bool,
+    /// Play the runs' worlds at random for so many episodes, and draw the mean return as a line
+    #[arg(long, value_name = "EPISODES", num_args = 0..=1, default_missing_value = "100",
+          value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub(crate) random: Option<u32>,
     /// The action affinity A of each run's newest checkpoint as a heat map, instead of charts
-    #[arg(long, conflicts_with_all = ["column", "smooth", "band", "separate"])]
+    #[arg(long, conflicts_with_all = ["column", "x", "smooth", "band", "separate", "random"])]
     pub(crate) affinity: bool,
     /// Picture to write, .svg or .png
     #[arg(long, value_name = "FILE", default_value = "plot.svg")]
@@ -37,9 +46,11 @@ impl PlotArgs {
         Self {
             runs,
             column: Vec::new(),
+            x: Over::Frames,
             smooth: None,
             band: Band::Range,
             separate: false,
+            random: None,
             affinity: false,
             out,
         }
@@ -53,4 +64,6 @@ pub enum Band {
     Range,
     /// One standard deviation to each side of the mean
     Sd,
+    /// 95% bootstrap interval of the mean, over the choice of runs
+    Ci,
 }

@@ -3,13 +3,24 @@
 
 use std::collections::VecDeque;
 
-use super::runs::{Run, SPREAD_OF_K};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::{
+    names,
+    runs::{Over, Run, SPREAD_OF_K},
+};
 use crate::plot::flags::Band;
 
 /// Points of a curve over several runs.
 const GRID_POINTS: usize = 240;
 /// Most points of a single run's curve; of a longer one every second, third, ... is drawn.
 const POINTS_MAX: usize = 600;
+/// Resamples of a bootstrap, and how many of them lie outside the interval at each end: 95% are in it.
+const RESAMPLES: usize = 2_000;
+const OUTSIDE: usize = RESAMPLES / 40;
+/// k is an environment step or more.
+const K_MIN: f64 = 1.0;
 
 /// What is drawn as one line.
 #[derive(Debug)]
@@ -18,7 +29,7 @@ pub(super) struct Group<'a> {
     pub(super) runs: Vec<&'a Run>,
 }
 
-/// A line and its band over frames.
+/// A line and its band.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Curve {
     pub(crate) points: Vec<(f64, f64)>,
@@ -42,26 +53,12 @@ pub(super) fn of(runs: &[Run], together: bool) -> Vec<Group<'_>> {
             }),
         }
     }
-    let names: Vec<String> = groups.iter().map(plain_name).collect();
-    for (group, name) in groups.iter_mut().zip(&names) {
-        let clashes = names.iter().filter(|other| *other == name).count() > 1;
-        group.name = if clashes && group.runs.len() > 1 {
-            format!("{name} ({}, ...)", group.runs[0].name)
-        } else {
-            name.clone()
-        };
+    let runs: Vec<_> = groups.iter().map(|group| &group.runs[..]).collect();
+    let names = names::of(&runs);
+    for (group, name) in groups.iter_mut().zip(names) {
+        group.name = name;
     }
     groups
-}
-
-fn plain_name(group: &Group<'_>) -> String {
-    match &group.runs[..] {
-        [only] => only.name.clone(),
-        runs => {
-            let what = runs[0].what.as_deref().unwrap_or(&runs[0].name);
-            format!("{what}, {} seeds", runs.len())
-        }
-    }
 }
 
 impl Group<'_> {
@@ -69,21 +66,16 @@ impl Group<'_> {
     ///
     /// # Errors
     /// A column that a run does not have.
-    pub(super) fn curve(
-        &self,
-        column: &str,
-        smooth: Option<u64>,
-        band: Band,
-    ) -> anyhow::Result<Curve> {
-        let mean = self.over_seeds(column, smooth, band)?;
+    pub(super) fn curve(&self, column: &str, way: Way) -> anyhow::Result<Curve> {
+        let mean = self.over_seeds(column, way)?;
         let has_spread = self.runs.iter().all(|run| run.has_values(SPREAD_OF_K));
         if column != "mean_k" || !has_spread {
             return Ok(mean);
         }
-        let spread = self.over_seeds(SPREAD_OF_K, smooth, band)?;
+        let spread = self.over_seeds(SPREAD_OF_K, way)?;
         let around = mean.points.iter().map(|&(x, k)| {
             let sd = between(&spread.points, x);
-            (x, k - sd, k + sd)
+            (x, (k - sd).max(K_MIN), k + sd)
         });
         Ok(Curve {
             band: around.collect(),
@@ -91,12 +83,12 @@ impl Group<'_> {
         })
     }
 
-    fn over_seeds(&self, column: &str, smooth: Option<u64>, band: Band) -> anyhow::Result<Curve> {
+    fn over_seeds(&self, column: &str, way: Way) -> anyhow::Result<Curve> {
         let mut each = Vec::new();
         for run in &self.runs {
-            let mut values = run.values(column)?;
-            if let Some(frames) = smooth {
-                values = smoothed(&values, frames as f64);
+            let mut values = run.values_over(way.over, column)?;
+            if let Some(window) = way.smooth {
+                values = smoothed(&values, window as f64);
             }
             if !values.is_empty() {
                 each.push(values);
@@ -108,9 +100,17 @@ impl Group<'_> {
                 points: thinned(only),
                 band: Vec::new(),
             },
-            many => together(many, band),
+            many => together(many, way.band),
         })
     }
+}
+
+/// How runs become curves.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Way {
+    pub(super) over: Over,
+    pub(super) smooth: Option<u64>,
+    pub(super) band: Band,
 }
 
 /// One or several curves as one, with a band of their range if there are several.
@@ -126,17 +126,13 @@ pub(crate) fn over_seeds(each: &[Vec<(f64, f64)>]) -> Curve {
     }
 }
 
-/// Mean over the points of the last `frames` frames, at each point.
-pub(crate) fn smoothed(points: &[(f64, f64)], frames: f64) -> Vec<(f64, f64)> {
+/// Mean over the points of the last `width` of x, at each point.
+pub(crate) fn smoothed(points: &[(f64, f64)], width: f64) -> Vec<(f64, f64)> {
     let mut window = VecDeque::new();
     let mut smooth = Vec::with_capacity(points.len());
     for &(x, y) in points {
         window.push_back((x, y));
-        while window
-            .front()
-            .is_some_and(|(first, _)| *first <= x - frames)
-            && window.len() > 1
-        {
+        while window.front().is_some_and(|(first, _)| *first <= x - width) && window.len() > 1 {
             window.pop_front();
         }
         let sum: f64 = window.iter().map(|(_, y)| y).sum();
@@ -154,7 +150,7 @@ fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
         .collect()
 }
 
-/// Mean and band of several curves, over the frames that all of them have.
+/// Mean and band of several curves, over the x that all of them have.
 fn together(curves: &[Vec<(f64, f64)>], band: Band) -> Curve {
     let first = |curve: &Vec<(f64, f64)>| curve[0].0;
     let last = |curve: &Vec<(f64, f64)>| curve[curve.len() - 1].0;
@@ -164,6 +160,10 @@ fn together(curves: &[Vec<(f64, f64)>], band: Band) -> Curve {
     if start > end {
         return curve;
     }
+    let resamples = match band {
+        Band::Ci => resamples(curves.len()),
+        Band::Range | Band::Sd => Vec::new(),
+    };
     for i in 0..=GRID_POINTS {
         let x = start + (end - start) * i as f64 / GRID_POINTS as f64;
         let values: Vec<f64> = curves.iter().map(|points| between(points, x)).collect();
@@ -179,6 +179,7 @@ fn together(curves: &[Vec<(f64, f64)>], band: Band) -> Curve {
                 let sd = (squares / (n - 1.0)).sqrt();
                 (mean - sd, mean + sd)
             }
+            Band::Ci => interval(&values, &resamples),
         };
         curve.points.push((x, mean));
         curve.band.push((x, low, high));
@@ -187,6 +188,24 @@ fn together(curves: &[Vec<(f64, f64)>], band: Band) -> Curve {
         }
     }
     curve
+}
+
+/// Which of so many curves each resample has, drawn with replacement: the same at every x, and for the same runs.
+fn resamples(curves: usize) -> Vec<Vec<usize>> {
+    let mut rng = ChaCha8Rng::seed_from_u64(0);
+    let mut one = || (0..curves).map(|_| rng.random_range(0..curves)).collect();
+    (0..RESAMPLES).map(|_| one()).collect()
+}
+
+/// The interval in which the mean of the values lies with 95% confidence: the percentiles of the resamples' means.
+fn interval(values: &[f64], resamples: &[Vec<usize>]) -> (f64, f64) {
+    let mean = |drawn: &Vec<usize>| {
+        let sum: f64 = drawn.iter().map(|&at| values[at]).sum();
+        sum / drawn.len() as f64
+    };
+    let mut means: Vec<f64> = resamples.iter().map(mean).collect();
+    means.sort_by(f64::total_cmp);
+    (means[OUTSIDE], means[RESAMPLES - 1 - OUTSIDE])
 }
 
 /// The value at `x` on the line through `points`, which are in the order of x and not empty; beyond its ends, theirs.
@@ -222,5 +241,21 @@ mod tests {
         assert!((curve.band[0].1 - (2.0 - root)).abs() < 1e-12);
         let apart = [vec![(0.0, 1.0)], vec![(5.0, 1.0)]];
         assert!(together(&apart, Band::Sd).points.is_empty());
+    }
+
+    #[test]
+    fn a_bootstrap_interval_lies_within_the_range_and_around_the_mean() {
+        // Of two curves a resample has twice the lower one in a quarter of the cases, more than the 2.5% outside.
+        let two = [vec![(0.0, 1.0), (9.0, 1.0)], vec![(0.0, 3.0), (9.0, 3.0)]];
+        assert_eq!(together(&two, Band::Ci).band[0], (0.0, 1.0, 3.0));
+        // Twenty normal-like values: by the law of large numbers near mean +- 1.96 sd / sqrt(20), which is 9.5 +- 2.5.
+        let many: Vec<_> = (0..20)
+            .map(|i| vec![(0.0, f64::from(i)), (1.0, 0.0)])
+            .collect();
+        let (_, low, high) = together(&many, Band::Ci).band[0];
+        assert!(
+            (low - 7.0).abs() < 0.3 && (high - 12.0).abs() < 0.3,
+            "{low} {high}"
+        );
     }
 }

@@ -4,27 +4,41 @@
 mod affinity;
 pub mod flags;
 mod groups;
+mod names;
 mod runs;
 
-use std::collections::BTreeSet;
+use std::{collections::BTreeSet, path::PathBuf};
 
-use driml_figure::{Axis, Chart, Figure, Format, Panel, Series};
-use driml_launch::{console::print, live_view::loss_title, run_folder::RunFolder};
+use driml_figure::{Axis, Chart, Figure, Format, GREY, Mark, Panel, Series};
+use driml_launch::{
+    console::{self, print},
+    evaluate::{mean_and_deviation, random_returns},
+    live_view::loss_title,
+    run_folder::RunFolder,
+};
 use driml_machine::error::usage;
 
 pub(crate) use self::{
     affinity::figure as affinities,
     groups::{Curve, over_seeds, smoothed},
-    runs::Run,
+    runs::{Over, Run},
 };
-use self::{groups::Group, runs::C51_LOSS};
+use self::{
+    groups::{Group, Way},
+    runs::C51_LOSS,
+};
 use crate::plot::flags::{Band, PlotArgs};
 
 /// Width and height of a chart.
 const CHART_SIZE: (f64, f64) = (460.0, 310.0);
+/// The column over which a random policy is a line.
+const RETURN: &str = "mean_return";
+/// The column of what checkpoints earned when they were played.
+const EVALUATED: &str = "evaluated_return";
 /// Columns that are drawn if none is asked for, those that the runs have values of; auxiliary losses follow [`C51_LOSS`].
-const OVERVIEW: [&str; 6] = [
-    "mean_return",
+const OVERVIEW: [&str; 7] = [
+    RETURN,
+    EVALUATED,
     C51_LOSS,
     "mean_k",
     "replay_ratio",
@@ -39,10 +53,7 @@ const OVERVIEW: [&str; 6] = [
 pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
     Format::of(&args.out).map_err(|e| usage!("{e}"))?;
     let figure = if args.affinity {
-        {
-            let folders: Vec<_> = args.runs.iter().map(RunFolder::new).collect();
-            affinity::figure(&folders)?
-        }
+        affinity::figure(&folders(args)?)?
     } else {
         charts(args)?
     };
@@ -64,14 +75,46 @@ fn overview(runs: &[Run]) -> Vec<String> {
     columns.into_iter().filter(has).map(String::from).collect()
 }
 
-fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
+/// The folders of runs among those named, each once; what is none is left out with a word, as `runs/*` names it too.
+fn folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     let mut seen = BTreeSet::new();
-    let runs = args
+    // A folder given twice is one run, not two seeds.
+    let whole = |folder: &PathBuf| folder.canonicalize().unwrap_or_else(|_| folder.clone());
+    let named: Vec<_> = args
         .runs
         .iter()
-        // A folder given twice is one run, not two seeds.
-        .filter(|folder| seen.insert(folder.canonicalize().unwrap_or_else(|_| (*folder).clone())))
-        .map(|folder| Run::read(&RunFolder::new(folder)))
+        .filter(|it| seen.insert(whole(it)))
+        .collect();
+    let (runs, others): (Vec<_>, Vec<_>) = named
+        .into_iter()
+        .map(RunFolder::new)
+        .partition(|folder| folder.metrics().is_file());
+    if runs.is_empty() {
+        let named: Vec<String> = others.iter().map(|it| it.display().to_string()).collect();
+        return Err(usage!(
+            "{} is not the folder of a run: there is no {} in it",
+            named.join(", "),
+            others[0]
+                .metrics()
+                .file_name()
+                .unwrap_or_default()
+                .display()
+        )
+        .into());
+    }
+    for other in others {
+        console::line(&format!(
+            "left out {}: it is not the folder of a run",
+            other.display()
+        ));
+    }
+    Ok(runs)
+}
+
+fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
+    let runs = folders(args)?
+        .iter()
+        .map(Run::read)
         .collect::<anyhow::Result<Vec<_>>>()?;
     let columns = if args.column.is_empty() {
         overview(&runs)
@@ -79,6 +122,20 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         args.column.clone()
     };
     let groups = groups::of(&runs, !args.separate);
+    let way = Way {
+        over: args.x,
+        smooth: args.smooth,
+        band: args.band,
+    };
+    let random = match args.random {
+        Some(episodes) if columns.iter().any(|it| it == RETURN || it == EVALUATED) => {
+            at_random(&runs, episodes as usize)?
+        }
+        Some(_) => {
+            return Err(usage!("--random is a line over {RETURN:?}, which is not drawn").into());
+        }
+        None => Vec::new(),
+    };
     let mut panels = Vec::new();
     for column in &columns {
         let reports = |run: &Run| run.auxiliary_losses().contains(column);
@@ -90,13 +147,17 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
                 if is_loss && !group.runs.iter().any(|run| reports(run)) {
                     return Ok(Curve::default());
                 }
-                group.curve(column, args.smooth, args.band)
+                group.curve(column, way)
             })
             .collect::<anyhow::Result<Vec<_>>>()?;
         if !args.column.is_empty() && drawn.iter().all(|curve| curve.points.is_empty()) {
             return Err(usage!("none of these runs has a value of {column:?} yet").into());
         }
-        panels.push(Panel::Chart(chart(column, is_loss, &groups, drawn)));
+        let mut series = series(&groups, drawn);
+        if column == RETURN || column == EVALUATED {
+            series.extend(lines(&random, &series));
+        }
+        panels.push(Panel::Chart(chart(column, is_loss, args.x, series)));
     }
     if panels.is_empty() {
         return Err(usage!("none of these runs has recorded a value yet").into());
@@ -114,27 +175,64 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
     })
 }
 
-fn chart(column: &str, is_loss: bool, groups: &[Group<'_>], curves: Vec<Curve>) -> Chart {
-    let series = groups.iter().zip(curves).enumerate();
-    let series = series
-        .filter(|(_, (_, curve))| !curve.points.is_empty())
+/// The curves that have points, each in the colour of its group.
+fn series(groups: &[Group<'_>], curves: Vec<Curve>) -> Vec<Series> {
+    let all = groups.iter().zip(curves).enumerate();
+    all.filter(|(_, (_, curve))| !curve.points.is_empty())
         .map(|(index, (group, curve))| {
             Series::line(&group.name, index, curve.points).banded(curve.band)
         })
-        .collect();
+        .collect()
+}
+
+fn chart(column: &str, is_loss: bool, x: Over, series: Vec<Series>) -> Chart {
     let (title, y) = if is_loss {
         let title = format!("{} loss", loss_title(column));
         (title, "auxiliary loss [nats]".into())
     } else {
         words(column)
     };
-    Chart::new(&title, Axis::linear("frames"), Axis::linear(&y), series)
+    Chart::new(&title, Axis::linear(x.column()), Axis::linear(&y), series)
+}
+
+/// What a random policy earns in each of the runs' worlds, by the world's name.
+fn at_random(runs: &[Run], episodes: usize) -> anyhow::Result<Vec<(String, f64)>> {
+    let mut worlds: Vec<(String, f64)> = Vec::new();
+    for run in runs {
+        let config = run.config()?;
+        let world = &config.run.world;
+        if !worlds.iter().any(|(known, _)| known == world) {
+            let (mean, _) = mean_and_deviation(&random_returns(&config, episodes, 0)?);
+            worlds.push((world.clone(), mean));
+        }
+    }
+    Ok(worlds)
+}
+
+/// Level lines from the start to where the longest curve ends.
+fn lines(random: &[(String, f64)], curves: &[Series]) -> Vec<Series> {
+    let xs = curves.iter().flat_map(|it| &it.points);
+    let last = xs.map(|point| point.0).fold(0.0, f64::max);
+    let line = |(world, mean): &(String, f64)| {
+        let name = match random {
+            [_] => "random policy".into(),
+            _ => format!("random policy, {world}"),
+        };
+        Series::line(&name, 0, vec![(0.0, *mean), (last, *mean)])
+            .marked(Mark::Dashed)
+            .coloured(GREY)
+    };
+    random.iter().map(line).collect()
 }
 
 /// Title and label of a column's chart, with its unit.
 fn words(column: &str) -> (String, String) {
     let (title, label) = match column {
         "mean_return" => ("Return", "mean of the last 100 episodes"),
+        EVALUATED => (
+            "Return of checkpoints, played greedily",
+            "mean over episodes",
+        ),
         "c51_kl" => ("C51 loss", "KL divergence [nats]"),
         "total_loss" => ("Total loss", "[nats]"),
         "mean_k" => (
@@ -175,6 +273,7 @@ fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -> Vec<Strin
             match args.band {
                 Band::Range => "their smallest and largest value",
                 Band::Sd => "one standard deviation to each side",
+                Band::Ci => "the 95% bootstrap interval of that mean over the choice of runs",
             }
         ));
     }
@@ -182,13 +281,20 @@ fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -> Vec<Strin
     if columns.iter().any(|column| column == "mean_k")
         && spread.clone().any(|run| run.has_values(runs::SPREAD_OF_K))
     {
-        notes.push("The band around k is one standard deviation of k itself to each side.".into());
+        notes.push(
+            "The band around k is one standard deviation of k itself to each side, cut at 1."
+                .into(),
+        );
     }
     match args.smooth {
-        Some(frames) => notes.push(format!(
-            "Smoothed: each point is the mean over the {frames} frames before it."
+        Some(width) => notes.push(format!(
+            "Smoothed: each point is the mean over the {width} {} before it.",
+            args.x.column()
         )),
         None => notes.push("Not smoothed.".into()),
+    }
+    if let Some(episodes) = args.random {
+        notes.push(format!("Random policy: mean of {episodes} whole episodes."));
     }
     notes
 }
@@ -198,7 +304,11 @@ mod tests {
     use std::path::{Path, PathBuf};
 
     use super::*;
-    use driml_machine::error::Usage;
+    use driml_machine::{error::Usage, resources::Machine};
+    use driml_settings::{
+        flags::{self, RunFlags},
+        resolve::Flags,
+    };
 
     /// A run's folder under `root`, with settings that differ in `agent` and `seed`.
     fn run_folder(root: &Path, name: &str, agent: &str, seed: u32, metrics: &str) -> PathBuf {
@@ -214,16 +324,16 @@ mod tests {
 
     fn args(runs: &[&PathBuf], columns: &[&str], out: PathBuf) -> PlotArgs {
         PlotArgs {
-            runs: runs.iter().map(|&run| run.clone()).collect(),
             column: columns.iter().map(|&column| column.into()).collect(),
-            smooth: None,
-            band: Band::Range,
-            separate: false,
-            affinity: false,
-            out,
+            ..PlotArgs::overview(runs.iter().map(|&run| run.clone()).collect(), out)
         }
     }
 
+    const WAY: Way = Way {
+        over: Over::Frames,
+        smooth: None,
+        band: Band::Range,
+    };
     const METRICS: &str = "seconds,frames,mean_return,mean_k,waiting\n1,0,,,warm-up\n2,10,1.5,1.0,-\n3,20,2.5,2.0,-\n";
 
     #[test]
@@ -238,8 +348,8 @@ mod tests {
             .into();
         let groups = groups::of(&runs, true);
         let names: Vec<_> = groups.iter().map(|group| group.name.as_str()).collect();
-        assert_eq!(names, ["chain c51, 2 seeds", "c"]);
-        let curve = groups[0].curve("mean_return", None, Band::Range).unwrap();
+        assert_eq!(names, ["chain c51, 2 seeds", "chain driml-ada, seed 1"]);
+        let curve = groups[0].curve("mean_return", WAY).unwrap();
         assert_eq!(curve.points.last(), Some(&(20.0, 3.5)));
         assert_eq!(curve.band.last(), Some(&(20.0, 2.5, 4.5)));
         assert_eq!(groups::of(&runs, false).len(), 3);
@@ -296,7 +406,13 @@ mod tests {
         let runs = [Run::read(&RunFolder::new(&a)).unwrap()];
         let groups = groups::of(&runs, true);
         let curve = groups[0]
-            .curve("mean_return", Some(15), Band::Range)
+            .curve(
+                "mean_return",
+                Way {
+                    smooth: Some(15),
+                    ..WAY
+                },
+            )
             .unwrap();
         assert_eq!(curve.points, [(10.0, 1.5), (20.0, 2.0)]);
         let mut args = args(&[&a], &["mean_return"], root.path().join("a.svg"));
@@ -304,6 +420,89 @@ mod tests {
         run(&args).unwrap();
         let svg = std::fs::read_to_string(&args.out).unwrap();
         assert!(svg.contains("Smoothed: each point is the mean over the 15 frames before it."));
+    }
+
+    #[test]
+    fn lines_are_called_by_what_differs_and_by_their_seeds() {
+        let root = tempfile::tempdir().unwrap();
+        let run = |name: &str, seed: u32, lr: &str| {
+            let folder = run_folder(root.path(), name, "c51", seed, METRICS);
+            let path = folder.join("config.toml");
+            let config = std::fs::read_to_string(&path).unwrap();
+            std::fs::write(path, format!("{config}[learner.update.adam]\nlr = {lr}\n")).unwrap();
+            Run::read(&RunFolder::new(folder)).unwrap()
+        };
+        let runs = [
+            run("a", 1, "0.1"),
+            run("b", 1, "0.1"),
+            run("c", 2, "0.1"),
+            run("d", 2, "0.2"),
+            run("e", 2, "0.2"),
+            run("f", 3, "0.3"),
+        ];
+        let names = |together| {
+            let groups = groups::of(&runs, together);
+            groups
+                .into_iter()
+                .map(|group| group.name)
+                .collect::<Vec<_>>()
+        };
+        let expected = [
+            "chain c51, lr=0.1, 3 runs of 2 seeds",
+            "chain c51, lr=0.2, 2 runs of seed 2",
+            "chain c51, lr=0.3, seed 3",
+        ];
+        assert_eq!(names(true), expected);
+        assert_eq!(
+            names(false)[..3],
+            [
+                "chain c51, lr=0.1, seed 1 (a)",
+                "chain c51, lr=0.1, seed 1 (b)",
+                "chain c51, lr=0.1, seed 2"
+            ]
+        );
+    }
+
+    #[test]
+    fn rows_at_the_same_place_are_one_point_whatever_their_order() {
+        let root = tempfile::tempdir().unwrap();
+        let metrics = "seconds,frames,updates,loss\n1,10,0,1\n2,10,1,3\n3,30,2,5\n4,20,2,7\n";
+        let folder = run_folder(root.path(), "a", "c51", 1, metrics);
+        let run = Run::read(&RunFolder::new(folder)).unwrap();
+        let over = |x| run.values_over(x, "loss").unwrap();
+        assert_eq!(over(Over::Frames), [(10.0, 2.0), (20.0, 7.0), (30.0, 5.0)]);
+        assert_eq!(over(Over::Updates), [(0.0, 1.0), (1.0, 3.0), (2.0, 6.0)]);
+        assert_eq!(over(Over::Seconds).len(), 4);
+    }
+
+    #[test]
+    fn a_folder_that_is_no_runs_is_left_out() {
+        let root = tempfile::tempdir().unwrap();
+        let a = run_folder(root.path(), "a", "c51", 1, METRICS);
+        let none = root.path().to_owned();
+        let out = root.path().join("p.svg");
+        run(&args(&[&none, &a], &[], out.clone())).unwrap();
+        assert!(std::fs::read_to_string(out).unwrap().contains("seed 1"));
+    }
+
+    #[test]
+    fn a_random_policy_is_a_line() {
+        let root = tempfile::tempdir().unwrap();
+        let a = run_folder(root.path(), "a", "c51", 1, METRICS);
+        let flags = RunFlags {
+            env: Some("chain".into()),
+            agent: Some("c51".into()),
+            preset: None,
+            config: None,
+            over: Flags::default(),
+        };
+        let (config, _) = flags::resolve(&flags, &Machine::this()).unwrap();
+        std::fs::write(a.join("config.toml"), config.to_toml()).unwrap();
+        let mut args = args(&[&a], &["mean_return"], root.path().join("p.svg"));
+        args.random = Some(8);
+        run(&args).unwrap();
+        let svg = std::fs::read_to_string(&args.out).unwrap();
+        assert!(svg.contains("random policy") && svg.contains("8 whole episodes"));
     }
 
     #[test]

@@ -1,12 +1,13 @@
 //! A run's folder as a plot needs it: the columns of `metrics.csv`, and the settings without the seed.
 //! It judges no value.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use clap::ValueEnum;
 use driml_launch::run_folder::{Columns, RunFolder};
 use driml_machine::error::{Usage, nearest, usage};
-use driml_settings::renamed;
+use driml_settings::{config::RunConfig, renamed};
 
 /// The column with the standard deviation of k; runs recorded by older programs lack it.
 pub(super) const SPREAD_OF_K: &str = "sd_k";
@@ -24,11 +25,36 @@ pub(crate) struct Run {
     pub(super) name: String,
     /// World and agent, if the settings say.
     pub(super) what: Option<String>,
+    /// The seed, if the settings say.
+    pub(super) seed: Option<i64>,
     /// The settings without seed and without what the machine decides; none if there are none.
     pub(super) settings: Option<toml::Table>,
     columns: Columns,
-    /// The place of the column `frames`.
-    frames: usize,
+    /// What its checkpoints earned when they were played; it has columns of `frames`, `updates` and `seconds` too.
+    evaluations: Columns,
+}
+
+/// What a curve is drawn over: columns that only grow.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum Over {
+    /// Environment steps, over all actors
+    #[default]
+    Frames,
+    /// Updates of the learner
+    Updates,
+    /// Seconds since the run began
+    Seconds,
+}
+
+impl Over {
+    /// The column of `metrics.csv`, which is the axis' label too.
+    pub(super) const fn column(self) -> &'static str {
+        match self {
+            Self::Frames => "frames",
+            Self::Updates => "updates",
+            Self::Seconds => "seconds",
+        }
+    }
 }
 
 impl Run {
@@ -42,13 +68,19 @@ impl Run {
             .map_err(|e| usage!("{} is not the folder of a run: {e}", folder.display()))?;
         let columns =
             Columns::parse(&text).with_context(|| format!("reading {}", path.display()))?;
-        let frames = columns.place("frames").ok_or_else(|| {
-            usage!(
+        if columns.place("frames").is_none() {
+            return Err(usage!(
                 "{} has no column \"frames\": it is no run's",
                 path.display()
             )
-        })?;
-        let settings = settings(&folder.config());
+            .into());
+        }
+        let evaluations = match std::fs::read(folder.evaluations()) {
+            Ok(text) => Columns::parse(&text)
+                .with_context(|| format!("reading {}", folder.evaluations().display()))?,
+            Err(_) => Columns::default(),
+        };
+        let (settings, seed) = settings(&folder.config()).unzip();
         let run = settings.as_ref().and_then(|table| table.get("run"));
         let word = |key: &str| run.and_then(|run| run.get(key)?.as_str());
         Ok(Self {
@@ -57,9 +89,10 @@ impl Run {
                 .zip(word("agent"))
                 .map(|(world, agent)| format!("{world} {agent}")),
             settings,
+            seed: seed.flatten(),
             folder: folder.clone(),
             columns,
-            frames,
+            evaluations,
         })
     }
 
@@ -68,39 +101,21 @@ impl Run {
     /// # Errors
     /// A column that is not there, or holds words.
     pub(crate) fn values(&self, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
-        self.values_over(self.frames, column)
+        self.values_over(Over::Frames, column)
     }
 
-    /// The values of a column over the seconds of the run; rows without a value are left out.
+    /// The values of a column over frames, updates or seconds, in their order; rows without a value are left out.
+    ///
+    /// Rows at the same place are one point, their mean: a row is written each second, in which there may be no new frame.
     ///
     /// # Errors
-    /// As for [`Run::values`], and metrics without seconds.
-    pub(crate) fn values_over_seconds(&self, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
-        let path = self.folder.metrics();
-        let seconds = self.columns.place("seconds");
-        let seconds =
-            seconds.ok_or_else(|| usage!("{} has no column \"seconds\"", path.display()))?;
-        self.values_over(seconds, column)
-    }
-
-    /// The values of a column over those in the column at `x`.
-    fn values_over(&self, x: usize, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
-        let place = self.columns.place(column);
-        let path = self.folder.metrics();
-        let place = place.filter(|_| !WORDS.contains(&column)).ok_or_else(|| {
-            let numbers = || {
-                let all = self.columns.header.iter().map(String::as_str);
-                all.filter(|name| !WORDS.contains(name))
-            };
-            usage!(
-                "{} has no column {column:?}{}; it has {}",
-                path.display(),
-                nearest(column, numbers()),
-                numbers().collect::<Vec<_>>().join(", ")
-            )
-        })?;
+    /// As for [`Run::values`], and metrics without the column that it goes over.
+    pub(crate) fn values_over(&self, over: Over, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
+        let (table, path) = self.table(column);
+        let x = self.place(table, over.column())?;
+        let place = self.place(table, column)?;
         let mut values = Vec::new();
-        for (line, row) in self.columns.rows.iter().enumerate() {
+        for (line, row) in table.rows.iter().enumerate() {
             let number = |text: &str| {
                 text.parse::<f64>().map_err(|_| {
                     usage!(
@@ -111,11 +126,58 @@ impl Run {
                 })
             };
             // What was not known yet at a time is empty.
-            if !row[place].is_empty() {
+            if !row[place].is_empty() && !row[x].is_empty() {
                 values.push((number(&row[x])?, number(&row[place])?));
             }
         }
-        Ok(values)
+        values.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let same = values.chunk_by(|a, b| a.0 == b.0);
+        Ok(same
+            .map(|rows| {
+                let sum: f64 = rows.iter().map(|(_, y)| y).sum();
+                (rows[0].0, sum / rows.len() as f64)
+            })
+            .collect())
+    }
+
+    /// The table that has the column, and its file; the metrics if neither has.
+    fn table(&self, column: &str) -> (&Columns, PathBuf) {
+        let in_metrics = self.columns.place(column).is_some();
+        if !in_metrics && self.evaluations.place(column).is_some() {
+            (&self.evaluations, self.folder.evaluations())
+        } else {
+            (&self.columns, self.folder.metrics())
+        }
+    }
+
+    /// The place of a column of numbers.
+    fn place(&self, table: &Columns, column: &str) -> Result<usize, Usage> {
+        let place = table.place(column);
+        place.filter(|_| !WORDS.contains(&column)).ok_or_else(|| {
+            let numbers = || {
+                let more = self.evaluations.header.iter();
+                let more = more.filter(|name| self.columns.place(name).is_none());
+                let all = self.columns.header.iter().chain(more);
+                all.map(String::as_str).filter(|name| !WORDS.contains(name))
+            };
+            usage!(
+                "{} has no column {column:?}{}; it has {}",
+                self.folder.metrics().display(),
+                nearest(column, numbers()),
+                numbers().collect::<Vec<_>>().join(", ")
+            )
+        })
+    }
+
+    /// The whole settings of the run, as `driml local --config` takes them.
+    ///
+    /// # Errors
+    /// They are not there or do not hold.
+    pub(super) fn config(&self) -> anyhow::Result<RunConfig> {
+        let path = self.folder.config();
+        let text = std::fs::read_to_string(&path)
+            .with_context(|| format!("reading {}", path.display()))?;
+        Ok(RunConfig::parse(&path.display().to_string(), &text)?)
     }
 
     /// The columns of auxiliary losses: those between C51's loss and the total.
@@ -129,8 +191,9 @@ impl Run {
 
     /// Whether the column is there and not empty.
     pub(crate) fn has_values(&self, column: &str) -> bool {
-        let place = self.columns.place(column);
-        place.is_some_and(|place| self.columns.rows.iter().any(|row| !row[place].is_empty()))
+        let (table, _) = self.table(column);
+        let place = table.place(column);
+        place.is_some_and(|place| table.rows.iter().any(|row| !row[place].is_empty()))
     }
 }
 
@@ -141,8 +204,9 @@ pub(super) fn folder_name(folder: &Path) -> String {
     name.to_string_lossy().into_owned()
 }
 
-/// Settings without the seed and without what differs between machines alone. A run without settings stands for itself.
-fn settings(path: &Path) -> Option<toml::Table> {
+/// Settings without the seed and without what differs between machines alone, and the seed. A run without settings stands
+/// for itself.
+fn settings(path: &Path) -> Option<(toml::Table, Option<i64>)> {
     let mut table: toml::Table = std::fs::read_to_string(path).ok()?.parse().ok()?;
     renamed::update(&mut table);
     // The machine decides most of how a run is launched, but what is learned depends on how many actors there are.
@@ -151,12 +215,17 @@ fn settings(path: &Path) -> Option<toml::Table> {
         .and_then(|local| local.get("actors").cloned());
     table.extend(actors.map(|actors| ("actors".to_owned(), actors)));
     table.remove("transport");
-    table.get_mut("run")?.as_table_mut()?.remove("seed");
+    let seed = table.get_mut("run")?.as_table_mut()?.remove("seed");
+    // How often it is saved and played changes nothing that is learned.
+    if let Some(learner) = table.get_mut("learner").and_then(toml::Value::as_table_mut) {
+        learner.remove("checkpoint_period_updates");
+        learner.remove("checkpoints_kept");
+    }
     if let Some(actor) = table.get_mut("actor").and_then(toml::Value::as_table_mut) {
         actor.remove("world_threads");
     }
     if let Some(replay) = table.get_mut("replay").and_then(toml::Value::as_table_mut) {
         replay.remove("capacity_transitions");
     }
-    Some(table)
+    Some((table, seed.and_then(|seed| seed.as_integer())))
 }

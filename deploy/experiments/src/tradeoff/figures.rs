@@ -3,7 +3,7 @@
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 
 use super::results::{Measure, PointResult, Results};
-use crate::plot::{Run, over_seeds};
+use crate::plot::{Over, Run, over_seeds};
 
 /// A point in return and speed.
 #[derive(Clone, Debug)]
@@ -123,7 +123,7 @@ pub(super) fn wall(results: &Results) -> anyhow::Result<Figure> {
 fn curve(name: &str, index: usize, point: &PointResult) -> anyhow::Result<Series> {
     let mut each = Vec::new();
     for it in &point.seeds {
-        each.push(Run::read(&it.ran.folder)?.values_over_seconds("mean_return")?);
+        each.push(Run::read(&it.ran.folder)?.values_over(Over::Seconds, "mean_return")?);
     }
     let curve = over_seeds(&each);
     Ok(Series::line(name, index, curve.points).banded(curve.band))

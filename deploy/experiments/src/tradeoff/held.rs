@@ -112,6 +112,7 @@ impl HeldBatch {
             n_step_return: &self.n_step_return,
             bootstrap_discount: &self.bootstrap_discount,
             positive_valid: &self.positive_valid,
+            importance_weight: None,
         }
     }
 

@@ -5,7 +5,7 @@ use driml_machine::units::rough_duration;
 use super::results::{LevelOf, Measure, PointResult, Results};
 use crate::{
     page::{Page, Table},
-    plot::Run,
+    plot::{Over, Run},
     statistics::{Interval, Spread},
     template::Values,
 };
@@ -408,7 +408,7 @@ fn training_curves(point: &PointResult) -> anyhow::Result<Vec<Vec<(f64, f64)>>> 
     let each = point
         .seeds
         .iter()
-        .map(|it| Ok(Run::read(&it.ran.folder)?.values_over_seconds("mean_return")?));
+        .map(|it| Ok(Run::read(&it.ran.folder)?.values_over(Over::Seconds, "mean_return")?));
     each.collect()
 }
 

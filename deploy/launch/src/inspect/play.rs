@@ -238,6 +238,7 @@ mod tests {
             held: 0,
             mean_age: 0.0,
             weights_versions: (0, 0),
+            origin: None,
         };
         let states = [
             ([1, 1], Some([9, 9]), Some([2, 2])),

@@ -13,18 +13,21 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use driml_machine::error::Interrupted;
 use driml_protocol::Shutdown;
-use driml_settings::config::RunConfig;
+use driml_settings::config::{EvaluationConfig, RunConfig};
 
 use crate::{
     console::{self, Screen, print},
+    evaluate::{self, Which},
     live_view::{Display, TEMPLATE},
     resume,
-    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder},
+    run_folder::{Evaluated, Outcome, ResumePoint, RunFolder, RunRecorder},
 };
 use parts::Lockstep;
 
 /// How often progress is shown and recorded.
 const POLL: Duration = Duration::from_secs(1);
+/// Rows of metrics that even the shortest run has, evenly over its frames: it may last no second.
+const ROWS_MIN: u64 = 200;
 
 /// Trains in this process, and leaves `run_dir`; with a resume point it goes on with the run that is there.
 ///
@@ -56,7 +59,10 @@ pub fn run(
         config.updates(),
         resumed.unwrap_or_default(),
     );
+    let mut evaluations = Evaluations::new(config, run_dir)?;
     let mut shown = Instant::now();
+    let row_frames = (config.frames() / ROWS_MIN).max(1);
+    let mut row = lockstep.frames() / row_frames;
     let folder = run_dir.checkpoints();
 
     let mut outcome = Outcome::Finished;
@@ -67,13 +73,18 @@ pub fn run(
         if lockstep.updates() / period > saved.unwrap_or(0) / period {
             saved = Some(lockstep.updates());
             lockstep.save(&folder)?;
+            evaluations.play(lockstep.updates(), false, &screen)?;
         }
-        if shown.elapsed() >= POLL {
-            shown = Instant::now();
+        let show = shown.elapsed() >= POLL;
+        if show || lockstep.frames() / row_frames > row {
+            row = lockstep.frames() / row_frames;
             let (replay, status) = lockstep.status();
             let said = recorder.record(std::slice::from_ref(&replay), status, &[]);
             said.iter().for_each(|line| screen.line(line));
-            display.show(&replay, status, recorder.episodes(&replay));
+            if show {
+                shown = Instant::now();
+                display.show(&replay, status, recorder.episodes(&replay), &[]);
+            }
         }
         if shutdown.is_set() {
             outcome = Outcome::Interrupted;
@@ -86,6 +97,9 @@ pub fn run(
     // After the last save: a longer run would go on from there without it.
     lockstep.end()?;
     screen.clear();
+    if outcome == Outcome::Finished {
+        evaluations.play(lockstep.updates(), true, &screen)?;
+    }
     let (replay, status) = lockstep.status();
     recorder.record(std::slice::from_ref(&replay), status, &[]);
     let missing = recorder.missing();
@@ -98,5 +112,39 @@ pub fn run(
         Err(Interrupted.into())
     } else {
         print(&summary.next_steps(run_dir))
+    }
+}
+
+/// Plays checkpoints between rounds, if they are to be played.
+struct Evaluations<'a> {
+    config: Option<EvaluationConfig>,
+    run_dir: &'a RunFolder,
+    /// Updates of the newest that was played.
+    newest: u64,
+}
+
+impl<'a> Evaluations<'a> {
+    fn new(config: &RunConfig, run_dir: &'a RunFolder) -> anyhow::Result<Self> {
+        let played = Evaluated::all(run_dir)?;
+        Ok(Self {
+            config: config.local.evaluation,
+            run_dir,
+            newest: played.iter().map(|it| it.updates).max().unwrap_or(0),
+        })
+    }
+
+    /// Plays the checkpoint after so many updates if it is time, or if it is the last.
+    fn play(&mut self, updates: u64, is_last: bool, screen: &Screen) -> anyhow::Result<()> {
+        let Some(config) = self.config else {
+            return Ok(());
+        };
+        let step = if is_last { 1 } else { config.every_updates };
+        if updates / step > self.newest / step {
+            self.newest = updates;
+            let which = Which::After(updates);
+            let (earned, _) = evaluate::keep(self.run_dir, which, config.episodes, 0)?;
+            screen.line(&earned.describe());
+        }
+        Ok(())
     }
 }

@@ -187,6 +187,8 @@ impl Lockstep {
             actor.set_weights(saved.acting.header.version, &saved.acting.safetensors)?;
             actor.go_on_from(state)?;
         }
+        let restored = self.replay.restore_priorities(saved.priorities.as_ref());
+        restored.map_err(anyhow::Error::msg)?;
         self.next_actor = saved.next_actor;
         self.unwanted = saved.unwanted;
         self.status = saved.status;
@@ -198,6 +200,11 @@ impl Lockstep {
     /// Updates so far.
     pub(super) const fn updates(&self) -> u64 {
         self.learner.updates()
+    }
+
+    /// Transitions stored so far.
+    pub(super) fn frames(&self) -> u64 {
+        self.replay.inserted_total()
     }
 
     /// What replay and learner say of themselves.
@@ -221,6 +228,7 @@ impl Lockstep {
             next_actor: self.next_actor,
             unwanted: self.unwanted.clone(),
             replay,
+            priorities: self.replay.saved_priorities(),
             status: self.status.clone(),
             acting: self.acting.clone(),
             published: self.published,
@@ -271,6 +279,12 @@ impl Lockstep {
 
     fn learn(&mut self, batch: &Batch) -> anyhow::Result<()> {
         let report = self.learner.update(batch)?;
+        let number = self.learner.updates();
+        if let Some(priorities) = batch.priority_update(LEARNER, number, &report.row_kls) {
+            let set = self.replay.set_priorities(&priorities);
+            set.map_err(anyhow::Error::msg)
+                .context("the replay refused priorities")?;
+        }
         self.learner.note(&report, &mut self.status);
         if let Some(affinity) = self.learner.affinity_update(LEARNER) {
             self.replay.set_affinity(&affinity)?;

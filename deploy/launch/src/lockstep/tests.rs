@@ -101,16 +101,22 @@ fn resumed_weights(config: &RunConfig, rounds: usize, lost: usize) -> String {
     sha256(&lockstep)
 }
 
+/// The numbers of Rainbow.
+const PRIORITISED: &str =
+    "replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}";
+
 /// Before the first update, and late; a ring that is full by then, and one that is compressed.
 #[test]
 fn a_run_that_was_interrupted_computes_what_it_would_have() {
     let small = ["replay.capacity_transitions=320"];
     let packed = ["replay.compression=lz4", "replay.capacity_transitions=320"];
+    let prioritised = [PRIORITISED, "replay.capacity_transitions=320"];
     for (world, agent, sets) in [
         ("chain", "driml-ada", &small[..]),
         ("mspacman", "driml-ada", &packed),
         ("mspacman", "curl", &[]),
         ("ising", "driml-fix", &[]),
+        ("mspacman", "driml-ada", &prioritised),
     ] {
         let config = config(world, agent, 800, sets);
         let whole = weights(&config);
@@ -122,6 +128,28 @@ fn a_run_that_was_interrupted_computes_what_it_would_have() {
             );
         }
     }
+}
+
+/// By which rule rows are drawn decides the weights, and a checkpoint of the one rule is none of the other.
+#[test]
+fn rows_that_are_drawn_by_priority_are_others() {
+    let uniform = config("chain", "c51", 800, &[]);
+    let prioritised = config("chain", "c51", 800, &[PRIORITISED]);
+    assert_eq!(weights(&prioritised), weights(&prioritised));
+    assert_ne!(weights(&prioritised), weights(&uniform));
+
+    let folder = tempfile::tempdir().unwrap();
+    let run_dir = RunFolder::new(folder.path());
+    let mut lockstep = Lockstep::begin(&uniform, &run_dir).unwrap();
+    (0..9).for_each(|_| assert!(lockstep.round().unwrap()));
+    lockstep.save(&run_dir.checkpoints()).unwrap();
+    drop(lockstep);
+    let error = Lockstep::resume(&prioritised, &run_dir).map(drop);
+    let why = format!("{:#}", error.unwrap_err());
+    assert!(
+        why.contains("replay.sampling is another rule than it was"),
+        "{why}"
+    );
 }
 
 /// Each resumption begins where the one before it saved.

@@ -57,6 +57,16 @@ impl RunFolder {
         self.path.join("endpoints")
     }
 
+    /// What checkpoints earned when they were played.
+    pub fn evaluations(&self) -> PathBuf {
+        self.path.join("evaluations.csv")
+    }
+
+    /// A folder with the checkpoint that earned most.
+    pub fn best(&self) -> PathBuf {
+        self.path.join("best")
+    }
+
     /// A folder for each checkpoint.
     pub fn checkpoints(&self) -> PathBuf {
         self.path.join(driml_learner::checkpoint::FOLDER)

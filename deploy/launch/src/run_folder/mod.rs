@@ -1,6 +1,7 @@
 //! A run's folder: the names of its files, what is written there while a run goes on, and reading it again.
 
 mod columns;
+mod evaluations;
 mod events;
 mod folder;
 mod growing_csv;
@@ -11,8 +12,10 @@ mod resume_point;
 mod returns;
 mod summary;
 
+pub(crate) use self::evaluations::Candidate;
 pub use self::{
     columns::Columns,
+    evaluations::{Evaluated, sweep},
     folder::{RunFolder, write_whole},
     metrics::{Progress, progress},
     recorder::RunRecorder,

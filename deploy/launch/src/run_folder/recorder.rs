@@ -156,6 +156,11 @@ impl RunRecorder {
         Ok(())
     }
 
+    /// The run has been going on for at least so many seconds.
+    pub(crate) fn count_seconds_from(&mut self, seconds: f64) {
+        self.seconds_before = self.seconds_before.max(seconds);
+    }
+
     /// Mean and standard deviation of k over all `updates` of the run, before it was resumed too.
     fn k(&self, replay: &ReplayStatus, updates: u64) -> Option<(f64, f64)> {
         let since = replay.mean_k().zip(replay.sd_k());
@@ -247,44 +252,25 @@ impl RunRecorder {
         let frames = replay.transitions_inserted.max(self.resume_point.frames);
         let updates = learner.updates.max(self.resume_point.updates);
         let rss = self.processes.iter().zip(&self.rss_max);
-        let episodes = self.episodes(replay);
-        Summary {
+        let of_whole_run = Summary::of(
             outcome,
-            world: run.world.clone(),
-            agent: run.agent.clone(),
-            seed: run.seed,
+            run,
+            replay,
+            learner,
+            self.episodes(replay),
+            wall_seconds,
+        );
+        Summary {
             resumed_after_updates: self.resume_point.updates,
             frames,
             updates,
-            transitions_inserted: replay.transitions_inserted,
-            transitions_lost: replay.transitions_lost,
-            transitions_duplicated: replay.transitions_duplicated,
-            rows_sampled: replay.rows_sampled,
-            rows_unlearned: replay.rows_unlearned,
-            replay_ratio: replay.replay_ratio(),
-            episodes: episodes.count,
-            mean_return: episodes.mean_return.map(|it| it.mean),
-            mean_return_of: episodes.mean_return.map_or(0, |it| it.of as u64),
-            wall_seconds,
             frames_per_second: frames as f64 / wall_seconds,
             updates_per_second: updates as f64 / wall_seconds,
             mean_k: self.k(replay, updates).map(|(mean, _)| mean),
-            k_histogram: replay.k_histogram.clone(),
-            action_histogram: replay.action_histogram.clone(),
-            weights_version: learner.weights_version,
-            weights_sha256: learner.weights_sha256.clone(),
-            chunks_retried: replay.chunks_retried,
-            batches_retried: replay.batches_retried,
-            replay_servers_restarted: 0,
-            actors_restarted: 0,
-            replay_frame_mib: replay.frame_bytes_held.div_ceil(1 << 20),
-            messages_refused: replay.messages_refused,
-            insert_ms: replay.insert_ms,
-            weights_behind_s: replay.weights_behind_s,
-            weights_behind_updates: replay.weights_behind_updates,
             rss_mib_max: rss
                 .map(|(name, mib)| (name.clone(), mib.map(f64::round).into()))
                 .collect(),
+            ..of_whole_run
         }
     }
 }

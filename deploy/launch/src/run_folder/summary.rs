@@ -5,10 +5,10 @@ use std::{fs, time::Duration};
 
 use anyhow::Context;
 use driml_machine::units::duration;
-use driml_protocol::{Quantiles, whole_file};
+use driml_protocol::{LearnerStatus, Quantiles, ReplayStatus, RunSpec, whole_file};
 use serde::{Deserialize, Serialize};
 
-use super::folder::RunFolder;
+use super::{folder::RunFolder, returns::Episodes};
 
 /// How a run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -109,6 +109,54 @@ pub struct Summary {
 }
 
 impl Summary {
+    /// What replay and learner counted in a run that took so many seconds and was never resumed.
+    pub(crate) fn of(
+        outcome: Outcome,
+        run: &RunSpec,
+        replay: &ReplayStatus,
+        learner: &LearnerStatus,
+        episodes: Episodes,
+        wall_seconds: f64,
+    ) -> Self {
+        let (frames, updates) = (replay.transitions_inserted, learner.updates);
+        Self {
+            outcome,
+            world: run.world.clone(),
+            agent: run.agent.clone(),
+            seed: run.seed,
+            resumed_after_updates: 0,
+            frames,
+            updates,
+            transitions_inserted: replay.transitions_inserted,
+            transitions_lost: replay.transitions_lost,
+            transitions_duplicated: replay.transitions_duplicated,
+            rows_sampled: replay.rows_sampled,
+            rows_unlearned: replay.rows_unlearned,
+            replay_ratio: replay.replay_ratio(),
+            episodes: episodes.count,
+            mean_return: episodes.mean_return.map(|it| it.mean),
+            mean_return_of: episodes.mean_return.map_or(0, |it| it.of as u64),
+            wall_seconds,
+            frames_per_second: frames as f64 / wall_seconds,
+            updates_per_second: updates as f64 / wall_seconds,
+            mean_k: replay.mean_k(),
+            k_histogram: replay.k_histogram.clone(),
+            action_histogram: replay.action_histogram.clone(),
+            weights_version: learner.weights_version,
+            weights_sha256: learner.weights_sha256.clone(),
+            chunks_retried: replay.chunks_retried,
+            batches_retried: replay.batches_retried,
+            replay_servers_restarted: 0,
+            actors_restarted: 0,
+            replay_frame_mib: replay.frame_bytes_held.div_ceil(1 << 20),
+            messages_refused: replay.messages_refused,
+            insert_ms: replay.insert_ms,
+            weights_behind_s: replay.weights_behind_s,
+            weights_behind_updates: replay.weights_behind_updates,
+            rss_mib_max: serde_json::Map::new(),
+        }
+    }
+
     /// Writes it into the run folder, whole or not at all.
     ///
     /// # Errors
@@ -164,6 +212,11 @@ impl Summary {
 
     /// What is printed at the end.
     pub fn describe(&self, run_dir: &RunFolder) -> String {
+        format!("{}\n{}\n", self.counts(), run_dir.display())
+    }
+
+    /// How the run ended and what it counted, in one line.
+    pub(crate) fn counts(&self) -> String {
         let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
         let how = if self.outcome == Outcome::Finished {
             "finished"
@@ -171,7 +224,7 @@ impl Summary {
             "interrupted"
         };
         format!(
-            "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, mean return {} over the last {} of {} episodes\n{}\n",
+            "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, mean return {} over the last {} of {} episodes",
             self.frames,
             self.updates,
             duration(Duration::from_secs_f64(self.wall_seconds)),
@@ -181,7 +234,6 @@ impl Summary {
             number(self.mean_return),
             self.mean_return_of,
             self.episodes,
-            run_dir.display()
         )
     }
 }

@@ -1,20 +1,15 @@
 //! Who waits for whom, and what it would take to go on, in sentences.
 //! It knows no more than a snapshot.
 
-use std::time::Duration;
-
-use driml_machine::units::duration;
 use driml_protocol::{PartName, PartStatus, PartsStatus, Waiting, session};
 
-use super::snapshot::{ServerAnswer, Snapshot};
+use super::{
+    numbers::seconds,
+    snapshot::{ServerAnswer, Snapshot},
+};
 
 /// How long a part may be silent, or the limiter closed, before it is worth a sentence.
 const SILENT: f64 = 30.0;
-
-/// A time for a person.
-pub(super) fn seconds(seconds: f64) -> String {
-    duration(Duration::try_from_secs_f64(seconds).unwrap_or_default())
-}
 
 /// The endpoint and the account of each replay server that answered.
 fn accounts(snapshot: &Snapshot) -> impl Iterator<Item = (&ServerAnswer, &PartsStatus)> {
@@ -49,7 +44,12 @@ pub(super) fn waits(snapshot: &Snapshot) -> Vec<String> {
 pub(super) fn to_go_on(snapshot: &Snapshot) -> Vec<String> {
     let mut needed = Vec::new();
     for server in &snapshot.servers {
-        if let Some(error) = &server.error {
+        if server.is_another_run {
+            needed.push(format!(
+                "a run with other settings has taken the place of this one on {}: ask anew",
+                server.endpoint
+            ));
+        } else if let Some(error) = &server.error {
             needed.push(format!(
                 "the replay server on {} does not answer ({error}): is its process frozen, or its machine cut off?",
                 server.endpoint
@@ -102,18 +102,13 @@ pub(super) fn to_go_on(snapshot: &Snapshot) -> Vec<String> {
         let PartName::Actor(id) = actor.who else {
             continue;
         };
-        let silent = actor.heard_s.unwrap_or(actor.since_s);
-        let says = actor
-            .doing
-            .as_ref()
-            .map_or(f64::INFINITY, |(_, _, said)| *said);
         if !actor.connected {
             needed.push(format!(
                 "actor-{id} is gone since {}; the others go on. To have it again: `driml actor --connect {endpoint}{} --id {id}`",
                 seconds(actor.since_s),
                 certificates(endpoint)
             ));
-        } else if silent > SILENT && says > SILENT && actor.held_s.is_none() {
+        } else if let Some(silent) = silent_for(actor) {
             needed.push(format!(
                 "actor-{id} is connected and has been silent for {}: is its process frozen?",
                 seconds(silent)
@@ -121,4 +116,39 @@ pub(super) fn to_go_on(snapshot: &Snapshot) -> Vec<String> {
         }
     }
     needed
+}
+
+/// Whether nobody plays the learner yet, and whether nobody acts yet; both false where no replay server says so.
+pub(crate) fn not_joined(snapshot: &Snapshot) -> (bool, bool) {
+    let said = accounts(snapshot).next().is_some();
+    let has = |learner| parts(snapshot).any(|(_, part)| (part.who == PartName::Learner) == learner);
+    (said && !has(true), said && !has(false))
+}
+
+/// For how many seconds a connected part has said nothing, where that is worth a sentence.
+fn silent_for(part: &PartStatus) -> Option<f64> {
+    let silent = part.heard_s.unwrap_or(part.since_s);
+    let doing = part.doing.as_ref();
+    let says = doing.map_or(f64::INFINITY, |(_, _, said)| *said);
+    (part.connected && silent > SILENT && says > SILENT && part.held_s.is_none()).then_some(silent)
+}
+
+/// Actors of which nothing is heard, a few words each; the first `max` of them.
+pub(crate) fn silent_actors(snapshot: &Snapshot, max: usize) -> Vec<String> {
+    let words = |part: &PartStatus| match silent_for(part) {
+        _ if part.who == PartName::Learner => None,
+        _ if !part.connected && snapshot.replay.finished => None,
+        _ if !part.connected => Some(format!("{}: gone for {}", part.who, seconds(part.since_s))),
+        Some(silent) => Some(format!("{}: no answer for {}", part.who, seconds(silent))),
+        None => None,
+    };
+    let mut words: Vec<_> = parts(snapshot)
+        .filter_map(|(_, part)| words(part))
+        .collect();
+    let more = words.len().saturating_sub(max);
+    if more > 0 {
+        words.truncate(max);
+        words.push(format!("and {more} more actors"));
+    }
+    words
 }

@@ -5,15 +5,17 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{
-    Hello, Keyed, Keys, LearnerStatus, PartsStatus, ReplayStatus, RunClient, codec,
+    CodecError, Hello, Keyed, Keys, LearnerStatus, PartsStatus, ReplayStatus, RunClient, codec,
+    reach,
     session::{self, Endpoints, SMALL_MESSAGE_BYTES_MAX, SessionError},
     tls::Credentials,
 };
 use driml_settings::config::RunConfig;
-use zenoh::bytes::ZBytes;
+use zenoh::{Wait, bytes::ZBytes};
 
 use super::{
     advice,
+    numbers::Numbers,
     snapshot::{ServerAnswer, Snapshot},
 };
 use crate::rates::Rates;
@@ -23,7 +25,10 @@ const ANSWER_MAX: Duration = Duration::from_secs(3);
 
 /// A run's replay servers, as one that only asks is connected to them.
 pub struct Connection {
-    config: RunConfig,
+    /// The run's settings.
+    pub config: RunConfig,
+    /// Updates after which the run goes on, if it was resumed.
+    pub after_updates: u64,
     /// Each with its endpoint.
     servers: Vec<(String, RunClient)>,
     rates: Rates,
@@ -41,12 +46,14 @@ impl Connection {
     ) -> anyhow::Result<Self> {
         let keys = Keys::new(namespace).map_err(driml_machine::error::Usage)?;
         let mut servers = Vec::new();
-        let mut config = None;
+        let mut first = None;
         for endpoint in endpoints {
             let reached = Endpoints {
                 listen: Vec::new(),
                 connect: vec![endpoint.clone()],
             };
+            // Whoever only looks does not wait for somebody to come.
+            reach::look(endpoint)?;
             let session = session::open_as(&reached, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
             let nothing = ZBytes::new();
             let hello = session::ask(
@@ -68,17 +75,35 @@ impl Connection {
                 .with_context(|| format!("the greeting of the replay server on {endpoint}"))?;
             let own = RunConfig::parse("the replay server's settings", &hello.config_toml)?;
             let spec_hash = own.run.hash();
-            config.get_or_insert(own);
+            let (of, _) = first.get_or_insert((own, hello.after_updates));
+            if of.run.hash() != spec_hash {
+                return Err(usage!(
+                    "{} and {endpoint} are of different runs: name the replay shards of one",
+                    endpoints[0]
+                )
+                .into());
+            }
             servers.push((
                 endpoint.clone(),
                 RunClient::new(session, keys.clone(), spec_hash),
             ));
         }
+        let (config, after_updates) = first.context("no endpoint to ask")?;
         Ok(Self {
-            config: config.context("no endpoint to ask")?,
+            config,
+            after_updates,
             servers,
             rates: Rates::default(),
         })
+    }
+
+    /// Leaves the run.
+    pub fn close(&self) {
+        for (_, client) in &self.servers {
+            if let Err(e) = client.session().close().wait() {
+                tracing::debug!("closing the session: {e}");
+            }
+        }
     }
 
     /// Asks everybody. Who does not answer is said in the snapshot.
@@ -87,6 +112,13 @@ impl Connection {
             let answers = client
                 .fetch::<ReplayStatus>(ANSWER_MAX)
                 .and_then(|replay| Ok((replay, client.fetch::<PartsStatus>(ANSWER_MAX)?)));
+            let is_another_run = matches!(
+                &answers,
+                Err(SessionError::Unreadable {
+                    why: CodecError::RunSpec { .. },
+                    ..
+                })
+            );
             let (answers, error) = match answers {
                 Ok(answers) => (Some(answers), None),
                 Err(e) => (None, Some(e.to_string())),
@@ -97,12 +129,14 @@ impl Connection {
                 replay,
                 parts,
                 error,
+                is_another_run,
             }
         };
         let servers: Vec<_> = self.servers.iter().map(ask).collect();
-        let learner = self
-            .servers
-            .first()
+        // The learner is asked through the first of them.
+        let first = self.servers.first();
+        let learner = first
+            .filter(|_| servers[0].error.is_none())
             .and_then(|(_, client)| client.fetch::<LearnerStatus>(ANSWER_MAX).ok());
         let answered: Vec<_> = servers.iter().filter_map(|it| it.replay.clone()).collect();
         let replay = ReplayStatus::merged(&answered);
@@ -111,17 +145,18 @@ impl Connection {
             self.rates
                 .add(Instant::now(), replay.transitions_inserted, updates);
         }
-        let (frames_per_s, updates_per_s) = self.rates.per_second();
         let config = &self.config;
         let mut snapshot = Snapshot {
             world: config.run.world.clone(),
             agent: config.run.agent.clone(),
+            seed: config.run.seed,
+            run_spec: format!("{:016x}", config.run.hash()),
+            well: false,
+            numbers: Numbers::of(&replay, learner.as_ref(), self.rates.per_second()),
             frames_planned: config.frames(),
             updates_planned: config.updates(),
             replay_ratio_planned: config.replay.replay_ratio,
             actors_planned: config.local.actors,
-            frames_per_s,
-            updates_per_s,
             servers,
             replay,
             learner,
@@ -130,6 +165,7 @@ impl Connection {
         };
         snapshot.waits = advice::waits(&snapshot);
         snapshot.to_go_on = advice::to_go_on(&snapshot);
+        snapshot.well = snapshot.to_go_on.is_empty();
         snapshot
     }
 }

@@ -3,6 +3,7 @@
 
 mod advice;
 mod connection;
+mod numbers;
 mod run_of_folder;
 mod snapshot;
 mod text;
@@ -11,8 +12,10 @@ use std::time::Duration;
 
 use driml_machine::error::Interrupted;
 
+pub(crate) use self::advice::{not_joined, silent_actors};
 pub use self::{
     connection::Connection,
+    numbers::Numbers,
     run_of_folder::{Live, endpoints_of},
     snapshot::{ServerAnswer, Snapshot},
 };
@@ -23,11 +26,11 @@ const PERIOD: Duration = Duration::from_secs(2);
 /// Between the two questions from which one answer's rates are taken.
 const BETWEEN: Duration = Duration::from_secs(1);
 
-/// Asks once, or again and again until it is interrupted, and prints what it is told.
+/// Asks once, or again and again until it is interrupted, and prints what it is told; gives the last of it.
 ///
 /// # Errors
 /// Nobody there, or not a run of this program; [`Interrupted`] if one answer was asked for and Ctrl-C came first.
-pub fn run(connection: &mut Connection, watch: bool, json: bool) -> anyhow::Result<()> {
+pub fn run(connection: &mut Connection, watch: bool, json: bool) -> anyhow::Result<Snapshot> {
     let interrupts = Interrupts::listen(None)?;
     // For the rates: what has happened since.
     connection.ask();
@@ -42,14 +45,15 @@ pub fn run(connection: &mut Connection, watch: bool, json: bool) -> anyhow::Resu
             false => text::describe(&snapshot),
         };
         if !watch {
-            return console::print(&text);
+            console::print(&text)?;
+            return Ok(snapshot);
         }
         match json {
             true => console::print(&text)?,
             false => terminal.show(&text)?,
         }
         if snapshot.is_over() || interrupts.wait_timeout(PERIOD) > 0 {
-            return Ok(());
+            return Ok(snapshot);
         }
     }
 }

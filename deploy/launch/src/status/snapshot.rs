@@ -3,6 +3,8 @@
 use driml_protocol::{LearnerStatus, PartsStatus, ReplayStatus};
 use serde::Serialize;
 
+use super::numbers::Numbers;
+
 /// What a run says of itself.
 #[derive(Clone, Debug, Serialize)]
 pub struct Snapshot {
@@ -10,6 +12,15 @@ pub struct Snapshot {
     pub world: String,
     /// The agent.
     pub agent: String,
+    /// The seed of every generator of the run.
+    pub seed: u64,
+    /// What all parts of the run agree on, as a hash: the same number is the same run.
+    pub run_spec: String,
+    /// Nothing is missing.
+    pub well: bool,
+    /// How far it is, how fast and how well, under the names of `metrics.csv`.
+    #[serde(flatten)]
+    pub numbers: Numbers,
     /// Frames that are planned.
     pub frames_planned: u64,
     /// Updates that are planned.
@@ -18,10 +29,6 @@ pub struct Snapshot {
     pub replay_ratio_planned: f64,
     /// Actors that the settings name.
     pub actors_planned: u32,
-    /// Frames a second, over the last while.
-    pub frames_per_s: f64,
-    /// Updates a second, over the last while.
-    pub updates_per_s: f64,
     /// Each replay server's answer.
     pub servers: Vec<ServerAnswer>,
     /// All replay servers' counts, as of one.
@@ -45,11 +52,13 @@ pub struct ServerAnswer {
     pub parts: Option<PartsStatus>,
     /// Why there is no answer.
     pub error: Option<String>,
+    /// It answers, and for a run with other settings.
+    pub is_another_run: bool,
 }
 
 impl Snapshot {
     /// All is learned and saved.
     pub fn is_over(&self) -> bool {
-        self.replay.finished && self.learner.as_ref().is_some_and(|it| it.finished)
+        self.numbers.finished
     }
 }

@@ -5,7 +5,7 @@ use std::fmt::Write;
 use driml_protocol::{PartStatus, Waiting};
 
 use super::{
-    advice::seconds,
+    numbers::seconds,
     snapshot::{ServerAnswer, Snapshot},
 };
 
@@ -37,9 +37,9 @@ pub(super) fn describe(snapshot: &Snapshot) -> String {
         "{world}, {agent}: frames {}/{} ({:.0}/s)  updates {updates}/{} ({:.1}/s)  replay ratio {ratio} of {}",
         replay.transitions_inserted,
         snapshot.frames_planned,
-        snapshot.frames_per_s,
+        snapshot.numbers.frames_per_second,
         snapshot.updates_planned,
-        snapshot.updates_per_s,
+        snapshot.numbers.updates_per_second,
         snapshot.replay_ratio_planned,
     );
     let counts = [

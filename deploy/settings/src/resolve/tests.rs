@@ -2,7 +2,7 @@
 //! The texts of single `--set`s are tested beside `overrides`.
 
 use driml_envs::WorldConfig;
-use driml_protocol::Horizon;
+use driml_protocol::{Horizon, Sampling};
 use expect_test::expect;
 
 use super::*;
@@ -482,4 +482,46 @@ fn a_known_bug_is_trained_with_only_where_it_is_asked_for() {
     assert_eq!(old.replay, faulty.replay);
     // What was trained with it can still be looked at.
     assert!(RunConfig::parse("faulty.toml", &faulty.to_toml()).is_ok());
+}
+
+#[test]
+fn rows_are_drawn_by_the_rule_that_is_set() {
+    let rule = |numbers: &str| format!("replay.sampling={{rule=\"prioritised\"{numbers}}}");
+    let all = rule(",alpha=0.5,beta_start=0.4,beta_end=1.0");
+    let config = with("chain", "c51", &[]).unwrap();
+    assert_eq!(config.replay.sampling, Sampling::Uniform);
+    // Rainbow's numbers; beta rises over the whole run.
+    let flags = Flags {
+        frames: Some(33_000),
+        ..sets(&[&all])
+    };
+    let config = resolve(&source("paper", "chain", "c51"), &flags, &MACHINE).unwrap();
+    let updates = (33_000 - config.replay.warmup_transitions) as f64 * config.replay.replay_ratio
+        / f64::from(config.learner.batch_size);
+    let expected = Sampling::Prioritised {
+        alpha: 0.5,
+        beta_start: 0.4,
+        beta_end: 1.0,
+        beta_updates: updates as u64,
+    };
+    assert_eq!(config.replay.sampling, expected);
+    let text = config.to_toml();
+    assert_eq!(RunConfig::parse("it", &text).unwrap().to_toml(), text);
+    let learner = driml_learner::LearnerConfig::from_toml(&text).unwrap();
+    assert_eq!(learner.sampling, expected);
+    // The hash of what all parts agree on is that of every other rule: checkpoints stay good.
+    assert_eq!(config.run, with("chain", "c51", &[]).unwrap().run);
+
+    let said = |sets: &[&str]| with("chain", "c51", sets).unwrap_err();
+    expect!["replay.sampling.alpha = 1.5 cannot work: it lies between 0 and 1"]
+        .assert_eq(&said(&[&rule(",alpha=1.5,beta_start=0.4,beta_end=1.0")]));
+    expect!["replay.sampling.beta_end = 0.3 cannot work: beta rises: use at least beta_start"]
+        .assert_eq(&said(&[&rule(",alpha=0.5,beta_start=0.4,beta_end=0.3")]));
+    expect!["in the settings' [replay] table: missing field `beta_end`, in `sampling`"]
+        .assert_eq(&said(&[&rule(",alpha=0.5,beta_start=0.4")]));
+    expect!["in the settings' [replay] table: unknown variant `greedy`, expected `uniform` or `prioritised`, in `sampling.rule`"].assert_eq(&said(&["replay.sampling={rule=\"greedy\"}"]));
+    expect![[r#"there is no setting "replay.sampling.alpha" (did you mean "replay.sampling.rule"?); [replay.sampling] has rule"#]].assert_eq(&said(&["replay.sampling.alpha=0.5"]));
+    let none = all.replace("}", ",beta_updates=0}");
+    expect!["replay.sampling.beta_updates = 0 cannot work: beta rises over at least one update"]
+        .assert_eq(&said(&[&none]));
 }

@@ -6,14 +6,16 @@ mod tile;
 
 use std::path::PathBuf;
 
+use anyhow::Context;
 use clap::Args;
 use driml_figure::Film;
 use driml_launch::{
     console::print,
-    evaluate::{Levels, Player, Who, levels, mean_and_deviation},
-    run_folder::RunFolder,
+    evaluate::{self, Levels, Player, Which, Who, levels, mean_and_deviation},
+    run_folder::{RunFolder, sweep},
 };
-use driml_machine::error::usage;
+use driml_machine::error::{EXIT_INTERRUPTED, usage};
+use driml_protocol::Shutdown;
 
 use self::recording::{RecordArgs, Recording};
 
@@ -34,9 +36,12 @@ pub(crate) struct EvaluateArgs {
     /// Seed of the worlds and of exploration
     #[arg(long, value_name = "S", default_value_t = 0)]
     pub(crate) seed: u64,
-    /// Play with the checkpoint after so many updates [default: the newest]
-    #[arg(long, value_name = "UPDATES")]
-    pub(crate) checkpoint: Option<u64>,
+    /// Play with the checkpoint after so many updates, or with the "best" of those that were played and kept
+    #[arg(long, value_name = "UPDATES", default_value = "newest")]
+    pub(crate) checkpoint: Which,
+    /// Add the agent's mean return to the run's evaluations.csv, and keep the checkpoint as the run's best if it earned most
+    #[arg(long, conflicts_with_all = ["levels", "returns", "json", "record"])]
+    pub(crate) keep: bool,
     /// Write every episode's return into this file, as CSV: who played, number of the episode, return
     #[arg(long, value_name = "FILE")]
     pub(crate) returns: Option<PathBuf>,
@@ -45,6 +50,9 @@ pub(crate) struct EvaluateArgs {
     pub(crate) json: bool,
     #[command(flatten)]
     pub(crate) film: RecordArgs,
+    /// End when the process that started this one, which has this number, ends
+    #[arg(long, value_name = "PID", hide = true, requires = "keep")]
+    pub(crate) exit_with_parent: Option<u32>,
 }
 
 /// Plays, and prints mean and standard deviation.
@@ -57,7 +65,14 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     }
     let folder = args.folder.as_ref().or(args.run.as_ref());
     let folder = folder.expect("clap asks for one of the two");
-    let player = Player::load_at(&RunFolder::new(folder), args.checkpoint)?;
+    let folder = RunFolder::new(folder);
+    if args.keep {
+        end_when_asked(folder.clone(), args.exit_with_parent)?;
+        let (earned, is_best) = evaluate::keep(&folder, args.checkpoint, args.episodes, args.seed)?;
+        let best = if is_best { ", the most so far" } else { "" };
+        return print(&format!("{}{best}\n", earned.describe()));
+    }
+    let player = Player::load_at(&folder, args.checkpoint)?;
     // Before an hour of playing.
     let table = args.returns.as_deref().map(report::Table::begin);
     let mut table = table.transpose()?;
@@ -108,6 +123,20 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     if args.json {
         print(&report::json(&player, args.levels, args.seed, &played)?)?;
     }
+    Ok(())
+}
+
+/// Ends this process when it is asked to or nobody waits for it any more, and leaves nothing half.
+fn end_when_asked(folder: RunFolder, parent: Option<u32>) -> anyhow::Result<()> {
+    let shutdown = Shutdown::on_signals(parent).context("listening for signals")?;
+    std::thread::Builder::new()
+        .name("end".into())
+        .spawn(move || {
+            shutdown.wait();
+            sweep(&folder);
+            std::process::exit(i32::from(EXIT_INTERRUPTED));
+        })
+        .context("starting a thread")?;
     Ok(())
 }
 

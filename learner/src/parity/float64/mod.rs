@@ -145,19 +145,25 @@ fn projection(
     Ok((greedy, projected))
 }
 
-/// Mean KL divergence of the taken actions' distributions from `projected` [B * N].
+/// Mean KL divergence of the taken actions' distributions from `projected` [B * N], of weighted rows times their weights.
 fn kl(logits: &Tensor, batch: &Batch<'_>, projected: &[f64]) -> candle_core::Result<Tensor> {
     let (rows, _, atoms) = logits.dims3()?;
     let taken: Vec<u32> = batch.action.iter().map(|&action| action.into()).collect();
     let taken = Tensor::from_vec(taken, (rows, 1, 1), &Device::Cpu)?;
     let taken = taken.broadcast_as((rows, 1, atoms))?.contiguous()?;
     let log_p = log_softmax(&logits.gather(&taken, 1)?.squeeze(1)?, D::Minus1)?;
-    let entropy: f64 = projected
+    let weight = |row: usize| batch.importance_weight.map_or(1.0, |it| it[row].into());
+    let target: Vec<f64> = (0..)
+        .zip(projected)
+        .map(|(at, t)| weight(at / atoms) * t)
+        .collect();
+    let entropy: f64 = target
         .iter()
-        .filter(|&&t| t > 0.0)
-        .map(|t| t * t.ln())
+        .zip(projected)
+        .filter(|&(_, &t)| t > 0.0)
+        .map(|(weighted, t)| weighted * t.ln())
         .sum();
-    let target = Tensor::from_slice(projected, (rows, atoms), &Device::Cpu)?;
+    let target = Tensor::from_vec(target, (rows, atoms), &Device::Cpu)?;
     let cross = (target * log_p)?.sum_all()?;
     cross.affine(-1.0 / rows as f64, entropy / rows as f64)
 }
@@ -270,6 +276,7 @@ mod tests {
             "noisy_dueling",
             "masked_positives",
             "no_action",
+            "weighted_rows",
         ] {
             let bytes = std::fs::read(folder.join(format!("{name}.safetensors"))).unwrap();
             let case = Case::parse(&bytes).unwrap();

@@ -162,6 +162,7 @@ fn evaluate(weight: f32, n_step_return: f32, discount: f32) -> anyhow::Result<()
         n_step_return: &[n_step_return],
         bootstrap_discount: &[discount],
         positive_valid: &[],
+        importance_weight: None,
     })?;
     Ok(())
 }

@@ -1,7 +1,7 @@
 //! N-step returns and discounts, as batches of a whole replay have them.
 
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
+    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
 };
 use driml_replay_server::{Compression, Config, RETURN_ERROR, Replay, return_sum_error};
 use rand::Rng;
@@ -42,6 +42,7 @@ pub(super) fn replay(spec: &RunSpec, rows: u32) -> anyhow::Result<Replay> {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
+        sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
         replay_ratio: 8.0,

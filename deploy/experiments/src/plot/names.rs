@@ -1,0 +1,145 @@
+//! What a line is called: world and agent, the settings in which it differs from others of these, and its seeds.
+//! It groups nothing.
+
+use std::collections::BTreeMap;
+
+use toml::Value;
+
+use super::runs::Run;
+
+/// Settings that a name tells at most; of more it tells how many.
+const TOLD_MAX: usize = 3;
+
+/// A name for each of these lists of runs, which differ in their seeds alone; no two are alike.
+pub(super) fn of(groups: &[&[&Run]]) -> Vec<String> {
+    let name = |runs: &&[&Run]| {
+        let Some(what) = &runs[0].what else {
+            return runs[0].name.clone();
+        };
+        let peers = groups.iter().map(|other| other[0]);
+        let peers = peers.filter(|other| other.what.as_ref() == Some(what));
+        let peers: Vec<_> = peers.map(settings).collect();
+        let mut parts = vec![what.clone()];
+        parts.extend(differences(&settings(runs[0]), &peers));
+        parts.push(seeds(runs));
+        parts.join(", ")
+    };
+    let names: Vec<String> = groups.iter().map(name).collect();
+    let alike = |name: &String| names.iter().filter(|other| *other == name).count() > 1;
+    let told_apart = names
+        .iter()
+        .zip(groups)
+        .map(|(name, runs)| match alike(name) {
+            true if *name != runs[0].name => format!("{name} ({})", runs[0].name),
+            _ => name.clone(),
+        });
+    told_apart.collect()
+}
+
+/// How many seeds there are, and that some were run again where that is so: runs of one seed are no independent samples.
+fn seeds(runs: &[&Run]) -> String {
+    let mut seeds: Vec<_> = runs.iter().map(|run| run.seed).collect();
+    seeds.sort_unstable();
+    seeds.dedup();
+    let seed = |seed: &Option<i64>| seed.map_or("unknown".into(), |seed| seed.to_string());
+    match (runs.len(), &seeds[..]) {
+        (1, [only]) => format!("seed {}", seed(only)),
+        (count, [only]) => format!("{count} runs of seed {}", seed(only)),
+        (count, seeds) if count == seeds.len() => format!("{count} seeds"),
+        (count, seeds) => format!("{count} runs of {} seeds", seeds.len()),
+    }
+}
+
+/// Every setting with its whole name.
+fn settings(run: &Run) -> BTreeMap<String, String> {
+    let mut all = BTreeMap::new();
+    for (key, value) in run.settings.iter().flatten() {
+        flatten(key, value, &mut all);
+    }
+    all
+}
+
+fn flatten(name: &str, value: &Value, all: &mut BTreeMap<String, String>) {
+    match value {
+        Value::Table(table) => {
+            for (key, value) in table {
+                flatten(&format!("{name}.{key}"), value, all);
+            }
+        }
+        Value::String(text) => {
+            all.insert(name.to_owned(), text.clone());
+        }
+        other => {
+            all.insert(name.to_owned(), other.to_string());
+        }
+    }
+}
+
+/// The settings of `own` that are not the same in all of `peers`, which contain it, each as `name=value`.
+fn differences(own: &BTreeMap<String, String>, peers: &[BTreeMap<String, String>]) -> Vec<String> {
+    let mut keys: Vec<&String> = peers.iter().flat_map(BTreeMap::keys).collect();
+    keys.sort_unstable();
+    keys.dedup();
+    keys.retain(|key| peers.iter().any(|peer| peer.get(*key) != own.get(*key)));
+    let mut told: Vec<String> = keys
+        .iter()
+        .take(TOLD_MAX)
+        .map(|key| {
+            let value = own.get(*key).map_or("unset", String::as_str);
+            format!("{}={value}", short(key, &keys))
+        })
+        .collect();
+    if keys.len() > TOLD_MAX {
+        told.push(format!("and {} more settings", keys.len() - TOLD_MAX));
+    }
+    told
+}
+
+/// The last parts of a key that no other of these keys ends with.
+fn short<'a>(key: &'a str, keys: &[&String]) -> &'a str {
+    let starts = key.rmatch_indices('.').map(|(at, _)| &key[at + 1..]);
+    let unique = |end: &&str| {
+        let others = keys.iter().filter(|other| other.as_str() != key);
+        !others
+            .into_iter()
+            .any(|other| other.ends_with(&format!(".{end}")) || other.as_str() == *end)
+    };
+    starts.chain([key]).find(unique).unwrap_or(key)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn settings(text: &str) -> BTreeMap<String, String> {
+        let mut all = BTreeMap::new();
+        for (key, value) in &text.parse::<toml::Table>().unwrap() {
+            flatten(key, value, &mut all);
+        }
+        all
+    }
+
+    #[test]
+    fn what_differs_is_told_by_its_shortest_name() {
+        let a = settings("actors = 1\n[learner.adam]\nlr = 0.1\neps = 1\n[actor]\nlr = 2\n");
+        let b = settings(
+            "actors = 1\n[learner.adam]\nlr = 0.2\neps = 1\n[actor]\nlr = 3\n[model]\nx = [1]\n",
+        );
+        let both = [a.clone(), b.clone()];
+        assert_eq!(
+            differences(&a, &both),
+            ["actor.lr=2", "adam.lr=0.1", "x=unset"]
+        );
+        assert_eq!(
+            differences(&b, &both),
+            ["actor.lr=3", "adam.lr=0.2", "x=[1]"]
+        );
+        assert_eq!(differences(&a, &[a.clone(), a.clone()]), [""; 0]);
+        let many = settings("a = 1\nb = 1\nc = 1\nd = 1\ne = 1\n");
+        let none = BTreeMap::new();
+        assert_eq!(
+            differences(&many, &[none, many.clone()]).last().unwrap(),
+            "and 2 more settings"
+        );
+    }
+}

@@ -1,0 +1,146 @@
+//! Plays a run's checkpoints while it goes on, each in a process of its own, one at a time.
+//! What a checkpoint earned, the process itself writes into the run's folder.
+
+use std::{
+    path::Path,
+    time::{Duration, Instant},
+};
+
+use driml_learner::checkpoint;
+use driml_settings::config::EvaluationConfig;
+
+use crate::{
+    console::Screen,
+    managed_process::{ManagedProcess, Surroundings},
+    run_folder::{Evaluated, RunFolder, sweep},
+};
+
+/// How long the last evaluation may take once the run is over.
+const LAST_MAX: Duration = Duration::from_secs(3600);
+/// How often it is looked at then.
+const POLL: Duration = Duration::from_millis(100);
+
+/// Plays checkpoints as they appear.
+pub(crate) struct Evaluator {
+    config: EvaluationConfig,
+    run_dir: RunFolder,
+    /// Updates of the newest checkpoint that was played or is.
+    newest: u64,
+    playing: Option<ManagedProcess>,
+}
+
+impl Evaluator {
+    /// Goes on after what the run's folder says was played already.
+    ///
+    /// # Errors
+    /// A table of evaluations that cannot be read.
+    pub(crate) fn new(config: EvaluationConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
+        let played = Evaluated::all(run_dir)?;
+        Ok(Self {
+            config,
+            run_dir: run_dir.clone(),
+            newest: played.iter().map(|it| it.updates).max().unwrap_or(0),
+            playing: None,
+        })
+    }
+
+    /// Says what an evaluation that has ended found, and begins the next if there is a checkpoint for it.
+    pub(crate) fn look(&mut self, screen: &Screen) {
+        self.hear(screen);
+        if self.playing.is_none() {
+            self.begin(self.config.every_updates, screen);
+        }
+    }
+
+    /// Plays the last checkpoint, and waits for it as long as nobody asks to stop.
+    pub(crate) fn finish(&mut self, screen: &Screen, abort: &impl Fn() -> bool) {
+        let deadline = Instant::now() + LAST_MAX;
+        let mut last = false;
+        loop {
+            self.hear(screen);
+            if self.playing.is_none() {
+                if last || !self.begin(1, screen) {
+                    return;
+                }
+                last = true;
+                screen.line("the last checkpoint is being played (Ctrl-C leaves that out)");
+            }
+            if abort() || Instant::now() > deadline {
+                screen.line("the last evaluation was left out");
+                return;
+            }
+            std::thread::sleep(POLL);
+        }
+    }
+
+    /// Begins to play the newest checkpoint if it is so many updates past the last one played. Says whether it did.
+    fn begin(&mut self, step: u64, screen: &Screen) -> bool {
+        let newest = match checkpoint::list(&self.run_dir.checkpoints()) {
+            Ok(all) => all.last().map(|(updates, _)| *updates),
+            Err(e) => {
+                tracing::debug!("looking for a checkpoint to play: {e}");
+                None
+            }
+        };
+        let Some(updates) = newest.filter(|it| it / step > self.newest / step) else {
+            return false;
+        };
+        self.newest = updates;
+        let logs = self.run_dir.logs();
+        match self.start(updates, &logs, screen) {
+            Ok(process) => self.playing = Some(process),
+            Err(e) => screen.line(&format!(
+                "the checkpoint after {updates} updates is not played: {e:#}"
+            )),
+        }
+        self.playing.is_some()
+    }
+
+    fn start(&self, updates: u64, logs: &Path, screen: &Screen) -> anyhow::Result<ManagedProcess> {
+        let args = [
+            "evaluate".into(),
+            self.run_dir.display().to_string(),
+            "--keep".into(),
+            "--checkpoint".into(),
+            updates.to_string(),
+            "--episodes".into(),
+            self.config.episodes.to_string(),
+        ];
+        let surroundings = Surroundings {
+            logs,
+            screen,
+            meeting: None,
+        };
+        ManagedProcess::start("evaluation", &args, 1, surroundings)
+    }
+
+    /// Takes note of an evaluation that has ended. One that failed costs the run nothing but a line.
+    fn hear(&mut self, screen: &Screen) {
+        let Some(process) = &mut self.playing else {
+            return;
+        };
+        if process.end().is_none() {
+            return;
+        }
+        process.wait_until(Instant::now(), || false);
+        let failed = process.end().is_some_and(|status| !status.success());
+        let said = match (failed, Evaluated::all(&self.run_dir)) {
+            (true, _) => format!(
+                "the run goes on without an evaluation: {}",
+                process.exit_report()
+            ),
+            (false, Ok(all)) => all.last().map(Evaluated::describe).unwrap_or_default(),
+            (false, Err(e)) => format!("{e:#}"),
+        };
+        screen.line(&said);
+        self.playing = None;
+    }
+}
+
+impl Drop for Evaluator {
+    fn drop(&mut self) {
+        // Which kills it.
+        self.playing = None;
+        sweep(&self.run_dir);
+    }
+}

@@ -1,0 +1,304 @@
+//! What a run's checkpoints earned when they were played: `evaluations.csv`, and the best of them, kept in `best/`.
+//! It plays nothing.
+
+use std::{
+    fs::{self, File},
+    io::{ErrorKind, Write},
+    path::{Path, PathBuf},
+};
+
+use anyhow::Context;
+use driml_machine::error::usage;
+
+use super::{columns::Columns, folder::RunFolder};
+
+const HEADER: [&str; 6] = [
+    "seconds",
+    "frames",
+    "updates",
+    "episodes",
+    "evaluated_return",
+    "evaluated_return_sd",
+];
+
+/// What the name of a checkpoint that is held begins with; the number of the process follows.
+const HELD: &str = ".playing-";
+
+/// What a checkpoint earned over whole episodes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Evaluated {
+    /// Seconds of the run at the checkpoint, by the row of metrics at or before it; none without metrics.
+    pub seconds: Option<f64>,
+    /// Frames of the run, likewise.
+    pub frames: Option<u64>,
+    /// Updates behind the weights.
+    pub updates: u64,
+    /// Whole episodes played.
+    pub episodes: u32,
+    /// Their mean undiscounted return.
+    pub mean_return: f64,
+    /// Its standard deviation over episodes; 0 for one.
+    pub deviation: f64,
+}
+
+impl Evaluated {
+    /// All that were kept in a run's folder, in the order in which they were played; none of a folder that has none.
+    ///
+    /// # Errors
+    /// A file that is no table of evaluations, or that cannot be read.
+    pub fn all(folder: &RunFolder) -> anyhow::Result<Vec<Self>> {
+        let path = folder.evaluations();
+        let text = match fs::read(&path) {
+            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
+            read => read.with_context(|| format!("reading {}", path.display()))?,
+        };
+        let table = Columns::parse(&text).with_context(|| format!("reading {}", path.display()))?;
+        let rows = table.rows.iter().map(|row| {
+            let number = |name| table.value::<f64>(row, name);
+            let whole = |name| table.value::<u64>(row, name);
+            Some(Self {
+                seconds: number("seconds"),
+                frames: whole("frames"),
+                updates: whole("updates")?,
+                episodes: table.value(row, "episodes")?,
+                mean_return: number("evaluated_return")?,
+                deviation: number("evaluated_return_sd")?,
+            })
+        });
+        rows.collect::<Option<_>>().with_context(|| {
+            usage!(
+                "{} is no table of evaluations: move it away",
+                path.display()
+            )
+        })
+    }
+
+    /// A checkpoint of so many updates, with the run's time and frames at it.
+    pub(crate) fn at(
+        folder: &RunFolder,
+        updates: u64,
+        episodes: u32,
+        (mean_return, deviation): (f64, f64),
+    ) -> Self {
+        let metrics = fs::read(folder.metrics()).ok();
+        let metrics = metrics
+            .and_then(|text| Columns::parse(&text).ok())
+            .unwrap_or_default();
+        let row = metrics.rows.iter().rev().find(|row| {
+            metrics
+                .value::<u64>(row, "updates")
+                .is_some_and(|at| at <= updates)
+        });
+        Self {
+            seconds: row.and_then(|row| metrics.value(row, "seconds")),
+            frames: row.and_then(|row| metrics.value(row, "frames")),
+            updates,
+            episodes,
+            mean_return,
+            deviation,
+        }
+    }
+
+    /// A line about it.
+    pub fn describe(&self) -> String {
+        format!(
+            "evaluated after {} updates: mean return {:.3}, standard deviation {:.3} over {} episodes",
+            self.updates, self.mean_return, self.deviation, self.episodes
+        )
+    }
+
+    /// Adds it to the run's table, which is made where there is none.
+    fn add(&self, folder: &RunFolder) -> anyhow::Result<()> {
+        let path = folder.evaluations();
+        let doing = || format!("writing {}", path.display());
+        let mut file = File::options()
+            .create(true)
+            .append(true)
+            .open(&path)
+            .with_context(doing)?;
+        let mut csv = csv::Writer::from_writer(Vec::new());
+        if file.metadata().with_context(doing)?.len() == 0 {
+            csv.write_record(HEADER)?;
+        }
+        csv.write_record([
+            self.seconds.map(|it| it.to_string()).unwrap_or_default(),
+            self.frames.map(|it| it.to_string()).unwrap_or_default(),
+            self.updates.to_string(),
+            self.episodes.to_string(),
+            self.mean_return.to_string(),
+            self.deviation.to_string(),
+        ])?;
+        // A whole row at once: others may read meanwhile.
+        file.write_all(&csv.into_inner()?).with_context(doing)
+    }
+}
+
+/// A checkpoint that is being played. Its files are held, so that it can be kept even if the learner clears it away meanwhile.
+#[derive(Debug)]
+pub(crate) struct Candidate {
+    best: PathBuf,
+    held: PathBuf,
+    name: PathBuf,
+}
+
+impl Candidate {
+    /// Holds the files of a checkpoint of the run.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(crate) fn hold(folder: &RunFolder, checkpoint: &Path) -> anyhow::Result<Self> {
+        sweep(folder);
+        let best = folder.best();
+        let name = PathBuf::from(checkpoint.file_name().unwrap_or_default());
+        let held = best.join(format!("{HELD}{}-{}", std::process::id(), name.display()));
+        let this = Self { best, held, name };
+        let doing = || {
+            format!(
+                "holding {} in {}",
+                checkpoint.display(),
+                this.held.display()
+            )
+        };
+        fs::create_dir_all(&this.held).with_context(doing)?;
+        for entry in fs::read_dir(checkpoint).with_context(doing)? {
+            let entry = entry.with_context(doing)?;
+            let to = this.held.join(entry.file_name());
+            // Files of a checkpoint never change; where there are no links, a copy does.
+            if fs::hard_link(entry.path(), &to).is_err() {
+                fs::copy(entry.path(), &to).with_context(doing)?;
+            }
+        }
+        Ok(this)
+    }
+
+    /// Adds what it earned to the run's table, and keeps it if nothing earned as much before. Says whether it is the best.
+    ///
+    /// # Errors
+    /// A file system that refuses, or a table that cannot be read.
+    pub(crate) fn judge(self, folder: &RunFolder, earned: &Evaluated) -> anyhow::Result<bool> {
+        let before = Evaluated::all(folder)?;
+        let is_best = before.iter().all(|it| it.mean_return < earned.mean_return);
+        if is_best {
+            let path = self.best.join(&self.name);
+            let doing = || format!("keeping {}", path.display());
+            let older = driml_learner::checkpoint::list(&self.best)?;
+            for (_, older) in older {
+                fs::remove_dir_all(&older).with_context(doing)?;
+            }
+            fs::rename(&self.held, &path).with_context(doing)?;
+        }
+        earned.add(folder)?;
+        Ok(is_best)
+    }
+}
+
+impl Drop for Candidate {
+    fn drop(&mut self) {
+        remove(&self.held);
+    }
+}
+
+/// Removes what this process, and processes that are gone, held while they played.
+pub fn sweep(folder: &RunFolder) {
+    let Ok(entries) = fs::read_dir(folder.best()) else {
+        return;
+    };
+    for entry in entries.flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let holder = name
+            .strip_prefix(HELD)
+            .and_then(|rest| rest.split('-').next()?.parse().ok());
+        let is_left =
+            |pid: u32| pid == std::process::id() || !Path::new(&format!("/proc/{pid}")).exists();
+        if holder.is_some_and(is_left) {
+            remove(&entry.path());
+        }
+    }
+}
+
+fn remove(held: &Path) {
+    if let Err(e) = fs::remove_dir_all(held)
+        && e.kind() != ErrorKind::NotFound
+    {
+        tracing::warn!("removing {}: {e}", held.display());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn checkpoint(folder: &RunFolder, updates: u64) -> PathBuf {
+        let path = folder.checkpoints().join(format!("checkpoint-{updates}"));
+        fs::create_dir_all(&path).unwrap();
+        fs::write(path.join("weights"), updates.to_string()).unwrap();
+        path
+    }
+
+    #[test]
+    fn the_best_is_kept_and_all_are_in_the_table() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        fs::write(
+            folder.metrics(),
+            "seconds,frames,updates\n0.5,100,0\n1.5,300,9\n2.5,500,25\n",
+        )
+        .unwrap();
+        assert_eq!(Evaluated::all(&folder).unwrap(), []);
+        let judge = |updates, mean| {
+            let path = checkpoint(&folder, updates);
+            let candidate = Candidate::hold(&folder, &path).unwrap();
+            // The learner clears it away while it is played.
+            fs::remove_dir_all(path).unwrap();
+            let earned = Evaluated::at(&folder, updates, 4, (mean, 0.5));
+            candidate.judge(&folder, &earned).unwrap()
+        };
+        assert!(judge(10, -1.0));
+        assert!(judge(20, 3.0));
+        assert!(!judge(30, 3.0), "the first of equals stays");
+        let best = driml_learner::checkpoint::list(&folder.best()).unwrap();
+        assert_eq!(best.len(), 1);
+        assert_eq!(fs::read_to_string(best[0].1.join("weights")).unwrap(), "20");
+        assert_eq!(fs::read_dir(folder.best()).unwrap().count(), 1);
+        // What a process that was killed left.
+        let left = folder
+            .best()
+            .join(format!("{HELD}{}-checkpoint-7", u32::MAX));
+        let other = folder.best().join(format!("{HELD}1-checkpoint-7"));
+        for folder in [&left, &other] {
+            fs::create_dir(folder).unwrap();
+        }
+        sweep(&folder);
+        assert!(!left.exists() && other.exists(), "process 1 lives");
+        let all = Evaluated::all(&folder).unwrap();
+        let at: Vec<_> = all
+            .iter()
+            .map(|it| (it.frames, it.updates, it.mean_return))
+            .collect();
+        assert_eq!(
+            at,
+            [
+                (Some(300), 10, -1.0),
+                (Some(300), 20, 3.0),
+                (Some(500), 30, 3.0)
+            ]
+        );
+        fs::write(folder.evaluations(), "a,b\n1,2\n").unwrap();
+        assert!(
+            Evaluated::all(&folder)
+                .unwrap_err()
+                .to_string()
+                .contains("is no table of evaluations")
+        );
+    }
+
+    #[test]
+    fn without_metrics_the_frames_are_unknown() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        let earned = Evaluated::at(&folder, 5, 1, (2.0, 0.0));
+        assert_eq!((earned.frames, earned.seconds), (None, None));
+        earned.add(&folder).unwrap();
+        assert_eq!(Evaluated::all(&folder).unwrap(), [earned]);
+    }
+}

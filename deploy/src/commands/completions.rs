@@ -1,0 +1,48 @@
+//! `driml completions` and `driml man`: the command line, as shells and `man` read it.
+
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::Args;
+use clap_complete::{Shell, generate};
+use driml_launch::console::print;
+
+/// The program's name, as it is called.
+const NAME: &str = "driml";
+
+#[derive(Debug, Args)]
+pub(crate) struct CompletionsArgs {
+    /// The shell that is to complete: bash, zsh, fish, elvish or powershell
+    shell: Shell,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ManArgs {
+    /// Folder for the pages: driml.1 and one for each command; it is made
+    #[arg(value_name = "DIR")]
+    out: PathBuf,
+}
+
+/// Prints the script that a shell reads.
+///
+/// # Errors
+/// The script cannot be printed.
+pub(crate) fn completions(
+    args: &CompletionsArgs,
+    mut command: clap::Command,
+) -> anyhow::Result<()> {
+    let mut script = Vec::new();
+    generate(args.shell, &mut command, NAME, &mut script);
+    print(&String::from_utf8(script).context("a script that is no text")?)
+}
+
+/// Writes the pages.
+///
+/// # Errors
+/// A file system that refuses.
+pub(crate) fn man(args: &ManArgs, command: clap::Command) -> anyhow::Result<()> {
+    let doing = || format!("writing pages into {}", args.out.display());
+    std::fs::create_dir_all(&args.out).with_context(doing)?;
+    clap_mangen::generate_to(command, &args.out).with_context(doing)?;
+    print(&format!("{}\n", args.out.join("driml.1").display()))
+}

@@ -1,0 +1,229 @@
+//! Whether anything listens at an endpoint, and what: zenoh itself says no more than that it gave up.
+//! It connects and hangs up, so it knows nothing of certificates, namespaces and runs.
+
+use std::{
+    io::{ErrorKind, Read, Write},
+    net::{TcpStream, ToSocketAddrs},
+    os::unix::net::UnixStream,
+    path::PathBuf,
+    time::{Duration, Instant},
+};
+
+/// How long one address may take to answer.
+const TRY_MAX: Duration = Duration::from_secs(2);
+/// Pauses between tries: the first, which doubles, and the longest.
+const PAUSES: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs(1)];
+/// How long somebody who is no driml may take to say something.
+const SAYS_MAX: Duration = Duration::from_secs(1);
+
+/// Why an endpoint cannot be reached.
+#[derive(Debug, thiserror::Error)]
+pub enum Unreachable {
+    /// No such host.
+    #[error(
+        "the host of {endpoint} is unknown: {why}. Correct the name, or take the machine's address"
+    )]
+    HostUnknown {
+        /// The endpoint.
+        endpoint: String,
+        /// What the system said.
+        why: String,
+        /// It may be otherwise in a moment.
+        is_temporary: bool,
+    },
+    /// The machine is there, and nothing listens at the port.
+    #[error(
+        "nobody listens on {endpoint}: start the replay server first, with this --listen, or correct the port. One with --tls-dir is \
+         reached with quic/HOST:PORT, which is UDP, and --tls-dir"
+    )]
+    Refused {
+        /// The endpoint.
+        endpoint: String,
+    },
+    /// No socket of this name.
+    #[error(
+        "nobody listens on {endpoint}: {what}. Start the replay server first, on this machine and with this --listen, or correct the \
+         path"
+    )]
+    NoSocket {
+        /// The endpoint.
+        endpoint: String,
+        /// What is there instead.
+        what: &'static str,
+    },
+    /// Whatever else the system says.
+    #[error(
+        "{endpoint} does not answer ({why}): is its machine up, is the address right, and does a firewall let this port through?"
+    )]
+    Silent {
+        /// The endpoint.
+        endpoint: String,
+        /// What the system said.
+        why: std::io::Error,
+    },
+}
+
+impl Unreachable {
+    /// Whether it makes sense to try again in a moment, as the replay server may be starting.
+    const fn may_pass(&self) -> bool {
+        match self {
+            Self::HostUnknown { is_temporary, .. } => *is_temporary,
+            Self::Refused { .. } | Self::NoSocket { .. } | Self::Silent { .. } => true,
+        }
+    }
+}
+
+/// Looks once whether something accepts connections at `endpoint`. Of `quic/` endpoints only the host is looked up, as nobody says
+/// over UDP that nobody listens.
+///
+/// # Errors
+/// Why nothing does, and what to do.
+pub fn look(endpoint: &str) -> Result<(), Unreachable> {
+    match endpoint.split_once('/') {
+        Some(("unixsock-stream", path)) => look_at_socket(endpoint, path.into()),
+        Some((protocol, address)) => {
+            let address = address.split('#').next().unwrap_or(address);
+            let addresses = address.to_socket_addrs().map_err(|e| {
+                let why = e.to_string();
+                let why = why.rsplit(": ").next().unwrap_or(&why).to_owned();
+                Unreachable::HostUnknown {
+                    endpoint: endpoint.into(),
+                    is_temporary: why.contains("emporary"),
+                    why,
+                }
+            })?;
+            if protocol != "tcp" {
+                return Ok(());
+            }
+            let mut failed = None;
+            for address in addresses {
+                match TcpStream::connect_timeout(&address, TRY_MAX) {
+                    Ok(_) => return Ok(()),
+                    Err(e) => failed = Some(e),
+                }
+            }
+            let failed = failed.unwrap_or_else(|| ErrorKind::AddrNotAvailable.into());
+            Err(of_error(endpoint, failed))
+        }
+        // zenoh says what is wrong with it.
+        None => Ok(()),
+    }
+}
+
+fn of_error(endpoint: &str, e: std::io::Error) -> Unreachable {
+    let endpoint = endpoint.to_owned();
+    match e.kind() {
+        ErrorKind::ConnectionRefused => Unreachable::Refused { endpoint },
+        _ => Unreachable::Silent { endpoint, why: e },
+    }
+}
+
+fn look_at_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
+    let what = match UnixStream::connect(path) {
+        Ok(_) => return Ok(()),
+        Err(e) if e.kind() == ErrorKind::NotFound => "there is no such socket",
+        Err(e) if e.kind() == ErrorKind::ConnectionRefused => {
+            "its socket was left by a process that has ended"
+        }
+        Err(e) => return Err(of_error(endpoint, e)),
+    };
+    Err(Unreachable::NoSocket {
+        endpoint: endpoint.into(),
+        what,
+    })
+}
+
+/// Waits until something accepts connections at one of `endpoints`.
+///
+/// # Errors
+/// Nothing does after `wait_max`, or never will.
+pub(crate) fn wait_for_any(endpoints: &[String], wait_max: Duration) -> Result<(), Unreachable> {
+    let (started, [mut pause, pause_max]) = (Instant::now(), PAUSES);
+    let mut said = false;
+    loop {
+        let mut failed = None;
+        for endpoint in endpoints {
+            match look(endpoint) {
+                Ok(()) => return Ok(()),
+                Err(e) => failed = Some(e),
+            }
+        }
+        let Some(e) = failed else {
+            return Ok(());
+        };
+        if !e.may_pass() || started.elapsed() + pause > wait_max {
+            return Err(e);
+        }
+        if started.elapsed() > TRY_MAX && !std::mem::replace(&mut said, true) {
+            tracing::info!("waiting for {} s: {e}", wait_max.as_secs());
+        }
+        std::thread::sleep(pause);
+        pause = (pause * 2).min(pause_max);
+    }
+}
+
+/// What somebody says who listens at `endpoint` and is no driml, if that is to be seen: the first words of an answer.
+pub(crate) fn what_listens(endpoint: &str) -> Option<String> {
+    let ("tcp", address) = endpoint.split_once('/')? else {
+        return None;
+    };
+    let address = address.to_socket_addrs().ok()?.next()?;
+    let mut stream = TcpStream::connect_timeout(&address, TRY_MAX).ok()?;
+    stream.set_read_timeout(Some(SAYS_MAX)).ok()?;
+    stream.write_all(b"GET / HTTP/1.0\r\n\r\n").ok()?;
+    let mut said = [0; 40];
+    let count = stream.read(&mut said).ok()?;
+    let line = said[..count].split(|&byte| byte == b'\r' || byte == b'\n');
+    let line = std::str::from_utf8(line.into_iter().next()?).ok()?;
+    let is_text = line.len() >= 4 && line.chars().all(|it| !it.is_control());
+    is_text.then(|| line.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::TcpListener;
+
+    use super::*;
+
+    fn said(endpoint: &str) -> String {
+        look(endpoint).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn each_cause_has_its_sentence() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let endpoint = format!("tcp/{}", listener.local_addr().unwrap());
+        assert!(look(&endpoint).is_ok());
+        drop(listener);
+        assert!(said(&endpoint).contains("nobody listens on tcp/127.0.0.1:"));
+        let unknown = said("tcp/no-such-host.invalid:7447");
+        assert!(
+            unknown.contains("the host of tcp/no-such-host.invalid:7447 is unknown: "),
+            "{unknown}"
+        );
+        assert!(said("quic/no-such-host.invalid:7447").contains("is unknown"));
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("s");
+        let endpoint = format!("unixsock-stream/{}", path.display());
+        assert!(said(&endpoint).contains("there is no such socket"));
+        let listener = std::os::unix::net::UnixListener::bind(&path).unwrap();
+        assert!(look(&endpoint).is_ok());
+        drop(listener);
+        assert!(said(&endpoint).contains("left by a process that has ended"));
+    }
+
+    #[test]
+    fn a_web_server_is_known_by_its_answer() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let endpoint = format!("tcp/{}", listener.local_addr().unwrap());
+        let server = std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            let mut request = [0; 64];
+            let _ = stream.read(&mut request).unwrap();
+            stream.write_all(b"HTTP/1.0 404 Not Found\r\n\r\n").unwrap();
+        });
+        let said = what_listens(&endpoint);
+        assert_eq!(said.as_deref(), Some("HTTP/1.0 404 Not Found"));
+        server.join().unwrap();
+    }
+}

@@ -1,0 +1,183 @@
+//! By which rule the replay draws the rows of a batch: the menu, and what the learner has to know of it.
+//! How rows are drawn is the replay server's, how they are weighted the learner's.
+
+use serde::{Deserialize, Serialize};
+
+/// By which rule the replay draws the rows of a batch: `replay.sampling`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "rule", rename_all = "kebab-case", from = "Read")]
+pub enum Sampling {
+    /// Each transition that can be an anchor is equally likely.
+    #[default]
+    Uniform,
+    /// By priority, the proportional rule of Schaul et al. 2016: P(i) = p_i^alpha / sum_j p_j^alpha, where p_i is the C51 loss of
+    /// transition i when it was learned from last. A row's loss is weighted by (N P(i))^-beta, over the batch's largest.
+    Prioritised {
+        /// How much priorities count, 0 to 1: at 0 all rows are equally likely.
+        alpha: f64,
+        /// beta at the first update, 0 to 1: at 1 weights undo the whole bias of the draw, at 0 nothing of it.
+        beta_start: f64,
+        /// beta from `beta_updates` on, no less than `beta_start`, at most 1.
+        beta_end: f64,
+        /// Updates over which beta rises, in a straight line.
+        beta_updates: u64,
+    },
+}
+
+/// [`Sampling`] as it is read: serde would let a variant without fields have any.
+#[derive(Deserialize)]
+#[serde(tag = "rule", rename_all = "kebab-case", deny_unknown_fields)]
+enum Read {
+    Uniform {},
+    Prioritised {
+        alpha: f64,
+        beta_start: f64,
+        beta_end: f64,
+        beta_updates: u64,
+    },
+}
+
+impl From<Read> for Sampling {
+    fn from(read: Read) -> Self {
+        match read {
+            Read::Uniform {} => Self::Uniform,
+            Read::Prioritised {
+                alpha,
+                beta_start,
+                beta_end,
+                beta_updates,
+            } => Self::Prioritised {
+                alpha,
+                beta_start,
+                beta_end,
+                beta_updates,
+            },
+        }
+    }
+}
+
+/// Why a rule cannot work: which of its numbers, what it is, and what to do.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SamplingError {
+    /// The number's path in the settings.
+    pub key: &'static str,
+    /// What it is.
+    pub value: String,
+    /// What is wrong with it.
+    pub why: &'static str,
+}
+
+impl Sampling {
+    /// Whether rows are drawn by priority: then batches say how likely each was, and the learner answers with priorities.
+    pub const fn is_prioritised(&self) -> bool {
+        matches!(self, Self::Prioritised { .. })
+    }
+
+    /// beta at the update that follows `updates`.
+    pub fn beta(&self, updates: u64) -> f64 {
+        match *self {
+            Self::Uniform => 0.0,
+            Self::Prioritised {
+                beta_start,
+                beta_end,
+                beta_updates,
+                ..
+            } => {
+                let share = updates.min(beta_updates) as f64 / beta_updates.max(1) as f64;
+                beta_start + share * (beta_end - beta_start)
+            }
+        }
+    }
+
+    /// Checks every number's range.
+    ///
+    /// # Errors
+    /// The first number that cannot work.
+    pub fn validate(&self) -> Result<(), SamplingError> {
+        let Self::Prioritised {
+            alpha,
+            beta_start,
+            beta_end,
+            beta_updates,
+        } = *self
+        else {
+            return Ok(());
+        };
+        let bad = |key, value: String, why| Err(SamplingError { key, value, why });
+        for (key, value) in [
+            ("replay.sampling.alpha", alpha),
+            ("replay.sampling.beta_start", beta_start),
+            ("replay.sampling.beta_end", beta_end),
+        ] {
+            if !(0.0..=1.0).contains(&value) {
+                return bad(key, value.to_string(), "it lies between 0 and 1");
+            }
+        }
+        if beta_end < beta_start {
+            let why = "beta rises: use at least beta_start";
+            return bad("replay.sampling.beta_end", beta_end.to_string(), why);
+        }
+        if beta_updates == 0 {
+            let why = "beta rises over at least one update";
+            return bad("replay.sampling.beta_updates", "0".into(), why);
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rainbow(change: impl FnOnce(&mut [f64; 3])) -> Sampling {
+        let mut numbers = [0.5, 0.4, 1.0];
+        change(&mut numbers);
+        let [alpha, beta_start, beta_end] = numbers;
+        Sampling::Prioritised {
+            alpha,
+            beta_start,
+            beta_end,
+            beta_updates: 600,
+        }
+    }
+
+    #[test]
+    fn beta_rises_in_a_straight_line_and_stays() {
+        let rule = rainbow(|_| ());
+        let near = |updates, beta: f64| assert!((rule.beta(updates) - beta).abs() < 1e-12);
+        near(0, 0.4);
+        near(300, 0.7);
+        near(600, 1.0);
+        near(u64::MAX, 1.0);
+        assert_eq!(Sampling::Uniform.beta(7), 0.0);
+    }
+
+    #[test]
+    fn numbers_out_of_range_are_named() {
+        assert_eq!(rainbow(|_| ()).validate(), Ok(()));
+        assert_eq!(Sampling::Uniform.validate(), Ok(()));
+        for (at, value, key) in [
+            (0, -0.1, "alpha"),
+            (0, f64::NAN, "alpha"),
+            (0, f64::INFINITY, "alpha"),
+            (1, 1.5, "beta_start"),
+            (2, 2.0, "beta_end"),
+            (2, 0.3, "beta_end"),
+        ] {
+            let said = rainbow(|numbers| numbers[at] = value).validate();
+            let key = format!("replay.sampling.{key}");
+            assert!(said.is_err_and(|e| e.key == key), "{key} = {value}");
+        }
+        let never = Sampling::Prioritised {
+            alpha: 0.5,
+            beta_start: 0.4,
+            beta_end: 1.0,
+            beta_updates: 0,
+        };
+        assert!(
+            never
+                .validate()
+                .is_err_and(|e| e.key.ends_with("beta_updates"))
+        );
+    }
+}

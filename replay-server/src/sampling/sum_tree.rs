@@ -1,0 +1,179 @@
+//! A sum tree: numbers by place, their sum, and a place drawn in proportion to its number, each in O(log n).
+//! Source: Schaul et al. 2016, Prioritized Experience Replay, appendix B.2.1.
+//!
+//! Every sum is computed anew from its two parts when one of them changes, never by adding a difference: it is what it would be had
+//! all numbers been set at once, however often they have changed.
+
+use rand::Rng;
+
+/// Numbers that are not negative, at places `0..capacity`; 0 at first.
+pub(crate) struct SumTree {
+    /// Places, rounded up to a power of two.
+    leaves: usize,
+    /// The root at 1, the parts of node i at 2 i and 2 i + 1, the numbers from `leaves` on.
+    nodes: Vec<f64>,
+}
+
+impl SumTree {
+    /// All 0. Its memory is taken as places are used.
+    ///
+    /// # Errors
+    /// The system refuses to reserve that much memory: the bytes asked for.
+    pub(crate) fn new(capacity: u64) -> Result<Self, u64> {
+        let leaves = capacity.checked_next_power_of_two().unwrap_or(u64::MAX);
+        let asked = leaves.saturating_mul(2 * size_of::<f64>() as u64);
+        let leaves = usize::try_from(leaves).map_err(|_| asked)?;
+        let length = leaves.checked_mul(2).ok_or(asked)?;
+        // Zeros that come from the system are not touched; whether it grants them is asked first, as that ends no process.
+        Vec::<f64>::new()
+            .try_reserve_exact(length)
+            .map_err(|_| asked)?;
+        let nodes = vec![0.0; length];
+        Ok(Self { leaves, nodes })
+    }
+
+    /// The sum of all numbers.
+    pub(crate) fn total(&self) -> f64 {
+        self.nodes[1]
+    }
+
+    /// The number at `place`.
+    pub(crate) fn get(&self, place: usize) -> f64 {
+        self.nodes[self.leaves + place]
+    }
+
+    /// Sets the number at `place`, which is finite and not negative.
+    pub(crate) fn set(&mut self, place: usize, number: f64) {
+        debug_assert!(number.is_finite() && number >= 0.0, "{number}");
+        let mut node = self.leaves + place;
+        if self.nodes[node] == number {
+            return;
+        }
+        self.nodes[node] = number;
+        while node > 1 {
+            node /= 2;
+            self.nodes[node] = self.nodes[2 * node] + self.nodes[2 * node + 1];
+        }
+    }
+
+    /// A place, each as likely as its share of the sum, those of number 0 never; none if the sum is 0.
+    pub(crate) fn draw(&self, rng: &mut impl Rng) -> Option<usize> {
+        if self.total() <= 0.0 {
+            return None;
+        }
+        let mut left_over = rng.random::<f64>() * self.total();
+        let mut node = 1;
+        while node < self.leaves {
+            node *= 2;
+            // Rounding must not lead where there is nothing.
+            if left_over >= self.nodes[node] && self.nodes[node + 1] > 0.0 {
+                left_over -= self.nodes[node];
+                node += 1;
+            }
+        }
+        Some(node - self.leaves)
+    }
+
+    /// Checks every sum; panics at the first that is wrong. Slow: for tests.
+    pub(crate) fn check_valid(&self) {
+        for node in 1..self.leaves {
+            let sum = self.nodes[2 * node] + self.nodes[2 * node + 1];
+            assert_eq!(self.nodes[node], sum, "node {node}");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    /// A generator that gives one number between 0 and 1.
+    struct Fixed(f64);
+
+    impl rand::RngCore for Fixed {
+        fn next_u32(&mut self) -> u32 {
+            self.next_u64() as u32
+        }
+
+        fn next_u64(&mut self) -> u64 {
+            // As `random::<f64>` takes the upper 53 bits.
+            ((self.0 * (1u64 << 53) as f64) as u64) << 11
+        }
+
+        fn fill_bytes(&mut self, _: &mut [u8]) {
+            unreachable!("only numbers are drawn");
+        }
+    }
+
+    proptest! {
+        /// Against a plain list that is summed from its first number on, after changes in any order. Numbers are whole, so that
+        /// sums are exact in either order and places agree to the last bit.
+        #[test]
+        fn equals_a_plain_loop(
+            capacity in 1usize..40,
+            changes in prop::collection::vec((any::<prop::sample::Index>(), 0u32..1000), 0..200),
+            share in 0.0f64..1.0,
+        ) {
+            let mut tree = SumTree::new(capacity as u64).unwrap();
+            let mut list = vec![0.0; capacity];
+            for (place, number) in changes {
+                let place = place.index(capacity);
+                tree.set(place, number.into());
+                list[place] = f64::from(number);
+                tree.check_valid();
+                prop_assert_eq!(tree.get(place), list[place]);
+            }
+            prop_assert_eq!(tree.total(), list.iter().sum::<f64>());
+            let mut rng = Fixed(share);
+            let drawn: f64 = rng.random();
+            let mut left_over = drawn * tree.total();
+            let found = list.iter().position(|&number| {
+                left_over -= number;
+                left_over < 0.0
+            });
+            prop_assert_eq!(tree.draw(&mut rng), found);
+        }
+
+        /// Numbers of any size: what is drawn is never a 0, and sums do not drift from those of a tree that is new.
+        #[test]
+        fn never_draws_a_zero_and_never_drifts(
+            numbers in prop::collection::vec(prop_oneof![Just(0.0), 1e-12f64..1e12, Just(1e38)], 1..70),
+            seed in any::<u64>(),
+        ) {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let mut tree = SumTree::new(numbers.len() as u64).unwrap();
+            for _ in 0..20 {
+                for place in 0..numbers.len() {
+                    tree.set(place, rng.random_range(0.0..1e30));
+                }
+            }
+            let mut fresh = SumTree::new(numbers.len() as u64).unwrap();
+            for (place, &number) in numbers.iter().enumerate() {
+                tree.set(place, number);
+                fresh.set(place, number);
+            }
+            prop_assert_eq!(&tree.nodes, &fresh.nodes);
+            for _ in 0..50 {
+                match tree.draw(&mut rng) {
+                    Some(place) => prop_assert!(numbers[place] > 0.0),
+                    None => prop_assert!(numbers.iter().all(|&number| number == 0.0)),
+                }
+            }
+            for edge in [0.0, 1.0 - f64::EPSILON] {
+                if let Some(place) = tree.draw(&mut Fixed(edge)) {
+                    prop_assert!(numbers[place] > 0.0);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn memory_that_is_not_there_is_an_error() {
+        assert!(SumTree::new(1 << 50).is_err_and(|bytes| bytes == 1 << 54));
+        assert!(SumTree::new(u64::MAX).is_err());
+    }
+}

@@ -1,0 +1,382 @@
+//! Prioritised sampling: the law of the draws, who can be drawn, and what becomes of priorities that come late, twice or from elsewhere.
+//! The tree by itself is tested beside its code.
+
+use std::collections::HashMap;
+
+use driml_protocol::{
+    Batch, ChunkHeader, Horizon, Origin, PriorityPart, PriorityUpdate, Sampling, TimeoutRule,
+};
+use driml_replay_server::{Config, PRIORITY_MIN, PriorityCounts, Replay};
+use proptest::prelude::*;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::{
+    batches::check_rows,
+    exactly_once::join,
+    history::{History, StreamKey, identity, spec, unlimited},
+    law::ChiSquare,
+};
+
+const ROWS: u32 = 64;
+const LEARNER: u64 = 5;
+
+pub(crate) fn prioritised(capacity: u64, alpha: f64) -> Config {
+    Config {
+        sampling: Sampling::Prioritised {
+            alpha,
+            beta_start: 0.4,
+            beta_end: 1.0,
+            beta_updates: 100,
+        },
+        ..unlimited(capacity)
+    }
+}
+
+/// A replay, all that it ever stored, and what its priorities have to be.
+struct Setup {
+    replay: Replay,
+    history: History,
+    rng: ChaCha8Rng,
+    alpha: f64,
+    /// Of each transition that was learned from.
+    priorities: HashMap<u64, f64>,
+    /// Of each that became an anchor, the highest priority then.
+    first: HashMap<u64, f64>,
+    highest: f64,
+    updates: u64,
+    /// Of each actor its chunks and transitions so far.
+    produced: [(u64, u64); 4],
+}
+
+impl Setup {
+    fn new(capacity: u64, alpha: f64, frame_stack: u32, horizon: Horizon) -> Self {
+        let spec = spec(3, frame_stack, 4, horizon);
+        let mut replay = Replay::new(&spec, &prioritised(capacity, alpha), ROWS).unwrap();
+        for actor in 0..4 {
+            join(&mut replay, actor, 1);
+        }
+        Self {
+            replay,
+            history: History::new(&spec, capacity),
+            rng: ChaCha8Rng::seed_from_u64(3),
+            alpha,
+            priorities: HashMap::new(),
+            first: HashMap::new(),
+            highest: 1.0,
+            updates: 0,
+            produced: [(0, 0); 4],
+        }
+    }
+
+    fn insert(&mut self, actor: u32, streams: u32, steps: u32) {
+        let (sequence, transitions) = &mut self.produced[actor as usize];
+        let header = ChunkHeader {
+            actor,
+            incarnation: 1,
+            sequence: *sequence,
+            first_transition: *transitions,
+            weights_version: 0,
+            leaving: false,
+            streams,
+            steps,
+            frame_bytes: self.history.spec.frame_bytes() as u32,
+        };
+        *sequence += 1;
+        *transitions += u64::from(streams * steps);
+        let chunk = self.history.next_chunk(header, 0, &mut self.rng);
+        self.replay.insert(&chunk);
+        for index in self.anchors() {
+            self.first.entry(index).or_insert(self.highest);
+        }
+        self.replay.check_valid();
+    }
+
+    /// Every transition that can be drawn, by its number.
+    fn anchors(&self) -> Vec<u64> {
+        let anchors = self.history.valid_anchors().into_iter();
+        let index = |(key, t): (StreamKey, usize)| self.history.streams[&key][t].index;
+        anchors.map(index).collect()
+    }
+
+    fn indices(&self, batch: &Batch) -> Vec<u64> {
+        let spec = &self.history.spec;
+        let states = batch.states_t().chunks(spec.state_bytes());
+        let index = |state| {
+            let (key, t) = identity(spec, state);
+            self.history.streams[&key][t].index
+        };
+        states.map(index).collect()
+    }
+
+    /// Draws a batch and says what its rows' losses are.
+    fn learn(&mut self) -> PriorityUpdate {
+        let batch = self.replay.sample(ROWS).unwrap();
+        check_rows(&batch, &self.history);
+        let found: Vec<f32> = (0..ROWS)
+            .map(|_| self.rng.random_range(0.0f32..4.0).powi(3))
+            .collect();
+        self.updates += 1;
+        let update = batch.priority_update(LEARNER, self.updates, &found);
+        let update = update.unwrap();
+        assert_eq!(update.parts[0].transitions, self.indices(&batch));
+        for (index, found) in update.parts[0].transitions.iter().zip(&found) {
+            self.priorities.insert(*index, f64::from(*found));
+            self.highest = self.highest.max(f64::from(*found));
+        }
+        self.replay.set_priorities(&update).unwrap();
+        update
+    }
+
+    /// The paper's law over the anchors, by a plain loop.
+    fn law(&self) -> HashMap<u64, f64> {
+        let mass = |index| {
+            let priority = self.priorities.get(&index).or(self.first.get(&index));
+            (priority.unwrap() + PRIORITY_MIN).powf(self.alpha)
+        };
+        let anchors = self.anchors().into_iter();
+        let masses: Vec<_> = anchors.map(|index| (index, mass(index))).collect();
+        let total: f64 = masses.iter().map(|it| it.1).sum();
+        let law = masses
+            .into_iter()
+            .map(|(index, mass)| (index, mass / total));
+        law.collect()
+    }
+
+    /// Draws follow the law, and say how likely they were.
+    fn check_law(&mut self, what: &str) {
+        let law = self.law();
+        let mut counts: HashMap<u64, u64> = law.keys().map(|&index| (index, 0)).collect();
+        // The first frames of some stacks may be gone: each is found once, then chances are those of the law.
+        for _ in 0..20 {
+            self.replay.sample(ROWS).unwrap();
+        }
+        for _ in 0..law.len() * 4 {
+            let batch = self.replay.sample(ROWS).unwrap();
+            let chances = batch.probabilities().unwrap();
+            for (index, chance) in self.indices(&batch).into_iter().zip(chances) {
+                *counts.get_mut(&index).unwrap() += 1;
+                let (chance, expected) = (f64::from(chance), law[&index]);
+                assert!(chance <= expected * (1.0 + 1e-5), "{chance}, {expected}");
+                let may_hide = self.history.spec.frame_stack > 1;
+                let near = chance >= expected * (1.0 - 1e-5);
+                assert!(near || may_hide, "{chance}, {expected}");
+            }
+        }
+        let (counts, chances): (Vec<u64>, Vec<f64>) = law
+            .iter()
+            .map(|(index, chance)| (counts[index], *chance))
+            .unzip();
+        let mut chi = ChiSquare::default();
+        chi.add(&counts, &chances);
+        chi.check(what);
+    }
+}
+
+#[test]
+fn draws_follow_the_paper_s_law() {
+    for (alpha, frame_stack) in [(0.0, 1), (0.5, 1), (0.5, 4), (1.0, 1)] {
+        let mut setup = Setup::new(200, alpha, frame_stack, Horizon::Uniform { k_max: 3 });
+        for _ in 0..12 {
+            setup.insert(0, 2, 5);
+            setup.insert(1, 1, 3);
+            setup.learn();
+        }
+        setup.check_law(&format!("alpha = {alpha}, a ring that is not full"));
+        for _ in 0..20 {
+            setup.insert(0, 2, 5);
+            setup.insert(1, 1, 3);
+            setup.learn();
+        }
+        assert!(setup.history.oldest() > 0);
+        setup.check_law(&format!(
+            "alpha = {alpha}, stack {frame_stack}, a full ring"
+        ));
+    }
+}
+
+/// Streams of a step each: most of what is held is no anchor, and none of it is in the way.
+#[test]
+fn what_is_no_anchor_is_never_tried() {
+    let mut setup = Setup::new(2000, 0.5, 1, Horizon::Uniform { k_max: 3 });
+    setup.history.ends = false;
+    setup.insert(0, 1, 20);
+    setup.insert(1, 900, 1);
+    setup.insert(2, 900, 1);
+    assert_eq!(setup.anchors().len(), 16);
+    setup.learn();
+    setup.check_law("few anchors");
+}
+
+/// k is drawn as it is where rows are drawn uniformly.
+#[test]
+fn k_follows_its_own_rule() {
+    let k_max = 3;
+    let mut setup = Setup::new(300, 0.5, 1, Horizon::Uniform { k_max });
+    for _ in 0..20 {
+        setup.insert(0, 2, 8);
+        setup.learn();
+    }
+    let mut counts = vec![[0u64; 3]; k_max as usize + 1];
+    for _ in 0..1000 {
+        let batch = setup.replay.sample(ROWS).unwrap();
+        let spec = &setup.history.spec;
+        let states = batch.states_t().chunks(spec.state_bytes());
+        for (state, &k) in states.zip(batch.ks()).filter(|(_, k)| **k > 0) {
+            let (key, t) = identity(spec, state);
+            let left = setup.history.row(key, t).steps_left;
+            counts[left][usize::from(k) - 1] += 1;
+        }
+    }
+    let mut chi = ChiSquare::default();
+    for left in 1..=k_max as usize {
+        chi.add(&counts[left][..left], &vec![1.0 / left as f64; left]);
+    }
+    chi.check("k");
+}
+
+fn counts(replay: &Replay) -> PriorityCounts {
+    replay.priority_counts().unwrap()
+}
+
+#[test]
+fn a_priority_counts_once_and_for_the_transition_that_was_drawn() {
+    let mut setup = Setup::new(100, 1.0, 1, Horizon::None);
+    setup.insert(0, 1, 60);
+    let first = setup.learn();
+    let rows = u64::from(ROWS);
+    assert_eq!(counts(&setup.replay).set, rows);
+
+    // The answer was lost, and the learner asks again: by then others are newer.
+    let law = setup.law();
+    let mut again = first.clone();
+    again.parts[0].priorities.fill(1e6);
+    setup.replay.set_priorities(&again).unwrap();
+    assert_eq!(counts(&setup.replay).repeated, rows);
+    assert_eq!(setup.law(), law);
+    setup.check_law("after a repetition");
+
+    // Of a life that is over, and of another shard.
+    let of = |origin, number| PriorityUpdate {
+        learner: LEARNER,
+        number,
+        parts: vec![PriorityPart {
+            origin,
+            ..again.parts[0].clone()
+        }],
+    };
+    let own = first.parts[0].origin;
+    let earlier = Origin {
+        incarnation: own.incarnation + 1,
+        ..own
+    };
+    let other = Origin {
+        shard: own.shard + 1,
+        ..own
+    };
+    setup.replay.set_priorities(&of(earlier, 100)).unwrap();
+    assert_eq!(counts(&setup.replay).gone, rows);
+    setup.replay.set_priorities(&of(other, 101)).unwrap();
+    let so_far = PriorityCounts {
+        set: rows,
+        gone: rows,
+        repeated: rows,
+    };
+    assert_eq!(counts(&setup.replay), so_far);
+    setup.check_law("after what was for others");
+
+    // Every slot is another transition's by now.
+    setup.insert(0, 1, 100);
+    setup.updates = 200;
+    setup.replay.set_priorities(&of(own, 102)).unwrap();
+    assert_eq!(counts(&setup.replay).gone, 2 * rows);
+    setup.check_law("after what came too late");
+
+    // Another learner counts from its own first.
+    let batch = setup.replay.sample(ROWS).unwrap();
+    let found = [3.0; ROWS as usize];
+    let update = batch.priority_update(LEARNER + 1, 1, &found).unwrap();
+    setup.replay.set_priorities(&update).unwrap();
+    assert_eq!(counts(&setup.replay).set, 2 * rows);
+}
+
+#[test]
+fn what_was_never_stored_or_drawn_is_refused_or_ignored() {
+    let mut setup = Setup::new(100, 0.5, 1, Horizon::None);
+    setup.insert(0, 1, 60);
+    let mut update = setup.learn();
+    update.number += 1;
+    update.parts[0].transitions[3] = 60;
+    let refused = setup.replay.set_priorities(&update).unwrap_err();
+    assert_eq!(refused, "a priority of transition 60, where 60 were stored");
+    // The newest one lacks the steps of its return.
+    setup.history.ends = false;
+    setup.insert(1, 1, 2);
+    let gone = counts(&setup.replay).gone;
+    update.parts[0].transitions[3] = 61;
+    setup.replay.set_priorities(&update).unwrap();
+    assert_eq!(counts(&setup.replay).gone, gone + 1);
+    setup.replay.check_valid();
+
+    let spec = setup.history.spec.clone();
+    let mut uniform = Replay::new(&spec, &unlimited(100), ROWS).unwrap();
+    let refused = uniform.set_priorities(&update).unwrap_err();
+    assert_eq!(refused, "priorities, in a run that draws uniformly");
+    assert_eq!(uniform.priority_counts(), None);
+}
+
+/// Saved and taken back by a replay that holds the same: the same draws from there on. By one that does not: a sentence.
+#[test]
+fn what_is_saved_comes_back() {
+    let run = |saved_at: usize| {
+        let mut setup = Setup::new(80, 0.5, 4, Horizon::Uniform { k_max: 3 });
+        let mut saved = None;
+        for round in 0..12 {
+            setup.insert(0, 2, 5);
+            if round == saved_at {
+                saved = setup.replay.saved_priorities();
+                let mut fresh = Setup::new(80, 0.5, 4, Horizon::Uniform { k_max: 3 });
+                fresh.insert(0, 2, 5);
+                let other = fresh.replay.restore_priorities(saved.as_ref());
+                let said = other.unwrap_err();
+                assert!(said.contains("transitions, where 10 are held"), "{said}");
+                setup.learn();
+                setup.replay.restore_priorities(saved.as_ref()).unwrap();
+                assert_eq!(setup.replay.saved_priorities(), saved);
+                let none = setup.replay.restore_priorities(None).unwrap_err();
+                assert!(none.contains("another rule"), "{none}");
+            }
+            setup.learn();
+        }
+        assert!(saved.is_some());
+    };
+    run(3);
+    run(10);
+}
+
+proptest! {
+    /// Chunks of several actors and shapes, learned from in between: after each step exactly the anchors have a mass, and rows are
+    /// those of the reference.
+    #[test]
+    fn exactly_the_anchors_can_be_drawn(
+        steps in prop::collection::vec((0u32..4, 1u32..9, any::<bool>()), 1..40),
+        capacity in 30u64..90,
+        frame_stack in 1u32..5,
+        bootstraps in any::<bool>(),
+    ) {
+        let mut setup = Setup::new(capacity, 0.5, frame_stack, Horizon::Uniform { k_max: 6 });
+        if bootstraps {
+            setup.history.spec.timeout = TimeoutRule::Bootstrap;
+            let config = prioritised(capacity, 0.5);
+            setup.replay = Replay::new(&setup.history.spec, &config, ROWS).unwrap();
+            (0..4).for_each(|actor| join(&mut setup.replay, actor, 1));
+        }
+        for (actor, steps, learns) in steps {
+            setup.insert(actor, 1 + actor % 2, steps.min(capacity as u32 / 2));
+            if learns && !setup.anchors().is_empty() {
+                setup.learn();
+                setup.replay.check_valid();
+            }
+        }
+    }
+}

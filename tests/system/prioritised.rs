@@ -1,0 +1,88 @@
+//! Rows drawn by priority, in whole runs: of one replay server and of several, of one that dies, and in lockstep.
+//! The law of the draws is tested beside the code.
+
+use nix::sys::signal::Signal;
+
+use crate::{PRIORITISED, SHORT, system};
+
+/// Rows whose priority was set, came too late and came twice, by the last word of a replay server.
+fn said(log: &str) -> [u64; 3] {
+    let line = log.lines().rfind(|line| line.contains("priorities of "));
+    let line = line.unwrap_or_else(|| panic!("no word of priorities: {log}"));
+    let words = line.split("priorities of ").nth(1).unwrap();
+    let numbers = words.split(|c: char| !c.is_ascii_digit());
+    let numbers: Vec<u64> = numbers.filter_map(|word| word.parse().ok()).collect();
+    numbers.try_into().unwrap()
+}
+
+/// The priorities of nearly all rows come back: those of the last updates may be on their way when the run ends.
+#[test]
+fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
+    for (shards, flags) in [(1, ""), (2, "--actors 2 --replay-shards 2")] {
+        let system = system();
+        system
+            .run(&format!(
+                "local --agent driml-ada {SHORT} {PRIORITISED} {flags} --run-dir run"
+            ))
+            .expect_code(0);
+        let run = system.run_folder("run");
+        let summary = run.check("finished");
+        let parts: Vec<String> = match shards {
+            1 => vec!["replay-server".into()],
+            _ => (0..shards)
+                .map(|shard| format!("replay-server-{shard}"))
+                .collect(),
+        };
+        let all = parts.iter().map(|part| said(&run.log(part)));
+        let sums = all.fold([0; 3], |sums, counts| {
+            std::array::from_fn(|at| sums[at] + counts[at])
+        });
+        let [set, gone, repeated] = sums;
+        let rows = summary.rows_sampled;
+        assert!(
+            set + gone <= rows && set * 10 > rows * 9,
+            "{sums:?} of {rows}"
+        );
+        assert_eq!(repeated, 0);
+        assert!(gone * 10 < rows, "{sums:?} of {rows}");
+    }
+}
+
+/// Its transitions come back, with the highest priority each; losses of rows that it drew before are not taken for those of others.
+#[test]
+fn a_replay_server_that_dies_goes_on_with_equal_priorities() {
+    let system = system();
+    let longer = SHORT.replace("--frames 1280", "--frames 6400");
+    let process = system.start(&format!(
+        "local --durable --agent c51 {longer} {PRIORITISED} --listen {} --run-dir run",
+        system.endpoint()
+    ));
+    let client = system.connect();
+    client.wait_for_learner("some updates", |learner| learner.updates > 500);
+    system.find_part("replay-server").signal(Signal::SIGKILL);
+    drop(client);
+    process
+        .wait()
+        .expect_code(0)
+        .expect_said("is started again with what it has kept");
+    let run = system.run_folder("run");
+    run.check("finished");
+    let log = run.log("replay-server");
+    assert!(log.contains("priorities are not kept on disk"), "{log}");
+    assert!(said(&log)[0] > 0, "{log}");
+}
+
+#[test]
+fn the_seed_decides_the_weights_in_lockstep() {
+    let system = system();
+    let run = |name: &str, more: &str| {
+        let flags = format!("{SHORT} --agent driml-ada --actors 2 {more}");
+        system
+            .run(&format!("local --lockstep {flags} --run-dir {name}"))
+            .expect_code(0);
+        system.run_folder(name).check_finished().weights_sha256
+    };
+    let first = run("first", PRIORITISED);
+    assert_eq!(first, run("same", PRIORITISED));
+    assert_ne!(first, run("uniform", ""));
+}

@@ -1,0 +1,337 @@
+//! `driml watch`: what is shown and recorded of runs that others have started, and that looking on disturbs nobody.
+//! What `driml status` says of a run is in `status`.
+
+use std::{collections::BTreeMap, fs};
+
+use driml_tests::{
+    Process, TestSystem,
+    python::{python_with, run as run_python},
+    wait_for,
+};
+use nix::sys::signal::Signal;
+use serde_json::Value;
+
+use crate::{LONG, SHORT, launched, system};
+
+/// Starts to watch the run at this system's endpoint.
+fn watch(system: &TestSystem, flags: &str) -> Process {
+    system.start(&format!("watch --connect {} {flags}", system.endpoint()))
+}
+
+fn run(system: &TestSystem, args: &str) -> Process {
+    system.start_part(args)
+}
+
+#[test]
+fn a_run_of_parts_by_hand_leaves_the_folder_of_a_launched_one() {
+    let system = system();
+    let endpoint = system.endpoint();
+    let flags = "--agent driml-ada --actors 2";
+    let server = run(
+        &system,
+        &format!("replay-server --listen {endpoint} {flags} {SHORT}"),
+    );
+    let client = system.connect();
+    let watch = watch(&system, "--run-dir run --tensorboard");
+    wait_for("the folder", || {
+        system.path("run/metrics.csv").exists().then_some(())
+    });
+    // Into the same folder, which is then as good as a launched run's.
+    let learner = run(
+        &system,
+        &format!("learner --connect {endpoint} --run-dir run"),
+    );
+    let actors = [system.start_actor(0), system.start_actor(1)];
+    let ended = watch.wait().expect_code(0);
+    assert!(
+        ended
+            .stdout
+            .contains("finished: 1280 frames and 540 updates"),
+        "{}",
+        ended.stdout
+    );
+    drop(client);
+    for part in actors.into_iter().chain([learner, server]) {
+        part.wait().expect_code(0);
+    }
+    let watched = system.run_folder("run");
+    let summary = watched.check_finished();
+    assert_eq!((summary.frames, summary.updates), (1280, 540));
+
+    // The columns are those of a launched run with these settings.
+    system
+        .run(&format!("local {flags} {SHORT} --run-dir launched"))
+        .expect_code(0);
+    let (header, rows) = watched.metrics();
+    assert_eq!(header, system.run_folder("launched").metrics().0);
+    let memory = header.iter().position(|it| it == "rss_mib_learner");
+    assert_eq!(rows.last().unwrap()[memory.unwrap()], "");
+    system
+        .run("plot run launched --out plot.svg")
+        .expect_code(0);
+    let files = fs::read_dir(system.path("run")).unwrap();
+    let names = files.map(|it| it.unwrap().file_name().into_string().unwrap());
+    assert!(names.into_iter().any(|name| name.contains("tfevents")));
+}
+
+#[test]
+fn a_launched_run_is_watched_and_goes_on_without() {
+    let system = system();
+    let launcher = launched(&system, 1);
+    let mut watched = system.start("watch --run run --run-dir seen");
+    let rows =
+        || fs::read_to_string(system.path("seen/metrics.csv")).map_or(0, |it| it.lines().count());
+    wait_for("two rows", || (rows() > 2).then_some(()));
+    watched.signal(Signal::SIGINT);
+    watched.wait_for_stderr("the run goes on without being watched");
+    watched.wait().expect_code(130);
+    let before = rows();
+    assert!(!system.path("seen/summary.json").exists());
+
+    // Where its launcher writes, nobody else does.
+    system
+        .run("watch --run run --run-dir run")
+        .expect_code(64)
+        .expect_said("run is written by `driml local` or by another `driml watch`");
+    // Another run's folder is not this one's.
+    system
+        .run(&format!("local --agent c51 {SHORT} --run-dir other"))
+        .expect_code(0);
+    system
+        .run("watch --run run --run-dir other")
+        .expect_code(64)
+        .expect_said("other holds another run (chain with c51, seed 1)");
+
+    let watched = system.start("watch --run run --run-dir seen");
+    wait_for("further rows", || (rows() > before + 1).then_some(()));
+    launcher.signal(Signal::SIGINT);
+    launcher.wait().expect_code(130);
+    watched.signal(Signal::SIGINT);
+    watched.wait().expect_code(130);
+    let text = fs::read_to_string(system.path("seen/metrics.csv")).unwrap();
+    let frames = text.lines().skip(1).map(|row| {
+        let frames = row.split(',').nth(1).unwrap();
+        frames.parse::<u64>().unwrap()
+    });
+    assert!(frames.is_sorted(), "{text}");
+}
+
+#[test]
+fn a_silent_part_is_named_and_a_restarted_server_found_again() {
+    let system = system();
+    let endpoint = system.endpoint();
+    let listen =
+        format!("replay-server --stay --listen {endpoint} --replay-dir replay --agent c51 {LONG}");
+    let server = run(&system, &listen);
+    let client = system.connect();
+    let mut watched = watch(&system, "--run-dir seen");
+    watched.wait_for_stderr("no learner has joined yet; no actor has joined yet");
+    let learner = system.start_learner("run");
+    let _actor = system.start_actor(0);
+    client.wait_for_learner("some updates", |it| it.updates > 0);
+    learner.signal(Signal::SIGSTOP);
+    watched.wait_for_stderr("learner: no answer for ");
+    learner.signal(Signal::SIGCONT);
+
+    let before = client.replay().unwrap().transitions_inserted;
+    drop(client);
+    server.signal(Signal::SIGKILL);
+    server.wait();
+    watched.wait_for_stderr("replay server: no answer for ");
+    let _server = run(&system, &listen);
+    let frames = || {
+        let text = fs::read_to_string(system.path("seen/metrics.csv")).ok()?;
+        let row = text.get(..text.rfind('\n')?)?.lines().last()?;
+        row.split(',').nth(1)?.parse::<u64>().ok()
+    };
+    wait_for("rows after the restart", || {
+        (frames()? > before).then_some(())
+    });
+    watched.signal(Signal::SIGINT);
+    watched.wait().expect_code(130);
+}
+
+/// The fields of `--once --json`, which deploy/launch/README.md describes.
+const FIELDS: [&str; 38] = [
+    "actors",
+    "actors_planned",
+    "affinity_version",
+    "agent",
+    "c51_kl",
+    "episodes",
+    "finished",
+    "frames",
+    "frames_per_second",
+    "frames_planned",
+    "grad_norm",
+    "learner",
+    "losses",
+    "mean_age",
+    "mean_k",
+    "mean_return",
+    "mean_return_of",
+    "messages_refused",
+    "q_mean",
+    "replay",
+    "replay_ratio",
+    "replay_ratio_planned",
+    "run_spec",
+    "sd_k",
+    "seed",
+    "servers",
+    "to_go_on",
+    "total_loss",
+    "transitions_duplicated",
+    "transitions_lost",
+    "updates",
+    "updates_per_second",
+    "updates_planned",
+    "waiting",
+    "waits",
+    "weights_version",
+    "well",
+    "world",
+];
+
+#[test]
+fn one_look_tells_scripts_and_monitors_how_a_run_is() {
+    let system = system();
+    let endpoint = system.endpoint();
+    let server = system.start_replay_server(&format!("--agent driml-ada {SHORT}"));
+    let client = system.connect();
+    let look = format!("watch --connect {endpoint} --once");
+    // Somebody is missing.
+    let ended = system.run(&look).expect_code(1);
+    ended.expect_said("error: the run is not well: no learner has joined: start `driml learner");
+    let _parts = [system.start_learner("run"), system.start_actor(0)];
+    client.wait_for_learner("the end", |it| it.finished);
+
+    let ended = system
+        .run(&format!("{look} --json --prometheus run.prom"))
+        .expect_code(0);
+    let said: Value = serde_json::from_str(&ended.stdout).unwrap();
+    let names: Vec<_> = said
+        .as_object()
+        .unwrap()
+        .keys()
+        .map(String::as_str)
+        .collect();
+    let mut sorted = names.clone();
+    sorted.sort_unstable();
+    assert_eq!(sorted, FIELDS);
+    assert_eq!(
+        (&said["frames"], &said["updates"]),
+        (&1280.into(), &540.into())
+    );
+    assert_eq!(
+        (&said["well"], &said["finished"]),
+        (&true.into(), &true.into())
+    );
+    assert_eq!(said["losses"].as_object().unwrap().len(), 1);
+    // The page for persons is that of `driml status`.
+    let page = system.run(&look).expect_code(0).stdout;
+    assert!(
+        page.contains("the run is over: all is learned and saved"),
+        "{page}"
+    );
+
+    let text = fs::read_to_string(system.path("run.prom")).unwrap();
+    let samples = parse_prometheus(&text);
+    let of = |name: &str| samples.iter().find(|(it, ..)| it == name).unwrap();
+    let (_, labels, frames) = of("driml_frames_total");
+    assert_eq!(*frames, 1280.0);
+    assert_eq!(
+        (&*labels["world"], &*labels["agent"], &*labels["seed"]),
+        ("chain", "driml-ada", "1")
+    );
+    assert_eq!(labels["endpoint"], endpoint);
+    assert_eq!(of("driml_updates_total").2, 540.0);
+    assert_eq!(
+        of("driml_mean_return").2,
+        said["mean_return"].as_f64().unwrap()
+    );
+    assert_eq!(of("driml_finished").2, 1.0);
+    let losses = samples.iter().filter(|it| it.0 == "driml_loss");
+    assert_eq!(losses.count(), 3);
+    let actor = samples
+        .iter()
+        .find(|it| it.0 == "driml_part_connected" && it.1["part"] == "actor-0");
+    assert_eq!(actor.unwrap().2, 0.0, "it has left");
+    drop(client);
+    drop(server);
+}
+
+/// Name, labels and value of each sample; panics at what Prometheus' text format does not allow.
+fn parse_prometheus(text: &str) -> Vec<(String, BTreeMap<String, String>, f64)> {
+    assert!(text.ends_with('\n'));
+    let (mut families, mut samples) = (BTreeMap::new(), Vec::new());
+    let (mut helped, mut family) = (None, String::new());
+    for line in text.lines() {
+        if let Some(help) = line.strip_prefix("# HELP ") {
+            helped = help.split_once(' ').map(|(name, _)| name.to_owned());
+        } else if let Some(of) = line.strip_prefix("# TYPE ") {
+            let (name, kind) = of.split_once(' ').unwrap();
+            assert_eq!(
+                helped.take().as_deref(),
+                Some(name),
+                "HELP comes before TYPE"
+            );
+            assert!(["counter", "gauge"].contains(&kind), "{line}");
+            assert_eq!(kind == "counter", name.ends_with("_total"), "{line}");
+            assert!(
+                name.bytes()
+                    .all(|it| it.is_ascii_lowercase() || it.is_ascii_digit() || it == b'_'),
+                "{line}"
+            );
+            assert!(
+                families.insert(name.to_owned(), kind).is_none(),
+                "{name} comes twice"
+            );
+            name.clone_into(&mut family);
+        } else {
+            let (name, rest) = line.split_once('{').unwrap();
+            assert_eq!(name, family, "samples follow their family");
+            let (labels, value) = rest.rsplit_once("} ").unwrap();
+            let labels = labels.split("\",").map(|label| {
+                let (name, value) = label.split_once("=\"").unwrap();
+                (name.to_owned(), value.trim_end_matches('"').to_owned())
+            });
+            let labels: BTreeMap<_, _> = labels.collect();
+            let twice = samples
+                .iter()
+                .any(|(other, their, _)| other == name && *their == labels);
+            assert!(!twice, "{line} comes twice");
+            samples.push((name.to_owned(), labels, value.parse().unwrap()));
+        }
+    }
+    samples
+}
+
+#[test]
+fn prometheus_reads_the_file_of_a_run_that_is_watched() {
+    let test = "watch::prometheus_reads_the_file_of_a_run_that_is_watched";
+    let Some(python) = python_with(test, &["prometheus_client"]) else {
+        return;
+    };
+    let system = system();
+    let launcher = launched(&system, 1);
+    let watched = system.start("watch --run run --prometheus run.prom");
+    let path = system.path("run.prom");
+    let read = "
+import sys
+from prometheus_client.parser import text_string_to_metric_families as parse
+print(next(it for it in parse(open(sys.argv[1]).read()) if it.name == 'driml_updates').samples[0].value)
+";
+    let updates = || {
+        path.exists().then(|| {
+            let said = run_python(&python, &["-c", read], &[&path.display().to_string()]);
+            said.trim().parse::<f64>().unwrap()
+        })
+    };
+    let first = wait_for("the file", updates);
+    wait_for("more updates", || (updates()? > first).then_some(()));
+    watched.signal(Signal::SIGINT);
+    watched.wait().expect_code(130);
+    launcher.signal(Signal::SIGINT);
+    launcher.wait().expect_code(130);
+}

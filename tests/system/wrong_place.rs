@@ -1,0 +1,118 @@
+//! Parts that are told to connect to the wrong place: each cause has its own sentence, soon, and with what to do.
+//! Wrong certificates are in `tls`, wrong settings in the learner's and the watch's own tests.
+
+use std::{
+    io::{Read, Write},
+    net::TcpListener,
+    thread,
+    time::{Duration, Instant},
+};
+
+use driml_protocol::session::{self, Endpoints};
+use driml_tests::{Ended, TestSystem};
+
+use crate::system;
+
+/// The commands that connect to a replay server.
+const COMMANDS: [&str; 4] = [
+    "actor --connect",
+    "learner --run-dir run --connect",
+    "status --connect",
+    "watch --connect",
+];
+
+/// Runs a command to its end, which must come within so many seconds of its own waiting, and checks that it names no file of
+/// whoever built it.
+fn refused(system: &TestSystem, command: &str, seconds: u64) -> Ended {
+    let started = Instant::now();
+    let ended = system.run(command).expect_code(1);
+    // Beside that a busy machine takes its time.
+    let took = started.elapsed();
+    assert!(
+        took < Duration::from_secs(seconds + 10),
+        "{command}: {took:?}"
+    );
+    for own in [".rs:", "registry", "Timeout!"] {
+        assert!(!ended.stderr.contains(own), "{}", ended.stderr);
+    }
+    ended
+}
+
+/// An endpoint and what listens there.
+fn listener() -> (String, TcpListener) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    (format!("tcp/{}", listener.local_addr().unwrap()), listener)
+}
+
+#[test]
+fn nobody_is_told_from_a_host_that_is_not_known() {
+    let system = system();
+    let (endpoint, listener) = listener();
+    drop(listener);
+    for command in COMMANDS {
+        // Parts give the replay server some seconds to start, who only looks does not.
+        refused(&system, &format!("{command} {endpoint}"), 10).expect_said(&format!(
+            "nobody listens on {endpoint}: start the replay server first"
+        ));
+        let unknown = "tcp/no-such-host.invalid:7447";
+        refused(&system, &format!("{command} {unknown}"), 10)
+            .expect_said(&format!("the host of {unknown} is unknown: "));
+    }
+    let started = Instant::now();
+    refused(&system, &format!("status --connect {endpoint}"), 0);
+    let socket = system.endpoint();
+    refused(&system, &format!("watch --connect {socket}"), 0)
+        .expect_said("there is no such socket. Start the replay server first");
+    assert!(started.elapsed() < Duration::from_secs(10));
+}
+
+#[test]
+fn a_web_server_is_no_replay_server() {
+    let system = system();
+    let (endpoint, listener) = listener();
+    thread::spawn(move || {
+        for stream in listener.incoming() {
+            let mut stream = stream.unwrap();
+            thread::spawn(move || {
+                let mut request = [0; 1024];
+                let count = stream.read(&mut request).unwrap_or(0);
+                // As web servers do with what they do not understand.
+                if request[..count].starts_with(b"GET") {
+                    let _ = stream.write_all(b"HTTP/1.0 404 Not Found\r\n\r\n");
+                }
+            });
+        }
+    });
+    for command in COMMANDS {
+        refused(&system, &format!("{command} {endpoint}"), 5)
+            .expect_said(&format!(
+                "something listens on {endpoint} that is no part of driml"
+            ))
+            .expect_said("it says \"HTTP/1.0 404 Not Found\"");
+    }
+}
+
+#[test]
+fn a_router_without_a_run_is_named_while_it_is_waited_for() {
+    let system = system();
+    let (endpoint, listener) = listener();
+    drop(listener);
+    let _router = session::open(&Endpoints {
+        listen: vec![endpoint.clone()],
+        connect: Vec::new(),
+    })
+    .unwrap();
+    let words = "somebody listens there, and nobody answers at driml/hello";
+    for command in [COMMANDS[0], COMMANDS[1]] {
+        let started = Instant::now();
+        let mut part = system.start_part(&format!("{command} {endpoint}"));
+        part.wait_for_stderr(words);
+        assert!(started.elapsed() < Duration::from_secs(30));
+    }
+    for command in [COMMANDS[2], COMMANDS[3]] {
+        system
+            .run(&format!("{command} {endpoint}"))
+            .expect_code(64)
+            .expect_said("it is no replay server with the namespace \"driml\"");
+    }
+}
