@@ -122,7 +122,7 @@ macro_rules! agents {
 
 agents! {
     "c51": "the return alone";
-    "rainbow": "c51 with double DQN, a dueling head and noisy layers in place of epsilon";
+    "rainbow": "c51 with double DQN, rows drawn by priority, a dueling head, and noisy layers in place of epsilon";
     "driml-fix": "DIM at a fixed k, chosen by game; augments its states on seven of them";
     "driml-ada": "DIM at a k that follows how predictable the stored actions are (the default)";
     "driml-randk": "DIM at a k drawn uniformly";

@@ -96,7 +96,7 @@ fn why_layer(config: &RunConfig, name: &str) -> String {
             let what = if name == "head" {
                 ""
             } else {
-                "what is better in "
+                "the advantage of "
             };
             format!("C51: {what}{actions} actions{of}, {atoms} atoms each")
         }
