@@ -126,7 +126,8 @@ impl Collector {
             settings.input.enlarge(sent, &settings.model)?,
             safetensors,
             settings.actor.precision,
-        )?;
+        )?
+        .with_noise();
         Ok(Self {
             acting: Acting::new(world, spec.frame_stack as usize, rng)?,
             recorder: ChunkRecorder::new(
@@ -200,7 +201,9 @@ impl Collector {
 #[cfg(test)]
 mod tests {
     use driml_envs::{CorridorConfig, WorldConfig};
-    use driml_model::{Compute, ConvLayer, DimHeads, InputSize, ModelConfig, Parameters};
+    use driml_model::{
+        Compute, ConvLayer, DimHeads, HeadConfig, InputSize, ModelConfig, Parameters,
+    };
     use driml_protocol::{Horizon, TimeoutRule, config::TransportConfig};
 
     use super::*;
@@ -261,6 +264,7 @@ mod tests {
                 rkhs: 4,
                 action_embed: 4,
                 dim: DimHeads::NONE,
+                head: HeadConfig::PLAIN,
             },
             actor: Config {
                 actions: driml_envs::ActionSet::All,

@@ -48,13 +48,14 @@ impl Policy for RandomPolicy {
     }
 }
 
-/// Greedy in the expected return of the C51 network, but for epsilon.
+/// Greedy in the expected return of the C51 network, but for epsilon and the noise of noisy layers.
 ///
 /// Which actions are random is drawn first: states in which chance decides do not pass through the network.
 pub struct NetworkPolicy {
     network: PolicyNetwork,
     enlarge: Option<Enlarge>,
     num_actions: u8,
+    noise: bool,
     /// The copies in which the network decides, their states if these are not all, at the network's size if that is another,
     /// and their actions: memory to use again.
     deciding: Vec<usize>,
@@ -81,11 +82,22 @@ impl NetworkPolicy {
             num_actions: u8::try_from(model.num_actions).map_err(|_| ActError::TooManyActions {
                 actions: model.num_actions,
             })?,
+            noise: false,
             deciding: Vec::new(),
             states: Vec::new(),
             enlarged: Vec::new(),
             greedy: Vec::new(),
         })
+    }
+
+    /// The same, exploring by the noise of the network's noisy layers, if it has some: drawn anew in each step, and the same for all
+    /// copies, as they pass through the network together. Without this their means act.
+    ///
+    /// Source: Fortunato et al. 2018, section 3.2 (a) and algorithm 1: a new sample before every action.
+    #[must_use]
+    pub const fn with_noise(mut self) -> Self {
+        self.noise = true;
+        self
     }
 
     /// Replaces the weights; on an error the old ones stay.
@@ -129,6 +141,9 @@ impl Policy for NetworkPolicy {
             enlarge.apply(input, &mut self.enlarged);
             input = &self.enlarged;
         }
+        if self.noise && count > 0 {
+            self.network.draw_noise(rng);
+        }
         self.greedy.resize(count, 0);
         self.network.greedy_actions(input, &mut self.greedy)?;
         for (&copy, &action) in self.deciding.iter().zip(&self.greedy) {
@@ -140,7 +155,7 @@ impl Policy for NetworkPolicy {
 
 #[cfg(test)]
 mod tests {
-    use driml_model::{Compute, ConvLayer, DimHeads, Parameters};
+    use driml_model::{Compute, ConvLayer, DimHeads, HeadConfig, Parameters};
     use rand::SeedableRng;
 
     use super::*;
@@ -153,6 +168,10 @@ mod tests {
     }
 
     fn policy_of(seed: u64) -> NetworkPolicy {
+        policy_with(HeadConfig::PLAIN, seed)
+    }
+
+    fn policy_with(head: HeadConfig, seed: u64) -> NetworkPolicy {
         let model = ModelConfig {
             height: 4,
             width: 4,
@@ -170,6 +189,7 @@ mod tests {
             rkhs: 4,
             action_embed: 4,
             dim: DimHeads::NONE,
+            head,
         };
         let rng = &mut ChaCha8Rng::seed_from_u64(seed);
         let weights = Parameters::init(&model, rng, &Compute::CPU.device).unwrap();
@@ -245,6 +265,37 @@ mod tests {
             let share = policy.greedy.len() as f64 / STATES as f64;
             assert!((share - (1.0 - epsilon)).abs() < 0.03, "{share}");
         }
+    }
+
+    /// Noise is drawn in every step, from the generator that is saved with the world; without `with_noise` the means act.
+    #[test]
+    fn noisy_layers_explore_without_epsilon_and_evaluation_has_no_noise() {
+        let head = HeadConfig {
+            dueling: true,
+            noisy_sigma: Some(3.0),
+        };
+        let states: Vec<u8> = (0..16 * 8).map(|i| (i * 37 % 251) as u8).collect();
+        let steps = |policy: &mut NetworkPolicy, rng: &mut ChaCha8Rng| {
+            let mut steps = vec![vec![0; 8]; 50];
+            for actions in &mut steps {
+                policy.act(&states, 0.0, rng, actions).unwrap();
+            }
+            steps
+        };
+        let mut means = policy_with(head, 1);
+        let greedy = steps(&mut means, &mut ChaCha8Rng::seed_from_u64(1));
+        assert!(greedy.iter().all(|actions| *actions == greedy[0]));
+        let mut noisy = policy_with(head, 1).with_noise();
+        let rng = &mut ChaCha8Rng::seed_from_u64(1);
+        let first = steps(&mut noisy, rng);
+        let others = first.iter().filter(|actions| **actions != greedy[0]);
+        assert!(others.count() > 25, "{first:?}");
+        // It goes on where the generator stands, whatever noise was drawn before.
+        let mut again = policy_with(head, 1).with_noise();
+        let saved = rng.clone();
+        let second = steps(&mut noisy, rng);
+        assert_eq!(steps(&mut again, &mut saved.clone()), second);
+        assert_ne!(first, second);
     }
 
     #[test]

@@ -70,6 +70,19 @@ class Block(nn.Module):
         return self.out(functional.relu(self.hidden(x))) + self.skip(x)
 
 
+class NoisyLinear(nn.Module):
+    """A noisy layer (Fortunato et al. 2018) as it evaluates: by its means. The sigmas are there to be looked at."""
+
+    def __init__(self, inputs, outputs):
+        super().__init__()
+        for end in ("mu", "sigma"):
+            self.register_parameter(f"weight_{end}", nn.Parameter(torch.zeros(outputs, inputs)))
+            self.register_parameter(f"bias_{end}", nn.Parameter(torch.zeros(outputs)))
+
+    def forward(self, x):
+        return functional.linear(x, self.weight_mu, self.bias_mu)
+
+
 class Network(nn.Module):
     """Torso, C51 head and the DIM heads of a `[model]` table; parameters have the names and shapes of the checkpoint's."""
 
@@ -85,7 +98,15 @@ class Network(nn.Module):
             self.torso[f"conv{number}"] = nn.Conv2d(channels, layer["out"], kernel, stride)
             height, width, channels = (height - kernel) // stride + 1, (width - kernel) // stride + 1, layer["out"]
         self.torso["fc"] = nn.Linear(channels * height * width, model["hidden"])
-        self.head = nn.Linear(model["hidden"], self.actions * self.atoms)
+        head = model.get("head", {})
+        layer = NoisyLinear if "noisy_sigma" in head else nn.Linear
+        self.dueling = head.get("dueling", False)
+        outputs = self.actions * self.atoms
+        if self.dueling:
+            streams = {"value": self.atoms, "advantage": outputs}
+            self.head = nn.ModuleDict({name: layer(model["hidden"], outputs) for name, outputs in streams.items()})
+        else:
+            self.head = layer(model["hidden"], outputs)
         self.dim = nn.ModuleDict()
         dim, rkhs = model["dim"], model["rkhs"]
         embed = model["action_embed"] if dim["action"] and (dim["psi3"] or dim["psi4"]) else 0
@@ -111,7 +132,11 @@ class Network(nn.Module):
     def logits(self, states):
         """Logits [B, A, N] of the returns at the atoms."""
         _, f4 = self.features(states)
-        return self.head(functional.relu(f4)).view(-1, self.actions, self.atoms)
+        x = functional.relu(f4)
+        if not self.dueling:
+            return self.head(x).view(-1, self.actions, self.atoms)
+        advantage = self.head["advantage"](x).view(-1, self.actions, self.atoms)
+        return self.head["value"](x).unsqueeze(1) + advantage - advantage.mean(1, keepdim=True)
 
     def forward(self, states):
         """Expected returns [B, A]; the agent takes the action of the largest."""

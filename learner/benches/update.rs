@@ -10,7 +10,7 @@ use driml_learner::{
     AdamSettings, Agent, Augment, AugmentSettings, Batch, Lambda, LearnerSettings, Objective,
     auxiliary::{cpc, curl, dim},
 };
-use driml_model::{Compute, ConvLayer, DimHeads, ModelConfig};
+use driml_model::{Compute, ConvLayer, DimHeads, HeadConfig, ModelConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -61,6 +61,7 @@ fn agent(objective: Objective, lambda: Lambda) -> Agent {
         rkhs: 512,
         action_embed: 64,
         dim: DimHeads::NONE,
+        head: HeadConfig::PLAIN,
     };
     model.dim = settings.dim_heads(ACTIONS);
     Agent::new(

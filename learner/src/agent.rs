@@ -4,7 +4,7 @@
 use std::{borrow::Cow, collections::HashMap};
 
 use candle_core::Tensor;
-use driml_model::{Compute, DimHeads, ModelConfig, Network, Parameters, StoredAs};
+use driml_model::{Compute, DimHeads, HeadNoise, ModelConfig, Network, Parameters, StoredAs};
 use driml_protocol::NO_ACTION;
 use rand_chacha::ChaCha8Rng;
 
@@ -19,6 +19,7 @@ use crate::{
         c51::{kl_loss, row_kls, softmax},
         projection::project,
     },
+    noise::UpdateNoise,
     optimiser::{
         adam::Adam,
         gradients::{Gradients, clip_factor},
@@ -85,6 +86,7 @@ pub struct Agent {
     settings: LearnerSettings,
     compute: Compute,
     equal_states: EqualStates,
+    noise_seed: [u8; 32],
     auxiliary: Box<dyn AuxiliaryLoss>,
     pub(crate) online: Parameters,
     pub(crate) target: Parameters,
@@ -163,6 +165,7 @@ impl Agent {
             adam: Adam::new(settings.adam, &online, kernels)?,
             compute: compute.clone(),
             equal_states: EqualStates::default(),
+            noise_seed: [0; 32],
             auxiliary,
             updates: 0,
             model,
@@ -176,6 +179,13 @@ impl Agent {
     #[must_use]
     pub const fn with_equal_states(mut self, equal_states: EqualStates) -> Self {
         self.equal_states = equal_states;
+        self
+    }
+
+    /// The same, with the noise of noisy layers drawn from this seed and the number of the update. Without this it is the seed 0.
+    #[must_use]
+    pub const fn with_noise_seed(mut self, noise_seed: [u8; 32]) -> Self {
+        self.noise_seed = noise_seed;
         self
     }
 
@@ -259,13 +269,30 @@ impl Agent {
         batch.validate(&self.model, self.settings.objective.positives())
     }
 
-    /// Losses and gradients of one batch at the present parameters.
+    /// The noise of the next update's noisy layers.
+    pub fn noise(&self) -> UpdateNoise {
+        UpdateNoise::draw(&self.model, self.noise_seed, self.updates)
+    }
+
+    /// Losses and gradients of one batch at the present parameters, with the noise of the next update.
     ///
     /// # Errors
     /// A batch that does not fit, or losses that are not finite.
     pub fn evaluate(&self, batch: &Batch<'_>) -> Result<Evaluation, UpdateError> {
+        self.evaluate_with(batch, &self.noise())
+    }
+
+    /// [`Agent::evaluate`] with this noise of noisy layers.
+    ///
+    /// # Errors
+    /// As there, and noise for a head without noisy layers.
+    pub fn evaluate_with(
+        &self,
+        batch: &Batch<'_>,
+        noise: &UpdateNoise,
+    ) -> Result<Evaluation, UpdateError> {
         self.check(batch)?;
-        let (next_greedy_action, target_projection) = self.make_target(batch)?;
+        let (next_greedy_action, target_projection) = self.make_target(batch, noise)?;
 
         let features = OnlineFeatures::new(
             &self.online_network,
@@ -275,9 +302,11 @@ impl Agent {
             self.equal_states,
             &self.compute.device,
         )?;
-        let taken_logits = self
-            .online_network
-            .taken_logits(&features.now.f4, batch.action)?;
+        let taken_logits = self.online_network.taken_logits(
+            &features.now.f4,
+            batch.action,
+            noise.online.as_ref(),
+        )?;
         let kl = kl_loss(
             &taken_logits,
             target_projection.clone(),
@@ -323,13 +352,14 @@ impl Agent {
         })
     }
 
-    /// Online values [B, A] of the batch's s_t, by a pass of their own: an update needs those of the actions taken alone.
+    /// Online values [B, A] of the batch's s_t, by a pass of their own: an update needs those of the actions taken alone. Without noise:
+    /// of noisy layers the means serve.
     ///
     /// # Errors
     /// States that do not fit the network.
     pub fn q_values_t(&self, batch: &Batch<'_>) -> Result<Vec<f32>, UpdateError> {
         let states = self.states(batch.states_t)?;
-        let logits = distribution(&self.online_network, &states)?;
+        let logits = distribution(&self.online_network, &states, None)?;
         flat(&self.online_network.q_values(&logits)?)
     }
 
@@ -362,7 +392,11 @@ impl Agent {
     /// Greedy actions in s_{t+n} [B] and their distributions one Bellman step earlier [B, N], without a graph.
     ///
     /// Rows without a bootstrap are left out of the pass: whatever s_{t+n} is, all of their mass goes to their return.
-    fn make_target(&self, batch: &Batch<'_>) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
+    fn make_target(
+        &self,
+        batch: &Batch<'_>,
+        noise: &UpdateNoise,
+    ) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
         let ModelConfig {
             atoms,
             v_min,
@@ -376,7 +410,7 @@ impl Agent {
         }
         let bootstraps: Vec<usize> = batch.bootstraps().collect();
         if !bootstraps.is_empty() {
-            let (actions, logits) = self.next_greedy(batch)?;
+            let (actions, logits) = self.next_greedy(batch, noise)?;
             for ((&row, action), logits) in bootstraps
                 .iter()
                 .zip(actions)
@@ -404,7 +438,11 @@ impl Agent {
     }
 
     /// Greedy actions in s_{t+n} of the rows that bootstrap [n], and the target network's logits [n, N] of them.
-    fn next_greedy(&self, batch: &Batch<'_>) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
+    fn next_greedy(
+        &self,
+        batch: &Batch<'_>,
+        noise: &UpdateNoise,
+    ) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
         let ModelConfig {
             num_actions, atoms, ..
         } = self.model;
@@ -418,9 +456,9 @@ impl Agent {
             None => Cow::Owned(one_after_another(frames.iter().copied(), len)),
         };
         let states_n = states(&self.model, states_n, &self.compute.device)?;
-        let target_logits = distribution(&self.target_network, &states_n)?;
+        let target_logits = distribution(&self.target_network, &states_n, noise.target.as_ref())?;
         let (network, values) = if self.settings.double_dqn {
-            let logits = distribution(&self.online_network, &states_n)?;
+            let logits = distribution(&self.online_network, &states_n, noise.choice.as_ref())?;
             ("online", self.online_network.q_values(&logits)?)
         } else {
             ("target", self.target_network.q_values(&target_logits)?)
@@ -465,8 +503,13 @@ impl Agent {
 }
 
 /// Logits [B, A, N] of `frames`, cut off from any graph.
-fn distribution(network: &Network, frames: &Tensor) -> Result<Tensor, UpdateError> {
-    Ok(network.logits(&network.features(frames)?.f4)?.detach())
+fn distribution(
+    network: &Network,
+    frames: &Tensor,
+    noise: Option<&HeadNoise>,
+) -> Result<Tensor, UpdateError> {
+    let f4 = network.features(frames)?.f4;
+    Ok(network.noisy_logits(&f4, noise)?.detach())
 }
 
 fn flat(tensor: &Tensor) -> Result<Vec<f32>, UpdateError> {

@@ -114,7 +114,7 @@ impl UpdateCost {
 
 #[cfg(test)]
 mod tests {
-    use driml_model::{ConvLayer, DimHeads};
+    use driml_model::{ConvLayer, DimHeads, HeadConfig};
 
     use super::*;
     use crate::auxiliary::settings::Lambda;
@@ -138,6 +138,7 @@ mod tests {
             rkhs: 4,
             action_embed: 2,
             dim,
+            head: HeadConfig::PLAIN,
         }
     }
 

@@ -121,7 +121,7 @@ impl Insight {
 
 #[cfg(test)]
 mod tests {
-    use driml_model::{ConvLayer, PolicyNetwork, Precision};
+    use driml_model::{ConvLayer, HeadConfig, PolicyNetwork, Precision};
     use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
     use super::*;
@@ -152,6 +152,7 @@ mod tests {
             rkhs: 8,
             action_embed: 2,
             dim,
+            head: HeadConfig::PLAIN,
         };
         let rng = &mut ChaCha8Rng::seed_from_u64(5);
         Agent::new(model, settings, &Compute::CPU, rng).unwrap()

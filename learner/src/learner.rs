@@ -21,6 +21,9 @@ use crate::{
     importance::importance_weights,
 };
 
+/// What the seed of noisy layers' noise is drawn for.
+const NOISE: &str = "noisy layers";
+
 /// Why a learner could not be made, learn or be saved.
 #[derive(Debug, thiserror::Error)]
 pub enum LearnerError {
@@ -78,7 +81,8 @@ impl Learner {
             compute,
             &mut init,
         )?
-        .with_equal_states(config.learner.equal_states);
+        .with_equal_states(config.learner.equal_states)
+        .with_noise_seed(spec.seed_for(NOISE, 0));
         let affinity = config
             .learner
             .affinity
@@ -140,7 +144,8 @@ impl Learner {
         this.weights_version = restored.weights_version;
         this.agent = restored
             .agent
-            .with_equal_states(this.config.learner.equal_states);
+            .with_equal_states(this.config.learner.equal_states)
+            .with_noise_seed(this.config.spec.seed_for(NOISE, 0));
         this.affinity = restored.affinity;
         this.rng = restored.rng;
         tracing::info!(

@@ -62,6 +62,7 @@ mod importance;
 pub mod insight;
 mod learner;
 pub mod losses;
+mod noise;
 pub mod optimiser;
 pub mod parity;
 mod ranges;
@@ -84,6 +85,7 @@ pub use config::{
 pub use driml_model::{Compute, DeviceName, Kernels, Precision};
 pub use error::UpdateError;
 pub use learner::{Learner, LearnerError};
+pub use noise::UpdateNoise;
 pub use optimiser::adam::AdamSettings;
 pub use remote::run::{RunArgs, run};
 pub use repeats::EqualStates;

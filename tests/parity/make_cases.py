@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Makes the parity cases of the agents that came after the first five files: no_action, cpc*, curl*, weighted_rows.
+"""Makes the parity cases of what came after the first five files: no_action, cpc*, curl*, dueling, noisy*, weighted_rows.
 
 Needs PyTorch and safetensors; nothing in the project needs either. Everything is float64 and automatic differentiation, and
 written from the formulas in README.md, not from the learner's code.
@@ -19,6 +19,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 HERE = Path(__file__).resolve().parent
+NOISES = ["online", "choice", "target"]
 PAIRS = ["3t3", "3t4", "4t3", "4t4"]
 ADAM = {"lr": 2.5e-4, "beta1": 0.9, "beta2": 0.999, "eps": 0.01 / 256}
 
@@ -33,6 +34,19 @@ def block(p, name, x):
     return out + F.linear(x, p[f"{name}.skip.weight"], p.get(f"{name}.skip.bias"))
 
 
+def linear(p, name, x, noise):
+    """A linear layer of the C51 head; of a noisy one the mean where no noise is given."""
+    if f"{name}.weight" in p:
+        return F.linear(x, p[f"{name}.weight"], p[f"{name}.bias"])
+    weight, bias = p[f"{name}.weight_mu"], p[f"{name}.bias_mu"]
+    if noise:
+        inputs, outputs = (noise[f"{name}.{side}"].double() for side in ["in", "out"])
+        inputs, outputs = (eps.sign() * eps.abs().sqrt() for eps in [inputs, outputs])
+        weight = weight + p[f"{name}.weight_sigma"] * outputs[:, None] * inputs
+        bias = bias + p[f"{name}.bias_sigma"] * outputs
+    return F.linear(x, weight, bias)
+
+
 def features(p, config, frames):
     """f3 [B, locations, channels] and f4 [B, hidden] of bytes [B, H, W, C]."""
     x = frames.double().permute(0, 3, 1, 2) / 255
@@ -42,10 +56,14 @@ def features(p, config, frames):
     return x.flatten(2).transpose(1, 2), f4
 
 
-def distribution(p, config, f4):
-    """Logarithms of the return distributions [B, actions, atoms]."""
-    logits = F.linear(F.relu(f4), p["head.weight"], p["head.bias"])
-    return F.log_softmax(logits.view(len(f4), config["actions"], config["atoms"]), 2)
+def distribution(p, config, f4, noise=None):
+    """Logarithms of the return distributions [B, actions, atoms], with the noise of noisy layers if it is given."""
+    sizes = (len(f4), config["actions"], config["atoms"])
+    if not config.get("head", {}).get("dueling"):
+        return F.log_softmax(linear(p, "head", F.relu(f4), noise).view(sizes), 2)
+    advantage = linear(p, "head.advantage", F.relu(f4), noise).view(sizes)
+    value = linear(p, "head.value", F.relu(f4), noise)[:, None]
+    return F.log_softmax(value + advantage - advantage.mean(1, keepdim=True), 2)
 
 
 def embedded(p, config, action):
@@ -137,25 +155,31 @@ def update(case, config):
     online = {n[7:]: t.double().requires_grad_() for n, t in case.items() if n.startswith("online.")}
     target = {n[7:]: t.double() for n, t in case.items() if n.startswith("target.")}
     key = {n[4:]: t.double() for n, t in case.items() if n.startswith("key.")}
+    noise = {
+        who: {n.removeprefix(f"noise.{who}."): t for n, t in case.items() if n.startswith(f"noise.{who}.")}
+        for who in NOISES
+    }
     rows = torch.arange(len(case["input.action"]))
     atoms = torch.linspace(config["v_min"], config["v_max"], config["atoms"], dtype=torch.float64)
     expect = {}
     with torch.no_grad():
-        after = distribution(target, config, features(target, config, case["input.frames_n"])[1]).exp()
-        chooser = online if config["double_dqn"] else target
-        choice = distribution(chooser, config, features(chooser, config, case["input.frames_n"])[1]).exp()
+        after = distribution(target, config, features(target, config, case["input.frames_n"])[1], noise["target"]).exp()
+        chooser, eps = (online, noise["choice"]) if config["double_dqn"] else (target, noise["target"])
+        choice = distribution(chooser, config, features(chooser, config, case["input.frames_n"])[1], eps).exp()
         greedy = (choice @ atoms).argmax(1)
         goal = projection(
             config, after[rows, greedy], case["input.n_step_return"].double(), case["input.bootstrap_discount"].double()
         )
-    log_probs = distribution(online, config, features(online, config, case["input.frames_t"])[1])
+        f4 = features(online, config, case["input.frames_t"])[1]
+        # Values are those that are acted on in evaluation: without noise.
+        expect["q_values_t"] = distribution(online, config, f4).exp() @ atoms
+    log_probs = distribution(online, config, features(online, config, case["input.frames_t"])[1], noise["online"])
     row_kl = (torch.xlogy(goal, goal) - goal * log_probs[rows, case["input.action"]]).sum(1)
     weight = case.get("input.importance_weight")
     kl = row_kl.mean() if weight is None else (weight.double() * row_kl).mean()
     losses = auxiliary_losses(online, key, config, case)
     total = kl + sum(config["lambda"][pair] * loss for pair, loss in losses.items() if config["lambda"][pair] > 0)
 
-    expect["q_values_t"] = (log_probs.exp() @ atoms).detach()
     expect["next_action"] = greedy
     expect["target_projection"] = goal
     if weight is not None:
@@ -184,6 +208,14 @@ def update(case, config):
 # --- The cases -----------------------------------------------------------------------------------------------------------
 
 
+def head_layers(config):
+    """Outputs of the C51 head's layers."""
+    outputs = config["actions"] * config["atoms"]
+    if config.get("head", {}).get("dueling"):
+        return {"head.value": config["atoms"], "head.advantage": outputs}
+    return {"head": outputs}
+
+
 def shapes(config, heads, action):
     """PyTorch's shapes of all parameters."""
     model, named = config["model"], {}
@@ -203,7 +235,13 @@ def shapes(config, heads, action):
         layer(f"torso.conv{i}", [out, channels, kernel, kernel])
         height, width, channels = (height - kernel) // stride + 1, (width - kernel) // stride + 1, out
     layer("torso.fc", [model["hidden"], height * width * channels])
-    layer("head", [config["actions"] * config["atoms"], model["hidden"]])
+    for name, outputs in head_layers(config).items():
+        if "noisy_sigma" in config.get("head", {}):
+            for end in ["mu", "sigma"]:
+                named[f"{name}.weight_{end}"] = [outputs, model["hidden"]]
+                named[f"{name}.bias_{end}"] = [outputs]
+        else:
+            layer(name, [outputs, model["hidden"]])
     if action:
         residual("dim.action", config["actions"], model["action_embed"], True)
     for head in heads:
@@ -218,7 +256,7 @@ def parameters(config, heads, action, generator, scale):
     made = {}
     for name, shape in shapes(config, heads, action).items():
         inputs = math.prod(shape[1:]) if len(shape) > 1 else 25
-        gain = scale if name.startswith("dim.") else 1.5
+        gain = scale if name.startswith("dim.") else 0.25 if name.endswith("_sigma") else 0.5 if name.endswith("_mu") else 1.5
         made[name] = (torch.randn(shape, generator=generator) * gain / math.sqrt(inputs)).float()
     return made
 
@@ -275,6 +313,11 @@ def make(seed, rows, height, width, objective, lambdas, positives=1, action=Fals
         case["input.frames_k"] = frames(rows)
         case["input.positive_valid"] = torch.ones(rows, dtype=torch.uint8)
         case["input.positive_valid"][0] = 0
+    if "noisy_sigma" in config.get("head", {}):
+        for who in NOISES:
+            for name, outputs in head_layers(config).items():
+                case[f"noise.{who}.{name}.in"] = torch.randn(config["model"]["hidden"], generator=g)
+                case[f"noise.{who}.{name}.out"] = torch.randn(outputs, generator=g)
     if beta is not None:
         # As of rows drawn by priority: (N P)^-beta over the batch's largest.
         chance = torch.rand(rows, generator=g).double() ** 4 + 1e-4
@@ -298,6 +341,18 @@ CASES = {
     "curl_clipped": dict(
         seed=15, rows=9, height=44, width=36, objective="curl", lambdas=[0.0, 0.0, 0.0, 0.5], heads=["psi4"],
         double_dqn=True, max_grad_norm=0.25, tanh_clip=5.0, key_tau=0.3,
+    ),
+    "dueling": dict(
+        seed=16, rows=8, height=36, width=44, objective="dim", lambdas=[0.5, 0.0, 0.0, 1.0], action=True,
+        double_dqn=True, head={"dueling": True},
+    ),
+    "noisy": dict(
+        seed=17, rows=7, height=44, width=36, objective="dim", lambdas=[0.0, 0.0, 0.0, 1.0], double_dqn=True,
+        head={"noisy_sigma": 0.5}, max_grad_norm=0.5,
+    ),
+    "noisy_dueling": dict(
+        seed=20, rows=8, height=36, width=44, objective="none", lambdas=[0.0, 0.0, 0.0, 0.0], double_dqn=True,
+        head={"dueling": True, "noisy_sigma": 0.5},
     ),
     "weighted_rows": dict(
         seed=16, rows=8, height=36, width=44, objective="dim", lambdas=[0.0, 0.0, 0.0, 1.0], action=True, beta=0.4,

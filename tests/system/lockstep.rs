@@ -75,11 +75,18 @@ fn interrupted(system: &TestSystem, flags: &str, signal: Signal) -> Summary {
 #[test]
 fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
     // 6,300 updates, some seconds, so that it is caught on its way.
-    let flags = "--env chain --agent driml-ada --preset smoke --frames 12800 --actors 2 \
+    let flags = "--env chain --preset smoke --frames 12800 --actors 2 \
                  --set replay.replay_ratio=8 --set learner.checkpoint_period_updates=200";
-    let whole = run(&system(), flags, "whole");
-    for signal in [Signal::SIGINT, Signal::SIGKILL] {
-        let resumed = interrupted(&system(), flags, signal);
+    let of = |agent: &str| format!("{flags} --agent {agent}");
+    let whole = run(&system(), &of("driml-ada"), "whole");
+    // Its noise goes on, in the learner and in the actors.
+    let rainbow = run(&system(), &of("rainbow"), "whole");
+    for (agent, whole, signal) in [
+        ("driml-ada", &whole, Signal::SIGINT),
+        ("driml-ada", &whole, Signal::SIGKILL),
+        ("rainbow", &rainbow, Signal::SIGKILL),
+    ] {
+        let resumed = interrupted(&system(), &of(agent), signal);
         assert_eq!(resumed.weights_sha256, whole.weights_sha256, "{signal}");
         assert_eq!(
             (resumed.updates, resumed.episodes, resumed.k_histogram),
@@ -92,13 +99,20 @@ fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
 /// N updates, saved and resumed for N more, are 2 N.
 #[test]
 fn a_run_that_is_prolonged_is_a_longer_one() {
-    let mut worlds = vec!["mspacman"];
+    let mut runs = vec![("mspacman", "driml-ada"), ("mspacman", "rainbow")];
     if !skipped_offline("lockstep::a_run_that_is_prolonged_is_a_longer_one (Procgen)") {
-        worlds.extend(["procgen:coinrun", "procgen:maze"]);
+        runs.extend([
+            ("procgen:coinrun", "driml-ada"),
+            ("procgen:maze", "driml-ada"),
+        ]);
     }
-    for world in worlds {
+    for (world, agent) in runs {
         let system = system();
-        let flags = format!("--env {world} --agent driml-ada --preset smoke");
+        let mut flags = format!("--env {world} --agent {agent} --preset smoke");
+        if agent == "rainbow" {
+            // Else beta rises over a run's own length.
+            flags += " --set replay.sampling.beta_updates=60";
+        }
         let whole = run(&system, &format!("{flags} --frames 1216"), "whole");
         let half = run(&system, &format!("{flags} --frames 608"), "half");
         assert_ne!(half.weights_sha256, whole.weights_sha256);

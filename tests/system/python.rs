@@ -46,10 +46,12 @@ states = numpy.fromfile(sys.argv[2], dtype=numpy.uint8).reshape(shape)
 print(json.dumps(session.run(['q_values'], {'states': states})[0].flatten().tolist()))
 ";
 
-/// A run of each kind of network: with all heads of local and global DIM and enlarged stacks, and C51 alone.
-const RUNS: [&str; 2] = [
+/// A run of each kind of network: with all heads of local and global DIM and enlarged stacks, C51 alone, and with Rainbow's streams
+/// of noisy layers.
+const RUNS: [&str; 3] = [
     "--env mspacman --agent driml-ada --preset smoke --frames 320",
     "--env chain --agent c51 --preset smoke --frames 320",
+    "--env chain --agent rainbow --preset smoke --frames 320",
 ];
 
 /// A run, what its network is, and random states in a file beside it.

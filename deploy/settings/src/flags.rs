@@ -27,7 +27,7 @@ pub struct RunFlags {
     /// learn within minutes]
     #[arg(long, value_name = "WORLD")]
     pub env: Option<String>,
-    /// Agent: c51, driml-fix, driml-ada, driml-randk, driml-noact, cpc or curl [default: driml-ada]
+    /// Agent: c51, rainbow, driml-fix, driml-ada, driml-randk, driml-noact, cpc or curl [default: driml-ada]
     #[arg(long, value_name = "AGENT")]
     pub agent: Option<String>,
     /// Named settings; `driml presets` lists them [default: paper]

@@ -122,6 +122,7 @@ macro_rules! agents {
 
 agents! {
     "c51": "the return alone";
+    "rainbow": "c51 with double DQN, rows drawn by priority, a dueling head, and noisy layers in place of epsilon";
     "driml-fix": "DIM at a fixed k, chosen by game; augments its states on seven of them";
     "driml-ada": "DIM at a k that follows how predictable the stored actions are (the default)";
     "driml-randk": "DIM at a k drawn uniformly";
@@ -390,7 +391,14 @@ mod tests {
             worlds("curl", augments).split(' ').count(),
             WorldName::all().count()
         );
-        for name in ["c51", "driml-ada", "driml-randk", "driml-noact", "cpc"] {
+        for name in [
+            "c51",
+            "rainbow",
+            "driml-ada",
+            "driml-randk",
+            "driml-noact",
+            "cpc",
+        ] {
             assert_eq!(worlds(name, augments), "", "{name}");
         }
     }

@@ -5,7 +5,7 @@
 use candle_core::{Device, Tensor};
 use criterion::{Criterion, criterion_group, criterion_main};
 use driml_model::{
-    ConvLayer, DimHeads, ModelConfig, Network, Parameters, PolicyNetwork, Precision,
+    ConvLayer, DimHeads, HeadConfig, ModelConfig, Network, Parameters, PolicyNetwork, Precision,
 };
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -31,6 +31,7 @@ fn config((height, width): (usize, usize), dim: DimHeads) -> ModelConfig {
         rkhs: 512,
         action_embed: 64,
         dim,
+        head: HeadConfig::PLAIN,
     }
 }
 

@@ -5,7 +5,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{ModelError, Result};
 use crate::geometry::{ConvLayer, ConvShape};
+pub(crate) use crate::heads::config::HeadConfig;
+use crate::heads::config::{ADVANTAGE, HEAD, VALUE};
 use crate::init::InitialLaw;
+use crate::layers::LayerShape;
 
 /// Largest size of any one dimension; a configuration beyond it is rejected.
 const DIMENSION_MAX: usize = 1 << 16;
@@ -44,6 +47,9 @@ pub struct ModelConfig {
     pub action_embed: usize,
     /// Which DIM heads exist.
     pub dim: DimHeads,
+    /// How the C51 head is made. Settings of earlier versions do not have it: one linear layer.
+    #[serde(default, skip_serializing_if = "HeadConfig::is_plain")]
+    pub head: HeadConfig,
 }
 
 /// Which DIM heads exist. Nothing is built that no lambda needs.
@@ -83,7 +89,7 @@ impl ModelConfig {
     ///
     /// # Errors
     /// [`ModelError::Config`] names the field: a size of 0 or above 65,536, a kernel larger than its input, a parameter
-    /// of more than 2^28 scalars, more than 255 actions, fewer than 2 atoms, `v_min` not below `v_max`, one of them beyond 1e30, no
+    /// of more than 2^28 scalars, more than 255 actions, fewer than 2 atoms, a `head.noisy_sigma` out of its range, `v_min` not below `v_max`, one of them beyond 1e30, no
     /// convolution.
     pub fn validate(&self) -> Result<()> {
         let fail = |what: String| Err(ModelError::Config(what));
@@ -124,6 +130,7 @@ impl ModelConfig {
                 self.v_min, self.v_max
             ));
         }
+        self.head.validate()?;
         if self.conv.is_empty() {
             return fail("conv is empty, at least one convolution is needed".to_owned());
         }
@@ -210,15 +217,17 @@ impl ModelConfig {
     /// weights are drawn, so the torso's and the head's do not depend on which DIM heads exist.
     pub fn parameter_shapes(&self) -> Vec<(String, Vec<usize>)> {
         let layers = self.layers().into_iter();
-        layers
-            .flat_map(|layer| {
-                let bias = (layer.bias_name(), vec![layer.weight[0]]);
-                let bias = layer.bias.then_some(bias);
-                [(layer.weight_name(), layer.weight)]
-                    .into_iter()
-                    .chain(bias)
-            })
-            .collect()
+        layers.flat_map(|layer| layer.parameters()).collect()
+    }
+
+    /// Names and outputs of the C51 head's layers, all of which take f4: the value's and the advantage's of a dueling head, else one.
+    pub(crate) fn head_layers(&self) -> Vec<(&'static str, usize)> {
+        let outputs = self.num_actions.saturating_mul(self.atoms);
+        if self.head.dueling {
+            vec![(VALUE, self.atoms), (ADVANTAGE, outputs)]
+        } else {
+            vec![(HEAD, outputs)]
+        }
     }
 
     /// All layers in the order of [`ModelConfig::parameter_shapes`].
@@ -231,6 +240,7 @@ impl ModelConfig {
                 weight,
                 bias,
                 initial,
+                noisy_sigma: self.head.noisy_sigma.filter(|_| name.starts_with(HEAD)),
             });
         };
 
@@ -249,12 +259,10 @@ impl ModelConfig {
             .saturating_mul(local_width)
             .saturating_mul(local_channels);
         layer("torso.fc", vec![self.hidden, flat], true, Orthogonal);
-        layer(
-            "head",
-            vec![self.num_actions.saturating_mul(self.atoms), self.hidden],
-            true,
-            Uniform,
-        );
+        // The means of noisy layers too, as Fortunato et al. 2018 draw them.
+        for (name, outputs) in self.head_layers() {
+            layer(name, vec![outputs, self.hidden], true, Uniform);
+        }
 
         // A residual block; its skip matrix starts orthogonal whatever the law of its two other layers.
         let mut block =
@@ -295,27 +303,5 @@ impl ModelConfig {
             }
         }
         layers
-    }
-}
-
-/// A layer's name, the shapes of its parameters, and how they are drawn at the start of a run.
-///
-/// Source of the laws: the paper authors' code. A C51 head that starts orthogonal too gives first Q values twice as large,
-/// and with a target network that moves once in 312 updates these outlive 100,000 frames.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct LayerShape {
-    pub(crate) name: String,
-    pub(crate) weight: Vec<usize>,
-    pub(crate) bias: bool,
-    pub(crate) initial: InitialLaw,
-}
-
-impl LayerShape {
-    pub(crate) fn weight_name(&self) -> String {
-        format!("{}.weight", self.name)
-    }
-
-    pub(crate) fn bias_name(&self) -> String {
-        format!("{}.bias", self.name)
     }
 }

@@ -5,6 +5,7 @@ use safetensors::tensor::TensorView;
 
 use crate::config::ModelConfig;
 use crate::error::Result;
+use crate::heads::config::VALUE;
 use crate::stored::StoredAs;
 
 /// What one layer costs. Arithmetic is multiplications and additions, each counted as one.
@@ -43,9 +44,16 @@ impl ModelConfig {
         let costs = layers.map(|(index, layer)| {
             let weight_len = layer.weight.iter().product::<usize>();
             let outputs = layer.weight[0];
+            let scalars = |of: &[(String, Vec<usize>)]| -> u64 {
+                let each = of.iter().map(|(_, shape)| shape.iter().product::<usize>());
+                each.sum::<usize>() as u64
+            };
             let is_of = |part: &str| layer.name.starts_with(part);
             // Products of each location, and those of what is joined to all locations of a state.
-            let products = if let Some(shape) = convolutions.get(index) {
+            let products = if layer.name == VALUE {
+                // Added to the advantage's weight before any product.
+                0
+            } else if let Some(shape) = convolutions.get(index) {
                 shape.locations() * weight_len
             } else if is_of("dim.psi3.") || is_of("dim.phi3.") {
                 let joined = layer.weight[1].saturating_sub(channels) * outputs;
@@ -65,7 +73,7 @@ impl ModelConfig {
             LayerCost {
                 forward,
                 backward: if is_first { forward } else { 2 * forward },
-                parameters: (weight_len + if layer.bias { outputs } else { 0 }) as u64,
+                parameters: scalars(&layer.parameters()),
                 name: layer.name,
             }
         });
@@ -99,7 +107,7 @@ mod tests {
     use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
     use super::*;
-    use crate::config::DimHeads;
+    use crate::config::{DimHeads, HeadConfig};
     use crate::geometry::ConvLayer;
     use crate::parameters::Parameters;
 
@@ -129,6 +137,7 @@ mod tests {
                 phi4: true,
                 action: true,
             },
+            head: HeadConfig::PLAIN,
         }
     }
 
@@ -169,6 +178,30 @@ mod tests {
         assert!(counted[3].is_of("head") && !counted[4].is_of("dim.act"));
     }
 
+    /// The value's stream has parameters and no products: it is added to the advantage's weight.
+    #[test]
+    fn a_dueling_head_has_the_products_of_a_plain_one() {
+        let plain = every_head();
+        let mut dueling = plain.clone();
+        dueling.head.dueling = true;
+        let of_head = |config: &ModelConfig| {
+            let layers = config.layer_costs().into_iter();
+            let layers: Vec<_> = layers.filter(|layer| layer.is_of("head")).collect();
+            let sum = |cost: fn(&LayerCost) -> u64| layers.iter().map(cost).sum::<u64>();
+            let names: Vec<_> = layers.iter().map(|layer| layer.name.clone()).collect();
+            (
+                sum(|it| it.parameters),
+                sum(|it| it.forward),
+                sum(|it| it.backward),
+                names,
+            )
+        };
+        let (plain, dueling) = (of_head(&plain), of_head(&dueling));
+        assert_eq!((plain.1, plain.2), (dueling.1, dueling.2));
+        assert_eq!(dueling.0 - plain.0, 6 * 7 + 6);
+        assert_eq!(dueling.3, ["head.value", "head.advantage"]);
+    }
+
     /// Mnih et al.'s network on 84 x 84 x 4: maps of 20 x 20, 9 x 9 and 7 x 7.
     #[test]
     fn a_known_network_is_counted() {
@@ -199,7 +232,11 @@ mod tests {
     #[test]
     fn the_parameters_are_those_that_are_built() {
         let every = every_head();
-        for config in [every.without_dim(), every] {
+        let mut dueling = every.without_dim();
+        dueling.head.dueling = true;
+        let mut noisy = dueling.clone();
+        noisy.head.noisy_sigma = Some(0.5);
+        for config in [dueling, noisy, every.without_dim(), every] {
             let rng = &mut ChaCha8Rng::seed_from_u64(1);
             let built = Parameters::init(&config, rng, &Device::Cpu).unwrap();
             for layer in config.layer_costs() {

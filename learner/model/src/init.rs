@@ -62,10 +62,7 @@ fn orthogonal(rows: usize, cols: usize, gain: f64, rng: &mut ChaCha8Rng) -> Vec<
     let (count, len) = (rows.min(cols), rows.max(cols));
     let mut basis: Vec<Vec<f64>> = Vec::with_capacity(count);
     for _ in 0..count {
-        let mut vector: Vec<f64> = (0..len.div_ceil(2))
-            .flat_map(|_| normal_pair(rng))
-            .take(len)
-            .collect();
+        let mut vector = normals(len, rng);
         for _ in 0..2 {
             for earlier in &basis {
                 let overlap = dot(earlier, &vector);
@@ -103,6 +100,12 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     }
     let rest: f64 = a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum();
     sums.iter().sum::<f64>() + rest
+}
+
+/// That many standard normal numbers.
+pub(crate) fn normals(len: usize, rng: &mut ChaCha8Rng) -> Vec<f64> {
+    let pairs = (0..len.div_ceil(2)).flat_map(|_| normal_pair(rng));
+    pairs.take(len).collect()
 }
 
 /// Two independent standard normal numbers, by Box and Muller's method.

@@ -290,6 +290,7 @@ mod tests {
                 rkhs: 1,
                 action_embed: 1,
                 dim: crate::DimHeads::NONE,
+                head: crate::HeadConfig::PLAIN,
             };
             let sent = cut(&image, frame.1, found.frame);
             let mut part = vec![0; found.input.0 * found.input.1];

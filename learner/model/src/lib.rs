@@ -2,19 +2,21 @@
 //! It has never heard of processes, replay or worlds, and it computes no loss.
 //!
 //! The learner differentiates through [`Network`]; an actor uses [`PolicyNetwork`], which runs the same kernels without
-//! a graph. [`Parameters`] hold the weights under PyTorch's names and shapes. Start at [`ModelConfig`], which fixes every
-//! shape, and at [`Network::features`]:
+//! a graph. The C51 head may be a dueling one, and noisy ([`HeadConfig`]): whatever it is made of, it amounts to one linear
+//! layer, so nothing after it knows. Noise is given from outside ([`HeadNoise`]); without it the means serve.
+//! [`Parameters`] hold the weights under PyTorch's names and shapes. Start at [`ModelConfig`], which fixes every shape, and
+//! at [`Network::features`]:
 //!
 //! ```
 //! use candle_core::{Device, Tensor};
-//! use driml_model::{ConvLayer, DimHeads, ModelConfig, Network, Parameters};
+//! use driml_model::{HeadConfig, ConvLayer, DimHeads, ModelConfig, Network, Parameters};
 //! use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 //!
 //! let no_heads = DimHeads { psi3: false, phi3: false, psi4: false, phi4: false, action: false };
 //! let config = ModelConfig {
 //!     height: 8, width: 8, channels: 1, num_actions: 3, atoms: 5, v_min: -1.0, v_max: 1.0,
 //!     conv: vec![ConvLayer { out: 4, kernel: 4, stride: 2 }],
-//!     hidden: 8, rkhs: 8, action_embed: 2, dim: no_heads,
+//!     hidden: 8, rkhs: 8, action_embed: 2, dim: no_heads, head: HeadConfig::PLAIN,
 //! };
 //! let rng = &mut ChaCha8Rng::seed_from_u64(1);
 //! let parameters = Parameters::init(&config, rng, &Device::Cpu)?;
@@ -38,6 +40,7 @@ mod heads;
 mod init;
 mod input;
 mod kernels;
+mod layers;
 mod network;
 mod parameters;
 mod policy;
@@ -52,6 +55,8 @@ pub use error::{ModelError, Result};
 pub use geometry::{ConvLayer, ConvShape, reach};
 pub use gradients::Backward;
 pub use heads::c51::EXPECTED_RETURN_ERROR;
+pub use heads::config::HeadConfig;
+pub use heads::noise::HeadNoise;
 pub use input::{Enlarge, FrameSize, InputRead, InputSize};
 pub use kernels::conv::{conv_stack, conv2d_relu};
 pub use kernels::exponentials::{exp_below, soft_clip};

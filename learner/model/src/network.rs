@@ -8,6 +8,7 @@ use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
 use crate::heads::c51::C51Head;
 use crate::heads::dim::{ActionEmbedding, Head};
+use crate::heads::noise::HeadNoise;
 use crate::kernels::rows::select_rows;
 use crate::parameters::Parameters;
 use crate::torso::Torso;
@@ -123,16 +124,29 @@ impl Network {
     /// # Errors
     /// Another shape.
     pub fn logits(&self, f4: &Tensor) -> Result<Tensor> {
-        self.head.logits(f4)
+        self.head.logits(f4, None)
+    }
+
+    /// [`Network::logits`] with the noise of the head's noisy layers; without noise their means serve.
+    ///
+    /// # Errors
+    /// Another shape, or noise for a head without noisy layers.
+    pub fn noisy_logits(&self, f4: &Tensor, noise: Option<&HeadNoise>) -> Result<Tensor> {
+        self.head.logits(f4, noise)
     }
 
     /// Of [`Network::logits`] those [B, atoms] of the actions [B] that were taken, each below the number of actions; the others
-    /// are not computed.
+    /// are not computed. With the noise of the head's noisy layers; without noise their means serve.
     ///
     /// # Errors
-    /// Another shape, or an action out of range.
-    pub fn taken_logits(&self, f4: &Tensor, actions: &[u8]) -> Result<Tensor> {
-        self.head.taken_logits(f4, actions)
+    /// Another shape, an action out of range, or noise for a head without noisy layers.
+    pub fn taken_logits(
+        &self,
+        f4: &Tensor,
+        actions: &[u8],
+        noise: Option<&HeadNoise>,
+    ) -> Result<Tensor> {
+        self.head.taken_logits(f4, actions, noise)
     }
 
     /// Expected returns [B, A] of `logits` [B, A, atoms]. No gradient flows through them. On the CPU they are right to

@@ -21,7 +21,8 @@ impl Parameters {
     /// Initial parameters, drawn layer by layer in the order of [`ModelConfig::parameter_shapes`].
     ///
     /// Orthogonal with gain sqrt(2) and zero bias: torso, action embedding, Psi_3, Phi_3, and the skip matrices of Psi_4 and
-    /// Phi_4. Weight and bias uniform on +-1/sqrt(fan_in): the C51 head and the other layers of Psi_4 and Phi_4.
+    /// Phi_4. Weight and bias uniform on +-1/sqrt(fan_in): the C51 head and the other layers of Psi_4 and Phi_4. Of noisy layers the
+    /// means are drawn so, and every sigma is `noisy_sigma` / sqrt(fan_in).
     ///
     /// # Errors
     /// An invalid configuration.
@@ -29,12 +30,9 @@ impl Parameters {
         config.validate()?;
         let mut vars = BTreeMap::new();
         for layer in config.layers() {
-            let (shape, law) = (&layer.weight, layer.initial);
-            let weight = Var::from_vec(law.weight(shape, rng), shape.as_slice(), device)?;
-            vars.insert(layer.weight_name(), weight);
-            if layer.bias {
-                let bias = Var::from_vec(law.bias(shape, rng), shape[0], device)?;
-                vars.insert(layer.bias_name(), bias);
+            let values = layer.initial_values(rng);
+            for ((name, shape), values) in layer.parameters().into_iter().zip(values) {
+                vars.insert(name, Var::from_vec(values, shape, device)?);
             }
         }
         Ok(Self(vars))

@@ -6,11 +6,14 @@
 
 use std::fmt;
 
+use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
+use crate::heads::acting::{ActingHead, InputsFirst};
 use crate::heads::c51::expected_returns;
+use crate::heads::noise::HeadNoise;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::convolution::{Convolution, forward};
 use crate::kernels::images::{Images, PADDING, Pixels};
@@ -58,6 +61,20 @@ impl PolicyNetwork {
     pub fn load(&mut self, safetensors: &[u8]) -> Result<()> {
         self.weights = weights(&self.config, safetensors, self.precision)?;
         Ok(())
+    }
+
+    /// Draws new noise for the head's noisy layers and computes with it until the next draw, or until other weights come, from when on
+    /// their means serve, as they do at first. Nothing is drawn where no layer is noisy.
+    pub fn draw_noise(&mut self, rng: &mut ChaCha8Rng) {
+        let noise = HeadNoise::draw(&self.config, rng);
+        if noise.is_some() {
+            self.set_noise(noise.as_ref());
+        }
+    }
+
+    /// Computes with this noise of the head's noisy layers from now on, or with their means.
+    pub fn set_noise(&mut self, noise: Option<&HeadNoise>) {
+        self.weights.set_noise(noise);
     }
 
     /// Expected returns `values` [B, A] of `frames` [B, H, W, C].
@@ -134,6 +151,9 @@ impl fmt::Debug for PolicyNetwork {
 trait Weights: Send + Sync {
     /// Expected returns of any number of frames, on the calling thread.
     fn q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]);
+
+    /// Computes with this noise of the head from now on; nothing happens where the head has none.
+    fn set_noise(&mut self, noise: Option<&HeadNoise>);
 }
 
 /// The weights in a safetensors file, for the fastest unit of this processor.
@@ -157,6 +177,8 @@ struct UnitWeights<U: Unit> {
     convolutions: Vec<Convolution<U::Element>>,
     fc: Dense<U>,
     head: Dense<U>,
+    /// What `head` is made of, with every noise anew; there if it is noisy.
+    noisy: Option<ActingHead>,
 }
 
 /// A fully connected layer.
@@ -189,14 +211,14 @@ impl<U: Unit> UnitWeights<U> {
         let column = |input: usize| input % channels * height * width + input / channels;
         let fc_weight = transposed(&take("torso.fc.weight"), config.hidden, column);
         let fc = Dense::new(unit, &fc_weight, take("torso.fc.bias"));
-        let outputs = config.num_actions * config.atoms;
-        let head_weight = transposed(&take("head.weight"), outputs, |input| input);
-        let head = Dense::new(unit, &head_weight, take("head.bias"));
+        let head = ActingHead::new(config, &mut take);
+        let dense = Dense::of(unit, &head.layer(None));
         Ok(Self {
             unit,
             convolutions,
             fc,
-            head,
+            head: dense,
+            noisy: config.head.noisy_sigma.map(|_| head),
         })
     }
 
@@ -251,9 +273,19 @@ impl<U: Unit> Weights for UnitWeights<U> {
             self.tile_q_values(support, frames, values);
         }
     }
+
+    fn set_noise(&mut self, noise: Option<&HeadNoise>) {
+        if let Some(noisy) = &self.noisy {
+            self.head = Dense::of(self.unit, &noisy.layer(noise));
+        }
+    }
 }
 
 impl<U: Unit> Dense<U> {
+    fn of(unit: U, layer: &InputsFirst) -> Self {
+        Self::new(unit, &layer.weight, layer.bias.clone())
+    }
+
     /// `weight` [in, out], `bias` [out].
     fn new(unit: U, weight: &[f32], bias: Vec<f32>) -> Self {
         let inputs = weight.len() / bias.len();

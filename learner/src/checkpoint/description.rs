@@ -12,13 +12,30 @@ const FORMAT: u32 = 1;
 /// For a reader who has nothing but the file. More: `deploy/python/weights.md`.
 const CONVENTIONS: &str = "Input: states u8 [B, height, width, channels] of [model], divided by 255; channels are the newest frame_stack \
     frames of [run], oldest first. Parameters have PyTorch's names and shapes: convolutions [out, in, k, k] without padding, each \
-    followed by ReLU; torso.fc takes their output as channel, row, column; head takes ReLU of that and gives [actions, atoms] logits. \
+    followed by ReLU; torso.fc takes their output as channel, row, column; HEAD. \
     Atoms: v_min to v_max, evenly. Value of an action: sum of softmax(logits) * atoms.";
+
+/// What the C51 head does, in [`CONVENTIONS`].
+const fn head(model: &ModelConfig) -> &'static str {
+    match (model.head.dueling, model.head.noisy_sigma.is_some()) {
+        (false, false) => "head takes ReLU of that and gives [actions, atoms] logits",
+        (false, true) => {
+            "head, a noisy layer whose means (weight_mu, bias_mu) evaluate, takes ReLU of that and gives [actions, atoms] logits"
+        }
+        (true, false) => {
+            "head.value [atoms] and head.advantage [actions, atoms] take ReLU of that; logits are value + advantage - mean of advantage over the actions"
+        }
+        (true, true) => {
+            "head.value [atoms] and head.advantage [actions, atoms], noisy layers whose means (weight_mu, bias_mu) evaluate, take ReLU of that; \
+             logits are value + advantage - mean of advantage over the actions"
+        }
+    }
+}
 
 #[derive(Serialize)]
 struct Description<'a> {
     format: u32,
-    conventions: &'static str,
+    conventions: String,
     model: &'a ModelConfig,
     input: &'a InputSize,
     run: &'a RunSpec,
@@ -28,7 +45,7 @@ struct Description<'a> {
 pub fn describe(run: &RunSpec, model: &ModelConfig, input: &InputSize) -> String {
     let description = Description {
         format: FORMAT,
-        conventions: CONVENTIONS,
+        conventions: CONVENTIONS.replace("HEAD", head(model)),
         model,
         input,
         run,

@@ -9,7 +9,7 @@ use std::{
 };
 
 use candle_core::{DType, Device, Tensor};
-use driml_model::{ConvLayer, DimHeads, ModelConfig};
+use driml_model::{ConvLayer, DimHeads, HeadConfig, HeadNoise, ModelConfig};
 use driml_protocol::NO_ACTION;
 use safetensors::SafeTensors;
 use serde::Deserialize;
@@ -18,6 +18,7 @@ use crate::{
     auxiliary::{Objective, dim::DIM, positives::Positives, settings::Lambda},
     batch::Batch,
     error::UpdateError,
+    noise::UpdateNoise,
     optimiser::adam::AdamSettings,
     settings::LearnerSettings,
 };
@@ -86,6 +87,9 @@ struct Config {
     /// Pace of the key encoder; not there for an objective without one.
     key_tau: Option<f64>,
     model: Sizes,
+    /// Not there: one linear layer.
+    #[serde(default)]
+    head: HeadConfig,
 }
 
 #[derive(Debug, Deserialize)]
@@ -251,6 +255,7 @@ impl Case {
             v_min,
             v_max,
             model,
+            head,
             ..
         } = &self.config;
         let conv = |&(out, kernel, stride): &(usize, usize, usize)| ConvLayer {
@@ -271,7 +276,24 @@ impl Case {
             rkhs: model.rkhs,
             action_embed: model.action_embed,
             dim,
+            head: *head,
         }
+    }
+
+    /// The noise that the case gives for noisy layers, made of its normal numbers.
+    pub(super) fn noise(&self, model: &ModelConfig) -> Result<UpdateNoise, ParityError> {
+        let of = |who: &str| {
+            HeadNoise::of_normals(model, |layer, side, len| {
+                let name = format!("noise.{who}.{layer}.{side}");
+                let tensor = self.input(&name, DType::F32, &[len])?;
+                Ok::<_, ParityError>(tensor.to_dtype(DType::F64)?.to_vec1()?)
+            })
+        };
+        Ok(UpdateNoise {
+            online: of("online")?,
+            choice: of("choice")?,
+            target: of("target")?,
+        })
     }
 
     pub(super) fn batch(&self) -> Batch<'_> {

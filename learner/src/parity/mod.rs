@@ -114,7 +114,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
     let allowed = Tolerances::of(compute.kernels);
     let mut lines = Vec::new();
     let forward = forward_losses(case, compute)?;
-    let evaluation = agent.evaluate(&case.batch())?;
+    let evaluation = agent.evaluate_with(&case.batch(), &case.noise(&model)?)?;
 
     let width = f64::from(model.v_max - model.v_min);
     let (rows, num_actions, atoms) = (case.rows, model.num_actions, model.atoms);

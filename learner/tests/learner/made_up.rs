@@ -5,7 +5,7 @@ use driml_learner::{
     AdamSettings, Agent, Batch, Lambda, LearnerSettings, Objective,
     auxiliary::{cpc, curl, dim},
 };
-use driml_model::{Compute, ConvLayer, Kernels, ModelConfig};
+use driml_model::{Compute, ConvLayer, HeadConfig, Kernels, ModelConfig};
 use driml_protocol::NO_ACTION;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -47,6 +47,7 @@ pub(crate) fn model(lambda: Lambda) -> ModelConfig {
         rkhs: 12,
         action_embed: 7,
         dim: lambda.dim_heads(true),
+        head: HeadConfig::PLAIN,
     }
 }
 
@@ -82,6 +83,31 @@ pub(crate) fn agent_on(compute: &Compute, lambda: Lambda, seed: u64) -> Agent {
     let rng = &mut ChaCha8Rng::seed_from_u64(seed);
     Agent::new(model(lambda), settings(lambda), compute, rng).unwrap()
 }
+
+/// A learner whose head is made so.
+pub(crate) fn agent_with(head: HeadConfig, settings: LearnerSettings, seed: u64) -> Agent {
+    let model = ModelConfig {
+        head,
+        ..model(settings.lambda)
+    };
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+    Agent::new(model, settings, &Compute::CPU, rng).unwrap()
+}
+
+pub(crate) const DUELING: HeadConfig = HeadConfig {
+    dueling: true,
+    noisy_sigma: None,
+};
+pub(crate) const NOISY: HeadConfig = HeadConfig {
+    dueling: false,
+    noisy_sigma: Some(0.5),
+};
+
+/// Rainbow's.
+pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
+    dueling: true,
+    noisy_sigma: Some(0.5),
+};
 
 /// The operations of a GPU, on the CPU.
 pub(crate) const CANDLE: Compute = Compute {

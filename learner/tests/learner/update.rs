@@ -4,13 +4,16 @@
 use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
-use driml_learner::{Agent, NetworkParameters, UpdateError};
-use driml_model::{Compute, Parameters};
+use driml_learner::{Agent, LearnerSettings, NetworkParameters, UpdateError, UpdateNoise};
+use driml_model::{Compute, HeadConfig, Parameters};
 use driml_protocol::NO_ACTION;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::made_up::{ALL_DIM, CANDLE, NO_DIM, Rows, agent, agent_on, model, settings};
+use crate::made_up::{
+    ALL_DIM, CANDLE, DUELING, NO_DIM, NOISY, NOISY_DUELING, Rows, agent, agent_on, agent_with,
+    model, settings,
+};
 
 type Values = HashMap<String, Vec<f32>>;
 
@@ -54,9 +57,7 @@ fn changed(agent: &Agent, change: impl Fn(&str, &mut [f32])) -> Agent {
 
 #[test]
 fn the_gradient_is_the_slope_of_the_total_in_every_part() {
-    let (agent, rows) = (agent(ALL_DIM, 1), Rows::random(9, 2));
-    let evaluation = agent.evaluate(&rows.batch()).unwrap();
-    for part in [
+    let every = [
         "torso.conv1",
         "torso.conv2",
         "torso.fc",
@@ -66,7 +67,28 @@ fn the_gradient_is_the_slope_of_the_total_in_every_part() {
         "dim.phi3",
         "dim.psi4",
         "dim.phi4",
-    ] {
+    ];
+    is_the_slope(&agent(ALL_DIM, 1), &every);
+    let dueling = agent_with(DUELING, settings(ALL_DIM), 1);
+    is_the_slope(&dueling, &["torso.fc", "head.value", "head.advantage"]);
+    let both = LearnerSettings {
+        double_dqn: true,
+        ..settings(ALL_DIM)
+    };
+    let noisy = agent_with(NOISY, both.clone(), 1);
+    let parts = ["weight_mu", "weight_sigma", "bias_mu", "bias_sigma"];
+    is_the_slope(&noisy, &parts.map(|part| format!("head.{part}")));
+    let rainbow = agent_with(NOISY_DUELING, both, 1);
+    for stream in ["value", "advantage"] {
+        is_the_slope(&rainbow, &parts.map(|part| format!("head.{stream}.{part}")));
+    }
+}
+
+/// Whether the gradient is the slope of the total in each of these parts of the network.
+fn is_the_slope(agent: &Agent, parts: &[impl AsRef<str>]) {
+    let rows = Rows::random(9, 2);
+    let evaluation = agent.evaluate(&rows.batch()).unwrap();
+    for part in parts.iter().map(AsRef::as_ref) {
         let mut direction = Values::new();
         for (name, _) in agent
             .online()
@@ -87,7 +109,7 @@ fn the_gradient_is_the_slope_of_the_total_in_every_part() {
         assert!(norm > 1e-5, "{part} has a gradient of {norm}");
         let step = 2e-3;
         let total = |by: f64| {
-            let moved = changed(&agent, |name, values| {
+            let moved = changed(agent, |name, values| {
                 if let Some(gradient) = direction.get(name) {
                     values
                         .iter_mut()
@@ -516,4 +538,39 @@ fn learners_of_one_process_do_not_touch_each_other() {
             assert!(learned == alone[i % 2], "learner {i} learnt something else");
         }
     });
+}
+
+/// Every update has its own noise, and in it each of the three networks; it is a function of the seed and the number of the update.
+#[test]
+fn noise_is_drawn_anew_for_each_update_and_each_network() {
+    let settings = LearnerSettings {
+        double_dqn: true,
+        ..settings(NO_DIM)
+    };
+    let rows = Rows::random(6, 2);
+    let agent =
+        |seed: u8| agent_with(NOISY_DUELING, settings.clone(), 1).with_noise_seed([seed; 32]);
+    let (mut one, mut same, other) = (agent(1), agent(1), agent(2));
+    let first = one.noise();
+    assert!(first.online.is_some() && first.online != first.choice);
+    assert!(first.target != first.online && first.target != first.choice);
+    assert!(same.noise() == first && other.noise() != first);
+    for _ in 0..2 {
+        one.update(&rows.batch()).unwrap();
+        same.update(&rows.batch()).unwrap();
+    }
+    assert!(one.noise() != first && one.noise() == same.noise());
+    assert_eq!(values(one.online()), values(same.online()));
+    // Means alone, or another noise, is another loss.
+    let means = one.evaluate_with(&rows.batch(), &UpdateNoise::default());
+    let (noisy, means) = (one.evaluate(&rows.batch()).unwrap(), means.unwrap());
+    assert_ne!(noisy.c51_kl, means.c51_kl);
+    assert!(means.gradients.get("head.value.weight_sigma").is_none());
+    let plain = agent_with(HeadConfig::PLAIN, settings, 1);
+    assert_eq!(plain.noise(), UpdateNoise::default());
+    let refused = plain.evaluate_with(&rows.batch(), &first).unwrap_err();
+    assert!(
+        refused.to_string().contains("without noisy layers"),
+        "{refused}"
+    );
 }

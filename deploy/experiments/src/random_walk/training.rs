@@ -10,7 +10,7 @@ use driml_learner::{
         gradients::{Gradients, clip_factor},
     },
 };
-use driml_model::{ConvLayer, Features, Kernels, ModelConfig, Network, Parameters};
+use driml_model::{ConvLayer, Features, HeadConfig, Kernels, ModelConfig, Network, Parameters};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -175,6 +175,7 @@ impl Heads {
             rkhs: settings.rkhs,
             action_embed: 1,
             dim: lambda.dim_heads(false),
+            head: HeadConfig::PLAIN,
         };
         let parameters = Parameters::init(&model, rng, &Device::Cpu)?;
         Ok(Self {

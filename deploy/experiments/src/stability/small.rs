@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
-use driml_model::{ConvLayer, DimHeads, ModelConfig, Parameters, Result};
+use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Result};
 
 /// A network of one pixel, one action and these atoms; its head's weight has `atoms` times `hidden` scalars.
 pub(super) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelConfig {
@@ -24,6 +24,7 @@ pub(super) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelC
         rkhs: 1,
         action_embed: 1,
         dim: DimHeads::NONE,
+        head: HeadConfig::PLAIN,
     }
 }
 

@@ -84,7 +84,8 @@ fn why_layer(config: &RunConfig, name: &str) -> String {
     };
     match name {
         "torso.fc" => format!("f4, {} numbers of the last map", model.hidden),
-        "head" => {
+        "head.value" => format!("C51: the state's value, {} atoms", model.atoms),
+        "head" | "head.advantage" => {
             let all = config.world.num_actions();
             let of = if model.num_actions == all {
                 String::new()
@@ -92,7 +93,12 @@ fn why_layer(config: &RunConfig, name: &str) -> String {
                 format!(" of {all} (actor.actions)")
             };
             let (actions, atoms) = (model.num_actions, model.atoms);
-            format!("C51: {actions} actions{of}, {atoms} atoms each")
+            let what = if name == "head" {
+                ""
+            } else {
+                "the advantage of "
+            };
+            format!("C51: {what}{actions} actions{of}, {atoms} atoms each")
         }
         "dim.action" if heads.embeds_action() => "psi is given a_t (condition_on_action)".into(),
         "dim.action" if heads == DimHeads::NONE => "not built: there is no psi".into(),
@@ -145,7 +151,8 @@ pub(super) fn decision_flops(config: &RunConfig, every: &Everything) -> Vec<Line
     let share = 100.0 * decided_share(config);
     let lines = units(&config.model.without_dim()).into_iter().map(|name| {
         let why = match name.as_str() {
-            "head" => "Q of every action, of which the largest is taken".into(),
+            "head" | "head.advantage" => "Q of every action, of which the largest is taken".into(),
+            "head.value" => "added to the weight of head.advantage once, not to every state".into(),
             "torso.conv1" => {
                 format!("for {share:.1}% of states; in the others chance decides (epsilon)")
             }

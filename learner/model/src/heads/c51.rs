@@ -10,6 +10,8 @@ use rayon::prelude::*;
 use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::Result;
+use crate::heads::noise::HeadNoise;
+use crate::heads::streams::{LinearLayer, Streams};
 use crate::kernels::exponentials::exp_below;
 use crate::kernels::linear::floats;
 use crate::parameters::Parameters;
@@ -20,8 +22,7 @@ const TASK_DISTRIBUTIONS: usize = 256;
 #[derive(Debug)]
 pub(crate) struct C51Head {
     kernels: Kernels,
-    weight: Tensor,
-    bias: Tensor,
+    streams: Streams,
     actions: usize,
     atoms: usize,
     support: Vec<f32>,
@@ -35,28 +36,33 @@ impl C51Head {
     ) -> Result<Self> {
         Ok(Self {
             kernels,
-            weight: parameters.tensor("head", "weight")?,
-            bias: parameters.tensor("head", "bias")?,
+            streams: Streams::new(config, parameters)?,
             actions: config.num_actions,
             atoms: config.atoms,
             support: config.atoms_support(),
         })
     }
 
-    /// Logits [B, A, atoms] of f4 [B, hidden] before its ReLU.
-    pub(crate) fn logits(&self, f4: &Tensor) -> Result<Tensor> {
+    /// Logits [B, A, atoms] of f4 [B, hidden] before its ReLU; a noisy layer without noise is its mean.
+    pub(crate) fn logits(&self, f4: &Tensor, noise: Option<&HeadNoise>) -> Result<Tensor> {
         let active = self.kernels.relu(f4)?;
-        let logits = self.kernels.linear(&active, &self.weight, &self.bias)?;
+        let layer = self.streams.layer(noise)?;
+        let logits = self.kernels.linear(&active, &layer.weight, &layer.bias)?;
         Ok(logits.reshape(((), self.actions, self.atoms))?)
     }
 
     /// Of those logits the ones [B, atoms] of one action a row.
-    pub(crate) fn taken_logits(&self, f4: &Tensor, actions: &[u8]) -> Result<Tensor> {
+    pub(crate) fn taken_logits(
+        &self,
+        f4: &Tensor,
+        actions: &[u8],
+        noise: Option<&HeadNoise>,
+    ) -> Result<Tensor> {
         let active = self.kernels.relu(f4)?;
-        let (weight, bias) = (&self.weight, &self.bias);
+        let LinearLayer { weight, bias } = self.streams.layer(noise)?;
         Ok(self
             .kernels
-            .grouped_linear(&active, weight, bias, actions, self.atoms)?)
+            .grouped_linear(&active, &weight, &bias, actions, self.atoms)?)
     }
 
     /// Expected returns [B, A] of logits [B, A, atoms]; no gradient flows.

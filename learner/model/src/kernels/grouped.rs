@@ -17,7 +17,7 @@ use crate::kernels::precision::Precision;
 use crate::kernels::product::multiply;
 use crate::kernels::units::Mode;
 
-/// y_r = x_r w_g^T + b_g with g = `groups[r]`, differentiable in `x`, and in `w` and `b` if they are variables.
+/// y_r = x_r w_g^T + b_g with g = `groups[r]`, differentiable in all arguments.
 ///
 /// `x` [rows, in]; `w` [groups * out, in]; `b` [groups * out]; result [rows, out]. All f32; operands of products are rounded to
 /// `precision`. Results have the bits that [`super::linear::linear`] gives, whatever the number of threads.
@@ -234,18 +234,22 @@ impl CustomOp3 for Grouped {
         });
         let to_weight = |sum: &mut [f32], there| self.add_to_weight(sum, there, &grad, sorted);
         let to_bias = |sum: &mut [f32], _| self.add_to_bias(sum, &grad);
-        for (parameter, done) in [
-            (w, !w.is_variable() || gradients::add_in_place(w, to_weight)),
-            (b, !b.is_variable() || gradients::add_in_place(b, to_bias)),
-        ] {
-            if !done || (parameter.track_op() && !parameter.is_variable()) {
-                bail!(
-                    "a grouped layer's parameters are variables, and its backward pass is one of Backward::of"
-                );
-            }
-        }
-        Ok((grad_x.transpose()?, None, None))
+        Ok((
+            grad_x.transpose()?,
+            gradient_of(w, to_weight)?,
+            gradient_of(b, to_bias)?,
+        ))
     }
+}
+
+/// The gradient that `add` adds to zeros; none where it is not wanted or went where that of a variable is summed.
+fn gradient_of(parameter: &Tensor, add: impl Fn(&mut [f32], bool)) -> Result<Option<Tensor>> {
+    if !parameter.track_op() || gradients::add_in_place(parameter, &add) {
+        return Ok(None);
+    }
+    let mut gradient = vec![0.0; parameter.elem_count()];
+    add(&mut gradient, false);
+    Tensor::from_vec(gradient, parameter.shape(), parameter.device()).map(Some)
 }
 
 #[cfg(test)]

@@ -3,10 +3,14 @@
 
 use candle_core::{DType, Device, Result, Tensor};
 use driml_model::{
-    Backward, ConvLayer, DimHeads, Kernels, ModelConfig, ModelError, Network, Parameters, Precision,
+    Backward, ConvLayer, DimHeads, HeadNoise, Kernels, ModelConfig, ModelError, Network,
+    Parameters, Precision,
 };
 
-use crate::support::{assert_close, bits, frames, parameters, rng, small, values, variable};
+use crate::support::{
+    DUELING, NOISY, NOISY_DUELING, assert_close, bits, frames, parameters, rng, small, small_with,
+    values, variable,
+};
 
 /// out(relu(hidden(x))) + skip(x) by candle's operations, x [rows, in].
 fn stock_block(parameters: &Parameters, name: &str, x: &Tensor) -> Result<Tensor> {
@@ -30,7 +34,7 @@ fn with_biases(config: &ModelConfig) -> Parameters {
     let (parameters, rng) = (parameters(config, 7), &mut rng(8));
     for (name, var) in parameters
         .iter()
-        .filter(|(name, _)| name.ends_with(".bias"))
+        .filter(|(name, _)| name.ends_with(".bias") || name.ends_with(".bias_mu"))
     {
         let values = crate::support::floats(var.dims(), rng);
         var.set(&values)
@@ -48,7 +52,8 @@ fn outputs_and_gradients(
     let network = Network::with_kernels(config, parameters, kernels).unwrap();
     let features = network.features(&frames(config, 6, &mut rng(1))).unwrap();
     let actions = Tensor::new(&[0u32, 4, 2, 2, 1, 3], &Device::Cpu)?;
-    let logits = network.logits(&features.f4).unwrap();
+    let noise = HeadNoise::draw(config, &mut rng(3));
+    let logits = network.noisy_logits(&features.f4, noise.as_ref()).unwrap();
     let outputs = vec![
         network.q_values(&logits).unwrap(),
         logits,
@@ -81,7 +86,13 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
             .to_vec(),
         ..small()
     };
-    for config in [odd, even] {
+    for config in [
+        odd,
+        even,
+        small_with(DUELING),
+        small_with(NOISY),
+        small_with(NOISY_DUELING),
+    ] {
         let parameters = with_biases(&config);
         let (ours, mut our_gradients) =
             outputs_and_gradients(&config, &parameters, Kernels::FUSED)?;
@@ -169,16 +180,20 @@ fn the_dim_heads_follow_their_formula_with_gradients() -> Result<()> {
 #[test]
 fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
     for precision in Precision::ALL {
-        the_same_bits_for_any_number_of_threads(precision);
+        the_same_bits_for_any_number_of_threads(precision, &small());
+        the_same_bits_for_any_number_of_threads(precision, &small_with(DUELING));
+        the_same_bits_for_any_number_of_threads(precision, &small_with(NOISY_DUELING));
     }
 }
 
-fn the_same_bits_for_any_number_of_threads(precision: Precision) {
-    let config = small();
-    let parameters = with_biases(&config);
+fn the_same_bits_for_any_number_of_threads(precision: Precision, config: &ModelConfig) {
+    let streams = if config.head.dueling { 2 } else { 1 };
+    let noise = HeadNoise::draw(config, &mut rng(3));
+    let head = streams * if noise.is_some() { 4 } else { 2 };
+    let parameters = with_biases(config);
     let kernels = Kernels::Fused(precision);
-    let network = Network::with_kernels(&config, &parameters, kernels).unwrap();
-    let batch = frames(&config, 61, &mut rng(2));
+    let network = Network::with_kernels(config, &parameters, kernels).unwrap();
+    let batch = frames(config, 61, &mut rng(2));
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
@@ -186,7 +201,7 @@ fn the_same_bits_for_any_number_of_threads(precision: Precision) {
             .unwrap();
         pool.install(|| {
             let features = network.features(&batch).unwrap();
-            let logits = network.logits(&features.f4).unwrap();
+            let logits = network.noisy_logits(&features.f4, noise.as_ref()).unwrap();
             let phi3 = network.phi3(&features.f3).unwrap();
             let loss = (logits.sqr().unwrap().sum_all().unwrap()
                 + phi3.sqr().unwrap().sum_all().unwrap())
@@ -200,10 +215,82 @@ fn the_same_bits_for_any_number_of_threads(precision: Precision) {
         })
     };
     let one = run(1);
-    assert_eq!(one.1.len(), 8 + 2 + 5, "torso, head, phi3");
+    assert_eq!(one.1.len(), 8 + head + 5, "torso, head, phi3");
     for threads in [2, 3] {
         assert!(run(threads) == one, "{threads} threads");
     }
+}
+
+/// Logits as the paper writes them, V + A - mean_a A after two products, and the same of one action a row.
+#[test]
+fn a_dueling_head_is_the_sum_of_its_streams() -> Result<()> {
+    let config = small_with(DUELING);
+    let parameters = with_biases(&config);
+    let network = Network::new(&config, &parameters).unwrap();
+    let f4 = crate::support::floats(&[6, config.hidden], &mut rng(4));
+    let stream = |name: &str, outputs: &[usize]| -> Result<Tensor> {
+        let weight = parameters.get(&format!("{name}.weight")).unwrap();
+        let bias = parameters.get(&format!("{name}.bias")).unwrap();
+        let outputs = [&[6], outputs].concat();
+        let y = f4.relu()?.matmul(&weight.t()?)?.broadcast_add(bias)?;
+        y.reshape(outputs)
+    };
+    let value = stream("head.value", &[1, 11])?;
+    let advantage = stream("head.advantage", &[5, 11])?;
+    let centred = advantage.broadcast_sub(&advantage.mean_keepdim(1)?)?;
+    let wanted = centred.broadcast_add(&value)?;
+    let found = network.logits(&f4).unwrap();
+    assert_close("logits", &found, &wanted, 1e-6);
+    let taken = [4u8, 0, 3, 3, 1, 2];
+    let found = values(&network.taken_logits(&f4, &taken, None).unwrap());
+    let wanted = values(&wanted);
+    for (row, action) in taken.into_iter().enumerate() {
+        let wanted = &wanted[(row * 5 + usize::from(action)) * 11..][..11];
+        for (found, wanted) in found[row * 11..].iter().zip(wanted) {
+            assert!((found - wanted).abs() < 1e-5, "{found} and {wanted}");
+        }
+    }
+    Ok(())
+}
+
+/// Each layer as the paper writes it: (mu + sigma * eps) x, with the same noise for all rows.
+#[test]
+fn a_noisy_layer_is_its_mean_and_its_scaled_noise() -> Result<()> {
+    let config = small_with(NOISY);
+    let parameters = with_biases(&config);
+    let network = Network::new(&config, &parameters).unwrap();
+    let f4 = crate::support::floats(&[6, config.hidden], &mut rng(4));
+    let noise = HeadNoise::draw(&config, &mut rng(5)).unwrap();
+    let (weight, bias) = noise.of_parameters(0);
+    let [weight, bias] =
+        [weight, bias].map(|it| it.into_iter().map(|it| it as f32).collect::<Vec<_>>());
+    let part = |part: &str| parameters.get(&format!("head.{part}")).unwrap();
+    // 0.5 / sqrt(19) everywhere, at the start of a run.
+    for sigma in ["weight_sigma", "bias_sigma"] {
+        let found = values(part(sigma));
+        assert!(
+            found
+                .iter()
+                .all(|&it| (it - 0.5 / 19f64.sqrt()).abs() < 1e-8)
+        );
+    }
+    let weight = Tensor::from_vec(weight, (55, 19), &Device::Cpu)?;
+    let bias = Tensor::from_vec(bias, 55, &Device::Cpu)?;
+    let weight = (part("weight_mu").as_tensor() + (weight * part("weight_sigma").as_tensor())?)?;
+    let bias = (part("bias_mu").as_tensor() + (bias * part("bias_sigma").as_tensor())?)?;
+    let layer = |weight: &Tensor, bias: &Tensor| {
+        let y = f4.relu()?.matmul(&weight.t()?)?.broadcast_add(bias)?;
+        y.reshape((6, 5, 11))
+    };
+    let found = network.noisy_logits(&f4, Some(&noise)).unwrap();
+    assert_close("noisy", &found, &layer(&weight, &bias)?, 1e-6);
+    // Without noise its means alone, which is what evaluation takes.
+    let mean = layer(part("weight_mu"), part("bias_mu"))?;
+    assert_close("means", &network.logits(&f4).unwrap(), &mean, 1e-6);
+    let plain = small();
+    let plain = Network::new(&plain, &crate::support::parameters(&plain, 1)).unwrap();
+    assert!(plain.noisy_logits(&f4, Some(&noise)).is_err());
+    Ok(())
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use candle_core::{Device, Tensor};
 use driml_model::{
-    ConvLayer, DimHeads, ModelConfig, Network, Parameters, PolicyNetwork, Precision,
+    ConvLayer, DimHeads, HeadConfig, ModelConfig, Network, Parameters, PolicyNetwork, Precision,
 };
 use serde_json::Value;
 
@@ -55,6 +55,9 @@ fn config(bytes: &[u8]) -> ModelConfig {
         action_embed: size(&model["action_embed"]),
         // What the cases have of heads differs; expected returns need none.
         dim: DimHeads::NONE,
+        head: json.get("head").map_or(HeadConfig::PLAIN, |head| {
+            serde_json::from_value(head.clone()).unwrap()
+        }),
     }
 }
 

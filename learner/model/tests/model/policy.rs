@@ -2,13 +2,20 @@
 //! Loading broken weights is tested with the weights.
 
 use candle_core::{Device, Tensor};
-use driml_model::{ModelConfig, ModelError, Network, PolicyNetwork, Precision};
+use driml_model::{
+    HeadConfig, HeadNoise, ModelConfig, ModelError, Network, PolicyNetwork, Precision,
+};
 
-use crate::support::{bytes, parameters, rng, small};
+use crate::support::{DUELING, NOISY, NOISY_DUELING, bytes, parameters, rng, small, small_with};
 
 #[test]
 fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
-    let config = small();
+    for head in [HeadConfig::PLAIN, DUELING, NOISY, NOISY_DUELING] {
+        it_agrees_with_the_network(small_with(head));
+    }
+}
+
+fn it_agrees_with_the_network(config: ModelConfig) {
     let parameters = parameters(&config, 3);
     let network = Network::new(&config, &parameters).unwrap();
     let mut policy = PolicyNetwork::new(
@@ -21,9 +28,10 @@ fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
         let frames = bytes(batch * config.frame_len(), &mut rng(batch as u64));
         let shape = (batch, config.height, config.width, config.channels);
         let tensor = Tensor::from_slice(&frames, shape, &Device::Cpu).unwrap();
-        let logits = network
-            .logits(&network.features(&tensor).unwrap().f4)
-            .unwrap();
+        let noise = HeadNoise::draw(&config, &mut rng(7 + batch as u64));
+        policy.set_noise(noise.as_ref());
+        let f4 = network.features(&tensor).unwrap().f4;
+        let logits = network.noisy_logits(&f4, noise.as_ref()).unwrap();
         let wanted: Vec<f32> = network
             .q_values(&logits)
             .unwrap()
@@ -157,4 +165,38 @@ fn wrong_lengths_and_overflow_are_errors() {
         policy.greedy_actions(&frames, &mut [0; 2]),
         Err(ModelError::NotFinite { row: 0 })
     ));
+}
+
+/// Weights that come have no noise until it is drawn: evaluation, which draws none, acts by the means.
+#[test]
+fn noise_is_drawn_when_it_is_asked_for() {
+    let config = small_with(NOISY_DUELING);
+    let weights = parameters(&config, 3).to_safetensors(|_| true).unwrap();
+    let mut policy = PolicyNetwork::new(&config, &weights, Precision::F32).unwrap();
+    let frames = bytes(config.frame_len(), &mut rng(1));
+    let values = |policy: &mut PolicyNetwork| {
+        let mut values = [0.0; 5];
+        policy.q_values(&frames, &mut values).unwrap();
+        values
+    };
+    let mean = values(&mut policy);
+    let generator = &mut rng(2);
+    policy.draw_noise(generator);
+    let first = values(&mut policy);
+    policy.draw_noise(generator);
+    let second = values(&mut policy);
+    assert!(first != mean && second != mean && first != second);
+    policy.draw_noise(&mut rng(2));
+    assert_eq!(values(&mut policy), first);
+    policy.load(&weights).unwrap();
+    assert_eq!(values(&mut policy), mean);
+    // A head without noisy layers draws nothing.
+    let plain = small();
+    let weights = parameters(&plain, 3).to_safetensors(|_| true).unwrap();
+    let mut policy = PolicyNetwork::new(&plain, &weights, Precision::F32).unwrap();
+    let mean = values(&mut policy);
+    let generator = &mut rng(2);
+    policy.draw_noise(generator);
+    assert_eq!(values(&mut policy), mean);
+    assert_eq!(*generator, rng(2));
 }

@@ -2,7 +2,7 @@
 //! No test lives here.
 
 use candle_core::{DType, Device, Result, Tensor, Var};
-use driml_model::{ConvLayer, DimHeads, ModelConfig, Parameters, Precision};
+use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Precision};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 
@@ -106,8 +106,29 @@ pub(crate) fn small() -> ModelConfig {
             phi4: true,
             action: true,
         },
+        head: HeadConfig::PLAIN,
     }
 }
+
+/// [`small`] with another head.
+pub(crate) fn small_with(head: HeadConfig) -> ModelConfig {
+    ModelConfig { head, ..small() }
+}
+
+pub(crate) const DUELING: HeadConfig = HeadConfig {
+    dueling: true,
+    noisy_sigma: None,
+};
+pub(crate) const NOISY: HeadConfig = HeadConfig {
+    dueling: false,
+    noisy_sigma: Some(0.5),
+};
+
+/// Rainbow's.
+pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
+    dueling: true,
+    noisy_sigma: Some(0.5),
+};
 
 pub(crate) fn parameters(config: &ModelConfig, seed: u64) -> Parameters {
     Parameters::init(config, &mut rng(seed), &Device::Cpu).unwrap()

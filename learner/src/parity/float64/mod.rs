@@ -16,6 +16,7 @@ use crate::{
     batch::Batch,
     error::UpdateError,
     losses::scores::Scores,
+    noise::UpdateNoise,
     settings::LearnerSettings,
 };
 
@@ -34,11 +35,20 @@ pub struct Float64 {
     pub gradients: BTreeMap<String, Vec<f64>>,
 }
 
-/// Computes the losses of `batch` at the parameters of `agent` in float64.
+/// Computes the losses of `batch` at the parameters of `agent` in float64, with the noise of its next update.
 ///
 /// # Errors
 /// An agent with another auxiliary objective than DIM, a batch that does not fit or leaves states out.
 pub fn float64(agent: &Agent, batch: &Batch<'_>) -> Result<Float64, UpdateError> {
+    float64_with(agent, batch, &agent.noise())
+}
+
+/// [`float64`] with this noise of noisy layers.
+fn float64_with(
+    agent: &Agent,
+    batch: &Batch<'_>,
+    noise: &UpdateNoise,
+) -> Result<Float64, UpdateError> {
     agent.check(batch)?;
     let len = agent.model().frame_len();
     let whole = [batch.rows, batch.positive_valid.len()].map(|states| states * len);
@@ -56,18 +66,18 @@ pub fn float64(agent: &Agent, batch: &Batch<'_>) -> Result<Float64, UpdateError>
     }
     let online = Net::of(agent.model(), agent.online())?;
     let target = Net::of(agent.model(), agent.target())?;
-    Ok(evaluate(settings, &online, &target, batch)?)
+    Ok(evaluate(settings, [&online, &target], batch, noise)?)
 }
 
 fn evaluate(
     settings: &LearnerSettings,
-    online: &Net<'_>,
-    target: &Net<'_>,
+    [online, target]: [&Net<'_>; 2],
     batch: &Batch<'_>,
+    noise: &UpdateNoise,
 ) -> candle_core::Result<Float64> {
-    let (next_greedy_action, projected) = projection(settings, online, target, batch)?;
+    let (next_greedy_action, projected) = projection(settings, [online, target], batch, noise)?;
     let now = online.features(batch.states_t)?;
-    let logits = online.logits(&now.global)?;
+    let logits = online.logits(&now.global, noise.online.as_ref())?;
     let kl = kl(&logits, batch, &projected)?;
     let mut total = kl.clone();
     for (loss, weight) in dim_losses(settings, online, &now, batch)? {
@@ -85,7 +95,7 @@ fn evaluate(
     Ok(Float64 {
         c51_kl: kl.to_scalar()?,
         total: total.to_scalar()?,
-        q_values_t: online.q_values(&logits)?,
+        q_values_t: online.q_values(&online.logits(&now.global, None)?)?,
         next_greedy_action,
         gradients,
     })
@@ -94,16 +104,18 @@ fn evaluate(
 /// Greedy actions in s_{t+n} and their distributions one Bellman step earlier [B * N].
 fn projection(
     settings: &LearnerSettings,
-    online: &Net<'_>,
-    target: &Net<'_>,
+    [online, target]: [&Net<'_>; 2],
     batch: &Batch<'_>,
+    noise: &UpdateNoise,
 ) -> candle_core::Result<(Vec<u8>, Vec<f64>)> {
     let model = target.model;
-    let logits = target
-        .logits(&target.features(batch.states_n)?.global)?
-        .detach();
+    let f4 = target.features(batch.states_n)?.global;
+    let logits = target.logits(&f4, noise.target.as_ref())?.detach();
     let values = match settings.double_dqn {
-        true => online.q_values(&online.logits(&online.features(batch.states_n)?.global)?)?,
+        true => {
+            let f4 = online.features(batch.states_n)?.global;
+            online.q_values(&online.logits(&f4, noise.choice.as_ref())?)?
+        }
         false => target.q_values(&logits)?,
     };
     let greedy = |values: &[f64]| {
@@ -257,8 +269,11 @@ mod tests {
         for name in [
             "all_four",
             "c51_only",
+            "dueling",
             "double_dqn_clipped",
             "global_global",
+            "noisy",
+            "noisy_dueling",
             "masked_positives",
             "no_action",
             "weighted_rows",
@@ -266,7 +281,8 @@ mod tests {
             let bytes = std::fs::read(folder.join(format!("{name}.safetensors"))).unwrap();
             let case = Case::parse(&bytes).unwrap();
             let (agent, _) = agent_of(&case, &Compute::CPU).unwrap();
-            let found = float64(&agent, &case.batch()).unwrap();
+            let noise = case.noise(agent.model()).unwrap();
+            let found = float64_with(&agent, &case.batch(), &noise).unwrap();
             let near = |what: &str, got: &[f64], shape: &[usize], scale: f64| {
                 let expected = case.expected(what, shape).unwrap();
                 for (got, expected) in got.iter().zip(&expected) {
@@ -299,7 +315,8 @@ mod tests {
                 }
             }
             // The learner's own f32 is right to a few of its last places.
-            let error = ErrorOfUpdate::of(&agent, &case.batch(), &found).unwrap();
+            let drawn = float64(&agent, &case.batch()).unwrap();
+            let error = ErrorOfUpdate::of(&agent, &case.batch(), &drawn).unwrap();
             assert!(
                 error.loss < 1e-5 && error.gradient < 1e-4 && error.q_max < 1e-4,
                 "{name}: {error:?}"

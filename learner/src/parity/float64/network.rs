@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use candle_core::{D, DType, Device, Tensor, Var};
 use candle_nn::ops::softmax;
-use driml_model::{ModelConfig, Parameters};
+use driml_model::{HeadNoise, ModelConfig, Parameters};
 
 /// A network's parameters in float64.
 pub(super) struct Net<'a> {
@@ -69,11 +69,54 @@ impl<'a> Net<'a> {
         })
     }
 
-    /// Logits [B, A, N].
-    pub(super) fn logits(&self, f4: &Tensor) -> candle_core::Result<Tensor> {
+    /// Logits [B, A, N], with the noise of noisy layers or with their means.
+    pub(super) fn logits(
+        &self,
+        f4: &Tensor,
+        noise: Option<&HeadNoise>,
+    ) -> candle_core::Result<Tensor> {
         let (actions, atoms) = (self.model.num_actions, self.model.atoms);
-        self.linear("head", &f4.relu()?)?
-            .reshape(((), actions, atoms))
+        let active = f4.relu()?;
+        let of_actions = |name: &str, number: usize| {
+            let y = self.head_layer(
+                name,
+                &active,
+                noise.map(|noise| noise.of_parameters(number)),
+            );
+            y?.reshape(((), actions, atoms))
+        };
+        if !self.model.head.dueling {
+            return of_actions("head", 0);
+        }
+        let advantage = of_actions("head.advantage", 1)?;
+        let noise = noise.map(|noise| noise.of_parameters(0));
+        let value = self.head_layer("head.value", &active, noise)?;
+        advantage
+            .broadcast_sub(&advantage.mean_keepdim(1)?)?
+            .broadcast_add(&value.unsqueeze(1)?)
+    }
+
+    /// A layer of C51's head, with noise of its weight and its bias where they are noisy.
+    fn head_layer(
+        &self,
+        name: &str,
+        x: &Tensor,
+        noise: Option<(Vec<f64>, Vec<f64>)>,
+    ) -> candle_core::Result<Tensor> {
+        if self.model.head.noisy_sigma.is_none() {
+            return self.linear(name, x);
+        }
+        let part = |part: &str| self.vars[&format!("{name}.{part}")].as_tensor();
+        let (mut weight, mut bias) = (part("weight_mu").clone(), part("bias_mu").clone());
+        if let Some((of_weight, of_bias)) = noise {
+            let scaled = |part: &Tensor, noise: Vec<f64>| {
+                let noise = Tensor::from_vec(noise, part.dims(), &Device::Cpu)?;
+                part * noise
+            };
+            weight = (weight + scaled(part("weight_sigma"), of_weight)?)?;
+            bias = (bias + scaled(part("bias_sigma"), of_bias)?)?;
+        }
+        x.broadcast_matmul(&weight.t()?)?.broadcast_add(&bias)
     }
 
     /// Values [B, A] of `logits` [B, A, N].

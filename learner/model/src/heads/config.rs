@@ -1,0 +1,53 @@
+//! How the C51 head is made: of one linear layer or of two streams, and whether these are noisy.
+//! It computes nothing.
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::{ModelError, Result};
+
+/// Name of the head, and of its streams if it is a dueling one.
+pub(crate) const HEAD: &str = "head";
+pub(crate) const VALUE: &str = "head.value";
+pub(crate) const ADVANTAGE: &str = "head.advantage";
+
+/// Largest sigma_0; a configuration beyond it is rejected.
+const NOISY_SIGMA_MAX: f64 = 100.0;
+
+/// How the C51 head is made, the table `[model.head]`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HeadConfig {
+    /// A stream for the state's value and one for what each action is better than the mean of all, added before the softmax.
+    /// Source: Wang et al. 2016; per atom as in Hessel et al. 2018.
+    #[serde(default)]
+    pub dueling: bool,
+    /// Of noisy layers sigma_0, above 0 and at most 100: the weights' noise at the start of a run, in units of 1 / sqrt(inputs). Not
+    /// there: layers without noise. Source: Fortunato et al. 2018, who take 0.5.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub noisy_sigma: Option<f64>,
+}
+
+impl HeadConfig {
+    /// One linear layer without noise.
+    pub const PLAIN: Self = Self {
+        dueling: false,
+        noisy_sigma: None,
+    };
+
+    pub(crate) fn validate(&self) -> Result<()> {
+        match self.noisy_sigma {
+            Some(sigma) if !(sigma > 0.0 && sigma <= NOISY_SIGMA_MAX) => {
+                Err(ModelError::Config(format!(
+                    "head.noisy_sigma is {sigma}, must be above 0 and at most {NOISY_SIGMA_MAX}"
+                )))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Whether it is one linear layer: what it then says need not be said.
+    #[allow(clippy::trivially_copy_pass_by_ref, reason = "serde asks by reference")]
+    pub(crate) fn is_plain(&self) -> bool {
+        *self == Self::PLAIN
+    }
+}

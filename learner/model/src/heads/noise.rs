@@ -1,0 +1,148 @@
+//! The noise of the C51 head's noisy layers: factorised Gaussian noise, one number for each input and output of a layer.
+//! It knows no weight and no generator's seed.
+//!
+//! Source: Fortunato et al. 2018, section 3.1 (b).
+
+use rand_chacha::ChaCha8Rng;
+
+use crate::config::ModelConfig;
+use crate::init::normals;
+
+/// One draw of the noise of all noisy layers of a head.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeadNoise {
+    /// In the order of the head's layers.
+    layers: Vec<LayerNoise>,
+}
+
+/// f(eps) of one layer, f(x) = sgn(x) sqrt|x|: its weight's noise is the product of an output's and an input's, its bias's the output's.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct LayerNoise {
+    pub(crate) inputs: Vec<f64>,
+    pub(crate) outputs: Vec<f64>,
+}
+
+impl HeadNoise {
+    /// Draws noise for the head of `config`; none if it has no noisy layer.
+    pub fn draw(config: &ModelConfig, rng: &mut ChaCha8Rng) -> Option<Self> {
+        let drawn = Self::of_normals(config, |_, _, len| Ok::<_, ()>(normals(len, rng)));
+        drawn.unwrap_or_default()
+    }
+
+    /// The noise that `normals` make, standard normal numbers: of a layer's name, `in` or `out`, as many as there are such; none for
+    /// a head without noisy layers.
+    ///
+    /// # Errors
+    /// The first of `normals`.
+    ///
+    /// # Panics
+    /// If they are more or fewer.
+    pub fn of_normals<E>(
+        config: &ModelConfig,
+        mut normals: impl FnMut(&str, &str, usize) -> Result<Vec<f64>, E>,
+    ) -> Result<Option<Self>, E> {
+        if config.head.noisy_sigma.is_none() {
+            return Ok(None);
+        }
+        let mut scaled = |layer: &str, side: &str, len: usize| -> Result<Vec<f64>, E> {
+            let normals = normals(layer, side, len)?;
+            assert_eq!(normals.len(), len, "noise of {layer}");
+            let f = |x: f64| x.signum() * x.abs().sqrt();
+            Ok(normals.into_iter().map(f).collect())
+        };
+        let mut layers = Vec::new();
+        for (name, outputs) in config.head_layers() {
+            layers.push(LayerNoise {
+                inputs: scaled(name, "in", config.hidden)?,
+                outputs: scaled(name, "out", outputs)?,
+            });
+        }
+        Ok(Some(Self { layers }))
+    }
+
+    /// The noise of the head's layer with this number.
+    pub(crate) fn of_layer(&self, number: usize) -> &LayerNoise {
+        &self.layers[number]
+    }
+
+    /// The noise of the weight [out, in] and of the bias [out] of the head's layer with this number.
+    pub fn of_parameters(&self, number: usize) -> (Vec<f64>, Vec<f64>) {
+        let LayerNoise { inputs, outputs } = self.of_layer(number);
+        let mut weight = Vec::with_capacity(inputs.len() * outputs.len());
+        for output in outputs {
+            weight.extend(inputs.iter().map(|input| input * output));
+        }
+        (weight, outputs.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand_chacha::rand_core::SeedableRng;
+
+    use super::*;
+    use crate::{ConvLayer, DimHeads, HeadConfig};
+
+    fn config(noisy_sigma: Option<f64>) -> ModelConfig {
+        ModelConfig {
+            height: 8,
+            width: 8,
+            channels: 1,
+            num_actions: 3,
+            atoms: 7,
+            v_min: -1.0,
+            v_max: 1.0,
+            conv: vec![ConvLayer {
+                out: 2,
+                kernel: 4,
+                stride: 2,
+            }],
+            hidden: 11,
+            rkhs: 4,
+            action_embed: 2,
+            dim: DimHeads::NONE,
+            head: HeadConfig {
+                dueling: true,
+                noisy_sigma,
+            },
+        }
+    }
+
+    #[test]
+    fn a_head_without_noisy_layers_draws_none() {
+        let (mut one, other) = (ChaCha8Rng::seed_from_u64(1), ChaCha8Rng::seed_from_u64(1));
+        assert_eq!(HeadNoise::draw(&config(None), &mut one), None);
+        assert_eq!(one, other);
+    }
+
+    /// f(eps) has mean 0 and E f^2 = E|eps| = sqrt(2 / pi); that of a product of two is their product, and both layers are drawn apart.
+    #[test]
+    fn it_has_the_moments_of_the_paper_s_noise() {
+        let config = config(Some(0.5));
+        let rng = &mut ChaCha8Rng::seed_from_u64(2);
+        let mut moments = [0.0; 4];
+        let mut count = 0.0;
+        for _ in 0..2000 {
+            let noise = HeadNoise::draw(&config, rng).unwrap();
+            let (value, value_bias) = noise.of_parameters(0);
+            let (advantage, bias) = noise.of_parameters(1);
+            assert_eq!((value.len(), advantage.len()), (77, 231));
+            assert_eq!((value_bias.len(), bias.len()), (7, 21));
+            for (v, a) in [(value[0], advantage[0]), (value[76], advantage[230])] {
+                for (moment, it) in moments.iter_mut().zip([v, v * v, a * a, v * a]) {
+                    *moment += it;
+                }
+                count += 1.0;
+            }
+        }
+        let [mean, square_v, square_a, together] = moments.map(|sum| sum / count);
+        let square = 2.0 / std::f64::consts::PI;
+        assert!(
+            mean.abs() < 0.06 && together.abs() < 0.06,
+            "{mean}, {together}"
+        );
+        for found in [square_v, square_a] {
+            assert!((found - square).abs() < 0.1, "{found}, not {square}");
+        }
+    }
+}

@@ -1,0 +1,57 @@
+//! A layer's name, the shapes of its parameters, and how they are drawn at the start of a run.
+//! Which layers a network has is `config`'s.
+
+use rand_chacha::ChaCha8Rng;
+
+use crate::init::InitialLaw;
+
+/// A layer's name, the shapes of its parameters, and how they are drawn at the start of a run.
+///
+/// Source of the laws: the paper authors' code. A C51 head that starts orthogonal too gives first Q values twice as large,
+/// and with a target network that moves once in 312 updates these outlive 100,000 frames.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct LayerShape {
+    pub(crate) name: String,
+    pub(crate) weight: Vec<usize>,
+    pub(crate) bias: bool,
+    pub(crate) initial: InitialLaw,
+    /// sigma_0 of a noisy layer, which has a mean and a sigma of weight and bias in place of these.
+    pub(crate) noisy_sigma: Option<f64>,
+}
+
+impl LayerShape {
+    /// Names and shapes of its parameters, in the order in which they are drawn.
+    pub(crate) fn parameters(&self) -> Vec<(String, Vec<usize>)> {
+        let name = &self.name;
+        let ends: &[&str] = match self.noisy_sigma {
+            None => &[""],
+            Some(_) => &["_mu", "_sigma"],
+        };
+        let weights = ends
+            .iter()
+            .map(|end| (format!("{name}.weight{end}"), self.weight.clone()));
+        let biases = ends
+            .iter()
+            .map(|end| (format!("{name}.bias{end}"), vec![self.weight[0]]));
+        let biases = biases.filter(|_| self.bias);
+        weights.chain(biases).collect()
+    }
+
+    /// First values of [`LayerShape::parameters`]. A sigma draws nothing: it is sigma_0 / sqrt(fan_in).
+    ///
+    /// Source: Fortunato et al. 2018, section 3.2 (b).
+    pub(crate) fn initial_values(&self, rng: &mut ChaCha8Rng) -> Vec<Vec<f32>> {
+        let weight = self.initial.weight(&self.weight, rng);
+        let outputs = self.weight[0];
+        let sigma = self.noisy_sigma.map(|sigma_0| {
+            let fan_in = weight.len() / outputs;
+            (sigma_0 / (fan_in as f64).sqrt()) as f32
+        });
+        let sigmas = |len: usize| sigma.map(|sigma| vec![sigma; len]);
+        let weight_sigmas = sigmas(weight.len());
+        let bias = self.bias.then(|| self.initial.bias(&self.weight, rng));
+        let bias_sigmas = bias.is_some().then(|| sigmas(outputs)).flatten();
+        let values = [Some(weight), weight_sigmas, bias, bias_sigmas];
+        values.into_iter().flatten().collect()
+    }
+}
