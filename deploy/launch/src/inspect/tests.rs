@@ -107,7 +107,8 @@ fn what_is_counted_is_what_is_built() {
             let weights = learner.next_weights().unwrap().safetensors.len();
             assert_eq!(find(&inspection.bytes, "a broadcast").is, weights as u64);
             // Rows that have every state that a row may have.
-            let header = BatchHeader::of(&config.run, config.learner.batch_size);
+            let header = BatchHeader::of(&config.run, config.learner.batch_size)
+                .sampled_by(&config.replay.sampling);
             let row = RowScalars {
                 action: 0,
                 next_action: 0,
