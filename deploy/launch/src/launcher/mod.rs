@@ -2,8 +2,10 @@
 //! order.
 //! Each is a `managed_process`; `status_client` asks how they are, `live_view` shows it and `run_folder` keeps it.
 
+mod parts;
+
 use std::{
-    path::{Path, PathBuf},
+    path::PathBuf,
     time::{Duration, Instant},
 };
 
@@ -22,7 +24,6 @@ use crate::{
     evaluator::Evaluator,
     interrupts::Interrupts,
     live_view::{Display, TEMPLATE, silence},
-    managed_process::{ManagedProcess, Surroundings},
     meeting::Meeting,
     processes::{Processes, stop},
     resume,
@@ -44,15 +45,8 @@ const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 /// How long the replay server may take to end, once it is told to stop.
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
-/// How often replay servers that keep their replay on disk are started again in a run, all together.
-const RESTARTS_MAX: u32 = 8;
-/// How often actors that have died are started again in one run, all together; one more is an error.
-const ACTOR_RESTARTS_MAX: u32 = 16;
 /// How often a learner that saves is asked whether it is done.
 const DRAIN_POLL: Duration = Duration::from_millis(100);
-/// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
-const PROCESS_THREADS: u32 = 1;
-
 /// Where the replay server is reached from outside the run.
 #[derive(Clone, Debug, Default)]
 pub struct Outside {
@@ -197,10 +191,6 @@ struct Launch<'a> {
     statuses: Option<Statuses>,
 }
 
-fn words(args: &[&str]) -> Vec<String> {
-    args.iter().map(|&arg| arg.to_owned()).collect()
-}
-
 /// The processes of a run that is started on one machine: replay servers, learner, actors.
 pub(crate) fn process_names(config: &RunConfig) -> Vec<String> {
     let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
@@ -218,30 +208,7 @@ fn server_names(shards: u32) -> Vec<String> {
     }
 }
 
-impl Outside {
-    /// What the first replay server is told of it, beside where the parts meet.
-    fn flags(&self) -> Vec<String> {
-        let mut flags = Vec::new();
-        if let (Some(listen), Some(folder)) = (&self.listen, &self.tls_dir) {
-            flags.extend(["--listen".into(), listen.clone()]);
-            flags.extend(["--tls-dir".into(), folder.display().to_string()]);
-        }
-        if self.insecure_network {
-            flags.push("--insecure-network".into());
-        }
-        flags
-    }
-}
-
 impl Launch<'_> {
-    fn surroundings<'a>(&'a self, logs: &'a Path) -> Surroundings<'a> {
-        Surroundings {
-            logs,
-            screen: &self.screen,
-            meeting: Some(&self.meeting),
-        }
-    }
-
     fn start_and_watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
         let logs = self.run_dir.logs();
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
@@ -259,126 +226,12 @@ impl Launch<'_> {
         let keys = Keys::new(NAMESPACE).map_err(Usage)?;
         self.statuses = Some(Statuses::new(sessions, keys, self.config.run.hash()));
 
-        let folder = self.run_dir.display().to_string();
-        let device = self.config.local.learner_device.to_string();
-        let mut args = words(&[
-            "learner",
-            "--stay",
-            "--run-dir",
-            &folder,
-            "--device",
-            &device,
-        ]);
-        for endpoint in &self.endpoints {
-            args.extend(words(&["--connect", endpoint]));
-        }
-        self.processes.learner = Some(ManagedProcess::start(
-            "learner",
-            &args,
-            self.config.local.learner_threads,
-            self.surroundings(&logs),
-        )?);
+        self.processes.learner = Some(self.start_learner()?);
         for id in 0..self.config.local.actors {
             let actor = self.start_actor(id)?;
             self.processes.actors.push(actor);
         }
         self.watch(recorder)
-    }
-
-    fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
-        let mut args = words(&[
-            "actor",
-            "--connect",
-            &self.endpoints[id as usize % self.endpoints.len()],
-            "--id",
-            &id.to_string(),
-        ]);
-        if self.config.world.name().foreign_code().is_some() {
-            args.extend(words(&["--env", &self.config.run.world]));
-        }
-        let logs = self.run_dir.logs();
-        let name = format!("actor-{id}");
-        ManagedProcess::start(&name, &args, PROCESS_THREADS, self.surroundings(&logs))
-    }
-
-    /// Starts actors that have died again. What one had not delivered is gone with it; the run goes on.
-    ///
-    /// # Errors
-    /// The process cannot be started.
-    fn revive_actors(&mut self) -> anyhow::Result<()> {
-        for id in 0..self.processes.actors.len() {
-            let actor = &mut self.processes.actors[id];
-            if self.actor_restarts == ACTOR_RESTARTS_MAX || !actor.may_be_started_again() {
-                continue;
-            }
-            self.actor_restarts += 1;
-            let report = actor.exit_report();
-            self.screen.line(&format!(
-                "{report}\nactor-{id} is started again ({} of {ACTOR_RESTARTS_MAX} times in a run)",
-                self.actor_restarts
-            ));
-            session::sweep_shared_memory();
-            self.processes.actors[id] = self.start_actor(id as u32)?;
-        }
-        Ok(())
-    }
-
-    /// Starts the replay server of one shard, in a run that goes on after so many updates.
-    fn start_server(&self, shard: usize, after_updates: u64) -> anyhow::Result<ManagedProcess> {
-        let config = self.run_dir.config().display().to_string();
-        let (number, after) = (shard.to_string(), after_updates.to_string());
-        let mut args = words(&[
-            "replay-server",
-            "--stay",
-            "--listen",
-            &self.endpoints[shard],
-            "--shard",
-            &number,
-            "--after-updates",
-            &after,
-            "--config",
-            &config,
-        ]);
-        if shard == 0 {
-            args.extend(self.outside.flags());
-        }
-        if let Some(bug) = self.config.replay.reproduced_bug {
-            args.extend(words(&["--reproduce-bug", bug.name()]));
-        }
-        if self.config.local.durable {
-            let folder = self.run_dir.replay().display().to_string();
-            args.extend(words(&["--replay-dir", &folder]));
-        }
-        let logs = self.run_dir.logs();
-        let name = &self.servers[shard];
-        ManagedProcess::start(name, &args, PROCESS_THREADS, self.surroundings(&logs))
-    }
-
-    /// Starts replay servers that have died again, if they go on with what they have kept.
-    ///
-    /// # Errors
-    /// It has happened too often, or the process cannot be started.
-    fn revive_servers(&mut self) -> anyhow::Result<()> {
-        if !self.config.local.durable {
-            return Ok(());
-        }
-        for shard in 0..self.processes.replay_servers.len() {
-            let server = &mut self.processes.replay_servers[shard];
-            if server.end().is_none() || self.restarts == RESTARTS_MAX {
-                continue;
-            }
-            self.restarts += 1;
-            let report = server.exit_report();
-            self.screen.line(&format!(
-                "{report}\n{} is started again with what it has kept ({} of {RESTARTS_MAX} times in a run)",
-                self.servers[shard], self.restarts
-            ));
-            session::sweep_shared_memory();
-            // What the learner has learned meanwhile, the log knows.
-            let server = self.start_server(shard, self.resume_point.updates)?;
-            self.processes.replay_servers[shard] = server;
-        }
-        Ok(())
     }
 
     /// Asks, shows and records once a second until the run is over.

@@ -1,0 +1,175 @@
+//! The launcher's processes: the words that start each, and those that are started again when they have died.
+//! When the first are started, and how all end, is in `mod`.
+
+use std::path::Path;
+
+use driml_protocol::session;
+
+use super::{Launch, Outside};
+use crate::managed_process::{ManagedProcess, Surroundings};
+
+/// How often replay servers that keep their replay on disk are started again in a run, all together.
+const RESTARTS_MAX: u32 = 8;
+/// How often actors that have died are started again in one run, all together; one more is an error.
+const ACTOR_RESTARTS_MAX: u32 = 16;
+/// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
+const PROCESS_THREADS: u32 = 1;
+
+fn words(args: &[&str]) -> Vec<String> {
+    args.iter().map(|&arg| arg.to_owned()).collect()
+}
+
+impl Outside {
+    /// What the first replay server is told of it, beside where the parts meet.
+    fn flags(&self) -> Vec<String> {
+        let mut flags = Vec::new();
+        if let (Some(listen), Some(folder)) = (&self.listen, &self.tls_dir) {
+            flags.extend(["--listen".into(), listen.clone()]);
+            flags.extend(["--tls-dir".into(), folder.display().to_string()]);
+        }
+        if self.insecure_network {
+            flags.push("--insecure-network".into());
+        }
+        flags
+    }
+}
+
+impl Launch<'_> {
+    fn surroundings<'a>(&'a self, logs: &'a Path) -> Surroundings<'a> {
+        Surroundings {
+            logs,
+            screen: &self.screen,
+            meeting: Some(&self.meeting),
+        }
+    }
+
+    /// Starts the learner.
+    ///
+    /// # Errors
+    /// The process cannot be started.
+    pub(super) fn start_learner(&self) -> anyhow::Result<ManagedProcess> {
+        let folder = self.run_dir.display().to_string();
+        let device = self.config.local.learner_device.to_string();
+        let mut args = words(&[
+            "learner",
+            "--stay",
+            "--run-dir",
+            &folder,
+            "--device",
+            &device,
+        ]);
+        for endpoint in &self.endpoints {
+            args.extend(words(&["--connect", endpoint]));
+        }
+        ManagedProcess::start(
+            "learner",
+            &args,
+            self.config.local.learner_threads,
+            self.surroundings(&self.run_dir.logs()),
+        )
+    }
+
+    /// Starts an actor.
+    ///
+    /// # Errors
+    /// The process cannot be started.
+    pub(super) fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
+        let mut args = words(&[
+            "actor",
+            "--connect",
+            &self.endpoints[id as usize % self.endpoints.len()],
+            "--id",
+            &id.to_string(),
+        ]);
+        if self.config.world.name().foreign_code().is_some() {
+            args.extend(words(&["--env", &self.config.run.world]));
+        }
+        let logs = self.run_dir.logs();
+        let name = format!("actor-{id}");
+        ManagedProcess::start(&name, &args, PROCESS_THREADS, self.surroundings(&logs))
+    }
+
+    /// Starts actors that have died again. What one had not delivered is gone with it; the run goes on.
+    ///
+    /// # Errors
+    /// The process cannot be started.
+    pub(super) fn revive_actors(&mut self) -> anyhow::Result<()> {
+        for id in 0..self.processes.actors.len() {
+            let actor = &mut self.processes.actors[id];
+            if self.actor_restarts == ACTOR_RESTARTS_MAX || !actor.may_be_started_again() {
+                continue;
+            }
+            self.actor_restarts += 1;
+            let report = actor.exit_report();
+            self.screen.line(&format!(
+                "{report}\nactor-{id} is started again ({} of {ACTOR_RESTARTS_MAX} times in a run)",
+                self.actor_restarts
+            ));
+            session::sweep_shared_memory();
+            self.processes.actors[id] = self.start_actor(id as u32)?;
+        }
+        Ok(())
+    }
+
+    /// Starts the replay server of one shard, in a run that goes on after so many updates.
+    pub(super) fn start_server(
+        &self,
+        shard: usize,
+        after_updates: u64,
+    ) -> anyhow::Result<ManagedProcess> {
+        let config = self.run_dir.config().display().to_string();
+        let (number, after) = (shard.to_string(), after_updates.to_string());
+        let mut args = words(&[
+            "replay-server",
+            "--stay",
+            "--listen",
+            &self.endpoints[shard],
+            "--shard",
+            &number,
+            "--after-updates",
+            &after,
+            "--config",
+            &config,
+        ]);
+        if shard == 0 {
+            args.extend(self.outside.flags());
+        }
+        if let Some(bug) = self.config.replay.reproduced_bug {
+            args.extend(words(&["--reproduce-bug", bug.name()]));
+        }
+        if self.config.local.durable {
+            let folder = self.run_dir.replay().display().to_string();
+            args.extend(words(&["--replay-dir", &folder]));
+        }
+        let logs = self.run_dir.logs();
+        let name = &self.servers[shard];
+        ManagedProcess::start(name, &args, PROCESS_THREADS, self.surroundings(&logs))
+    }
+
+    /// Starts replay servers that have died again, if they go on with what they have kept.
+    ///
+    /// # Errors
+    /// It has happened too often, or the process cannot be started.
+    pub(super) fn revive_servers(&mut self) -> anyhow::Result<()> {
+        if !self.config.local.durable {
+            return Ok(());
+        }
+        for shard in 0..self.processes.replay_servers.len() {
+            let server = &mut self.processes.replay_servers[shard];
+            if server.end().is_none() || self.restarts == RESTARTS_MAX {
+                continue;
+            }
+            self.restarts += 1;
+            let report = server.exit_report();
+            self.screen.line(&format!(
+                "{report}\n{} is started again with what it has kept ({} of {RESTARTS_MAX} times in a run)",
+                self.servers[shard], self.restarts
+            ));
+            session::sweep_shared_memory();
+            // What the learner has learned meanwhile, the log knows.
+            let server = self.start_server(shard, self.resume_point.updates)?;
+            self.processes.replay_servers[shard] = server;
+        }
+        Ok(())
+    }
+}
