@@ -24,7 +24,7 @@ pub enum Unreachable {
         "the host of {endpoint} is unknown: {why}. Correct the name, or take the machine's address"
     )]
     HostUnknown {
-        /// The endpoint.
+        /// The endpoint as it was given.
         endpoint: String,
         /// What the system said.
         why: String,
@@ -37,7 +37,7 @@ pub enum Unreachable {
          reached with quic/HOST:PORT, which is UDP, and --tls-dir"
     )]
     Refused {
-        /// The endpoint.
+        /// The endpoint as it was given.
         endpoint: String,
     },
     /// No socket of this name.
@@ -46,7 +46,7 @@ pub enum Unreachable {
          path"
     )]
     NoSocket {
-        /// The endpoint.
+        /// The endpoint as it was given.
         endpoint: String,
         /// What is there instead.
         what: &'static str,
@@ -56,7 +56,7 @@ pub enum Unreachable {
         "{endpoint} does not answer ({why}): is its machine up, is the address right, and does a firewall let this port through?"
     )]
     Silent {
-        /// The endpoint.
+        /// The endpoint as it was given.
         endpoint: String,
         /// What the system said.
         why: std::io::Error,

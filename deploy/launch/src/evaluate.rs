@@ -48,7 +48,7 @@ pub enum Levels {
 /// Which checkpoint of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Which {
-    /// The newest.
+    /// The one with the most updates behind it.
     Newest,
     /// The one after so many updates.
     After(u64),

@@ -35,11 +35,10 @@ impl Evaluator {
     /// # Errors
     /// A table of evaluations that cannot be read.
     pub(crate) fn new(config: EvaluationConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
-        let played = Evaluated::all(run_dir)?;
         Ok(Self {
             config,
             run_dir: run_dir.clone(),
-            newest: played.iter().map(|it| it.updates).max().unwrap_or(0),
+            newest: Evaluated::newest(run_dir)?,
             playing: None,
         })
     }
@@ -48,7 +47,7 @@ impl Evaluator {
     pub(crate) fn look(&mut self, screen: &Screen) {
         self.hear(screen);
         if self.playing.is_none() {
-            self.begin(self.config.every_updates, screen);
+            self.begin(false, screen);
         }
     }
 
@@ -59,7 +58,7 @@ impl Evaluator {
         loop {
             self.hear(screen);
             if self.playing.is_none() {
-                if last || !self.begin(1, screen) {
+                if last || !self.begin(true, screen) {
                     return;
                 }
                 last = true;
@@ -73,8 +72,8 @@ impl Evaluator {
         }
     }
 
-    /// Begins to play the newest checkpoint if it is so many updates past the last one played. Says whether it did.
-    fn begin(&mut self, step: u64, screen: &Screen) -> bool {
+    /// Begins to play the newest checkpoint if it is due. Says whether it did.
+    fn begin(&mut self, is_last: bool, screen: &Screen) -> bool {
         let newest = match checkpoint::list(&self.run_dir.checkpoints()) {
             Ok(all) => all.last().map(|(updates, _)| *updates),
             Err(e) => {
@@ -82,7 +81,8 @@ impl Evaluator {
                 None
             }
         };
-        let Some(updates) = newest.filter(|it| it / step > self.newest / step) else {
+        let Some(updates) = newest.filter(|&it| self.config.is_due(it, self.newest, is_last))
+        else {
             return false;
         };
         self.newest = updates;

@@ -50,6 +50,13 @@ pub struct EvaluationConfig {
 }
 
 impl EvaluationConfig {
+    /// Whether a checkpoint after so many updates is to be played, where the newest that was played is after `played`; the last one
+    /// of a run is if it was not.
+    pub const fn is_due(&self, updates: u64, played: u64, is_last: bool) -> bool {
+        let step = if is_last { 1 } else { self.every_updates };
+        updates / step > played / step
+    }
+
     fn validate(&self, checkpoint_period_updates: u64) -> Result<(), Usage> {
         let Self {
             every_updates,

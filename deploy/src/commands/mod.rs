@@ -15,3 +15,4 @@ pub(crate) mod train;
 pub(crate) mod watch;
 
 mod join;
+mod look;

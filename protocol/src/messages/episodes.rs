@@ -48,9 +48,9 @@ pub struct EndedEpisode {
 /// What is known of an episode of which all was seen, up to some step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Played {
-    /// Undiscounted return.
+    /// Sum of the rewards as the world gave them, undiscounted.
     pub episode_return: f64,
-    /// Steps.
+    /// Environment steps, the last one included.
     pub steps: u64,
 }
 

@@ -13,7 +13,7 @@ use crate::wire::{
 /// Which life of which replay server drew rows by priority: their numbers mean nothing to another one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Origin {
-    /// The shard.
+    /// Which of the run's replay shards drew them, from 0.
     pub shard: u32,
     /// A number that a replay server has for as long as it runs.
     pub incarnation: u64,

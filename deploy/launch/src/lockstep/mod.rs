@@ -147,11 +147,10 @@ struct Evaluations<'a> {
 
 impl<'a> Evaluations<'a> {
     fn new(config: &RunConfig, run_dir: &'a RunFolder) -> anyhow::Result<Self> {
-        let played = Evaluated::all(run_dir)?;
         Ok(Self {
             config: config.local.evaluation,
             run_dir,
-            newest: played.iter().map(|it| it.updates).max().unwrap_or(0),
+            newest: Evaluated::newest(run_dir)?,
         })
     }
 
@@ -160,8 +159,7 @@ impl<'a> Evaluations<'a> {
         let Some(config) = self.config else {
             return Ok(());
         };
-        let step = if is_last { 1 } else { config.every_updates };
-        if updates / step > self.newest / step {
+        if config.is_due(updates, self.newest, is_last) {
             self.newest = updates;
             let which = Which::After(updates);
             let (earned, _) = evaluate::keep(self.run_dir, which, config.episodes, 0)?;

@@ -73,6 +73,15 @@ impl Evaluated {
         })
     }
 
+    /// Updates behind the newest checkpoint that was played; 0 if none was.
+    ///
+    /// # Errors
+    /// As [`Evaluated::all`].
+    pub(crate) fn newest(folder: &RunFolder) -> anyhow::Result<u64> {
+        let all = Self::all(folder)?;
+        Ok(all.iter().map(|it| it.updates).max().unwrap_or(0))
+    }
+
     /// A checkpoint of so many updates, with the run's time and frames at it.
     pub(crate) fn at(
         folder: &RunFolder,

@@ -9,7 +9,7 @@ use serde::Serialize;
 /// How far a run is, how fast and how well; what is not known yet is none.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Numbers {
-    /// Transitions stored.
+    /// Transitions that the replay servers have stored, all shards together.
     pub frames: u64,
     /// Updates that the learner has done; none while no learner answers.
     pub updates: Option<u64>,
