@@ -292,16 +292,22 @@ impl Agent {
         noise: &UpdateNoise,
     ) -> Result<Evaluation, UpdateError> {
         self.check(batch)?;
-        let (next_greedy_action, target_projection) = self.make_target(batch, noise)?;
-
-        let features = OnlineFeatures::new(
-            &self.online_network,
-            &self.model,
-            &*self.auxiliary,
-            batch,
-            self.equal_states,
-            &self.compute.device,
-        )?;
+        // Neither needs the other: what one does on a single thread falls into the other's products.
+        let (target, features) = rayon::join(
+            || self.make_target(batch, noise),
+            || {
+                OnlineFeatures::new(
+                    &self.online_network,
+                    &self.model,
+                    &*self.auxiliary,
+                    batch,
+                    self.equal_states,
+                    &self.compute.device,
+                )
+            },
+        );
+        let (next_greedy_action, target_projection) = target?;
+        let features = features?;
         let taken_logits = self.online_network.taken_logits(
             &features.now.f4,
             batch.action,

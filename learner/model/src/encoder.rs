@@ -33,7 +33,7 @@ impl Encoder {
         config.validate()?;
         Ok(Self {
             torso: Torso::new(config, parameters, kernels)?,
-            psi4: Head::new("dim.psi4", config.hidden, parameters, kernels)?,
+            psi4: Head::new("dim.psi4", parameters, kernels)?,
         })
     }
 

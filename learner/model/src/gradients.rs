@@ -69,16 +69,17 @@ impl Backward {
 
 /// Adds to the gradient of `parameter` in place, if that is a variable and the backward pass is one of [`Backward::of`]; says whether.
 ///
-/// `add` gets the sum, in the parameter's layout, and whether it holds anything yet; if not, it may overwrite it.
-pub(crate) fn add_in_place(parameter: &Tensor, add: impl FnOnce(&mut [f32], bool)) -> bool {
+/// `add` gets the sum so far, in the parameter's layout, and gives back the sum with its part.
+pub(crate) fn add_in_place(
+    parameter: &Tensor,
+    add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>,
+) -> bool {
     if !parameter.is_variable() {
         return false;
     }
     let kept = SUMS.with_borrow_mut(|sums| Some(sums.as_mut()?.remove(&parameter.id())));
     let Some(kept) = kept else { return false };
-    let there = kept.is_some();
-    let mut sum = kept.unwrap_or_else(|| vec![0.0; parameter.elem_count()]);
-    add(&mut sum, there);
+    let sum = add(kept);
     SUMS.with_borrow_mut(|sums| {
         if let Some(sums) = sums {
             sums.insert(parameter.id(), sum);

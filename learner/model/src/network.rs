@@ -82,10 +82,9 @@ impl Network {
         kernels: Kernels,
     ) -> Result<Self> {
         config.validate()?;
-        let channels = config.local_shape().2;
-        let head = |exists: bool, name: &str, features: usize| {
+        let head = |exists: bool, name: &str| {
             exists
-                .then(|| Head::new(name, features, parameters, kernels))
+                .then(|| Head::new(name, parameters, kernels))
                 .transpose()
         };
         let action = config
@@ -98,10 +97,10 @@ impl Network {
             torso: Torso::new(config, parameters, kernels)?,
             head: C51Head::new(config, parameters, kernels)?,
             action,
-            psi3: head(config.dim.psi3, "dim.psi3", channels)?,
-            phi3: head(config.dim.phi3, "dim.phi3", channels)?,
-            psi4: head(config.dim.psi4, "dim.psi4", config.hidden)?,
-            phi4: head(config.dim.phi4, "dim.phi4", config.hidden)?,
+            psi3: head(config.dim.psi3, "dim.psi3")?,
+            phi3: head(config.dim.phi3, "dim.phi3")?,
+            psi4: head(config.dim.psi4, "dim.psi4")?,
+            phi4: head(config.dim.phi4, "dim.phi4")?,
         })
     }
 

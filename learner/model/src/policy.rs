@@ -316,7 +316,7 @@ impl<U: Unit> Dense<U> {
             runs: 1,
         };
         self.weight
-            .multiply_rows(unit, count, left, Mode::Add, &mut y);
+            .multiply_rows(unit, count, left, Mode::Add, &mut y, outputs);
         y
     }
 }

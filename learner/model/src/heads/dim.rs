@@ -8,14 +8,13 @@ use candle_core::{D, DType, Tensor};
 use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::kernels::residual::{BlockWeights, residual_block};
+use crate::kernels::residual::{BlockParameters, residual_block};
 use crate::parameters::Parameters;
 
 /// A residual block on features, to which an action's embedding may be joined.
 #[derive(Debug)]
 pub(crate) struct Head {
     block: Block,
-    features: usize,
 }
 
 /// The block's parameters; `out_bias` is the sum of the biases of `out` and, where it has one, `skip`.
@@ -46,72 +45,72 @@ impl Block {
         })
     }
 
-    /// The block on `x` [.., f].
-    fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        self.with_biases(x, &self.hidden_bias, &self.out_bias)
+    /// The block on `x` [.., f], or on [x; joined], with further biases of its outputs.
+    ///
+    /// `joined` [B, e] serves all locations of its row, so its products are biases of one group a row, and the tiled concatenation
+    /// is never built.
+    fn forward(
+        &self,
+        x: &Tensor,
+        joined: Option<&Tensor>,
+        skip_bias: Option<&Tensor>,
+    ) -> Result<Tensor> {
+        let Kernels::Fused(precision) = self.kernels else {
+            return self.of_layers(x, joined, skip_bias);
+        };
+        let out_biases = [Some(&self.out_bias), skip_bias];
+        let parameters = BlockParameters {
+            hidden_weight: self.hidden_weight.clone(),
+            hidden_bias: self.hidden_bias.clone(),
+            out_weight: self.out_weight.clone(),
+            skip_weight: self.skip_weight.clone(),
+            out_biases: out_biases.into_iter().flatten().cloned().collect(),
+        };
+        Ok(residual_block(x, joined, &parameters, precision)?)
     }
 
-    /// The block on x = [features; joined], as W x = W_features features + W_joined joined.
-    ///
-    /// `joined` [B, e] serves all locations of its row, so its products become biases of one group a row, and the tiled
-    /// concatenation is never built.
-    fn forward_joined(&self, features: &Tensor, joined: &Tensor, split: usize) -> Result<Tensor> {
+    /// The same of candle's operations, layer by layer: W [x; joined] = W_x x + W_joined joined.
+    fn of_layers(
+        &self,
+        x: &Tensor,
+        joined: Option<&Tensor>,
+        skip_bias: Option<&Tensor>,
+    ) -> Result<Tensor> {
+        let with = self.kernels;
+        let features = x.dim(D::Minus1)?;
         let bias = |weight: &Tensor, bias: &Tensor| -> Result<Tensor> {
-            let weight = weight.narrow(1, split, weight.dim(1)? - split)?;
-            Ok(self.kernels.linear(joined, &weight, bias)?)
+            let Some(joined) = joined else {
+                return Ok(bias.clone());
+            };
+            let weight = weight.narrow(1, features, weight.dim(1)? - features)?;
+            Ok(with.linear(joined, &weight, bias)?)
+        };
+        let out_bias = match skip_bias {
+            None => self.out_bias.clone(),
+            Some(skip_bias) => (&self.out_bias + skip_bias)?,
         };
         let hidden_bias = bias(&self.hidden_weight, &self.hidden_bias)?;
-        let skip_bias = bias(&self.skip_weight, &self.out_bias)?;
-        self.with_biases(features, &hidden_bias, &skip_bias)
-    }
-
-    /// The block on the first columns of its weights, as many as `x` [.., f] has, with biases of any number of groups.
-    fn with_biases(&self, x: &Tensor, hidden_bias: &Tensor, skip_bias: &Tensor) -> Result<Tensor> {
-        let with = self.kernels;
-        if let Kernels::Fused(precision) = with {
-            let weights = BlockWeights {
-                hidden: self.hidden_weight.clone(),
-                out: self.out_weight.clone(),
-                skip: self.skip_weight.clone(),
-            };
-            return Ok(residual_block(
-                x,
-                hidden_bias,
-                skip_bias,
-                &weights,
-                precision,
-            )?);
-        }
-        let features = x.dim(D::Minus1)?;
+        let skip_bias = bias(&self.skip_weight, &out_bias)?;
         let hidden_weight = self.hidden_weight.narrow(1, 0, features)?;
         let skip_weight = self.skip_weight.narrow(1, 0, features)?;
-        let hidden = with.linear_relu(x, &hidden_weight, hidden_bias)?;
+        let hidden = with.linear_relu(x, &hidden_weight, &hidden_bias)?;
         // The skip's result is the bias of `out`, so nothing is added separately.
-        let skip = with.linear(x, &skip_weight, skip_bias)?;
+        let skip = with.linear(x, &skip_weight, &skip_bias)?;
         Ok(with.linear(&hidden, &self.out_weight, &skip)?)
     }
 }
 
 impl Head {
-    /// The head of this name on features of this width.
-    pub(crate) fn new(
-        name: &str,
-        features: usize,
-        parameters: &Parameters,
-        kernels: Kernels,
-    ) -> Result<Self> {
+    /// The head of this name.
+    pub(crate) fn new(name: &str, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         Ok(Self {
             block: Block::new(name, parameters, kernels)?,
-            features,
         })
     }
 
     /// Vectors [..., rkhs] of `features` [..., f], joined with `action` [B, e] if it is there.
     pub(crate) fn forward(&self, features: &Tensor, action: Option<&Tensor>) -> Result<Tensor> {
-        match action {
-            None => self.block.forward(features),
-            Some(action) => self.block.forward_joined(features, action, self.features),
-        }
+        self.block.forward(features, action, None)
     }
 }
 
@@ -139,9 +138,7 @@ impl ActionEmbedding {
     /// Embeddings [B, e] of `actions` [B], integers below the number of actions; best on the CPU, where they are looked at.
     pub(crate) fn forward(&self, actions: &Tensor) -> Result<Tensor> {
         let one_hot = self.one_hot(actions)?;
-        let block = &self.block;
-        let bias = (&block.out_bias + &self.skip_bias)?;
-        block.with_biases(&one_hot, &block.hidden_bias, &bias)
+        self.block.forward(&one_hot, None, Some(&self.skip_bias))
     }
 
     fn one_hot(&self, actions: &Tensor) -> Result<Tensor> {

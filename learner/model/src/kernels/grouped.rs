@@ -11,10 +11,10 @@ use rayon::prelude::*;
 
 use crate::gradients;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::linear::{cpu, floats};
-use crate::kernels::panels::{Matrix, Threads};
+use crate::kernels::linear::{Biases, cpu, floats};
+use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
-use crate::kernels::product::multiply;
+use crate::kernels::product::Product;
 use crate::kernels::units::Mode;
 
 /// y_r = x_r w_g^T + b_g with g = `groups[r]`, differentiable in all arguments.
@@ -125,25 +125,22 @@ impl Grouped {
         Matrix::new(&w[group * len..][..len], self.out, self.inputs)
     }
 
-    /// Adds the gradient of the weight to `sum`, which holds nothing yet unless it is `there`.
-    fn add_to_weight(&self, sum: &mut [f32], there: bool, grad: &[f32], x: &[f32]) {
-        let mode = if there { Mode::Add } else { Mode::Replace };
-        let mut starts = vec![None; sum.len() / (self.out * self.inputs)];
+    /// Adds the gradient of the weight to `sum`.
+    fn add_to_weight(&self, sum: &mut [f32], grad: &[f32], x: &[f32]) {
+        let mut starts = Vec::new();
         let mut first = 0;
         for &(group, rows) in &self.parts {
-            starts[group] = Some(first..first + rows);
+            starts.resize(group, None);
+            starts.push(Some(first..first + rows));
             first += rows;
         }
         sum.par_chunks_exact_mut(self.out * self.inputs)
             .zip(starts)
-            .for_each(|(sum, rows)| match rows {
-                Some(rows) => {
-                    let grad = Self::rows(grad, &rows, self.out).transposed();
-                    let x = Self::rows(x, &rows, self.inputs);
-                    multiply(self.precision, sum, mode, grad, x, Threads::Pool);
-                }
-                None if !there => sum.fill(0.0),
-                None => {}
+            .for_each(|(sum, rows)| {
+                let Some(rows) = rows else { return };
+                let grad = Self::rows(grad, &rows, self.out).transposed();
+                let x = Self::rows(x, &rows, self.inputs);
+                Product::new(self.precision, grad, x).write(sum, Mode::Add);
             });
     }
 
@@ -179,18 +176,16 @@ impl CustomOp3 for Grouped {
         let (w, b) = (floats(w, w_layout)?, floats(b, b_layout)?);
         let mut y = Buffer::new(self.order.len() * self.out);
         self.for_each_part(&mut y, self.out, |group, rows, y| {
-            for row in y.chunks_exact_mut(self.out) {
-                row.copy_from_slice(&b[group * self.out..][..self.out]);
-            }
+            let biases = Biases {
+                values: &b[group * self.out..][..self.out],
+                outputs: self.out,
+                each: self.order.len(),
+            };
+            let biases = |_: usize, rows: &mut [f32]| biases.write(0, rows);
             let (x, w) = (Self::rows(&x, &rows, self.inputs), self.weight(w, group));
-            multiply(
-                self.precision,
-                y,
-                Mode::Add,
-                x,
-                w.transposed(),
-                Threads::Pool,
-            );
+            Product::new(self.precision, x, w.transposed())
+                .added_to(&biases)
+                .write(y, Mode::Replace);
         });
         *self.sorted.lock().unwrap_or_else(PoisonError::into_inner) = Some(x);
         Ok((
@@ -221,19 +216,12 @@ impl CustomOp3 for Grouped {
             let mut grad_x = Buffer::new(self.order.len() * self.inputs);
             self.for_each_part(&mut grad_x, self.inputs, |group, rows, grad_x| {
                 let (grad, w) = (Self::rows(&grad, &rows, self.out), self.weight(w, group));
-                multiply(
-                    self.precision,
-                    grad_x,
-                    Mode::Replace,
-                    grad,
-                    w,
-                    Threads::Pool,
-                );
+                Product::new(self.precision, grad, w).write(grad_x, Mode::Replace);
             });
             Tensor::from_vec(self.unsort(&grad_x), x.shape(), x.device())
         });
-        let to_weight = |sum: &mut [f32], there| self.add_to_weight(sum, there, &grad, sorted);
-        let to_bias = |sum: &mut [f32], _| self.add_to_bias(sum, &grad);
+        let to_weight = |sum: &mut [f32]| self.add_to_weight(sum, &grad, sorted);
+        let to_bias = |sum: &mut [f32]| self.add_to_bias(sum, &grad);
         Ok((
             grad_x.transpose()?,
             gradient_of(w, to_weight)?,
@@ -243,13 +231,16 @@ impl CustomOp3 for Grouped {
 }
 
 /// The gradient that `add` adds to zeros; none where it is not wanted or went where that of a variable is summed.
-fn gradient_of(parameter: &Tensor, add: impl Fn(&mut [f32], bool)) -> Result<Option<Tensor>> {
-    if !parameter.track_op() || gradients::add_in_place(parameter, &add) {
+fn gradient_of(parameter: &Tensor, add: impl Fn(&mut [f32])) -> Result<Option<Tensor>> {
+    let summed = |sum: Option<Vec<f32>>| {
+        let mut sum = sum.unwrap_or_else(|| vec![0.0; parameter.elem_count()]);
+        add(&mut sum);
+        sum
+    };
+    if !parameter.track_op() || gradients::add_in_place(parameter, summed) {
         return Ok(None);
     }
-    let mut gradient = vec![0.0; parameter.elem_count()];
-    add(&mut gradient, false);
-    Tensor::from_vec(gradient, parameter.shape(), parameter.device()).map(Some)
+    Tensor::from_vec(summed(None), parameter.shape(), parameter.device()).map(Some)
 }
 
 #[cfg(test)]

@@ -11,9 +11,9 @@ use rayon::prelude::*;
 
 use crate::gradients;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::panels::{Matrix, Threads};
+use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
-use crate::kernels::product::multiply;
+use crate::kernels::product::Product;
 use crate::kernels::units::Mode;
 
 /// Rows that one task sums. Fixed, so that sums are taken in the same order whatever the number of threads.
@@ -147,29 +147,33 @@ impl CustomOp3 for Linear {
         let x = floats(x, x_layout)?;
         let w = Matrix::new(floats(w, w_layout)?, self.outputs, self.inputs);
         let b = floats(b, b_layout)?;
-        let mut y = rows_of_biases(b, self.outputs, self.rows / self.groups);
-        let mut multiply = |x: &[f32]| {
-            let (x, w) = (Matrix::new(x, self.rows, self.inputs), w.transposed());
-            multiply(self.precision, &mut y, Mode::Add, x, w, Threads::Pool);
+        let biases = Biases {
+            values: b,
+            outputs: self.outputs,
+            each: self.rows / self.groups,
+        };
+        let biases = |first: usize, rows: &mut [f32]| biases.write(first, rows);
+        let relu = |_: usize, rows: &mut [f32]| relu_in_place(rows);
+        let product = |x| {
+            let x = Matrix::new(x, self.rows, self.inputs);
+            Product::new(self.precision, x, w.transposed())
         };
         let mut dims = x_layout.dims().to_vec();
-        match self.form {
-            Form::Plain => multiply(x),
-            Form::WithRelu => {
-                multiply(x);
-                y.par_chunks_mut(TASK_LEN).for_each(relu_in_place);
-            }
+        let y = match self.form {
+            Form::Plain => product(x).added_to(&biases).to_vec(),
+            Form::WithRelu => product(x).added_to(&biases).then(&relu).to_vec(),
             Form::OfMaps {
                 locations,
                 channels,
             } => {
                 let mut flat = Buffer::new(x.len());
                 transpose_each(x, locations, channels, &mut flat);
-                multiply(&flat);
+                let y = product(&flat).added_to(&biases).to_vec();
                 *self.flat.lock().unwrap_or_else(PoisonError::into_inner) = Some(flat);
                 dims.truncate(2);
+                y
             }
-        }
+        };
         if let Some(last) = dims.last_mut() {
             *last = self.outputs;
         }
@@ -202,22 +206,20 @@ impl CustomOp3 for Linear {
                 self.outputs,
                 self.inputs,
             );
-            let mut grad_x = vec![0.0; self.rows * self.inputs];
-            let multiply = |grad_x: &mut [f32]| {
-                let mode = Mode::Replace;
-                multiply(self.precision, grad_x, mode, grad, w, Threads::Pool);
+            let product = Product::new(self.precision, grad, w);
+            let grad_x = match self.form {
+                Form::Plain | Form::WithRelu => product.to_vec(),
+                Form::OfMaps {
+                    locations,
+                    channels,
+                } => {
+                    let mut grad_flat = Buffer::new(self.rows * self.inputs);
+                    product.write(&mut grad_flat, Mode::Replace);
+                    let mut grad_x = vec![0.0; grad_flat.len()];
+                    transpose_each(&grad_flat, channels, locations, &mut grad_x);
+                    grad_x
+                }
             };
-            if let Form::OfMaps {
-                locations,
-                channels,
-            } = self.form
-            {
-                let mut grad_flat = Buffer::new(grad_x.len());
-                multiply(&mut grad_flat);
-                transpose_each(&grad_flat, channels, locations, &mut grad_x);
-            } else {
-                multiply(&mut grad_x);
-            }
             Tensor::from_vec(grad_x, x.shape(), device)
         });
         let flat = self.flat.lock().unwrap_or_else(PoisonError::into_inner);
@@ -225,42 +227,22 @@ impl CustomOp3 for Linear {
             Some(flat) => flat,
             None => floats(cpu(&x_storage)?, x_layout)?,
         };
-        let add_to_w = |sum: &mut [f32], there: bool| {
-            let mode = if there { Mode::Add } else { Mode::Replace };
-            let x = Matrix::new(x_values, self.rows, self.inputs);
-            multiply(
-                self.precision,
-                sum,
-                mode,
-                grad.transposed(),
-                x,
-                Threads::Pool,
-            );
-        };
-        let grad_w = if !w.track_op() || gradients::add_in_place(w, add_to_w) {
+        let x_values = Matrix::new(x_values, self.rows, self.inputs);
+        let product = Product::new(self.precision, grad.transposed(), x_values);
+        let grad_w = if !w.track_op() || gradients::add_in_place(w, |sum| product.summed(sum)) {
             None
         } else {
-            let mut grad_w = vec![0.0; self.outputs * self.inputs];
-            add_to_w(&mut grad_w, false);
-            Some(Tensor::from_vec(grad_w, w.shape(), device)?)
+            Some(Tensor::from_vec(product.to_vec(), w.shape(), device)?)
         };
-        let add_to_b = |sum: &mut [f32], _: bool| {
-            for (sum, value) in
-                sum.iter_mut()
-                    .zip(group_sums(grad_values, self.groups, self.outputs))
-            {
-                *sum += value;
-            }
-        };
+        let sums = || group_sums(grad_values, self.groups, self.outputs);
         let grad_b = if !b.track_op() {
             None
         } else if self.groups == self.rows {
             Some(grad_y.reshape(b.shape())?)
-        } else if gradients::add_in_place(b, add_to_b) {
+        } else if gradients::add_in_place(b, |sum| add_to(sum, sums())) {
             None
         } else {
-            let sums = group_sums(grad_values, self.groups, self.outputs);
-            Some(Tensor::from_vec(sums, b.shape(), device)?)
+            Some(Tensor::from_vec(sums(), b.shape(), device)?)
         };
         Ok((grad_x.transpose()?, grad_w, grad_b))
     }
@@ -299,15 +281,31 @@ pub(crate) fn group_sums(grads: &[f32], groups: usize, outputs: usize) -> Vec<f3
     add_in_order(parts.collect(), outputs)
 }
 
-/// Rows of `biases` [groups, outputs], each `times` times: what products are added to. Written once, without zeros before them.
-pub(crate) fn rows_of_biases(biases: &[f32], outputs: usize, times: usize) -> Vec<f32> {
-    let mut y = Vec::with_capacity(biases.len() * times);
-    for bias in biases.chunks_exact(outputs) {
-        for _ in 0..times {
-            y.extend_from_slice(bias);
+/// `part` and the sum so far, if there is one.
+pub(crate) fn add_to(sum: Option<Vec<f32>>, part: Vec<f32>) -> Vec<f32> {
+    let Some(mut sum) = sum else { return part };
+    add_rows(&mut sum, &part);
+    sum
+}
+
+/// Biases that products are added to.
+#[derive(Clone, Copy)]
+pub(crate) struct Biases<'a> {
+    /// [groups, outputs]
+    pub(crate) values: &'a [f32],
+    pub(crate) outputs: usize,
+    /// Rows that a group serves.
+    pub(crate) each: usize,
+}
+
+impl Biases<'_> {
+    /// Writes those of the rows from the `first` on.
+    pub(crate) fn write(self, first: usize, rows: &mut [f32]) {
+        for (row, to) in rows.chunks_exact_mut(self.outputs).enumerate() {
+            let group = (first + row) / self.each;
+            to.copy_from_slice(&self.values[group * self.outputs..][..self.outputs]);
         }
     }
-    y
 }
 
 fn add_rows(sum: &mut [f32], rows: &[f32]) {

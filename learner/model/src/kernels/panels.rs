@@ -9,12 +9,14 @@ use crate::kernels::units::{
     Columns, Element, LANES, Left, Mode, Unit, multiply_tile, row_tiles, tile_vecs, vectorized,
 };
 
-/// A matrix laid over a slice: its rows one after the other, or its columns if it is transposed.
+/// A matrix laid over a slice: its rows are runs of it, or its columns if it is transposed.
 #[derive(Clone, Copy)]
 pub(crate) struct Matrix<'a> {
     data: &'a [f32],
     pub(super) rows: usize,
     pub(super) cols: usize,
+    /// Scalars from the start of a run to the next one's.
+    stride: usize,
     transposed: bool,
 }
 
@@ -30,17 +32,42 @@ impl<'a> Matrix<'a> {
             data,
             rows,
             cols,
+            stride: cols,
             transposed: false,
+        }
+    }
+
+    /// Its columns.
+    pub(crate) const fn cols(self) -> usize {
+        self.cols
+    }
+
+    /// Some of the columns, where they are. They serve as a right operand; a left one has its runs one after the other.
+    ///
+    /// # Panics
+    /// If it is transposed, or has not these columns.
+    pub(crate) fn columns(self, columns: std::ops::Range<usize>) -> Self {
+        assert!(
+            !self.transposed && !columns.is_empty() && columns.end <= self.cols,
+            "columns {columns:?} of a {}x{} matrix",
+            self.rows,
+            self.cols
+        );
+        let end = self.rows.saturating_sub(1) * self.stride + columns.end;
+        Self {
+            data: &self.data[columns.start..end],
+            cols: columns.len(),
+            ..self
         }
     }
 
     /// The transposed matrix over the same data.
     pub(crate) fn transposed(self) -> Self {
         Self {
-            data: self.data,
             rows: self.cols,
             cols: self.rows,
             transposed: !self.transposed,
+            ..self
         }
     }
 }
@@ -112,7 +139,7 @@ impl<E: Element> Panels<E> {
         self.multiply_apart(unit, rows, left, mode, out, self.cols);
     }
 
-    /// Multiplies any number of rows of one run into `out`, whose rows are this operand's columns long.
+    /// Multiplies any number of rows of one run into `out`, whose rows begin `stride` scalars apart.
     ///
     /// A block of a panel stays in the first cache while all rows pass it.
     pub(crate) fn multiply_rows<U: Unit<Element = E>>(
@@ -122,6 +149,7 @@ impl<E: Element> Panels<E> {
         left: Left<'_, E>,
         mode: Mode,
         out: &mut [f32],
+        stride: usize,
     ) {
         let width = self.vecs * LANES;
         let panels = self.values.chunks_exact(self.steps * width * E::DEPTH);
@@ -139,8 +167,8 @@ impl<E: Element> Panels<E> {
                         ..left
                     };
                     let columns = Columns {
-                        out: &mut out[row * self.cols + first..],
-                        stride: self.cols,
+                        out: &mut out[row * stride + first..],
+                        stride,
                         cols: width.min(self.cols - first),
                         vecs: self.vecs,
                         mode,
@@ -196,9 +224,9 @@ vectorized! {
         }
         let (cols, depth) = (width.min(b.cols - first), U::Element::DEPTH);
         let steps = panel.chunks_exact_mut(width * depth);
-        for (step, rows) in steps.zip(b.data.chunks(b.cols * depth)) {
+        for (step, rows) in steps.zip(b.data.chunks(b.stride * depth)) {
             let part = |row: usize| {
-                let row = rows.get(row * b.cols..).unwrap_or_default();
+                let row = rows.get(row * b.stride..).unwrap_or_default();
                 row.get(first..first + cols).unwrap_or_default()
             };
             U::Element::join(unit, part(0), part(1), step);
@@ -217,12 +245,12 @@ fn pack_transposed<U: Unit>(
 ) {
     let (k, depth) = (b.rows, U::Element::DEPTH);
     let (steps, cols) = (k.div_ceil(depth), width.min(b.cols - first));
-    let columns = &b.data[first * k..(first + cols) * k];
+    let columns = b.data[first * b.stride..].chunks(b.stride).take(cols);
     for step in (0..steps).step_by(LANES) {
         let run = step * depth..k.min((step + LANES) * depth);
         for col in (0..width).step_by(LANES) {
             let mut block = [[0; LANES]; LANES];
-            let block_columns = columns.chunks_exact(k).skip(col).take(LANES);
+            let block_columns = columns.clone().skip(col).take(LANES);
             for (block, column) in block.iter_mut().zip(block_columns) {
                 U::Element::steps(unit, &column[run.clone()], block);
             }
@@ -253,7 +281,14 @@ enum Operand<'a, E: Element> {
 
 impl<'a, E: Element> Rows<'a, E> {
     /// The rows of `a` [m, k]: where they are if that is possible, else a rounded copy.
+    ///
+    /// # Panics
+    /// If the runs of `a` do not follow each other.
     pub(crate) fn pack<U: Unit<Element = E>>(unit: U, a: Matrix<'a>, threads: Threads) -> Self {
+        assert!(
+            a.data.len() == a.rows * a.cols,
+            "some columns of a matrix as a left operand"
+        );
         let (m, k, depth) = (a.rows, a.cols, E::DEPTH);
         let steps = k.div_ceil(depth);
         let (row_stride, step) = match a.transposed {

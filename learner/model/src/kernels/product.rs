@@ -5,19 +5,234 @@ use rayon::prelude::*;
 
 use crate::kernels::panels::{Matrix, Panels, Rows, Threads};
 use crate::kernels::precision::Precision;
-use crate::kernels::units::{ForUnit, Mode, Unit, with_unit};
+use crate::kernels::units::{Element, ForUnit, Mode, Unit, with_unit};
 
 /// Rows of the output that one task computes. Fixed, so that a product's bits do not depend on the number of threads.
 const TASK_ROWS: usize = 32;
 /// Multiplications below which a product is not split.
 const SPLIT_MIN: usize = 1 << 18;
 
-/// Multiplies `a` [m, k] by `b` [k, n] into `out` [m, n], rows one after the other; operands are rounded to `precision`.
+/// What a task does with its rows of the output: gets the number of the first one, and the rows one after the other.
+pub(crate) type RowsWork<'a> = &'a (dyn Fn(usize, &mut [f32]) + Sync);
+
+/// A product of `a` [m, k] and `b` [k, n], to be computed into rows of n scalars.
 ///
-/// Each entry is summed in the order of k, in f32, whatever the number of threads; it is right to [`Precision::product_error`].
-///
-/// # Panics
-/// If the shapes do not match.
+/// Operands are rounded to `precision`. Each entry is summed in the order of k, in f32, whatever the number of threads; it is right to
+/// [`Precision::product_error`].
+#[derive(Clone, Copy)]
+pub(crate) struct Product<'a> {
+    precision: Precision,
+    a: Matrix<'a>,
+    b: Matrix<'a>,
+    threads: Threads,
+    before: Option<RowsWork<'a>>,
+    after: Option<RowsWork<'a>>,
+}
+
+impl<'a> Product<'a> {
+    /// On the pool.
+    ///
+    /// # Panics
+    /// If the shapes do not match.
+    pub(crate) fn new(precision: Precision, a: Matrix<'a>, b: Matrix<'a>) -> Self {
+        assert!(
+            a.cols == b.rows,
+            "product of {}x{} and {}x{} matrices",
+            a.rows,
+            a.cols,
+            b.rows,
+            b.cols
+        );
+        Self {
+            precision,
+            a,
+            b,
+            threads: Threads::Pool,
+            before: None,
+            after: None,
+        }
+    }
+
+    /// By these threads.
+    pub(crate) fn on(self, threads: Threads) -> Self {
+        Self { threads, ..self }
+    }
+
+    /// Added to what `before` writes: biases, in the cache of the core that multiplies.
+    pub(crate) fn added_to(self, before: RowsWork<'a>) -> Self {
+        let before = Some(before);
+        Self { before, ..self }
+    }
+
+    /// With `after` on each row that is done.
+    pub(crate) fn then(self, after: RowsWork<'a>) -> Self {
+        let after = Some(after);
+        Self { after, ..self }
+    }
+
+    /// Into `out` [m, n].
+    ///
+    /// # Panics
+    /// If `out` has another length.
+    pub(crate) fn write(self, out: &mut [f32], mode: Mode) {
+        assert!(
+            out.len() == self.a.rows * self.b.cols,
+            "a {}x{} product into {} scalars",
+            self.a.rows,
+            self.b.cols,
+            out.len()
+        );
+        self.run(out, self.b.cols, mode);
+    }
+
+    /// Added to columns of `sums` from `first` on, whose rows are `stride` long.
+    ///
+    /// # Panics
+    /// If they do not have these columns, or rows are worked on before or after.
+    pub(crate) fn add_to_columns(self, sums: &mut [f32], stride: usize, first: usize) {
+        let end = first + self.b.cols;
+        assert!(
+            sums.len() == self.a.rows * stride && end <= stride,
+            "a {}x{} product into columns {first}..{end} of {} rows of {stride}",
+            self.a.rows,
+            self.b.cols,
+            sums.len() / stride.max(1)
+        );
+        assert!(
+            self.before.is_none() && self.after.is_none(),
+            "rows have gaps"
+        );
+        let last = sums.len() - stride + end;
+        self.run(&mut sums[first..last], stride, Mode::Add);
+    }
+
+    /// As a vector of its own.
+    pub(crate) fn to_vec(self) -> Vec<f32> {
+        struct Made<'a>(Product<'a>);
+        impl ForUnit for Made<'_> {
+            type Output = Vec<f32>;
+            fn run<U: Unit>(self, unit: U) -> Vec<f32> {
+                let Self(product) = self;
+                let len = product.a.rows * product.b.cols;
+                // Clearing memory takes a core about as long as laying out the operands.
+                let (mut out, operands) =
+                    product.both(|| vec![0.0; len], || Operands::new(unit, product));
+                product.multiply(unit, operands, &mut out, product.b.cols, Mode::Replace);
+                out
+            }
+        }
+        with_unit(self.precision, Made(self))
+    }
+
+    /// Added to `sum` [m, n], if there is one.
+    pub(crate) fn summed(self, sum: Option<Vec<f32>>) -> Vec<f32> {
+        match sum {
+            None => self.to_vec(),
+            Some(mut sum) => {
+                self.write(&mut sum, Mode::Add);
+                sum
+            }
+        }
+    }
+
+    fn run(self, out: &mut [f32], stride: usize, mode: Mode) {
+        struct Into<'a>(Product<'a>, &'a mut [f32], usize, Mode);
+        impl ForUnit for Into<'_> {
+            type Output = ();
+            fn run<U: Unit>(self, unit: U) {
+                let Self(product, out, stride, mode) = self;
+                let operands = Operands::new(unit, product);
+                product.multiply(unit, operands, out, stride, mode);
+            }
+        }
+        with_unit(self.precision, Into(self, out, stride, mode));
+    }
+
+    /// Whether it is split, as it is large enough and may be.
+    fn splits(self) -> bool {
+        self.threads == Threads::Pool && self.a.rows * self.a.cols * self.b.cols >= SPLIT_MIN
+    }
+
+    /// Both at once, if it is split.
+    fn both<A: Send, B: Send>(
+        self,
+        a: impl FnOnce() -> A + Send,
+        b: impl FnOnce() -> B + Send,
+    ) -> (A, B) {
+        match self.splits() {
+            true => rayon::join(a, b),
+            false => (a(), b()),
+        }
+    }
+
+    fn multiply<U: Unit>(
+        self,
+        unit: U,
+        operands: Option<Operands<'a, U::Element>>,
+        out: &mut [f32],
+        stride: usize,
+        mode: Mode,
+    ) {
+        if out.is_empty() {
+            return;
+        }
+        let task = |first: usize, out: &mut [f32]| {
+            let mode = match self.before {
+                None => mode,
+                Some(before) => {
+                    before(first, out);
+                    Mode::Add
+                }
+            };
+            match &operands {
+                Some(Operands { panels, rows }) => {
+                    let count = out.len().div_ceil(stride);
+                    panels.multiply_rows(unit, count, rows.left(first), mode, out, stride);
+                }
+                None if mode == Mode::Replace => out.fill(0.0),
+                None => {}
+            }
+            if let Some(after) = self.after {
+                after(first, out);
+            }
+        };
+        if self.splits() {
+            out.par_chunks_mut(TASK_ROWS * stride)
+                .with_max_len(1)
+                .enumerate()
+                .for_each(|(index, out)| task(index * TASK_ROWS, out));
+        } else {
+            task(0, out);
+        }
+    }
+}
+
+/// A product's operands as a unit reads them.
+struct Operands<'a, E: Element> {
+    panels: Panels<E>,
+    rows: Rows<'a, E>,
+}
+
+impl<'a, E: Element> Operands<'a, E> {
+    /// Those of `product`, if there is anything to sum.
+    fn new<U: Unit<Element = E>>(unit: U, product: Product<'a>) -> Option<Self> {
+        let (a, b) = (product.a, product.b);
+        if a.rows * a.cols * b.cols == 0 {
+            return None;
+        }
+        let threads = match product.splits() {
+            true => Threads::Pool,
+            false => Threads::Caller,
+        };
+        let (panels, rows) = product.both(
+            || Panels::pack(unit, b, threads),
+            || Rows::pack(unit, a, threads),
+        );
+        Some(Self { panels, rows })
+    }
+}
+
+/// [`Product`] into `out`, by `threads`.
 pub(crate) fn multiply(
     precision: Precision,
     out: &mut [f32],
@@ -26,59 +241,7 @@ pub(crate) fn multiply(
     b: Matrix<'_>,
     threads: Threads,
 ) {
-    struct Product<'a>(&'a mut [f32], Mode, Matrix<'a>, Matrix<'a>, Threads);
-    impl ForUnit for Product<'_> {
-        type Output = ();
-        fn run<U: Unit>(self, unit: U) {
-            let Self(out, mode, a, b, threads) = self;
-            multiply_with(unit, out, mode, a, b, threads);
-        }
-    }
-    with_unit(precision, Product(out, mode, a, b, threads));
-}
-
-fn multiply_with<U: Unit>(
-    unit: U,
-    out: &mut [f32],
-    mode: Mode,
-    a: Matrix<'_>,
-    b: Matrix<'_>,
-    threads: Threads,
-) {
-    let (m, k, n) = (a.rows, a.cols, b.cols);
-    assert!(
-        b.rows == k && out.len() == m * n,
-        "product of {m}x{k} and {}x{n} matrices into {} scalars",
-        b.rows,
-        out.len()
-    );
-    if out.is_empty() {
-        return;
-    }
-    if k == 0 {
-        if mode == Mode::Replace {
-            out.fill(0.0);
-        }
-        return;
-    }
-    let threads = if m * k * n >= SPLIT_MIN {
-        threads
-    } else {
-        Threads::Caller
-    };
-    let panels = Panels::pack(unit, b, threads);
-    let rows = Rows::pack(unit, a, threads);
-    let task = |first: usize, out: &mut [f32]| {
-        panels.multiply_rows(unit, out.len() / n, rows.left(first), mode, out);
-    };
-    match threads {
-        Threads::Caller => task(0, out),
-        Threads::Pool => out
-            .par_chunks_mut(TASK_ROWS * n)
-            .with_max_len(1)
-            .enumerate()
-            .for_each(|(index, out)| task(index * TASK_ROWS, out)),
-    }
+    Product::new(precision, a, b).on(threads).write(out, mode);
 }
 
 #[cfg(test)]

@@ -1,167 +1,331 @@
 //! A residual block, out(relu(hidden(x))) + skip(x), as one candle operation with gradients.
 //! It knows no action and no level of features; it runs on the CPU only.
 //!
-//! As three layers, each would hand the other a gradient through candle, which adds every one of them to fresh zeros on a single thread.
+//! As three layers, each would hand the other a gradient through candle, which adds every one of them to fresh zeros on a single thread;
+//! so would the parts of a weight that x and what is joined to it have.
 
 use std::sync::{Mutex, PoisonError};
 
-use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
-use rayon::prelude::*;
+use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
 
 use crate::gradients;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::linear::{
-    cpu, floats, group_sums, relu_gradient, relu_in_place, rows_of_biases,
+    Biases, add_to, cpu, floats, group_sums, relu_gradient, relu_in_place,
 };
-use crate::kernels::panels::{Matrix, Threads};
+use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
-use crate::kernels::product::multiply;
+use crate::kernels::product::Product;
 use crate::kernels::units::Mode;
 
-/// Scalars of an elementwise pass that one task takes.
-const TASK_LEN: usize = 1 << 15;
-
-/// The weights of a block; its operation uses the first columns of `hidden` and `skip`, as many as x has.
+/// The parameters of a block on x, or on x with `joined` behind it.
 #[derive(Clone, Debug)]
-pub(crate) struct BlockWeights {
-    /// [hidden, features and more]
-    pub(crate) hidden: Tensor,
+pub(crate) struct BlockParameters {
+    /// [hidden, features + joined]
+    pub(crate) hidden_weight: Tensor,
+    /// [hidden]
+    pub(crate) hidden_bias: Tensor,
     /// [outputs, hidden]
-    pub(crate) out: Tensor,
-    /// [outputs, features and more]
-    pub(crate) skip: Tensor,
+    pub(crate) out_weight: Tensor,
+    /// [outputs, features + joined]
+    pub(crate) skip_weight: Tensor,
+    /// The biases of `out` and, where it has one, of `skip`, which are added up: [outputs] each.
+    pub(crate) out_biases: Vec<Tensor>,
 }
 
-/// `out(relu(hidden x + hidden_bias)) + skip x + skip_bias`, [..., outputs], of x [..., features].
+/// `out(relu(hidden([x, joined]))) + skip([x, joined])`, [..., outputs], of x [..., features].
 ///
-/// Biases are [groups..., hidden] and [groups..., outputs], as `linear` takes them. Gradients of weights that are variables are
-/// summed in place, so that a backward pass has to be one of [`Backward::of`](crate::Backward::of). Results and gradients have the
-/// same bits whatever the number of threads.
+/// `joined` [groups, joined] serves an equal share of consecutive rows of x, and is never written out for each. Gradients of parameters
+/// that are variables are summed in place, so that a backward pass has to be one of [`Backward::of`](crate::Backward::of); those of
+/// other parameters are not computed. Results and gradients have the same bits whatever the number of threads.
 ///
 /// # Errors
 /// Shapes that do not match, other types; in the backward pass, one that is not `Backward::of`'s.
 pub(crate) fn residual_block(
     x: &Tensor,
-    hidden_bias: &Tensor,
-    skip_bias: &Tensor,
-    weights: &BlockWeights,
+    joined: Option<&Tensor>,
+    parameters: &BlockParameters,
     precision: Precision,
 ) -> Result<Tensor> {
     let features = x.dims().last().copied().unwrap_or(0);
     let rows = x.elem_count() / features.max(1);
-    let (hidden, hidden_inputs) = weights.hidden.dims2()?;
-    let (outputs, out_inputs) = weights.out.dims2()?;
-    let (skip_outputs, skip_inputs) = weights.skip.dims2()?;
-    let groups = |bias: &Tensor, width: usize| {
-        let groups = bias.elem_count() / width;
-        (bias.dims().last() == Some(&width) && groups > 0 && rows.is_multiple_of(groups))
-            .then_some(groups)
+    let (hidden, inputs) = parameters.hidden_weight.dims2()?;
+    let outputs = parameters.out_weight.dims2()?.0;
+    let (groups, joins) = match joined {
+        Some(joined) => joined.dims2()?,
+        None => (1, 0),
     };
-    let (hidden_groups, skip_groups) = (groups(hidden_bias, hidden), groups(skip_bias, outputs));
+    let is_bias = |bias: &Tensor| bias.dims() == [outputs];
     let fits = features > 0
-        && features <= hidden_inputs.min(skip_inputs)
-        && out_inputs == hidden
-        && skip_outputs == outputs;
-    let (true, Some(hidden_groups), Some(skip_groups)) = (fits, hidden_groups, skip_groups) else {
+        && features + joins == inputs
+        && groups > 0
+        && rows.is_multiple_of(groups)
+        && parameters.hidden_bias.dims() == [hidden]
+        && parameters.out_weight.dims() == [outputs, hidden]
+        && parameters.skip_weight.dims() == [outputs, inputs]
+        && parameters.out_biases.iter().all(is_bias);
+    if !fits {
         bail!(
-            "residual block of x {:?} with weights {:?}, {:?}, {:?} and biases {:?}, {:?}",
+            "residual block of x {:?} and {:?} with weights {:?}, {:?}, {:?} and biases {:?}, {:?}",
             x.shape(),
-            weights.hidden.shape(),
-            weights.out.shape(),
-            weights.skip.shape(),
-            hidden_bias.shape(),
-            skip_bias.shape()
+            joined.map(Tensor::shape),
+            parameters.hidden_weight.shape(),
+            parameters.out_weight.shape(),
+            parameters.skip_weight.shape(),
+            parameters.hidden_bias.shape(),
+            parameters.out_biases
         );
-    };
+    }
     let block = Block {
-        weights: weights.clone(),
+        parameters: parameters.clone(),
         rows,
+        groups,
         features,
+        joins,
         hidden,
         outputs,
-        hidden_groups,
-        skip_groups,
         precision,
         saved: Mutex::new(None),
     };
-    x.contiguous()?
-        .apply_op3(&hidden_bias.contiguous()?, &skip_bias.contiguous()?, block)
+    let x = x.contiguous()?;
+    // As an argument a parameter ties the result to the backward pass, whatever x is.
+    let bias = &parameters.hidden_bias;
+    match joined {
+        None => x.apply_op2(bias, block),
+        Some(joined) => x.apply_op3(&joined.contiguous()?, bias, block),
+    }
 }
 
 struct Block {
-    weights: BlockWeights,
+    parameters: BlockParameters,
     rows: usize,
+    /// Rows of what is joined; 1 if nothing is.
+    groups: usize,
     features: usize,
+    /// Columns of what is joined.
+    joins: usize,
     hidden: usize,
     outputs: usize,
-    hidden_groups: usize,
-    skip_groups: usize,
     precision: Precision,
-    /// relu(hidden(x)) [rows, hidden]: what the forward pass leaves to the backward pass.
+    /// relu(hidden([x, joined])) [rows, hidden]: what the forward pass leaves to the backward pass.
     saved: Mutex<Option<Buffer<f32>>>,
 }
 
+/// Gradients of x and of what is joined to it, where they are wanted.
+type Gradients = [Option<Vec<f32>>; 2];
+
 impl Block {
-    /// [m, n] (+)= a b, on the pool.
-    fn multiply(&self, out: &mut [f32], mode: Mode, a: Matrix<'_>, b: Matrix<'_>) {
-        multiply(self.precision, out, mode, a, b, Threads::Pool);
+    /// What `weight` [outputs, features + joined] multiplies x by, and what is joined.
+    fn parts<'a>(&self, weight: &'a [f32]) -> (Matrix<'a>, Option<Matrix<'a>>) {
+        let inputs = self.features + self.joins;
+        let weight = Matrix::new(weight, weight.len() / inputs, inputs);
+        let joined = (self.joins > 0).then(|| weight.columns(self.features..inputs));
+        (weight.columns(0..self.features), joined)
     }
 
-    /// Adds `grad_y`^T `x` to the gradient of `weight`, of which x's are the first columns.
-    fn add_to_weight(
-        &self,
-        weight: &Tensor,
-        grad_y: Matrix<'_>,
-        x: Matrix<'_>,
-        columns: usize,
-    ) -> Result<()> {
-        if !weight.is_variable() {
-            return Ok(());
+    fn product<'a>(&self, a: Matrix<'a>, b: Matrix<'a>) -> Product<'a> {
+        Product::new(self.precision, a, b)
+    }
+
+    /// The biases [groups, outputs] of each row of what is joined: `bias`, and its product with its part of a weight.
+    fn biases(&self, bias: &[f32], joined: Option<(Matrix<'_>, Matrix<'_>)>) -> Buffer<f32> {
+        let mut biases = Buffer::new(self.groups * bias.len());
+        for row in biases.chunks_exact_mut(bias.len()) {
+            row.copy_from_slice(bias);
         }
-        let stride = weight.dims()[1];
-        let done = gradients::add_in_place(weight, |sum, there| {
-            if columns == stride {
-                let mode = if there { Mode::Add } else { Mode::Replace };
-                self.multiply(sum, mode, grad_y.transposed(), x);
-                return;
+        if let Some((joined, weight)) = joined {
+            let product = self.product(joined, weight.transposed());
+            product.write(&mut biases, Mode::Add);
+        }
+        biases
+    }
+
+    /// [rows, outputs] of `x` and `joined`.
+    fn forward(&self, x: &[f32], joined: Option<&[f32]>) -> Result<Vec<f32>> {
+        let parameters = &self.parameters;
+        let each = self.rows / self.groups;
+        let x = Matrix::new(x, self.rows, self.features);
+        let joined = joined.map(|joined| Matrix::new(joined, self.groups, self.joins));
+
+        let (weight, layout) = parameters.hidden_weight.storage_and_layout();
+        let (weight, of_joined) = self.parts(values_of(&weight, layout)?);
+        let (bias, layout) = parameters.hidden_bias.storage_and_layout();
+        let biases = self.biases(values_of(&bias, layout)?, joined.zip(of_joined));
+        let biases = Biases {
+            values: &biases,
+            outputs: self.hidden,
+            each,
+        };
+        let mut hidden = Buffer::new(self.rows * self.hidden);
+        self.product(x, weight.transposed())
+            .added_to(&|first, rows| biases.write(first, rows))
+            .then(&|_, rows| relu_in_place(rows))
+            .write(&mut hidden, Mode::Replace);
+
+        let (weight, layout) = parameters.skip_weight.storage_and_layout();
+        let (weight, of_joined) = self.parts(values_of(&weight, layout)?);
+        let mut bias = vec![0.0; self.outputs];
+        for part in &parameters.out_biases {
+            let (part, layout) = part.storage_and_layout();
+            for (bias, part) in bias.iter_mut().zip(values_of(&part, layout)?) {
+                *bias += part;
             }
-            let mut part = Buffer::new(sum.len() / stride * columns);
-            self.multiply(&mut part, Mode::Replace, grad_y.transposed(), x);
-            sum.par_chunks_mut(stride)
-                .zip(part.par_chunks(columns))
-                .for_each(|(sum, part)| {
-                    for (sum, part) in sum.iter_mut().zip(part) {
-                        *sum += part;
-                    }
-                });
-        });
-        if !done {
-            bail!("the backward pass of a residual block has to be one of Backward::of");
         }
-        Ok(())
+        let biases = self.biases(&bias, joined.zip(of_joined));
+        let biases = Biases {
+            values: &biases,
+            outputs: self.outputs,
+            each,
+        };
+        let mut y = self
+            .product(x, weight.transposed())
+            .added_to(&|first, rows| biases.write(first, rows))
+            .to_vec();
+        let (weight, layout) = parameters.out_weight.storage_and_layout();
+        let weight = Matrix::new(values_of(&weight, layout)?, self.outputs, self.hidden);
+        let active = Matrix::new(&hidden, self.rows, self.hidden);
+        self.product(active, weight.transposed())
+            .write(&mut y, Mode::Add);
+        *self.saved.lock().unwrap_or_else(PoisonError::into_inner) = Some(hidden);
+        Ok(y)
+    }
+
+    /// Gradients of `x` and `joined` for `grad_y`; the parameters' are summed in place.
+    fn backward(&self, x: &Tensor, joined: Option<&Tensor>, grad_y: &Tensor) -> Result<Gradients> {
+        let grad_y = grad_y.detach().contiguous()?;
+        let (grad, layout) = grad_y.storage_and_layout();
+        let grad_values = values_of(&grad, layout)?;
+        let grad = Matrix::new(grad_values, self.rows, self.outputs);
+        let wanted = [Some(x), joined].map(|input| input.is_some_and(Tensor::track_op));
+        let (x, layout) = x.storage_and_layout();
+        let x = Matrix::new(values_of(&x, layout)?, self.rows, self.features);
+        let saved = self.saved.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(hidden) = &*saved else {
+            bail!("the backward pass of a residual block comes after its forward pass");
+        };
+        let parameters = &self.parameters;
+        let active = Matrix::new(hidden, self.rows, self.hidden);
+        let to_out = self.product(grad.transposed(), active);
+        sum_in_place(&parameters.out_weight, |sum| to_out.summed(sum))?;
+
+        let (out, layout) = parameters.out_weight.storage_and_layout();
+        let out = Matrix::new(values_of(&out, layout)?, self.outputs, self.hidden);
+        let mut grad_hidden = Buffer::new(self.rows * self.hidden);
+        let mask = |first: usize, rows: &mut [f32]| {
+            let active = &hidden[first * self.hidden..][..rows.len()];
+            for (grad, &active) in rows.iter_mut().zip(active) {
+                *grad = relu_gradient(active, *grad);
+            }
+        };
+        self.product(grad, out)
+            .then(&mask)
+            .write(&mut grad_hidden, Mode::Replace);
+
+        // Of a group's rows, the gradients of the hidden layer's and of the outputs' biases.
+        let of_groups = |grads: &[f32], width: usize| -> Option<Vec<f32>> {
+            (self.groups < self.rows).then(|| group_sums(grads, self.groups, width))
+        };
+        let hidden_sums = of_groups(&grad_hidden, self.hidden);
+        let hidden_sums = hidden_sums.as_deref().unwrap_or(&grad_hidden);
+        let out_sums = of_groups(grad_values, self.outputs);
+        let out_sums = out_sums.as_deref().unwrap_or(grad_values);
+
+        let joined = joined.map(Tensor::storage_and_layout);
+        let joined = match &joined {
+            None => None,
+            Some((joined, layout)) => Some(values_of(joined, layout)?),
+        };
+        let joined = joined.map(|joined| Matrix::new(joined, self.groups, self.joins));
+        let (hidden_weight, hidden_layout) = parameters.hidden_weight.storage_and_layout();
+        let (skip_weight, skip_layout) = parameters.skip_weight.storage_and_layout();
+        let mut gradients = [None, None];
+        let layers = [
+            (
+                &parameters.skip_weight,
+                values_of(&skip_weight, skip_layout)?,
+                grad,
+                out_sums,
+            ),
+            (
+                &parameters.hidden_weight,
+                values_of(&hidden_weight, hidden_layout)?,
+                Matrix::new(&grad_hidden, self.rows, self.hidden),
+                hidden_sums,
+            ),
+        ];
+        for (weight, values, grad, sums) in layers {
+            let sums = Matrix::new(sums, self.groups, grad.cols());
+            sum_in_place(weight, |sum| {
+                self.of_weight(sum, grad, x, joined.map(|it| (sums, it)))
+            })?;
+            let (of_x, of_joined) = self.parts(values);
+            let parts = [Some((grad, of_x)), of_joined.map(|weight| (sums, weight))];
+            for ((gradient, part), wanted) in gradients.iter_mut().zip(parts).zip(wanted) {
+                if let Some((grad, weight)) = part.filter(|_| wanted) {
+                    *gradient = Some(self.product(grad, weight).summed(gradient.take()));
+                }
+            }
+        }
+        let of_bias = |sums: &[f32], width| group_sums(sums, 1, width);
+        let hidden_bias = of_bias(hidden_sums, self.hidden);
+        sum_in_place(&parameters.hidden_bias, |sum| add_to(sum, hidden_bias))?;
+        let out_bias = of_bias(out_sums, self.outputs);
+        for bias in &parameters.out_biases {
+            sum_in_place(bias, |sum| add_to(sum, out_bias.clone()))?;
+        }
+        Ok(gradients)
+    }
+
+    /// The gradient of a weight, of which x's columns are the first and those of what is joined the others, added to `sum`.
+    fn of_weight(
+        &self,
+        sum: Option<Vec<f32>>,
+        grad: Matrix<'_>,
+        x: Matrix<'_>,
+        joined: Option<(Matrix<'_>, Matrix<'_>)>,
+    ) -> Vec<f32> {
+        let product = self.product(grad.transposed(), x);
+        let Some((sums, joined)) = joined else {
+            return product.summed(sum);
+        };
+        let inputs = self.features + self.joins;
+        let mut sum = sum.unwrap_or_else(|| vec![0.0; grad.cols() * inputs]);
+        product.add_to_columns(&mut sum, inputs, 0);
+        self.product(sums.transposed(), joined)
+            .add_to_columns(&mut sum, inputs, self.features);
+        sum
     }
 }
 
-/// The first `columns` columns of a weight, as rows one after the other.
-fn first_columns(weight: &Tensor, columns: usize) -> Result<Buffer<f32>> {
-    let (rows, stride) = weight.dims2()?;
-    let (storage, layout) = weight.storage_and_layout();
-    let values = floats(cpu(&storage)?, layout)?;
-    let mut part = Buffer::new(rows * columns);
-    for (part, row) in part
-        .chunks_exact_mut(columns)
-        .zip(values.chunks_exact(stride))
-    {
-        part.copy_from_slice(&row[..columns]);
+/// Adds to the gradient of a parameter; of one that is no variable there is none.
+fn sum_in_place(parameter: &Tensor, add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>) -> Result<()> {
+    if parameter.is_variable() && !gradients::add_in_place(parameter, add) {
+        bail!("the backward pass of a residual block has to be one of Backward::of");
     }
-    Ok(part)
+    Ok(())
 }
 
 fn values_of<'a>(storage: &'a Storage, layout: &Layout) -> Result<&'a [f32]> {
     floats(cpu(storage)?, layout)
 }
 
-impl CustomOp3 for Block {
+/// The shape of x with `outputs` in place of its features.
+fn shape_of(x: &Layout, outputs: usize) -> Shape {
+    let mut dims = x.dims().to_vec();
+    if let Some(last) = dims.last_mut() {
+        *last = outputs;
+    }
+    dims.into()
+}
+
+/// `values` as a tensor like `input`.
+fn like(values: Option<Vec<f32>>, input: &Tensor) -> Result<Option<Tensor>> {
+    let tensor = values.map(|values| Tensor::from_vec(values, input.shape(), input.device()));
+    tensor.transpose()
+}
+
+/// Of x and the hidden layer's bias.
+impl CustomOp2 for Block {
     fn name(&self) -> &'static str {
         "residual-block"
     }
@@ -170,110 +334,53 @@ impl CustomOp3 for Block {
         &self,
         x: &CpuStorage,
         x_layout: &Layout,
-        hidden_bias: &CpuStorage,
-        hidden_bias_layout: &Layout,
-        skip_bias: &CpuStorage,
-        skip_bias_layout: &Layout,
+        _hidden_bias: &CpuStorage,
+        _hidden_bias_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let x = Matrix::new(floats(x, x_layout)?, self.rows, self.features);
-        let weight = first_columns(&self.weights.hidden, self.features)?;
-        let weight = Matrix::new(&weight, self.hidden, self.features).transposed();
-        let mut hidden = Buffer::new(self.rows * self.hidden);
-        let each = self.rows / self.hidden_groups;
-        let biases = floats(hidden_bias, hidden_bias_layout)?.chunks_exact(self.hidden);
-        let mut rows = hidden.chunks_exact_mut(self.hidden);
-        for bias in biases {
-            for row in rows.by_ref().take(each) {
-                row.copy_from_slice(bias);
-            }
-        }
-        self.multiply(&mut hidden, Mode::Add, x, weight);
-        hidden.par_chunks_mut(TASK_LEN).for_each(relu_in_place);
-
-        let biases = floats(skip_bias, skip_bias_layout)?;
-        let mut y = rows_of_biases(biases, self.outputs, self.rows / self.skip_groups);
-        let skip = first_columns(&self.weights.skip, self.features)?;
-        let skip = Matrix::new(&skip, self.outputs, self.features).transposed();
-        self.multiply(&mut y, Mode::Add, x, skip);
-        let (out_storage, out_layout) = self.weights.out.storage_and_layout();
-        let out = values_of(&out_storage, out_layout)?;
-        let out = Matrix::new(out, self.outputs, self.hidden).transposed();
-        let active = Matrix::new(&hidden, self.rows, self.hidden);
-        self.multiply(&mut y, Mode::Add, active, out);
-        *self.saved.lock().unwrap_or_else(PoisonError::into_inner) = Some(hidden);
-
-        let mut dims = x_layout.dims().to_vec();
-        if let Some(last) = dims.last_mut() {
-            *last = self.outputs;
-        }
-        Ok((CpuStorage::F32(y), dims.into()))
+        let y = self.forward(floats(x, x_layout)?, None)?;
+        Ok((CpuStorage::F32(y), shape_of(x_layout, self.outputs)))
     }
 
     fn bwd(
         &self,
         x: &Tensor,
-        hidden_bias: &Tensor,
-        skip_bias: &Tensor,
+        _hidden_bias: &Tensor,
+        _y: &Tensor,
+        grad_y: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        let [grad_x, _] = self.backward(x, None, grad_y)?;
+        Ok((like(grad_x, x)?, None))
+    }
+}
+
+/// Of x, what is joined to it, and the hidden layer's bias.
+impl CustomOp3 for Block {
+    fn name(&self) -> &'static str {
+        "residual-block-of-joined"
+    }
+
+    fn cpu_fwd(
+        &self,
+        x: &CpuStorage,
+        x_layout: &Layout,
+        joined: &CpuStorage,
+        joined_layout: &Layout,
+        _hidden_bias: &CpuStorage,
+        _hidden_bias_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let y = self.forward(floats(x, x_layout)?, Some(floats(joined, joined_layout)?))?;
+        Ok((CpuStorage::F32(y), shape_of(x_layout, self.outputs)))
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        joined: &Tensor,
+        _hidden_bias: &Tensor,
         _y: &Tensor,
         grad_y: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let grad_y = grad_y.detach().contiguous()?;
-        let (grad_storage, grad_layout) = grad_y.storage_and_layout();
-        let grad_values = values_of(&grad_storage, grad_layout)?;
-        let grad = Matrix::new(grad_values, self.rows, self.outputs);
-        let (x_storage, x_layout) = x.storage_and_layout();
-        let x_matrix = Matrix::new(values_of(&x_storage, x_layout)?, self.rows, self.features);
-        let saved = self.saved.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(hidden) = &*saved else {
-            bail!("the backward pass of a residual block comes after its forward pass");
-        };
-        let active = Matrix::new(hidden, self.rows, self.hidden);
-
-        self.add_to_weight(&self.weights.out, grad, active, self.hidden)?;
-        self.add_to_weight(&self.weights.skip, grad, x_matrix, self.features)?;
-
-        let mut grad_hidden = Buffer::new(self.rows * self.hidden);
-        let (out_storage, out_layout) = self.weights.out.storage_and_layout();
-        let out = Matrix::new(
-            values_of(&out_storage, out_layout)?,
-            self.outputs,
-            self.hidden,
-        );
-        self.multiply(&mut grad_hidden, Mode::Replace, grad, out);
-        grad_hidden
-            .par_chunks_mut(TASK_LEN)
-            .zip(hidden.par_chunks(TASK_LEN))
-            .for_each(|(grads, hidden)| {
-                for (grad, &hidden) in grads.iter_mut().zip(hidden) {
-                    *grad = relu_gradient(hidden, *grad);
-                }
-            });
-        let grad_matrix = Matrix::new(&grad_hidden, self.rows, self.hidden);
-        self.add_to_weight(&self.weights.hidden, grad_matrix, x_matrix, self.features)?;
-
-        let device = x.device();
-        let grad_x = if x.track_op() {
-            let mut grad_x = vec![0.0; self.rows * self.features];
-            let skip = first_columns(&self.weights.skip, self.features)?;
-            let skip = Matrix::new(&skip, self.outputs, self.features);
-            self.multiply(&mut grad_x, Mode::Replace, grad, skip);
-            let weight = first_columns(&self.weights.hidden, self.features)?;
-            let weight = Matrix::new(&weight, self.hidden, self.features);
-            self.multiply(&mut grad_x, Mode::Add, grad_matrix, weight);
-            Some(Tensor::from_vec(grad_x, x.shape(), device)?)
-        } else {
-            None
-        };
-        let bias = |bias: &Tensor, grads: &[f32], groups: usize, width: usize| {
-            bias.track_op()
-                .then(|| {
-                    let sums = group_sums(grads, groups, width);
-                    Tensor::from_vec(sums, bias.shape(), device)
-                })
-                .transpose()
-        };
-        let hidden_grad = bias(hidden_bias, &grad_hidden, self.hidden_groups, self.hidden)?;
-        let skip_grad = bias(skip_bias, grad_values, self.skip_groups, self.outputs)?;
-        Ok((grad_x, hidden_grad, skip_grad))
+        let [grad_x, grad_joined] = self.backward(x, Some(joined), grad_y)?;
+        Ok((like(grad_x, x)?, like(grad_joined, joined)?, None))
     }
 }

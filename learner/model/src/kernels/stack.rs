@@ -1,5 +1,7 @@
 //! A stack of convolutions over one task's images, forward and backward, on slices.
-//! It knows neither tensors nor threads; `conv` splits the batch and `convolution` computes each layer.
+//! It knows no tensors; `conv` splits the batch and `convolution` computes each layer.
+
+use rayon::prelude::*;
 
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
@@ -24,15 +26,20 @@ pub(crate) fn layers<U: Unit>(
     backward: bool,
     images: bool,
 ) -> Vec<Convolution<U::Element>> {
-    let mut layers = Vec::with_capacity(shapes.len());
-    for (index, &shape) in shapes.iter().enumerate() {
-        let (weight, rest) = parameters.split_at(shape.weight_len());
-        let (bias, rest) = rest.split_at(shape.channels_out);
-        let backward = backward && (index > 0 || images);
-        layers.push(Convolution::new(unit, shape, weight, bias, backward));
+    let mut of_layers = Vec::with_capacity(shapes.len());
+    for shape in shapes {
+        let (own, rest) = parameters.split_at(shape.parameters_len());
+        of_layers.push((shape, own));
         parameters = rest;
     }
-    layers
+    // On the pool, which all wait for.
+    let layers = of_layers.into_par_iter().enumerate();
+    let layers = layers.map(|(index, (&shape, own))| {
+        let (weight, bias) = own.split_at(shape.weight_len());
+        let backward = backward && (index > 0 || images);
+        Convolution::new(unit, shape, weight, bias, backward)
+    });
+    layers.with_max_len(1).collect()
 }
 
 /// Gradients as `stack_backward` sums them, with the weights back as [out, in, k, k].
