@@ -98,7 +98,7 @@ fn learner(criterion: &mut Criterion) {
             });
         });
         group.bench_function("psi3 forward and backward", |bencher| {
-            let f3 = network.features(&frames).unwrap().f3.detach();
+            let f3 = network.features(&frames).unwrap().local().unwrap().detach();
             bencher.iter(|| {
                 network
                     .psi3(&f3, &actions)

@@ -42,7 +42,7 @@ impl Encoder {
     /// # Errors
     /// Frames of another type or size.
     pub fn encode(&self, frames: &Tensor) -> Result<Tensor> {
-        let (_, f4) = self.torso.features(frames)?;
+        let (_, f4) = self.torso.features(frames, false)?;
         Ok(self.psi4.forward(&f4.detach(), None)?.detach())
     }
 }

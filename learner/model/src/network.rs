@@ -16,20 +16,29 @@ use crate::torso::Torso;
 /// What the torso makes of a batch of frames.
 #[derive(Clone, Debug)]
 pub struct Features {
-    /// The last convolution's output after ReLU, [B, h, w, c], channels last.
-    pub f3: Tensor,
+    /// The last convolution's output after ReLU, [B, h, w, c], channels last; there if the network has a head that reads it.
+    pub f3: Option<Tensor>,
     /// The fully connected layer's output before its ReLU, [B, hidden].
     pub f4: Tensor,
 }
 
 impl Features {
+    /// f3.
+    ///
+    /// # Errors
+    /// The network that made them has no head that reads it.
+    pub fn local(&self) -> Result<&Tensor> {
+        self.f3.as_ref().ok_or(ModelError::NoHead("psi3 or phi3"))
+    }
+
     /// Those of `rows` rows from `first` on.
     ///
     /// # Errors
     /// There are fewer rows than that.
     pub fn narrow(&self, first: usize, rows: usize) -> candle_core::Result<Self> {
+        let narrowed = |f3: &Tensor| f3.narrow(0, first, rows);
         Ok(Self {
-            f3: self.f3.narrow(0, first, rows)?,
+            f3: self.f3.as_ref().map(narrowed).transpose()?,
             f4: self.f4.narrow(0, first, rows)?,
         })
     }
@@ -39,8 +48,9 @@ impl Features {
     /// # Errors
     /// A row that is not there.
     pub fn select(&self, rows: &[u32]) -> candle_core::Result<Self> {
+        let selected = |f3: &Tensor| select_rows(f3, rows);
         Ok(Self {
-            f3: select_rows(&self.f3, rows)?,
+            f3: self.f3.as_ref().map(selected).transpose()?,
             f4: select_rows(&self.f4, rows)?,
         })
     }
@@ -109,12 +119,13 @@ impl Network {
         self.kernels
     }
 
-    /// f3 and f4 of `frames` [B, H, W, C] u8, which are scaled by 1/255.
+    /// f4, and f3 if a head reads it, of `frames` [B, H, W, C] u8, which are scaled by 1/255.
     ///
     /// # Errors
     /// Frames of another type or size.
     pub fn features(&self, frames: &Tensor) -> Result<Features> {
-        let (f3, f4) = self.torso.features(frames)?;
+        let local = self.psi3.is_some() || self.phi3.is_some();
+        let (f3, f4) = self.torso.features(frames, local)?;
         Ok(Features { f3, f4 })
     }
 

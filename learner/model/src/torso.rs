@@ -6,6 +6,7 @@ use candle_core::{DType, Tensor};
 use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
+use crate::kernels::torso::torso;
 use crate::parameters::Parameters;
 
 #[derive(Debug)]
@@ -42,8 +43,13 @@ impl Torso {
         })
     }
 
-    /// f3 [B, h, w, c] after ReLU and f4 [B, hidden] before it, of `frames` [B, H, W, C] u8, which are scaled by 1/255.
-    pub(crate) fn features(&self, frames: &Tensor) -> Result<(Tensor, Tensor)> {
+    /// f4 [B, hidden] before its ReLU, of `frames` [B, H, W, C] u8, which are scaled by 1/255; and f3 [B, h, w, c] after its ReLU, if
+    /// `local` features are wanted.
+    pub(crate) fn features(
+        &self,
+        frames: &Tensor,
+        local: bool,
+    ) -> Result<(Option<Tensor>, Tensor)> {
         if frames.dtype() != DType::U8 || frames.dims().get(1..) != Some(&self.input[..]) {
             let (dtype, shape, input) = (frames.dtype(), frames.shape(), self.input);
             return Err(ModelError::Input(format!(
@@ -55,10 +61,16 @@ impl Torso {
             .iter()
             .map(|(weight, bias, stride)| (weight, bias, *stride))
             .collect();
-        let maps = self.kernels.conv_stack(frames, &layers)?;
-        let f4 = self
-            .kernels
-            .linear_of_maps(&maps, &self.fc_weight, &self.fc_bias)?;
-        Ok((maps, f4))
+        let (weight, bias) = (&self.fc_weight, &self.fc_bias);
+        match self.kernels {
+            Kernels::Fused(precision) if !local => {
+                Ok((None, torso(frames, &layers, weight, bias, precision)?))
+            }
+            with => {
+                let maps = with.conv_stack(frames, &layers)?;
+                let f4 = with.linear_of_maps(&maps, weight, bias)?;
+                Ok((local.then_some(maps), f4))
+            }
+        }
     }
 }

@@ -175,9 +175,11 @@ impl Vectors {
         Ok(Self {
             kernels: network.kernels(),
             psi3: when(local_local || local_global, || {
-                network.psi3(&features_t.f3, action)
+                network.psi3(features_t.local()?, action)
             })?,
-            phi3: when(local_local || global_local, || network.phi3(&features_k.f3))?,
+            phi3: when(local_local || global_local, || {
+                network.phi3(features_k.local()?)
+            })?,
             psi4: when(global_local || global_global, || {
                 network.psi4(&features_t.f4, action)
             })?,

@@ -227,7 +227,7 @@ impl Scorer<'_> {
     fn loss(&self, now: &[u8], next: &[u8]) -> anyhow::Result<Tensor> {
         let features_t = self.network.features(&self.tensor(now)?)?;
         let features_k = self.network.features(&self.tensor(next)?)?;
-        let rows = features_t.f3.dim(0)?;
+        let rows = features_t.f4.dim(0)?;
         let action = Tensor::zeros(rows, DType::U8, &Device::Cpu)?;
         let valid = vec![1; rows];
         let losses =
@@ -241,7 +241,7 @@ impl Scorer<'_> {
     fn scores(&self, now: &[u8], next: &[u8]) -> anyhow::Result<Vec<f64>> {
         let features_t = self.network.features(&self.tensor(now)?)?;
         let features_k = self.network.features(&self.tensor(next)?)?;
-        let action = Tensor::zeros(features_t.f3.dim(0)?, DType::U8, &Device::Cpu)?;
+        let action = Tensor::zeros(features_t.f4.dim(0)?, DType::U8, &Device::Cpu)?;
         let wanted = [true, false, false, false];
         let [local, ..] = dots(self.network, &features_t, &features_k, &action, wanted)?;
         let local = local.expect("the first pair is wanted");

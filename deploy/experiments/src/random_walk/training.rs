@@ -199,7 +199,7 @@ impl Heads {
             one_hot[row * self.states + state] = 1.0;
         }
         Ok(Features {
-            f3: Tensor::zeros((rows, 1, 1, 1), candle_core::DType::F32, &Device::Cpu)?,
+            f3: None,
             f4: Tensor::from_vec(one_hot, (rows, self.states), &Device::Cpu)?,
         })
     }

@@ -11,8 +11,10 @@ use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result, Shape, Tensor, b
 use rayon::prelude::*;
 
 use crate::geometry::{ConvLayer, ConvShape};
+use crate::kernels::buffer::Buffer;
+use crate::kernels::candle::ConvLayerTensors;
 use crate::kernels::images::Pixels;
-use crate::kernels::linear::{add_in_order, cpu, floats};
+use crate::kernels::linear::{add_in_order, cpu, floats, transpose};
 use crate::kernels::precision::Precision;
 use crate::kernels::stack::{
     SavedActivations, layers, parameters_len, stack_backward, stack_forward, unpacked,
@@ -48,9 +50,23 @@ pub fn conv2d_relu(
 /// No layer, shapes that do not match, a kernel that is not square or larger than its input, a stride of 0, other types.
 pub fn conv_stack(
     images: &Tensor,
-    layers: &[(&Tensor, &Tensor, usize)],
+    layers: &[ConvLayerTensors<'_>],
     precision: Precision,
 ) -> Result<Tensor> {
+    let (shapes, parameters) = stack_of(images, layers)?;
+    let stack = Apply {
+        images: &images.contiguous()?,
+        parameters: &parameters,
+        shapes,
+    };
+    with_unit(precision, stack)
+}
+
+/// The shapes of `layers` on `images`, and their parameters, which are small, as one vector: an operation has at most three arguments.
+pub(crate) fn stack_of(
+    images: &Tensor,
+    layers: &[ConvLayerTensors<'_>],
+) -> Result<(Vec<ConvShape>, Tensor)> {
     let (_, height, width, channels) = images.dims4()?;
     if layers.is_empty() {
         bail!("a stack of no convolutions");
@@ -77,14 +93,7 @@ pub fn conv_stack(
         shapes.push(shape);
         parameters.extend([weight.flatten_all()?, bias.clone()]);
     }
-    // An operation has at most three arguments, so the parameters, which are small, travel as one vector.
-    let parameters = Tensor::cat(&parameters, 0)?;
-    let stack = Apply {
-        images: &images.contiguous()?,
-        parameters: &parameters,
-        shapes,
-    };
-    with_unit(precision, stack)
+    Ok((shapes, Tensor::cat(&parameters, 0)?))
 }
 
 struct Apply<'a> {
@@ -97,16 +106,13 @@ impl ForUnit for Apply<'_> {
     type Output = Result<Tensor>;
 
     fn run<U: Unit>(self, unit: U) -> Result<Tensor> {
-        let stack = ConvStack {
-            unit,
-            shapes: self.shapes,
-            saved: Mutex::default(),
-        };
+        let stack = ConvStack::new(unit, self.shapes);
         self.images.apply_op2(self.parameters, stack)
     }
 }
 
-struct ConvStack<U: Unit> {
+/// Convolutions of one pass, forward and then backward, on slices.
+pub(crate) struct ConvStack<U: Unit> {
     unit: U,
     shapes: Vec<ConvShape>,
     /// Of each task, the maps of all layers but the last: what the forward pass leaves to the backward pass.
@@ -114,12 +120,26 @@ struct ConvStack<U: Unit> {
 }
 
 impl<U: Unit> ConvStack<U> {
+    /// One that has not passed anything yet; `shapes` has a layer at least.
+    pub(crate) fn new(unit: U, shapes: Vec<ConvShape>) -> Self {
+        Self {
+            unit,
+            shapes,
+            saved: Mutex::default(),
+        }
+    }
+
     fn first(&self) -> &ConvShape {
         &self.shapes[0]
     }
 
-    fn last(&self) -> &ConvShape {
+    pub(crate) fn last(&self) -> &ConvShape {
         &self.shapes[self.shapes.len() - 1]
+    }
+
+    /// How many images these are.
+    pub(crate) fn count(&self, images: Pixels<'_>) -> usize {
+        images.len() / self.first().image_len()
     }
 
     /// The images of the task with this index.
@@ -127,6 +147,110 @@ impl<U: Unit> ConvStack<U> {
         let task_len = TASK_IMAGES * self.first().image_len();
         images.slice(task * task_len..images.len().min((task + 1) * task_len))
     }
+
+    /// Computes `maps` of `images`, and has `then` work on each task's, with as much of `room`, while they are in the cache.
+    pub(crate) fn forward(
+        &self,
+        images: Pixels<'_>,
+        parameters: &[f32],
+        maps: &mut [f32],
+        room: &mut [f32],
+        then: &(dyn Fn(&[f32], &mut [f32]) + Sync),
+    ) {
+        let layers = layers(self.unit, &self.shapes, parameters, false, false);
+        let task_len = TASK_IMAGES * self.last().map_len();
+        let mut rooms = room.chunks_mut(task_len);
+        let tasks: Vec<_> = maps
+            .chunks_mut(task_len)
+            .map(|maps| (maps, rooms.next().unwrap_or_default()))
+            .collect();
+        let saved = tasks
+            .into_par_iter()
+            .enumerate()
+            .with_max_len(1)
+            .map(|(task, (maps, room))| {
+                let saved = stack_forward(self.unit, &layers, self.task_images(images, task), maps);
+                then(maps, room);
+                saved
+            })
+            .collect();
+        *self.saved.lock().unwrap_or_else(PoisonError::into_inner) = saved;
+    }
+
+    /// The gradient of the parameters for `grad_maps` in this layout, where `maps` are the pass's; the images' is written into
+    /// `grad_images`, which is as long as they or empty.
+    pub(crate) fn backward(
+        &self,
+        images: Pixels<'_>,
+        parameters: &[f32],
+        maps: &[f32],
+        grad_maps: &[f32],
+        layout: GradLayout,
+        grad_images: &mut [f32],
+    ) -> Vec<f32> {
+        let wanted = !grad_images.is_empty();
+        let layers = layers(self.unit, &self.shapes, parameters, true, wanted);
+        let saved = self.saved.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut grad_parts = grad_images.chunks_mut(TASK_IMAGES * self.first().image_len());
+        let grad_parts: Vec<Option<&mut [f32]>> = saved.iter().map(|_| grad_parts.next()).collect();
+        let task_len = TASK_IMAGES * self.last().map_len();
+        let sums = maps
+            .par_chunks(task_len)
+            .zip(grad_maps.par_chunks(task_len))
+            .zip(saved.par_iter())
+            .zip(grad_parts)
+            .enumerate()
+            .with_max_len(1)
+            .map(|(task, (((maps, grad_maps), saved), grad_images))| {
+                let images = self.task_images(images, task);
+                let turned;
+                let grad_maps = match layout {
+                    GradLayout::Maps => grad_maps,
+                    GradLayout::Flat => {
+                        turned = self.maps_of_flat(grad_maps);
+                        &turned
+                    }
+                };
+                stack_backward(
+                    self.unit,
+                    &layers,
+                    images,
+                    saved,
+                    maps,
+                    grad_maps,
+                    grad_images,
+                )
+            });
+        let sum = add_in_order(sums.collect(), parameters_len(&self.shapes));
+        unpacked(&self.shapes, &sum)
+    }
+
+    /// `maps` [n, locations, channels] as `flat` [n, channels, locations], the order of PyTorch's weights.
+    pub(crate) fn flatten(&self, maps: &[f32], flat: &mut [f32]) {
+        let (last, len) = (self.last(), self.last().map_len());
+        for (maps, flat) in maps.chunks_exact(len).zip(flat.chunks_exact_mut(len)) {
+            transpose(maps, last.locations(), last.channels_out, flat);
+        }
+    }
+
+    /// The inverse of [`ConvStack::flatten`].
+    fn maps_of_flat(&self, flat: &[f32]) -> Buffer<f32> {
+        let (last, len) = (self.last(), self.last().map_len());
+        let mut maps = Buffer::new(flat.len());
+        for (maps, flat) in maps.chunks_exact_mut(len).zip(flat.chunks_exact(len)) {
+            transpose(flat, last.channels_out, last.locations(), maps);
+        }
+        maps
+    }
+}
+
+/// The order in which gradients of maps are.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum GradLayout {
+    /// [n, locations, channels], as maps are.
+    Maps,
+    /// [n, channels, locations], as they are flattened.
+    Flat,
 }
 
 impl<U: Unit> CustomOp2 for ConvStack<U> {
@@ -143,20 +267,9 @@ impl<U: Unit> CustomOp2 for ConvStack<U> {
     ) -> Result<(CpuStorage, Shape)> {
         let images = pixels(images, images_layout)?;
         let parameters = floats(parameters, parameters_layout)?;
-        let layers = layers(self.unit, &self.shapes, parameters, false, false);
-        let last = self.last();
-        let batch = images.len() / self.first().image_len();
+        let (last, batch) = (self.last(), self.count(images));
         let mut maps = vec![0.0; batch * last.map_len()];
-        let tasks = maps
-            .par_chunks_mut(TASK_IMAGES * last.map_len())
-            .enumerate();
-        let saved = tasks
-            .with_max_len(1)
-            .map(|(task, maps)| {
-                stack_forward(self.unit, &layers, self.task_images(images, task), maps)
-            })
-            .collect();
-        *self.saved.lock().unwrap_or_else(PoisonError::into_inner) = saved;
+        self.forward(images, parameters, &mut maps, &mut [], &|_, _| {});
         let dims = (
             batch,
             last.out_height(),
@@ -181,53 +294,25 @@ impl<U: Unit> CustomOp2 for ConvStack<U> {
         let (maps_storage, maps_layout) = maps.storage_and_layout();
         let (grad_storage, grad_layout) = grad_maps.storage_and_layout();
         let image_values = pixels(cpu(&images_storage)?, images_layout)?;
-        let parameter_values = floats(cpu(&parameters_storage)?, parameters_layout)?;
-        let layers = layers(
-            self.unit,
-            &self.shapes,
-            parameter_values,
-            true,
-            needs_images,
-        );
-        let map_values = floats(cpu(&maps_storage)?, maps_layout)?;
-        let grad_values = floats(cpu(&grad_storage)?, grad_layout)?;
-        let saved = self.saved.lock().unwrap_or_else(PoisonError::into_inner);
-
         let mut grad_images = vec![0.0f32; if needs_images { image_values.len() } else { 0 }];
-        let mut grad_parts = grad_images.chunks_mut(TASK_IMAGES * self.first().image_len());
-        let grad_parts: Vec<Option<&mut [f32]>> = saved.iter().map(|_| grad_parts.next()).collect();
-        let task_len = TASK_IMAGES * self.last().map_len();
-        let sums = map_values
-            .par_chunks(task_len)
-            .zip(grad_values.par_chunks(task_len))
-            .zip(saved.par_iter())
-            .zip(grad_parts)
-            .enumerate()
-            .with_max_len(1)
-            .map(|(task, (((maps, grad_maps), saved), grad_images))| {
-                let images = self.task_images(image_values, task);
-                stack_backward(
-                    self.unit,
-                    &layers,
-                    images,
-                    saved,
-                    maps,
-                    grad_maps,
-                    grad_images,
-                )
-            });
-        let sum = add_in_order(sums.collect(), parameters_len(&self.shapes));
-
+        let grad_parameters = self.backward(
+            image_values,
+            floats(cpu(&parameters_storage)?, parameters_layout)?,
+            floats(cpu(&maps_storage)?, maps_layout)?,
+            floats(cpu(&grad_storage)?, grad_layout)?,
+            GradLayout::Maps,
+            &mut grad_images,
+        );
         let device = parameters.device();
-        let grad_parameters =
-            Tensor::from_vec(unpacked(&self.shapes, &sum), parameters.shape(), device)?;
+        let grad_parameters = Tensor::from_vec(grad_parameters, parameters.shape(), device)?;
         let grad_images =
             needs_images.then(|| Tensor::from_vec(grad_images, images.shape(), device));
         Ok((grad_images.transpose()?, Some(grad_parameters)))
     }
 }
 
-fn pixels<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<Pixels<'a>> {
+/// The scalars of contiguous images.
+pub(crate) fn pixels<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<Pixels<'a>> {
     match storage {
         CpuStorage::U8(bytes) => match layout.contiguous_offsets() {
             Some((start, end)) => Ok(Pixels::Bytes(&bytes[start..end])),

@@ -1,7 +1,7 @@
 //! Images and maps as convolutions take them: as they are stored, and one by one as operands of products.
 
 use crate::kernels::buffer::Buffer;
-use crate::kernels::rounding::{pair_neighbours, store, store_bytes, store_steps_of_bytes};
+use crate::kernels::rounding::{store, store_bytes, store_steps_of, store_steps_of_bytes};
 use crate::kernels::units::{Element, Unit};
 
 /// Images [n, height, width, channels_in], as they are stored.
@@ -93,7 +93,7 @@ impl<E: Element> Images<'_, E> {
             return image;
         }
         let steps = room.of(len * E::DEPTH);
-        pair_neighbours(unit, image, shift, steps);
+        store_steps_of(unit, image, shift, steps);
         steps
     }
 }

@@ -255,13 +255,16 @@ fn transpose_each(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) 
         .par_chunks_mut(len)
         .zip(values.par_chunks(len))
         .with_min_len(16)
-        .for_each(|(result, values)| {
-            for (col, result) in result.chunks_exact_mut(rows).enumerate() {
-                for (to, &value) in result.iter_mut().zip(values[col..].iter().step_by(cols)) {
-                    *to = value;
-                }
-            }
-        });
+        .for_each(|(result, values)| transpose(values, rows, cols, result));
+}
+
+/// Transposes an image [rows, cols].
+pub(crate) fn transpose(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) {
+    for (col, result) in result.chunks_exact_mut(rows).enumerate() {
+        for (to, &value) in result.iter_mut().zip(values[col..].iter().step_by(cols)) {
+            *to = value;
+        }
+    }
 }
 
 /// Sums of each group's rows: `grads` [rows, outputs] to [groups, outputs].

@@ -1,6 +1,6 @@
 //! What the network is computed with: this project's kernels for the CPU, and the same from candle's operations for the rest.
 //!
-//! From the outside in: [`conv`], [`linear`], [`grouped`], [`residual`], [`dots`] and [`rows`] are candle operations with gradients, which split their work over the rayon pool.
+//! From the outside in: [`torso`], [`conv`], [`linear`], [`grouped`], [`residual`], [`dots`] and [`rows`] are candle operations with gradients, which split their work over the rayon pool.
 //! [`stack`] takes a task's images through all convolutions, [`convolution`] computes one of them, [`product`] a matrix product, both on
 //! operands of [`panels`] and in tiles for a [`units`] unit, an instruction set with the type that it multiplies; all unsafe code of the crate is there.
 //! [`rounding`] makes operands, [`exponentials`] what losses are made of, [`buffer`] keeps memory, [`precision`] is the setting. [`candle`] needs none of them.
@@ -21,4 +21,5 @@ pub(crate) mod residual;
 pub(crate) mod rounding;
 pub(crate) mod rows;
 pub(crate) mod stack;
+pub(crate) mod torso;
 pub(crate) mod units;

@@ -298,14 +298,21 @@ impl Block {
 }
 
 /// Adds to the gradient of a parameter; of one that is no variable there is none.
-fn sum_in_place(parameter: &Tensor, add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>) -> Result<()> {
+///
+/// # Errors
+/// A backward pass that is not one of [`Backward::of`](crate::Backward::of).
+pub(crate) fn sum_in_place(
+    parameter: &Tensor,
+    add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>,
+) -> Result<()> {
     if parameter.is_variable() && !gradients::add_in_place(parameter, add) {
-        bail!("the backward pass of a residual block has to be one of Backward::of");
+        bail!("a backward pass through these layers has to be one of Backward::of");
     }
     Ok(())
 }
 
-fn values_of<'a>(storage: &'a Storage, layout: &Layout) -> Result<&'a [f32]> {
+/// The scalars behind a tensor on the CPU.
+pub(crate) fn values_of<'a>(storage: &'a Storage, layout: &Layout) -> Result<&'a [f32]> {
     floats(cpu(storage)?, layout)
 }
 

@@ -5,9 +5,7 @@ use crate::kernels::units::{Element, vectorized};
 vectorized! {
     /// Stores pixels in the first of `values`.
     pub(crate) fn store_bytes<U>(unit, bytes: &'a [u8], values: &'a mut [U::Element]) {
-        for (value, &byte) in values.iter_mut().zip(bytes) {
-            *value = U::Element::of_byte(byte);
-        }
+        U::Element::store_bytes(unit, bytes, values);
     }
 }
 
@@ -19,7 +17,7 @@ vectorized! {
         shift: usize,
         steps: &'a mut [U::Element],
     ) {
-        U::Element::steps_of_bytes(bytes, shift, steps);
+        U::Element::steps_of_bytes(unit, bytes, shift, steps);
     }
 }
 
@@ -43,21 +41,13 @@ vectorized! {
 }
 
 vectorized! {
-    /// Pairs every scalar with the one `shift` further, or with 0 where the image ends before.
-    pub(crate) fn pair_neighbours<U>(
+    /// Elements as operands of a sum over windows, as [`Element::steps_of`].
+    pub(crate) fn store_steps_of<U>(
         unit,
         values: &'a [U::Element],
         shift: usize,
-        pairs: &'a mut [U::Element],
+        steps: &'a mut [U::Element],
     ) {
-        let later = values.get(shift..).unwrap_or_default();
-        let (both, one) = pairs.split_at_mut(later.len() * 2);
-        let (begin, end) = values.split_at(later.len());
-        for ((pair, &value), &later) in both.chunks_exact_mut(2).zip(begin).zip(later) {
-            (pair[0], pair[1]) = (value, later);
-        }
-        for (pair, &value) in one.chunks_exact_mut(2).zip(end) {
-            (pair[0], pair[1]) = (value, U::Element::default());
-        }
+        U::Element::steps_of(unit, values, shift, steps);
     }
 }

@@ -57,11 +57,11 @@ fn outputs_and_gradients(
     let outputs = vec![
         network.q_values(&logits).unwrap(),
         logits,
-        network.psi3(&features.f3, &actions).unwrap(),
-        network.phi3(&features.f3).unwrap(),
+        network.psi3(features.local().unwrap(), &actions).unwrap(),
+        network.phi3(features.local().unwrap()).unwrap(),
         network.psi4(&features.f4, &actions).unwrap(),
         network.phi4(&features.f4).unwrap(),
-        features.f3,
+        features.local().unwrap().clone(),
         features.f4,
     ];
     let mut total = Tensor::new(0f32, &Device::Cpu)?;
@@ -117,7 +117,7 @@ fn the_dim_heads_follow_their_formula_with_gradients() -> Result<()> {
         let parameters = with_biases(&config);
         let network = Network::new(&config, &parameters).unwrap();
         let features = network.features(&frames(&config, 6, &mut rng(1))).unwrap();
-        let (f3, f4) = (features.f3.detach(), features.f4.detach());
+        let (f3, f4) = (features.local().unwrap().detach(), features.f4.detach());
         let (h, w, c) = config.local_shape();
         assert_eq!(f3.dims(), [6, h, w, c]);
         let indices = [0u32, 4, 2, 2, 1, 3];
@@ -202,7 +202,7 @@ fn the_same_bits_for_any_number_of_threads(precision: Precision, config: &ModelC
         pool.install(|| {
             let features = network.features(&batch).unwrap();
             let logits = network.noisy_logits(&features.f4, noise.as_ref()).unwrap();
-            let phi3 = network.phi3(&features.f3).unwrap();
+            let phi3 = network.phi3(features.local().unwrap()).unwrap();
             let loss = (logits.sqr().unwrap().sum_all().unwrap()
                 + phi3.sqr().unwrap().sum_all().unwrap())
             .unwrap();
@@ -372,7 +372,7 @@ fn heads_that_are_left_out_are_not_there() {
     let features = network.features(&frames(&config, 2, &mut rng(5))).unwrap();
     let actions = Tensor::zeros(2, DType::I64, &Device::Cpu).unwrap();
     assert!(matches!(
-        network.psi3(&features.f3, &actions),
+        network.psi3(features.local().unwrap(), &actions),
         Err(ModelError::NoHead("psi3"))
     ));
     assert!(matches!(

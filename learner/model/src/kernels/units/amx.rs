@@ -257,6 +257,21 @@ impl Rounding for Amx {
     fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
         self.0.round_pairs(first, second, pairs);
     }
+
+    #[inline(always)]
+    fn pair(self, first: &[bf16], second: &[bf16], pairs: &mut [bf16]) {
+        self.0.pair(first, second, pairs);
+    }
+
+    #[inline(always)]
+    fn of_bytes(self, bytes: &[u8], to: &mut [bf16]) {
+        self.0.of_bytes(bytes, to);
+    }
+
+    #[inline(always)]
+    fn pair_bytes(self, first: &[u8], second: &[u8], pairs: &mut [bf16]) {
+        self.0.pair_bytes(first, second, pairs);
+    }
 }
 
 impl Unit for Amx {

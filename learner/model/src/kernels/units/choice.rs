@@ -306,6 +306,44 @@ mod tests {
     }
 
     #[test]
+    fn every_unit_puts_scalars_in_pairs() {
+        #[derive(Clone, Copy)]
+        struct Pair<'a>(&'a [u8], &'a [u8]);
+        impl ForUnit for Pair<'_> {
+            type Output = [Vec<bf16>; 3];
+            fn run<U: Unit>(self, unit: U) -> [Vec<bf16>; 3] {
+                let Self(first, second) = self;
+                // What lies beyond is left alone.
+                let room = |len: usize| vec![bf16::NEG_ONE; len + 3];
+                let [mut bytes, mut others] = [room(first.len()), room(second.len())];
+                unit.of_bytes(first, &mut bytes);
+                unit.of_bytes(second, &mut others);
+                let [mut pairs, mut of_bytes] = [room(2 * first.len()), room(2 * first.len())];
+                let (one, other) = (&bytes[..first.len()], &others[..second.len()]);
+                unit.pair(one, other, &mut pairs);
+                unit.pair_bytes(first, second, &mut of_bytes);
+                [bytes, pairs, of_bytes]
+            }
+        }
+        for len in (0..140).chain([10_000]) {
+            let first: Vec<u8> = (0..len).map(|at| (at * 31 % 256) as u8).collect();
+            let second: Vec<u8> = (0..len).map(|at| (at * 7 % 255 + 1) as u8).collect();
+            for [bytes, pairs, of_bytes] in with_every_unit(Precision::Bf16, Pair(&first, &second))
+            {
+                for (at, both) in first.iter().zip(&second).enumerate() {
+                    let wanted = [*both.0, *both.1].map(|byte| bf16::from_f32(byte.into()));
+                    assert_eq!(bytes[at], wanted[0]);
+                    assert_eq!(pairs[2 * at..][..2], wanted);
+                    assert_eq!(of_bytes[2 * at..][..2], wanted);
+                }
+                assert_eq!(bytes[len..], [bf16::NEG_ONE; 3]);
+                assert_eq!(pairs[2 * len..], [bf16::NEG_ONE; 3]);
+                assert_eq!(of_bytes[2 * len..], [bf16::NEG_ONE; 3]);
+            }
+        }
+    }
+
+    #[test]
     fn the_kernels_of_this_processor_have_names() {
         for precision in [Precision::F32, Precision::Bf16] {
             assert!(!kernels_in_words(precision).is_empty());

@@ -8,7 +8,7 @@ use crate::kernels::buffer::Pooled;
 /// Columns of one register, on every unit.
 pub(crate) const LANES: usize = 16;
 
-/// Instructions that round.
+/// Instructions that round, and that put scalars in pairs.
 pub(crate) trait Rounding: Copy {
     /// The nearest bf16 of each of `values`, ties to even, into the first of `to`. A subnormal may become a 0 of its sign, which is
     /// what such a unit's products take it for.
@@ -24,6 +24,30 @@ pub(crate) trait Rounding: Copy {
     fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
         for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
             (pair[0], pair[1]) = (bf16::of(first), bf16::of(second));
+        }
+    }
+
+    /// Two rows that are rounded already, as long as each other, as pairs: `pairs` [columns, 2].
+    #[inline(always)]
+    fn pair(self, first: &[bf16], second: &[bf16], pairs: &mut [bf16]) {
+        for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
+            (pair[0], pair[1]) = (first, second);
+        }
+    }
+
+    /// Pixels as [`Element::of_byte`], into the first of `to`.
+    #[inline(always)]
+    fn of_bytes(self, bytes: &[u8], to: &mut [bf16]) {
+        for (to, &byte) in to.iter_mut().zip(bytes) {
+            *to = bf16::of_byte(byte);
+        }
+    }
+
+    /// As [`Rounding::pair`], of pixels.
+    #[inline(always)]
+    fn pair_bytes(self, first: &[u8], second: &[u8], pairs: &mut [bf16]) {
+        for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
+            (pair[0], pair[1]) = (bf16::of_byte(first), bf16::of_byte(second));
         }
     }
 }
@@ -55,9 +79,15 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     /// `LANES` steps of `values`, [`LANES`, DEPTH], each as 32 bits.
     fn steps<R: Rounding>(rounding: R, values: &[f32], steps: &mut [u32; LANES]);
 
+    /// Pixels as [`Element::of_byte`], into the first of `to`.
+    fn store_bytes<R: Rounding>(rounding: R, bytes: &[u8], to: &mut [Self]);
+
     /// Pixels as [`Element::of_byte`], each with the one `shift` further if `DEPTH` is 2, or with 0 where they end before:
     /// `steps` [pixels, DEPTH].
-    fn steps_of_bytes(bytes: &[u8], shift: usize, steps: &mut [Self]);
+    fn steps_of_bytes<R: Rounding>(rounding: R, bytes: &[u8], shift: usize, steps: &mut [Self]);
+
+    /// The same of elements.
+    fn steps_of<R: Rounding>(rounding: R, values: &[Self], shift: usize, steps: &mut [Self]);
 
     /// The scalars of a step, into `step` [DEPTH].
     fn unpack(bits: u32, step: &mut [Self]);
@@ -105,10 +135,20 @@ impl Element for f32 {
     }
 
     #[inline(always)]
-    fn steps_of_bytes(bytes: &[u8], _: usize, steps: &mut [Self]) {
-        for (step, &byte) in steps.iter_mut().zip(bytes) {
-            *step = Self::of_byte(byte);
+    fn store_bytes<R: Rounding>(_: R, bytes: &[u8], to: &mut [Self]) {
+        for (to, &byte) in to.iter_mut().zip(bytes) {
+            *to = Self::of_byte(byte);
         }
+    }
+
+    #[inline(always)]
+    fn steps_of_bytes<R: Rounding>(rounding: R, bytes: &[u8], _: usize, steps: &mut [Self]) {
+        Self::store_bytes(rounding, bytes, steps);
+    }
+
+    #[inline(always)]
+    fn steps_of<R: Rounding>(_: R, values: &[Self], _: usize, steps: &mut [Self]) {
+        steps.copy_from_slice(values);
     }
 
     #[inline(always)]
@@ -174,15 +214,29 @@ impl Element for bf16 {
     }
 
     #[inline(always)]
-    fn steps_of_bytes(bytes: &[u8], shift: usize, steps: &mut [Self]) {
+    fn store_bytes<R: Rounding>(rounding: R, bytes: &[u8], to: &mut [Self]) {
+        rounding.of_bytes(bytes, to);
+    }
+
+    #[inline(always)]
+    fn steps_of_bytes<R: Rounding>(rounding: R, bytes: &[u8], shift: usize, steps: &mut [Self]) {
         let later = bytes.get(shift..).unwrap_or_default();
         let (begin, end) = bytes.split_at(later.len());
         let (both, one) = steps.split_at_mut(later.len() * 2);
-        for ((pair, &byte), &later) in both.chunks_exact_mut(2).zip(begin).zip(later) {
-            (pair[0], pair[1]) = (Self::of_byte(byte), Self::of_byte(later));
-        }
+        rounding.pair_bytes(begin, later, both);
         for (pair, &byte) in one.chunks_exact_mut(2).zip(end) {
             (pair[0], pair[1]) = (Self::of_byte(byte), Self::default());
+        }
+    }
+
+    #[inline(always)]
+    fn steps_of<R: Rounding>(rounding: R, values: &[Self], shift: usize, steps: &mut [Self]) {
+        let later = values.get(shift..).unwrap_or_default();
+        let (begin, end) = values.split_at(later.len());
+        let (both, one) = steps.split_at_mut(later.len() * 2);
+        rounding.pair(begin, later, both);
+        for (pair, &value) in one.chunks_exact_mut(2).zip(end) {
+            (pair[0], pair[1]) = (value, Self::default());
         }
     }
 
