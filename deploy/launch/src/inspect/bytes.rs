@@ -2,7 +2,7 @@
 //! The replay may hold frames compressed, and a socket adds its own; neither is counted.
 
 use driml_model::StoredAs;
-use driml_protocol::{BatchHeader, RunSpec, TRANSITION_BYTES};
+use driml_protocol::{BatchHeader, Horizon, RunSpec, TRANSITION_BYTES};
 use driml_settings::{config::RunConfig, memory::replay_bytes_each};
 
 use super::{everything::Everything, line::Line};
@@ -18,9 +18,22 @@ pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Resu
         let header = BatchHeader::of(run, rows).sampled_by(&config.replay.sampling);
         header.payload_bytes() as u64
     };
-    let states = |run: &RunSpec, states: usize| rows as u64 * (states * run.state_bytes()) as u64;
+    // Of all states, and of s_t and s_{t+n} alone.
+    let states = |run: &RunSpec| {
+        let frames = match BatchHeader::of(run, rows).stacked {
+            None => rows as usize * (2 + run.horizon.positives()),
+            Some(stacked) => stacked.frames as usize,
+        };
+        (frames * run.frame_bytes()) as u64
+    };
+    let first_states = |run: &RunSpec| {
+        states(&RunSpec {
+            horizon: Horizon::None,
+            ..run.clone()
+        })
+    };
     let transition = |run: &RunSpec| (run.frame_bytes() + TRANSITION_BYTES) as u64;
-    let (positives, every_positives) = (run.horizon.positives(), every.run.horizon.positives());
+    let positives = run.horizon.positives();
     let whole = config.world.frame_shape();
     let size = |height, width, channels| format!("{height}x{width}x{channels}");
     let frame = size(run.frame_height, run.frame_width, run.frame_channels);
@@ -36,13 +49,17 @@ pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Resu
     };
     let state_why = match run.frame_stack {
         1 => "one frame each".into(),
-        stack => format!("{stack} frames each"),
+        stack => format!("{stack} frames each; one that several states of a row have travels once"),
     };
     let published = config.learner.publish_as;
     let weights = config.weights_bytes()?;
     let every_weights = every.model.weights_bytes(StoredAs::F32)?;
-    let scalars = batch(run) - states(run, 2 + positives);
-    let every_scalars = batch(&every.run) - states(&every.run, 2 + every_positives);
+    let scalars = batch(run) - states(run);
+    let every_scalars = batch(&every.run) - states(&every.run);
+    let scalars_why = match run.frame_stack {
+        1 => "returns, discounts, actions, k",
+        _ => "returns, discounts, actions, k, and which frames make a state",
+    };
     Ok(vec![
         Line::new(
             "a transition in a chunk",
@@ -64,22 +81,17 @@ pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Resu
         ),
         Line::new(
             "  s_t and s_{t+n}",
-            states(run, 2),
-            states(&every.run, 2),
+            first_states(run),
+            first_states(&every.run),
             state_why,
         ),
         Line::new(
             "  s_{t+k}",
-            states(run, positives),
-            states(&every.run, every_positives),
+            states(run) - first_states(run),
+            states(&every.run) - first_states(&every.run),
             format!("{positives} a row: what {} is served", config.run.agent),
         ),
-        Line::new(
-            "  numbers",
-            scalars,
-            every_scalars,
-            "returns, discounts, actions, k",
-        ),
+        Line::new("  numbers", scalars, every_scalars, scalars_why),
         Line::new(
             "a broadcast",
             weights as u64,
