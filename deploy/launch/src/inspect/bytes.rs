@@ -14,18 +14,18 @@ use super::{everything::Everything, line::Line};
 pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Result<Vec<Line>> {
     let run = &config.run;
     let rows = config.learner.batch_size;
-    let batch = |run: &RunSpec| {
-        let header = BatchHeader::of(run, rows).sampled_by(&config.replay.sampling);
-        header.payload_bytes() as u64
-    };
-    // Of all states, and of s_t and s_{t+n} alone.
-    let states = |run: &RunSpec| {
-        let frames = match BatchHeader::of(run, rows).stacked {
-            None => rows as usize * (2 + run.horizon.positives()),
-            Some(stacked) => stacked.frames as usize,
+    let header = |run: &RunSpec| BatchHeader::of(run, rows).sampled_by(&config.replay.sampling);
+    let batch = |run: &RunSpec| header(run).payload_bytes() as u64;
+    let scalars = |run: &RunSpec| {
+        let without_states = BatchHeader {
+            state_bytes: 0,
+            stacked: None,
+            ..header(run)
         };
-        (frames * run.frame_bytes()) as u64
+        without_states.payload_bytes() as u64
     };
+    // Of all states, and of s_t and s_{t+n} alone; of stacks, their frames and what says which are whose.
+    let states = |run: &RunSpec| batch(run) - scalars(run);
     let first_states = |run: &RunSpec| {
         states(&RunSpec {
             horizon: Horizon::None,
@@ -54,12 +54,6 @@ pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Resu
     let published = config.learner.publish_as;
     let weights = config.weights_bytes()?;
     let every_weights = every.model.weights_bytes(StoredAs::F32)?;
-    let scalars = batch(run) - states(run);
-    let every_scalars = batch(&every.run) - states(&every.run);
-    let scalars_why = match run.frame_stack {
-        1 => "returns, discounts, actions, k",
-        _ => "returns, discounts, actions, k, and which frames make a state",
-    };
     Ok(vec![
         Line::new(
             "a transition in a chunk",
@@ -91,7 +85,12 @@ pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Resu
             states(&every.run) - first_states(&every.run),
             format!("{positives} a row: what {} is served", config.run.agent),
         ),
-        Line::new("  numbers", scalars, every_scalars, scalars_why),
+        Line::new(
+            "  numbers",
+            scalars(run),
+            scalars(&every.run),
+            "returns, discounts, actions, k",
+        ),
         Line::new(
             "a broadcast",
             weights as u64,

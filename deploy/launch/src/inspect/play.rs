@@ -27,8 +27,8 @@ pub struct RowShares {
     pub without_positive: f64,
     /// Bytes that a batch would have if every row had all of its states, and does not have.
     pub absent_bytes: f64,
-    /// Bytes that it would have if each state came with all its frames, and does not have, as another state has them; 0 where a
-    /// state is one frame.
+    /// Bytes that it would have if each state came with all its frames, and does not have, as another state has them, less those
+    /// that say which frames are whose; 0 where a state is one frame.
     pub shared_bytes: f64,
     /// Of a batch's states s_t and s_{t+k}, those that are equal to another of them.
     pub repeated_online: f64,
