@@ -177,7 +177,9 @@ impl Learner {
     /// A batch that does not fit, or arithmetic that left the finite numbers; all is then as it was, except after
     /// [`UpdateError::Diverged`](crate::UpdateError::Diverged), when neither weights nor a checkpoint can be had any more.
     pub fn update(&mut self, batch: &WireBatch) -> Result<UpdateReport, LearnerError> {
-        let mut frames = [batch.states_t(), batch.states_k(), batch.states_n()];
+        // Stacks of frames are put together here, once an update.
+        let states = [batch.states_t(), batch.states_k(), batch.states_n()];
+        let mut frames = states.each_ref().map(|states| &states[..]);
         if let Some(enlarge) = &self.enlarge {
             for (states, larger) in frames.iter_mut().zip(&mut self.enlarged) {
                 enlarge_all(enlarge, states, larger);

@@ -42,6 +42,7 @@ pub use client::{Announcer, PendingReply, RunClient, Sealed};
 pub use messages::{
     affinity::AffinityUpdate,
     batch::{Batch, BatchHeader, BatchReply, NO_ACTION, POOL_BATCHES},
+    batch_frames::StackedFrames,
     batch_request::{BatchRequest, RequestId},
     batch_rows::{BatchStatesMut, RowScalars},
     chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES, transitions_max},
@@ -69,7 +70,7 @@ pub use process::{
     whole_file,
 };
 pub use query_workers::{Incoming, QueryWorkers, Responder};
-pub use run_spec::{Horizon, POSITIVES_MAX, RunSpec, RunSpecError, TimeoutRule};
+pub use run_spec::{FRAME_STACK_MAX, Horizon, POSITIVES_MAX, RunSpec, RunSpecError, TimeoutRule};
 pub use sampling::{Sampling, SamplingError};
 pub use wire::{
     buffers::{Buffer, BufferPool},

@@ -12,6 +12,9 @@ const FIELDS: u16 = 1;
 /// Most positives a row can carry; a rule that asks for more is refused.
 pub const POSITIVES_MAX: usize = 32;
 
+/// Most frames that make one state.
+pub const FRAME_STACK_MAX: u32 = 16;
+
 /// How far ahead a positive lies: the rule by which the replay server draws k.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "rule", rename_all = "kebab-case", deny_unknown_fields)]
@@ -147,7 +150,7 @@ impl RunSpec {
             ("frame_height", self.frame_height, 4096),
             ("frame_width", self.frame_width, 4096),
             ("frame_channels", self.frame_channels, 16),
-            ("frame_stack", self.frame_stack, 16),
+            ("frame_stack", self.frame_stack, FRAME_STACK_MAX),
         ];
         for (key, value, max) in sides {
             if value == 0 || value > max {

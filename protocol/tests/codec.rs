@@ -10,8 +10,8 @@ use driml_protocol::{
     EpisodesRequest, Goodbye, Hello, Horizon, InsertReply, JoinReply, Kind, LearnerJoin,
     LearnerStatus, Life, Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus,
     PartsStatus, Played, PriorityPart, PriorityUpdate, ReplayStatus, Report, RequestId, Returns,
-    RowScalars, RunSpec, Tally, TimeoutRule, Waiting, Warning, WeightsHeader, WeightsReply,
-    WeightsRequest, WeightsUpload, WeightsVersion,
+    RowScalars, RunSpec, StackedFrames, Tally, TimeoutRule, Waiting, Warning, WeightsHeader,
+    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -97,7 +97,20 @@ const ORIGIN: Origin = Origin {
     incarnation: u64::MAX,
 };
 
-/// Of its rows the first does not bootstrap, the second has no positive and ends its episode.
+/// Of these the first does not bootstrap, the second has no positive and ends its episode.
+fn rows() -> Vec<RowScalars> {
+    let rows = [(4, 0.0, 2), (NO_ACTION, 0.0, 0), (6, 0.5, 300)];
+    let scalars = |(row, (next_action, bootstrap_discount, k)): (u8, _)| RowScalars {
+        action: row,
+        next_action,
+        n_step_return: 0.5 + f32::from(row),
+        bootstrap_discount,
+        positives: u32::from(k > 0),
+        k_first: k,
+    };
+    (0..).zip(rows).map(scalars).collect()
+}
+
 fn batch_from(origin: Option<Origin>) -> Batch {
     let header = BatchHeader {
         rows: 3,
@@ -113,18 +126,9 @@ fn batch_from(origin: Option<Origin>) -> Batch {
         mean_age: 12.5,
         weights_versions: (8, 2),
         origin,
+        stacked: None,
     };
-    let rows = [(4, 0.0, 2), (NO_ACTION, 0.0, 0), (6, 0.5, 300)];
-    let scalars = |(row, (next_action, bootstrap_discount, k)): (u8, _)| RowScalars {
-        action: row,
-        next_action,
-        n_step_return: 0.5 + f32::from(row),
-        bootstrap_discount,
-        positives: u32::from(k > 0),
-        k_first: k,
-    };
-    let rows: Vec<_> = (0..).zip(rows).map(scalars).collect();
-    let mut batch = Batch::of_rows(header, &rows, |bytes| Buffer::from(vec![0xAB; bytes]));
+    let mut batch = Batch::of_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
     assert_eq!(batch.header, header);
     let mut places = batch.states_mut();
     for row in 0..3 {
@@ -134,6 +138,35 @@ fn batch_from(origin: Option<Origin>) -> Batch {
     places.n(2).unwrap().fill(22);
     places.k(0, 0).unwrap().fill(30);
     places.k(0, 2).unwrap().fill(32);
+    batch
+}
+
+const STACKED: StackedFrames = StackedFrames {
+    frames: 5,
+    frame_stack: 2,
+    frame_channels: 1,
+};
+
+/// The same rows, whose states are stacks of two of five frames.
+fn stacked_batch(origin: Option<Origin>) -> Batch {
+    let header = BatchHeader {
+        stacked: Some(STACKED),
+        ..batch_from(origin).header
+    };
+    let mut batch = Batch::of_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
+    assert_eq!(batch.header, header);
+    let mut places = batch.states_mut();
+    for frame in 0..5 {
+        places.frame(frame).fill(50 + frame as u8);
+    }
+    // s_t; s_{t+k} of the first and the last; s_{t+n} of the last.
+    let stacks = [[0, 0], [0, 1], [1, 2], [0, 1], [3, 4], [4, 4]];
+    for (state, stack) in stacks.iter().enumerate() {
+        places.set_stack(state, stack);
+    }
+    if origin.is_some() {
+        batch.set_draws([(1, 0.5), (2, 0.5), (3, 0.5)].into_iter());
+    }
     batch
 }
 
@@ -390,6 +423,18 @@ fn samples() -> Vec<Sample> {
             sealed(prioritised_batch()),
             read_batch,
         ),
+        (
+            "batch of stacked frames",
+            Kind::BatchReply,
+            sealed(stacked_batch(None)),
+            read_batch,
+        ),
+        (
+            "batch of stacked frames drawn by priority",
+            Kind::BatchReply,
+            sealed(stacked_batch(Some(ORIGIN))),
+            read_batch,
+        ),
         ("weights", Kind::WeightsUpload, weights(), read_weights),
     ];
     samples.extend(with_payload.map(|(name, kind, bytes, read)| Sample {
@@ -448,11 +493,11 @@ fn chunk_batch_and_weights_come_back() {
     let back = Batch::from_payload(header, payload.to_vec().into()).unwrap();
     assert_eq!(back, batch());
     assert_eq!(
-        back.states_t(),
+        back.states_t()[..],
         [10, 10, 10, 10, 11, 11, 11, 11, 12, 12, 12, 12]
     );
-    assert_eq!(back.states_n(), [22; 4], "no state that a row lacks");
-    assert_eq!(back.states_k(), [30, 30, 30, 30, 32, 32, 32, 32]);
+    assert_eq!(back.states_n()[..], [22; 4], "no state that a row lacks");
+    assert_eq!(back.states_k()[..], [30, 30, 30, 30, 32, 32, 32, 32]);
     assert_eq!(
         (back.actions(), back.next_actions()),
         (&[0, 1, 2][..], &[4, NO_ACTION, 6][..])
@@ -558,6 +603,183 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     assert_eq!(Batch::merged_header(&mixed), None);
 }
 
+/// What a run without stacks sends has no byte of what stacks need; what it sends otherwise is each frame once.
+#[test]
+fn stacks_come_back_as_whole_states() {
+    for origin in [None, Some(ORIGIN)] {
+        let sent = stacked_batch(origin);
+        let more = sent.header.payload_bytes() - batch_from(origin).header.payload_bytes();
+        // Five frames of two bytes, and two numbers of four for each of six states, which had four bytes.
+        assert_eq!(more, 5 * 2 + 6 * 8 - 6 * 4);
+        let bytes = sealed(sent.clone());
+        let (reply, payload) = codec::decode::<BatchReply>(&bytes, Some(SPEC)).unwrap();
+        assert!(matches!(reply, BatchReply::Stacked(_, STACKED, from) if from == origin));
+        let back = Batch::from_payload(reply.header().unwrap(), payload.to_vec().into()).unwrap();
+        assert_eq!(back, sent);
+        assert_eq!(back.probabilities().is_some(), origin.is_some());
+        assert_eq!(
+            back.states_t()[..],
+            [50, 50, 50, 50, 50, 51, 50, 51, 51, 52, 51, 52],
+            "a pixel's oldest channels come first"
+        );
+        assert_eq!(back.states_k()[..], [50, 51, 50, 51, 53, 54, 53, 54]);
+        assert_eq!(back.states_n()[..], [54, 54, 54, 54]);
+        assert_eq!(back.ks(), [2, 0, 255]);
+    }
+}
+
+/// Each part's states are made of its own frames.
+#[test]
+fn parts_of_stacks_are_merged() {
+    let first = stacked_batch(None);
+    let mut second = stacked_batch(None);
+    for frame in 0..5 {
+        second.states_mut().frame(frame).fill(150 + frame as u8);
+    }
+    let parts = [first, second, stacked_batch(None)];
+    let whole = Batch::merged_header(&parts).unwrap();
+    assert_eq!(whole.stacked.unwrap().frames, 15);
+    let merged = Batch::merge(&parts, Buffer::from(vec![0xAB; whole.payload_bytes()]));
+    let planes = |batch: &Batch| {
+        [batch.states_t(), batch.states_k(), batch.states_n()].map(|plane| plane.to_vec())
+    };
+    let parts_planes = parts.each_ref().map(planes);
+    for (at, plane) in planes(&merged).into_iter().enumerate() {
+        assert_eq!(
+            plane,
+            parts_planes.each_ref().map(|it| &it[at][..]).concat()
+        );
+    }
+    let (header, payload) = merged.into_payload();
+    assert!(Batch::from_payload(header, payload).is_ok());
+
+    let [part, ..] = parts;
+    for other in [
+        None,
+        Some(StackedFrames {
+            frame_stack: 4,
+            ..STACKED
+        }),
+    ] {
+        let mut other_part = part.clone();
+        other_part.header.stacked = other;
+        assert_eq!(Batch::merged_header(&[part.clone(), other_part]), None);
+    }
+}
+
+#[test]
+fn stacks_that_cannot_be_are_refused() {
+    let said = |header, payload: Buffer| {
+        let message = codec::encode(SPEC, &BatchReply::of(header), &payload).unwrap();
+        read_batch(&message).unwrap_err().to_string()
+    };
+    for number in [5, 6, u32::MAX] {
+        let mut wrong = stacked_batch(None);
+        wrong.states_mut().set_stack(5, &[0, number]);
+        let (header, payload) = wrong.into_payload();
+        let said = said(header, payload);
+        assert!(
+            said.contains(&format!("a state of frame {number}, of 5 that travel")),
+            "{said}"
+        );
+    }
+    let (header, payload) = stacked_batch(None).into_payload();
+    for wrong in [
+        StackedFrames {
+            frames: 0,
+            ..STACKED
+        },
+        StackedFrames {
+            frames: 4,
+            ..STACKED
+        },
+        StackedFrames {
+            frames: u32::MAX,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_stack: 0,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_stack: 1,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_stack: 17,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_stack: u32::MAX,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_channels: 0,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_channels: 3,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_channels: u32::MAX,
+            ..STACKED
+        },
+    ] {
+        let header = BatchHeader {
+            stacked: Some(wrong),
+            ..header
+        };
+        let said = said(header, payload.clone());
+        assert!(said.contains("do not fill"), "{wrong:?}: {said}");
+    }
+    // More frames than all stacks have room for.
+    let most = StackedFrames {
+        frames: 13,
+        ..STACKED
+    };
+    let header = BatchHeader {
+        stacked: Some(most),
+        ..header
+    };
+    assert!(said(header, Buffer::zeroed(13 * 2 + 6 * 8 + 36)).contains("do not fill"));
+}
+
+/// A message of some MB whose states would fill the memory.
+#[test]
+fn few_frames_do_not_make_more_than_a_message_may_have() {
+    let rows = vec![
+        RowScalars {
+            positives: 0,
+            bootstrap_discount: 0.0,
+            ..rows()[0]
+        };
+        4096
+    ];
+    let whole_bytes = codec::PAYLOAD_BYTES_MAX / rows.len();
+    for (state_bytes, is_refused) in [(whole_bytes - 16, false), (whole_bytes, true)] {
+        let header = BatchHeader {
+            state_bytes: state_bytes as u32,
+            stacked: Some(StackedFrames {
+                frames: 1,
+                ..STACKED
+            }),
+            ..batch().header
+        };
+        let (header, payload) = Batch::of_rows(header, &rows, Buffer::zeroed).into_payload();
+        match Batch::from_payload(header, payload) {
+            Ok(_) => assert!(!is_refused),
+            Err(e) => {
+                let said = e.to_string();
+                assert!(
+                    is_refused && said.contains("states would fill more than"),
+                    "{said}"
+                );
+            }
+        }
+    }
+}
+
 #[test]
 fn draws_and_priorities_that_cannot_be_are_refused() {
     for chance in [0.0, -0.5, 1.5, f32::NAN, f32::INFINITY] {
@@ -603,6 +825,7 @@ fn parts_are_merged_row_by_row() {
         mean_age,
         weights_versions: versions,
         origin: None,
+        stacked: None,
     };
     // Rows from `first` on, which have fewer positives and bootstraps, the higher their number.
     let part = |header: BatchHeader, values: std::ops::Range<u8>| {
@@ -643,7 +866,7 @@ fn parts_are_merged_row_by_row() {
     assert_eq!((whole.rows, whole.states_k, whole.states_n), (8, 12, 4));
     assert_eq!(merged, expected);
     assert_eq!(
-        merged.states_n(),
+        merged.states_n()[..],
         [[20; 3], [22; 3], [24; 3], [26; 3]].concat()
     );
 

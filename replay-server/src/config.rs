@@ -253,8 +253,11 @@ fn disk_bytes_least(spec: &RunSpec, config: &Config) -> u64 {
 
 /// Most rows of one batch of this run, so that it stays below the codec's limit; larger requests are refused.
 pub(crate) fn rows_max(spec: &RunSpec, sampling: &Sampling) -> u32 {
-    let row_bytes = BatchHeader::of(spec, 1)
-        .sampled_by(sampling)
-        .payload_bytes();
+    // With each state whole: a receiver may make them so.
+    let header = BatchHeader {
+        stacked: None,
+        ..BatchHeader::of(spec, 1)
+    };
+    let row_bytes = header.sampled_by(sampling).payload_bytes();
     u32::try_from(PAYLOAD_BYTES_MAX / row_bytes).unwrap_or(u32::MAX)
 }

@@ -99,7 +99,13 @@ fn learn(run: &RunClient, learner: u64) -> u64 {
     loop {
         id = id.again();
         match ask(id) {
-            Ok((BatchReply::Batch(header) | BatchReply::Prioritised(header, _), payload)) => {
+            Ok((
+                reply @ (BatchReply::Batch(_)
+                | BatchReply::Prioritised(..)
+                | BatchReply::Stacked(..)),
+                payload,
+            )) => {
+                let header = reply.header().unwrap();
                 Batch::from_payload(header, payload).unwrap();
                 batches += 1;
                 id = id.next();

@@ -9,7 +9,7 @@ use std::{
 };
 
 use anyhow::{Context, bail, ensure};
-use driml_protocol::{Batch, BatchReply, BatchRequest, BufferPool, InsertReply, RequestId};
+use driml_protocol::{Batch, BatchRequest, BufferPool, InsertReply, RequestId};
 use nix::fcntl::{PosixFadviseAdvice, posix_fadvise};
 
 use crate::{
@@ -179,11 +179,12 @@ fn ask_one_by_one(run: &mut Run, effort: &Effort) -> anyhow::Result<Vec<f64>> {
         let asked = client.send(client.seal(&request)?, ANSWER_MAX)?;
         let (reply, payload) = asked.receive(&pool)?;
         seconds.push(started.elapsed().as_secs_f64());
-        let BatchReply::Batch(header) = reply else {
+        let Some(header) = reply.header() else {
             bail!("no batch: {reply:?}");
         };
         let batch = Batch::from_payload(header, payload)?;
-        black_box([batch.states_t(), batch.states_k(), batch.states_n()].map(touched));
+        let planes = [batch.states_t(), batch.states_k(), batch.states_n()];
+        black_box(planes.map(|plane| touched(&plane)));
     }
     Ok(seconds)
 }

@@ -292,7 +292,7 @@ impl Run {
         let rate = effort.rate_overall(|| match source.next(ANSWER_MAX)? {
             Next::Batch(batch) => {
                 let planes = [batch.states_t(), batch.states_k(), batch.states_n()];
-                black_box(planes.map(touched));
+                black_box(planes.map(|plane| touched(&plane)));
                 Ok(())
             }
             Next::NotYet(waiting) => {

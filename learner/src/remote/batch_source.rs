@@ -372,7 +372,7 @@ impl Fetcher {
             }
         })?;
         Ok(match reply {
-            BatchReply::Batch(_) | BatchReply::Prioritised(..) => {
+            BatchReply::Batch(_) | BatchReply::Prioritised(..) | BatchReply::Stacked(..) => {
                 if shared_memory {
                     self.trust.worked();
                 }

@@ -448,7 +448,7 @@ fn a_psi_that_is_not_given_the_action_does_not_see_it() {
 
 const STATE: usize = 20 * 24 * 2;
 
-fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConfig {
+pub(crate) fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConfig {
     let (model, update) = of(objective, GLOBAL);
     let horizon = match objective.name() {
         "cpc" => Horizon::All { k_max: 3 },
@@ -504,7 +504,7 @@ fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConf
 }
 
 /// A batch as the replay server of this run would send it.
-fn served(config: &LearnerConfig, seed: u64) -> WireBatch {
+pub(crate) fn served(config: &LearnerConfig, seed: u64) -> WireBatch {
     served_with(config, seed, |_| {})
 }
 

@@ -9,4 +9,5 @@ mod checkpoint;
 mod equal_states;
 mod made_up;
 mod ranges;
+mod stacked;
 mod update;

@@ -1,9 +1,12 @@
 //! Batches on their way from the replay server to the learner.
 //! It does not sample: which rows and which k are the replay server's choice.
 
+use std::borrow::Cow;
+
 use serde::{Deserialize, Serialize};
 
 use super::{
+    batch_frames::StackedFrames,
     batch_layout::{BatchLayout, Column},
     batch_rows::{BatchStatesMut, RowScalars},
     priorities::{Origin, PriorityPart, PriorityUpdate},
@@ -15,6 +18,7 @@ use crate::{
     sampling::Sampling,
     wire::{
         buffers::Buffer,
+        codec::PAYLOAD_BYTES_MAX,
         error::CodecError,
         message::{Kind, Message, no_payload},
         shared_memory,
@@ -52,6 +56,10 @@ pub struct BatchHeader {
     /// byte of it.
     #[serde(skip)]
     pub origin: Option<Origin>,
+    /// The frames that states are stacks of, each of which travels once; it travels as [`BatchReply::Stacked`], and batches whose
+    /// states are one frame each have no byte of it.
+    #[serde(skip)]
+    pub stacked: Option<StackedFrames>,
 }
 
 impl BatchHeader {
@@ -69,6 +77,7 @@ impl BatchHeader {
             mean_age: 0.0,
             weights_versions: (0, u64::MAX),
             origin: None,
+            stacked: StackedFrames::of(spec, rows),
         }
     }
 
@@ -104,15 +113,26 @@ impl BatchHeader {
             states_k: self.states_k as usize,
             states_n: self.states_n as usize,
             is_prioritised: self.origin.is_some(),
+            stacked: self.stacked,
         }
     }
 
-    /// Checks that `payload` is as long as such a batch's, and has as many states as its rows say.
+    /// Checks that `payload` is as long as such a batch's, has as many states as its rows say, and that these are made of its frames.
     fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
         let layout = self.layout();
         if layout.bytes() != Some(payload.len()) || self.rows == 0 {
+            let of_frames = self.stacked.map_or_else(String::new, |stacked| {
+                let StackedFrames {
+                    frames,
+                    frame_stack,
+                    frame_channels,
+                } = stacked;
+                format!(
+                    ", made of {frames} frames of {frame_channels} channels, {frame_stack} each,"
+                )
+            });
             return Err(CodecError::Header(format!(
-                "{} rows with {} positives of {} bytes, {} and {} of them there, do not fill {} bytes of payload",
+                "{} rows with {} positives of {} bytes, {} and {} of them there{of_frames} do not fill {} bytes of payload",
                 self.rows,
                 self.positives,
                 self.state_bytes,
@@ -120,6 +140,26 @@ impl BatchHeader {
                 self.states_n,
                 payload.len()
             )));
+        }
+        if let Some(stacked) = self.stacked {
+            // What few frames may be made into, if many states have them.
+            let whole = BatchLayout {
+                stacked: None,
+                ..layout
+            };
+            if whole.bytes().is_none_or(|bytes| bytes > PAYLOAD_BYTES_MAX) {
+                return Err(CodecError::Header(format!(
+                    "{} rows whose states would fill more than {PAYLOAD_BYTES_MAX} bytes",
+                    self.rows
+                )));
+            }
+            let stacks = layout.range(Column::StatesT).start..layout.range(Column::StatesN).end;
+            if let Some(number) = stacked.first_unknown(&payload[stacks]) {
+                return Err(CodecError::Header(format!(
+                    "a state of frame {number}, of {} that travel",
+                    stacked.frames
+                )));
+            }
         }
         let rows = (layout.positives_there(payload), layout.bootstraps(payload));
         let count = |there: &[bool]| there.iter().filter(|there| **there).count();
@@ -157,14 +197,17 @@ pub enum BatchReply {
     },
     /// The payload that follows is a batch whose rows were drawn by priority, and who drew them.
     Prioritised(BatchHeader, Origin),
+    /// The payload that follows is a batch whose states are stacks of these frames; and who drew its rows, if by priority.
+    Stacked(BatchHeader, StackedFrames, Option<Origin>),
 }
 
 impl BatchReply {
     /// The reply with a batch of this header.
     pub const fn of(header: BatchHeader) -> Self {
-        match header.origin {
-            None => Self::Batch(header),
-            Some(origin) => Self::Prioritised(header, origin),
+        match (header.stacked, header.origin) {
+            (None, None) => Self::Batch(header),
+            (None, Some(origin)) => Self::Prioritised(header, origin),
+            (Some(stacked), origin) => Self::Stacked(header, stacked, origin),
         }
     }
 
@@ -174,6 +217,11 @@ impl BatchReply {
             Self::Batch(header) => Some(header),
             Self::Prioritised(header, origin) => Some(BatchHeader {
                 origin: Some(origin),
+                ..header
+            }),
+            Self::Stacked(header, stacked, origin) => Some(BatchHeader {
+                stacked: Some(stacked),
+                origin,
                 ..header
             }),
             Self::Wait(_) | Self::Finished | Self::Refused { .. } => None,
@@ -198,6 +246,9 @@ impl Message for BatchReply {
 /// states_n of the rows that bootstrap; then B rows each: n-step return f32, bootstrap discount f32 (little-endian); action, next action,
 /// positive valid [P, B], k [P, B] (u8). Where rows are drawn by priority, then: transition u64, probability f32. No state travels
 /// that a row does not have.
+///
+/// Where a state is a stack of frames, these come first, each once however many states have it; and in place of each state the
+/// numbers of its frames, oldest first (u32).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Batch {
     /// What it says of itself.
@@ -209,7 +260,7 @@ pub struct Batch {
 
 impl Batch {
     /// A batch of `rows`, whose states are then to be written with [`Batch::states_mut`]; rows and states of `header` are set to
-    /// what `rows` has. `memory` gives so many bytes, with anything in them.
+    /// what `rows` has, its frames are as many as it says. `memory` gives so many bytes, with anything in them.
     ///
     /// # Panics
     /// If the memory is of another size, or a row has more positives than the header.
@@ -255,12 +306,18 @@ impl Batch {
             let mut to = &mut merged.payload[whole.range(column)];
             // Of each positive, the rows of the part come together.
             for positive in 0..whole.values_a_row(column) {
+                let mut frames_before = 0;
                 for part in parts {
                     let from = part.of_positive(column, positive);
                     let place = to.split_off_mut(..from.len());
-                    place
-                        .expect("the parts fill the column")
-                        .copy_from_slice(from);
+                    let place = place.expect("the parts fill the column");
+                    place.copy_from_slice(from);
+                    if let Some(stacked) = part.header.stacked {
+                        if column.is_of_states() {
+                            StackedFrames::shift(place, frames_before);
+                        }
+                        frames_before += stacked.frames;
+                    }
                 }
             }
         }
@@ -278,8 +335,8 @@ impl Batch {
                 let there = |valid: &[u8]| valid.iter().filter(|valid| **valid != 0).count();
                 let before: usize = valid.clone().take(positive).map(there).sum();
                 let own = valid.clone().nth(positive).map_or(0, there);
-                let state_bytes = self.header.state_bytes as usize;
-                &values[before * state_bytes..(before + own) * state_bytes]
+                let bytes = self.header.layout().value_bytes();
+                &values[before * bytes..(before + own) * bytes]
             }
             Column::PositiveValid | Column::K => &values[positive * self.rows()..][..self.rows()],
             _ => values,
@@ -292,6 +349,12 @@ impl Batch {
         let mut age_total = 0.0;
         (merged.rows, merged.tally, merged.held) = (0, Tally::default(), 0);
         (merged.states_k, merged.states_n) = (0, 0);
+        let without_frames = |stacked: StackedFrames| StackedFrames {
+            frames: 0,
+            ..stacked
+        };
+        merged.stacked = merged.stacked.map(without_frames);
+        let frames_of = merged.stacked;
         for BatchHeader {
             rows,
             positives,
@@ -303,12 +366,17 @@ impl Batch {
             mean_age,
             weights_versions: (newest, oldest),
             origin,
+            stacked,
         } in parts.iter().map(|part| part.header)
         {
             if (positives, state_bytes) != (merged.positives, merged.state_bytes)
                 || origin.is_some() != merged.origin.is_some()
+                || stacked.map(without_frames) != frames_of
             {
                 return None;
+            }
+            if let (Some(merged), Some(part)) = (&mut merged.stacked, stacked) {
+                merged.frames += part.frames;
             }
             merged.rows += rows;
             merged.states_k += states_k;
@@ -342,19 +410,31 @@ impl Batch {
         values.iter().copied().map(f32::from_le_bytes).collect()
     }
 
-    /// s_t [B, state bytes].
-    pub fn states_t(&self) -> &[u8] {
-        self.column(Column::StatesT)
+    /// The states of a column; where they are stacks of frames, put together now.
+    fn states(&self, column: Column) -> Cow<'_, [u8]> {
+        let values = self.column(column);
+        match self.header.stacked {
+            None => Cow::Borrowed(values),
+            Some(stacked) => {
+                let (frames, state_bytes) = (self.column(Column::Frames), self.header.state_bytes);
+                Cow::Owned(stacked.stacked(frames, values, state_bytes as usize))
+            }
+        }
+    }
+
+    /// s_t [B, state bytes]; a state [H, W, C * stack] has a pixel's oldest channels first.
+    pub fn states_t(&self) -> Cow<'_, [u8]> {
+        self.states(Column::StatesT)
     }
 
     /// s_{t+k} of the positives that rows have, in the order of [P, B].
-    pub fn states_k(&self) -> &[u8] {
-        self.column(Column::StatesK)
+    pub fn states_k(&self) -> Cow<'_, [u8]> {
+        self.states(Column::StatesK)
     }
 
     /// s_{t+n} of the rows that bootstrap.
-    pub fn states_n(&self) -> &[u8] {
-        self.column(Column::StatesN)
+    pub fn states_n(&self) -> Cow<'_, [u8]> {
+        self.states(Column::StatesN)
     }
 
     /// Sum of gamma^i r_{t+i} over i < n, stopped at the episode's end [B].

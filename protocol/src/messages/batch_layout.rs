@@ -3,10 +3,15 @@
 
 use std::ops::Range;
 
+use super::batch_frames::StackedFrames;
+
 /// The columns of a batch, in the order in which they lie one after the other. Each has a value for every row; those of the
 /// positives have one for every row of the first positive, then of the second, and so on. States that a row does not have are left out.
+/// Where states are stacks of frames, each frame is there once, and the columns of states say which of them each is made of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Column {
+    /// The frames of all states, where states are stacks of them.
+    Frames,
     /// s_t, the state of the anchor.
     StatesT,
     /// s_{t+k}, of each positive.
@@ -33,7 +38,8 @@ pub(super) enum Column {
 
 impl Column {
     /// All of them, in their order.
-    pub(super) const ALL: [Self; 11] = [
+    pub(super) const ALL: [Self; 12] = [
+        Self::Frames,
         Self::StatesT,
         Self::StatesK,
         Self::StatesN,
@@ -57,10 +63,15 @@ impl Column {
         matches!(self, Self::Transition | Self::Probability)
     }
 
-    /// Bytes of a value that is no state.
+    /// Whether its values are states.
+    pub(super) const fn is_of_states(self) -> bool {
+        matches!(self, Self::StatesT | Self::StatesK | Self::StatesN)
+    }
+
+    /// Bytes of a value that is neither a state nor a frame.
     const fn scalar_bytes(self) -> usize {
         match self {
-            Self::StatesT | Self::StatesK | Self::StatesN => 0,
+            Self::Frames | Self::StatesT | Self::StatesK | Self::StatesN => 0,
             Self::NStepReturn | Self::BootstrapDiscount | Self::Probability => size_of::<f32>(),
             Self::Transition => size_of::<u64>(),
             Self::Action | Self::NextAction | Self::PositiveValid | Self::K => size_of::<u8>(),
@@ -106,10 +117,13 @@ pub(super) struct BatchLayout {
     pub(super) states_n: usize,
     /// Whether rows say which transition they are and how likely they were.
     pub(super) is_prioritised: bool,
+    /// The frames that states are stacks of; none where a state is one frame.
+    pub(super) stacked: Option<StackedFrames>,
 }
 
 impl BatchLayout {
-    /// Bytes of all columns; none if they are more than the address space, or if there are more states than rows can have.
+    /// Bytes of all columns; none if they are more than the address space, if there are more states than rows can have, or if
+    /// states are no stacks of the frames.
     pub(super) fn bytes(&self) -> Option<usize> {
         let positives = self.rows.checked_mul(self.positives)?;
         if self.states_k > positives || self.states_n > self.rows {
@@ -117,7 +131,16 @@ impl BatchLayout {
         }
         let states = self.rows.checked_add(self.states_k)?;
         let states = states.checked_add(self.states_n)?;
-        let states = states.checked_mul(self.state_bytes)?;
+        let frames = match self.stacked {
+            None => 0,
+            Some(stacked) if stacked.fit(states, self.state_bytes) => {
+                let frame_bytes = stacked.frame_bytes(self.state_bytes);
+                frame_bytes.checked_mul(stacked.frames as usize)?
+            }
+            Some(_) => return None,
+        };
+        let states = states.checked_mul(self.value_bytes())?;
+        let states = states.checked_add(frames)?;
         let of_priorities = if self.is_prioritised {
             PRIORITY_SCALAR_BYTES
         } else {
@@ -141,6 +164,25 @@ impl BatchLayout {
         valid.map(|&valid| valid != 0).collect()
     }
 
+    /// Bytes of a value in a column of states: all of a state, or what says of which frames it is made.
+    pub(super) const fn value_bytes(&self) -> usize {
+        match self.stacked {
+            None => self.state_bytes,
+            Some(stacked) => stacked.stack_bytes(),
+        }
+    }
+
+    /// Frames that travel, and bytes of each: states where they are one frame.
+    pub(super) const fn frames(&self) -> (usize, usize) {
+        match self.stacked {
+            None => (self.rows + self.states_k + self.states_n, self.state_bytes),
+            Some(stacked) => (
+                stacked.frames as usize,
+                stacked.frame_bytes(self.state_bytes),
+            ),
+        }
+    }
+
     /// Values that a row has in a column.
     pub(super) const fn values_a_row(&self, column: Column) -> usize {
         if column.is_per_positive() {
@@ -153,9 +195,16 @@ impl BatchLayout {
     /// Bytes of a column.
     pub(super) const fn column_bytes(&self, column: Column) -> usize {
         match column {
-            Column::StatesT => self.rows * self.state_bytes,
-            Column::StatesK => self.states_k * self.state_bytes,
-            Column::StatesN => self.states_n * self.state_bytes,
+            Column::Frames => match self.stacked {
+                None => 0,
+                Some(_) => {
+                    let (count, bytes) = self.frames();
+                    count * bytes
+                }
+            },
+            Column::StatesT => self.rows * self.value_bytes(),
+            Column::StatesK => self.states_k * self.value_bytes(),
+            Column::StatesN => self.states_n * self.value_bytes(),
             _ if column.is_of_priorities() && !self.is_prioritised => 0,
             _ => self.rows * self.values_a_row(column) * column.scalar_bytes(),
         }
@@ -173,6 +222,12 @@ impl BatchLayout {
 mod tests {
     use super::*;
 
+    const FRAMES: StackedFrames = StackedFrames {
+        frames: 5,
+        frame_stack: 4,
+        frame_channels: 1,
+    };
+
     #[test]
     fn columns_fill_the_payload_without_gaps() {
         for (rows, positives, state_bytes, states_k, states_n) in [
@@ -188,6 +243,7 @@ mod tests {
                 states_k,
                 states_n,
                 is_prioritised: rows % 2 == 0,
+                stacked: state_bytes.is_multiple_of(4).then_some(FRAMES),
             };
             let mut end = 0;
             for column in Column::ALL {
@@ -204,6 +260,7 @@ mod tests {
             states_k: 4,
             states_n: 2,
             is_prioritised: false,
+            stacked: None,
         };
         assert_eq!(small.bytes(), Some(2 * (3 + 1 + 10 + 2 * 2)));
         let prioritised = BatchLayout {
@@ -211,7 +268,51 @@ mod tests {
             ..small
         };
         assert_eq!(prioritised.bytes(), Some(2 * (3 + 1 + 10 + 2 * 2 + 12)));
+        let stacks = BatchLayout {
+            state_bytes: 8,
+            stacked: Some(FRAMES),
+            ..small
+        };
+        // Five frames of two bytes, and four numbers of four for each of eight states.
+        let of_states = 5 * 2 + 8 * 16;
+        assert_eq!(stacks.bytes(), Some(of_states + 2 * (10 + 2 * 2)));
+        let of = |stacked| BatchLayout {
+            stacked: Some(stacked),
+            ..stacks
+        };
         for wrong in [
+            of(StackedFrames {
+                frames: 8 * 4 + 1,
+                ..FRAMES
+            }),
+            of(StackedFrames {
+                frame_stack: 0,
+                ..FRAMES
+            }),
+            of(StackedFrames {
+                frame_stack: 1,
+                ..FRAMES
+            }),
+            of(StackedFrames {
+                frame_stack: 3,
+                ..FRAMES
+            }),
+            of(StackedFrames {
+                frame_stack: u32::MAX,
+                ..FRAMES
+            }),
+            of(StackedFrames {
+                frame_channels: 0,
+                ..FRAMES
+            }),
+            of(StackedFrames {
+                frame_channels: 3,
+                ..FRAMES
+            }),
+            BatchLayout {
+                state_bytes: usize::MAX / 4 * 4,
+                ..stacks
+            },
             BatchLayout {
                 rows: usize::MAX,
                 ..small

@@ -1,7 +1,10 @@
-//! How a batch is written: first all of its rows but their states, then each state in the place that follows from them.
+//! How a batch is written: first all of its rows but their states, then each state, or its frames, in the place that follows from them.
 //! What the values mean is said at `Batch`.
 
-use super::batch_layout::{BatchLayout, Column};
+use super::{
+    batch_frames::StackedFrames,
+    batch_layout::{BatchLayout, Column},
+};
 
 /// All of a row but its states.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -48,64 +51,102 @@ impl RowScalars {
     }
 }
 
-/// The places of a batch's states, borrowed for writing.
+/// The places of a batch's states and their frames, borrowed for writing.
+///
+/// States have numbers: those of s_t, then those of s_{t+k}, then those of s_{t+n}. Where a state is one frame, that has its number.
 #[derive(Debug)]
 pub struct BatchStatesMut<'a> {
     rows: usize,
-    state_bytes: usize,
-    states_t: &'a mut [u8],
-    states_k: &'a mut [u8],
-    states_n: &'a mut [u8],
-    /// Of each positive [P, B] its place among those that travel.
-    places_k: Vec<Option<usize>>,
-    /// Of each row the place of its s_{t+n} among those that travel.
-    places_n: Vec<Option<usize>>,
+    frame_bytes: usize,
+    /// The frames that travel.
+    frames: &'a mut [u8],
+    /// Of each state, which of them it is made of; none where states are one frame each.
+    stacks: &'a mut [u8],
+    stack_bytes: usize,
+    /// Of each positive [P, B] the number of its state.
+    numbers_k: Vec<Option<usize>>,
+    /// Of each row the number of its s_{t+n}.
+    numbers_n: Vec<Option<usize>>,
 }
 
 impl<'a> BatchStatesMut<'a> {
     /// Those of a payload whose scalars are written.
     pub(super) fn new(layout: BatchLayout, payload: &'a mut [u8]) -> Self {
-        let places_k = places(&layout.positives_there(payload));
-        let places_n = places(&layout.bootstraps(payload));
-        let (states_t, rest) = payload.split_at_mut(layout.column_bytes(Column::StatesT));
-        let (states_k, rest) = rest.split_at_mut(layout.column_bytes(Column::StatesK));
+        let first_n = layout.rows + layout.states_k;
+        let numbers_k = numbers(&layout.positives_there(payload), layout.rows);
+        let numbers_n = numbers(&layout.bootstraps(payload), first_n);
+        let (count, frame_bytes) = layout.frames();
+        let (frames, rest) = payload.split_at_mut(count * frame_bytes);
+        let (stack_bytes, stacks) = match layout.stacked {
+            None => (0, &mut [][..]),
+            Some(_) => {
+                let bytes = layout.value_bytes();
+                (bytes, &mut rest[..(first_n + layout.states_n) * bytes])
+            }
+        };
         Self {
             rows: layout.rows,
-            state_bytes: layout.state_bytes,
-            states_t,
-            states_k,
-            states_n: &mut rest[..layout.column_bytes(Column::StatesN)],
-            places_k,
-            places_n,
+            frame_bytes,
+            frames,
+            stacks,
+            stack_bytes,
+            numbers_k,
+            numbers_n,
         }
     }
 
-    /// Where s_t of `row` is written.
+    /// The numbers of the states that `row` has: of s_t, of s_{t+n}, and of s_{t+k} of each positive.
+    pub fn of_row(&self, row: usize) -> impl Iterator<Item = usize> {
+        let of_positives = self.numbers_k.iter().skip(row).step_by(self.rows);
+        let first = [Some(row), self.numbers_n[row]];
+        first.into_iter().chain(of_positives.copied()).flatten()
+    }
+
+    /// Where frame `number` is written.
+    pub fn frame(&mut self, number: usize) -> &mut [u8] {
+        &mut self.frames[number * self.frame_bytes..][..self.frame_bytes]
+    }
+
+    /// Says of which frames state `number` is made, oldest first.
+    ///
+    /// # Panics
+    /// If they are not as many as a stack has.
+    pub fn set_stack(&mut self, number: usize, frames: &[u32]) {
+        let stack = &mut self.stacks[number * self.stack_bytes..][..self.stack_bytes];
+        StackedFrames::write(stack, frames);
+    }
+
+    /// Where s_t of `row` is written, in a batch whose states are one frame each.
     pub fn t(&mut self, row: usize) -> &mut [u8] {
-        &mut self.states_t[row * self.state_bytes..][..self.state_bytes]
+        self.state(row)
     }
 
-    /// Where s_{t+k} of positive `p` of `row` is written, if the row has it.
+    /// Where s_{t+k} of positive `p` of `row` is written, if the row has it; as [`BatchStatesMut::t`].
     pub fn k(&mut self, p: usize, row: usize) -> Option<&mut [u8]> {
-        let place = self.places_k[p * self.rows + row]?;
-        Some(&mut self.states_k[place * self.state_bytes..][..self.state_bytes])
+        let number = self.numbers_k[p * self.rows + row]?;
+        Some(self.state(number))
     }
 
-    /// Where s_{t+n} of `row` is written, if the row bootstraps.
+    /// Where s_{t+n} of `row` is written, if the row bootstraps; as [`BatchStatesMut::t`].
     pub fn n(&mut self, row: usize) -> Option<&mut [u8]> {
-        let place = self.places_n[row]?;
-        Some(&mut self.states_n[place * self.state_bytes..][..self.state_bytes])
+        let number = self.numbers_n[row]?;
+        Some(self.state(number))
+    }
+
+    fn state(&mut self, number: usize) -> &mut [u8] {
+        assert!(self.stacks.is_empty(), "a stack of frames has no place");
+        self.frame(number)
     }
 }
 
-/// Of each its place among those that are there.
-fn places(there: &[bool]) -> Vec<Option<usize>> {
-    let mut next = 0;
-    let place = |&there: &bool| {
+/// Of each its number, counted from `first` over those that are there.
+fn numbers(there: &[bool], first: usize) -> Vec<Option<usize>> {
+    let mut next = first;
+    let number = |&there: &bool| {
         there.then(|| {
             next += 1;
             next - 1
         })
     };
-    there.iter().map(place).collect()
+    there.iter().map(number).collect()
 }

@@ -3,6 +3,7 @@
 
 pub(crate) mod affinity;
 pub(crate) mod batch;
+pub(crate) mod batch_frames;
 mod batch_layout;
 pub(crate) mod batch_request;
 pub(crate) mod batch_rows;

@@ -11,7 +11,8 @@ use crate::{
     ledger::requests::{Dedup, Requests},
     sampling::{
         assemble::RowStates,
-        packed_batch::{PackedBatch, PackedStates},
+        needed_frames::NeededFrames,
+        packed_batch::{PackedBatch, PackedFrames},
     },
 };
 
@@ -105,6 +106,11 @@ impl Replay {
         self.limiter.sampled(rows);
         header.tally = self.limiter.tally();
         let (scalars, states): (Vec<_>, Vec<_>) = drawn.into_iter().unzip();
+        let mut needed = NeededFrames::default();
+        if let Some(stacked) = &mut header.stacked {
+            needed = NeededFrames::of(&self.ring, &self.episodes, states.iter());
+            stacked.frames = needed.count() as u32;
+        }
         let mut batch = Batch::of_rows(header, &scalars, memory);
         if let Some(priorities) = &self.priorities {
             // All by the masses that are there now: to find that one was no anchor any more makes the others more likely.
@@ -112,11 +118,20 @@ impl Replay {
             let drawn = states.iter().map(RowStates::anchor);
             batch.set_draws(drawn.map(|index| (index, chance(index))));
         }
-        let pixel_bytes = self.spec.frame_channels as usize;
-        let mut packed = PackedStates::new(self.spec.frame_bytes(), pixel_bytes);
+        let mut packed = PackedFrames::new(self.spec.frame_bytes());
         let mut places = batch.states_mut();
-        for (row, states) in states.into_iter().enumerate() {
-            packed.write_or_take_row(&self.ring, &self.episodes, states, &mut places, row);
+        let mut stacks = needed.stacks();
+        for (row, states) in states.iter().enumerate() {
+            let numbers: Vec<usize> = places.of_row(row).collect();
+            if header.stacked.is_none() {
+                let frames = states.indices().zip(numbers);
+                packed.write_or_take_row(&self.ring, frames, &mut places);
+                continue;
+            }
+            for (number, stack) in numbers.into_iter().zip(&mut stacks) {
+                places.set_stack(number, stack);
+            }
+            packed.write_or_take_row(&self.ring, needed.first_in(row), &mut places);
         }
         self.starving = false;
         Ok(PackedBatch { batch, packed, ks })

@@ -1,9 +1,7 @@
 //! Makes one row of a batch: a_t, a_{t+1}, the n-step return, and which transitions' states are s_t, s_{t+n} and s_{t+k}, with
 //! each k drawn here. It does not choose the anchor and reads no frame.
 
-use driml_protocol::{
-    BatchStatesMut, End, Horizon, NO_ACTION, POSITIVES_MAX, RowScalars, RunSpec, TimeoutRule,
-};
+use driml_protocol::{End, Horizon, NO_ACTION, POSITIVES_MAX, RowScalars, RunSpec, TimeoutRule};
 use rand::Rng;
 
 use super::{
@@ -40,30 +38,10 @@ impl RowStates {
         }
     }
 
-    /// s_t, s_{t+n}, s_{t+k} for each k: those that the row has.
+    /// s_t, s_{t+n}, s_{t+k} for each k: those that the row has, in the order of their numbers in `BatchStatesMut::of_row`.
     pub(crate) fn indices(&self) -> impl Iterator<Item = u64> {
         let first = [Some(self.t), self.n].into_iter().flatten();
         first.chain(self.s_tpk.into_iter().take(self.positives))
-    }
-
-    /// Calls `write` with the index and the place of each state, in the order of [`RowStates::indices`].
-    ///
-    /// # Panics
-    /// If `places` are those of another row's scalars.
-    pub(crate) fn write(
-        &self,
-        places: &mut BatchStatesMut<'_>,
-        row: usize,
-        mut write: impl FnMut(u64, &mut [u8]),
-    ) {
-        write(self.t, places.t(row));
-        if let Some(index) = self.n {
-            write(index, places.n(row).expect("a row that bootstraps"));
-        }
-        for p in 0..self.positives {
-            let place = places.k(p, row).expect("a positive that the row has");
-            write(self.s_tpk[p], place);
-        }
     }
 }
 

@@ -1,7 +1,7 @@
-//! Walks along stored episodes: which transitions can be an anchor, the steps that follow it, and stacked frames.
+//! Walks along stored episodes: which transitions can be an anchor, the steps that follow it, and the frames of a state.
 //! It does not draw anchors and computes no returns.
 
-use driml_protocol::{End, RunSpec, TimeoutRule};
+use driml_protocol::{End, FRAME_STACK_MAX, RunSpec, TimeoutRule};
 
 use crate::{
     config,
@@ -86,6 +86,11 @@ impl Episodes {
         true
     }
 
+    /// Frames of one state.
+    pub(crate) const fn frame_stack(&self) -> usize {
+        self.frame_stack
+    }
+
     /// The frames that make the state at `index`.
     ///
     /// At the start of a level its first frame fills the slots of the frames before it. The stack must be held, which it is
@@ -93,7 +98,7 @@ impl Episodes {
     pub(crate) fn stack(&self, ring: &Ring, mut index: u64) -> Stack {
         let mut stack = Stack {
             length: self.frame_stack,
-            indices: [index; FRAME_STACK_MAX],
+            indices: [index; FRAME_STACK_MAX as usize],
         };
         for slot in (0..self.frame_stack - 1).rev() {
             match ring.previous(index) {
@@ -109,63 +114,15 @@ impl Episodes {
     }
 }
 
-/// Longest frame stack that a run spec allows.
-const FRAME_STACK_MAX: usize = 16;
-
 /// The frames of one state, as indices in the ring, oldest first.
 pub(crate) struct Stack {
     length: usize,
-    indices: [u64; FRAME_STACK_MAX],
+    indices: [u64; FRAME_STACK_MAX as usize],
 }
 
 impl Stack {
     /// Indices of the frames, oldest first; at the start of a level the first one several times.
     pub(crate) fn frames(&self) -> impl Iterator<Item = u64> {
         self.indices.into_iter().take(self.length)
-    }
-
-    /// Writes the state into `out` [H, W, C * stack], a pixel's oldest channels first; `frame` gives a frame [H, W, C].
-    pub(crate) fn write<'a>(
-        &self,
-        pixel_bytes: usize,
-        out: &mut [u8],
-        frame: impl Fn(u64) -> &'a [u8],
-    ) {
-        if self.length == 1 {
-            return out.copy_from_slice(frame(self.indices[0]));
-        }
-        let mut frames: [&[u8]; FRAME_STACK_MAX] = [&[]; FRAME_STACK_MAX];
-        for (to, index) in frames.iter_mut().zip(self.frames()) {
-            *to = frame(index);
-        }
-        interleave(&frames[..self.length], pixel_bytes, out);
-    }
-}
-
-/// Writes `frames`, each [pixels, C], into `out` [pixels, stack, C].
-///
-/// A pixel of the output is written at once: the sizes in use are compiled, the others take their time.
-fn interleave(frames: &[&[u8]], pixel_bytes: usize, out: &mut [u8]) {
-    fn compiled<const STACK: usize, const C: usize>(frames: &[&[u8]], out: &mut [u8]) {
-        let frames: [&[[u8; C]]; STACK] = std::array::from_fn(|slot| frames[slot].as_chunks().0);
-        let (pixels, _) = out.as_chunks_mut::<C>().0.as_chunks_mut::<STACK>();
-        // Equal lengths, known before the loop, keep bounds checks out of it.
-        let frames = frames.map(|frame| &frame[..pixels.len()]);
-        for (i, pixel) in pixels.iter_mut().enumerate() {
-            for slot in 0..STACK {
-                pixel[slot] = frames[slot][i];
-            }
-        }
-    }
-    match (frames.len(), pixel_bytes) {
-        (4, 1) => compiled::<4, 1>(frames, out),
-        (4, 3) => compiled::<4, 3>(frames, out),
-        (stack, _) => {
-            for (slot, frame) in frames.iter().enumerate() {
-                let to = out.chunks_exact_mut(pixel_bytes).skip(slot).step_by(stack);
-                to.zip(frame.chunks_exact(pixel_bytes))
-                    .for_each(|(to, from)| to.copy_from_slice(from));
-            }
-        }
     }
 }

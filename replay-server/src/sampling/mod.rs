@@ -5,6 +5,7 @@ pub(crate) mod anchors;
 pub(crate) mod assemble;
 pub(crate) mod episodes;
 pub mod horizon;
+pub(crate) mod needed_frames;
 pub(crate) mod packed_batch;
 pub(crate) mod prioritised;
 pub(crate) mod sum_tree;

@@ -1,15 +1,11 @@
 //! A batch that left the replay with its frames still compressed, and their unpacking, for which nothing is locked.
-//! It draws nothing: which states a row has was decided before.
+//! It draws nothing: which frames a row needs was decided before.
 
 use std::ops::Range;
 
 use driml_protocol::{Batch, BatchStatesMut};
 use lz4_flex::block::{decompress_into, decompress_into_with_dict};
 
-use super::{
-    assemble::RowStates,
-    episodes::{Episodes, Stack},
-};
 use crate::storage::{
     frame_store::{
         Frames,
@@ -23,7 +19,7 @@ use crate::storage::{
 pub struct PackedBatch {
     pub(crate) batch: Batch,
     /// No rows if the batch has its frames.
-    pub(crate) packed: PackedStates,
+    pub(crate) packed: PackedFrames,
     /// k of each row, of several the furthest; 0 where there is none.
     pub(crate) ks: Vec<u32>,
 }
@@ -39,20 +35,19 @@ impl PackedBatch {
     }
 }
 
-/// Copies of the parts of blocks that a batch's states need, row by row.
-pub(crate) struct PackedStates {
+/// Copies of the parts of blocks that a batch's frames need, row by row.
+pub(crate) struct PackedFrames {
     frame_bytes: usize,
-    pixel_bytes: usize,
     rows: Vec<PackedRow>,
-    stacks: Vec<Stack>,
+    /// Indices in the ring, and places in the batch.
+    frames: Vec<(u64, usize)>,
     parts: Vec<PackedPart>,
     bytes: Vec<u8>,
 }
 
-/// A row's states; their stacks, in the states' order; and the parts with all their frames.
+/// The frames that a row is the first to need, and the parts with all of them.
 struct PackedRow {
-    states: RowStates,
-    stacks: Range<usize>,
+    frames: Range<usize>,
     parts: Range<usize>,
 }
 
@@ -63,67 +58,55 @@ struct PackedPart {
     key: Option<u64>,
 }
 
-impl PackedStates {
+impl PackedFrames {
     /// No rows yet, of frames of this size.
-    pub(crate) fn new(frame_bytes: usize, pixel_bytes: usize) -> Self {
+    pub(crate) fn new(frame_bytes: usize) -> Self {
         Self {
             frame_bytes,
-            pixel_bytes,
             rows: Vec::new(),
-            stacks: Vec::new(),
+            frames: Vec::new(),
             parts: Vec::new(),
             bytes: Vec::new(),
         }
     }
 
-    /// Writes the states of the next row, number `row`, where frames are plain; takes what is needed to write them later where
-    /// they are compressed.
+    /// Writes the frames of the next row, indices in the ring and places in the batch, where frames are plain; takes what is needed
+    /// to write them later where they are compressed.
     pub(crate) fn write_or_take_row(
         &mut self,
         ring: &Ring,
-        episodes: &Episodes,
-        states: RowStates,
+        row: impl Iterator<Item = (u64, usize)>,
         places: &mut BatchStatesMut<'_>,
-        row: usize,
     ) {
         match ring.frames() {
-            Frames::Plain(frames) => states.write(places, row, |index, out| {
-                let stack = episodes.stack(ring, index);
-                stack.write(self.pixel_bytes, out, |index| frames.frame(index));
-            }),
-            Frames::Compressed(frames) => self.take_row(ring, frames, episodes, states),
+            Frames::Plain(frames) => {
+                for (index, place) in row {
+                    places.frame(place).copy_from_slice(frames.frame(index));
+                }
+            }
+            Frames::Compressed(frames) => self.take_row(frames, row),
         }
     }
 
-    /// Takes what the next row needs; a part that several of its states share is taken once.
-    fn take_row(
-        &mut self,
-        ring: &Ring,
-        frames: &CompressedFrames,
-        episodes: &Episodes,
-        states: RowStates,
-    ) {
-        let (first_stack, first_part) = (self.stacks.len(), self.parts.len());
-        for state in states.indices() {
-            let stack = episodes.stack(ring, state);
-            for index in stack.frames() {
-                if self.has(first_part, index) {
-                    continue;
-                }
-                let (key, part) = frames.parts(index);
-                let key_index = key.transitions.start;
-                if !self.has(first_part, key_index) {
-                    self.take(frames, &key, None);
-                }
-                if let Some(part) = part {
-                    self.take(frames, &part, Some(key_index));
-                }
+    /// Takes what the next row needs; a part that several of its frames share is taken once.
+    fn take_row(&mut self, frames: &CompressedFrames, row: impl Iterator<Item = (u64, usize)>) {
+        let (first_frame, first_part) = (self.frames.len(), self.parts.len());
+        for (index, place) in row {
+            self.frames.push((index, place));
+            if self.has(first_part, index) {
+                continue;
             }
-            self.stacks.push(stack);
+            let (key, part) = frames.parts(index);
+            let key_index = key.transitions.start;
+            if !self.has(first_part, key_index) {
+                self.take(frames, &key, None);
+            }
+            if let Some(part) = part {
+                self.take(frames, &part, Some(key_index));
+            }
         }
         self.rows.push(PackedRow {
-            states,
-            stacks: first_stack..self.stacks.len(),
+            frames: first_frame..self.frames.len(),
             parts: first_part..self.parts.len(),
         });
     }
@@ -144,20 +127,17 @@ impl PackedStates {
         });
     }
 
-    /// Unpacks every row's parts and writes its states.
+    /// Unpacks every row's parts and writes its frames.
     fn write(&self, batch: &mut Batch) {
         let mut places = batch.states_mut();
         let mut unpacked = Vec::new();
-        for (number, row) in self.rows.iter().enumerate() {
+        for row in &self.rows {
             let parts = &self.parts[row.parts.clone()];
             self.unpack(parts, &mut unpacked);
-            let mut stacks = self.stacks[row.stacks.clone()].iter();
-            row.states.write(&mut places, number, |_, out| {
-                let stack = stacks.next().expect("every state has its stack");
-                stack.write(self.pixel_bytes, out, |index| {
-                    self.frame(parts, &unpacked, index)
-                });
-            });
+            for &(index, place) in &self.frames[row.frames.clone()] {
+                let frame = self.frame(parts, &unpacked, index);
+                places.frame(place).copy_from_slice(frame);
+            }
         }
     }
 

@@ -1,9 +1,11 @@
 //! Batches against the reference, through wrap-around, restarts, losses, retries and strays.
 //! It does not test how often each row or k comes: `anchors` and `horizon` do.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
-use driml_protocol::{Batch, ChunkHeader, Goodbye, Horizon, InsertReply, TimeoutRule, Waiting};
+use driml_protocol::{
+    Batch, BatchHeader, ChunkHeader, Goodbye, Horizon, InsertReply, RunSpec, TimeoutRule, Waiting,
+};
 use driml_replay_server::{Compression, PackedBatch, Replay, ReproducedBug, Unready};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
@@ -32,9 +34,11 @@ pub(crate) fn check_rows(batch: &Batch, history: &History) -> (f64, (u64, u64)) 
     let state = |plane: &[u8], row: usize| plane[row * bytes..(row + 1) * bytes].to_vec();
     let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
     let (mut ages, mut versions) = (0, (0, u64::MAX));
-    let mut next = batch.states_n().chunks_exact(bytes);
+    let [states_t, states_k, states_n] = [batch.states_t(), batch.states_k(), batch.states_n()];
+    check_frames(batch, spec);
+    let mut next = states_n.chunks_exact(bytes);
     for row in 0..rows {
-        let (key, t) = identity(spec, &state(batch.states_t(), row));
+        let (key, t) = identity(spec, &state(&states_t, row));
         assert!(
             history.is_valid(key, t),
             "{key:?} step {t} is no valid anchor"
@@ -42,11 +46,7 @@ pub(crate) fn check_rows(batch: &Batch, history: &History) -> (f64, (u64, u64)) 
         let want = history.row(key, t);
         let context = format!("{key:?} step {t}: {want:?}");
         let record = &history.streams[&key][t];
-        assert_eq!(
-            state(batch.states_t(), row),
-            history.state(key, t),
-            "{context}"
-        );
+        assert_eq!(state(&states_t, row), history.state(key, t), "{context}");
         assert_eq!(batch.actions()[row], want.action, "{context}");
         assert_eq!(batch.next_actions()[row], want.next_action, "{context}");
         assert!(
@@ -79,7 +79,7 @@ pub(crate) fn check_rows(batch: &Batch, history: &History) -> (f64, (u64, u64)) 
             assert_eq!(batch.positive_valid()[at], u8::from(k > 0), "{context}");
             if k > 0 {
                 let place = batch.positive_valid()[..at].iter().filter(|it| **it != 0);
-                let frame_k = state(batch.states_k(), place.count());
+                let frame_k = state(&states_k, place.count());
                 assert_eq!(frame_k, history.state(key, t + k), "{context}: k = {k}");
             }
         }
@@ -91,8 +91,43 @@ pub(crate) fn check_rows(batch: &Batch, history: &History) -> (f64, (u64, u64)) 
     }
     assert!(next.next().is_none(), "no state that no row has");
     let positives = batch.positive_valid().iter().filter(|it| **it != 0);
-    assert_eq!(batch.states_k().len(), positives.count() * bytes);
+    assert_eq!(states_k.len(), positives.count() * bytes);
     (ages as f64 / rows as f64, versions)
+}
+
+/// Checks that each frame of a stacked state travels once, and that no more of them do than were reckoned with.
+fn check_frames(batch: &Batch, spec: &RunSpec) {
+    let (header, payload) = batch.clone().into_payload();
+    assert_eq!(&Batch::from_payload(header, payload).unwrap(), batch);
+    let reckoned = BatchHeader {
+        origin: header.origin,
+        ..BatchHeader::of(spec, header.rows)
+    };
+    assert_eq!(header.stacked.is_some(), spec.frame_stack > 1);
+    assert!(header.payload_bytes() <= reckoned.payload_bytes());
+    let Some(stacked) = header.stacked else {
+        return;
+    };
+    let planes = [batch.states_t(), batch.states_k(), batch.states_n()];
+    let (channels, stack) = (spec.frame_channels as usize, spec.frame_stack as usize);
+    let mut frames = HashSet::new();
+    for state in planes
+        .iter()
+        .flat_map(|plane| plane.chunks(spec.state_bytes()))
+    {
+        let pixels = state.chunks(channels * stack);
+        let frame = |slot: usize| {
+            pixels
+                .clone()
+                .flat_map(move |it| &it[slot * channels..][..channels])
+        };
+        frames.extend((0..stack).map(|slot| frame(slot).copied().collect::<Vec<u8>>()));
+    }
+    assert_eq!(
+        stacked.frames as usize,
+        frames.len(),
+        "each frame is another"
+    );
 }
 
 /// What an actor knows of itself.

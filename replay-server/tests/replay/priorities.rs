@@ -101,7 +101,8 @@ impl Setup {
 
     fn indices(&self, batch: &Batch) -> Vec<u64> {
         let spec = &self.history.spec;
-        let states = batch.states_t().chunks(spec.state_bytes());
+        let states_t = batch.states_t();
+        let states = states_t.chunks(spec.state_bytes());
         let index = |state| {
             let (key, t) = identity(spec, state);
             self.history.streams[&key][t].index
@@ -221,7 +222,8 @@ fn k_follows_its_own_rule() {
     for _ in 0..1000 {
         let batch = setup.replay.sample(ROWS).unwrap();
         let spec = &setup.history.spec;
-        let states = batch.states_t().chunks(spec.state_bytes());
+        let states_t = batch.states_t();
+        let states = states_t.chunks(spec.state_bytes());
         for (state, &k) in states.zip(batch.ks()).filter(|(_, k)| **k > 0) {
             let (key, t) = identity(spec, state);
             let left = setup.history.row(key, t).steps_left;

@@ -7,8 +7,8 @@ use driml_protocol::{
     Chunk, ChunkHeader, Claim, CodecError, Done, End, EndedEpisode, EpisodesReply, EpisodesRequest,
     Goodbye, Hello, InsertReply, JoinReply, Kind, LearnerJoin, LearnerStatus, Life, Message,
     NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus, PartsStatus, Played, PriorityUpdate,
-    ReplayStatus, Report, RequestId, Returns, RowScalars, Tally, Waiting, Warning, WeightsHeader,
-    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec,
+    ReplayStatus, Report, RequestId, Returns, RowScalars, StackedFrames, Tally, Waiting, Warning,
+    WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec,
 };
 
 /// The hash of the run that these messages are of.
@@ -63,8 +63,13 @@ fn read_batch(bytes: &[u8]) {
             return;
         };
         assert_eq!(batch.n_step_returns().len(), batch.rows());
-        let states = header.states_k as usize * header.state_bytes as usize;
-        assert_eq!(batch.states_k().len(), states);
+        let bytes = |states: u32| states as usize * header.state_bytes as usize;
+        let planes = [header.rows, header.states_k, header.states_n].map(bytes);
+        // Few frames may be many states.
+        if planes.iter().sum::<usize>() < 1 << 20 {
+            let states = [batch.states_t(), batch.states_k(), batch.states_n()];
+            assert_eq!(states.map(|states| states.len()), planes);
+        }
         let found = vec![0.5; batch.rows()];
         let update = batch.priority_update(1, 1, &found);
         assert_eq!(update.is_some(), batch.probabilities().is_some());
@@ -192,6 +197,7 @@ pub fn samples() -> Vec<Vec<u8>> {
         mean_age: 12.5,
         weights_versions: (8, 2),
         origin: None,
+        stacked: None,
     };
     let row = |(action, positives, bootstrap_discount)| RowScalars {
         action,
@@ -212,6 +218,18 @@ pub fn samples() -> Vec<Vec<u8>> {
     prioritised.set_draws([(5, 0.5), (1 << 40, 0.25), (7, 1e-9)].into_iter());
     let priorities = prioritised.priority_update(5, 9, &[0.0, 1.5, 3e38]);
     let (prioritised, draws) = prioritised.into_payload();
+    let mut stacked = header;
+    stacked.stacked = Some(StackedFrames {
+        frames: 5,
+        frame_stack: 2,
+        frame_channels: 1,
+    });
+    let mut stacked = Batch::of_rows(stacked, &rows, memory);
+    let mut places = stacked.states_mut();
+    for state in 0..6 {
+        places.set_stack(state, &[state as u32 / 2, 4]);
+    }
+    let (stacked, frames) = stacked.into_payload();
     let (header, payload) = Batch::of_rows(header, &rows, memory).into_payload();
     let weights = WeightsHeader::new(4, 312, b"weights");
     let upload = WeightsUpload {
@@ -367,6 +385,7 @@ pub fn samples() -> Vec<Vec<u8>> {
             offset: 1 << 18,
         }),
         codec::encode(SPEC, &BatchReply::of(prioritised), &draws).unwrap(),
+        codec::encode(SPEC, &BatchReply::of(stacked), &frames).unwrap(),
         of(priorities.unwrap()),
     ]
 }

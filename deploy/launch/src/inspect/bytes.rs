@@ -2,7 +2,7 @@
 //! The replay may hold frames compressed, and a socket adds its own; neither is counted.
 
 use driml_model::StoredAs;
-use driml_protocol::{BatchHeader, RunSpec, TRANSITION_BYTES};
+use driml_protocol::{BatchHeader, Horizon, RunSpec, TRANSITION_BYTES};
 use driml_settings::{config::RunConfig, memory::replay_bytes_each};
 
 use super::{everything::Everything, line::Line};
@@ -14,13 +14,26 @@ use super::{everything::Everything, line::Line};
 pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Result<Vec<Line>> {
     let run = &config.run;
     let rows = config.learner.batch_size;
-    let batch = |run: &RunSpec| {
-        let header = BatchHeader::of(run, rows).sampled_by(&config.replay.sampling);
-        header.payload_bytes() as u64
+    let header = |run: &RunSpec| BatchHeader::of(run, rows).sampled_by(&config.replay.sampling);
+    let batch = |run: &RunSpec| header(run).payload_bytes() as u64;
+    let scalars = |run: &RunSpec| {
+        let without_states = BatchHeader {
+            state_bytes: 0,
+            stacked: None,
+            ..header(run)
+        };
+        without_states.payload_bytes() as u64
     };
-    let states = |run: &RunSpec, states: usize| rows as u64 * (states * run.state_bytes()) as u64;
+    // Of all states, and of s_t and s_{t+n} alone; of stacks, their frames and what says which are whose.
+    let states = |run: &RunSpec| batch(run) - scalars(run);
+    let first_states = |run: &RunSpec| {
+        states(&RunSpec {
+            horizon: Horizon::None,
+            ..run.clone()
+        })
+    };
     let transition = |run: &RunSpec| (run.frame_bytes() + TRANSITION_BYTES) as u64;
-    let (positives, every_positives) = (run.horizon.positives(), every.run.horizon.positives());
+    let positives = run.horizon.positives();
     let whole = config.world.frame_shape();
     let size = |height, width, channels| format!("{height}x{width}x{channels}");
     let frame = size(run.frame_height, run.frame_width, run.frame_channels);
@@ -36,13 +49,11 @@ pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Resu
     };
     let state_why = match run.frame_stack {
         1 => "one frame each".into(),
-        stack => format!("{stack} frames each"),
+        stack => format!("{stack} frames each; one that several states of a row have travels once"),
     };
     let published = config.learner.publish_as;
     let weights = config.weights_bytes()?;
     let every_weights = every.model.weights_bytes(StoredAs::F32)?;
-    let scalars = batch(run) - states(run, 2 + positives);
-    let every_scalars = batch(&every.run) - states(&every.run, 2 + every_positives);
     Ok(vec![
         Line::new(
             "a transition in a chunk",
@@ -64,20 +75,20 @@ pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Resu
         ),
         Line::new(
             "  s_t and s_{t+n}",
-            states(run, 2),
-            states(&every.run, 2),
+            first_states(run),
+            first_states(&every.run),
             state_why,
         ),
         Line::new(
             "  s_{t+k}",
-            states(run, positives),
-            states(&every.run, every_positives),
+            states(run) - first_states(run),
+            states(&every.run) - first_states(&every.run),
             format!("{positives} a row: what {} is served", config.run.agent),
         ),
         Line::new(
             "  numbers",
-            scalars,
-            every_scalars,
+            scalars(run),
+            scalars(&every.run),
             "returns, discounts, actions, k",
         ),
         Line::new(

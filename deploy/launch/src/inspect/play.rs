@@ -6,7 +6,7 @@ use std::collections::HashSet;
 use anyhow::bail;
 use driml_actor::{ActorSettings, Collector, Incarnation};
 use driml_learner::{Compute, EqualStates, Learner, LearnerConfig, Positives};
-use driml_protocol::{ActorJoin, Batch, BufferPool, InsertReply};
+use driml_protocol::{ActorJoin, Batch, BatchHeader, BufferPool, InsertReply};
 use driml_replay_server::{Replay, Unready};
 use driml_settings::config::RunConfig;
 use serde::Serialize;
@@ -27,6 +27,9 @@ pub struct RowShares {
     pub without_positive: f64,
     /// Bytes that a batch would have if every row had all of its states, and does not have.
     pub absent_bytes: f64,
+    /// Bytes that it would have if each state came with all its frames, and does not have, as another state has them, less those
+    /// that say which frames are whose; 0 where a state is one frame.
+    pub shared_bytes: f64,
     /// Of a batch's states s_t and s_{t+k}, those that are equal to another of them.
     pub repeated_online: f64,
     /// Of a batch's states s_{t+n}, those that are equal to another of them.
@@ -43,6 +46,7 @@ struct Counts {
     rows: usize,
     bytes: usize,
     absent_bytes: usize,
+    shared_bytes: usize,
     without_bootstrap: usize,
     positives: usize,
     without_positive: usize,
@@ -115,14 +119,23 @@ impl Counts {
         let no_bootstrap = no_bootstrap.count();
         let no_positive = valid.iter().filter(|valid| **valid == 0).count();
         let absent_bytes = (no_bootstrap + no_positive) * state_bytes;
+        let whole = BatchHeader {
+            stacked: None,
+            ..batch.header
+        };
+        let whole_bytes = whole.payload_bytes();
         self.rows += batch.rows();
-        self.bytes += batch.header.payload_bytes() + absent_bytes;
+        self.bytes += whole_bytes + absent_bytes;
         self.absent_bytes += absent_bytes;
+        self.shared_bytes += whole_bytes.saturating_sub(batch.header.payload_bytes());
         self.without_bootstrap += no_bootstrap;
         self.positives += valid.len();
         self.without_positive += no_positive;
-        let [now, later, next] = [batch.states_t(), batch.states_k(), batch.states_n()]
+        let planes = [batch.states_t(), batch.states_k(), batch.states_n()];
+        let states = planes
+            .each_ref()
             .map(|plane| plane.chunks_exact(state_bytes));
+        let [now, later, next] = states;
         let blank = if learner.blank_positives {
             no_positive
         } else {
@@ -213,6 +226,7 @@ fn shares(counts: &Counts, frames: u64) -> RowShares {
         without_bootstrap: share(counts.without_bootstrap, counts.rows),
         without_positive: share(counts.without_positive, counts.positives),
         absent_bytes: share(counts.absent_bytes, counts.bytes),
+        shared_bytes: share(counts.shared_bytes, counts.bytes),
         repeated_online: counts.online.share(),
         repeated_target: counts.target.share(),
         computed_online: share(counts.online.computed, counts.online.places),
@@ -222,7 +236,7 @@ fn shares(counts: &Counts, frames: u64) -> RowShares {
 
 #[cfg(test)]
 mod tests {
-    use driml_protocol::{BatchHeader, Buffer, RowScalars};
+    use driml_protocol::{Buffer, RowScalars};
 
     use super::*;
 
@@ -239,6 +253,7 @@ mod tests {
             mean_age: 0.0,
             weights_versions: (0, 0),
             origin: None,
+            stacked: None,
         };
         let states = [
             ([1, 1], Some([9, 9]), Some([2, 2])),
@@ -285,6 +300,6 @@ mod tests {
         assert_eq!((counts.online.places, counts.online.computed), (16, 5 + 6));
         assert_eq!((counts.target.places, counts.target.computed), (8, 2 + 3));
         assert_eq!(counts.bytes, 2 * 4 * (3 * 2 + 12));
-        assert_eq!(counts.absent_bytes, 2 * 3 * 2);
+        assert_eq!((counts.absent_bytes, counts.shared_bytes), (2 * 3 * 2, 0));
     }
 }

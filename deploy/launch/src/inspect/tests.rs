@@ -119,12 +119,21 @@ fn what_is_counted_is_what_is_built() {
             };
             let rows = vec![row; header.rows as usize];
             let batch = Batch::of_rows(header, &rows, Buffer::zeroed);
-            let states = [batch.states_t(), batch.states_n(), batch.states_k()].map(<[u8]>::len);
+            let states = [batch.states_t(), batch.states_n(), batch.states_k()];
+            let states = states.map(|states| states.len());
             let (_, payload) = batch.into_payload();
             let said = |what| find(&inspection.bytes, what).is as usize;
             assert_eq!(said("a batch"), payload.len());
-            assert_eq!(said("s_t and s_{t+n}"), states[0] + states[1]);
-            assert_eq!(said("s_{t+k}"), states[2]);
+            let said_states = [said("s_t and s_{t+n}"), said("s_{t+k}")];
+            match header.stacked {
+                None => assert_eq!(said_states, [states[0] + states[1], states[2]]),
+                Some(stacked) => {
+                    // Four bytes say which frame each of a state is.
+                    let frames = stacked.frames as usize * config.run.frame_bytes();
+                    let stacks = states.iter().sum::<usize>() / config.run.frame_bytes() * 4;
+                    assert_eq!(said_states.iter().sum::<usize>(), frames + stacks);
+                }
+            }
             for line in inspection.parameters.iter().chain(&inspection.bytes) {
                 assert!(line.is <= line.everything, "{agent} on {world}: {line:?}");
                 let is_absent = line.why.starts_with("not ");

@@ -32,6 +32,7 @@ pub(super) fn played(shares: &RowShares) -> String {
         without_bootstrap,
         without_positive,
         absent_bytes,
+        shared_bytes,
         repeated_online,
         repeated_target,
         computed_online,
@@ -51,6 +52,10 @@ pub(super) fn played(shares: &RowShares) -> String {
         (
             "of a batch's bytes do not travel, as rows do not have these states",
             absent_bytes,
+        ),
+        (
+            "of a batch's bytes do not travel, as they are frames that another of its states has (run.frame_stack)",
+            shared_bytes,
         ),
         (
             "of s_t and s_{t+k} are equal to another of the batch",

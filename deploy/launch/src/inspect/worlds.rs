@@ -4,6 +4,7 @@
 use std::collections::BTreeSet;
 
 use driml_learner::cost::{UpdateCost, UpdateShape};
+use driml_protocol::BatchHeader;
 use driml_settings::config::RunConfig;
 
 use super::{Inspection, play::RowShares};
@@ -66,11 +67,20 @@ fn cells(config: &RunConfig, shares: Option<RowShares>) -> anyhow::Result<Vec<St
     let frame = config.world.frame_shape();
     let differ: BTreeSet<_> = config.world.visible_actions().into_iter().collect();
     let transition = |it| bytes(it, "a transition in a chunk").to_string();
-    let batch = |it| format!("{:.2}", bytes(it, "a batch") as f64 / 1e6);
     let update = |flops: f64| format!("{:.2}", flops / 1e9);
-    let whole_batch = bytes(&is, "a batch") as f64;
-    let travels = 1.0 - shares.map_or(0.0, |shares| shares.absent_bytes);
-    let batch_is = format!("{:.2}", whole_batch * travels / 1e6);
+    // With every state, and each of them whole.
+    let whole_batch = |config: &RunConfig| {
+        let header = BatchHeader {
+            stacked: None,
+            ..BatchHeader::of(&config.run, config.learner.batch_size)
+        };
+        let header = header.sampled_by(&config.replay.sampling);
+        header.payload_bytes() as f64
+    };
+    let batch_is = shares.map_or(bytes(&is, "a batch") as f64, |shares| {
+        whole_batch(config) * (1.0 - shares.absent_bytes - shares.shared_bytes)
+    });
+    let megabytes = |bytes: f64| format!("{:.2}", bytes / 1e6);
     Ok(vec![
         run.world.clone(),
         beside(
@@ -78,7 +88,7 @@ fn cells(config: &RunConfig, shares: Option<RowShares>) -> anyhow::Result<Vec<St
             format!("{}x{}", frame.height, frame.width),
         ),
         beside(transition(&is), transition(&whole)),
-        beside(batch_is, batch(&whole)),
+        beside(megabytes(batch_is), megabytes(whole_batch(&whole_frames))),
         beside(
             update(flops(config, false, shares)),
             update(flops(&whole_frames, true, None)),
@@ -109,6 +119,7 @@ fn played_cells(shares: RowShares) -> Vec<String> {
         without_bootstrap,
         without_positive,
         absent_bytes,
+        shared_bytes,
         repeated_online,
         repeated_target,
         ..
@@ -116,7 +127,7 @@ fn played_cells(shares: RowShares) -> Vec<String> {
     let percents = [
         without_bootstrap,
         without_positive,
-        absent_bytes,
+        absent_bytes + shared_bytes,
         repeated_online,
         repeated_target,
     ];
