@@ -19,6 +19,8 @@ pub(super) const HEAD_BYTES: usize = 32;
 const MAGIC: u32 = u32::from_le_bytes(*b"DRL1");
 /// Longest body: a message's, and some.
 const BODY_BYTES_MAX: u64 = (1 << 29) + (1 << 21);
+/// Highest number of a record that is believed: no log has so many.
+const ORDINAL_MAX: u64 = 1 << 60;
 /// Places at which a record is looked for after one that is too long: those that look like one.
 const CANDIDATES_MAX: usize = 64;
 /// Bytes read at once.
@@ -140,7 +142,10 @@ impl RecordReader {
         let long = |at: usize| u64::from(number(at)) | u64::from(number(at + 4)) << 32;
         let (ordinal, body_bytes, checked) = (long(8), long(16), u64::from(number(24)));
         let kind = RecordKind::of(number(4));
-        let sane = number(0) == MAGIC && body_bytes <= BODY_BYTES_MAX && checked <= body_bytes;
+        let sane = number(0) == MAGIC
+            && ordinal <= ORDINAL_MAX
+            && body_bytes <= BODY_BYTES_MAX
+            && checked <= body_bytes;
         let Some(kind) = kind.filter(|_| sane) else {
             // A machine that lost its power leaves zeros where it had not written yet.
             let zeros = head.iter().all(|&byte| byte == 0) && self.rest_is_zero()?;
