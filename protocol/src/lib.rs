@@ -52,7 +52,7 @@ pub use messages::{
     hello::Hello,
     insert_reply::{Claim, InsertReply},
     join::{ActorJoin, JoinReply, LearnerJoin},
-    parts::{PartName, PartStatus, PartsStatus, WARNINGS_MAX},
+    parts::{LogStatus, PartName, PartStatus, PartsStatus, WARNINGS_MAX},
     priorities::{Origin, PriorityPart, PriorityUpdate},
     report::{Life, Report, Warning},
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},

@@ -57,7 +57,8 @@ pub enum SessionError {
     },
     /// Nobody listens where the session was to connect, as far as can be told over UDP.
     #[error(
-        "nobody listens on {}, after {} s: is the replay server running, with --tls-dir, and is the endpoint right? Its port is one of UDP",
+        "nobody listens on {}, after {} s: is the replay server running, with --tls-dir, and is the endpoint right? Its port is one of UDP. \
+         One that goes on with a --replay-dir listens once it has read it",
         .connect.join(", "), CONNECT_MAX.as_secs()
     )]
     NobodyListens {

@@ -8,10 +8,10 @@ use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, BufferPool,
     Chunk, ChunkHeader, Claim, CodecError, Done, EPISODES_MAX, End, EndedEpisode, EpisodesReply,
     EpisodesRequest, Goodbye, Hello, Horizon, InsertReply, JoinReply, Kind, LearnerJoin,
-    LearnerStatus, Life, Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus,
-    PartsStatus, Played, PriorityPart, PriorityUpdate, ReplayStatus, Report, RequestId, Returns,
-    RowScalars, RunSpec, StackedFrames, Tally, TimeoutRule, Waiting, Warning, WeightsHeader,
-    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
+    LearnerStatus, Life, LogStatus, Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName,
+    PartStatus, PartsStatus, Played, PriorityPart, PriorityUpdate, ReplayStatus, Report, RequestId,
+    Returns, RowScalars, RunSpec, StackedFrames, Tally, TimeoutRule, Waiting, Warning,
+    WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 use proptest::prelude::*;
@@ -201,6 +201,14 @@ fn parts_status() -> PartsStatus {
         chunk_bytes_waiting: 1 << 20,
         weights_version: 4,
         weights_age_s: Some(1.0),
+        log: Some(LogStatus {
+            folder: "replay".into(),
+            bytes: 1 << 20,
+            bytes_max: Some(1 << 30),
+            flushed_s: 0.5,
+            refused: Some((2.0, "full".into())),
+            unwritten_bytes: 40,
+        }),
         last_warning: None,
         parts: vec![PartStatus {
             who: PartName::Actor(3),

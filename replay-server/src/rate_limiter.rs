@@ -132,7 +132,8 @@ impl RateLimiter {
 
     /// Counts `rows` that were sampled before, whatever the replay ratio allowed then.
     pub(crate) fn sampled_before(&mut self, rows: u64) {
-        self.this_shard.rows_sampled += rows;
+        let sampled = &mut self.this_shard.rows_sampled;
+        *sampled = sampled.saturating_add(rows);
     }
 
     /// Counts `rows` that were sampled, and of which nothing was learned, as not sampled.

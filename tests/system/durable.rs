@@ -431,11 +431,28 @@ fn a_full_disk_makes_everybody_wait_until_there_is_room() {
     let filler = disk.fill();
     server.wait_for_stderr("cannot be written: No space left on device (os error 28); nothing is taken or served until it can");
     let stopped = client.replay().unwrap();
+    let ask = format!("status --connect {}", system.endpoint());
+    wait_for("a status that says it", || {
+        let said = system.run(&ask).stdout;
+        let words = [
+            "replay on disk: ",
+            "REFUSED for",
+            "No space left on device",
+            "If the replay server dies now",
+            "to go on: the disk of the replay server on",
+        ];
+        words.iter().all(|it| said.contains(it)).then_some(())
+    });
     filler.remove();
     client.wait_for_replay("more frames", |replay| {
         replay.transitions_inserted > stopped.transitions_inserted + 1_000
     });
     server.wait_for_stderr("can be written again; nothing was lost");
+    let said = system.run(&ask).stdout;
+    assert!(
+        said.contains("replay on disk: ") && !said.contains("REFUSED"),
+        "{said}"
+    );
     actor.stop().expect_code(0);
     learner.stop().expect_code(0);
     let before = client.replay().unwrap();

@@ -427,3 +427,49 @@ fn strangers_in_the_place_of_a_replay_server() {
     });
     nobody.expect_code(1).expect_said("nobody listens on");
 }
+
+/// Of every part that has a file in the folder it is said whether it can take part, and what to do if it cannot.
+#[test]
+fn the_doctor_looks_at_certificates() {
+    let Some(tls) = TlsSystem::new("the_doctor_looks_at_certificates") else {
+        return;
+    };
+    let doctor = |dir: &str| tls.system.run(&format!("doctor --tls-dir {dir}"));
+    let well = doctor("tls");
+    let said = |ended: &driml_tests::Ended, state: &str, what: &str, words: &str| {
+        let line = |it: &&str| it.starts_with(state) && it.contains(what) && it.contains(words);
+        let found = ended.stdout.lines().find(line);
+        assert!(found.is_some(), "{state} {what} {words}: {}", ended.stdout);
+    };
+    for (what, words) in [
+        ("tls replay-server", "127.0.0.1"),
+        ("tls learner", "good until"),
+        ("tls observer", "days)"),
+        ("tls actors", "from 0 to"),
+    ] {
+        said(&well, "ok", what, words);
+    }
+    said(&well, "note", "tls authority", "ca.key is here");
+    assert!(!well.stderr.contains("--tls-dir"), "{}", well.stderr);
+
+    let bad = tls.good.copy(tls.system.path("bad"));
+    bad.sign_again("learner", Valid::UntilYesterday);
+    bad.pass_off("actor-0", "observer");
+    std::fs::remove_file(bad.path("actor-1.key")).unwrap();
+    let open = std::os::unix::fs::PermissionsExt::from_mode(0o644);
+    std::fs::set_permissions(bad.path("replay-server.key"), open).unwrap();
+    let ended = doctor("bad").expect_code(1);
+    said(&ended, "missing", "tls learner", "expired at");
+    said(&ended, "missing", "tls observer", "is the certificate of");
+    said(&ended, "missing", "tls actor-1", "actor-1.key is not there");
+    said(&ended, "note", "tls replay-server", "chmod 600");
+    ended.expect_said(
+        "with --tls-dir these parts cannot take part: tls learner, tls observer, tls actor-1",
+    );
+    said(
+        &doctor("nowhere").expect_code(1),
+        "missing",
+        "tls folder",
+        "deploy/certs.sh",
+    );
+}

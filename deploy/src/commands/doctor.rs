@@ -11,6 +11,9 @@ pub(crate) struct DoctorArgs {
     /// Where runs go: the disk that is looked at
     #[arg(long, value_name = "DIR", default_value = "runs")]
     pub(crate) run_dir: PathBuf,
+    /// Look also at the certificates in DIR: whose there are, whether they are good, for which addresses and for how long
+    #[arg(long, value_name = "DIR")]
+    pub(crate) tls_dir: Option<PathBuf>,
     /// Fail also where --device cuda would
     #[arg(long)]
     pub(crate) cuda: bool,
@@ -25,12 +28,12 @@ pub(crate) struct DoctorArgs {
 /// Prints the facts.
 ///
 /// # Errors
-/// Something is missing that training on the CPU needs; with `--cuda`, also what training on a GPU needs.
+/// Something is missing that training on the CPU needs; with `--tls-dir`, a certificate is not good; with `--cuda`, also what training on a GPU needs.
 pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     if args.devices {
         return print(&doctor::devices_json()?);
     }
-    let report = doctor::examine(&args.run_dir);
+    let report = doctor::examine(&args.run_dir, args.tls_dir.as_deref());
     if args.json {
         print(&report.json()?)?;
     } else {

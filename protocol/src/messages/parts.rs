@@ -51,6 +51,23 @@ pub struct PartStatus {
     pub last_warning: Option<Warning>,
 }
 
+/// How the log stands in which a replay server keeps its replay on disk.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LogStatus {
+    /// The folder, on the replay server's machine.
+    pub folder: String,
+    /// Bytes on disk.
+    pub bytes: u64,
+    /// Most that they may become; none if the replay's capacity alone limits them.
+    pub bytes_max: Option<u64>,
+    /// Seconds since a flush began that succeeded: a power cut takes what was written since.
+    pub flushed_s: f64,
+    /// For how many seconds the disk has been refusing what is to be written, and what it says; none if it takes it.
+    pub refused: Option<(f64, String)>,
+    /// Bytes of what has happened and could not be written: lost if the process dies now. No transitions are among them.
+    pub unwritten_bytes: u64,
+}
+
 /// A replay server's account of itself and of all parts that have joined it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PartsStatus {
@@ -70,6 +87,8 @@ pub struct PartsStatus {
     pub weights_version: u64,
     /// Their age, seconds; none before the first.
     pub weights_age_s: Option<f64>,
+    /// The log on disk; none if the replay is in memory alone.
+    pub log: Option<LogStatus>,
     /// The last warning in the replay server's own log.
     pub last_warning: Option<Warning>,
     /// The learner, then the actors by number.

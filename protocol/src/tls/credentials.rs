@@ -3,6 +3,7 @@
 
 use std::{
     fs, io,
+    net::IpAddr,
     os::unix::fs::PermissionsExt,
     path::{Path, PathBuf},
     time::{Duration, SystemTime, UNIX_EPOCH},
@@ -16,7 +17,7 @@ use rustls::{
     server::{ParsedCertificate, WebPkiClientVerifier},
     sign::CertifiedKey,
 };
-use x509_parser::prelude::{FromDer, X509Certificate};
+use x509_parser::prelude::{FromDer, GeneralName, X509Certificate};
 
 use super::{
     role::{ACTORS_MAX, Role},
@@ -40,6 +41,10 @@ pub struct Credentials {
     key: PathBuf,
     /// Until when the certificate is good, seconds since 1970.
     expires: i64,
+    /// The same, for a person.
+    expires_on: String,
+    /// The names and addresses that it is for: a replay server's.
+    hosts: Vec<String>,
     pub(super) roots: RootCertStore,
     pub(super) chain: Vec<CertificateDer<'static>>,
     pub(super) secret: PrivateKeyDer<'static>,
@@ -51,6 +56,21 @@ impl Credentials {
     /// # Errors
     /// A file that is missing, unreadable, of another role, authority or key, expired or not valid yet; what to do.
     pub fn read(folder: &Path, role: Role) -> Result<Self, TlsError> {
+        let read = Self::examine(folder, role)?;
+        if read.is_key_open() {
+            let key = read.key.display();
+            tracing::warn!(
+                "{key} can be read by other users of this machine, who could play this part: chmod 600 {key}"
+            );
+        }
+        Ok(read)
+    }
+
+    /// As [`Credentials::read`], and logs nothing.
+    ///
+    /// # Errors
+    /// As [`Credentials::read`].
+    pub fn examine(folder: &Path, role: Role) -> Result<Self, TlsError> {
         match role {
             Role::Actor(number) if number >= ACTORS_MAX => {
                 return Err(TlsError::Number { number });
@@ -65,8 +85,6 @@ impl Credentials {
             let (path, what) = (key.clone(), "private key");
             TlsError::NotPem { path, what }
         })?;
-        warn_if_open(&key);
-
         let own = parsed(&chain[0], &certificate)?;
         let names: Vec<_> = own
             .subject()
@@ -82,6 +100,7 @@ impl Credentials {
         }
         check_dates(&own, &certificate, role)?;
         let expires = own.validity().not_after.timestamp();
+        let (expires_on, hosts) = (own.validity().not_after.to_string(), hosts_of(&own));
         let mut roots = RootCertStore::empty();
         for one in authorities {
             check_dates(&parsed(&one, &authority)?, &authority, role)?;
@@ -107,6 +126,8 @@ impl Credentials {
             certificate,
             key,
             expires,
+            expires_on,
+            hosts,
             roots,
             chain,
             secret,
@@ -126,6 +147,27 @@ impl Credentials {
     /// The certificate's file.
     pub fn certificate_path(&self) -> &Path {
         &self.certificate
+    }
+
+    /// Until when the certificate is good, for a person.
+    pub fn expires_on(&self) -> &str {
+        &self.expires_on
+    }
+
+    /// The names and addresses that the certificate is for: whoever connects to a replay server calls it by one of them.
+    pub fn hosts(&self) -> &[String] {
+        &self.hosts
+    }
+
+    /// The key's file.
+    pub fn key_path(&self) -> &Path {
+        &self.key
+    }
+
+    /// Whether other users of this machine can read the key, and so play this part.
+    pub fn is_key_open(&self) -> bool {
+        let mode = fs::metadata(&self.key).map(|it| it.permissions().mode());
+        mode.is_ok_and(|mode| mode & 0o077 != 0)
     }
 
     /// How long the certificate is still good.
@@ -254,13 +296,20 @@ fn check_signed(
     verified.map(drop).map_err(in_words)
 }
 
-/// Whoever can read a key can play its part.
-fn warn_if_open(key: &Path) {
-    let mode = fs::metadata(key).map(|it| it.permissions().mode());
-    if mode.is_ok_and(|mode| mode & 0o077 != 0) {
-        let key = key.display();
-        tracing::warn!(
-            "{key} can be read by other users of this machine, who could play this part: chmod 600 {key}"
-        );
-    }
+/// The names and addresses that a certificate is for.
+fn hosts_of(certificate: &X509Certificate<'_>) -> Vec<String> {
+    let Ok(Some(names)) = certificate.subject_alternative_name() else {
+        return Vec::new();
+    };
+    let names = names.value.general_names.iter();
+    names
+        .filter_map(|name| match name {
+            GeneralName::DNSName(name) => Some((*name).to_owned()),
+            GeneralName::IPAddress(bytes) => match bytes.len() {
+                4 => Some(IpAddr::from(<[u8; 4]>::try_from(*bytes).ok()?).to_string()),
+                _ => Some(IpAddr::from(<[u8; 16]>::try_from(*bytes).ok()?).to_string()),
+            },
+            _ => None,
+        })
+        .collect()
 }

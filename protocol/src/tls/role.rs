@@ -29,6 +29,24 @@ impl std::fmt::Display for Role {
     }
 }
 
+impl std::str::FromStr for Role {
+    type Err = String;
+
+    /// Reads what [`Role`] is displayed as, and nothing else.
+    fn from_str(name: &str) -> Result<Self, String> {
+        let number = name.strip_prefix("actor-").and_then(|it| it.parse().ok());
+        let role = match name {
+            "learner" => Some(Self::Learner),
+            "replay-server" => Some(Self::ReplayServer),
+            "observer" => Some(Self::Observer),
+            _ => number.map(Self::Actor),
+        };
+        role.filter(|role| role.to_string() == name).ok_or_else(|| {
+            format!("{name:?} is no role: take replay-server, learner, observer or actor-N")
+        })
+    }
+}
+
 impl Role {
     /// How `deploy/certs.sh` is told to make the certificate of this role in DIR.
     pub(super) fn how_to_make(self) -> String {

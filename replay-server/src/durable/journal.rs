@@ -8,10 +8,10 @@ use std::{
     os::unix::fs::FileExt,
     path::PathBuf,
     sync::Arc,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
-use driml_protocol::{Seldom, codec};
+use driml_protocol::{LogStatus, Seldom, codec};
 
 use super::{
     error::DurableError,
@@ -68,8 +68,10 @@ pub(super) struct Limits {
 }
 
 /// A disk that refuses.
-#[derive(Default)]
 struct Failing {
+    since: Instant,
+    /// What it said last.
+    why: String,
     said: Seldom,
 }
 
@@ -133,6 +135,19 @@ impl Journal {
     pub(super) fn flush(&mut self) {
         self.is_ready();
         self.syncer.flush();
+    }
+
+    /// How it stands.
+    pub(super) fn status(&self) -> LogStatus {
+        let refused = self.failing.as_ref();
+        LogStatus {
+            folder: self.folder.display().to_string(),
+            bytes: self.bytes(),
+            bytes_max: self.limits.disk_bytes_max,
+            flushed_s: self.syncer.flushed_s(),
+            refused: refused.map(|it| (it.since.elapsed().as_secs_f64(), it.why.clone())),
+            unwritten_bytes: self.pending.len() as u64,
+        }
     }
 
     /// Bytes on disk.
@@ -225,7 +240,12 @@ impl Journal {
     }
 
     fn note_failing(&mut self, e: &io::Error) {
-        let failing = self.failing.get_or_insert_default();
+        let failing = self.failing.get_or_insert_with(|| Failing {
+            since: Instant::now(),
+            why: String::new(),
+            said: Seldom::default(),
+        });
+        failing.why = e.to_string();
         if let Some(more) = failing.said.due() {
             tracing::error!(
                 "the replay's log in {} cannot be written: {e}; nothing is taken or served until it can: make room or make it writable{more}",

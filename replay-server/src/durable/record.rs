@@ -19,6 +19,10 @@ pub(super) const HEAD_BYTES: usize = 32;
 const MAGIC: u32 = u32::from_le_bytes(*b"DRL1");
 /// Longest body: a message's, and some.
 const BODY_BYTES_MAX: u64 = (1 << 29) + (1 << 21);
+/// Highest number of a record that is believed: no log has so many.
+const ORDINAL_MAX: u64 = 1 << 60;
+/// Places at which a record is looked for after one that is too long: those that look like one.
+const CANDIDATES_MAX: usize = 64;
 /// Bytes read at once.
 const READ_BYTES: usize = 1 << 18;
 
@@ -138,7 +142,10 @@ impl RecordReader {
         let long = |at: usize| u64::from(number(at)) | u64::from(number(at + 4)) << 32;
         let (ordinal, body_bytes, checked) = (long(8), long(16), u64::from(number(24)));
         let kind = RecordKind::of(number(4));
-        let sane = number(0) == MAGIC && body_bytes <= BODY_BYTES_MAX && checked <= body_bytes;
+        let sane = number(0) == MAGIC
+            && ordinal <= ORDINAL_MAX
+            && body_bytes <= BODY_BYTES_MAX
+            && checked <= body_bytes;
         let Some(kind) = kind.filter(|_| sane) else {
             // A machine that lost its power leaves zeros where it had not written yet.
             let zeros = head.iter().all(|&byte| byte == 0) && self.rest_is_zero()?;
@@ -149,7 +156,13 @@ impl RecordReader {
             })));
         };
         if left - (HEAD_BYTES as u64) < body_bytes {
-            return Ok(Some(Err(Broken::Torn)));
+            // Where others follow, it is its length that is wrong.
+            let follows = self.a_record_follows()?;
+            return Ok(Some(Err(if follows {
+                Broken::Damaged
+            } else {
+                Broken::Torn
+            })));
         }
         self.body.resize(body_bytes as usize, 0);
         self.file.read_exact(&mut self.body)?;
@@ -169,6 +182,17 @@ impl RecordReader {
         })))
     }
 
+    /// Whether a whole record is somewhere in the rest.
+    fn a_record_follows(&mut self) -> io::Result<bool> {
+        let mut rest = Vec::new();
+        self.file.read_to_end(&mut rest)?;
+        let magic = MAGIC.to_le_bytes();
+        let begins = (0..rest.len()).filter(|&at| rest[at..].starts_with(&magic));
+        Ok(begins
+            .take(CANDIDATES_MAX)
+            .any(|at| begins_with_a_record(&rest[at..])))
+    }
+
     fn rest_is_zero(&mut self) -> io::Result<bool> {
         let mut bytes = [0; 4096];
         loop {
@@ -179,6 +203,23 @@ impl RecordReader {
             }
         }
     }
+}
+
+/// Whether a record whose checksum is right begins here.
+fn begins_with_a_record(bytes: &[u8]) -> bool {
+    let Some((head, after)) = bytes.split_first_chunk::<HEAD_BYTES>() else {
+        return false;
+    };
+    let number = |at: usize| {
+        u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]) as usize
+    };
+    let mut sum = crc32fast::Hasher::new();
+    sum.update(&head[..HEAD_BYTES - 4]);
+    let Some(checked) = after.get(..number(24)) else {
+        return false;
+    };
+    sum.update(checked);
+    sum.finalize() as usize == number(28)
 }
 
 /// Memory for chunks that are read, used again and again.

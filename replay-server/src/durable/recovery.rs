@@ -1,7 +1,11 @@
 //! Reads a log back: the replay as it was when the last whole record was written, and what of it is damaged or missing.
 //! Transitions come back through the code that stored them; what is gone leaves a gap that no row of a batch reaches into.
 
-use std::{fs, io, path::Path};
+use std::{
+    fs, io,
+    path::Path,
+    time::{Duration, Instant},
+};
 
 use driml_protocol::{BufferPool, Chunk, codec};
 
@@ -15,6 +19,9 @@ use crate::{
     replay::{Replay, events::Event},
     storage::frame_store::Packer,
 };
+
+/// How often it is said how far the reading is: nobody can ask before it is done.
+const SAY: Duration = Duration::from_secs(5);
 
 /// Where a log goes on, and what was found on the way there.
 pub(super) struct Recovered {
@@ -146,7 +153,26 @@ pub(super) fn recover(
         mark,
     };
     let last = files.len().saturating_sub(1);
+    let bytes = |file: &SegmentFile| fs::metadata(&file.path).map_or(0, |it| it.len());
+    let total: u64 = files.iter().map(bytes).sum();
+    let dir = folder.path.display();
+    tracing::info!(
+        "reads the replay in {dir}: {} segments, {} MiB; nobody can connect before that is done",
+        files.len(),
+        total >> 20
+    );
+    let (started, mut due, mut read) = (Instant::now(), SAY, 0);
     for (at, file) in files.iter().enumerate() {
+        if started.elapsed() > due {
+            due = started.elapsed() + SAY;
+            tracing::info!(
+                "reads the replay in {dir}: {} of {} MiB after {} s",
+                read >> 20,
+                total >> 20,
+                started.elapsed().as_secs()
+            );
+        }
+        read += bytes(file);
         recovery.read_segment(file, at == last)?;
     }
     recovery.finish()

@@ -5,7 +5,7 @@ use std::{borrow::Cow, collections::VecDeque, ops::Deref};
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, Buffer, Chunk, Claim, CodecError, Goodbye, InsertReply,
-    PriorityUpdate, RequestId, Tally, codec,
+    LogStatus, PriorityUpdate, RequestId, Tally, codec,
 };
 
 use super::{
@@ -149,6 +149,11 @@ impl DurableReplay {
     /// Bytes of the log; 0 without one.
     pub fn log_bytes(&self) -> u64 {
         self.log.as_ref().map_or(0, |log| log.journal.bytes())
+    }
+
+    /// How the log stands; none without one.
+    pub fn log_status(&self) -> Option<LogStatus> {
+        self.log.as_ref().map(|log| log.journal.status())
     }
 
     /// The learner that is served.

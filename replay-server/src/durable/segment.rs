@@ -15,6 +15,9 @@ pub(super) const FORMAT: u32 = 2;
 const PREFIX: &str = "segment-";
 const SUFFIX: &str = ".log";
 
+/// Highest number of a segment; files of higher ones are none of a log's.
+const NUMBER_MAX: u64 = 1 << 60;
+
 /// What a segment says first.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct SegmentHeader {
@@ -80,7 +83,8 @@ pub(super) fn list(folder: &Path) -> io::Result<Vec<SegmentFile>> {
         let path = entry?.path();
         let name = path.file_name().and_then(|name| name.to_str());
         let digits = name.and_then(|name| name.strip_prefix(PREFIX)?.strip_suffix(SUFFIX));
-        if let Some(number) = digits.and_then(|digits| digits.parse().ok()) {
+        let number = digits.and_then(|digits| digits.parse().ok());
+        if let Some(number) = number.filter(|&number| number <= NUMBER_MAX) {
             segments.push(SegmentFile { number, path });
         }
     }

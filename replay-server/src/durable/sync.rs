@@ -9,7 +9,7 @@ use std::{
         atomic::{AtomicBool, Ordering},
     },
     thread::JoinHandle,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use driml_protocol::{Seldom, fault};
@@ -27,14 +27,31 @@ struct Files {
     stop: bool,
 }
 
-#[derive(Default)]
 struct Shared {
     files: Mutex<Files>,
     wake: Condvar,
     dirty: AtomicBool,
+    /// One flush at a time: whoever asks for another one gets it done, not only begun.
+    flushing: Mutex<()>,
+    /// When the last flush that succeeded began.
+    flushed: Mutex<Instant>,
 }
 
 impl Shared {
+    fn new() -> Self {
+        Self {
+            files: Mutex::default(),
+            wake: Condvar::new(),
+            dirty: AtomicBool::new(false),
+            flushing: Mutex::default(),
+            flushed: Mutex::new(Instant::now()),
+        }
+    }
+
+    fn flushed(&self) -> MutexGuard<'_, Instant> {
+        self.flushed.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     fn files(&self) -> MutexGuard<'_, Files> {
         self.files.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -50,7 +67,7 @@ pub(super) struct Syncer {
 impl Syncer {
     /// Flushes every `period`, or, where that is zero, whenever [`Syncer::written`] is called.
     pub(super) fn start(folder: File, period: Duration) -> io::Result<Self> {
-        let shared = Arc::<Shared>::default();
+        let shared = Arc::new(Shared::new());
         let mut thread = None;
         if !period.is_zero() {
             let shared = shared.clone();
@@ -79,6 +96,14 @@ impl Syncer {
         if too_many {
             self.flush();
         }
+    }
+
+    /// Seconds since a flush began that succeeded; 0 where each write is flushed and all were.
+    pub(super) fn flushed_s(&self) -> f64 {
+        if self.thread.is_none() && !self.shared.dirty.load(Ordering::Acquire) {
+            return 0.0;
+        }
+        self.shared.flushed().elapsed().as_secs_f64()
     }
 
     /// Segment `number` is gone: nobody needs it on the disk.
@@ -153,18 +178,36 @@ fn work(shared: &Shared, period: Duration) {
 
 /// Flushes what was written since the last time.
 fn flush(shared: &Shared) -> io::Result<()> {
-    if !shared.dirty.swap(false, Ordering::AcqRel) {
-        return Ok(());
+    let _one = shared
+        .flushing
+        .lock()
+        .unwrap_or_else(PoisonError::into_inner);
+    let begun = Instant::now();
+    if shared.dirty.swap(false, Ordering::AcqRel) {
+        let files = shared.files();
+        let (open, folder) = (files.open.clone(), files.folder.clone());
+        drop(files);
+        if let Err(e) = flush_all(&open, folder.as_deref()) {
+            // What was not flushed is due the next time again.
+            shared.dirty.store(true, Ordering::Release);
+            return Err(e);
+        }
+        let mut files = shared.files();
+        // Older ones are not written any more.
+        if let Some((newest, _)) = open.last() {
+            files.open.retain(|(number, _)| number >= newest);
+            if files.open.last().is_none_or(|(number, _)| number == newest) {
+                files.folder = None;
+            }
+        }
     }
-    let mut files = shared.files();
-    let open = files.open.clone();
-    let folder = files.folder.take();
-    // Older ones are not written any more.
-    let older = files.open.len().saturating_sub(1);
-    files.open.drain(..older);
-    drop(files);
-    for (_, file) in &open {
+    *shared.flushed() = begun;
+    Ok(())
+}
+
+fn flush_all(open: &[(u64, Arc<File>)], folder: Option<&File>) -> io::Result<()> {
+    for (_, file) in open {
         file.sync_data()?;
     }
-    folder.map_or(Ok(()), |folder| folder.sync_all())
+    folder.map_or(Ok(()), File::sync_all)
 }

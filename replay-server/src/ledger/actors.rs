@@ -1,7 +1,7 @@
 //! Exactly once: which life of each actor counts, which chunk it sends next, what it says it produced, where its streams stand.
 //! It stores no transitions, answers nothing itself and does not know who is connected.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use driml_protocol::{ActorJoin, ChunkHeader, Claim, Goodbye, Played};
 use serde::{Deserialize, Serialize};
@@ -252,6 +252,25 @@ impl Actors {
         for stream in self.actors.values_mut().flat_map(|it| &mut it.streams) {
             stream.link = stream.link.without(first_lost);
         }
+    }
+
+    /// Why these cannot be the actors of a replay that has stored `inserted` transitions; none if they can.
+    pub(crate) fn unfit(&self, inserted: u64) -> Option<&'static str> {
+        let too_many = |it: &Actor| {
+            it.streams.len() > STREAMS_MAX as usize || it.past.len() > PAST_INCARNATIONS_MAX
+        };
+        if self.actors.len() > ACTORS_MAX || self.actors.values().any(too_many) {
+            return Some("a state with more actors, lives or streams than a run may have");
+        }
+        // No transition has two that follow it.
+        let mut followed = BTreeSet::new();
+        let streams = self.actors.values().flat_map(|it| &it.streams);
+        for after in streams.filter_map(|it| it.link.after()) {
+            if after >= inserted || !followed.insert(after) {
+                return Some("a state with streams that follow on nothing");
+            }
+        }
+        None
     }
 
     /// Actors of which a chunk has come.

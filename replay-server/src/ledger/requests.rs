@@ -76,6 +76,26 @@ impl Requests {
         }
     }
 
+    /// Why these cannot be the requests of a replay that has served so many rows of each k; none if they can.
+    pub(crate) fn unfit(&self, served: &[u64]) -> Option<&'static str> {
+        if self.last.len() > CLIENTS_MAX {
+            return Some("a state with more requests than are remembered");
+        }
+        let mut left = served.to_vec();
+        for &k in self
+            .last
+            .iter()
+            .filter_map(|it| it.given.as_ref())
+            .flatten()
+        {
+            match left.get_mut(k as usize) {
+                Some(left @ 1..) => *left -= 1,
+                _ => return Some("a state in which more rows were given than were served"),
+            }
+        }
+        None
+    }
+
     /// How often this has changed, in this process.
     pub(crate) const fn changes(&self) -> u64 {
         self.changes

@@ -105,6 +105,15 @@ impl Statistics {
         self.recorded = Some(episodes.min(self.episodes));
     }
 
+    /// Why these cannot be the counts of a replay; none if they can.
+    pub(crate) fn unfit(&self) -> Option<&'static str> {
+        let fits = self.newest.len() <= EPISODES_KEPT_MAX
+            && self.newest.len() as u64 <= self.episodes
+            && self.returns.len() <= RETURNS_OF
+            && self.returns_known <= self.episodes;
+        (!fits).then_some("a state with more episodes than have ended")
+    }
+
     /// What a log keeps of a moment.
     pub(crate) fn logged(&self) -> Self {
         let mut logged = self.clone();

@@ -84,7 +84,8 @@ impl Replay {
     /// Rows count as served that the learner has learned from.
     pub(crate) fn count_served_before(&mut self, rows: u64) {
         self.limiter.sampled_before(rows);
-        self.resume_point.rows_sampled += rows;
+        let before = &mut self.resume_point.rows_sampled;
+        *before = before.saturating_add(rows);
     }
 
     /// Applies what [`Replay::draw_for`] changed; whether the anchors are listed is the result, as the ring is not yet what it was.

@@ -12,6 +12,8 @@ use crate::{
     sampling::horizon::Affinity,
 };
 
+/// Most of anything that a run counts.
+const COUNT_MAX: u64 = 1 << 60;
 /// Transitions of one piece of what is gone.
 const GONE_PIECE: u64 = 256;
 
@@ -58,11 +60,14 @@ impl Replay {
     }
 
     /// Takes back a snapshot. The transitions between what is stored and those that the snapshot knows are gone: of an empty replay
-    /// all, else they leave a gap, whose size is the result.
+    /// all, else they leave a gap, whose size is the result; 0 if it is so large that nothing before it is held.
     ///
     /// # Errors
     /// It is none of a replay of this run; the reason, for a person.
     pub(crate) fn restore(&mut self, snapshot: Snapshot) -> Result<u64, String> {
+        if let Some(why) = self.unfit_state(&snapshot) {
+            return Err(why.into());
+        }
         let Snapshot {
             inserted,
             oldest,
@@ -78,15 +83,24 @@ impl Replay {
             starving,
             are_listed: _,
         } = snapshot;
-        let fits = affinity.is_for(self.spec.num_actions)
-            && statistics.k_histogram.len() == self.statistics.k_histogram.len()
-            && statistics.action_histogram.len() == self.statistics.action_histogram.len();
-        if !fits {
-            return Err("a state of a run with other actions or another horizon".into());
-        }
         let stored = self.ring.inserted();
         if self.ring.first() == stored {
             self.ring.start_at(inserted);
+        } else if inserted.saturating_sub(stored) >= self.ring.capacity() {
+            // Nothing that is stored would be held.
+            let Self {
+                spec,
+                config,
+                batch_size,
+                origin,
+                ..
+            } = self;
+            let mut fresh =
+                Self::shard(spec, config, *batch_size, origin.shard).map_err(|e| e.to_string())?;
+            fresh.origin = *origin;
+            fresh.ring.start_at(inserted);
+            *self = fresh;
+            actors.cut_streams(stored);
         }
         let gap = inserted.checked_sub(self.ring.inserted()).ok_or_else(|| {
             format!("a state after {inserted} transitions, where {stored} are stored")
@@ -103,6 +117,51 @@ impl Replay {
         (self.affinity, self.rng, self.statistics) = (affinity, rng, statistics);
         self.starving = starving;
         Ok(gap)
+    }
+
+    /// Why a snapshot is none of a replay of this run, whatever its checksum says; none if it is. One that is taken can be counted on
+    /// from: no count overflows, and none becomes less than nothing.
+    fn unfit_state(&self, snapshot: &Snapshot) -> Option<&'static str> {
+        let Snapshot {
+            inserted,
+            resume_point,
+            tally,
+            statistics,
+            ..
+        } = snapshot;
+        let is_ours = snapshot.affinity.is_for(self.spec.num_actions)
+            && statistics.k_histogram.len() == self.statistics.k_histogram.len()
+            && statistics.action_histogram.len() == self.statistics.action_histogram.len();
+        if !is_ours {
+            return Some("a state of a run with other actions or another horizon");
+        }
+        let sum = |counts: &[u64]| counts.iter().copied().fold(0, u64::saturating_add);
+        let served = sum(&statistics.k_histogram);
+        let counts = [
+            *inserted,
+            served,
+            statistics.rows_unlearned,
+            statistics.episodes,
+            resume_point.inserted,
+            resume_point.rows_sampled,
+            tally.inserted,
+            tally.rows_sampled,
+        ];
+        if counts.iter().any(|&count| count > COUNT_MAX) {
+            return Some("a state with counts that no run reaches");
+        }
+        let agrees = sum(&statistics.action_histogram) == *inserted
+            && resume_point.inserted + inserted == tally.inserted
+            && resume_point.rows_sampled + served == tally.rows_sampled + statistics.rows_unlearned
+            && snapshot.oldest <= *inserted;
+        if !agrees {
+            return Some("a state whose counts contradict each other");
+        }
+        snapshot
+            .actors
+            .unfit(*inserted)
+            .or_else(|| snapshot.requests.unfit(&statistics.k_histogram))
+            .or_else(|| statistics.unfit())
     }
 
     /// Takes the place of `count` transitions that are gone.

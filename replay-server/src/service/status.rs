@@ -118,6 +118,7 @@ impl Service {
             chunk_bytes_waiting: state.chunks.bytes() as u64,
             weights_version,
             weights_age_s,
+            log: state.replay.log_status(),
             last_warning: own_warning(),
             parts: state.accounts.parts(now, held_since),
         };

@@ -30,6 +30,14 @@ impl Link {
         }
     }
 
+    /// The transition that it follows, if there is one.
+    pub(crate) const fn after(self) -> Option<u64> {
+        match self {
+            Self::LevelStart { after } | Self::Within { after } => Some(after),
+            Self::EpisodeStart | Self::Lost => None,
+        }
+    }
+
     /// The link of the transition that follows `index`, which ended `end`.
     pub(crate) const fn following(index: u64, end: End) -> Self {
         match end {

@@ -168,6 +168,23 @@ fn a_flipped_bit_costs_its_segment_alone() {
     );
 }
 
+/// A length that became too large looks like a write that the end of the process cut off. Nobody was told of such a one; of what is
+/// lost here somebody was.
+#[test]
+fn a_damaged_length_is_no_torn_write() {
+    let kept = Kept::new(10_000);
+    let newest = kept.segments().pop().unwrap();
+    let bytes = fs::read(&newest).unwrap();
+    let heads = bytes.windows(4).enumerate();
+    let heads: Vec<_> = heads.filter(|(_, it)| it == b"DRL1").collect();
+    assert!(heads.len() > 4, "{}", heads.len());
+    // The third byte of the length of the second record.
+    flip(&newest, |_| heads[1].0 + 16 + 3);
+    let (replay, recovery) = kept.open();
+    assert!(said(&recovery, "are cut off"), "{recovery:?}");
+    replay.check_valid();
+}
+
 #[test]
 fn a_damaged_beginning_costs_its_segment_and_it_is_set_aside() {
     let kept = Kept::new(10_000);

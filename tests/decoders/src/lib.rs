@@ -1,8 +1,8 @@
 //! Everything that reads bytes of others, as functions of bytes alone: what fuzzers and the bounded runs in CI call.
 //! None may panic, whatever the bytes; what is read must come back as it is when it is written again.
 //!
-//! A new decoder, such as that of the replay's segments on disk, is a function here, a line in [`ALL`], a target in `fuzz/` and
-//! seeds in `fuzz/corpus/NAME/`; a test holds that none of these is forgotten.
+//! A new decoder is a function here, a line in [`ALL`], a target in `fuzz/` and seeds in `fuzz/corpus/NAME/`; a test holds that none
+//! of these is forgotten.
 
 #![allow(
     clippy::unwrap_used,
@@ -12,8 +12,10 @@
 mod files;
 mod messages;
 mod replay;
+mod segments;
 
 pub use messages::{forged, samples};
+pub use segments::{held, logs};
 
 /// One decoder: its name, and what is to be tried with some bytes.
 pub type Decoder = (&'static str, fn(&[u8]));
@@ -25,4 +27,5 @@ pub const ALL: &[Decoder] = &[
     ("replay", replay::replay),
     ("state", files::state),
     ("config", files::config),
+    ("segments", segments::segments),
 ];

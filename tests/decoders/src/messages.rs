@@ -5,10 +5,11 @@ use std::fmt::Debug;
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, BufferPool,
     Chunk, ChunkHeader, Claim, CodecError, Done, End, EndedEpisode, EpisodesReply, EpisodesRequest,
-    Goodbye, Hello, InsertReply, JoinReply, Kind, LearnerJoin, LearnerStatus, Life, Message,
-    NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus, PartsStatus, Played, PriorityUpdate,
-    ReplayStatus, Report, RequestId, Returns, RowScalars, StackedFrames, Tally, Waiting, Warning,
-    WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, codec,
+    Goodbye, Hello, InsertReply, JoinReply, Kind, LearnerJoin, LearnerStatus, Life, LogStatus,
+    Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus, PartsStatus, Played,
+    PriorityUpdate, ReplayStatus, Report, RequestId, Returns, RowScalars, StackedFrames, Tally,
+    Waiting, Warning, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
+    codec,
 };
 
 /// The hash of the run that these messages are of.
@@ -299,6 +300,14 @@ pub fn samples() -> Vec<Vec<u8>> {
         chunk_bytes_waiting: 1 << 20,
         weights_version: 4,
         weights_age_s: Some(1.0),
+        log: Some(LogStatus {
+            folder: "replay".into(),
+            bytes: 1 << 20,
+            bytes_max: Some(1 << 30),
+            flushed_s: 0.5,
+            refused: Some((2.0, "full".into())),
+            unwritten_bytes: 40,
+        }),
         last_warning: None,
         parts: vec![part],
     };

@@ -8,12 +8,14 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_decoders::{ALL, forged, samples};
+use driml_decoders::{ALL, forged, held, logs, samples};
 use rand::{Rng, SeedableRng, seq::IndexedRandom};
 use rand_chacha::ChaCha8Rng;
 
 /// Executions of each decoder in CI.
 const RUNS: u64 = 20_000;
+/// The same of the decoder of segments, each of which opens a folder twice.
+const SEGMENTS_RUNS: u64 = 3_000;
 /// Bytes beyond which a changed seed is cut.
 const BYTES_MAX: usize = 1 << 14;
 
@@ -71,7 +73,12 @@ fn change(bytes: &mut Vec<u8>, seeds: &[Vec<u8>], rng: &mut ChaCha8Rng) {
 
 fn run(name: &str) {
     let runs = std::env::var("DRIML_DECODER_RUNS").ok();
-    let runs = runs.map_or(RUNS, |it| it.parse().expect("a number of executions"));
+    let usual = if name == "segments" {
+        SEGMENTS_RUNS
+    } else {
+        RUNS
+    };
+    let runs = runs.map_or(usual, |it| it.parse().expect("a number of executions"));
     let (_, decoder) = ALL.iter().find(|(it, _)| *it == name).unwrap();
     let seeds = seeds(name);
     seeds.iter().for_each(|seed| decoder(seed));
@@ -140,6 +147,11 @@ fn config() {
     run("config");
 }
 
+#[test]
+fn segments() {
+    run("segments");
+}
+
 /// Each decoder has a target and seeds, and the seeds of messages are today's: `UPDATE_CORPUS=1` writes them.
 #[test]
 fn every_decoder_has_a_target_and_seeds() {
@@ -164,5 +176,24 @@ fn every_decoder_has_a_target_and_seeds() {
                 file.display()
             );
         }
+    }
+}
+
+/// The logs among the seeds are ones that this version reads: `UPDATE_CORPUS=1` writes them. They are not the same each time.
+#[test]
+fn the_logs_among_the_seeds_can_be_read() {
+    for (name, log) in logs() {
+        let file = folder("segments").join(name);
+        if std::env::var_os("UPDATE_CORPUS").is_some() {
+            fs::create_dir_all(folder("segments")).unwrap();
+            fs::write(&file, &log).unwrap();
+        }
+        assert!(log.len() < BYTES_MAX, "{}: too long", file.display());
+        let stored = fs::read(&file).unwrap_or_default();
+        assert!(
+            !stored.is_empty() && held(&stored) == held(&log) && held(&log) > 0,
+            "{} cannot be read any more: UPDATE_CORPUS=1 writes it",
+            file.display()
+        );
     }
 }

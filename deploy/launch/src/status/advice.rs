@@ -56,6 +56,19 @@ pub(super) fn to_go_on(snapshot: &Snapshot) -> Vec<String> {
             ));
         }
     }
+    for (server, account) in accounts(snapshot) {
+        if let Some(log) = &account.log
+            && let Some((since, why)) = &log.refused
+        {
+            needed.push(format!(
+                "the disk of the replay server on {} has refused its replay for {} ({why}): make room for {}, or make it writable, and all \
+                 goes on by itself",
+                server.endpoint,
+                seconds(*since),
+                log.folder
+            ));
+        }
+    }
     if snapshot.is_over() || accounts(snapshot).next().is_none() {
         return needed;
     }

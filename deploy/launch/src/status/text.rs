@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use driml_protocol::{PartStatus, Waiting};
+use driml_protocol::{LogStatus, PartStatus, Waiting};
 
 use super::{
     numbers::seconds,
@@ -90,6 +90,9 @@ pub(super) fn describe(snapshot: &Snapshot) -> String {
         }
     }
     table(&mut page, &rows);
+    for (server, log) in logs(snapshot) {
+        let _ = writeln!(page, "\n{}", log_line(server, log, snapshot.servers.len()));
+    }
     for (who, warning) in warnings {
         let age = seconds(warning.age_s);
         let _ = writeln!(page, "\n{who} warned {age} ago: {}", warning.text);
@@ -104,6 +107,48 @@ pub(super) fn describe(snapshot: &Snapshot) -> String {
         let _ = writeln!(page, "to go on: {needed}");
     }
     page
+}
+
+/// Each replay server that keeps its replay on disk, and how its log stands.
+fn logs(snapshot: &Snapshot) -> impl Iterator<Item = (&ServerAnswer, &LogStatus)> {
+    let servers = snapshot.servers.iter();
+    servers.filter_map(|server| Some((server, server.parts.as_ref()?.log.as_ref()?)))
+}
+
+fn log_line(server: &ServerAnswer, log: &LogStatus, of: usize) -> String {
+    let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
+    let name = match of {
+        1 => "replay on disk".to_owned(),
+        _ => format!("{}, replay on disk", server.endpoint),
+    };
+    let most = log
+        .bytes_max
+        .map_or(String::new(), |max| format!(" of at most {:.1}", mib(max)));
+    let bytes = mib(log.bytes);
+    let flushed = seconds(log.flushed_s);
+    let mut line = format!(
+        "{name}: {bytes:.1} MiB{most} in {}, flushed {flushed} ago",
+        log.folder
+    );
+    if let Some((since, why)) = &log.refused {
+        let _ = write!(
+            line,
+            "; REFUSED for {} ({why}): nothing is taken or served. {}",
+            seconds(*since),
+            lost_if_it_dies(log)
+        );
+    }
+    line
+}
+
+/// What a disk that refuses costs if the process dies before it takes things again.
+fn lost_if_it_dies(log: &LogStatus) -> String {
+    match log.unwritten_bytes {
+        0 => "If the replay server dies now, nothing is lost".into(),
+        bytes => format!(
+            "If the replay server dies now, it forgets who joined or left and what was drawn since, {bytes} bytes, and no transition"
+        ),
+    }
 }
 
 fn server_row(server: &ServerAnswer, of: usize) -> [String; 7] {

@@ -1,6 +1,7 @@
 //! `driml doctor`: what this machine can do and what it lacks, one line a fact, with what to do about it.
 //! It changes nothing, fetches nothing and measures no speed.
 
+mod certificates;
 pub mod cuda;
 mod engine;
 mod fact;
@@ -17,14 +18,20 @@ use self::fact::{Fact, State};
 pub struct Report {
     cpu: Vec<Fact>,
     cuda: Vec<Fact>,
+    certificates: Vec<Fact>,
 }
 
-/// Looks at this machine; runs would go to `run_dir`.
-pub fn examine(run_dir: &Path) -> Report {
+/// Looks at this machine; runs would go to `run_dir`, with the certificates in `tls_dir`, if any.
+pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
     let mut cpu = host::facts(run_dir);
     cpu.push(engine::fact());
     let cuda = cuda::facts();
-    Report { cpu, cuda }
+    let certificates = tls_dir.map_or_else(Vec::new, certificates::facts);
+    Report {
+        cpu,
+        cuda,
+        certificates,
+    }
 }
 
 /// Only the CUDA devices, as JSON: so the usual program asks its CUDA flavour.
@@ -50,17 +57,23 @@ impl Report {
     }
 
     fn all(&self) -> Vec<Fact> {
-        self.cpu.iter().chain(&self.cuda).cloned().collect()
+        let all = self.cpu.iter().chain(&self.cuda);
+        all.chain(&self.certificates).cloned().collect()
     }
 
     /// Whether what training needs is there.
     ///
     /// # Errors
-    /// Something is missing that training on the CPU needs; with `cuda`, also what training on a GPU needs.
+    /// Something is missing that training on the CPU needs, or a certificate is not good; with `cuda`, also what training on a GPU
+    /// needs.
     pub fn check(&self, cuda: bool) -> anyhow::Result<()> {
         let missing = lacking(&self.cpu, |state| state == State::Missing);
         if !missing.is_empty() {
             bail!("training on the CPU needs what is missing here: {missing}");
+        }
+        let bad = lacking(&self.certificates, |state| state == State::Missing);
+        if !bad.is_empty() {
+            bail!("with --tls-dir these parts cannot take part: {bad}");
         }
         if cuda && !cuda::is_ready(&self.cuda) {
             let missing = lacking(&self.cuda, |state| state != State::Ok);

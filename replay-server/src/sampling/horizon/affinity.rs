@@ -45,10 +45,11 @@ impl Affinity {
         Ok(())
     }
 
-    /// Whether it is one for so many actions.
-    pub(crate) const fn is_for(&self, num_actions: u32) -> bool {
+    /// Whether it is one for so many actions, and of probabilities.
+    pub(crate) fn is_for(&self, num_actions: u32) -> bool {
         let n = num_actions as usize;
-        self.num_actions == num_actions && self.matrix.len() == n * n
+        let are_probabilities = self.matrix.iter().all(|p| (0.0..=1.0).contains(p));
+        self.num_actions == num_actions && self.matrix.len() == n * n && are_probabilities
     }
 
     /// Version in use; 0 is the uniform one.

@@ -1,0 +1,136 @@
+//! The certificates in a folder for `--tls-dir`: whose are there, which are good, and what to do about the others.
+//! It makes none: `deploy/certs.sh` does.
+
+use std::{collections::BTreeSet, fs, path::Path, time::Duration};
+
+use driml_protocol::tls::{self, Credentials, Role};
+
+use super::fact::Fact;
+
+/// A certificate that expires sooner is a note.
+const EXPIRES_SOON: Duration = Duration::from_secs(30 * 24 * 3600);
+const DAY_S: u64 = 24 * 3600;
+
+/// What there is to say of `folder`: a line for each part that has a file there, and one for all actors that are well.
+pub(super) fn facts(folder: &Path) -> Vec<Fact> {
+    let dir = folder.display();
+    let entries = match fs::read_dir(folder) {
+        Ok(entries) => entries,
+        Err(e) => {
+            let text = format!("{dir} cannot be read ({e}): `deploy/certs.sh {dir}` makes them");
+            return vec![Fact::missing("tls folder", text)];
+        }
+    };
+    // By the certificate or the key alone, too: then the other one is missing.
+    let names: BTreeSet<String> = entries
+        .flatten()
+        .filter_map(|entry| {
+            let path = entry.path();
+            let is_one = path
+                .extension()
+                .is_some_and(|it| it == "pem" || it == "key");
+            is_one.then(|| path.file_stem()?.to_str().map(str::to_owned))?
+        })
+        .filter(|name| name != "ca")
+        .collect();
+    let mut facts = Vec::new();
+    let mut roles = Vec::new();
+    for name in &names {
+        match name.parse::<Role>() {
+            Ok(role) => roles.push(role),
+            Err(e) => facts.push(Fact::note("tls other", format!("{dir}/{name}.*: {e}"))),
+        }
+    }
+    if roles.is_empty() {
+        let text = format!("no part has one in {dir}: `deploy/certs.sh {dir}` makes them");
+        facts.push(Fact::missing("tls folder", text));
+    }
+    roles.sort_by_key(|role| match role {
+        Role::ReplayServer => (0, 0),
+        Role::Learner => (1, 0),
+        Role::Observer => (2, 0),
+        Role::Actor(number) => (3, *number),
+    });
+    let mut actors = Vec::new();
+    for role in roles {
+        match (role, Credentials::examine(folder, role)) {
+            (_, Err(e)) => facts.push(Fact::missing(&what(role), e.to_string())),
+            (Role::Actor(number), Ok(it)) if complaint(&it).is_none() => actors.push((number, it)),
+            (_, Ok(it)) => facts.push(fact(role, &it)),
+        }
+    }
+    facts.extend(all_well(&actors));
+    facts.extend(authority(folder));
+    facts
+}
+
+fn what(role: Role) -> String {
+    format!("tls {role}")
+}
+
+/// What is to be done about a certificate that is good.
+fn complaint(credentials: &Credentials) -> Option<String> {
+    let (role, key) = (credentials.role(), credentials.key_path().display());
+    let left = credentials.expires_in();
+    if credentials.is_key_open() {
+        Some(format!(
+            "{key} can be read by other users of this machine, who could play this part: chmod 600 {key}"
+        ))
+    } else if left < EXPIRES_SOON {
+        Some(format!(
+            "good for {} days more, then its part is cut off: remove {role}.pem and {role}.key, let deploy/certs.sh make new ones, and \
+             start that part again",
+            left.as_secs() / DAY_S
+        ))
+    } else if role == Role::ReplayServer && credentials.hosts().is_empty() {
+        Some(format!(
+            "it is for no name or address, so nobody can connect: remove {role}.pem and {role}.key, and `deploy/certs.sh DIR --host \
+             NAME_OR_ADDRESS` makes one"
+        ))
+    } else {
+        None
+    }
+}
+
+fn fact(role: Role, credentials: &Credentials) -> Fact {
+    if let Some(text) = complaint(credentials) {
+        return Fact::note(&what(role), text);
+    }
+    let mut text = good_until(credentials);
+    if role == Role::ReplayServer {
+        text += &format!(
+            ", for {}: whoever connects calls it by one of these",
+            credentials.hosts().join(", ")
+        );
+    }
+    Fact::ok(&what(role), text)
+}
+
+fn good_until(credentials: &Credentials) -> String {
+    let days = credentials.expires_in().as_secs() / DAY_S;
+    format!("good until {} ({days} days)", credentials.expires_on())
+}
+
+/// The actors of which nothing is to be said each.
+fn all_well(actors: &[(u32, Credentials)]) -> Option<Fact> {
+    let (first, last) = (actors.first()?.0, actors.last()?.0);
+    let (_, soonest) = actors.iter().min_by_key(|(_, it)| it.expires_in())?;
+    let until = good_until(soonest);
+    let text = match actors.len() {
+        1 => format!("{first}: {until}"),
+        count => format!("{count} of them, from {first} to {last}: {until}"),
+    };
+    Some(Fact::ok("tls actors", text))
+}
+
+/// What is to be said of the authority: its certificate is checked with each part's.
+fn authority(folder: &Path) -> Option<Fact> {
+    let key = tls::authority_path(folder).with_extension("key");
+    key.exists().then(|| {
+        let text = format!(
+            "{} is here, with which any certificate can be made: leave it on the machine on which it was made, and copy it to no other",
+            key.display()
+        );
+        Fact::note("tls authority", text)
+    })
+}

@@ -1,0 +1,365 @@
+//! The replay's segments on disk, in any state: the server starts or says why not, what it serves was stored, and it comes back.
+//! That every row is right to the last field is for the replay server's own tests: here the bytes decide what was stored.
+
+use std::{
+    collections::HashSet,
+    fs,
+    ops::Range,
+    path::{Path, PathBuf},
+};
+
+use driml_protocol::{
+    ActorJoin, AffinityUpdate, Buffer, Chunk, ChunkHeader, End, Goodbye, Horizon, InsertReply,
+    RequestId, RunSpec, Sampling, TimeoutRule, codec,
+};
+use driml_replay_server::{Compression, Config, DurableArgs, DurableReplay};
+
+/// Bytes of a frame: its number, which is never 0.
+const FRAME_BYTES: usize = 4;
+/// Actions of the world.
+const ACTIONS: u32 = 3;
+/// Rows of a batch.
+const ROWS: u32 = 4;
+/// Batches that are drawn from what came back.
+const BATCHES: u64 = 8;
+/// Segments of one try.
+const SEGMENTS_MAX: usize = 8;
+/// Transitions that are held.
+const CAPACITY: u64 = 64;
+/// From this size on, a segment is followed by another.
+const SEGMENT_BYTES: u64 = 700;
+
+/// A record's head: where its fields are, and how long it is.
+const KIND: Range<usize> = 4..8;
+const BODY_BYTES: Range<usize> = 16..24;
+const CHECKED_BYTES: Range<usize> = 24..28;
+const RECORD_SUM: Range<usize> = 28..32;
+const HEAD_BYTES: usize = 32;
+/// The kind of a record that holds a chunk.
+const CHUNK: u32 = 3;
+/// A message's prefix: the lengths of its header and payload, and its checksum.
+const HEADER_BYTES: Range<usize> = 16..20;
+const PAYLOAD_BYTES: Range<usize> = 20..28;
+const MESSAGE_SUM: Range<usize> = 28..32;
+
+/// A frame, and the action that followed.
+type Step = ([u8; FRAME_BYTES], u8);
+
+fn spec() -> RunSpec {
+    RunSpec {
+        world: "counter".into(),
+        agent: "driml-ada".into(),
+        seed: 1,
+        frame_height: 1,
+        frame_width: 1,
+        frame_channels: FRAME_BYTES as u32,
+        frame_stack: 2,
+        num_actions: ACTIONS,
+        n_step: 2,
+        gamma: 0.99,
+        horizon: Horizon::Nhg { k_max: 3 },
+        timeout: TimeoutRule::Bootstrap,
+    }
+}
+
+fn config() -> Config {
+    Config {
+        capacity_transitions: CAPACITY,
+        shards: 1,
+        compression: Compression::None,
+        compressed_bytes_max: None,
+        sampling: Sampling::Uniform,
+        disk_bytes_max: None,
+        // Without a thread.
+        fsync_ms: Some(0),
+        replay_ratio: 1e6,
+        warmup_transitions: 0,
+        slack_transitions: 1 << 40,
+        transitions_max: None,
+        reproduced_bug: None,
+    }
+}
+
+fn open(dir: &Path) -> Result<DurableReplay, String> {
+    let args = DurableArgs {
+        dir: dir.to_owned(),
+        shard: 0,
+        after_updates: 0,
+        segment_bytes: Some(SEGMENT_BYTES),
+        mark: None,
+    };
+    DurableReplay::open(&args, &spec(), &config(), ROWS)
+        .map(|(replay, _)| replay)
+        .map_err(|e| e.to_string())
+}
+
+/// A folder in memory if there is such a place: whether a real disk keeps what it was given is not what is tried.
+fn folder() -> tempfile::TempDir {
+    let memory = Path::new("/dev/shm");
+    if memory.is_dir() {
+        tempfile::tempdir_in(memory).unwrap()
+    } else {
+        tempfile::tempdir().unwrap()
+    }
+}
+
+/// The file of segment `number`.
+fn path(dir: &Path, number: usize) -> PathBuf {
+    dir.join(format!("segment-{number:012}.log"))
+}
+
+/// A folder with the segments that the bytes hold: a byte of which the lowest bit says whether the checksums are to be mended, the
+/// number of the first, then each segment after its length in two bytes.
+pub(crate) fn segments(bytes: &[u8]) {
+    let Some((&[mode, first], rest)) = bytes.split_first_chunk() else {
+        return;
+    };
+    let dir = folder();
+    let mut stored = HashSet::new();
+    for (number, mut segment) in split(rest).into_iter().enumerate() {
+        if mode % 2 == 1 {
+            mend(&mut segment);
+        }
+        add_stored(&segment, &mut stored);
+        fs::write(path(dir.path(), usize::from(first) + number), segment).unwrap();
+    }
+    let Ok(mut replay) = open(dir.path()) else {
+        return;
+    };
+    replay.check_valid();
+    let status = replay.status();
+    assert!(status.transitions_held <= status.transitions_inserted.min(CAPACITY));
+    draw(&mut replay, &stored);
+    let before = replay.state_bytes().unwrap();
+    drop(replay);
+    let mut replay = open(dir.path()).unwrap();
+    assert_eq!(replay.state_bytes().unwrap(), before);
+    // It goes on.
+    let actor = 1000;
+    let join = ActorJoin {
+        actor,
+        incarnation: 1,
+    };
+    if replay.join_actor(join).is_ok() {
+        let mut chunk = Chunk::zeroed(header(actor, 0, 0));
+        set(&mut chunk, &mut 1);
+        let reply = replay.insert(&chunk);
+        if matches!(reply, InsertReply::Stored { .. }) {
+            add_chunk(&chunk, &mut stored);
+        }
+        draw(&mut replay, &stored);
+    }
+    replay.check_valid();
+}
+
+fn draw(replay: &mut DurableReplay, stored: &HashSet<Step>) {
+    for client in 0..BATCHES {
+        let id = RequestId::first(1_000 + client);
+        let Ok(batch) = replay.draw_for(id, ROWS, Buffer::zeroed) else {
+            return;
+        };
+        let batch = batch.unpack();
+        let states = batch.states_t();
+        let states = states.chunks_exact(2 * FRAME_BYTES);
+        for (state, &action) in states.zip(batch.actions()) {
+            let newest = *state.last_chunk().unwrap();
+            assert!(
+                stored.contains(&(newest, action)),
+                "a row with {newest:?} and action {action}: no chunk whose checksum is right has it"
+            );
+        }
+    }
+}
+
+/// The segments that the bytes hold.
+fn split(mut bytes: &[u8]) -> Vec<Vec<u8>> {
+    let mut all = Vec::new();
+    while let Some((length, rest)) = bytes.split_first_chunk()
+        && all.len() < SEGMENTS_MAX
+    {
+        let length = usize::from(u16::from_le_bytes(*length)).min(rest.len());
+        let (segment, after) = rest.split_at(length);
+        all.push(segment.to_vec());
+        bytes = after;
+    }
+    all
+}
+
+/// Adds the transitions of all chunks in `bytes` whose own checksum is right.
+fn add_stored(bytes: &[u8], stored: &mut HashSet<Step>) {
+    for at in 0..bytes.len() {
+        let rest = &bytes[at..];
+        if rest.starts_with(b"DRML")
+            && let Some(length) = message_bytes(rest)
+            && let Ok(chunk) = Chunk::decode(&rest[..length], spec().hash(), ACTIONS)
+        {
+            add_chunk(&chunk, stored);
+        }
+    }
+}
+
+fn add_chunk(chunk: &Chunk, stored: &mut HashSet<Step>) {
+    // One of another world, whose frames do not fit.
+    let frames = chunk.frames().chunks_exact(FRAME_BYTES);
+    for (frame, &action) in frames.zip(chunk.actions()) {
+        stored.insert((*frame.first_chunk().unwrap(), action));
+    }
+}
+
+/// Length of the message that begins here, if it is all there.
+fn message_bytes(bytes: &[u8]) -> Option<usize> {
+    let prefix = bytes.get(..codec::PREFIX_BYTES)?;
+    let header = number(&prefix[HEADER_BYTES]);
+    let length = header
+        .checked_add(number(&prefix[PAYLOAD_BYTES]))?
+        .checked_add(codec::PREFIX_BYTES)?;
+    (length <= bytes.len()).then_some(length)
+}
+
+/// A number of up to 8 bytes, little-endian.
+fn number(bytes: &[u8]) -> usize {
+    let number = |sum: u64, &byte: &u8| sum << 8 | u64::from(byte);
+    usize::try_from(bytes.iter().rev().fold(0, number)).unwrap_or(usize::MAX)
+}
+
+/// Makes the lengths and checksums of all records right, and those of the chunks in them, so that what is behind them is reached.
+fn mend(segment: &mut [u8]) {
+    let mut at = 0;
+    while segment.len() - at >= HEAD_BYTES {
+        let (head, rest) = segment[at..].split_at_mut(HEAD_BYTES);
+        head[..4].copy_from_slice(b"DRL1");
+        let length = number(&head[BODY_BYTES]).min(rest.len());
+        let body = &mut rest[..length];
+        let is_chunk = number(&head[KIND]) == CHUNK as usize;
+        let mut checked = length;
+        if is_chunk {
+            checked = number(&head[CHECKED_BYTES]).min(length);
+            mend_message(body);
+        }
+        head[BODY_BYTES].copy_from_slice(&(length as u64).to_le_bytes());
+        head[CHECKED_BYTES].copy_from_slice(&(checked as u32).to_le_bytes());
+        let sum = crc32(&[&head[..RECORD_SUM.start], &body[..checked]]);
+        head[RECORD_SUM].copy_from_slice(&sum.to_le_bytes());
+        at += HEAD_BYTES + length;
+    }
+}
+
+fn mend_message(body: &mut [u8]) {
+    if body.len() < codec::PREFIX_BYTES {
+        return;
+    }
+    let after = body.len() - codec::PREFIX_BYTES;
+    let header = number(&body[HEADER_BYTES]).min(after);
+    body[HEADER_BYTES].copy_from_slice(&(header as u32).to_le_bytes());
+    body[PAYLOAD_BYTES].copy_from_slice(&((after - header) as u64).to_le_bytes());
+    let sum = crc32(&[&body[..MESSAGE_SUM.start], &body[MESSAGE_SUM.end..]]);
+    body[MESSAGE_SUM].copy_from_slice(&sum.to_le_bytes());
+}
+
+fn crc32(pieces: &[&[u8]]) -> u32 {
+    let mut sum = crc32fast::Hasher::new();
+    pieces.iter().for_each(|piece| sum.update(piece));
+    sum.finalize()
+}
+
+fn header(actor: u32, sequence: u64, first_transition: u64) -> ChunkHeader {
+    ChunkHeader {
+        actor,
+        incarnation: 1,
+        sequence,
+        first_transition,
+        weights_version: 1,
+        leaving: false,
+        streams: 2,
+        steps: 4,
+        frame_bytes: FRAME_BYTES as u32,
+    }
+}
+
+/// Fills a chunk with frames from `frame` on.
+fn set(chunk: &mut Chunk, frame: &mut u32) {
+    for row in 0..chunk.header.transitions() {
+        chunk.frame_mut(row).copy_from_slice(&frame.to_le_bytes());
+        let end = match *frame % 13 {
+            0 => End::Terminal,
+            5 => End::TimedOut,
+            9 => End::LevelChange,
+            _ => End::Running,
+        };
+        chunk.set(row, (*frame % ACTIONS) as u8, 0.5, end);
+        *frame += 1;
+    }
+}
+
+/// What the decoder `segments` takes, of a log of several segments and of one of a single segment; as it is, and to be mended.
+pub fn logs() -> Vec<(String, Vec<u8>)> {
+    let mut all = Vec::new();
+    for (name, chunks) in [("short", 2), ("long", 12)] {
+        let log = log(chunks);
+        for (mode, suffix) in [(0, ""), (1, "-mended")] {
+            let bytes = [vec![mode], log.clone()].concat();
+            all.push((format!("{name}{suffix}"), bytes));
+        }
+    }
+    all
+}
+
+/// The segments of a replay in which every kind of record was written.
+fn log(chunks: u64) -> Vec<u8> {
+    let dir = folder();
+    let mut replay = open(dir.path()).unwrap();
+    for actor in 0..2 {
+        let incarnation = 1;
+        replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
+    }
+    replay.learner_starts(7, 0).unwrap();
+    let mut affinity = AffinityUpdate {
+        learner: 7,
+        version: 1,
+        num_actions: ACTIONS,
+        matrix: vec![0.5; (ACTIONS * ACTIONS) as usize],
+    };
+    let (mut frame, mut id) = (1, RequestId::first(5));
+    for sequence in 0..chunks {
+        let mut chunk = Chunk::zeroed(header(0, sequence, 8 * sequence));
+        set(&mut chunk, &mut frame);
+        let reply = replay.insert(&chunk);
+        assert!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
+        let _ = replay.draw_for(id, ROWS, Buffer::zeroed);
+        id = id.next();
+        if sequence % 4 == 1 {
+            replay.set_affinity(&affinity).unwrap();
+            affinity.version += 1;
+        }
+    }
+    let refused = replay.goodbye(&Goodbye {
+        actor: 1,
+        incarnation: 1,
+        produced: 0,
+    });
+    assert_eq!(refused, None);
+    drop(replay);
+    let mut files: Vec<_> = fs::read_dir(dir.path())
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|it| it == "log"))
+        .collect();
+    files.sort();
+    let first = files[0].to_str().unwrap().strip_suffix(".log").unwrap();
+    let mut bytes = vec![first[first.len() - 3..].parse().unwrap()];
+    for file in files {
+        let segment = fs::read(file).unwrap();
+        bytes.extend_from_slice(&u16::try_from(segment.len()).unwrap().to_le_bytes());
+        bytes.extend_from_slice(&segment);
+    }
+    bytes
+}
+
+/// Transitions that are held in a log as [`logs`] gives it, if all of it can be read.
+pub fn held(log: &[u8]) -> u64 {
+    let dir = folder();
+    for (number, segment) in split(&log[2..]).iter().enumerate() {
+        fs::write(path(dir.path(), usize::from(log[1]) + number), segment).unwrap();
+    }
+    open(dir.path()).map_or(0, |replay| replay.status().transitions_held)
+}
