@@ -14,8 +14,9 @@ use crate::geometry::{ConvLayer, ConvShape};
 use crate::kernels::buffer::Buffer;
 use crate::kernels::candle::ConvLayerTensors;
 use crate::kernels::images::Pixels;
-use crate::kernels::linear::{add_in_order, cpu, floats, transpose};
+use crate::kernels::linear::{add_in_order, cpu, floats};
 use crate::kernels::precision::Precision;
+use crate::kernels::rounding::transpose;
 use crate::kernels::stack::{
     SavedActivations, layers, parameters_len, stack_backward, stack_forward, unpacked,
 };
@@ -221,7 +222,8 @@ impl<U: Unit> ConvStack<U> {
                     grad_images,
                 )
             });
-        let sum = add_in_order(sums.collect(), parameters_len(&self.shapes));
+        let sums: Vec<_> = sums.collect();
+        let sum = add_in_order(&sums, parameters_len(&self.shapes));
         unpacked(&self.shapes, &sum)
     }
 
@@ -229,7 +231,7 @@ impl<U: Unit> ConvStack<U> {
     pub(crate) fn flatten(&self, maps: &[f32], flat: &mut [f32]) {
         let (last, len) = (self.last(), self.last().map_len());
         for (maps, flat) in maps.chunks_exact(len).zip(flat.chunks_exact_mut(len)) {
-            transpose(maps, last.locations(), last.channels_out, flat);
+            transpose(self.unit, maps, last.locations(), last.channels_out, flat);
         }
     }
 
@@ -238,7 +240,7 @@ impl<U: Unit> ConvStack<U> {
         let (last, len) = (self.last(), self.last().map_len());
         let mut maps = Buffer::new(flat.len());
         for (maps, flat) in maps.chunks_exact_mut(len).zip(flat.chunks_exact(len)) {
-            transpose(flat, last.channels_out, last.locations(), maps);
+            transpose(self.unit, flat, last.channels_out, last.locations(), maps);
         }
         maps
     }

@@ -156,7 +156,7 @@ vectorized! {
     }
 }
 
-/// Gradients that `backward` adds to.
+/// Where `backward` writes gradients of parameters, and adds those of images.
 pub(crate) struct ConvGradients<'a> {
     /// [k, k, in, out]
     pub(crate) packed: &'a mut [f32],
@@ -185,8 +185,8 @@ impl<'a> ConvGradients<'a> {
     }
 }
 
-/// Adds the gradients of `forward` for `grad_maps` [n, out_h, out_w, out], whose entries count only where `maps` is above 0, as in
-/// PyTorch. The weight's is still to be multiplied by the images' scale.
+/// The gradients of `forward` for `grad_maps` [n, out_h, out_w, out], one image or more, whose entries count only where `maps` is above
+/// 0, as in PyTorch. The weight's is still to be multiplied by the images' scale.
 pub(crate) fn backward<U: Unit, M: Element>(
     unit: U,
     layer: &Convolution<U::Element>,
@@ -197,6 +197,7 @@ pub(crate) fn backward<U: Unit, M: Element>(
 ) {
     let shape = &layer.shape;
     let mut masked = Masked::new::<U>(shape);
+    grads.bias.fill(0.0);
     let (len, mut rooms) = (shape.image_len(), [Room::new(), Room::new()]);
     for (image, (maps, grad_maps)) in maps
         .chunks_exact(shape.map_len())
@@ -206,7 +207,8 @@ pub(crate) fn backward<U: Unit, M: Element>(
         masked.mask(unit, maps, grad_maps, grads.bias);
         masked.write_panels(unit, shape);
         let steps = images.steps(unit, image, (len, shape.shift()), &mut rooms);
-        weight_gradient(unit, shape, steps, &masked.panels, grads.packed);
+        let mode = if image == 0 { Mode::Replace } else { Mode::Add };
+        weight_gradient(unit, shape, steps, &masked.panels, grads.packed, mode);
         if let Some(grad_images) = &mut grads.images {
             masked.write_rows(unit, shape.channels_out);
             let pixels = &mut grad_images[image * len..(image + 1) * len];
@@ -310,13 +312,14 @@ fn panel_len<E: Element>(shape: &ConvShape, width: usize) -> usize {
     steps * width * E::DEPTH
 }
 
-/// Adds one image's part of the weight's gradient: windows, transposed, times masked gradients. `image` is from [`Images::steps`].
+/// One image's part of the weight's gradient: windows, transposed, times masked gradients. `image` is from [`Images::steps`].
 fn weight_gradient<U: Unit>(
     unit: U,
     shape: &ConvShape,
     image: &[U::Element],
     panels: &[U::Element],
     packed: &mut [f32],
+    mode: Mode,
 ) {
     let (depth, out) = (U::Element::DEPTH, shape.channels_out);
     let vecs = tile_vecs::<U>(out);
@@ -342,7 +345,7 @@ fn weight_gradient<U: Unit>(
                     stride: out,
                     cols: width.min(out - col),
                     vecs,
-                    mode: Mode::Add,
+                    mode,
                 };
                 multiply_tile(unit, count, left, panel, columns);
             }

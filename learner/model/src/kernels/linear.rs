@@ -4,6 +4,7 @@
 //! candle's own path is a matrix product and a broadcast addition, whose backward pass sums the bias on a single thread,
 //! and its ReLU passes a gradient at exactly 0, which PyTorch's does not.
 
+use std::ops::Deref;
 use std::sync::{Mutex, PoisonError};
 
 use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
@@ -14,7 +15,8 @@ use crate::kernels::buffer::Buffer;
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
-use crate::kernels::units::Mode;
+use crate::kernels::rounding::transpose;
+use crate::kernels::units::{ForUnit, Mode, Unit, with_unit};
 
 /// Rows that one task sums. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_ROWS: usize = 256;
@@ -250,21 +252,20 @@ impl CustomOp3 for Linear {
 
 /// Transposes every image [rows, cols] of a batch.
 fn transpose_each(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) {
-    let len = rows * cols;
-    result
-        .par_chunks_mut(len)
-        .zip(values.par_chunks(len))
-        .with_min_len(16)
-        .for_each(|(result, values)| transpose(values, rows, cols, result));
-}
-
-/// Transposes an image [rows, cols].
-pub(crate) fn transpose(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) {
-    for (col, result) in result.chunks_exact_mut(rows).enumerate() {
-        for (to, &value) in result.iter_mut().zip(values[col..].iter().step_by(cols)) {
-            *to = value;
+    struct Each<'a>(&'a [f32], usize, usize, &'a mut [f32]);
+    impl ForUnit for Each<'_> {
+        type Output = ();
+        fn run<U: Unit>(self, unit: U) {
+            let Self(values, rows, cols, result) = self;
+            result
+                .par_chunks_mut(rows * cols)
+                .zip(values.par_chunks(rows * cols))
+                .with_min_len(16)
+                .for_each(|(result, values)| transpose(unit, values, rows, cols, result));
         }
     }
+    // Nothing is rounded.
+    with_unit(Precision::F32, Each(values, rows, cols, result));
 }
 
 /// Sums of each group's rows: `grads` [rows, outputs] to [groups, outputs].
@@ -281,7 +282,7 @@ pub(crate) fn group_sums(grads: &[f32], groups: usize, outputs: usize) -> Vec<f3
         add_rows(&mut sum, rows);
         sum
     });
-    add_in_order(parts.collect(), outputs)
+    add_in_order(&parts.collect::<Vec<_>>(), outputs)
 }
 
 /// `part` and the sum so far, if there is one.
@@ -320,14 +321,18 @@ fn add_rows(sum: &mut [f32], rows: &[f32]) {
 }
 
 /// Sum of equally long vectors, first to last; `len` zeros if there are none.
-pub(crate) fn add_in_order(parts: Vec<Vec<f32>>, len: usize) -> Vec<f32> {
-    let mut parts = parts.into_iter();
-    let mut sum = parts.next().unwrap_or_else(|| vec![0.0; len]);
-    let parts: Vec<_> = parts.collect();
+pub(crate) fn add_in_order<P>(parts: &[P], len: usize) -> Vec<f32>
+where
+    P: Deref<Target = [f32]> + Sync,
+{
+    let Some((first, others)) = parts.split_first() else {
+        return vec![0.0; len];
+    };
+    let mut sum = first.to_vec();
     sum.par_chunks_mut(SUM_LEN)
         .enumerate()
         .for_each(|(index, sum)| {
-            for part in &parts {
+            for part in others {
                 for (sum, value) in sum.iter_mut().zip(&part[index * SUM_LEN..]) {
                     *sum += value;
                 }

@@ -1,6 +1,6 @@
-//! From f32 and bytes to the operands of products, element by element.
+//! From f32 and bytes to the operands of products, element by element; images turned.
 
-use crate::kernels::units::{Element, vectorized};
+use crate::kernels::units::{Element, LANES, vectorized};
 
 vectorized! {
     /// Stores pixels in the first of `values`.
@@ -49,5 +49,67 @@ vectorized! {
         steps: &'a mut [U::Element],
     ) {
         U::Element::steps_of(unit, values, shift, steps);
+    }
+}
+
+vectorized! {
+    /// Transposes an image [rows, cols], in square blocks that fit the registers.
+    pub(crate) fn transpose<U>(
+        unit,
+        values: &'a [f32],
+        rows: usize,
+        cols: usize,
+        turned: &'a mut [f32],
+    ) {
+        for row in (0..rows).step_by(LANES) {
+            for col in (0..cols).step_by(LANES) {
+                let (height, width) = (LANES.min(rows - row), LANES.min(cols - col));
+                let mut block = [[0; LANES]; LANES];
+                for (line, block) in block.iter_mut().enumerate().take(height) {
+                    let values = &values[(row + line) * cols + col..][..width];
+                    for (bits, value) in block.iter_mut().zip(values) {
+                        *bits = value.to_bits();
+                    }
+                }
+                unit.transpose(&mut block);
+                for (line, block) in block.iter().enumerate().take(width) {
+                    let turned = &mut turned[(col + line) * rows + row..][..height];
+                    for (value, &bits) in turned.iter_mut().zip(block) {
+                        *value = f32::from_bits(bits);
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::precision::Precision;
+    use crate::kernels::units::{ForUnit, Unit, with_every_unit};
+
+    #[test]
+    fn every_unit_turns_images_of_any_size() {
+        #[derive(Clone, Copy)]
+        struct Turn<'a>(&'a [f32], usize, usize);
+        impl ForUnit for Turn<'_> {
+            type Output = Vec<f32>;
+            fn run<U: Unit>(self, unit: U) -> Vec<f32> {
+                let mut turned = vec![f32::NAN; self.0.len()];
+                transpose(unit, self.0, self.1, self.2, &mut turned);
+                turned
+            }
+        }
+        for [rows, cols] in [[1, 1], [16, 64], [17, 15], [3, 70], [33, 32], [5, 0]] {
+            let values: Vec<f32> = (0..rows * cols).map(|at| at as f32).collect();
+            for precision in Precision::ALL {
+                for turned in with_every_unit(precision, Turn(&values, rows, cols)) {
+                    for (at, &value) in turned.iter().enumerate() {
+                        assert_eq!(value, values[at % rows * cols + at / rows]);
+                    }
+                }
+            }
+        }
     }
 }

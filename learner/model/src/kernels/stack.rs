@@ -98,9 +98,9 @@ pub(crate) fn stack_backward<U: Unit>(
     maps: &[f32],
     grad_maps: &[f32],
     mut grad_images: Option<&mut [f32]>,
-) -> Vec<f32> {
+) -> Buffer<f32> {
     let lens = layers.iter().map(|layer| layer.shape.parameters_len());
-    let mut sums = vec![0.0; lens.sum()];
+    let mut sums = Buffer::new(lens.sum());
     let Some((first, rest)) = layers.split_first() else {
         return sums;
     };
@@ -196,7 +196,7 @@ mod tests {
                 self.grad_maps,
                 Some(&mut grad_images),
             );
-            [maps, grads, grad_images]
+            [maps, grads.to_vec(), grad_images]
         }
     }
 
