@@ -7,7 +7,7 @@ use std::sync::{Mutex, PoisonError};
 use half::bf16;
 
 /// Buffers that the pool of each type keeps; more go back to the allocator.
-const KEPT_MAX: usize = 96;
+const KEPT_MAX: usize = 384;
 
 /// Scalars that a pool holds.
 pub(crate) trait Pooled: Copy + Default + 'static {
