@@ -10,7 +10,7 @@ use crate::kernels::buffer::Buffer;
 use crate::kernels::linear::{cpu, floats};
 use crate::kernels::panels::{Matrix, Threads};
 use crate::kernels::precision::Precision;
-use crate::kernels::product::multiply;
+use crate::kernels::product::Product;
 use crate::kernels::units::Mode;
 
 /// Dot products [L, B, B] of `psi` and `phi`, each [B, L, R], or [B, R] where one vector meets every location of the other.
@@ -76,13 +76,12 @@ impl Dots {
         Located::Copied(copied)
     }
 
-    /// Who computes the products of one location.
-    fn threads(&self) -> Threads {
-        if self.locations == 1 {
-            Threads::Pool
-        } else {
-            Threads::Caller
-        }
+    /// A product of one location.
+    fn product<'a>(&self, a: Matrix<'a>, b: Matrix<'a>) -> Product<'a> {
+        Product::new(Precision::F32, a, b).on(match self.locations {
+            1 => Threads::Pool,
+            _ => Threads::Caller,
+        })
     }
 
     /// For each location the product of `grad` [L, B, B], or of its transposed, with the others' vectors, as the gradient [B, own
@@ -104,15 +103,7 @@ impl Dots {
                 let others = self.located(others, others_locations, at);
                 let others = Matrix::new(others.values(), self.rows, self.rkhs);
                 let mut part = Buffer::new(self.rows * self.rkhs);
-                let threads = self.threads();
-                multiply(
-                    Precision::F32,
-                    &mut part,
-                    Mode::Replace,
-                    grad,
-                    others,
-                    threads,
-                );
+                self.product(grad, others).write(&mut part, Mode::Replace);
                 part
             })
             .collect();
@@ -163,14 +154,7 @@ impl CustomOp2 for Dots {
                 let phi = self.located(phi, self.phi_locations, at);
                 let psi = Matrix::new(psi.values(), rows, rkhs);
                 let phi = Matrix::new(phi.values(), rows, rkhs).transposed();
-                multiply(
-                    Precision::F32,
-                    dots,
-                    Mode::Replace,
-                    psi,
-                    phi,
-                    self.threads(),
-                );
+                self.product(psi, phi).write(dots, Mode::Replace);
             });
         Ok((CpuStorage::F32(dots), (self.locations, rows, rows).into()))
     }

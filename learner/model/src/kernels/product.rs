@@ -232,18 +232,6 @@ impl<'a, E: Element> Operands<'a, E> {
     }
 }
 
-/// [`Product`] into `out`, by `threads`.
-pub(crate) fn multiply(
-    precision: Precision,
-    out: &mut [f32],
-    mode: Mode,
-    a: Matrix<'_>,
-    b: Matrix<'_>,
-    threads: Threads,
-) {
-    Product::new(precision, a, b).on(threads).write(out, mode);
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -305,7 +293,9 @@ mod tests {
                             _ => Matrix::new(&b_t, n, k).transposed(),
                         };
                         let mut out = vec![2.0; m * n];
-                        multiply(precision, &mut out, mode, left, right, threads);
+                        Product::new(precision, left, right)
+                            .on(threads)
+                            .write(&mut out, mode);
                         for (got, wanted) in out.iter().zip(&wanted) {
                             let error = (f64::from(*got) - start - wanted).abs();
                             assert!(
@@ -320,19 +310,82 @@ mod tests {
     }
 
     #[test]
+    fn columns_of_a_matrix_serve_as_they_are() {
+        for [m, k, n, stride] in [[5, 7, 17, 40], [70, 33, 65, 66], [64, 64, 64, 64]] {
+            let (a, first) = (values(m * k, 7), stride - n);
+            let wide = values(k * stride, 11);
+            let columns = Matrix::new(&wide, k, stride).columns(first..stride);
+            let b: Vec<f32> = wide
+                .chunks(stride)
+                .flat_map(|row| row[first..].to_vec())
+                .collect();
+            let (tall, high) = (values(n * stride, 5), values(m * stride, 3));
+            let turned = Matrix::new(&tall, n, stride).columns(0..k.min(stride));
+            for precision in Precision::ALL {
+                let left = Matrix::new(&a, m, k);
+                let whole = Product::new(precision, left, Matrix::new(&b, k, n)).to_vec();
+                let product = Product::new(precision, left, columns);
+                assert_eq!(product.to_vec(), whole, "the same bits");
+
+                let mut sums = high.clone();
+                product.add_to_columns(&mut sums, stride, first);
+                for (at, (sum, before)) in sums.iter().zip(&high).enumerate() {
+                    let (row, column) = (at / stride, at % stride);
+                    let added = match column.checked_sub(first) {
+                        Some(column) => whole[row * n + column],
+                        None => 0.0,
+                    };
+                    assert_eq!(*sum, before + added, "row {row}, column {column}");
+                }
+
+                let by_rows: Vec<f32> = tall
+                    .chunks(stride)
+                    .flat_map(|row| row[..k.min(stride)].to_vec())
+                    .collect();
+                let dense = Matrix::new(&by_rows, n, k.min(stride)).transposed();
+                let left = Matrix::new(&high[..m * k.min(stride)], m, k.min(stride));
+                let of = |b| Product::new(precision, left, b).to_vec();
+                assert_eq!(of(turned.transposed()), of(dense), "transposed");
+            }
+        }
+    }
+
+    #[test]
+    fn rows_are_worked_on_before_and_after() {
+        // Split and not.
+        for [m, k, n] in [[3, 2, 5], [100, 77, 64]] {
+            let (a, b) = (values(m * k, 7), values(k * n, 11));
+            let before = |first: usize, rows: &mut [f32]| {
+                for (row, values) in rows.chunks_mut(n).enumerate() {
+                    values.fill((first + row) as f32);
+                }
+            };
+            let after =
+                |_: usize, rows: &mut [f32]| rows.iter_mut().for_each(|value| *value *= 2.0);
+            let product =
+                Product::new(Precision::F32, Matrix::new(&a, m, k), Matrix::new(&b, k, n));
+            let (plain, edged) = (
+                product.to_vec(),
+                product.added_to(&before).then(&after).to_vec(),
+            );
+            for (at, (edged, plain)) in edged.iter().zip(&plain).enumerate() {
+                let wanted = 2.0 * (plain + (at / n) as f32);
+                assert!((edged - wanted).abs() < 1e-3, "{edged}, wanted {wanted}");
+            }
+            assert_eq!(product.summed(None), plain);
+            let twice: Vec<f32> = plain.iter().map(|value| 2.0 * value).collect();
+            assert_eq!(product.summed(Some(plain)), twice);
+        }
+    }
+
+    #[test]
     fn an_empty_sum_is_zero() {
         let mut out = [3.0; 4];
         let (a, b) = (Matrix::new(&[], 2, 0), Matrix::new(&[], 0, 2));
-        multiply(Precision::F32, &mut out, Mode::Add, a, b, Threads::Caller);
+        let product = Product::new(Precision::F32, a, b);
+        product.write(&mut out, Mode::Add);
         assert_eq!(out, [3.0; 4]);
-        multiply(
-            Precision::F32,
-            &mut out,
-            Mode::Replace,
-            a,
-            b,
-            Threads::Caller,
-        );
+        product.write(&mut out, Mode::Replace);
         assert_eq!(out, [0.0; 4]);
     }
 }
