@@ -43,23 +43,34 @@ impl Processes {
             .collect()
     }
 
-    /// Checks that all are as they should be: running, or actors that are not needed any more.
+    /// Checks that all are as they should be: running, about to be started again, or actors that are not needed any more.
     ///
     /// # Errors
     /// The first that has ended, and its last words.
-    pub(crate) fn check_alive(&mut self) -> anyhow::Result<()> {
-        for process in self.replay_servers.iter_mut().chain(&mut self.learner) {
+    pub(crate) fn check_alive(&mut self, revived: Revived) -> anyhow::Result<()> {
+        let servers = self.replay_servers.iter_mut().filter(|_| !revived.servers);
+        for process in servers.chain(&mut self.learner) {
             if process.end().is_some() {
                 bail!("{}", process.exit_report());
             }
         }
         for actor in &mut self.actors {
-            if actor.end().is_some_and(|status| !status.success()) {
+            let comes_back = revived.actors && actor.may_be_started_again();
+            if actor.end().is_some_and(|status| !status.success()) && !comes_back {
                 bail!("{}", actor.exit_report());
             }
         }
         Ok(())
     }
+}
+
+/// Which parts of a run are started again when they have died: their end is none of the run's, however soon it comes.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Revived {
+    /// All replay servers.
+    pub(crate) servers: bool,
+    /// Actors that had lived for a while.
+    pub(crate) actors: bool,
 }
 
 /// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left.

@@ -25,7 +25,7 @@ use crate::{
     interrupts::Interrupts,
     live_view::{Display, TEMPLATE, silence},
     meeting::Meeting,
-    processes::{Processes, stop},
+    processes::{Processes, Revived, stop},
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     status_client::Statuses,
@@ -218,7 +218,9 @@ impl Launch<'_> {
         }
         let mut sessions = Vec::new();
         for endpoint in self.endpoints.clone() {
-            match connect(&endpoint, &self.interrupts, || self.processes.check_alive())? {
+            match connect(&endpoint, &self.interrupts, || {
+                self.processes.check_alive(Revived::default())
+            })? {
                 Some(session) => sessions.push(session),
                 None => return Ok(Outcome::Interrupted),
             }
@@ -244,7 +246,7 @@ impl Launch<'_> {
             }
             self.revive_servers()?;
             self.revive_actors()?;
-            self.processes.check_alive()?;
+            self.processes.check_alive(self.revived())?;
             let statuses = self
                 .statuses
                 .as_mut()

@@ -6,7 +6,10 @@ use std::path::Path;
 use driml_protocol::session;
 
 use super::{Launch, Outside};
-use crate::managed_process::{ManagedProcess, Surroundings};
+use crate::{
+    managed_process::{ManagedProcess, Surroundings},
+    processes::Revived,
+};
 
 /// How often replay servers that keep their replay on disk are started again in a run, all together.
 const RESTARTS_MAX: u32 = 8;
@@ -87,6 +90,14 @@ impl Launch<'_> {
         let logs = self.run_dir.logs();
         let name = format!("actor-{id}");
         ManagedProcess::start(&name, &args, PROCESS_THREADS, self.surroundings(&logs))
+    }
+
+    /// Who is still started again.
+    pub(super) fn revived(&self) -> Revived {
+        Revived {
+            servers: self.config.local.durable && self.restarts < RESTARTS_MAX,
+            actors: self.actor_restarts < ACTOR_RESTARTS_MAX,
+        }
     }
 
     /// Starts actors that have died again. What one had not delivered is gone with it; the run goes on.
