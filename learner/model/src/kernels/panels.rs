@@ -13,8 +13,8 @@ use crate::kernels::units::{
 #[derive(Clone, Copy)]
 pub(crate) struct Matrix<'a> {
     data: &'a [f32],
-    pub(super) rows: usize,
-    pub(super) cols: usize,
+    pub(crate) rows: usize,
+    pub(crate) cols: usize,
     /// Scalars from the start of a run to the next one's.
     stride: usize,
     transposed: bool,
@@ -35,11 +35,6 @@ impl<'a> Matrix<'a> {
             stride: cols,
             transposed: false,
         }
-    }
-
-    /// Its columns.
-    pub(crate) const fn cols(self) -> usize {
-        self.cols
     }
 
     /// Some of the columns, where they are. They serve as a right operand; a left one has its runs one after the other.

@@ -254,7 +254,7 @@ impl Block {
             ),
         ];
         for (weight, values, grad, sums) in layers {
-            let sums = Matrix::new(sums, self.groups, grad.cols());
+            let sums = Matrix::new(sums, self.groups, grad.cols);
             sum_in_place(weight, |sum| {
                 self.of_weight(sum, grad, x, joined.map(|it| (sums, it)))
             })?;
@@ -289,7 +289,7 @@ impl Block {
             return product.summed(sum);
         };
         let inputs = self.features + self.joins;
-        let mut sum = sum.unwrap_or_else(|| vec![0.0; grad.cols() * inputs]);
+        let mut sum = sum.unwrap_or_else(|| vec![0.0; grad.cols * inputs]);
         product.add_to_columns(&mut sum, inputs, 0);
         self.product(sums.transposed(), joined)
             .add_to_columns(&mut sum, inputs, self.features);
