@@ -1,0 +1,345 @@
+//! Batches of all kinds: drawn by priority, made of stacks of frames, merged of parts; and those that cannot be.
+
+use driml_protocol::{
+    Batch, BatchHeader, BatchReply, Buffer, Origin, PriorityPart, PriorityUpdate, RowScalars,
+    StackedFrames, Tally, codec,
+};
+
+use crate::samples::{
+    ORIGIN, SPEC, STACKED, batch, batch_from, prioritised_batch, priority_update, read_batch, rows,
+    sealed, stacked_batch,
+};
+
+/// What a uniform run sends has no byte of what priorities need.
+#[test]
+fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
+    let (plain, prioritised) = (batch(), prioritised_batch());
+    let more = prioritised.header.payload_bytes() - plain.header.payload_bytes();
+    assert_eq!((more, plain.probabilities()), (3 * 12, None));
+    let sent = [sealed(plain.clone()), sealed(prioritised.clone())].map(|bytes| bytes.len());
+    // The origin: a byte of the shard, nine of the incarnation.
+    assert_eq!(sent[1] - sent[0], 3 * 12 + 10);
+    assert_eq!(plain.priority_update(5, 9, &[0.0; 3]), None);
+
+    let bytes = sealed(prioritised.clone());
+    let (reply, payload) = codec::decode::<BatchReply>(&bytes, Some(SPEC)).unwrap();
+    assert!(matches!(reply, BatchReply::Prioritised(_, ORIGIN)));
+    let mut back = Batch::from_payload(reply.header().unwrap(), payload.to_vec().into()).unwrap();
+    assert_eq!(back, prioritised);
+    assert_eq!(back.probabilities().unwrap(), [0.5, 1.0, 1e-30]);
+    assert_eq!(
+        (back.actions(), back.ks()),
+        (&[0, 1, 2][..], &[2, 0, 255][..])
+    );
+    let update = back.priority_update(5, 9, &[1.0, 2.0, 3.0]).unwrap();
+    let part = |origin, transitions: &[u64], priorities: &[f32]| PriorityPart {
+        origin,
+        transitions: transitions.to_vec(),
+        priorities: priorities.to_vec(),
+    };
+    let own = [1 << 40, 7, u64::MAX];
+    assert_eq!((update.learner, update.number, update.rows()), (5, 9, 3));
+    assert_eq!(update.parts, [part(ORIGIN, &own, &[1.0, 2.0, 3.0])]);
+
+    // Of two shards, the second of which gives three rows of four.
+    let other = Origin {
+        shard: 0,
+        incarnation: 3,
+    };
+    let mut second = batch_from(Some(other));
+    second.set_draws([(10, 0.5), (11, 0.25), (12, 0.25)].into_iter());
+    back.scale_probabilities(0.25);
+    second.scale_probabilities(0.75);
+    let parts = [back, second];
+    let whole = Batch::merged_header(&parts).unwrap();
+    let merged = Batch::merge(&parts, Buffer::zeroed(whole.payload_bytes()));
+    assert_eq!(
+        merged.probabilities().unwrap(),
+        [0.125, 0.25, 2.5e-31, 0.375, 0.1875, 0.1875]
+    );
+    let found = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0];
+    let update = merged.priority_update(5, 9, &found).unwrap();
+    let expected = [
+        part(ORIGIN, &own, &found[..3]),
+        part(other, &[10, 11, 12], &found[3..]),
+    ];
+    assert_eq!(update.parts, expected);
+    let mixed = [merged, plain];
+    assert_eq!(Batch::merged_header(&mixed), None);
+}
+
+/// What a run without stacks sends has no byte of what stacks need; what it sends otherwise is each frame once.
+#[test]
+fn stacks_come_back_as_whole_states() {
+    for origin in [None, Some(ORIGIN)] {
+        let sent = stacked_batch(origin);
+        let more = sent.header.payload_bytes() - batch_from(origin).header.payload_bytes();
+        // Five frames of two bytes, and two numbers of four for each of six states, which had four bytes.
+        assert_eq!(more, 5 * 2 + 6 * 8 - 6 * 4);
+        let bytes = sealed(sent.clone());
+        let (reply, payload) = codec::decode::<BatchReply>(&bytes, Some(SPEC)).unwrap();
+        assert!(matches!(reply, BatchReply::Stacked(_, STACKED, from) if from == origin));
+        let back = Batch::from_payload(reply.header().unwrap(), payload.to_vec().into()).unwrap();
+        assert_eq!(back, sent);
+        assert_eq!(back.probabilities().is_some(), origin.is_some());
+        assert_eq!(
+            back.states_t()[..],
+            [50, 50, 50, 50, 50, 51, 50, 51, 51, 52, 51, 52],
+            "a pixel's oldest channels come first"
+        );
+        assert_eq!(back.states_k()[..], [50, 51, 50, 51, 53, 54, 53, 54]);
+        assert_eq!(back.states_n()[..], [54, 54, 54, 54]);
+        assert_eq!(back.ks(), [2, 0, 255]);
+    }
+}
+
+/// Each part's states are made of its own frames.
+#[test]
+fn parts_of_stacks_are_merged() {
+    let first = stacked_batch(None);
+    let mut second = stacked_batch(None);
+    for frame in 0..5 {
+        second.states_mut().frame(frame).fill(150 + frame as u8);
+    }
+    let parts = [first, second, stacked_batch(None)];
+    let whole = Batch::merged_header(&parts).unwrap();
+    assert_eq!(whole.stacked.unwrap().frames, 15);
+    let merged = Batch::merge(&parts, Buffer::from(vec![0xAB; whole.payload_bytes()]));
+    let planes = |batch: &Batch| {
+        [batch.states_t(), batch.states_k(), batch.states_n()].map(|plane| plane.to_vec())
+    };
+    let parts_planes = parts.each_ref().map(planes);
+    for (at, plane) in planes(&merged).into_iter().enumerate() {
+        assert_eq!(
+            plane,
+            parts_planes.each_ref().map(|it| &it[at][..]).concat()
+        );
+    }
+    let (header, payload) = merged.into_payload();
+    assert!(Batch::from_payload(header, payload).is_ok());
+
+    let [part, ..] = parts;
+    for other in [
+        None,
+        Some(StackedFrames {
+            frame_stack: 4,
+            ..STACKED
+        }),
+    ] {
+        let mut other_part = part.clone();
+        other_part.header.stacked = other;
+        assert_eq!(Batch::merged_header(&[part.clone(), other_part]), None);
+    }
+}
+
+#[test]
+fn stacks_that_cannot_be_are_refused() {
+    let said = |header, payload: Buffer| {
+        let message = codec::encode(SPEC, &BatchReply::of(header), &payload).unwrap();
+        read_batch(&message).unwrap_err().to_string()
+    };
+    for number in [5, 6, u32::MAX] {
+        let mut wrong = stacked_batch(None);
+        wrong.states_mut().set_stack(5, &[0, number]);
+        let (header, payload) = wrong.into_payload();
+        let said = said(header, payload);
+        assert!(
+            said.contains(&format!("a state of frame {number}, of 5 that travel")),
+            "{said}"
+        );
+    }
+    let (header, payload) = stacked_batch(None).into_payload();
+    for wrong in [
+        StackedFrames {
+            frames: 0,
+            ..STACKED
+        },
+        StackedFrames {
+            frames: 4,
+            ..STACKED
+        },
+        StackedFrames {
+            frames: u32::MAX,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_stack: 0,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_stack: 1,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_stack: 17,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_stack: u32::MAX,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_channels: 0,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_channels: 3,
+            ..STACKED
+        },
+        StackedFrames {
+            frame_channels: u32::MAX,
+            ..STACKED
+        },
+    ] {
+        let header = BatchHeader {
+            stacked: Some(wrong),
+            ..header
+        };
+        let said = said(header, payload.clone());
+        assert!(said.contains("do not fill"), "{wrong:?}: {said}");
+    }
+    // More frames than all stacks have room for.
+    let most = StackedFrames {
+        frames: 13,
+        ..STACKED
+    };
+    let header = BatchHeader {
+        stacked: Some(most),
+        ..header
+    };
+    assert!(said(header, Buffer::zeroed(13 * 2 + 6 * 8 + 36)).contains("do not fill"));
+}
+
+/// A message of some MB whose states would fill the memory.
+#[test]
+fn few_frames_do_not_make_more_than_a_message_may_have() {
+    let rows = vec![
+        RowScalars {
+            positives: 0,
+            bootstrap_discount: 0.0,
+            ..rows()[0]
+        };
+        4096
+    ];
+    let whole_bytes = codec::PAYLOAD_BYTES_MAX / rows.len();
+    for (state_bytes, is_refused) in [(whole_bytes - 16, false), (whole_bytes, true)] {
+        let header = BatchHeader {
+            state_bytes: state_bytes as u32,
+            stacked: Some(StackedFrames {
+                frames: 1,
+                ..STACKED
+            }),
+            ..batch().header
+        };
+        let (header, payload) = Batch::of_rows(header, &rows, Buffer::zeroed).into_payload();
+        match Batch::from_payload(header, payload) {
+            Ok(_) => assert!(!is_refused),
+            Err(e) => {
+                let said = e.to_string();
+                assert!(
+                    is_refused && said.contains("states would fill more than"),
+                    "{said}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn draws_and_priorities_that_cannot_be_are_refused() {
+    for chance in [0.0, -0.5, 1.5, f32::NAN, f32::INFINITY] {
+        let mut batch = prioritised_batch();
+        batch.set_draws([(1, 0.5), (2, chance), (3, 0.5)].into_iter());
+        let refused = read_batch(&sealed(batch)).unwrap_err().to_string();
+        assert!(
+            refused.contains("was drawn with the probability"),
+            "{refused}"
+        );
+    }
+    for priority in [-1.0, -1e-30, f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let mut update = priority_update();
+        update.parts[0].priorities[1] = priority;
+        let bytes = codec::encode(SPEC, &update, &[]).unwrap();
+        let refused = codec::decode::<PriorityUpdate>(&bytes, Some(SPEC)).unwrap_err();
+        let said = refused.to_string();
+        assert!(said.contains("no number from 0 on"), "{said}");
+    }
+    let mut update = priority_update();
+    update.parts[0].priorities.pop();
+    let bytes = codec::encode(SPEC, &update, &[]).unwrap();
+    let refused = codec::decode::<PriorityUpdate>(&bytes, Some(SPEC)).unwrap_err();
+    assert!(
+        refused.to_string().contains("1 priorities of 2"),
+        "{refused}"
+    );
+}
+
+#[test]
+fn parts_are_merged_row_by_row() {
+    let header = |mean_age, versions| BatchHeader {
+        rows: 0,
+        positives: 3,
+        state_bytes: 3,
+        states_k: 0,
+        states_n: 0,
+        tally: Tally {
+            inserted: 10,
+            rows_sampled: 1,
+        },
+        held: 5,
+        mean_age,
+        weights_versions: versions,
+        origin: None,
+        stacked: None,
+    };
+    // Rows from `first` on, which have fewer positives and bootstraps, the higher their number.
+    let part = |header: BatchHeader, values: std::ops::Range<u8>| {
+        let scalars = |value: u8| RowScalars {
+            action: value,
+            next_action: value + 100,
+            n_step_return: value.into(),
+            bootstrap_discount: if value.is_multiple_of(2) { 0.5 } else { 0.0 },
+            positives: 3 - u32::from(value) % 4,
+            k_first: 1,
+        };
+        let rows: Vec<_> = values.clone().map(scalars).collect();
+        let mut batch = Batch::of_rows(header, &rows, Buffer::zeroed);
+        let mut places = batch.states_mut();
+        for (row, value) in values.enumerate() {
+            places.t(row).fill(value);
+            if let Some(place) = places.n(row) {
+                place.fill(value + 20);
+            }
+            for p in 0..3 {
+                if let Some(place) = places.k(p, row) {
+                    place.fill(value + 40 + 20 * p as u8);
+                }
+            }
+        }
+        batch
+    };
+    let parts = [
+        part(header(1.0, (7, 3)), 0..4),
+        part(header(4.0, (9, 5)), 4..6),
+        part(header(1.0, (8, 4)), 6..8),
+    ];
+    let whole = Batch::merged_header(&parts).unwrap();
+    let merged = Batch::merge(&parts, Buffer::from(vec![0xAB; whole.payload_bytes()]));
+    let expected = part(whole, 0..8);
+    assert_eq!((whole.mean_age, whole.weights_versions), (1.75, (9, 3)));
+    assert_eq!((whole.tally.inserted, whole.held), (30, 15));
+    assert_eq!((whole.rows, whole.states_k, whole.states_n), (8, 12, 4));
+    assert_eq!(merged, expected);
+    assert_eq!(
+        merged.states_n()[..],
+        [[20; 3], [22; 3], [24; 3], [26; 3]].concat()
+    );
+
+    let other = BatchHeader {
+        state_bytes: 4,
+        ..header(0.0, (1, 1))
+    };
+    let other = part(other, 0..1);
+    assert_eq!(Batch::merged_header(&[parts[0].clone(), other]), None);
+    assert_eq!(Batch::merged_header(&[]), None);
+}

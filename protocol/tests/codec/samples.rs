@@ -1,0 +1,460 @@
+//! A message of every kind, whole or forged, and what reads it.
+//! It tests nothing but that each comes back.
+
+use std::fmt::Debug;
+
+use driml_protocol::{
+    ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, Chunk,
+    ChunkHeader, Claim, CodecError, Done, End, EndedEpisode, EpisodesReply, EpisodesRequest,
+    Goodbye, Hello, InsertReply, JoinReply, Kind, LearnerJoin, LearnerStatus, Life, LogStatus,
+    Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus, PartsStatus, Played,
+    PriorityPart, PriorityUpdate, ReplayStatus, Report, RequestId, Returns, RowScalars,
+    StackedFrames, Tally, Waiting, Warning, WeightsHeader, WeightsReply, WeightsRequest,
+    WeightsUpload, WeightsVersion,
+    codec::{self},
+};
+
+pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
+pub(crate) const ACTIONS: u32 = 15;
+
+/// A message of one type, and whether some bytes are accepted in its place.
+pub(crate) struct Sample {
+    pub(crate) name: String,
+    pub(crate) kind: Kind,
+    pub(crate) bytes: Vec<u8>,
+    pub(crate) read: fn(&[u8]) -> Result<(), CodecError>,
+}
+
+impl Sample {
+    /// Encodes `header`, checks that it comes back, and keeps the bytes.
+    pub(crate) fn of<M: Message + PartialEq + Debug>(header: &M) -> Self {
+        let bytes = codec::encode(SPEC, header, &[]).unwrap();
+        let (back, payload) = codec::decode::<M>(&bytes, Some(SPEC)).unwrap();
+        assert_eq!((&back, payload.len()), (header, 0));
+        let (back, _) = codec::decode::<M>(&bytes, None).unwrap();
+        assert_eq!(&back, header, "where any run is welcome");
+        Self {
+            name: format!("{header:?}"),
+            kind: M::KIND,
+            bytes,
+            read: |bytes| codec::decode::<M>(bytes, Some(SPEC)).map(|_| ()),
+        }
+    }
+}
+
+pub(crate) fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
+    Chunk::decode(bytes, SPEC, ACTIONS).map(|_| ())
+}
+
+pub(crate) fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
+    let (reply, payload) = codec::decode::<BatchReply>(bytes, Some(SPEC))?;
+    match reply.header() {
+        Some(header) => Batch::from_payload(header, payload.to_vec().into()).map(|_| ()),
+        None => Ok(()),
+    }
+}
+
+pub(crate) fn read_weights(bytes: &[u8]) -> Result<(), CodecError> {
+    codec::decode::<WeightsUpload>(bytes, Some(SPEC)).map(|_| ())
+}
+
+pub(crate) fn chunk() -> Chunk {
+    let mut chunk = Chunk::zeroed(ChunkHeader {
+        actor: 3,
+        incarnation: u64::MAX,
+        sequence: 5,
+        first_transition: 60,
+        weights_version: 7,
+        leaving: true,
+        streams: 2,
+        steps: 3,
+        frame_bytes: 5,
+    });
+    for row in 0..6 {
+        chunk.frame_mut(row).fill(row as u8 + 1);
+        let end = End::from_byte(row as u8 % 4).unwrap();
+        chunk.set(row, row as u8, -0.5 * row as f32, end);
+    }
+    chunk
+}
+
+pub(crate) fn batch() -> Batch {
+    batch_from(None)
+}
+
+/// Its rows drawn by priority.
+pub(crate) fn prioritised_batch() -> Batch {
+    let mut batch = batch_from(Some(ORIGIN));
+    let draws = [(1 << 40, 0.5), (7, 1.0), (u64::MAX, 1e-30)];
+    batch.set_draws(draws.into_iter());
+    batch
+}
+
+pub(crate) const ORIGIN: Origin = Origin {
+    shard: 2,
+    incarnation: u64::MAX,
+};
+
+/// Of these the first does not bootstrap, the second has no positive and ends its episode.
+pub(crate) fn rows() -> Vec<RowScalars> {
+    let rows = [(4, 0.0, 2), (NO_ACTION, 0.0, 0), (6, 0.5, 300)];
+    let scalars = |(row, (next_action, bootstrap_discount, k)): (u8, _)| RowScalars {
+        action: row,
+        next_action,
+        n_step_return: 0.5 + f32::from(row),
+        bootstrap_discount,
+        positives: u32::from(k > 0),
+        k_first: k,
+    };
+    (0..).zip(rows).map(scalars).collect()
+}
+
+pub(crate) fn batch_from(origin: Option<Origin>) -> Batch {
+    let header = BatchHeader {
+        rows: 3,
+        positives: 1,
+        state_bytes: 4,
+        states_k: 2,
+        states_n: 1,
+        tally: Tally {
+            inserted: 99,
+            rows_sampled: 12,
+        },
+        held: 9,
+        mean_age: 12.5,
+        weights_versions: (8, 2),
+        origin,
+        stacked: None,
+    };
+    let mut batch = Batch::of_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
+    assert_eq!(batch.header, header);
+    let mut places = batch.states_mut();
+    for row in 0..3 {
+        places.t(row).fill(10 + row as u8);
+    }
+    assert!(places.n(0).is_none() && places.n(1).is_none() && places.k(0, 1).is_none());
+    places.n(2).unwrap().fill(22);
+    places.k(0, 0).unwrap().fill(30);
+    places.k(0, 2).unwrap().fill(32);
+    batch
+}
+
+pub(crate) const STACKED: StackedFrames = StackedFrames {
+    frames: 5,
+    frame_stack: 2,
+    frame_channels: 1,
+};
+
+/// The same rows, whose states are stacks of two of five frames.
+pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
+    let header = BatchHeader {
+        stacked: Some(STACKED),
+        ..batch_from(origin).header
+    };
+    let mut batch = Batch::of_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
+    assert_eq!(batch.header, header);
+    let mut places = batch.states_mut();
+    for frame in 0..5 {
+        places.frame(frame).fill(50 + frame as u8);
+    }
+    // s_t; s_{t+k} of the first and the last; s_{t+n} of the last.
+    let stacks = [[0, 0], [0, 1], [1, 2], [0, 1], [3, 4], [4, 4]];
+    for (state, stack) in stacks.iter().enumerate() {
+        places.set_stack(state, stack);
+    }
+    if origin.is_some() {
+        batch.set_draws([(1, 0.5), (2, 0.5), (3, 0.5)].into_iter());
+    }
+    batch
+}
+
+/// The bytes of a message as the wire joins them.
+pub(crate) fn join((mut head, payload): (Vec<u8>, impl AsRef<[u8]>)) -> Vec<u8> {
+    head.extend_from_slice(payload.as_ref());
+    head
+}
+
+/// A batch as it travels.
+pub(crate) fn sealed(batch: Batch) -> Vec<u8> {
+    let (header, payload) = batch.into_payload();
+    codec::encode(SPEC, &BatchReply::of(header), &payload).unwrap()
+}
+
+pub(crate) fn weights() -> Vec<u8> {
+    let payload: Vec<u8> = (0..40).collect();
+    let upload = WeightsUpload {
+        learner: 5,
+        weights: WeightsHeader::new(4, 312, &payload),
+    };
+    codec::encode(SPEC, &upload, &payload).unwrap()
+}
+
+pub(crate) fn parts_status() -> PartsStatus {
+    PartsStatus {
+        up_s: 60.0,
+        waiting: Waiting::ActorsWaitForLearner,
+        waiting_s: 2.5,
+        requests_waiting: 1,
+        chunks_waiting: 2,
+        chunk_bytes_waiting: 1 << 20,
+        weights_version: 4,
+        weights_age_s: Some(1.0),
+        log: Some(LogStatus {
+            folder: "replay".into(),
+            bytes: 1 << 20,
+            bytes_max: Some(1 << 30),
+            flushed_s: 0.5,
+            refused: Some((2.0, "full".into())),
+            unwritten_bytes: 40,
+        }),
+        last_warning: None,
+        parts: vec![PartStatus {
+            who: PartName::Actor(3),
+            connected: true,
+            since_s: 50.0,
+            lives: 2,
+            heard_s: Some(0.5),
+            held_s: None,
+            weights_version: Some(3),
+            doing: Some(("plays".into(), 5.0, 1.0)),
+            last_warning: Some(Warning::new("late", 9.0)),
+        }],
+    }
+}
+
+/// An episode of which all was seen, and one of which a part was lost.
+pub(crate) fn episodes() -> EpisodesReply {
+    let whole = EndedEpisode {
+        frames: 1 << 20,
+        actor: 3,
+        copy: 15,
+        played: Some(Played {
+            episode_return: 2.5,
+            steps: 99,
+        }),
+    };
+    EpisodesReply {
+        ended: 9,
+        before: 7,
+        episodes: vec![
+            whole,
+            EndedEpisode {
+                played: None,
+                ..whole
+            },
+        ],
+    }
+}
+
+pub(crate) fn priority_update() -> PriorityUpdate {
+    PriorityUpdate {
+        learner: 5,
+        number: 9,
+        parts: vec![PriorityPart {
+            origin: ORIGIN,
+            transitions: vec![0, u64::MAX],
+            priorities: vec![0.0, 2.5],
+        }],
+    }
+}
+
+/// One or more messages of every kind.
+pub(crate) fn samples() -> Vec<Sample> {
+    let replies = [
+        InsertReply::Stored {
+            inserted_total: 1 << 40,
+            actors: 64,
+            waited: true,
+        },
+        InsertReply::Wait {
+            inserted_total: 0,
+            kept: true,
+        },
+        InsertReply::OutOfOrder { expected: 3 },
+        InsertReply::Finished { inserted_total: 7 },
+        InsertReply::Refused {
+            why: "frames of 7 bytes".into(),
+        },
+    ];
+    let waits = [
+        Waiting::Nobody,
+        Waiting::WarmUp {
+            have: 3,
+            need: 1000,
+        },
+        Waiting::LearnerWaitsForActors,
+        Waiting::ActorsWaitForLearner,
+        Waiting::Finished,
+    ];
+    let replay = ReplayStatus {
+        transitions_inserted: 5,
+        returns: Returns {
+            known: 120,
+            newest: vec![-1.25, 3.0],
+        },
+        k_histogram: vec![1, 2, 3],
+        action_histogram: vec![0; 15],
+        waiting: Waiting::WarmUp { have: 5, need: 9 },
+        ..ReplayStatus::default()
+    };
+    let learner = LearnerStatus {
+        updates: 3,
+        losses: vec![("dim_3t3".into(), 0.5), ("dim_4t4".into(), 1.5)],
+        ..LearnerStatus::default()
+    };
+    let affinity = AffinityUpdate {
+        learner: 5,
+        version: 2,
+        num_actions: 3,
+        matrix: [0.25, 0.5, 0.25].repeat(3),
+    };
+    let hello = Hello {
+        config_toml: "[run]\nseed = 1\n".into(),
+        inserted_total: 12,
+        tally: Tally::default(),
+        after_updates: 3,
+        shard: (1, 2),
+        shared_memory: true,
+    };
+    let goodbye = Goodbye {
+        actor: 1,
+        incarnation: 2,
+        produced: 3,
+    };
+    let mut samples: Vec<Sample> = replies.iter().map(Sample::of).collect();
+    let joined = [
+        JoinReply::Welcome {
+            inserted_total: 3,
+            weights_version: 4,
+            earlier_incarnations: 5,
+        },
+        JoinReply::Taken { why: "a".into() },
+        JoinReply::Refused { why: "b".into() },
+    ];
+    samples.extend(joined.map(|reply| Sample::of(&reply)));
+    samples.extend(waits.map(|waiting| Sample::of(&BatchReply::Wait(waiting))));
+    samples.extend([
+        Sample::of(&BatchReply::Finished),
+        Sample::of(&BatchReply::Refused { why: String::new() }),
+        Sample::of(&BatchRequest {
+            learner: 5,
+            id: RequestId::first(u64::MAX).again(),
+            rows: 256,
+            shared_memory: true,
+            other_shards: Some(Tally::default()),
+        }),
+        Sample::of(&affinity),
+        Sample::of(&priority_update()),
+        Sample::of(&WeightsVersion { version: 9 }),
+        Sample::of(&goodbye),
+        Sample::of(&ReplayStatus::default()),
+        Sample::of(&replay),
+        Sample::of(&learner),
+        Sample::of(&hello),
+        Sample::of(&ActorJoin {
+            actor: 1,
+            incarnation: 2,
+        }),
+        Sample::of(&LearnerJoin {
+            learner: 5,
+            rows_sampled: 9,
+        }),
+        Sample::of(&Claim {
+            actor: 1,
+            incarnation: 2,
+            sequence: 3,
+            leaving: true,
+        }),
+        Sample::of(&WeightsRequest::NewerThan(7)),
+        Sample::of(&WeightsRequest::Piece {
+            version: 8,
+            offset: 1 << 18,
+        }),
+        Sample::of(&WeightsReply::NoneNewer),
+        Sample::of(&WeightsReply::Gone),
+        Sample::of(&WeightsReply::Piece {
+            weights: WeightsHeader::new(8, 9, b"these"),
+            bytes: 5,
+            offset: 0,
+        }),
+        Sample::of(&Done),
+        Sample::of(&Report::new(
+            Life::Learner(5),
+            "learns",
+            1.5,
+            Some(Warning::new("a chunk was refused", 3.0)),
+        )),
+        Sample::of(&parts_status()),
+        Sample::of(&EpisodesRequest { since: 7 }),
+        Sample::of(&episodes()),
+    ]);
+    let with_payload = [
+        (
+            "chunk",
+            Kind::Chunk,
+            join(chunk().seal(SPEC).unwrap()),
+            read_chunk as fn(&[u8]) -> _,
+        ),
+        ("batch", Kind::BatchReply, sealed(batch()), read_batch),
+        (
+            "batch drawn by priority",
+            Kind::BatchReply,
+            sealed(prioritised_batch()),
+            read_batch,
+        ),
+        (
+            "batch of stacked frames",
+            Kind::BatchReply,
+            sealed(stacked_batch(None)),
+            read_batch,
+        ),
+        (
+            "batch of stacked frames drawn by priority",
+            Kind::BatchReply,
+            sealed(stacked_batch(Some(ORIGIN))),
+            read_batch,
+        ),
+        ("weights", Kind::WeightsUpload, weights(), read_weights),
+    ];
+    samples.extend(with_payload.map(|(name, kind, bytes, read)| Sample {
+        name: name.into(),
+        kind,
+        bytes,
+        read,
+    }));
+    samples
+}
+
+/// A message with a right checksum and whatever else.
+pub(crate) fn forge(
+    version: u16,
+    kind: u16,
+    lengths: (u32, u64),
+    header: &[u8],
+    payload: &[u8],
+) -> Vec<u8> {
+    let mut bytes = b"DRML".to_vec();
+    bytes.extend(version.to_le_bytes());
+    bytes.extend(kind.to_le_bytes());
+    bytes.extend(SPEC.to_le_bytes());
+    bytes.extend(lengths.0.to_le_bytes());
+    bytes.extend(lengths.1.to_le_bytes());
+    let mut hasher = crc32fast::Hasher::new();
+    [&bytes, header, payload]
+        .iter()
+        .for_each(|part| hasher.update(part));
+    bytes.extend(hasher.finalize().to_le_bytes());
+    bytes.extend_from_slice(header);
+    bytes.extend_from_slice(payload);
+    bytes
+}
+
+pub(crate) fn forge_whole(kind: Kind, header: &[u8], payload: &[u8]) -> Vec<u8> {
+    forge(
+        PROTOCOL_VERSION,
+        kind as u16,
+        (header.len() as u32, payload.len() as u64),
+        header,
+        payload,
+    )
+}
