@@ -6,6 +6,7 @@ use driml_experiments::{
     flags::{ExperimentCommand, GridArgs, TradeoffArgs},
     plot::{self, flags::PlotArgs},
 };
+use driml_machine::process_env::Purpose;
 
 use crate::commands::{
     actor::{self, ActorArgs},
@@ -83,6 +84,14 @@ impl Command {
         match self {
             Self::ReplayServer(args) => args.tls.is_set(),
             _ => false,
+        }
+    }
+
+    /// What its process is for.
+    pub(crate) const fn purpose(&self) -> Purpose {
+        match self {
+            Self::ReplayServer(_) => Purpose::ReplayServer,
+            _ => Purpose::Other,
         }
     }
 

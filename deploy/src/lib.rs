@@ -10,7 +10,10 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use driml_launch::{console, panics};
-use driml_machine::error::{EXIT_INTERRUPTED, EXIT_USAGE, Interrupted, Usage};
+use driml_machine::{
+    error::{EXIT_INTERRUPTED, EXIT_USAGE, Interrupted, Usage},
+    process_env,
+};
 
 use crate::cli::Cli;
 
@@ -29,7 +32,11 @@ pub fn main() -> ExitCode {
             };
         }
     };
+    let settled = process_env::settle(cli.command.purpose());
     console::log_to_stderr(cli.command.is_guarded());
+    if let Err(e) = settled {
+        tracing::warn!("this process goes on without the environment that makes it fast: {e}");
+    }
     match cli.command.run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) if e.is::<Interrupted>() => ExitCode::from(EXIT_INTERRUPTED),

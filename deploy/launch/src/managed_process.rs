@@ -43,19 +43,9 @@ pub struct Surroundings<'a> {
     pub meeting: Option<&'a Meeting>,
 }
 
-/// The environment that suits candle in every process: its second pool spins while it waits, which costs more than it gives on
-/// busy cores, and glibc returns each large tensor to the system and faults it in again unless told to keep it.
-const FOR_CANDLE: [(&str, &str); 3] = [
-    ("CANDLE_NUM_THREADS", "1"),
-    ("MALLOC_MMAP_THRESHOLD_", "1000000000"),
-    ("MALLOC_TRIM_THRESHOLD_", "10000000000"),
-];
-
-/// Gives a process the environment of every process of a run, with `threads` threads for arithmetic.
+/// Gives a process `threads` threads for arithmetic. Everything else that it needs of its environment it has from this one.
 pub fn set_thread_env(command: &mut Command, threads: u32) {
-    command
-        .env("RAYON_NUM_THREADS", threads.to_string())
-        .envs(FOR_CANDLE);
+    command.env("RAYON_NUM_THREADS", threads.to_string());
 }
 
 /// Flags for a child that is to end when this process does. They name this process, as it may have died before the child looks

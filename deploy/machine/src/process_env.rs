@@ -1,0 +1,60 @@
+//! The environment that a process of this program needs before its first allocation and its first tensor.
+//! It is read by the C library and by candle, each once: so a process that lacks it starts itself again with it.
+
+use std::{env, ffi::OsString, io, os::unix::process::CommandExt, process::Command};
+
+/// What every process needs. candle's second pool of threads spins while it waits, which costs more than it gives on busy
+/// cores; and glibc returns each large tensor to the system and faults it in again unless told to keep it.
+const EVERYONE: [(&str, &str); 3] = [
+    ("CANDLE_NUM_THREADS", "1"),
+    ("MALLOC_MMAP_THRESHOLD_", "1000000000"),
+    ("MALLOC_TRIM_THRESHOLD_", "10000000000"),
+];
+/// What a replay server needs beside it: glibc gives each thread a heap of its own, up to eight a core, and each keeps the
+/// chunks that were freed in it, which is memory that only grows in a run whose actors come and go.
+const REPLAY_SERVER: (&str, &str) = ("MALLOC_ARENA_MAX", "2");
+
+/// What a process is for, as far as its environment depends on it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    /// A replay server.
+    ReplayServer,
+    /// Everything else.
+    Other,
+}
+
+/// Starts this program again, in the same process and with the same arguments, if the environment lacks something. What the user
+/// has set stays as it is.
+///
+/// # Errors
+/// The program cannot be started again, for example because its file was replaced. It may go on as it is, only slower.
+pub fn settle(purpose: Purpose) -> io::Result<()> {
+    let missing = missing(purpose, |name| env::var_os(name).is_some());
+    if missing.is_empty() {
+        return Ok(());
+    }
+    let mut args = env::args_os();
+    let name = args.next().unwrap_or_else(|| OsString::from("driml"));
+    let mut again = Command::new(env::current_exe()?);
+    Err(again.arg0(name).args(args).envs(missing).exec())
+}
+
+/// The variables that a process for `purpose` lacks, with their values.
+fn missing(purpose: Purpose, has: impl Fn(&str) -> bool) -> Vec<(&'static str, &'static str)> {
+    let own = (purpose == Purpose::ReplayServer).then_some(REPLAY_SERVER);
+    let needed = EVERYONE.into_iter().chain(own);
+    needed.filter(|(name, _)| !has(name)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_missing_is_added_and_what_is_set_stays() {
+        assert_eq!(missing(Purpose::Other, |_| false), EVERYONE);
+        assert_eq!(missing(Purpose::Other, |_| true), []);
+        let server = missing(Purpose::ReplayServer, |name| name == "CANDLE_NUM_THREADS");
+        assert_eq!(server, [EVERYONE[1], EVERYONE[2], REPLAY_SERVER]);
+    }
+}
