@@ -9,5 +9,6 @@ mod checkpoint;
 mod equal_states;
 mod made_up;
 mod ranges;
+mod served;
 mod stacked;
 mod update;

@@ -7,8 +7,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    agents::config,
     made_up::{CPC, DIM},
+    served::config,
 };
 
 const ROWS: usize = 6;

@@ -5,56 +5,63 @@ use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 use super::results::{Measure, PointResult, Results};
 use crate::plot::{Over, Run, over_seeds};
 
+/// Panels side by side.
+const COLUMNS: usize = 3;
+/// Width and height of a panel.
+const PANEL: (f64, f64) = (330.0, 250.0);
+
 /// A point in return and speed.
-#[derive(Clone, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 struct Placed {
-    name: String,
     speed: f64,
     value: f64,
     ends: (f64, f64),
 }
 
-/// Return against frames a second, of every point; a dashed line joins those that no other beats in both.
+/// Return against frames a second, a panel for each dial with its base, all over the same axes; a dashed line joins those points of
+/// all dials that no other beats in both.
 pub(super) fn pareto(results: &Results) -> Figure {
-    let mut placed = Vec::new();
-    for (key, point) in &results.points {
-        placed.extend(place(name(results, key), point));
-    }
-    let front = front(&placed);
-    let line: Vec<(f64, f64)> = front.iter().map(|it| (it.speed, it.value)).collect();
-    let mut series = vec![
-        Series::line("not beaten in both", 0, line)
-            .coloured(GREY)
-            .marked(Mark::Dashed),
-    ];
-    for (index, it) in placed.iter().enumerate() {
-        series.push(
-            Series::line(&it.name, index, vec![(it.speed, it.value)])
-                .banded(vec![(it.speed, it.ends.0, it.ends.1)])
-                .marked(Mark::Bars),
-        );
-    }
+    let placed: Vec<Placed> = results.points.values().filter_map(place).collect();
+    let front: Vec<(f64, f64)> = front(&placed).map(|it| (it.speed, it.value)).collect();
+    let speeds: Vec<f64> = placed.iter().map(|it| it.speed).collect();
+    let values: Vec<f64> = placed
+        .iter()
+        .flat_map(|it| [it.ends.0, it.ends.1])
+        .collect();
+    let panel = |dial: &[Named<'_>]| {
+        let line = Series::line("not beaten in both", 0, front.clone());
+        let mut series = vec![line.coloured(GREY).marked(Mark::Dashed)];
+        for (index, (name, point)) in dial.iter().enumerate() {
+            let Some(it) = place(point) else { continue };
+            series.push(
+                Series::line(name, index, vec![(it.speed, it.value)])
+                    .banded(vec![(it.speed, it.ends.0, it.ends.1)])
+                    .marked(Mark::Bars),
+            );
+        }
+        let (x, y) = (Axis::linear("frames/s"), Axis::linear("greedy return"));
+        (x.showing(&speeds), y.showing(&values), series)
+    };
+    let panels = by_dial(results).into_iter().map(|(dial, named)| {
+        let (x, y, series) = panel(&named);
+        Panel::Chart(Chart::new(dial, x, y, series))
+    });
     Figure {
         title: format!("{}: return against speed", results.settings.common.env),
         notes: vec![
             "Greedy return, mean over seeds with its 95% interval, and frames a second of whole runs; to the upper right is better."
                 .into(),
+            "The dashed line is the same in all: it joins the levels of all dials than which no other is better in both.".into(),
         ],
-        columns: 1,
-        panel_size: (860.0, 460.0),
-        panels: vec![Panel::Chart(Chart::new(
-            "",
-            Axis::linear("frames/s"),
-            Axis::linear("greedy return"),
-            series,
-        ))],
+        columns: COLUMNS,
+        panel_size: PANEL,
+        panels: panels.collect(),
     }
 }
 
-fn place(name: String, point: &PointResult) -> Option<Placed> {
+fn place(point: &PointResult) -> Option<Placed> {
     let value = point.mean(Measure::Greedy)?;
     Some(Placed {
-        name,
         speed: point.mean(Measure::FramesPerSecond)?.mean,
         value: value.mean,
         ends: value.ends.unwrap_or((value.mean, value.mean)),
@@ -62,7 +69,7 @@ fn place(name: String, point: &PointResult) -> Option<Placed> {
 }
 
 /// Those than which no other is faster and no worse, or better and no slower; the slowest first.
-fn front(placed: &[Placed]) -> Vec<Placed> {
+fn front(placed: &[Placed]) -> impl Iterator<Item = Placed> {
     let beaten = |it: &Placed| {
         placed.iter().any(|other| {
             other.speed >= it.speed
@@ -70,39 +77,39 @@ fn front(placed: &[Placed]) -> Vec<Placed> {
                 && (other.speed > it.speed || other.value > it.value)
         })
     };
-    let mut front: Vec<_> = placed.iter().filter(|it| !beaten(it)).cloned().collect();
+    let mut front: Vec<_> = placed.iter().filter(|it| !beaten(it)).copied().collect();
     front.sort_by(|a, b| a.speed.total_cmp(&b.speed));
-    front
+    front.into_iter()
 }
 
-/// A point by its level, or by its agent where it is a base.
-fn name(results: &Results, key: &str) -> String {
-    let level = results.levels.iter().find(|it| it.point.key == key);
-    match level {
-        Some(of) if !of.point.sets.is_empty() => of.name(),
-        _ => format!("{key} (base)"),
+/// A point by the name of its level.
+type Named<'a> = (&'a str, &'a PointResult);
+
+/// The dials that have runs, each with its base and then its levels.
+fn by_dial(results: &Results) -> Vec<(&str, Vec<Named<'_>>)> {
+    let mut dials: Vec<(&str, Vec<Named<'_>>)> = Vec::new();
+    for of in &results.levels {
+        if dials.last().is_none_or(|(name, _)| *name != of.dial.name) {
+            let base = (of.dial.base.as_str(), &results.points[&of.base.key]);
+            dials.push((&of.dial.name, vec![base]));
+        }
+        if let Some((_, named)) = dials.last_mut() {
+            named.push((&of.level, &results.points[&of.point.key]));
+        }
     }
+    dials
 }
 
 /// Training return over seconds, a panel for each dial with its base.
 pub(super) fn wall(results: &Results) -> anyhow::Result<Figure> {
     let mut panels = Vec::new();
-    let mut dials: Vec<&str> = Vec::new();
-    for of in &results.levels {
-        if dials.contains(&of.dial.name.as_str()) {
-            continue;
-        }
-        dials.push(&of.dial.name);
-        let mut series = vec![curve(&of.dial.base, 0, &results.points[&of.base.key])?];
-        let levels = results
-            .levels
-            .iter()
-            .filter(|it| it.dial.name == of.dial.name);
-        for (index, it) in levels.enumerate() {
-            series.push(curve(&it.level, index + 1, &results.points[&it.point.key])?);
+    for (dial, named) in by_dial(results) {
+        let mut series = Vec::new();
+        for (index, (name, point)) in named.into_iter().enumerate() {
+            series.push(curve(name, index, point)?);
         }
         panels.push(Panel::Chart(Chart::new(
-            &of.dial.name,
+            dial,
             Axis::linear("seconds"),
             Axis::linear("mean return"),
             series,
@@ -114,8 +121,8 @@ pub(super) fn wall(results: &Results) -> anyhow::Result<Figure> {
             "Training return, mean of the last 100 episodes; mean and range over seeds. Every run has the same number of frames."
                 .into(),
         ],
-        columns: 3,
-        panel_size: (330.0, 250.0),
+        columns: COLUMNS,
+        panel_size: PANEL,
         panels,
     })
 }
@@ -135,20 +142,15 @@ mod tests {
 
     #[test]
     fn the_front_has_what_no_other_beats() {
-        let at = |name: &str, speed: f64, value: f64| Placed {
-            name: name.into(),
+        let at = |speed: f64, value: f64| Placed {
             speed,
             value,
             ends: (value, value),
         };
-        let all = [
-            at("slow and good", 1.0, 9.0),
-            at("slow and bad", 1.0, 2.0),
-            at("fast and bad", 5.0, 3.0),
-            at("between", 3.0, 5.0),
-            at("beaten", 2.0, 4.9),
-        ];
-        let names: Vec<_> = front(&all).into_iter().map(|it| it.name).collect();
-        assert_eq!(names, ["slow and good", "between", "fast and bad"]);
+        let (slow_and_good, slow_and_bad) = (at(1.0, 9.0), at(1.0, 2.0));
+        let (between, beaten, fast_and_bad) = (at(3.0, 5.0), at(2.0, 4.9), at(5.0, 3.0));
+        let all = [slow_and_good, slow_and_bad, fast_and_bad, between, beaten];
+        let front: Vec<_> = front(&all).collect();
+        assert_eq!(front, [slow_and_good, between, fast_and_bad]);
     }
 }

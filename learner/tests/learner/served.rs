@@ -1,0 +1,343 @@
+//! What a learner of each agent does with batches as its replay server sends them: augmentation, priorities, checkpoints.
+//! Losses and gradients on made-up rows are in `agents`.
+
+use std::fs;
+
+use driml_learner::{
+    AffinityConfig, AugmentSettings, Config, EqualStates, EstimatorKind, Learner, LearnerConfig,
+    Objective,
+};
+use driml_model::{Compute, DimHeads, InputSize};
+use driml_protocol::{
+    Batch as WireBatch, BatchHeader, Buffer, Horizon, RowScalars, RunSpec, Sampling, TimeoutRule,
+    config::TransportConfig,
+};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::{
+    agents,
+    checkpoint::{Folder, change_state},
+    made_up::{CPC, CURL, DIM},
+};
+
+/// Bytes of a state.
+const STATE: usize = 20 * 24 * 2;
+
+pub(crate) fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConfig {
+    let (model, update) = agents::of(objective, agents::GLOBAL);
+    let horizon = match objective.name() {
+        "cpc" => Horizon::All { k_max: 3 },
+        "dim" => Horizon::Fixed { k: 1 },
+        _ => Horizon::None,
+    };
+    LearnerConfig {
+        spec: RunSpec {
+            world: "test".into(),
+            agent: objective.name().into(),
+            seed: 5,
+            frame_height: 20,
+            frame_width: 24,
+            frame_channels: 2,
+            frame_stack: 1,
+            num_actions: 4,
+            n_step: 3,
+            gamma: 0.9,
+            horizon,
+            timeout: TimeoutRule::Terminal,
+        },
+        input: InputSize {
+            height: model.height as u32,
+            width: model.width as u32,
+            frame: None,
+        },
+        model,
+        learner: Config {
+            equal_states: EqualStates::Once,
+            precision: Default::default(),
+            publish_as: Default::default(),
+            batch_size: 6,
+            batches_in_flight: 1,
+            publish_period_updates: 2,
+            checkpoint_period_updates: 2,
+            checkpoints_kept: 1,
+            unreachable_max_ms: 60_000,
+            update,
+            augment,
+            affinity: AffinityConfig {
+                estimator: EstimatorKind::None,
+                alphabet: None,
+                visible: None,
+                learned: None,
+                exact: None,
+            },
+        },
+        sampling: Sampling::Uniform,
+        transport: TransportConfig {
+            shared_memory: false,
+        },
+    }
+}
+
+/// A batch as the replay server of this run would send it.
+pub(crate) fn served(config: &LearnerConfig, seed: u64) -> WireBatch {
+    served_with(config, seed, |_| {})
+}
+
+/// [`served`], with its rows changed.
+fn served_with(config: &LearnerConfig, seed: u64, change: impl Fn(&mut [RowScalars])) -> WireBatch {
+    let positives = config.spec.horizon.positives();
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let row = |row: usize| RowScalars {
+        action: (row % 4) as u8,
+        next_action: 0,
+        n_step_return: rng.random_range(-1.0..1.0),
+        // The last one's episode ends.
+        bootstrap_discount: if row < 5 { 0.9 } else { 0.0 },
+        positives: positives.min(row) as u32,
+        k_first: 1,
+    };
+    let mut rows: Vec<_> = (0..6).map(row).collect();
+    change(&mut rows);
+    let header = BatchHeader {
+        state_bytes: STATE as u32,
+        held: 9,
+        weights_versions: (1, 1),
+        ..BatchHeader::of(&config.spec, 6)
+    };
+    let mut batch = WireBatch::of_rows(header, &rows, Buffer::zeroed);
+    let mut places = batch.states_mut();
+    for row in 0..6 {
+        rng.fill(places.t(row));
+        if let Some(place) = places.n(row) {
+            rng.fill(place);
+        }
+        for p in 0..positives {
+            if let Some(place) = places.k(p, row) {
+                rng.fill(place);
+            }
+        }
+    }
+    batch
+}
+
+const STRONG: AugmentSettings = AugmentSettings {
+    crop_side: 0.8,
+    brightness: 0.4,
+    contrast: 0.4,
+    saturation: 0.4,
+    hue: 0.4,
+};
+const NOTHING: AugmentSettings = AugmentSettings {
+    crop_side: 1.0,
+    brightness: 0.0,
+    contrast: 0.0,
+    saturation: 0.0,
+    hue: 0.0,
+};
+
+#[test]
+fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
+    for objective in [DIM, CPC] {
+        let report = |augment| {
+            let config = config(objective, augment);
+            let batch = served(&config, 1);
+            Learner::new(config, &Compute::CPU)
+                .unwrap()
+                .update(&batch)
+                .unwrap()
+        };
+        let (plain, identity, strong) = (report(None), report(Some(NOTHING)), report(Some(STRONG)));
+        // The augmented states go through a pass of their own, so the sum of gradients may round otherwise.
+        assert_eq!(
+            (plain.c51_kl, &plain.losses),
+            (identity.c51_kl, &identity.losses)
+        );
+        assert!((plain.grad_norm - identity.grad_norm).abs() < 1e-5 * plain.grad_norm);
+        assert_eq!((plain.c51_kl, plain.q_mean), (strong.c51_kl, strong.q_mean));
+        assert_ne!(plain.losses, strong.losses);
+    }
+}
+
+/// The draws and the key encoder are part of a checkpoint: half a run and the other half are the run.
+#[test]
+fn an_augmenting_run_resumes_bit_for_bit() {
+    for objective in [CURL, DIM] {
+        let folder = std::env::temp_dir().join(format!(
+            "driml-agents-{}-{}",
+            objective.name(),
+            std::process::id()
+        ));
+        let _ = fs::remove_dir_all(&folder);
+        let config = config(objective, Some(STRONG));
+        let learn = |learner: &mut Learner, updates: std::ops::Range<u64>| {
+            for seed in updates {
+                learner.update(&served(&config, seed)).unwrap();
+            }
+        };
+        let mut straight = Learner::new(config.clone(), &Compute::CPU).unwrap();
+        learn(&mut straight, 0..8);
+        let mut half = Learner::new(config.clone(), &Compute::CPU).unwrap();
+        learn(&mut half, 0..4);
+        half.save(&folder).unwrap();
+        let mut resumed = Learner::resume(config.clone(), &Compute::CPU, &folder).unwrap();
+        assert_eq!(resumed.updates(), 4);
+        learn(&mut resumed, 4..8);
+        let (mut a, mut b) = (folder.join("a"), folder.join("b"));
+        straight.save(&a).unwrap();
+        resumed.save(&b).unwrap();
+        let mut files = vec![
+            "online.safetensors",
+            "target.safetensors",
+            "optimizer.safetensors",
+        ];
+        if objective == CURL {
+            files.push("key.safetensors");
+        }
+        for file in files {
+            let read = |folder: &mut std::path::PathBuf| {
+                fs::read(folder.join("checkpoint-000000000008").join(file)).unwrap()
+            };
+            assert!(read(&mut a) == read(&mut b), "{objective:?}: {file}");
+        }
+        fs::remove_dir_all(&folder).unwrap();
+    }
+}
+
+/// A checkpoint whose keys came from the target network is not this agent's.
+#[test]
+fn a_curl_checkpoint_without_a_key_encoder_is_refused() {
+    let folder = Folder::new("old-curl");
+    let config = config(CURL, Some(STRONG));
+    let learner = Learner::new(config.clone(), &Compute::CPU).unwrap();
+    learner.save(&folder.0).unwrap();
+    let path = folder.0.join("checkpoint-000000000000");
+    change_state(&path, |state| state["format"] = 1.into());
+    let resume = || Learner::resume(config.clone(), &Compute::CPU, &folder.0).map(|_| ());
+    let said = resume().unwrap_err().to_string();
+    assert!(
+        said.contains("keys came from the target network") && said.contains("begin anew"),
+        "{said}"
+    );
+    // One of today's that lost the file is damaged.
+    change_state(&path, |state| state["format"] = 2.into());
+    resume().unwrap();
+    fs::remove_file(path.join("key.safetensors")).unwrap();
+    let said = resume().unwrap_err().to_string();
+    assert!(
+        said.contains("key.safetensors is damaged: it is missing"),
+        "{said}"
+    );
+}
+
+/// A refused batch leaves the generator where it was.
+#[test]
+fn a_refused_batch_draws_nothing() {
+    let config = config(CURL, Some(STRONG));
+    let good = served(&config, 1);
+    let bad = served_with(&config, 2, |rows| rows[0].action = 77);
+    let mut learner = Learner::new(config.clone(), &Compute::CPU).unwrap();
+    assert!(learner.update(&bad).is_err());
+    let after = learner.update(&good).unwrap();
+    assert_eq!(
+        after,
+        Learner::new(config, &Compute::CPU)
+            .unwrap()
+            .update(&good)
+            .unwrap()
+    );
+}
+
+#[test]
+fn augmentation_and_objective_belong_together() {
+    let said = |objective, augment| {
+        config(objective, augment)
+            .learner
+            .validate()
+            .unwrap_err()
+            .to_string()
+    };
+    assert!(said(CURL, None).contains("take the agent curl"));
+    let mut c51 = config(DIM, Some(STRONG)).learner;
+    c51.update.objective = Objective::NONE;
+    assert!(
+        c51.validate()
+            .unwrap_err()
+            .to_string()
+            .contains("this agent has none")
+    );
+    let wild = AugmentSettings { hue: 0.7, ..STRONG };
+    assert_eq!(
+        said(DIM, Some(wild)),
+        "learner.augment.hue = 0.7 cannot work: it must lie between 0 and 0.5, half a turn either way"
+    );
+    assert_eq!(
+        config(CURL, Some(NOTHING)).model.dim,
+        DimHeads {
+            psi4: true,
+            ..DimHeads::NONE
+        }
+    );
+}
+
+/// The chance of each row weights its C51 loss, at the beta of the update's number; nothing else, and the row's own loss comes back.
+#[test]
+fn rows_drawn_by_priority_are_weighted_and_answered() {
+    let uniform = config(DIM, None);
+    let sampling = Sampling::Prioritised {
+        alpha: 0.5,
+        beta_start: 0.5,
+        beta_end: 1.0,
+        beta_updates: 1,
+    };
+    let config = LearnerConfig {
+        sampling,
+        ..uniform.clone()
+    };
+    let chances = [0.5f32, 0.25, 0.125, 0.1, 0.5, 1.0];
+    let drawn = |chances: &[f32]| {
+        let plain = served(&config, 1);
+        let header = BatchHeader::of(&config.spec, 6).sampled_by(&sampling);
+        let header = BatchHeader {
+            origin: header.origin,
+            ..plain.header
+        };
+        let (_, payload) = plain.into_payload();
+        let mut more = Buffer::zeroed(header.payload_bytes());
+        more[..payload.len()].copy_from_slice(&payload);
+        for (row, chance) in chances.iter().enumerate() {
+            let at = payload.len() + 6 * 8 + row * 4;
+            more[at..at + 4].copy_from_slice(&chance.to_le_bytes());
+        }
+        WireBatch::from_payload(header, more).unwrap()
+    };
+    let learner = |config: &LearnerConfig| Learner::new(config.clone(), &Compute::CPU).unwrap();
+    let plain = learner(&uniform).update(&served(&uniform, 1)).unwrap();
+    assert!(plain.row_kls.is_empty());
+
+    // Equal chances are a weight of 1 each.
+    let mut equal = learner(&config);
+    let report = equal.update(&drawn(&[0.25; 6])).unwrap();
+    assert_eq!(report.losses, plain.losses);
+    assert!((report.c51_kl - plain.c51_kl).abs() < 1e-6 * plain.c51_kl);
+    assert!((report.grad_norm - plain.grad_norm).abs() < 1e-5 * plain.grad_norm);
+
+    let mut learner = learner(&config);
+    for beta in [0.5, 1.0, 1.0] {
+        let report = learner.update(&drawn(&chances)).unwrap();
+        let weighted = chances.iter().zip(&report.row_kls).map(|(chance, kl)| {
+            let weight = (0.1 / f64::from(*chance)).powf(beta);
+            weight * f64::from(*kl)
+        });
+        let mean = weighted.sum::<f64>() / 6.0;
+        let error = f64::from(report.c51_kl) - mean;
+        assert!(error.abs() < 1e-6 * mean, "beta {beta}: {error} of {mean}");
+        let dim: f32 = report.losses.iter().map(|it| it.1).sum();
+        assert!(
+            (report.total - report.c51_kl - dim).abs() < 1e-5,
+            "DIM is as it is"
+        );
+    }
+    let rows = report.row_kls.iter().map(|kl| f64::from(*kl)).sum::<f64>();
+    assert!((rows / 6.0 - f64::from(plain.c51_kl)).abs() < 1e-6 * f64::from(plain.c51_kl));
+}
