@@ -5,6 +5,8 @@
 mod batches;
 mod samples;
 
+use std::{fs, path::Path};
+
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, BatchReply, Buffer, BufferPool, Chunk, ChunkHeader,
     CodecError, EPISODES_MAX, End, EndedEpisode, EpisodesReply, Hello, Horizon, Kind, NO_ACTION,
@@ -120,7 +122,7 @@ fn episodes_that_did_not_end_are_refused() {
 #[test]
 fn every_kind_has_a_sample_that_is_read() {
     let samples = samples();
-    for kind in 1..=20 {
+    for kind in 1..=Kind::EpisodesReply as u16 {
         assert!(
             samples.iter().any(|sample| sample.kind as u16 == kind),
             "kind {kind}"
@@ -128,6 +130,25 @@ fn every_kind_has_a_sample_that_is_read() {
     }
     for sample in &samples {
         assert_eq!((sample.read)(&sample.bytes), Ok(()), "{}", sample.name);
+    }
+}
+
+/// What fuzzers of the decoders begin with is today's messages: `UPDATE_CORPUS=1` writes them.
+#[test]
+fn the_fuzzers_seeds_are_the_samples() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/decoders/fuzz/corpus/wire");
+    for (number, sample) in samples().iter().enumerate() {
+        let file = folder.join(format!("sample-{number:02}"));
+        if std::env::var_os("UPDATE_CORPUS").is_some() {
+            fs::write(&file, &sample.bytes).unwrap();
+        }
+        let stored = fs::read(&file).unwrap_or_default();
+        assert!(
+            stored == sample.bytes,
+            "{} is not today's {}: UPDATE_CORPUS=1 writes it",
+            file.display(),
+            sample.name
+        );
     }
 }
 

@@ -14,7 +14,7 @@ mod messages;
 mod replay;
 mod segments;
 
-pub use messages::{forged, samples};
+pub use messages::forged;
 pub use segments::{held, logs};
 
 /// One decoder: its name, and what is to be tried with some bytes.
