@@ -101,11 +101,13 @@ struct Menu {
     dial: Vec<Dial>,
 }
 
-/// What all runs in the worlds of one kind have.
+/// What all runs in the worlds of one kind have, or in one game of it.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct WorldBase {
     kind: String,
+    /// The one game that it is for; all that no other entry names if there is none.
+    game: Option<String>,
     /// Frames of a run.
     pub(super) frames: u64,
     /// In the form of `--set`.
@@ -134,9 +136,20 @@ pub(super) fn dials(world: WorldName) -> Vec<Dial> {
 pub(super) fn world_base(world: WorldName) -> Result<WorldBase, Usage> {
     let worlds: Worlds = toml::from_str(WORLDS)
         .unwrap_or_else(|e| panic!("worlds.toml is built in, and a test reads it: {e}"));
-    let kinds: Vec<_> = worlds.world.iter().map(|it| it.kind.clone()).collect();
-    let found = worlds.world.into_iter().find(|it| it.kind == world.kind());
-    found.ok_or_else(|| {
+    let mut of_kind: Vec<_> = worlds
+        .world
+        .iter()
+        .filter(|it| it.kind == world.kind())
+        .collect();
+    // A game's own before that of all.
+    of_kind.sort_by_key(|it| it.game.is_none());
+    let is_for = |it: &WorldBase| {
+        let game = it.game.as_ref();
+        game.is_none_or(|game| format!("{}:{game}", it.kind) == world.to_string())
+    };
+    of_kind.into_iter().find(|it| is_for(it)).cloned().ok_or_else(|| {
+        let mut kinds: Vec<_> = worlds.world.iter().map(|it| it.kind.as_str()).collect();
+        kinds.dedup();
         usage!(
             "driml tradeoff has no settings for {world}, with which something is learned in minutes; it has some for {}",
             kinds.join(", ")
@@ -162,4 +175,24 @@ pub(super) fn chosen(all: Vec<Dial>, names: &[String]) -> Result<Vec<Dial>, Usag
     }
     let asked = |dial: &Dial| names.is_empty() || names.contains(&dial.name);
     Ok(all.into_iter().filter(asked).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_game_of_its_own_comes_before_its_kind() {
+        let frames = |name: &str| {
+            let world = driml_settings::presets::world(name).unwrap();
+            world_base(world).map(|base| (base.frames, base.sets.len()))
+        };
+        assert_eq!(frames("procgen:dodgeball").unwrap(), (40_000, 2));
+        assert_eq!(frames("procgen:coinrun").unwrap(), (30_000, 1));
+        let said = frames("ising").unwrap_err().to_string();
+        assert!(
+            said.ends_with("it has some for mspacman, procgen, chain"),
+            "{said}"
+        );
+    }
 }

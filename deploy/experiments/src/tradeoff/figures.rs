@@ -29,7 +29,7 @@ pub(super) fn pareto(results: &Results) -> Figure {
         .flat_map(|it| [it.ends.0, it.ends.1])
         .collect();
     let panel = |dial: &[Named<'_>]| {
-        let line = Series::line("not beaten in both", 0, front.clone());
+        let line = Series::line("", 0, front.clone());
         let mut series = vec![line.coloured(GREY).marked(Mark::Dashed)];
         for (index, (name, point)) in dial.iter().enumerate() {
             let Some(it) = place(point) else { continue };
