@@ -7,9 +7,9 @@ use driml_protocol::{
     Chunk, ChunkHeader, Claim, CodecError, Done, End, EndedEpisode, EpisodesReply, EpisodesRequest,
     Goodbye, Hello, InsertReply, JoinReply, Kind, LearnerJoin, LearnerStatus, Life, LogStatus,
     Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus, PartsStatus, Played,
-    PriorityUpdate, ReplayStatus, Report, RequestId, Returns, RowScalars, StackedFrames, Tally,
-    Waiting, Warning, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
-    codec,
+    PriorityUpdate, Recovering, RecoveryProgress, ReplayStatus, Report, RequestId, Returns,
+    RowScalars, StackedFrames, Tally, Waiting, Warning, WeightsHeader, WeightsReply,
+    WeightsRequest, WeightsUpload, WeightsVersion, codec,
 };
 
 /// The hash of the run that these messages are of.
@@ -78,7 +78,7 @@ fn read_batch(bytes: &[u8]) {
 }
 
 /// Every kind of message and how it is read.
-const KINDS: [(Kind, Read); 23] = [
+const KINDS: [(Kind, Read); 24] = [
     (Kind::Chunk, read_chunk),
     (Kind::InsertReply, read::<InsertReply>),
     (Kind::BatchRequest, read::<BatchRequest>),
@@ -102,6 +102,7 @@ const KINDS: [(Kind, Read); 23] = [
     (Kind::EpisodesRequest, read::<EpisodesRequest>),
     (Kind::EpisodesReply, read::<EpisodesReply>),
     (Kind::Priorities, read::<PriorityUpdate>),
+    (Kind::Recovering, read::<Recovering>),
 ];
 
 fn read_affinity(bytes: &[u8]) {
@@ -263,6 +264,14 @@ pub fn samples() -> Vec<Vec<u8>> {
         shard: (0, 1),
         shared_memory: true,
     };
+    let recovering = Recovering {
+        progress: RecoveryProgress {
+            bytes_read: 1 << 30,
+            bytes: 1 << 33,
+            since_s: 12.5,
+        },
+        config_toml: Some("[run]\nworld = \"chain\"\n".into()),
+    };
     let status = ReplayStatus {
         transitions_inserted: 1000,
         returns: Returns {
@@ -352,6 +361,7 @@ pub fn samples() -> Vec<Vec<u8>> {
         of(status),
         of(LearnerStatus::default()),
         of(hello),
+        of(recovering),
         of(Done),
         of(ActorJoin {
             actor: 3,
