@@ -164,17 +164,23 @@ impl WeightsSource {
     /// Pulls the first weights, waiting until the learner has sent some; `None` if told to stop before.
     ///
     /// # Errors
-    /// No weights within `wait_max`.
+    /// No weights within `wait_max`, not counting the time in which the replay server reads its replay back from disk.
     pub fn first(
         &self,
         wait_max: Duration,
         shutdown: &Shutdown,
     ) -> Result<Option<Weights>, WeightsError> {
-        let started = Instant::now();
+        let mut started = Instant::now();
         let mut said = Seldom::default();
         loop {
             let pulled = self.pull(0);
             match pulled {
+                Err(WeightsError::Session(SessionError::Recovering(recovering))) => {
+                    started = Instant::now();
+                    if recovering.progress.is_slow() && said.due().is_some() {
+                        tracing::info!("waiting for weights for as long as it takes: {recovering}");
+                    }
+                }
                 Ok(Some(weights)) => return Ok(Some(weights)),
                 pulled if started.elapsed() > wait_max => {
                     let source = pulled.err().map(Box::new);

@@ -10,6 +10,7 @@ use crate::{
     messages::{
         hello::Hello,
         join::{ActorJoin, JoinReply, LearnerJoin},
+        recovering::Recovering,
     },
     process::{seldom::Seldom, shutdown::Shutdown},
     session::{self, SessionError},
@@ -69,7 +70,8 @@ pub struct Welcome {
     pub earlier_incarnations: u32,
 }
 
-/// Asks the replay server for the run's settings, waiting for it if it is not there yet; `None` if told to stop before.
+/// Asks the replay server for the run's settings, waiting for it if it is not there yet, and for as long as it reads its replay back
+/// from disk; `None` if told to stop before.
 ///
 /// # Errors
 /// Nobody there within a minute, or another protocol version.
@@ -78,15 +80,14 @@ pub fn hello(
     keys: &Keys,
     shutdown: &Shutdown,
 ) -> Result<Option<Hello>, JoinError> {
-    let (started, mut said) = (Instant::now(), Seldom::default());
+    let mut patience = Patience::begin();
     loop {
         let (key, nothing) = (keys.of::<Hello>(), ZBytes::new());
         match session::ask(session, &key, nothing, Hello::PRIORITY, TRY_MAX) {
             Ok(answer) => {
                 return Ok(Some(codec::decode(&answer.to_bytes(), None)?.0));
             }
-            Err(last) if started.elapsed() > SERVER_MAX => return Err(JoinError::Nobody { last }),
-            Err(e) => say_waiting(started, &e, &mut said),
+            Err(e) => patience.wait_after(e)?,
         }
         if shutdown.wait_timeout(PAUSE) {
             return Ok(None);
@@ -94,18 +95,62 @@ pub fn hello(
     }
 }
 
-fn say_waiting(started: Instant, e: &SessionError, said: &mut Seldom) {
-    let since = started.elapsed();
-    if since > SILENT_MAX && said.due().is_some() {
-        let (since, max) = (since.as_secs(), SERVER_MAX.as_secs());
-        // Whoever listens there may be a router between the parts, to which the replay server has yet to connect.
-        let why = match e {
-            SessionError::Nobody { key } => format!(
-                "somebody listens there, and nobody answers at {key}: is it the replay server of this run, with the same --namespace?"
-            ),
-            other => other.to_string(),
-        };
-        tracing::info!("waiting for the replay server since {since} s, for {max} s at most: {why}");
+/// How long a part that joins waits for its replay server, and what it says meanwhile.
+struct Patience {
+    /// Since when nobody has answered.
+    silent_since: Instant,
+    silence_said: Seldom,
+    recovery_said: Seldom,
+}
+
+impl Patience {
+    fn begin() -> Self {
+        Self {
+            silent_since: Instant::now(),
+            silence_said: Seldom::default(),
+            recovery_said: Seldom::default(),
+        }
+    }
+
+    /// Takes note that a try failed; says now and then what is waited for.
+    ///
+    /// # Errors
+    /// Nobody has answered for too long. A server that reads its replay back does answer.
+    fn wait_after(&mut self, e: SessionError) -> Result<(), JoinError> {
+        match e {
+            SessionError::Recovering(recovering) => {
+                self.silent_since = Instant::now();
+                self.say_recovering(&recovering);
+            }
+            last if self.silent_since.elapsed() > SERVER_MAX => {
+                return Err(JoinError::Nobody { last });
+            }
+            e => self.say_silent(&e),
+        }
+        Ok(())
+    }
+
+    fn say_recovering(&mut self, recovering: &Recovering) {
+        if recovering.progress.is_slow() && self.recovery_said.due().is_some() {
+            tracing::info!("waiting for as long as it takes: {recovering}");
+        }
+    }
+
+    fn say_silent(&mut self, e: &SessionError) {
+        let since = self.silent_since.elapsed();
+        if since > SILENT_MAX && self.silence_said.due().is_some() {
+            let (since, max) = (since.as_secs(), SERVER_MAX.as_secs());
+            // Whoever listens there may be a router between the parts, to which the replay server has yet to connect.
+            let why = match e {
+                SessionError::Nobody { key } => format!(
+                    "somebody listens there, and nobody answers at {key}: is it the replay server of this run, with the same --namespace?"
+                ),
+                other => other.to_string(),
+            };
+            tracing::info!(
+                "waiting for the replay server since {since} s, for {max} s at most: {why}"
+            );
+        }
     }
 }
 
@@ -138,8 +183,8 @@ fn take_part(
     join: &impl Request<Reply = JoinReply>,
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
-    let (started, mut waiting_said) = (Instant::now(), Seldom::default());
-    let mut said = false;
+    let mut patience = Patience::begin();
+    let mut taken_since = None;
     loop {
         match client.ask(join, TRY_MAX) {
             Ok(JoinReply::Welcome {
@@ -154,18 +199,19 @@ fn take_part(
                 }));
             }
             Ok(JoinReply::Refused { why }) => return Err(JoinError::Refused { why }),
-            Ok(JoinReply::Taken { why }) if started.elapsed() > TAKEN_MAX => {
-                return Err(JoinError::Taken { why });
-            }
-            Ok(JoinReply::Taken { why }) => {
-                if !std::mem::replace(&mut said, true) {
+            Ok(JoinReply::Taken { why }) => match taken_since {
+                Some(since) if Instant::now() - since > TAKEN_MAX => {
+                    return Err(JoinError::Taken { why });
+                }
+                Some(_) => {}
+                None => {
                     let max = TAKEN_MAX.as_secs();
                     tracing::warn!("{why}; waiting up to {max} s for its end");
+                    taken_since = Some(Instant::now());
                 }
-            }
+            },
             Err(SessionError::Unreadable { why, .. }) => return Err(why.into()),
-            Err(last) if started.elapsed() > SERVER_MAX => return Err(JoinError::Nobody { last }),
-            Err(e) => say_waiting(started, &e, &mut waiting_said),
+            Err(e) => patience.wait_after(e)?,
         }
         if shutdown.wait_timeout(PAUSE) {
             return Ok(None);

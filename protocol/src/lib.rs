@@ -54,6 +54,7 @@ pub use messages::{
     join::{ActorJoin, JoinReply, LearnerJoin},
     parts::{LogStatus, PartName, PartStatus, PartsStatus, WARNINGS_MAX},
     priorities::{Origin, PriorityPart, PriorityUpdate},
+    recovering::{Recovering, RecoveryProgress},
     report::{Life, Report, Warning},
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
     tally::Tally,

@@ -22,6 +22,7 @@ use zenoh::{
 
 use crate::{
     client::{RunClient, Sealed},
+    messages::recovering::Recovering,
     process::fault,
     session,
     wire::{
@@ -110,6 +111,14 @@ impl<M: Message> Responder<M> {
     /// Sends the reply with a payload, as [`Responder::reply`] does without.
     pub fn reply_with(self, reply: &M, payload: ZBytes) {
         self.send(Sealed::with_payload(reply, payload, self.spec_hash));
+    }
+
+    /// Says instead of a reply that there is none yet, as the replay is being read back from disk.
+    pub fn put_off(self, recovering: &Recovering) {
+        match Sealed::new(recovering, self.spec_hash) {
+            Ok(sealed) => session::put_off(&self.query, sealed.into_bytes()),
+            Err(e) => tracing::error!("that the replay is being read back was not said: {e}"),
+        }
     }
 
     fn send(&self, sealed: Result<Sealed<M>, CodecError>) {

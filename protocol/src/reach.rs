@@ -34,7 +34,7 @@ pub enum Unreachable {
     /// The machine is there, and nothing listens at the port.
     #[error(
         "nobody listens on {endpoint}: start the replay server first, with this --listen, or correct the port. One with --tls-dir is \
-         reached with quic/HOST:PORT, which is UDP, and --tls-dir; one that goes on with a --replay-dir listens once it has read it"
+         reached with quic/HOST:PORT, which is UDP, and --tls-dir"
     )]
     Refused {
         /// The endpoint as it was given.
@@ -42,8 +42,7 @@ pub enum Unreachable {
     },
     /// No socket of this name.
     #[error(
-        "nobody listens on {endpoint}: {what}. Start the replay server first, on this machine and with this --listen, or correct the \
-         path; one that goes on with a --replay-dir listens once it has read it"
+        "nobody listens on {endpoint}: {what}. Start the replay server first, on this machine and with this --listen, or correct the path"
     )]
     NoSocket {
         /// The endpoint as it was given.

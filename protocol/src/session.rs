@@ -13,9 +13,10 @@ use zenoh::{
 };
 
 use crate::{
+    messages::recovering::Recovering,
     reach::{self, Unreachable},
     tls::{self, Credentials, Role, TlsError},
-    wire::{error::CodecError, keys::Keys},
+    wire::{codec, error::CodecError, keys::Keys},
 };
 
 /// How a part reaches the others.
@@ -57,8 +58,7 @@ pub enum SessionError {
     },
     /// Nobody listens where the session was to connect, as far as can be told over UDP.
     #[error(
-        "nobody listens on {}, after {} s: is the replay server running, with --tls-dir, and is the endpoint right? Its port is one of UDP. \
-         One that goes on with a --replay-dir listens once it has read it",
+        "nobody listens on {}, after {} s: is the replay server running, with --tls-dir, and is the endpoint right? Its port is one of UDP",
         .connect.join(", "), CONNECT_MAX.as_secs()
     )]
     NobodyListens {
@@ -82,6 +82,10 @@ pub enum SessionError {
         /// How long the reply was waited for.
         within_ms: u128,
     },
+    /// The replay server is reading its replay back from disk, and will answer then. It is there: this may be waited for as long as it
+    /// takes.
+    #[error("{0}")]
+    Recovering(Recovering),
     /// A request that is larger than a message may be.
     #[error("{key}: {why}")]
     TooLarge {
@@ -362,6 +366,9 @@ impl PendingBytes {
             .into_result()
             .map(|it| it.payload().clone())
             .map_err(|e| {
+                if let Ok((recovering, _)) = codec::decode(&e.payload().to_bytes(), None) {
+                    return SessionError::Recovering(recovering);
+                }
                 let why = e.payload().try_to_string().unwrap_or_default().into_owned();
                 match why.as_str() {
                     TIMED_OUT => SessionError::NoReply {
@@ -391,6 +398,13 @@ pub fn ask(
 /// Answers a question with `payload`; an asker that has gone away is logged and forgotten.
 pub fn answer(query: &Query, payload: ZBytes) {
     if let Err(e) = query.reply(query.key_expr().clone(), payload).wait() {
+        tracing::debug!("{}: the asker is gone: {e}", query.key_expr());
+    }
+}
+
+/// Answers a question that cannot be dealt with now by an error, `payload`; its asker asks again.
+pub(crate) fn put_off(query: &Query, payload: ZBytes) {
+    if let Err(e) = query.reply_err(payload).wait() {
         tracing::debug!("{}: the asker is gone: {e}", query.key_expr());
     }
 }

@@ -85,7 +85,7 @@ mod service;
 mod storage;
 
 pub use config::{Compression, Config, ConfigError, ReproducedBug};
-pub use durable::{DurableArgs, DurableError, DurableReplay, Mark, Recovery};
+pub use durable::{DurableArgs, DurableError, DurableReplay, KeptReplay, Mark, Reading, Recovery};
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use rate_limiter::RateLimiter;
 pub use replay::{Replay, Unready};

@@ -14,6 +14,7 @@ mod process;
 pub mod python;
 mod run_folder;
 mod skipped;
+mod slow_machine;
 mod system;
 mod waiting;
 
@@ -23,5 +24,6 @@ pub use network::Network;
 pub use process::{Ended, Process};
 pub use run_folder::{EpisodeRow, RunFolder, Summary};
 pub use skipped::{note, skip, skipped_offline};
+pub use slow_machine::SlowMachine;
 pub use system::{Survivor, TestSystem};
 pub use waiting::{DEADLINE, wait_for};

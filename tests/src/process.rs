@@ -90,7 +90,12 @@ impl Process {
 
     /// Sends a signal. It has not been waited for, so its number is still its own.
     pub fn signal(&self, signal: Signal) {
-        kill(Pid::from_raw(self.child.id() as i32), signal).unwrap();
+        kill(Pid::from_raw(self.pid()), signal).unwrap();
+    }
+
+    /// Its number.
+    pub fn pid(&self) -> i32 {
+        self.child.id() as i32
     }
 
     /// Standard error so far.

@@ -28,6 +28,7 @@ mod parity;
 mod prioritised;
 mod procgen;
 mod python;
+mod recovering;
 mod repo_rules;
 mod resume;
 mod roles;

@@ -225,6 +225,17 @@ impl DeliveryWorker {
             // Judged while one before it waited; all of those are stored now.
             Ok(InsertReply::OutOfOrder { .. }) => Ok(self.again()),
             Ok(InsertReply::Refused { why }) => Err(DeliveryError::Refused { why }),
+            Err(SessionError::Recovering(recovering)) => {
+                self.answered = Instant::now();
+                if let Some(more) = self.retries_said.due() {
+                    tracing::warn!("chunk {sequence} waits: {recovering}{more}");
+                }
+                // A question of a few bytes, in the place of chunks again and again: the answer to it says that they are wanted.
+                self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
+                self.outgoing[0].is_kept = true;
+                self.shutdown.wait_timeout(RETRY_PAUSE);
+                Ok(self.again())
+            }
             Err(e) if self.answered.elapsed() > self.limits.unreachable_max => {
                 Err(DeliveryError::OutOfReach {
                     within: self.limits.unreachable_max,

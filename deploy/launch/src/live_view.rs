@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant};
 
 use driml_machine::units::duration;
-use driml_protocol::{LearnerStatus, ReplayStatus, Waiting};
+use driml_protocol::{LearnerStatus, RecoveryProgress, ReplayStatus, Waiting};
 
 use crate::{
     console::Screen,
@@ -71,11 +71,21 @@ impl Display {
         if !notes.is_empty() {
             texts.push(notes.join("; "));
         }
+        if let Some(bar) = self.screen.bar() {
+            bar.set_position(replay.transitions_inserted.min(self.frames_max));
+        }
+        self.write(&texts);
+    }
+
+    /// Shows `note` in the place of the state of the run, which nobody can tell now.
+    pub(crate) fn show_alone(&mut self, note: &str) {
+        self.write(&[note.to_owned()]);
+    }
+
+    fn write(&mut self, texts: &[String]) {
+        let now = Instant::now();
         match self.screen.bar() {
-            Some(bar) => {
-                bar.set_position(replay.transitions_inserted.min(self.frames_max));
-                bar.set_message(texts.join("\n"));
-            }
+            Some(bar) => bar.set_message(texts.join("\n")),
             None if now >= self.plain_next => {
                 self.plain_next = now + PLAIN_PERIOD;
                 self.screen.line(&texts.join("  "));
@@ -135,6 +145,11 @@ impl Display {
 pub(crate) fn silence(part: &str, heard: Instant) -> Option<String> {
     let silent = heard.elapsed();
     (silent >= SILENT_MAX).then(|| format!("{part}: no answer for {}", duration(silent)))
+}
+
+/// What to say of a replay server that reads its replay back.
+pub(crate) fn recovery(server: &str, progress: RecoveryProgress) -> String {
+    format!("{server}: reads its replay back from disk, {progress}")
 }
 
 /// Who waits for whom, and how many actors do.

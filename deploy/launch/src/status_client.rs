@@ -4,7 +4,10 @@
 use std::time::Duration;
 
 use anyhow::Context;
-use driml_protocol::{EpisodesRequest, Keys, LearnerStatus, ReplayStatus, RunClient};
+use driml_protocol::{
+    EpisodesRequest, Keys, LearnerStatus, RecoveryProgress, ReplayStatus, RunClient,
+    session::SessionError,
+};
 use zenoh::{Session, Wait};
 
 use crate::ended_episodes::EndedEpisodes;
@@ -20,6 +23,8 @@ pub struct Statuses {
     pub shards: Vec<ReplayStatus>,
     /// The same, as of one.
     pub replay: ReplayStatus,
+    /// Each replay server that has just said that it reads its replay back from disk: which shard it is, and how far.
+    pub recovering: Vec<(usize, RecoveryProgress)>,
     /// The learner's last answer.
     pub learner: LearnerStatus,
     /// Episodes that ended and were not taken yet.
@@ -34,6 +39,7 @@ impl Statuses {
             clients: sessions.into_iter().map(client).collect(),
             shards: Vec::new(),
             replay: ReplayStatus::default(),
+            recovering: Vec::new(),
             learner: LearnerStatus::default(),
             episodes: EndedEpisodes::default(),
         }
@@ -42,10 +48,19 @@ impl Statuses {
     /// Asks the replay servers how they are, and for the episodes that ended.
     ///
     /// # Errors
-    /// No answer in time, or one that is not of this run.
+    /// No answer in time, or one that is not of this run; one that is `recovering`, too.
     pub fn ask_replay(&mut self) -> anyhow::Result<()> {
         let answers = self.clients.iter().map(|client| client.fetch(ANSWER_MAX));
-        let shards = answers.collect::<Result<Vec<_>, _>>()?;
+        let answers: Vec<Result<ReplayStatus, _>> = answers.collect();
+        let recovering = answers
+            .iter()
+            .enumerate()
+            .filter_map(|(shard, it)| match it {
+                Err(SessionError::Recovering(it)) => Some((shard, it.progress)),
+                _ => None,
+            });
+        self.recovering = recovering.collect();
+        let shards = answers.into_iter().collect::<Result<Vec<_>, _>>()?;
         self.replay = ReplayStatus::merged(&shards);
         self.shards = shards;
         for (shard, (client, status)) in self.clients.iter().zip(&self.shards).enumerate() {

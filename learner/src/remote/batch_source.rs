@@ -204,13 +204,18 @@ impl Fetcher {
                     continue;
                 }
                 Ok(Some(fetched)) => fetched,
-                Err(e) if answered.elapsed() > self.requests.unreachable_max => {
+                Err(e)
+                    if !e.is_recovering() && answered.elapsed() > self.requests.unreachable_max =>
+                {
                     Fetched::Failed(BatchError::Unreachable {
                         unreachable_max: self.requests.unreachable_max,
                         source: Box::new(e),
                     })
                 }
                 Err(e) => {
+                    if e.is_recovering() {
+                        answered = Instant::now();
+                    }
                     if let Some(more) = self.said.due() {
                         tracing::warn!("asking for a batch again: {e}{more}");
                     }

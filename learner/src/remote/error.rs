@@ -34,3 +34,13 @@ pub enum BatchError {
     #[error("the threads that fetch batches have ended")]
     ThreadsEnded,
 }
+
+impl BatchError {
+    /// Whether a replay server has said that it reads its replay back from disk: it is there, and will answer.
+    pub(crate) const fn is_recovering(&self) -> bool {
+        matches!(
+            self,
+            Self::Session(SessionError::Recovering(_)) | Self::Status(SessionError::Recovering(_))
+        )
+    }
+}

@@ -14,6 +14,7 @@ use std::{
 use driml_protocol::{
     AffinityUpdate, CodecError, Done, LearnerStatus, PriorityUpdate, QueryWorkers, Request,
     Responder, RunClient, Sampling, Sealed, Seldom, Shutdown, Weights, WeightsUpload, fault,
+    session::SessionError,
 };
 use zenoh::query::Queryable;
 
@@ -28,6 +29,8 @@ const PRIORITIES_MAX: usize = 128;
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(10);
 /// Pause between two tries.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
+/// The same while the replay server reads its replay back from disk: weights are megabytes.
+const RECOVERY_PAUSE: Duration = Duration::from_secs(2);
 /// How often a thread that has nothing to send looks whether it should end.
 const TICK: Duration = Duration::from_millis(200);
 
@@ -230,7 +233,11 @@ impl Sender {
         for client in &self.clients {
             let send = || client.send(message.clone(), self.timeout)?.wait();
             while let Err(e) = send() {
-                if is_old() || self.shutdown.wait_timeout(RETRY_PAUSE) {
+                let pause = match e {
+                    SessionError::Recovering(_) => RECOVERY_PAUSE,
+                    _ => RETRY_PAUSE,
+                };
+                if is_old() || self.shutdown.wait_timeout(pause) {
                     break;
                 }
                 if let Some(more) = self.said.due() {

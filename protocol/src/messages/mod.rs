@@ -16,6 +16,7 @@ pub(crate) mod insert_reply;
 pub(crate) mod join;
 pub(crate) mod parts;
 pub(crate) mod priorities;
+pub(crate) mod recovering;
 pub(crate) mod report;
 pub(crate) mod status;
 pub(crate) mod tally;

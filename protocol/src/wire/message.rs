@@ -104,4 +104,6 @@ pub enum Kind {
     EpisodesRequest = 22,
     /// Episodes that ended.
     EpisodesReply = 23,
+    /// "Not yet: the replay is being read back from disk", replay server to whoever asks anything.
+    Recovering = 24,
 }

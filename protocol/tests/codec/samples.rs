@@ -8,9 +8,9 @@ use driml_protocol::{
     ChunkHeader, Claim, CodecError, Done, End, EndedEpisode, EpisodesReply, EpisodesRequest,
     Goodbye, Hello, InsertReply, JoinReply, Kind, LearnerJoin, LearnerStatus, Life, LogStatus,
     Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus, PartsStatus, Played,
-    PriorityPart, PriorityUpdate, ReplayStatus, Report, RequestId, Returns, RowScalars,
-    StackedFrames, Tally, Waiting, Warning, WeightsHeader, WeightsReply, WeightsRequest,
-    WeightsUpload, WeightsVersion,
+    PriorityPart, PriorityUpdate, Recovering, RecoveryProgress, ReplayStatus, Report, RequestId,
+    Returns, RowScalars, StackedFrames, Tally, Waiting, Warning, WeightsHeader, WeightsReply,
+    WeightsRequest, WeightsUpload, WeightsVersion,
     codec::{self},
 };
 
@@ -316,6 +316,14 @@ pub(crate) fn samples() -> Vec<Sample> {
         shard: (1, 2),
         shared_memory: true,
     };
+    let recovering = Recovering {
+        progress: RecoveryProgress {
+            bytes_read: 1,
+            bytes: 2,
+            since_s: 3.5,
+        },
+        config_toml: Some("[run]\nseed = 1\n".into()),
+    };
     let goodbye = Goodbye {
         actor: 1,
         incarnation: 2,
@@ -351,6 +359,7 @@ pub(crate) fn samples() -> Vec<Sample> {
         Sample::of(&replay),
         Sample::of(&learner),
         Sample::of(&hello),
+        Sample::of(&recovering),
         Sample::of(&ActorJoin {
             actor: 1,
             incarnation: 2,

@@ -54,6 +54,9 @@ pub enum DurableError {
     /// The log does not reach back to a mark.
     #[error("{} is missing or damaged: the replay cannot go back to where the checkpoint was made", .0.display())]
     NoMark(PathBuf),
+    /// The process was told to end before the log was read.
+    #[error("it was told to end while it read its replay back; what is kept is as it was")]
+    Stopped,
     /// A value that cannot be written.
     #[error(transparent)]
     Codec(#[from] CodecError),

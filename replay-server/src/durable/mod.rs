@@ -13,6 +13,7 @@ mod error;
 mod folder;
 mod journal;
 mod opening;
+mod progress;
 mod record;
 mod recovery;
 mod replay;
@@ -21,6 +22,7 @@ mod sync;
 
 pub use error::DurableError;
 pub(crate) use opening::shard_dir;
-pub use opening::{DurableArgs, Recovery};
+pub use opening::{DurableArgs, KeptReplay, Recovery};
+pub use progress::Reading;
 pub use replay::DurableReplay;
 pub use segment::Mark;

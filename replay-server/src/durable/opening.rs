@@ -6,12 +6,13 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{RunSpec, TRANSITION_BYTES};
+use driml_protocol::{RunSpec, Shutdown, TRANSITION_BYTES};
 
 use super::{
     error::DurableError,
     folder::LogFolder,
     journal::{Journal, Limits, Place},
+    progress::Reading,
     recovery::{Recovered, find_id, go_back, recover},
     replay::{DurableReplay, Log, Marked},
     segment::{DurableState, FORMAT, LogId, Mark},
@@ -60,16 +61,44 @@ impl DurableReplay {
     /// The replay of a run that is kept in a folder: as it was, if it was kept there before, else an empty one.
     ///
     /// # Errors
-    /// Settings that cannot work; a folder that cannot be written, is in use, or holds the replay of another run. Damage is no
-    /// error: what is left is used, and what was lost is said.
+    /// Those of [`KeptReplay::find`] and [`KeptReplay::read`].
     pub fn open(
         args: &DurableArgs,
         spec: &RunSpec,
         config: &Config,
         batch_size: u32,
     ) -> Result<(Self, Recovery), DurableError> {
-        let started = Instant::now();
-        let mut replay = Replay::shard(spec, config, batch_size, args.shard)?;
+        let kept = KeptReplay::find(args, spec, config, batch_size)?;
+        kept.read(&Reading::begin(Shutdown::default()))
+    }
+}
+
+/// The folder of a replay, which nobody else uses any more and which is this run's. What is kept there is not read yet.
+pub struct KeptReplay {
+    args: DurableArgs,
+    config: Config,
+    batch_size: u32,
+    num_actions: u32,
+    /// Of this run and shard, if the log is new.
+    id: LogId,
+    is_new: bool,
+    limits: Limits,
+    folder: LogFolder,
+    replay: Replay,
+}
+
+impl KeptReplay {
+    /// Takes the folder and looks whose replay is in it, if any: at once, however much there is.
+    ///
+    /// # Errors
+    /// Settings that cannot work; a folder that cannot be written, is in use, or holds the replay of another run.
+    pub fn find(
+        args: &DurableArgs,
+        spec: &RunSpec,
+        config: &Config,
+        batch_size: u32,
+    ) -> Result<Self, DurableError> {
+        let replay = Replay::shard(spec, config, batch_size, args.shard)?;
         let folder = LogFolder::open(&args.dir)?;
         let ours = LogId {
             format: FORMAT,
@@ -83,12 +112,43 @@ impl DurableReplay {
         };
         let id = known.unwrap_or(ours);
         folder.check(&id, &ours)?;
+        Ok(Self {
+            args: args.clone(),
+            config: config.clone(),
+            batch_size,
+            num_actions: spec.num_actions,
+            id,
+            is_new: known.is_none(),
+            limits: limits(args, spec, config),
+            folder,
+            replay,
+        })
+    }
+
+    /// Reads what is kept: the replay as it was, or an empty one.
+    ///
+    /// # Errors
+    /// A folder that cannot be read or written; [`DurableError::Stopped`] if `reading` is told so. Damage is no error: what is left is
+    /// used, and what was lost is said.
+    pub fn read(self, reading: &Reading) -> Result<(DurableReplay, Recovery), DurableError> {
+        let started = Instant::now();
+        let Self {
+            args,
+            config,
+            batch_size,
+            num_actions,
+            id,
+            is_new,
+            limits,
+            folder,
+            mut replay,
+        } = self;
         if let Some(mark) = args.mark {
             go_back(&folder, mark)?;
         }
-        let found = match known {
-            Some(id) => recover(&folder, id, spec.num_actions, &mut replay, args.mark)?,
-            None => None,
+        let found = match is_new {
+            false => recover(&folder, id, num_actions, &mut replay, args.mark, reading)?,
+            true => None,
         };
         let mut recovery = Recovery::default();
         let (found, is_new) = match found {
@@ -121,14 +181,14 @@ impl DurableReplay {
                 ordinal: found.ordinal,
             },
             &found.segments,
-            limits(args, spec, config),
+            limits,
             fsync,
             state,
         )?;
         let oldest_row = replay.oldest_row();
         let marked = args.mark.map(|mark| Marked { mark, oldest_row });
         let log = Log::new(journal, id.spec_hash, folder).marked(marked);
-        let mut this = Self::with_log(replay, log, found.learner, found.after_updates);
+        let mut this = DurableReplay::with_log(replay, log, found.learner, found.after_updates);
         this.catch_up(args.after_updates, batch_size, config.shards);
         this.tidy();
         recovery.took = started.elapsed();

@@ -12,6 +12,7 @@ use driml_protocol::{BufferPool, Chunk, codec};
 use super::{
     error::DurableError,
     folder::{LogFolder, io_error},
+    progress::Reading,
     record::{self, Broken, Record, RecordKind, RecordReader},
     segment::{self, LogId, Mark, SegmentFile, SegmentHeader},
 };
@@ -20,7 +21,7 @@ use crate::{
     storage::frame_store::Packer,
 };
 
-/// How often it is said how far the reading is: nobody can ask before it is done.
+/// How often it is logged how far the reading is.
 const SAY: Duration = Duration::from_secs(5);
 
 /// Where a log goes on, and what was found on the way there.
@@ -126,6 +127,7 @@ pub(super) fn recover(
     num_actions: u32,
     replay: &mut Replay,
     mark: Option<Mark>,
+    reading: &Reading,
 ) -> Result<Option<Recovered>, DurableError> {
     let files = segment::list(&folder.path).map_err(io_error("listing", &folder.path))?;
     let number = files.last().map_or(0, |it| it.number + 1);
@@ -157,23 +159,23 @@ pub(super) fn recover(
     let total: u64 = files.iter().map(bytes).sum();
     let dir = folder.path.display();
     tracing::info!(
-        "reads the replay in {dir}: {} segments, {} MiB; nobody can connect before that is done",
+        "reads the replay in {dir}: {} segments, {} MiB; whoever asks hears how far it is",
         files.len(),
         total >> 20
     );
-    let (started, mut due, mut read) = (Instant::now(), SAY, 0);
+    reading.set_bytes(total);
+    let mut due = Instant::now() + SAY;
     for (at, file) in files.iter().enumerate() {
-        if started.elapsed() > due {
-            due = started.elapsed() + SAY;
-            tracing::info!(
-                "reads the replay in {dir}: {} of {} MiB after {} s",
-                read >> 20,
-                total >> 20,
-                started.elapsed().as_secs()
-            );
+        if Instant::now() > due {
+            due += SAY;
+            tracing::info!("reads the replay in {dir}: {}", reading.progress());
         }
-        read += bytes(file);
+        if reading.is_stopped() {
+            return Err(DurableError::Stopped);
+        }
+        let of_it = bytes(file);
         recovery.read_segment(file, at == last)?;
+        reading.add_read(of_it);
     }
     recovery.finish()
 }

@@ -7,9 +7,11 @@
 mod accounts;
 mod batches;
 mod chunks;
+mod entrance;
 mod joining;
 mod limits;
 mod members;
+mod origin;
 mod parked;
 mod refused;
 mod run;

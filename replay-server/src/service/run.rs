@@ -2,15 +2,15 @@
 //! What an answer is, is in the files named for the messages.
 
 use std::{
-    path::{Path, PathBuf},
+    path::PathBuf,
     sync::{Arc, Condvar, Mutex},
     thread::JoinHandle,
     time::{Duration, Instant},
 };
 
 use driml_protocol::{
-    BatchHeader, BufferPool, Incoming, Keyed, Keys, POOL_BATCHES, QueryWorkers, Request, Responder,
-    RunClient, RunSpec, SeldomEach, Shutdown, TRANSITION_BYTES,
+    BatchHeader, BufferPool, Incoming, Keyed, Keys, POOL_BATCHES, QueryWorkers, Recovering,
+    Request, Responder, RunClient, RunSpec, Sampling, SeldomEach, Shutdown, TRANSITION_BYTES,
     config::{Settings, TransportConfig},
     join_within,
     session::{self, Endpoints},
@@ -21,17 +21,17 @@ use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
 use super::{
     accounts::Accounts,
+    entrance::Entrance,
     limits::{Limits, number},
     members::Members,
+    origin::Origin,
     parked::{ParkedChunks, ParkedRequests},
     server::{Service, State},
     timings::Timings,
-    weights_store::WeightsStore,
 };
 use crate::{
     config::Config,
-    durable::{DurableArgs, DurableReplay, shard_dir},
-    replay::Replay,
+    durable::{DurableError, Reading},
     sampling::prioritised::PriorityCounts,
 };
 
@@ -87,18 +87,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let ack_timeout = Duration::from_millis(number(&settings, "actor", "ack_timeout_ms")?.into());
     // Of this process alone: priorities of rows that an earlier one drew are not taken for those of others.
     let incarnation = rand::random();
-    let (replay, weights) = match &args.dir {
-        Some(dir) => open_durable(&args, dir, &spec, &config, batch_size)?,
-        None => {
-            let mut replay = Replay::shard(&spec, &config, batch_size, args.shard)?;
-            if args.after_updates > 0 {
-                replay = replay.resumed_at(args.after_updates, args.shard);
-            }
-            let replay = DurableReplay::in_memory(replay, args.after_updates);
-            (replay, WeightsStore::default())
-        }
-    };
-    let replay = replay.with_incarnation(incarnation);
+    let origin = Origin::find(&args, &spec, &config, batch_size)?;
     let transport: TransportConfig = settings.table("transport")?;
     let batch = BatchHeader::of(&spec, batch_size).sampled_by(&config.sampling);
     let pool = if transport.shared_memory {
@@ -133,6 +122,35 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let client = RunClient::new(session, keys, spec.hash());
     let declaring =
         |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
+    let reading = Reading::begin(shutdown.clone());
+    let entrance = Arc::new(Entrance::closed(reading, args.config_toml.clone()));
+    let Answers {
+        queryables,
+        mut threads,
+        ..
+    } = Answers::declare(&client, &entrance, limits, &config.sampling).map_err(declaring)?;
+    tracing::info!(
+        "replay server listens on {:?}, run {:016x}",
+        args.listen,
+        client.spec_hash()
+    );
+    let (replay, weights) = match origin.read(entrance.reading(), spec.hash()) {
+        Ok(read) => read,
+        Err(e) => {
+            // So that whoever waits for the replay hears at once that nobody is there any more.
+            drop(queryables);
+            let closed = client.session().close().wait();
+            join_within(threads, THREADS_END_MAX);
+            return match e {
+                DurableError::Stopped => {
+                    tracing::info!("replay server stops: {e}");
+                    closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+                }
+                e => Err(e.into()),
+            };
+        }
+    };
+    let replay = replay.with_incarnation(incarnation);
     let service = Arc::new(Service {
         num_actions: spec.num_actions,
         limits,
@@ -159,20 +177,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     });
     let _alive = watch_members(&client, &service)
         .map_err(|e| anyhow::anyhow!("watching for actors and learner: {e}"))?;
-    let Answers {
-        queryables,
-        mut threads,
-        ..
-    } = Answers::declare(&client, &service).map_err(declaring)?;
+    entrance.open(service.clone());
     threads.extend(service.clone().start_working()?);
     if let Some(reports) = reports {
         threads.push(service.clone().start_hearing(reports)?);
     }
-    tracing::info!(
-        "replay server listens on {:?}, run {:016x}",
-        args.listen,
-        client.spec_hash()
-    );
     service.wait_until_over(args.stay);
     // Threads of its own wait for that.
     shutdown.set();
@@ -201,48 +210,6 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
-/// The replay that is kept in `dir`, and the newest weights that were handed over.
-fn open_durable(
-    args: &RunArgs,
-    dir: &Path,
-    spec: &RunSpec,
-    config: &Config,
-    batch_size: u32,
-) -> anyhow::Result<(DurableReplay, WeightsStore)> {
-    let dir = shard_dir(dir, args.shard, config.shards);
-    let durable = DurableArgs {
-        dir: dir.clone(),
-        shard: args.shard,
-        after_updates: args.after_updates,
-        segment_bytes: None,
-        mark: None,
-    };
-    let (replay, recovery) = DurableReplay::open(&durable, spec, config, batch_size)?;
-    for warning in &recovery.warnings {
-        tracing::warn!("{}: {warning}", dir.display());
-    }
-    if recovery.found {
-        let status = replay.status();
-        tracing::info!(
-            "goes on with the replay in {}: {} transitions stored, {} held, {} rows served; {} MiB read in {:.1} s",
-            dir.display(),
-            status.transitions_inserted,
-            status.transitions_held,
-            status.rows_sampled,
-            recovery.bytes >> 20,
-            recovery.took.as_secs_f64()
-        );
-        if replay.priority_counts().is_some() {
-            tracing::info!(
-                "priorities are not kept on disk: each transition has the highest one until it is learned from"
-            );
-        }
-    } else {
-        tracing::info!("keeps the replay in {}", dir.display());
-    }
-    Ok((replay, WeightsStore::kept_in(&dir, spec.hash())))
-}
-
 /// Bytes of shared memory that all actors of the run make for their chunks together, as far as the settings know of them.
 fn chunk_pools_bytes(settings: &Settings, spec: &RunSpec) -> anyhow::Result<usize> {
     let actor = |key| anyhow::Ok(number(settings, "actor", key)? as usize);
@@ -263,30 +230,36 @@ type Threads = Vec<JoinHandle<()>>;
 /// Everything that the replay server answers: each message by threads of its own.
 struct Answers<'a> {
     client: &'a RunClient,
-    service: &'a Arc<Service>,
+    entrance: &'a Arc<Entrance>,
+    limits: Limits,
     /// Dropping them ends the answers, and with them the threads.
     queryables: Vec<Queryable<()>>,
     threads: Threads,
 }
 
 impl<'a> Answers<'a> {
-    /// Declares all of it.
-    fn declare(client: &'a RunClient, service: &'a Arc<Service>) -> zenoh::Result<Self> {
+    /// Declares all of it, where rows are drawn by `sampling`. Until the entrance is open everybody is told to ask again.
+    fn declare(
+        client: &'a RunClient,
+        entrance: &'a Arc<Entrance>,
+        limits: Limits,
+        sampling: &Sampling,
+    ) -> zenoh::Result<Self> {
         let mut this = Self {
             client,
-            service,
+            entrance,
+            limits,
             queryables: Vec::new(),
             threads: Threads::new(),
         };
-        let limits = service.limits;
         this.answer("insert", 1, limits.chunk, Service::insert)?;
         this.answer("claim", 1, limits.small, Service::claim)?;
         this.answer("request", 1, limits.small, Service::request)?;
         this.answer("affinity", 1, limits.affinity, Service::affinity)?;
-        if service.state().replay.priority_counts().is_some() {
+        if sampling.is_prioritised() {
             this.answer("priorities", 1, limits.priorities, Service::priorities)?;
         }
-        this.offer("hello", 1, Service::hello)?;
+        this.offer("hello", 1, Service::hello, Entrance::put_off_with_settings)?;
         this.answer("join-actor", 1, limits.small, Service::join_actor)?;
         this.answer("join-learner", 1, limits.small, Service::join_learner)?;
         this.answer("goodbye", 1, limits.small, Service::goodbye)?;
@@ -298,8 +271,8 @@ impl<'a> Answers<'a> {
             Service::give_weights,
         )?;
         this.answer("report", 1, limits.small, Service::report)?;
-        this.offer("status", 1, Service::status)?;
-        this.offer("parts", 1, Service::parts)?;
+        this.offer("status", 1, Service::status, Entrance::put_off)?;
+        this.offer("parts", 1, Service::parts, Entrance::put_off)?;
         this.answer("episodes", 1, limits.small, Service::episodes)?;
         Ok(this)
     }
@@ -312,23 +285,30 @@ impl<'a> Answers<'a> {
         bytes_max: usize,
         answer: fn(&Service, Incoming<R>),
     ) -> zenoh::Result<()> {
-        let (service, spec_hash) = (self.service.clone(), self.client.spec_hash());
-        let answer = move |incoming| answer(&service, incoming);
+        let (entrance, spec_hash) = (self.entrance.clone(), self.client.spec_hash());
+        let answer = move |incoming: Incoming<R>| match entrance.service() {
+            Some(service) => answer(service, incoming),
+            None => incoming.into_responder().put_off(&entrance.put_off()),
+        };
         let workers = QueryWorkers::answer(name, threads, spec_hash, answer)?;
         self.add(name, bytes_max, workers)
     }
 
-    /// Gives an `M` to whoever fetches it, on so many threads of this name.
+    /// Gives an `M` to whoever fetches it, on so many threads of this name; what it says before there is one is `put_off`'s.
     fn offer<M: Keyed + 'static>(
         &mut self,
         name: &'static str,
         threads: usize,
         give: fn(&Service, Responder<M>),
+        put_off: fn(&Entrance) -> Recovering,
     ) -> zenoh::Result<()> {
-        let (service, spec_hash) = (self.service.clone(), self.client.spec_hash());
-        let give = move |responder| give(&service, responder);
+        let (entrance, spec_hash) = (self.entrance.clone(), self.client.spec_hash());
+        let give = move |responder: Responder<M>| match entrance.service() {
+            Some(service) => give(service, responder),
+            None => responder.put_off(&put_off(&entrance)),
+        };
         let workers = QueryWorkers::offer(name, threads, spec_hash, give)?;
-        self.add(name, self.service.limits.small, workers)
+        self.add(name, self.limits.small, workers)
     }
 
     fn add<M: Keyed + 'static>(
@@ -337,8 +317,11 @@ impl<'a> Answers<'a> {
         bytes_max: usize,
         workers: QueryWorkers<M>,
     ) -> zenoh::Result<()> {
-        let service = self.service.clone();
-        let refused = move |bytes| service.refuse_long(name, bytes, bytes_max);
+        let entrance = self.entrance.clone();
+        let refused = move |bytes| match entrance.service() {
+            Some(service) => service.refuse_long(name, bytes, bytes_max),
+            None => tracing::debug!("a message of {bytes} bytes to {name:?} is too long"),
+        };
         let queryable = workers.declare_limited(self.client, bytes_max, refused)?;
         self.queryables.push(queryable);
         self.threads.extend(workers.into_threads());

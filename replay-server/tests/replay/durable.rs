@@ -9,10 +9,11 @@ use std::{
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Buffer, ChunkHeader, Goodbye, Horizon, InsertReply, RequestId,
-    RunSpec,
+    RunSpec, Shutdown,
 };
 use driml_replay_server::{
-    Compression, Config, DurableArgs, DurableError, DurableReplay, Recovery, Unready,
+    Compression, Config, DurableArgs, DurableError, DurableReplay, KeptReplay, Reading, Recovery,
+    Unready,
 };
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
@@ -504,4 +505,45 @@ fn a_resumed_run_goes_on_with_what_was_kept() {
         (replay.after_updates(), replay.tally().rows_sampled),
         (70, 280)
     );
+}
+
+/// Reading can be watched and broken off; what is kept is then what it was.
+#[test]
+fn reading_says_how_far_it_is_and_can_be_broken_off() {
+    let root = tempfile::tempdir().unwrap();
+    let mut life = Life::begin(root.path(), unlimited(200), 2_000, 5);
+    for _ in 0..60 {
+        life.act();
+    }
+    let (before, args, config) = (state(&life.replay), life.args.clone(), life.config.clone());
+    drop(life);
+    let bytes = || -> u64 {
+        let lengths = segments(root.path()).into_iter();
+        lengths.map(|it| fs::metadata(it).unwrap().len()).sum()
+    };
+    let find = || KeptReplay::find(&args, &test_spec(), &config, ROWS).unwrap();
+
+    let (kept, all, stop) = (find(), bytes(), Shutdown::default());
+    stop.set();
+    let reading = Reading::begin(stop);
+    let broken_off = kept.read(&reading).map(drop);
+    assert!(
+        matches!(broken_off, Err(DurableError::Stopped)),
+        "{broken_off:?}"
+    );
+    let progress = reading.progress();
+    assert_eq!((progress.bytes_read, progress.bytes), (0, all));
+    assert_eq!(bytes(), all);
+
+    let kept = find();
+    assert!(
+        matches!(open(&args, &config), Err(DurableError::InUse(_))),
+        "the folder is taken before it is read"
+    );
+    let reading = Reading::begin(Shutdown::default());
+    let (replay, recovery) = kept.read(&reading).unwrap();
+    assert!(recovery.found && recovery.warnings.is_empty());
+    let progress = reading.progress();
+    assert_eq!((progress.bytes_read, progress.bytes), (all, all));
+    assert_eq!(state(&replay), before);
 }

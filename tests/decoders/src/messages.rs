@@ -6,7 +6,7 @@ use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchReply, BatchRequest, BufferPool, Chunk, ChunkHeader,
     Claim, CodecError, Done, EpisodesReply, EpisodesRequest, Goodbye, Hello, InsertReply,
     JoinReply, Kind, LearnerJoin, LearnerStatus, Message, PROTOCOL_VERSION, PartsStatus,
-    PriorityUpdate, ReplayStatus, Report, WeightsReply, WeightsRequest, WeightsUpload,
+    PriorityUpdate, Recovering, ReplayStatus, Report, WeightsReply, WeightsRequest, WeightsUpload,
     WeightsVersion, codec,
 };
 
@@ -76,7 +76,7 @@ fn read_batch(bytes: &[u8]) {
 }
 
 /// Every kind of message and how it is read.
-const KINDS: [(Kind, Read); 23] = [
+const KINDS: [(Kind, Read); 24] = [
     (Kind::Chunk, read_chunk),
     (Kind::InsertReply, read::<InsertReply>),
     (Kind::BatchRequest, read::<BatchRequest>),
@@ -100,6 +100,7 @@ const KINDS: [(Kind, Read); 23] = [
     (Kind::EpisodesRequest, read::<EpisodesRequest>),
     (Kind::EpisodesReply, read::<EpisodesReply>),
     (Kind::Priorities, read::<PriorityUpdate>),
+    (Kind::Recovering, read::<Recovering>),
 ];
 
 fn read_affinity(bytes: &[u8]) {

@@ -23,7 +23,7 @@ use crate::{
     endpoint::NAMESPACE,
     evaluator::Evaluator,
     interrupts::Interrupts,
-    live_view::{Display, TEMPLATE, silence},
+    live_view::{Display, TEMPLATE, recovery, silence},
     meeting::Meeting,
     processes::{Processes, Revived, stop},
     resume,
@@ -251,10 +251,21 @@ impl Launch<'_> {
                 .statuses
                 .as_mut()
                 .expect("it was set before the run is watched");
-            for (heard, (name, answer)) in heard.iter_mut().zip([
+            let answers = [
                 ("replay server", statuses.ask_replay()),
                 ("learner", statuses.ask_learner()),
-            ]) {
+            ];
+            if !statuses.recovering.is_empty() {
+                // It is there, and the others wait for it; whether any of them has died is seen above.
+                heard = [Instant::now(); 2];
+                progress.0 = Instant::now();
+                let servers = statuses.recovering.iter();
+                let notes = servers.map(|(shard, it)| recovery(&self.servers[*shard], *it));
+                self.display
+                    .show_alone(&notes.collect::<Vec<_>>().join("; "));
+                continue;
+            }
+            for (heard, (name, answer)) in heard.iter_mut().zip(answers) {
                 match answer {
                     Ok(()) => *heard = Instant::now(),
                     Err(e) if heard.elapsed() > SILENCE_MAX => {

@@ -49,6 +49,11 @@ pub(super) fn to_go_on(snapshot: &Snapshot) -> Vec<String> {
                 "a run with other settings has taken the place of this one on {}: ask anew",
                 server.endpoint
             ));
+        } else if let Some(progress) = server.recovering {
+            needed.push(format!(
+                "the replay server on {} reads its replay back from disk ({progress}): wait, all goes on by itself",
+                server.endpoint
+            ));
         } else if let Some(error) = &server.error {
             needed.push(format!(
                 "the replay server on {} does not answer ({error}): is its process frozen, or its machine cut off?",

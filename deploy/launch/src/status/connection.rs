@@ -6,7 +6,7 @@ use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{
     CodecError, EpisodesReply, EpisodesRequest, Hello, Keyed, Keys, LearnerStatus, PartsStatus,
-    ReplayStatus, RunClient, codec, reach,
+    Recovering, ReplayStatus, RunClient, codec, reach,
     session::{self, Endpoints, SMALL_MESSAGE_BYTES_MAX, SessionError},
     tls::Credentials,
 };
@@ -27,8 +27,8 @@ const ANSWER_MAX: Duration = Duration::from_secs(3);
 pub struct Connection {
     /// The run's settings.
     pub config: RunConfig,
-    /// Updates after which the run goes on, if it was resumed.
-    pub after_updates: u64,
+    /// Updates after which the run goes on, if it was resumed; none before the first replay server has read its replay back.
+    pub after_updates: Option<u64>,
     /// Each with its endpoint.
     servers: Vec<(String, RunClient)>,
     rates: Rates,
@@ -65,19 +65,32 @@ impl Connection {
                 Hello::PRIORITY,
                 ANSWER_MAX,
             );
-            let hello = hello.map_err(|e| match e {
-                SessionError::Nobody { .. } => usage!(
-                    "somebody listens on {endpoint}, but it is no replay server with the namespace {namespace:?}"
-                )
-                .into(),
-                other => anyhow::Error::new(other)
-                    .context(format!("the replay server on {endpoint} does not answer")),
-            })?;
-            let (hello, _) = codec::decode::<Hello>(&hello.to_bytes(), None)
-                .with_context(|| format!("the greeting of the replay server on {endpoint}"))?;
-            let own = RunConfig::parse("the replay server's settings", &hello.config_toml)?;
+            let (config_toml, after_updates) = match hello {
+                Ok(hello) => {
+                    let (hello, _) =
+                        codec::decode::<Hello>(&hello.to_bytes(), None).with_context(|| {
+                            format!("the greeting of the replay server on {endpoint}")
+                        })?;
+                    (hello.config_toml, Some(hello.after_updates))
+                }
+                Err(SessionError::Recovering(Recovering {
+                    config_toml: Some(config_toml),
+                    ..
+                })) => (config_toml, None),
+                Err(SessionError::Nobody { .. }) => {
+                    return Err(usage!(
+                        "somebody listens on {endpoint}, but it is no replay server with the namespace {namespace:?}"
+                    )
+                    .into());
+                }
+                Err(other) => {
+                    let what = format!("the replay server on {endpoint} does not answer");
+                    return Err(anyhow::Error::new(other).context(what));
+                }
+            };
+            let own = RunConfig::parse("the replay server's settings", &config_toml)?;
             let spec_hash = own.run.hash();
-            let (of, _) = first.get_or_insert((own, hello.after_updates));
+            let (of, _) = first.get_or_insert((own, after_updates));
             if of.run.hash() != spec_hash {
                 return Err(usage!(
                     "{} and {endpoint} are of different runs: name the replay shards of one",
@@ -137,15 +150,17 @@ impl Connection {
                     ..
                 })
             );
-            let (answers, error) = match answers {
-                Ok(answers) => (Some(answers), None),
-                Err(e) => (None, Some(e.to_string())),
+            let (answers, recovering, error) = match answers {
+                Ok(answers) => (Some(answers), None, None),
+                Err(SessionError::Recovering(it)) => (None, Some(it.progress), None),
+                Err(e) => (None, None, Some(e.to_string())),
             };
             let (replay, parts) = answers.unzip();
             ServerAnswer {
                 endpoint: endpoint.clone(),
                 replay,
                 parts,
+                recovering,
                 error,
                 is_another_run,
             }
@@ -153,9 +168,12 @@ impl Connection {
         let servers: Vec<_> = self.servers.iter().map(ask).collect();
         // The learner is asked through the first of them.
         let first = self.servers.first();
-        let learner = first
-            .filter(|_| servers[0].error.is_none())
-            .and_then(|(_, client)| client.fetch::<LearnerStatus>(ANSWER_MAX).ok());
+        let first = first.filter(|_| servers[0].replay.is_some());
+        if let (None, Some((_, client))) = (self.after_updates, first) {
+            let hello = client.fetch::<Hello>(ANSWER_MAX);
+            self.after_updates = hello.ok().map(|it| it.after_updates);
+        }
+        let learner = first.and_then(|(_, client)| client.fetch::<LearnerStatus>(ANSWER_MAX).ok());
         let answered: Vec<_> = servers.iter().filter_map(|it| it.replay.clone()).collect();
         let replay = ReplayStatus::merged(&answered);
         if answered.len() == servers.len() && learner.is_some() {

@@ -1,6 +1,6 @@
 //! What a run says of itself when it is asked: one answer of all parts that can be asked.
 
-use driml_protocol::{LearnerStatus, PartsStatus, ReplayStatus};
+use driml_protocol::{LearnerStatus, PartsStatus, RecoveryProgress, ReplayStatus};
 use serde::Serialize;
 
 use super::numbers::Numbers;
@@ -46,10 +46,12 @@ pub struct Snapshot {
 pub struct ServerAnswer {
     /// Where it was asked.
     pub endpoint: String,
-    /// Its counts; none if it does not answer.
+    /// Its counts; none if it does not answer, or not yet.
     pub replay: Option<ReplayStatus>,
-    /// Who takes part; none if it does not answer.
+    /// Who takes part; none if it does not answer, or not yet.
     pub parts: Option<PartsStatus>,
+    /// How far it is with reading its replay back from disk, before which it can answer nothing else; none if it is not about that.
+    pub recovering: Option<RecoveryProgress>,
     /// Why there is no answer.
     pub error: Option<String>,
     /// It answers, and for a run with other settings.
@@ -57,6 +59,17 @@ pub struct ServerAnswer {
 }
 
 impl Snapshot {
+    /// Each replay server that reads its replay back from disk, and how far it is.
+    pub(crate) fn recovering(&self) -> impl Iterator<Item = (&ServerAnswer, RecoveryProgress)> {
+        let servers = self.servers.iter();
+        servers.filter_map(|it| Some((it, it.recovering?)))
+    }
+
+    /// Whether all replay servers have told their counts.
+    pub(crate) fn is_answered(&self) -> bool {
+        self.servers.iter().all(|it| it.replay.is_some())
+    }
+
     /// All is learned and saved.
     pub fn is_over(&self) -> bool {
         self.numbers.finished

@@ -31,11 +31,14 @@ pub(super) fn describe(snapshot: &Snapshot) -> String {
     let ratio = replay
         .replay_ratio()
         .map_or("-".into(), |it| format!("{it:.2}"));
+    let frames = match snapshot.is_answered() {
+        true => replay.transitions_inserted.to_string(),
+        false => "?".into(),
+    };
     // Writing to a string cannot fail.
     let _ = writeln!(
         page,
-        "{world}, {agent}: frames {}/{} ({:.0}/s)  updates {updates}/{} ({:.1}/s)  replay ratio {ratio} of {}",
-        replay.transitions_inserted,
+        "{world}, {agent}: frames {frames}/{} ({:.0}/s)  updates {updates}/{} ({:.1}/s)  replay ratio {ratio} of {}",
         snapshot.frames_planned,
         snapshot.numbers.frames_per_second,
         snapshot.updates_planned,
@@ -156,6 +159,10 @@ fn server_row(server: &ServerAnswer, of: usize) -> [String; 7] {
         1 => "replay-server".to_owned(),
         _ => server.endpoint.clone(),
     };
+    if let Some(progress) = server.recovering {
+        let does = progress.to_string();
+        return [&*name, "reads its replay back", &does, "", "", "", ""].map(str::to_owned);
+    }
     let Some(account) = &server.parts else {
         return [&*name, "does not answer", "", "", "", "", ""].map(str::to_owned);
     };

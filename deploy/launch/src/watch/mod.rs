@@ -6,16 +6,18 @@ mod outputs;
 mod prometheus;
 mod watched;
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use driml_machine::error::{Interrupted, usage};
+use driml_protocol::Seldom;
 
 use crate::{
     console,
     interrupts::Interrupts,
+    live_view::recovery,
     run_folder::Outcome,
-    status::{self, Connection},
+    status::{self, Connection, Snapshot},
 };
 pub use outputs::Outputs;
 use prometheus::PrometheusFile;
@@ -44,6 +46,40 @@ pub fn once(mut connection: Connection, outputs: &Outputs, json: bool) -> anyhow
     }
 }
 
+/// Waits for replay servers that read their replay back from disk, as long as it takes, and says how far they are; the first answer
+/// of all of them.
+///
+/// # Errors
+/// One that has died instead and does not come back; [`Interrupted`].
+fn wait_until_recovered(
+    connection: &mut Connection,
+    interrupts: &Interrupts,
+) -> anyhow::Result<Snapshot> {
+    let silent_max = Duration::from_millis(connection.config.learner.unreachable_max_ms);
+    let (mut heard, mut said) = (Instant::now(), Seldom::default());
+    loop {
+        let snapshot = connection.ask();
+        if snapshot.is_answered() && connection.after_updates.is_some() {
+            return Ok(snapshot);
+        }
+        if snapshot.recovering().next().is_some() {
+            heard = Instant::now();
+        }
+        let is_another_run = snapshot.servers.iter().any(|it| it.is_another_run);
+        if is_another_run || heard.elapsed() > silent_max {
+            bail!("{}", snapshot.to_go_on.join("; "));
+        }
+        if said.due().is_some() {
+            for (server, progress) in snapshot.recovering() {
+                console::line(&recovery(&server.endpoint, progress));
+            }
+        }
+        if interrupts.wait_timeout(POLL) > 0 {
+            return Err(Interrupted.into());
+        }
+    }
+}
+
 /// Shows and records a run until it is over, or until Ctrl-C, which leaves the run alone.
 ///
 /// # Errors
@@ -55,6 +91,10 @@ pub fn run(mut connection: Connection, outputs: &Outputs) -> anyhow::Result<()> 
     let mut file = outputs.prometheus.as_deref().map(PrometheusFile::new);
     if let Some(failed) = file.as_mut().and_then(|it| it.write(&snapshot)) {
         return Err(usage!("--prometheus: {failed}").into());
+    }
+    if snapshot.recovering().next().is_some() {
+        // What the run has done so far is not known before.
+        snapshot = wait_until_recovered(&mut connection, &interrupts)?;
     }
     let mut watched = Watched::new(&connection, &snapshot, outputs)?;
     let ended = loop {

@@ -14,7 +14,7 @@ use super::{
 };
 use crate::{
     console::{self, Screen},
-    live_view::{Display, TEMPLATE, silence},
+    live_view::{Display, TEMPLATE, recovery, silence},
     run_folder::{Episodes, MeanReturn, Outcome, ResumePoint, RunRecorder, Summary},
     status::{Connection, Snapshot, not_joined, silent_actors},
 };
@@ -54,7 +54,8 @@ impl Watched {
         snapshot: &Snapshot,
         outputs: &Outputs,
     ) -> anyhow::Result<Self> {
-        let (config, after_updates) = (connection.config.clone(), connection.after_updates);
+        let config = connection.config.clone();
+        let after_updates = connection.after_updates.unwrap_or_default();
         let servers = snapshot.servers.iter();
         let up_s = servers
             .filter_map(|it| Some(it.parts.as_ref()?.up_s))
@@ -126,6 +127,10 @@ impl Watched {
             (self.shards, self.replay) = (shards, snapshot.replay.clone());
             self.replay_heard = Instant::now();
         }
+        if snapshot.recovering().next().is_some() {
+            // It is there, and nobody can be asked through it.
+            (self.replay_heard, self.learner_heard) = (Instant::now(), Instant::now());
+        }
         if let Some(learner) = &snapshot.learner {
             self.learner = learner.clone();
             self.learner_heard = Instant::now();
@@ -159,6 +164,13 @@ impl Watched {
 
     /// Who does not answer, and for how long.
     fn notes(&self, snapshot: &Snapshot) -> Vec<String> {
+        let recovering = snapshot.recovering();
+        let recovering: Vec<_> = recovering
+            .map(|(server, progress)| recovery(&server.endpoint, progress))
+            .collect();
+        if !recovering.is_empty() {
+            return recovering;
+        }
         let replay = silence("replay server", self.replay_heard);
         // While it is silent nobody else can be heard.
         if let Some(replay) = replay {

@@ -1,0 +1,102 @@
+//! What a replay server answers to everything while it reads its replay back from disk: how far it is.
+//! It travels as an error reply, so whoever asked anything else asks again.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::wire::{
+    error::CodecError,
+    message::{Kind, Message, no_payload},
+};
+
+/// How far a replay server is with reading its replay back from disk.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RecoveryProgress {
+    /// Bytes of the log that have been read.
+    pub bytes_read: u64,
+    /// Bytes of the whole log.
+    pub bytes: u64,
+    /// Seconds for which it has been reading.
+    pub since_s: f64,
+}
+
+impl RecoveryProgress {
+    /// Whether it takes so long that a person should know.
+    pub fn is_slow(&self) -> bool {
+        self.since_s >= 1.0
+    }
+}
+
+impl fmt::Display for RecoveryProgress {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            bytes_read,
+            bytes,
+            since_s,
+        } = self;
+        let (read, all) = (bytes_read >> 20, bytes >> 20);
+        write!(f, "{read} of {all} MiB after {since_s:.0} s")
+    }
+}
+
+/// The replay server cannot answer yet, as it is reading its replay back. Whatever was asked has had no effect.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Recovering {
+    /// How far it is.
+    pub progress: RecoveryProgress,
+    /// The run's resolved settings, TOML, if the question was for [`Hello`](super::hello::Hello): with them a status says which run it
+    /// is.
+    pub config_toml: Option<String>,
+}
+
+impl fmt::Display for Recovering {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let progress = self.progress;
+        write!(
+            f,
+            "the replay server reads its replay back from disk, {progress}"
+        )
+    }
+}
+
+impl Message for Recovering {
+    const KIND: Kind = Kind::Recovering;
+
+    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+        let since_s = self.progress.since_s;
+        if !since_s.is_finite() || since_s < 0.0 {
+            return Err(CodecError::Header(format!(
+                "a recovery that began {since_s} s ago"
+            )));
+        }
+        no_payload(payload)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_says_how_far_it_is_and_since_when() {
+        let mut recovering = Recovering {
+            progress: RecoveryProgress {
+                bytes_read: 3 << 30,
+                bytes: 11 << 30,
+                since_s: 33.7,
+            },
+            config_toml: None,
+        };
+        assert_eq!(
+            recovering.to_string(),
+            "the replay server reads its replay back from disk, 3072 of 11264 MiB after 34 s"
+        );
+        assert!(recovering.validate(&[]).is_ok());
+        assert!(recovering.validate(&[1]).is_err());
+        for bad in [f64::NAN, f64::INFINITY, -1.0] {
+            recovering.progress.since_s = bad;
+            assert!(recovering.validate(&[]).is_err(), "{bad}");
+        }
+    }
+}

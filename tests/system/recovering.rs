@@ -1,0 +1,336 @@
+//! A replay server that has a long log to read back: everybody hears how far it is, waits, and goes on; nothing is lost or doubled.
+//! The log is real, and its server gets little of the processor, as on a slow machine: nothing in the program waits for these tests.
+
+use std::{borrow::Cow, fs, path::Path, time::Duration};
+
+use driml_protocol::{
+    ActorJoin, BatchRequest, Chunk, ChunkHeader, End, Hello, InsertReply, Keys, LearnerJoin,
+    ReplayStatus, RequestId, RunClient, RunSpec, WeightsHeader, WeightsUpload,
+    config::Settings,
+    session::{self, Endpoints, SessionError},
+};
+use driml_replay_server::{Config, DurableArgs, DurableReplay};
+use driml_tests::{Process, SlowMachine, TestSystem, wait_for};
+use nix::sys::signal::Signal;
+use serde_json::Value;
+
+use crate::{system, tls::TlsSystem};
+
+/// Transitions in the log, each in a record of its own.
+const KEPT: u64 = 190_016;
+/// Updates of a run that goes on with them: one of 16 rows for 256 transitions after the warm-up.
+const UPDATES: u64 = 800;
+const WARMUP: u64 = 192;
+const FRAMES: u64 = WARMUP + 256 * UPDATES;
+/// How long the parts of these runs would wait for a server that is silent, seconds.
+const UNREACHABLE_MAX_S: f64 = 5.0;
+/// What whoever waits says.
+const WAITING: &str =
+    "waiting for as long as it takes: the replay server reads its replay back from disk, ";
+
+fn flags() -> String {
+    format!(
+        "--agent c51 --env chain --preset smoke --frames {FRAMES} --set replay.replay_ratio=0.0625 \
+         --set replay.warmup_transitions={WARMUP} --set replay.capacity_transitions=250000 \
+         --set actor.unreachable_max_ms=5000 --set learner.unreachable_max_ms=5000"
+    )
+}
+
+/// Puts transitions of another actor into the log in `folder`, whose run has these settings.
+fn keep(folder: &Path, config_toml: &str) -> RunSpec {
+    let settings = Settings::parse(config_toml).unwrap();
+    let spec: RunSpec = settings.table("run").unwrap();
+    let mut config: Config = settings.table("replay").unwrap();
+    // So that the learner need not follow.
+    config.replay_ratio = 1e-6;
+    let args = DurableArgs {
+        dir: folder.to_owned(),
+        shard: 0,
+        after_updates: 0,
+        segment_bytes: Some(1 << 18),
+        mark: None,
+    };
+    let (mut replay, _) = DurableReplay::open(&args, &spec, &config, 16).unwrap();
+    let join = ActorJoin {
+        actor: 9,
+        incarnation: 1,
+    };
+    replay.join_actor(join).unwrap();
+    let mut header = header_of(9, spec.frame_bytes());
+    for sequence in 0..KEPT {
+        (header.sequence, header.first_transition) = (sequence, sequence);
+        let mut chunk = Chunk::zeroed(header);
+        chunk.set(0, 0, 0.0, End::Running);
+        let packed = replay.packer().pack(Cow::Owned(chunk));
+        let reply = replay.insert_packed(&packed);
+        assert!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
+    }
+    spec
+}
+
+/// The first chunk of an actor, of one transition.
+fn header_of(actor: u32, frame_bytes: usize) -> ChunkHeader {
+    ChunkHeader {
+        actor,
+        incarnation: 1,
+        sequence: 0,
+        first_transition: 0,
+        weights_version: 0,
+        leaving: false,
+        streams: 1,
+        steps: 1,
+        frame_bytes: frame_bytes as u32,
+    }
+}
+
+/// A folder with the log of a run with these settings.
+fn keep_for(system: &TestSystem, folder: &str) -> RunSpec {
+    let server = system.start_replay_server(&flags());
+    let client = system.connect();
+    let spec = keep(&system.path(folder), &client.config_toml);
+    drop(client);
+    server.stop().expect_code(0);
+    spec
+}
+
+/// Waits until a server has begun to read, and makes its machine a slow one.
+fn slow_down(server: &mut Process) -> SlowMachine {
+    server.wait_for_stderr("reads the replay in ");
+    SlowMachine::for_process(server.pid())
+}
+
+/// How far the server is, as `driml status --json` has it; none once it has read all.
+fn recovering(system: &TestSystem) -> Option<Value> {
+    let ended = system.run(&format!("status --connect {} --json", system.endpoint()));
+    let answer: Value = serde_json::from_str(&ended.expect_code(0).stdout).unwrap();
+    let recovering = answer["servers"][0]["recovering"].clone();
+    if recovering.is_null() {
+        return None;
+    }
+    assert_eq!(answer["well"], false);
+    Some(recovering)
+}
+
+/// Whatever is asked is put off.
+fn check_put_off(system: &TestSystem, spec: &RunSpec) {
+    let endpoints = Endpoints {
+        listen: Vec::new(),
+        connect: vec![system.endpoint()],
+    };
+    let session = session::open(&endpoints).unwrap();
+    let run = RunClient::new(session, Keys::new("driml").unwrap(), spec.hash());
+    let answer_max = Duration::from_secs(10);
+    let chunk = Chunk::zeroed(header_of(5, spec.frame_bytes()));
+    let (header, payload) = (chunk.header, chunk.into_payload().freeze());
+    let actor = ActorJoin {
+        actor: 5,
+        incarnation: 1,
+    };
+    let learner = LearnerJoin {
+        learner: 99,
+        rows_sampled: 0,
+    };
+    let request = BatchRequest {
+        learner: 99,
+        id: RequestId::first(1),
+        rows: 16,
+        shared_memory: false,
+        other_shards: None,
+    };
+    let upload = WeightsUpload {
+        learner: 99,
+        weights: WeightsHeader::new(1, 0, b"weights"),
+    };
+    let sealed = |payload: &[u8]| run.seal_with(&upload, payload.to_vec().into()).unwrap();
+    let asked = [
+        ("a chunk", {
+            let chunk = run.seal_with(&header, payload).unwrap();
+            run.send(chunk, answer_max).unwrap().wait().map(drop)
+        }),
+        ("weights", {
+            let upload = run.send(sealed(b"weights"), answer_max).unwrap();
+            upload.wait().map(drop)
+        }),
+        ("a batch", run.ask(&request, answer_max).map(drop)),
+        ("an actor", run.ask(&actor, answer_max).map(drop)),
+        ("a learner", run.ask(&learner, answer_max).map(drop)),
+        ("settings", run.fetch::<Hello>(answer_max).map(drop)),
+        ("a status", run.fetch::<ReplayStatus>(answer_max).map(drop)),
+    ];
+    for (what, asked) in asked {
+        assert!(
+            matches!(asked, Err(SessionError::Recovering(_))),
+            "{what}: {asked:?}"
+        );
+    }
+}
+
+/// Parts that were there when the server died, and parts that come while it reads, for longer than they would wait for a silent one.
+#[test]
+fn everybody_waits_for_a_server_that_reads_its_replay_back() {
+    let system = system();
+    let spec = keep_for(&system, "replay");
+    let serve = format!("{} --replay-dir replay", flags());
+    let server = system.start_replay_server(&serve);
+    let mut learner = system.start_learner("run");
+    let mut actors = vec![system.start_actor(0)];
+    let client = system.connect();
+    client.wait_for_learner("some updates", |it| it.updates > 50);
+    drop(client);
+    server.signal(Signal::SIGKILL);
+    server.wait();
+
+    let mut server = system.start_replay_server(&serve);
+    let slow = slow_down(&mut server);
+    let first = recovering(&system).expect("it has a long log");
+    check_put_off(&system, &spec);
+    let endpoint = system.endpoint();
+    let status = format!("status --connect {endpoint}");
+    let said = system.run(&status).expect_code(0).stdout;
+    for words in [
+        "chain, c51: frames ?/",
+        "replay-server  reads its replay back",
+        "reads its replay back from disk (",
+        "wait, all goes on by itself",
+    ] {
+        assert!(said.contains(words), "{words:?}: {said}");
+    }
+    system
+        .run(&format!("watch --once --connect {endpoint}"))
+        .expect_code(1)
+        .expect_said("reads its replay back from disk");
+    let mut watched = system.start(&format!("watch --connect {endpoint} --run-dir seen"));
+    watched.wait_for_stderr(": reads its replay back from disk, ");
+    actors.push(system.start_actor(1));
+    actors[1].wait_for_stderr(WAITING);
+    actors[0].wait_for_stderr("the replay server reads its replay back from disk, ");
+    learner.wait_for_stderr("the replay server reads its replay back from disk, ");
+    let last = wait_for("more than parts would wait for a silent server", || {
+        let now = recovering(&system).expect("the log is long enough");
+        (now["since_s"].as_f64() > Some(UNREACHABLE_MAX_S + 3.0)).then_some(now)
+    });
+    let read = |it: &Value| it["bytes_read"].as_u64();
+    assert!(read(&last) > read(&first) && last["bytes"] == first["bytes"]);
+    assert!(read(&last) < last["bytes"].as_u64(), "{last}");
+    drop(slow);
+
+    for actor in actors {
+        actor.wait().expect_code(0);
+    }
+    let client = system.connect();
+    let status = client.wait_for_learner("the learner's last update", |it| it.finished);
+    let replay = client.replay().unwrap();
+    assert_eq!(
+        (status.updates, replay.rows_sampled),
+        (UPDATES, 16 * UPDATES)
+    );
+    assert_eq!(replay.transitions_inserted, FRAMES);
+    assert_eq!(
+        (replay.transitions_lost, replay.transitions_duplicated),
+        (0, 0)
+    );
+    assert_eq!(replay.actors_acting, 3, "9, 0 and 1, and never 5");
+    watched.wait().expect_code(0);
+    assert_eq!(system.run_folder("seen").summary().updates, UPDATES);
+    learner.stop().expect_code(0);
+    drop(client);
+    server
+        .stop()
+        .expect_code(0)
+        .expect_said("goes on with the replay in replay");
+}
+
+/// A server that is told to end does, however much is left to read; the next one reads it all.
+#[test]
+fn a_server_that_reads_is_stopped_and_started_again() {
+    let system = system();
+    keep_for(&system, "replay");
+    let serve = format!("{} --replay-dir replay", flags());
+    let mut server = system.start_replay_server(&serve);
+    let slow = slow_down(&mut server);
+    let mut actor = system.start_actor(0);
+    actor.wait_for_stderr(WAITING);
+    server
+        .stop()
+        .expect_code(0)
+        .expect_said("it was told to end while it read its replay back");
+    drop(slow);
+    actor.stop().expect_code(0);
+    let server = system.start_replay_server(&serve);
+    let replay = system.connect().replay().unwrap();
+    assert_eq!(replay.transitions_inserted, KEPT);
+    server.stop().expect_code(0);
+
+    // What cannot be read at all ends it with a sentence, and nobody waits for it any more.
+    for entry in fs::read_dir(system.path("replay")).unwrap() {
+        let path = entry.unwrap().path();
+        if path.extension().is_some_and(|it| it == "log") {
+            fs::write(path, "no log").unwrap();
+        }
+    }
+    let ended = system.start_replay_server(&serve).wait().expect_code(1);
+    ended.expect_said("no segment can be read");
+}
+
+#[test]
+fn a_resumed_run_shows_how_far_its_server_is() {
+    let system = system();
+    let mut process = system.start(&format!(
+        "local --durable {} --listen {} --run-dir run",
+        flags(),
+        system.endpoint()
+    ));
+    let client = system.connect();
+    client.wait_for_learner("some updates", |it| it.updates > 10);
+    drop(client);
+    process.stop().expect_code(130);
+    let run = system.run_folder("run");
+    let config = fs::read_to_string(run.path().join("config.toml")).unwrap();
+    keep(&run.path().join("replay"), &config);
+    let stored = run.summary().transitions_inserted + KEPT;
+    let frames = WARMUP + (stored + 2_000).next_multiple_of(256);
+
+    process = system.start(&format!("local --resume run --frames {frames}"));
+    wait_for("a server that reads", || {
+        let log = fs::read_to_string(run.path().join("logs/replay-server.log")).ok()?;
+        log.contains("reads the replay in ").then_some(())
+    });
+    let slow = SlowMachine::for_process(system.find_part("replay-server").pid);
+    process.wait_for_stderr("replay-server: reads its replay back from disk, ");
+    drop(slow);
+    process.wait().expect_code(0);
+    let summary = run.check_finished();
+    let updates = (frames - WARMUP) / 256;
+    assert_eq!((summary.frames, summary.updates), (frames, updates));
+    assert_eq!(
+        (summary.transitions_lost, summary.transitions_duplicated),
+        (0, 0)
+    );
+    assert_eq!(system.survivors(), []);
+}
+
+/// Each role hears it in the place of what it asked for.
+#[test]
+fn roles_are_told_too() {
+    let Some(tls) = TlsSystem::new("roles_are_told_too") else {
+        return;
+    };
+    keep_for(&tls.system, "replay");
+    let mut server = tls.start_server(&format!("{} --replay-dir replay", flags()));
+    let slow = slow_down(&mut server);
+    let mut parts = [
+        tls.start("actor --id 0", "tls"),
+        tls.start("learner --stay --run-dir run", "tls"),
+    ];
+    for part in &mut parts {
+        part.wait_for_stderr(WAITING);
+    }
+    let status = format!("status --connect {} --tls-dir tls", tls.endpoint);
+    let said = tls.system.run(&status).expect_code(0).stdout;
+    assert!(said.contains("reads its replay back"), "{said}");
+    drop(slow);
+    let [actor, learner] = parts;
+    actor.wait().expect_code(0);
+    learner.stop().expect_code(0);
+    server.stop().expect_code(0);
+}
