@@ -13,8 +13,8 @@ use nix::{
 };
 
 /// For how long it runs, and stands still, in turn.
-const RUNS: Duration = Duration::from_millis(10);
-const STANDS: Duration = Duration::from_millis(90);
+const RUNS: Duration = Duration::from_millis(3);
+const STANDS: Duration = Duration::from_millis(97);
 
 /// A process is slow until this is dropped.
 #[derive(Debug)]

@@ -17,11 +17,11 @@ use serde_json::Value;
 use crate::{system, tls::TlsSystem};
 
 /// Transitions in the log, each in a record of its own.
-const KEPT: u64 = 190_016;
-/// Updates of a run that goes on with them: one of 16 rows for 256 transitions after the warm-up.
-const UPDATES: u64 = 800;
+const KEPT: u64 = 500_000;
+/// Updates of a run that goes on with them: one of 16 rows for 1,024 transitions after the warm-up.
+const UPDATES: u64 = 503;
 const WARMUP: u64 = 192;
-const FRAMES: u64 = WARMUP + 256 * UPDATES;
+const FRAMES: u64 = WARMUP + 1024 * UPDATES;
 /// How long the parts of these runs would wait for a server that is silent, seconds.
 const UNREACHABLE_MAX_S: f64 = 5.0;
 /// What whoever waits says.
@@ -30,8 +30,8 @@ const WAITING: &str =
 
 fn flags() -> String {
     format!(
-        "--agent c51 --env chain --preset smoke --frames {FRAMES} --set replay.replay_ratio=0.0625 \
-         --set replay.warmup_transitions={WARMUP} --set replay.capacity_transitions=250000 \
+        "--agent c51 --env chain --preset smoke --frames {FRAMES} --set replay.replay_ratio=0.015625 \
+         --set replay.warmup_transitions={WARMUP} --set replay.capacity_transitions=550000 \
          --set actor.unreachable_max_ms=5000 --set learner.unreachable_max_ms=5000"
     )
 }
@@ -42,7 +42,7 @@ fn keep(folder: &Path, config_toml: &str) -> RunSpec {
     let spec: RunSpec = settings.table("run").unwrap();
     let mut config: Config = settings.table("replay").unwrap();
     // So that the learner need not follow.
-    config.replay_ratio = 1e-6;
+    (config.slack_transitions, config.transitions_max) = (1 << 40, None);
     let args = DurableArgs {
         dir: folder.to_owned(),
         shard: 0,
@@ -288,7 +288,7 @@ fn a_resumed_run_shows_how_far_its_server_is() {
     let config = fs::read_to_string(run.path().join("config.toml")).unwrap();
     keep(&run.path().join("replay"), &config);
     let stored = run.summary().transitions_inserted + KEPT;
-    let frames = WARMUP + (stored + 2_000).next_multiple_of(256);
+    let frames = WARMUP + (stored + 2_000).next_multiple_of(1024);
 
     process = system.start(&format!("local --resume run --frames {frames}"));
     wait_for("a server that reads", || {
@@ -300,7 +300,7 @@ fn a_resumed_run_shows_how_far_its_server_is() {
     drop(slow);
     process.wait().expect_code(0);
     let summary = run.check_finished();
-    let updates = (frames - WARMUP) / 256;
+    let updates = (frames - WARMUP) / 1024;
     assert_eq!((summary.frames, summary.updates), (frames, updates));
     assert_eq!(
         (summary.transitions_lost, summary.transitions_duplicated),
