@@ -21,8 +21,8 @@ def serve(make):
     gives rewards, ends and frames; frames are anything of N * height * width * channels bytes, channels last. A copy that ended
     begins anew in the same step: its frame is the first of the next episode.
 
-    A world that has `save_state()`, which gives bytes, and `load_state(bytes)` can be saved: one that loads a state goes on exactly as
-    the one did that saved it, so generators belong to it. The frames that `step` gave last do not: driml keeps them.
+    A world that has `save_state()`, which gives bytes, and `load_state(bytes)` can be saved: what loads a state goes on exactly as
+    what saved it did, so generators belong to it. The frames that `step` gave last do not: driml keeps them.
     """
     # The two pipes are driml's alone: whatever prints does so to the log, and whatever reads has nothing to read.
     asks, answers = os.fdopen(os.dup(0), "rb", 0), os.fdopen(os.dup(1), "wb", 0)
@@ -142,8 +142,9 @@ class Gymnasium:
 class Layers:
     """An environment, those that it wraps and those in a vector: what each of them holds, and how they take it back.
 
-    A layer with methods `save_state` and `load_state` of its own says so itself, generators included; ALE's is the emulator's state. Of any other it is all
-    attributes, as `pickle` copies them, with what functions without a name hold in their closures. What cannot be copied cannot be saved.
+    A layer with methods `save_state` and `load_state` of its own says so itself, generators included; ALE's is its emulator's. Of any
+    other it is all attributes, as `pickle` copies them, with what functions without a name hold in their closures. What cannot be copied
+    cannot be saved.
     """
 
     KEPT = {"env", "envs", "env_fns", "spec", "_cached_spec"}  # As they were made.
@@ -154,6 +155,8 @@ class Layers:
 
     def _add(self, env):
         self.layers.append(env)
+        if is_ale(env):
+            env.ale = Emulator(env.ale)
         inner = [vars(env)["env"]] if "env" in vars(env) else vars(env).get("envs", ())
         for env in inner:
             self._add(env)
@@ -197,17 +200,14 @@ class Layers:
             return layer.save_state()
         if not is_ale(layer):
             return {name: value for name, value in vars(layer).items() if name not in self.KEPT}
-        if layer.ale.getFloat("repeat_action_probability") > 0:
-            # Which action the emulator took last, and may take again, is in no state of it.
-            raise NotSaved("ALE does not save which action it repeats: --atari can be saved, or repeat_action_probability=0")
-        return layer.clone_state(include_rng=True), vars(layer).get("_np_random"), vars(layer).get("_np_random_seed")
+        return layer.ale.save(), vars(layer).get("_np_random"), vars(layer).get("_np_random_seed")
 
     def _take(self, layer, saved):
         if offers_state(layer):
             layer.load_state(saved)
         elif is_ale(layer):
             emulator, layer._np_random, layer._np_random_seed = saved
-            layer.restore_state(emulator)
+            layer.ale.load(*emulator)
         else:
             for name in vars(layer).keys() - self.KEPT - saved.keys():
                 delattr(layer, name)
@@ -231,6 +231,49 @@ class Layers:
                 if name not in self.KEPT:
                     add((number, name), value)
         return places, cells
+
+
+class Emulator:
+    """ALE's emulator: its state before the episode, and the actions since.
+
+    Its state of this moment would not do: in it are neither the action that it may repeat nor, in some games, all of the picture. The
+    reset that begins an episode sets both, and so the episode is played again.
+    """
+
+    def __init__(self, ale):
+        self.ale, self.before, self.first_frame, self.actions = ale, None, 0, bytearray()
+
+    def __getattr__(self, name):
+        return getattr(self.ale, name)
+
+    def reset_game(self):
+        self.before = self.ale.cloneState(include_rng=True)
+        self.actions.clear()
+        self.ale.reset_game()
+        self.first_frame = self.ale.getEpisodeFrameNumber()  # Not 0 where the game is chosen with a key.
+
+    def act(self, action, strength=1.0):
+        if strength != 1.0:
+            self.before = None
+        self.actions.append(action.value)
+        return self.ale.act(action, strength)
+
+    def restoreState(self, state):
+        self.before = None
+        self.ale.restoreState(state)
+
+    def save(self):
+        if self.before is None or self.ale.getEpisodeFrameNumber() != self.first_frame + len(self.actions):
+            raise NotSaved("ALE's emulator was not only reset and given actions since the episode began")
+        return self.before, bytes(self.actions)
+
+    def load(self, before, actions):
+        import ale_py
+
+        self.ale.restoreState(before)
+        self.reset_game()
+        for action in actions:
+            self.act(ale_py.Action(action))
 
 
 class Pickler(pickle.Pickler):
@@ -275,7 +318,7 @@ def offers_state(layer):
 
 
 def is_ale(layer):
-    return "ale" in vars(layer) and hasattr(type(layer), "clone_state") and hasattr(type(layer), "restore_state")
+    return type(layer).__module__.startswith("ale_py.") and "ale" in vars(layer)
 
 
 def made_with():
@@ -299,32 +342,14 @@ def maker(args):
     for module in args.imports:
         importlib.import_module(module)
     options = json.loads(args.kwargs)
-    sticky = 0.0
-    if args.atari:
-        # Every frame of the emulator is asked for, and four of them made one step here. Actions stick here too: ALE saves no action.
-        sticky = options.pop("repeat_action_probability", 0.25)
-        options = {"frameskip": 1} | options | {"repeat_action_probability": 0.0}
+    if args.atari:  # Every frame of the emulator is asked for, and four of them made one step here.
+        options = {"frameskip": 1, "repeat_action_probability": 0.25} | options
     if args.pixels:
         options = {"render_mode": "rgb_array"} | options
-
-    class Sticky(gymnasium.Wrapper):
-        """Repeats the action of the frame before with a probability, as ALE does: the no-op in an episode's first frame."""
-
-        taken = 0
-
-        def reset(self, **how):
-            self.taken = 0
-            return self.env.reset(**how)
-
-        def step(self, action):
-            if self.np_random.random() >= sticky:
-                self.taken = action
-            return self.env.step(self.taken)
 
     def make():
         env = gymnasium.make(args.env, **options)
         if args.atari:
-            env = Sticky(env)
             # Dopamine's: 4 frames a step, the larger of the last two, 84 x 84 grey, a life is not an episode, sticky actions and so no no-ops.
             env = wrappers.AtariPreprocessing(env, noop_max=0, frame_skip=4, screen_size=84, terminal_on_life_loss=False, grayscale_obs=True)
         if args.pixels:

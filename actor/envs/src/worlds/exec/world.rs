@@ -157,7 +157,8 @@ impl ExecWorld {
         let written = self.block.write_frames(frames);
         written.map_err(|e| self.process.fail(system(e)))?;
         self.say_state(LOAD, &memory, doing)?;
-        self.hear_done(self.config.step_patience(), doing)
+        // It belongs to a start, and may take as long: a world may have to play an episode again.
+        self.hear_done(self.config.start_patience(), doing)
     }
 }
 
