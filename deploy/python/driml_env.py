@@ -5,9 +5,13 @@ It needs nothing but what it wraps. `serve` alone, which needs nothing but Pytho
 methods of `Gymnasium` below; what is said to driml is described in actor/envs/src/worlds/exec/mod.rs.
 """
 
-import argparse, array, importlib, inspect, json, mmap, os, sys
+import argparse, array, importlib, inspect, io, json, mmap, os, pickle, platform, random, sys, types
 
 RUNNING, NEXT_LEVEL, TIMED_OUT, TERMINAL = 0, 1, 2, 3
+
+
+class NotSaved(Exception):
+    """Raised by a world's `save_state` where it cannot be done after all; says why."""
 
 
 def serve(make):
@@ -16,6 +20,9 @@ def serve(make):
     A world has `height`, `width`, `channels` and `actions` (names), `reset(seeds)`, which gives frames, and `step(actions)`, which
     gives rewards, ends and frames; frames are anything of N * height * width * channels bytes, channels last. A copy that ended
     begins anew in the same step: its frame is the first of the next episode.
+
+    A world that has `save_state()`, which gives bytes, and `load_state(bytes)` can be saved: what loads a state goes on exactly as
+    what saved it did, so generators belong to it. The frames that `step` gave last do not: driml keeps them.
     """
     # The two pipes are driml's alone: whatever prints does so to the log, and whatever reads has nothing to read.
     asks, answers = os.fdopen(os.dup(0), "rb", 0), os.fdopen(os.dup(1), "wb", 0)
@@ -28,6 +35,8 @@ def serve(make):
     world = make(copies)
     declaration = {"driml_env": 1, "copies": copies, "actions": list(world.actions)}
     declaration |= {"height": world.height, "width": world.width, "channels": world.channels}
+    if hasattr(world, "save_state") and hasattr(world, "load_state"):
+        declaration["saves"] = True
     answers.write(json.dumps(declaration).encode() + b"\n")
     opening = asks.readline()
     if not opening:
@@ -40,11 +49,33 @@ def serve(make):
     frames = begins("frames", copies * world.height * world.width * world.channels)
     block[frames] = world.reset(request["seeds"])
     answers.write(b".")
-    while asks.read(1):
-        earned, ended, block[frames] = world.step(block[actions])
-        block[rewards] = array.array("f", earned).tobytes()
-        block[ends] = bytes(ended)
-        answers.write(b".")
+    while asked := asks.read(1):
+        if asked == b"s":
+            earned, ended, block[frames] = world.step(block[actions])
+            block[rewards] = array.array("f", earned).tobytes()
+            block[ends] = bytes(ended)
+            answers.write(b".")
+        elif asked == b"S":
+            answers.write(save(world, json.loads(asks.readline())))
+        elif asked == b"L":
+            with open(json.loads(asks.readline())["state"], "rb") as file:
+                world.load_state(file.read())
+            answers.write(b".")
+        else:
+            sys.exit(f"this driml asks for {asked}, which this file does not know: take the file that came with it")
+
+
+def save(world, place):
+    """Writes the state of a world where driml wants it, and gives the answer."""
+    try:
+        state = world.save_state()
+    except NotSaved as why:
+        return b"-" + " ".join(str(why).split()).encode() + b"\n"
+    if len(state) > place["bytes_max"]:
+        return f"-its state has {len(state)} bytes, and {place['bytes_max']} are possible\n".encode()
+    with open(place["state"], "wb") as file:
+        file.write(state)
+    return b"."
 
 
 class Gymnasium:
@@ -60,6 +91,7 @@ class Gymnasium:
         else:
             vector = AsyncVectorEnv if workers else SyncVectorEnv
             self.env = vector([make] * copies, autoreset_mode=AutoresetMode.SAME_STEP)
+        self.layers = Layers(self.env)
         mode = AutoresetMode(self.env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         if mode == AutoresetMode.NEXT_STEP:
             # Its step after an end takes no action: as a transition it would lead from one episode into the next.
@@ -97,8 +129,201 @@ class Gymnasium:
         ends = numpy.where(terminated, TERMINAL, numpy.where(truncated, TIMED_OUT, RUNNING))
         return rewards, ends.astype(numpy.uint8), self._frames(frames)
 
+    def save_state(self):
+        return self.layers.save()
+
+    def load_state(self, state):
+        self.layers.load(state)
+
     def _frames(self, frames):
         return self.numpy.ascontiguousarray(self.numpy.moveaxis(frames, 1, -1) if self.channels_first else frames)
+
+
+class Layers:
+    """An environment, those that it wraps and those in a vector: what each of them holds, and how they take it back.
+
+    A layer with methods `save_state` and `load_state` of its own says so itself, generators included; ALE's is its emulator's. Of any
+    other it is all attributes, as `pickle` copies them, with what functions without a name hold in their closures. What cannot be copied
+    cannot be saved.
+    """
+
+    KEPT = {"env", "envs", "env_fns", "spec", "_cached_spec"}  # As they were made.
+
+    def __init__(self, env):
+        self.layers = []
+        self._add(env)
+
+    def _add(self, env):
+        self.layers.append(env)
+        if is_ale(env):
+            env.ale = Emulator(env.ale)
+        inner = [vars(env)["env"]] if "env" in vars(env) else vars(env).get("envs", ())
+        for env in inner:
+            self._add(env)
+
+    def save(self):
+        for layer in self.layers:
+            if hasattr(layer, "processes"):
+                raise NotSaved("the copies are processes of their own; without --workers they can be saved")
+        file = io.BytesIO()
+        try:
+            places, cells = self._places()
+            content = [self._content(layer) for layer in self.layers]
+            generators = random.getstate(), sys.modules["numpy"].random.get_state()
+            state = made_with(), generators, content, [cell.cell_contents for cell in cells]
+            Pickler(file, {id(it): place for place, it in places.items()}).dump(state)
+        except NotSaved:
+            raise
+        except Exception as why:  # What an environment holds may say no in any way.
+            raise NotSaved(f"{type(why).__name__}: {why}") from why
+        return file.getvalue()
+
+    def load(self, state):
+        places, cells = self._places()
+        try:
+            made, (python, numpy), content, contents = Unpickler(io.BytesIO(state), places).load()
+        except KeyError as why:
+            sys.exit(f"the state is of another world: this one has no {why}")
+        if made != made_with():
+            sys.exit(f"the state was saved with {made}, and this is {made_with()}: only the same goes on exactly")
+        if len(content) != len(self.layers) or len(contents) != len(cells):
+            sys.exit(f"the state is of another world: of {len(content)} environments and wrappers where this one has {len(self.layers)}")
+        for layer, saved in zip(self.layers, content):
+            self._take(layer, saved)
+        for cell, saved in zip(cells, contents):
+            cell.cell_contents = saved
+        random.setstate(python)
+        sys.modules["numpy"].random.set_state(numpy)
+
+    def _content(self, layer):
+        if offers_state(layer):
+            return layer.save_state()
+        if not is_ale(layer):
+            return {name: value for name, value in vars(layer).items() if name not in self.KEPT}
+        return layer.ale.save(), vars(layer).get("_np_random"), vars(layer).get("_np_random_seed")
+
+    def _take(self, layer, saved):
+        if offers_state(layer):
+            layer.load_state(saved)
+        elif is_ale(layer):
+            emulator, layer._np_random, layer._np_random_seed = saved
+            layer.ale.load(*emulator)
+        else:
+            for name in vars(layer).keys() - self.KEPT - saved.keys():
+                delattr(layer, name)
+            vars(layer).update(saved)
+
+    def _places(self):
+        """Where layers, and functions that they hold, are: one goes where it was. And all cells of those functions."""
+        places, cells, seen = {}, [], set()
+
+        def add(place, it):
+            if isinstance(it, types.FunctionType) and id(it) not in seen:
+                seen.add(id(it))
+                places[place] = it
+                for number, cell in enumerate(it.__closure__ or ()):
+                    cells.append(cell)
+                    add((*place, number), cell.cell_contents)
+
+        for number, layer in enumerate(self.layers):
+            places[number,] = layer
+            for name, value in sorted(vars(layer).items()):
+                if name not in self.KEPT:
+                    add((number, name), value)
+        return places, cells
+
+
+class Emulator:
+    """ALE's emulator: its state before the episode, and the actions since.
+
+    Its state of this moment would not do: in it are neither the action that it may repeat nor, in some games, all of the picture. The
+    reset that begins an episode sets both, and so the episode is played again.
+    """
+
+    def __init__(self, ale):
+        self.ale, self.before, self.first_frame, self.actions = ale, None, 0, bytearray()
+
+    def __getattr__(self, name):
+        return getattr(self.ale, name)
+
+    def reset_game(self):
+        self.before = self.ale.cloneState(include_rng=True)
+        self.actions.clear()
+        self.ale.reset_game()
+        self.first_frame = self.ale.getEpisodeFrameNumber()  # Not 0 where the game is chosen with a key.
+
+    def act(self, action, strength=1.0):
+        if strength != 1.0:
+            self.before = None
+        self.actions.append(action.value)
+        return self.ale.act(action, strength)
+
+    def restoreState(self, state):
+        self.before = None
+        self.ale.restoreState(state)
+
+    def save(self):
+        if self.before is None or self.ale.getEpisodeFrameNumber() != self.first_frame + len(self.actions):
+            raise NotSaved("ALE's emulator was not only reset and given actions since the episode began")
+        return self.before, bytes(self.actions)
+
+    def load(self, before, actions):
+        import ale_py
+
+        self.ale.restoreState(before)
+        self.reset_game()
+        for action in actions:
+            self.act(ale_py.Action(action))
+
+
+class Pickler(pickle.Pickler):
+    """Leaves in its place what has one, and refuses what would not come back as it is."""
+
+    def __init__(self, file, places):
+        super().__init__(file)
+        self.places = places
+        self.memory = set()
+
+    def persistent_id(self, it):
+        return self.places.get(id(it))
+
+    def reducer_override(self, it):
+        from gymnasium import Env, utils, vector
+
+        if isinstance(it, types.ModuleType):
+            return importlib.import_module, (it.__name__,)
+        if isinstance(it, (Env, vector.VectorEnv, utils.EzPickle)):
+            # Copied, it would be one that begins anew.
+            raise NotSaved(f"it holds a {type(it).__name__} that is not what it wraps; give it save_state and load_state")
+        if isinstance(it, sys.modules["numpy"].ndarray):
+            while getattr(it, "base", None) is not None:
+                it = it.base
+            if id(it) in self.memory:  # Copied, each would have its own.
+                raise NotSaved("it holds two arrays that share memory; give it save_state and load_state")
+            self.memory.add(id(it))
+        return NotImplemented
+
+
+class Unpickler(pickle.Unpickler):
+    def __init__(self, file, places):
+        super().__init__(file)
+        self.places = places
+
+    def persistent_load(self, place):
+        return self.places[place]
+
+
+def offers_state(layer):
+    return hasattr(type(layer), "save_state") and hasattr(type(layer), "load_state")
+
+
+def is_ale(layer):
+    return type(layer).__module__.startswith("ale_py.") and "ale" in vars(layer)
+
+
+def made_with():
+    names = [name for name in ("gymnasium", "numpy", "ale_py") if name in sys.modules]
+    return {"python": platform.python_version()} | {name: sys.modules[name].__version__ for name in names}
 
 
 def maker(args):

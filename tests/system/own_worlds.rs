@@ -3,7 +3,7 @@
 
 use std::{fs, path::Path};
 
-use driml_tests::{Process, TestSystem, skip, skipped_offline, wait_for};
+use driml_tests::{Process, Summary, TestSystem, skip, skipped_offline, wait_for};
 use nix::sys::signal::Signal;
 
 use crate::system;
@@ -72,6 +72,99 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let agent = ended.stdout.lines().nth(1).unwrap();
     assert!(agent.contains("mean return 10"), "{agent}");
     assert_eq!(system.survivors(), []);
+}
+
+/// What a run in lockstep came to.
+fn result(summary: Summary) -> (String, Option<f64>, Vec<u64>, u64) {
+    let Summary {
+        weights_sha256,
+        mean_return,
+        k_histogram,
+        episodes,
+        ..
+    } = summary;
+    (weights_sha256, mean_return, k_histogram, episodes)
+}
+
+/// Runs it whole; ended by each signal and resumed; and finished after half of its frames and prolonged. All come to the same.
+fn lockstep_goes_on(env: &str, flags: &str, frames: u64) {
+    let system = system();
+    let run = |frames: u64, name: &str| {
+        let args = format!("local --lockstep {flags} --frames {frames} --run-dir {name}");
+        start(&system, &args, env).wait().expect_code(0);
+        system.run_folder(name).check_finished()
+    };
+    let whole = run(frames, "whole");
+    assert!(whole.updates > 300 && whole.episodes > 0, "{whole:#?}");
+    let whole = result(whole);
+
+    let half = run(frames / 2, "half");
+    assert_ne!(half.weights_sha256, whole.0);
+    system
+        .run(&format!("local --resume half --frames {frames}"))
+        .expect_code(0);
+    let prolonged = system.run_folder("half").check_finished();
+    assert_eq!(result(prolonged), whole, "prolonged");
+
+    for signal in [Signal::SIGINT, Signal::SIGKILL] {
+        let args = format!("local --lockstep {flags} --frames {frames} --run-dir {signal}");
+        let process = start(&system, &args, env);
+        let run = system.run_folder(signal.as_str());
+        // After a checkpoint and before the next: what follows it is done again.
+        wait_for("updates after a checkpoint", || {
+            run.updates_recorded().filter(|&updates| updates > 110)
+        });
+        process.signal(signal);
+        process.wait();
+        system
+            .run(&format!("local --resume {signal}"))
+            .expect_code(0);
+        let resumed = run.check_finished();
+        assert!(resumed.resumed_after_updates >= 100, "{resumed:#?}");
+        assert_eq!(result(resumed), whole, "{signal}");
+    }
+    assert_eq!(system.survivors(), []);
+}
+
+#[test]
+fn a_process_that_saves_its_state_goes_on_exactly_in_lockstep() {
+    let flags = format!(
+        "{SMALL} --agent driml-ada --actors 2 --set replay.replay_ratio=8 --set learner.checkpoint_period_updates=100"
+    );
+    lockstep_goes_on(&numbered("saves"), &flags, 4096);
+}
+
+#[test]
+fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
+    let flags = format!("local --lockstep {SMALL} --agent c51 --frames 640");
+    for (fault, sentence) in [
+        ("", "this world's state cannot be saved"),
+        (
+            "saves never",
+            "cannot save its state: the dragon sits on it",
+        ),
+    ] {
+        let system = system();
+        let process = start(&system, &format!("{flags} --run-dir run"), &numbered(fault));
+        process
+            .wait()
+            .expect_code(0)
+            .expect_said(sentence)
+            .expect_said(": the run cannot be resumed, only repeated");
+        let run = system.run_folder("run");
+        run.check_finished();
+        assert!(!run.path().join("replay").exists());
+    }
+    // One that fails in it ends the run.
+    let system = system();
+    start(
+        &system,
+        &format!("{flags} --run-dir run"),
+        &numbered("saves large"),
+    )
+    .wait()
+    .expect_code(1)
+    .expect_said("wrote a state of 67108865 bytes; 67108864 are possible");
 }
 
 #[test]
@@ -224,6 +317,22 @@ fn atari_by_gymnasium_trains() {
     }
     assert_eq!(config["world"]["channels"].as_integer(), Some(1));
     assert_eq!(system.survivors(), []);
+}
+
+/// ALE's emulator, wrappers and generators come back as they were.
+#[test]
+fn atari_goes_on_exactly_in_lockstep() {
+    let Some(python) = gymnasium("own_worlds::atari_goes_on_exactly_in_lockstep") else {
+        return;
+    };
+    let env = format!(
+        "exec:{python} {} ALE/Breakout-v5 --atari --clip --size 20",
+        file("deploy/python/driml_env.py")
+    );
+    let flags = format!(
+        "{SMALL} --agent driml-ada --actors 2 --set replay.replay_ratio=8 --set learner.checkpoint_period_updates=100"
+    );
+    lockstep_goes_on(&env, &flags, 2048);
 }
 
 /// The adapter's own test, which needs Gymnasium: every way in which vectors begin anew, seeds, shapes, and what is refused.

@@ -1,6 +1,9 @@
-"""Checks driml_env.py's adapter with an environment of which every observation says which one it is. Needs Gymnasium."""
+"""Checks driml_env.py's adapter with an environment of which every observation says which one it is. Needs Gymnasium and ALE.
 
-import os, sys
+`check_adapter.py --games`: whether each of ALE's games goes on as it was saved, with Dopamine's preprocessing.
+"""
+
+import os, random, sys
 
 sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "../../deploy/python"))
 import driml_env
@@ -72,6 +75,126 @@ def check_refused(word, make):
         raise AssertionError(f"{word!r} was not said")
 
 
+class Chance(Numbered):
+    """Frames of chance: by its own generator, by one of Python's, and by what the episodes before were."""
+
+    def __init__(self):
+        super().__init__()
+        self.before = {"steps": [np.zeros(3, np.int64)]}
+
+    def observation(self, action):
+        self.before["steps"][0] += action + 1
+        drawn = [self.np_random.integers(256), random.randrange(256), self.before["steps"][0].sum() % 256, self.step_number]
+        return np.array(drawn, np.uint8).reshape(2, 2)
+
+
+class Own(Chance):
+    """It says itself how it stands, though `pickle` would not copy it."""
+
+    def __init__(self):
+        super().__init__()
+        self.open = (number for number in range(3))
+
+    def save_state(self):
+        return repr((self.np_random.bit_generator.state, self.episode, self.step_number, list(map(int, self.before["steps"][0])))).encode()
+
+    def load_state(self, state):
+        self.np_random.bit_generator.state, self.episode, self.step_number, steps = eval(state)
+        self.before["steps"][0][:] = steps
+
+
+def wrapped():
+    """A time limit, and a reward that a function without a name counts."""
+    count = 0
+
+    def reward(earned):
+        nonlocal count
+        count += 1
+        return earned + count
+
+    return gymnasium.wrappers.TransformReward(gymnasium.wrappers.TimeLimit(Chance(), 3), reward)
+
+
+def ale(*arguments, game="ALE/Breakout-v5"):
+    return driml_env.maker(driml_env.parser().parse_args([game, *arguments]))
+
+
+def check_games():
+    import ale_py
+
+    gymnasium.register_envs(ale_py)
+    games = sorted(name for name in gymnasium.registry if name.startswith("ALE/") and name.endswith("-v5"))
+    for game in games:
+        check_saved(ale("--atari", game=game), moves=False)
+        print(game, "goes on", flush=True)
+    print(len(games), "games go on as they were saved")
+
+
+def meddled():
+    """Its emulator is put back without a reset."""
+
+    class Meddled(gymnasium.Wrapper):
+        def reset(self, **how):
+            first = self.env.reset(**how)
+            self.unwrapped.restore_state(self.unwrapped.clone_state())
+            return first
+
+    return Meddled(ale()())
+
+
+def check_saved(make, steps=60, moves=True):
+    saver, other = driml_env.Gymnasium(make, 2), driml_env.Gymnasium(make, 2)
+    draw = np.random.default_rng(3)
+    actions = lambda: bytes(draw.integers(0, len(saver.actions), 2, np.uint8))
+    saver.reset([1, 2])
+    [saver.step(actions()) for _ in range(5)]
+    other.reset([3, 4])
+    [other.step(actions()) for _ in range(8)]
+    later = [[actions() for _ in range(steps)] for _ in range(2)]
+    state = saver.save_state()
+    goes_on = lambda world, chosen: [[bytes(np.asarray(it)) for it in world.step(them)] for them in chosen]
+    first, second = goes_on(saver, later[0]), goes_on(saver, later[1])
+    before = goes_on(other, later[0])
+    # Else what is checked below says nothing.
+    assert not moves or first != second and first != before
+    other.load_state(state)
+    assert goes_on(other, later[0]) == first
+    # It goes on from a state of one that had loaded one.
+    other.load_state(other.save_state())
+    assert goes_on(other, later[1]) == second
+
+
+def check_not_saved(word, make):
+    world = driml_env.Gymnasium(make, 2)
+    world.reset([1, 2])
+    try:
+        world.save_state()
+    except driml_env.NotSaved as said:
+        assert word in str(said), said
+    else:
+        raise AssertionError(f"{word!r} was not said")
+
+
+def check_foreign(word, saver, loader):
+    saver, loader = driml_env.Gymnasium(saver, 2), driml_env.Gymnasium(loader, 2)
+    saver.reset([1, 2]), loader.reset([1, 2])
+    try:
+        loader.load_state(saver.save_state())
+    except SystemExit as said:
+        assert word in str(said), said
+    else:
+        raise AssertionError(f"{word!r} was not said")
+
+
+def holding(what):
+    def make():
+        env = Chance()
+        env.held = what(env)
+        return env
+
+    return make
+
+
 def vector(mode, kind=SyncVectorEnv):
     return lambda copies: kind([Numbered] * copies, autoreset_mode=mode)
 
@@ -81,6 +204,8 @@ def with_spaces(**spaces):
 
 
 if __name__ == "__main__":
+    if sys.argv[1:] == ["--games"]:
+        sys.exit(check_games())
     check_episodes(driml_env.Gymnasium(lambda: Numbered(), 2))
     check_episodes(driml_env.Gymnasium(lambda: Numbered(), 2, workers=True))
     check_episodes(driml_env.Gymnasium(vector(AutoresetMode.SAME_STEP), 2))
@@ -95,3 +220,16 @@ if __name__ == "__main__":
     assert (world.height, world.width, world.channels) == (32, 20, 3)
     frames = np.frombuffer(bytes(world.reset([1, 2])), np.uint8).reshape(2, 32, 20, 3)
     assert (frames[1] == np.moveaxis(ChannelsFirst().observation(0), 0, -1)).all()
+    for make in (Numbered, Chance, Own, wrapped, lambda: Chance(), ale("--atari"), ale("--atari", "--clip", "--size", "40")):
+        check_saved(make)
+    check_saved(ale("--grey", "--size", "64"))
+    check_saved(lambda: gymnasium.make("ALE/Pong-v5", frameskip=(2, 5)))
+    for mode in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
+        check_saved(lambda copies: SyncVectorEnv([wrapped] * copies, autoreset_mode=mode))
+    check_not_saved("without --workers", vector(AutoresetMode.SAME_STEP, AsyncVectorEnv))
+    check_not_saved("generator", holding(lambda env: (number for number in range(3))))
+    check_not_saved("holds a Chance", holding(lambda env: [Chance()]))
+    check_not_saved("share memory", holding(lambda env: [array := np.zeros(9), array[3:]]))
+    check_not_saved("not only reset and given actions", meddled)
+    check_foreign("this one has no", wrapped, Chance)
+    check_foreign("3 environments and wrappers where this one has 7", Chance, wrapped)

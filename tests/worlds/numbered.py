@@ -4,13 +4,15 @@ A frame is 12 x 12 x 1 bytes, all of them the number of the copy's step in its e
 episode (counted from 0), and the two halves of the copy's seed modulo 65,536. Copy i has episodes of 3 + i steps: even ones end,
 odd ones time out. The reward is the action plus the step divided by 100, and 1000 in the last step.
 
-`numbered.py FAULT STEP`: what goes wrong in a step of that number, counted from 1.
+`numbered.py FAULT STEP`: what goes wrong in a step of that number, counted from 1. `numbered.py saves FAULT`: it offers to save its
+state, and what goes wrong then.
 """
 
-import os, sys, time
+import json, os, sys, time
 
 sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "../../deploy/python"))
-from driml_env import RUNNING, TERMINAL, TIMED_OUT, serve
+import driml_env
+from driml_env import RUNNING, TERMINAL, TIMED_OUT, NotSaved, serve
 
 FAULT, STEP = (sys.argv + ["none", "0"])[1:3]
 
@@ -39,7 +41,7 @@ class Numbered:
 
     def step(self, actions):
         self.steps_of_all += 1
-        if self.steps_of_all == int(STEP):
+        if str(self.steps_of_all) == STEP:
             fail()
         rewards, ends = [], []
         for copy, action in enumerate(actions):
@@ -51,9 +53,9 @@ class Numbered:
             ends.append(end)
             if end:
                 self.steps[copy], self.episodes[copy] = 0, self.episodes[copy] + 1
-        if self.steps_of_all == int(STEP) and FAULT == "nan":
+        if str(self.steps_of_all) == STEP and FAULT == "nan":
             rewards[1] = float("nan")
-        if self.steps_of_all == int(STEP) and FAULT == "end":
+        if str(self.steps_of_all) == STEP and FAULT == "end":
             ends[1] = 7
         return rewards, ends, self.frames()
 
@@ -70,5 +72,30 @@ def fail():
         Numbered.frames = lambda self: b"few bytes"
 
 
+class Saved(Numbered):
+    def save_state(self):
+        if STEP == "never":
+            raise NotSaved("the dragon sits on it")
+        if STEP == "raise":
+            raise RuntimeError("the dragon ate it")
+        if STEP == "hang":
+            time.sleep(3600)
+        return json.dumps([self.seeds, self.steps, self.episodes, self.steps_of_all]).encode()
+
+    def load_state(self, state):
+        if STEP == "lost":
+            sys.exit("the dragon does not give it back")
+        self.seeds, self.steps, self.episodes, self.steps_of_all = json.loads(state)
+
+
+def wrong_answer(world, place):
+    """What no `serve` does."""
+    if STEP == "large":
+        os.truncate(place["state"], place["bytes_max"] + 1)
+    return b"?" if STEP == "byte" else b"."
+
+
 if __name__ == "__main__":
-    serve(Numbered)
+    if STEP in ("large", "byte", "nothing"):
+        driml_env.save = wrong_answer
+    serve(Saved if FAULT == "saves" else Numbered)

@@ -70,7 +70,8 @@ pub trait Environment: Send {
     /// exactly as this one does.
     ///
     /// # Errors
-    /// [`EnvError::NotSaved`] where a world cannot do this, as it does unless it says otherwise; a fault of the engine.
+    /// One that [`is_not_saved`](EnvError::is_not_saved) where a world cannot do this, [`EnvError::NotSaved`] unless it says otherwise; a
+    /// fault of the engine.
     fn save(&mut self) -> Result<Vec<u8>, EnvError> {
         Err(EnvError::NotSaved)
     }

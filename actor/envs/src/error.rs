@@ -1,6 +1,6 @@
 //! Why a world could not be made or stepped.
 
-use crate::worlds::exec::error::ExecError;
+use crate::worlds::exec::error::{ExecError, Fault};
 
 /// Why a world could not be made or stepped.
 #[derive(Debug, thiserror::Error)]
@@ -40,6 +40,17 @@ pub enum EnvError {
         /// The world's copies.
         num_envs: usize,
     },
+}
+
+impl EnvError {
+    /// Whether it says that a world cannot say how it stands, though nothing is wrong with it.
+    pub fn is_not_saved(&self) -> bool {
+        match self {
+            Self::NotSaved => true,
+            Self::Exec(error) => matches!(error.fault, Fault::NotSaved { .. }),
+            _ => false,
+        }
+    }
 }
 
 impl From<ExecError> for EnvError {

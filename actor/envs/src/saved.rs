@@ -14,25 +14,35 @@ pub(crate) fn encode<T: Serialize>(state: &T) -> Result<Vec<u8>, EnvError> {
         .map_err(|e| EnvError::State(e.to_string()))
 }
 
+/// The state that [`encode`] wrote.
+pub(crate) fn decode_whole<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvError> {
+    let config = bincode::config::standard().with_limit::<STATE_BYTES_MAX>();
+    let (state, used) = bincode::serde::decode_from_slice(bytes, config)
+        .map_err(|e| EnvError::State(e.to_string()))?;
+    match bytes.len() - used {
+        0 => Ok(state),
+        over => Err(EnvError::State(format!("{over} bytes after its end"))),
+    }
+}
+
 /// The state of so many copies that [`encode`] wrote.
 pub(crate) fn decode<T: DeserializeOwned>(
     bytes: &[u8],
     num_envs: usize,
 ) -> Result<Vec<T>, EnvError> {
-    let config = bincode::config::standard().with_limit::<STATE_BYTES_MAX>();
-    let (copies, used): (Vec<T>, usize) = bincode::serde::decode_from_slice(bytes, config)
-        .map_err(|e| EnvError::State(e.to_string()))?;
-    if used != bytes.len() {
-        let over = bytes.len() - used;
-        return Err(EnvError::State(format!("{over} bytes after its end")));
-    }
-    if copies.len() != num_envs {
-        let count = copies.len();
-        return Err(EnvError::State(format!(
-            "{count} copies, and this world has {num_envs}"
-        )));
-    }
+    let copies: Vec<T> = decode_whole(bytes)?;
+    check_copies(copies.len(), num_envs)?;
     Ok(copies)
+}
+
+/// An error unless a state is of as many copies as this world has.
+pub(crate) fn check_copies(found: usize, num_envs: usize) -> Result<(), EnvError> {
+    if found == num_envs {
+        return Ok(());
+    }
+    Err(EnvError::State(format!(
+        "{found} copies, and this world has {num_envs}"
+    )))
 }
 
 /// An error unless `holds`: a state that this world cannot be in.

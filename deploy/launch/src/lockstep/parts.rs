@@ -5,7 +5,6 @@ use std::path::Path;
 
 use anyhow::{Context, bail};
 use driml_actor::{ActError, ActorSettings, Collector, CollectorState, Incarnation};
-use driml_envs::EnvError;
 use driml_learner::{Learner, LearnerConfig};
 use driml_machine::error::usage;
 use driml_protocol::{
@@ -71,11 +70,14 @@ impl Lockstep {
     /// Settings that cannot work, a world that cannot be made, a folder that cannot be written.
     pub(super) fn begin(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         let mut this = Self::in_memory(config)?;
-        if this.actor_states()?.is_none() {
-            console::line(
-                "this world's state cannot be saved: the run cannot be resumed, only repeated",
-            );
-            return Ok(this);
+        if let Err(e) = this.actor_states() {
+            return match e {
+                ActError::World(e) if e.is_not_saved() => {
+                    console::line(&format!("{e}: the run cannot be resumed, only repeated"));
+                    Ok(this)
+                }
+                e => Err(e.into()),
+            };
         }
         this.replay = open(config, run_dir, None)?;
         this.join_actors()?;
@@ -164,14 +166,12 @@ impl Lockstep {
         Ok(())
     }
 
-    /// How the actors stand; none where their world cannot say.
-    fn actor_states(&mut self) -> anyhow::Result<Option<Vec<CollectorState>>> {
-        let states: Result<Vec<_>, _> = self.actors.iter_mut().map(Collector::state).collect();
-        match states {
-            Ok(states) => Ok(Some(states)),
-            Err(ActError::World(EnvError::NotSaved)) => Ok(None),
-            Err(e) => Err(e.into()),
-        }
+    /// How the actors stand.
+    ///
+    /// # Errors
+    /// A world that cannot say, which [`EnvError::is_not_saved`](driml_envs::EnvError::is_not_saved) tells, or one that failed.
+    fn actor_states(&mut self) -> Result<Vec<CollectorState>, ActError> {
+        self.actors.iter_mut().map(Collector::state).collect()
     }
 
     /// Takes back what [`Lockstep::save`] kept.
@@ -231,9 +231,9 @@ impl Lockstep {
         let Some(replay) = self.replay.mark()? else {
             return Ok(self.learner.save(folder)?);
         };
-        let actors = self.actor_states()?.context(
-            "this world's state could be saved at the run's start and cannot be saved now",
-        )?;
+        let actors = self
+            .actor_states()
+            .context("saving the worlds for a checkpoint; at the run's start it could be done")?;
         let saved = SavedParts {
             actors,
             next_actor: self.next_actor,

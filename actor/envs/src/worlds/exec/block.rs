@@ -1,4 +1,4 @@
-//! The memory that an actor and a world's process share, read and written here as a file.
+//! The memory that an actor and a world's process share, read and written here as a file: what passes in each step, and a state.
 
 use std::fs::File;
 use std::io;
@@ -72,9 +72,8 @@ impl Block {
         self.layout
     }
 
-    /// Under which name another process of the same user opens it, as long as this process lives.
     pub(super) fn path(&self) -> String {
-        format!("/proc/{}/fd/{}", std::process::id(), self.file.as_raw_fd())
+        path(&self.file)
     }
 
     /// Puts down the actions [N].
@@ -111,4 +110,54 @@ impl Block {
     pub(super) fn read_frames(&self, frames: &mut [u8]) -> io::Result<()> {
         self.file.read_exact_at(frames, self.layout.frames as u64)
     }
+
+    /// Puts down the frames [N, H, W, C], as after a step.
+    ///
+    /// # Errors
+    /// The operating system refuses.
+    pub(super) fn write_frames(&self, frames: &[u8]) -> io::Result<()> {
+        self.file.write_all_at(frames, self.layout.frames as u64)
+    }
+}
+
+/// Memory for a state of a world, whose length is that of the state. It goes when this is dropped.
+pub(super) struct StateMemory {
+    file: File,
+}
+
+impl StateMemory {
+    /// # Errors
+    /// The operating system refuses.
+    pub(super) fn new(state: &[u8]) -> io::Result<Self> {
+        let file = File::from(memfd_create(c"driml-world-state", MFdFlags::MFD_CLOEXEC)?);
+        file.write_all_at(state, 0)?;
+        Ok(Self { file })
+    }
+
+    pub(super) fn path(&self) -> String {
+        path(&self.file)
+    }
+
+    /// How long the state is that lies there, bytes.
+    ///
+    /// # Errors
+    /// The operating system refuses.
+    pub(super) fn len(&self) -> io::Result<u64> {
+        Ok(self.file.metadata()?.len())
+    }
+
+    /// Reads the first `len` bytes.
+    ///
+    /// # Errors
+    /// The operating system refuses, or there are fewer.
+    pub(super) fn read(&self, len: usize) -> io::Result<Vec<u8>> {
+        let mut state = vec![0; len];
+        self.file.read_exact_at(&mut state, 0)?;
+        Ok(state)
+    }
+}
+
+/// Under which name another process of the same user opens a file without one, as long as this process lives.
+fn path(file: &File) -> String {
+    format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd())
 }

@@ -39,9 +39,9 @@ pub struct ExecConfig {
     pub channels: usize,
     /// The names of the actions, as declared.
     pub actions: Vec<String>,
-    /// How long the process may take to declare itself and for its first frames, milliseconds; then it is killed.
+    /// How long the process may take to declare itself, for its first frames and to load a state, milliseconds; then it is killed.
     pub start_timeout_ms: u64,
-    /// How long a step of all copies may take, milliseconds; then the process is killed.
+    /// How long a step of all copies may take, and to save their state, milliseconds; then the process is killed.
     pub step_timeout_ms: u64,
 }
 

@@ -92,11 +92,13 @@ pub enum Fault {
         /// Those asked for.
         asked: usize,
     },
-    /// It said something else than a byte that ends a step.
+    /// It said something else than the byte that it was to answer with.
     #[error(
-        "answered a step with the byte {byte:#04x} and not with `.`: does it print to stdout? That belongs to the protocol"
+        "answered {doing} with the byte {byte:#04x} and not with `.`: does it print to stdout? That belongs to the protocol"
     )]
     OtherByte {
+        /// In the middle of what.
+        doing: &'static str,
         /// What it said.
         byte: u8,
     },
@@ -117,6 +119,25 @@ pub enum Fault {
         copy: usize,
         /// The number.
         end: u8,
+    },
+    /// It offers to save its state, and found that it cannot.
+    #[error("cannot save its state: {why}")]
+    NotSaved {
+        /// Why, in its own words.
+        why: String,
+    },
+    /// It said that its state is saved and wrote none.
+    #[error(
+        "wrote no state: where it says `.` in the middle of saving its state, the bytes have to lie in \"state\""
+    )]
+    NoState,
+    /// Its state is too long.
+    #[error("wrote a state of {bytes} bytes; {max} are possible for all its copies together")]
+    StateTooLarge {
+        /// Its length.
+        bytes: u64,
+        /// The longest possible.
+        max: u64,
     },
 }
 

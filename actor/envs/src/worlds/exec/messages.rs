@@ -1,4 +1,5 @@
-//! The three lines of JSON with which an actor and a world's process find out what they are to each other.
+//! The three lines of JSON with which an actor and a world's process find out what they are to each other, and the one that says
+//! where a state lies.
 
 use serde::{Deserialize, Serialize};
 
@@ -37,6 +38,9 @@ pub(super) struct Declaration {
     pub(super) width: usize,
     pub(super) channels: usize,
     pub(super) actions: Vec<String>,
+    /// Whether it knows how to save and to load its state. Worlds of before say nothing of it.
+    #[serde(default)]
+    pub(super) saves: bool,
 }
 
 impl Declaration {
@@ -72,4 +76,11 @@ pub(super) struct Opening<'a> {
     pub(super) block: &'a str,
     #[serde(flatten)]
     pub(super) layout: Layout,
+}
+
+/// Where a state is to be written, or lies.
+#[derive(Debug, Serialize)]
+pub(super) struct StatePlace<'a> {
+    pub(super) state: &'a str,
+    pub(super) bytes_max: u64,
 }

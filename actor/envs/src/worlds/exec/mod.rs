@@ -11,6 +11,19 @@
 //! | actor | the actions lie in the block | the byte `s`, for each step |
 //! | world | rewards, ends and the next frames lie there | the byte `.`, for each step |
 //!
+//! A world that declares `"saves": true` besides is also asked for its state, between two steps:
+//!
+//! | who | says | by |
+//! | --- | --- | --- |
+//! | actor | `S` and `{"state": PATH, "bytes_max": M}` | a line to its stdin |
+//! | world | the state of all copies is written into the empty file `PATH` | the byte `.` |
+//! | | or: this world cannot be saved after all | the byte `-` and a line that says why |
+//! | actor | `L` and `{"state": PATH, "bytes_max": M}`: the file holds a state that a world of this command and of as many copies wrote | a line to its stdin |
+//! | world | goes on from that state; the frames lie in the block already | the byte `.` |
+//!
+//! A state is everything that decides what follows, generators included, in at most M bytes of the world's own choice. A state that
+//! the world does not take back is a reason to end, with a word to stderr.
+//!
 //! The end of its stdin tells the process to end. A process that only has to declare itself sees that end after its line: so
 //! the shapes are found before the actors start. There are as many `seeds` as copies, each below 2^31; copy i is seeded with
 //! the i-th. `PATH` is memory that both share; the numbers are where in it the columns begin, by bytes: `actions` [N] u8,
@@ -26,6 +39,7 @@ mod config;
 pub(crate) mod error;
 mod messages;
 mod process;
+mod state;
 #[cfg(test)]
 mod tests;
 mod world;

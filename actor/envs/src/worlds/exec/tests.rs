@@ -4,9 +4,11 @@
 use std::fs;
 use std::time::{Duration, Instant};
 
+use super::state::SavedExec;
 use super::*;
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
+use crate::saved::tests::goes_on;
 use crate::settings::WorldSettings;
 
 /// The command of the world that numbers its frames.
@@ -246,6 +248,136 @@ fn what_is_printed_into_the_protocol_is_named() {
             .unwrap_err(),
     );
     assert!(text.contains("the byte 0x72 and not with `.`"), "{text}");
+}
+
+#[test]
+fn a_world_that_offers_it_goes_on_where_it_was_saved() {
+    let config = config(numbered("saves"));
+    let mut worlds = Vec::new();
+    // Another seed each: what a world is, is in its state alone.
+    let ended = goes_on("a process", 60, || {
+        worlds.push(());
+        Box::new(ExecWorld::new(&config, 3, worlds.len() as u64).unwrap())
+    });
+    assert!(ended > 20, "{ended}");
+    // The frames that its next actions are taken in are those that there were.
+    let mut world = ExecWorld::new(&config, 2, 1).unwrap();
+    let (mut rewards, mut ends) = ([0.0; 2], [StepEnd::Running; 2]);
+    world.step(&[0, 1], &mut rewards, &mut ends).unwrap();
+    let (mut frames, mut other_frames) = (vec![0; 2 * 144], vec![0; 2 * 144]);
+    world.observe(&mut frames);
+    let mut other = ExecWorld::new(&config, 2, 2).unwrap();
+    other.load(&world.save().unwrap()).unwrap();
+    other.observe(&mut other_frames);
+    assert_eq!(numbers(&other_frames), numbers(&frames));
+}
+
+/// What is said of a world that offers to save its state, when it is asked to.
+fn save_fault(kind: &str) -> EnvError {
+    let config = ExecConfig {
+        step_timeout_ms: if kind == "hang" { 700 } else { 60_000 },
+        ..config(numbered(&format!("saves {kind}")))
+    };
+    let mut world = ExecWorld::new(&config, 2, 1).unwrap();
+    let state = world.save();
+    match kind {
+        "lost" => world.load(&state.unwrap()).unwrap_err(),
+        _ => state.unwrap_err(),
+    }
+}
+
+#[test]
+fn each_way_in_which_saving_can_fail_has_its_sentence() {
+    for (kind, sentences) in [
+        (
+            "never",
+            vec!["cannot save its state: the dragon sits on it"],
+        ),
+        ("nothing", vec!["wrote no state"]),
+        (
+            "large",
+            vec!["wrote a state of 67108865 bytes; 67108864 are possible"],
+        ),
+        (
+            "byte",
+            vec!["answered in the middle of saving its state with the byte 0x3f"],
+        ),
+        (
+            "raise",
+            vec![
+                "ended in the middle of saving its state (exit status: 1)",
+                "RuntimeError: the dragon ate it",
+            ],
+        ),
+        (
+            "hang",
+            vec![
+                "has not answered for 0.7 s in the middle of saving its state",
+                "--set world.step_timeout_ms=N",
+            ],
+        ),
+        (
+            "lost",
+            vec![
+                "ended in the middle of loading its state",
+                "the dragon does not give it back",
+            ],
+        ),
+    ] {
+        let error = save_fault(kind);
+        assert_eq!(error.is_not_saved(), kind == "never", "{kind}");
+        let text = said(error);
+        assert!(
+            text.starts_with("the world `exec python3 "),
+            "{kind}: {text}"
+        );
+        for sentence in sentences {
+            assert!(text.contains(sentence), "{kind}: {text}");
+        }
+    }
+}
+
+#[test]
+fn a_world_that_does_not_offer_it_is_not_asked() {
+    let mut world = ExecWorld::new(&config(numbered("")), 2, 1).unwrap();
+    assert!(matches!(world.save(), Err(EnvError::NotSaved)));
+    // It hears nothing of it, and goes on.
+    let (mut rewards, mut ends) = ([0.0; 2], [StepEnd::Running; 2]);
+    world.step(&[0, 1], &mut rewards, &mut ends).unwrap();
+}
+
+#[test]
+fn a_state_of_another_world_is_refused_by_name() {
+    let world =
+        |arguments: &str, copies| ExecWorld::new(&config(numbered(arguments)), copies, 1).unwrap();
+    let state = world("saves", 2).save().unwrap();
+    let refused = |arguments: &str, copies, state: &[u8]| {
+        said(world(arguments, copies).load(state).unwrap_err())
+    };
+    let text = refused("saves none other", 2, &state);
+    assert!(text.contains("it is of the world `exec python3 "), "{text}");
+    assert!(text.contains("numbered.py saves`, and this is `"), "{text}");
+    assert!(
+        text.contains("saves none other`: give the command"),
+        "{text}"
+    );
+    let text = refused("saves", 3, &state);
+    assert!(text.contains("2 copies, and this world has 3"), "{text}");
+    for wrong in [
+        &state[..state.len() - 1],
+        &[state.clone(), vec![0]].concat(),
+        &[],
+    ] {
+        let text = refused("saves", 2, wrong);
+        assert!(text.contains("no state of this world"), "{text}");
+    }
+    // The same command, which is another world now.
+    let config = ExecConfig {
+        height: 13,
+        ..config(numbered("saves"))
+    };
+    let why = SavedExec::from_bytes(&state, &config, 2).unwrap_err();
+    assert!(said(why).contains("the shape of its frames or its actions"));
 }
 
 /// Processes with this word in their command line.

@@ -1,12 +1,14 @@
 //! Copies of a game in a process of their own, as the trait has them: a byte to the process and one back for each step.
+//! What a saved state holds, and whose it is, is for `state`.
 
 use tracing::Level;
 
-use super::block::Block;
+use super::block::{Block, StateMemory};
 use super::config::{ExecConfig, in_words, introduce, seeds};
 use super::error::{ExecError, Fault};
-use super::messages::Opening;
+use super::messages::{Opening, StatePlace};
 use super::process::{Patience, WorldProcess};
+use super::state::{SavedExec, WORLD_STATE_BYTES_MAX};
 use crate::copies::{check_num_envs, check_step};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
@@ -15,17 +17,26 @@ use crate::settings::{Variants, WorldSettings};
 /// Says that the actions lie in the block.
 const STEP: u8 = b's';
 
-/// Says that the frames lie there, and after a step rewards and ends.
+/// Says that the frames lie there, and after a step rewards and ends; that a state is written, or taken.
 const DONE: u8 = b'.';
+
+/// Asks for the state.
+const SAVE: u8 = b'S';
+
+/// Gives a state back.
+const LOAD: u8 = b'L';
+
+/// Says that there is no state to be had, and why.
+const NOT_SAVED: u8 = b'-';
 
 /// Copies of one game, stepped by a process of their own.
 pub struct ExecWorld {
     process: WorldProcess,
     block: Block,
-    shape: FrameShape,
-    num_actions: usize,
+    config: ExecConfig,
     num_envs: usize,
-    step_patience: Patience,
+    /// Whether the process offers to save its state.
+    saves: bool,
 }
 
 impl ExecWorld {
@@ -78,10 +89,9 @@ impl ExecWorld {
         let mut world = Self {
             process,
             block,
-            shape,
-            num_actions: config.actions.len(),
+            config: config.clone(),
             num_envs,
-            step_patience: config.step_patience(),
+            saves: declared.saves,
         };
         world.hear_done(patience, doing)?;
         Ok(world)
@@ -90,8 +100,65 @@ impl ExecWorld {
     fn hear_done(&mut self, patience: Patience, doing: &'static str) -> Result<(), ExecError> {
         match self.process.byte(patience, doing)? {
             DONE => Ok(()),
-            byte => Err(self.process.fail(Fault::OtherByte { byte })),
+            byte => Err(self.process.fail(Fault::OtherByte { doing, byte })),
         }
+    }
+
+    /// Says that a state is to be saved or loaded, and where it lies.
+    fn say_state(
+        &mut self,
+        what: u8,
+        memory: &StateMemory,
+        doing: &'static str,
+    ) -> Result<(), ExecError> {
+        let path = memory.path();
+        let place = StatePlace {
+            state: &path,
+            bytes_max: WORLD_STATE_BYTES_MAX,
+        };
+        let mut line = vec![what];
+        line.extend(serde_json::to_vec(&place).expect("plain text and numbers are JSON"));
+        line.push(b'\n');
+        self.process.say(&line, doing)
+    }
+
+    /// The process's own bytes for how its copies stand.
+    fn save_process(&mut self) -> Result<Vec<u8>, ExecError> {
+        let doing = "in the middle of saving its state";
+        let patience = self.config.step_patience();
+        let system = |source| Fault::System { doing, source };
+        let memory = StateMemory::new(&[]).map_err(|e| self.process.fail(system(e)))?;
+        self.say_state(SAVE, &memory, doing)?;
+        match self.process.byte(patience, doing)? {
+            DONE => {}
+            NOT_SAVED => {
+                let line = self.process.line(patience, doing)?;
+                let why = String::from_utf8_lossy(&line).trim().to_owned();
+                return Err(self.process.fail(Fault::NotSaved { why }));
+            }
+            byte => return Err(self.process.fail(Fault::OtherByte { doing, byte })),
+        }
+        let bytes = memory.len().map_err(|e| self.process.fail(system(e)))?;
+        if bytes == 0 {
+            return Err(self.process.fail(Fault::NoState));
+        }
+        if bytes > WORLD_STATE_BYTES_MAX {
+            let max = WORLD_STATE_BYTES_MAX;
+            return Err(self.process.fail(Fault::StateTooLarge { bytes, max }));
+        }
+        let state = memory.read(bytes as usize);
+        state.map_err(|e| self.process.fail(system(e)))
+    }
+
+    fn load_process(&mut self, state: &[u8], frames: &[u8]) -> Result<(), ExecError> {
+        let doing = "in the middle of loading its state";
+        let system = |source| Fault::System { doing, source };
+        let memory = StateMemory::new(state).map_err(|e| self.process.fail(system(e)))?;
+        let written = self.block.write_frames(frames);
+        written.map_err(|e| self.process.fail(system(e)))?;
+        self.say_state(LOAD, &memory, doing)?;
+        // It belongs to a start, and may take as long: a world may have to play an episode again.
+        self.hear_done(self.config.start_patience(), doing)
     }
 }
 
@@ -132,11 +199,11 @@ impl WorldSettings for ExecConfig {
 
 impl Environment for ExecWorld {
     fn frame_shape(&self) -> FrameShape {
-        self.shape
+        self.config.frame_shape()
     }
 
     fn num_actions(&self) -> usize {
-        self.num_actions
+        self.config.actions.len()
     }
 
     fn num_envs(&self) -> usize {
@@ -146,7 +213,7 @@ impl Environment for ExecWorld {
     fn observe(&mut self, frames: &mut [u8]) {
         assert_eq!(
             frames.len(),
-            self.num_envs * self.shape.bytes(),
+            self.num_envs * self.config.frame_shape().bytes(),
             "observe needs room for every copy's frame"
         );
         self.block
@@ -160,13 +227,13 @@ impl Environment for ExecWorld {
         rewards: &mut [f32],
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError> {
-        check_step(self.num_envs, self.num_actions, actions, rewards, ends)?;
+        check_step(self.num_envs, self.num_actions(), actions, rewards, ends)?;
         let doing = "in the middle of a step";
         if let Err(source) = self.block.write_actions(actions) {
             return Err(self.process.fail(Fault::System { doing, source }).into());
         }
         self.process.say(&[STEP], doing)?;
-        self.hear_done(self.step_patience, doing)?;
+        self.hear_done(self.config.step_patience(), doing)?;
         let numbers = match self.block.read_results(rewards) {
             Ok(numbers) => numbers,
             Err(source) => return Err(self.process.fail(Fault::System { doing, source }).into()),
@@ -185,5 +252,24 @@ impl Environment for ExecWorld {
             return Err(self.process.fail(Fault::Reward { copy, reward }).into());
         }
         Ok(())
+    }
+
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        if !self.saves {
+            return Err(EnvError::NotSaved);
+        }
+        let state = self.save_process()?;
+        let mut frames = vec![0; self.num_envs * self.config.frame_shape().bytes()];
+        self.observe(&mut frames);
+        SavedExec::new(&self.config, self.num_envs, frames, state).to_bytes()
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        let SavedExec { frames, state, .. } =
+            SavedExec::from_bytes(state, &self.config, self.num_envs)?;
+        if !self.saves {
+            return Err(EnvError::NotSaved);
+        }
+        Ok(self.load_process(&state, &frames)?)
     }
 }

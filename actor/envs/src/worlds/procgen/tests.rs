@@ -96,6 +96,9 @@ fn another_build_of_the_library_is_played_by_its_path() {
     );
     std::os::unix::fs::symlink(engine.assets(), folder.path().join("assets")).unwrap();
 
+    crate::saved::tests::goes_on("another build", 50, || {
+        Box::new(ProcgenWorld::new(&other(&library), 2, 3, 0).unwrap())
+    });
     let mut published = ProcgenWorld::new(&config(Game::Coinrun), 2, 3, 0).unwrap();
     let mut other = ProcgenWorld::new(&other(&library), 2, 3, 0).unwrap();
     let mut rng = ChaCha8Rng::seed_from_u64(4);
