@@ -31,7 +31,7 @@ const WAITING: &str =
 fn flags() -> String {
     format!(
         "--agent c51 --env chain --preset smoke --frames {FRAMES} --set replay.replay_ratio=0.015625 \
-         --set replay.warmup_transitions={WARMUP} --set replay.capacity_transitions=550000 \
+         --set replay.warmup_transitions={WARMUP} --set replay.capacity_transitions=550000 --set replay.slack_transitions=2048 \
          --set actor.unreachable_max_ms=5000 --set learner.unreachable_max_ms=5000"
     )
 }
