@@ -5,7 +5,7 @@ use tracing::Level;
 
 use super::block::{Block, StateMemory};
 use super::config::{ExecConfig, in_words, introduce, seeds};
-use super::error::{ExecError, Fault};
+use super::error::{ExecError, Fault, LastWords};
 use super::messages::{Opening, StatePlace};
 use super::process::{Patience, WorldProcess};
 use super::state::{SavedExec, WORLD_STATE_BYTES_MAX};
@@ -134,7 +134,11 @@ impl ExecWorld {
             NOT_SAVED => {
                 let line = self.process.line(patience, doing)?;
                 let why = String::from_utf8_lossy(&line).trim().to_owned();
-                return Err(self.process.fail(Fault::NotSaved { why }));
+                // It lives on, and has said all there is to say.
+                return Err(ExecError {
+                    words: LastWords::default(),
+                    ..self.process.fail(Fault::NotSaved { why })
+                });
             }
             byte => return Err(self.process.fail(Fault::OtherByte { doing, byte })),
         }
