@@ -15,10 +15,12 @@ mod origin;
 mod parked;
 mod refused;
 mod run;
+mod run_args;
 mod server;
 mod status;
 mod timings;
 mod weights;
 mod weights_store;
 
-pub use run::{RunArgs, run};
+pub use run::run;
+pub use run_args::RunArgs;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use driml_protocol::RunSpec;
 
-use super::{run::RunArgs, weights_store::WeightsStore};
+use super::{run_args::RunArgs, weights_store::WeightsStore};
 use crate::{
     config::Config,
     durable::{DurableArgs, DurableError, DurableReplay, KeptReplay, Reading, shard_dir},

@@ -2,7 +2,6 @@
 //! What an answer is, is in the files named for the messages.
 
 use std::{
-    path::PathBuf,
     sync::{Arc, Condvar, Mutex},
     thread::JoinHandle,
     time::{Duration, Instant},
@@ -14,8 +13,7 @@ use driml_protocol::{
     config::{Settings, TransportConfig},
     join_within,
     session::{self, Endpoints},
-    shared_memory,
-    tls::{self, Credentials},
+    shared_memory, tls,
 };
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
@@ -26,6 +24,7 @@ use super::{
     members::Members,
     origin::Origin,
     parked::{ParkedChunks, ParkedRequests},
+    run_args::RunArgs,
     server::{Service, State},
     timings::Timings,
 };
@@ -48,31 +47,6 @@ const SPARE_MAX: usize = 8;
 
 /// How long the threads may take to end.
 const THREADS_END_MAX: Duration = Duration::from_secs(2);
-
-/// What a replay server is told at its start.
-#[derive(Clone, Debug)]
-pub struct RunArgs {
-    /// Endpoints to listen on.
-    pub listen: Vec<String>,
-    /// Routers to connect to, if any.
-    pub connect: Vec<String>,
-    /// With which certificate it takes part; none without TLS.
-    pub credentials: Option<Arc<Credentials>>,
-    /// Prefix of the run's keys.
-    pub namespace: String,
-    /// Which of the replay's shards this is, from 0.
-    pub shard: u32,
-    /// Updates of the learner after which the run goes on; 0 starts it.
-    pub after_updates: u64,
-    /// Bytes of a version of the weights, of which the replay server itself knows nothing; longer uploads are refused.
-    pub weights_bytes_max: usize,
-    /// The folder in which the replay is kept, if it is kept on disk; of several shards each has a folder of its own there.
-    pub dir: Option<PathBuf>,
-    /// Stay when the run is over, to be asked, until `shutdown`.
-    pub stay: bool,
-    /// The run's resolved settings, which it hands to whoever joins.
-    pub config_toml: String,
-}
 
 /// Runs the replay server until `shutdown`.
 ///

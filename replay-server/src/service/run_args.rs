@@ -1,0 +1,30 @@
+//! What a replay server is told at its start. It opens nothing.
+
+use std::{path::PathBuf, sync::Arc};
+
+use driml_protocol::tls::Credentials;
+
+/// What a replay server is told at its start.
+#[derive(Clone, Debug)]
+pub struct RunArgs {
+    /// Endpoints to listen on.
+    pub listen: Vec<String>,
+    /// Routers to connect to, if any.
+    pub connect: Vec<String>,
+    /// With which certificate it takes part; none without TLS.
+    pub credentials: Option<Arc<Credentials>>,
+    /// Prefix of the run's keys.
+    pub namespace: String,
+    /// Which of the replay's shards this is, from 0.
+    pub shard: u32,
+    /// Updates of the learner after which the run goes on; 0 starts it.
+    pub after_updates: u64,
+    /// Bytes of a version of the weights, of which the replay server itself knows nothing; longer uploads are refused.
+    pub weights_bytes_max: usize,
+    /// The folder in which the replay is kept, if it is kept on disk; of several shards each has a folder of its own there.
+    pub dir: Option<PathBuf>,
+    /// Stay when the run is over, to be asked, until `shutdown`.
+    pub stay: bool,
+    /// The run's resolved settings, which it hands to whoever joins.
+    pub config_toml: String,
+}
