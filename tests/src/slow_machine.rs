@@ -13,8 +13,8 @@ use nix::{
 };
 
 /// For how long it runs, and stands still, in turn.
-const RUNS: Duration = Duration::from_millis(3);
-const STANDS: Duration = Duration::from_millis(97);
+const RUNS: Duration = Duration::from_millis(2);
+const STANDS: Duration = Duration::from_millis(98);
 
 /// A process is slow until this is dropped.
 #[derive(Debug)]

@@ -17,9 +17,9 @@ use serde_json::Value;
 use crate::{system, tls::TlsSystem};
 
 /// Transitions in the log, each in a record of its own.
-const KEPT: u64 = 500_000;
+const KEPT: u64 = 1_000_000;
 /// Updates of a run that goes on with them: one of 16 rows for 1,024 transitions after the warm-up.
-const UPDATES: u64 = 503;
+const UPDATES: u64 = 991;
 const WARMUP: u64 = 192;
 const FRAMES: u64 = WARMUP + 1024 * UPDATES;
 /// How long the parts of these runs would wait for a server that is silent, seconds.
@@ -31,7 +31,7 @@ const WAITING: &str =
 fn flags() -> String {
     format!(
         "--agent c51 --env chain --preset smoke --frames {FRAMES} --set replay.replay_ratio=0.015625 \
-         --set replay.warmup_transitions={WARMUP} --set replay.capacity_transitions=550000 --set replay.slack_transitions=2048 \
+         --set replay.warmup_transitions={WARMUP} --set replay.capacity_transitions=1100000 --set replay.slack_transitions=2048 \
          --set actor.unreachable_max_ms=5000 --set learner.unreachable_max_ms=5000"
     )
 }
