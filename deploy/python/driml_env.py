@@ -241,10 +241,10 @@ class Emulator:
     """
 
     def __init__(self, ale):
-        self.ale, self.before, self.first_frame, self.actions = ale, None, 0, bytearray()
-
-    def __getattr__(self, name):
-        return getattr(self.ale, name)
+        self.ale, self.before, self.first_frame, self.actions = ale, None, 0, []
+        self.take, self.record = ale.act, self.actions.append
+        # All else that it can do, found without a detour.
+        vars(self).update({name: getattr(ale, name) for name in dir(ale) if not name.startswith("_") and not hasattr(Emulator, name)})
 
     def reset_game(self):
         self.before = self.ale.cloneState(include_rng=True)
@@ -255,8 +255,8 @@ class Emulator:
     def act(self, action, strength=1.0):
         if strength != 1.0:
             self.before = None
-        self.actions.append(action.value)
-        return self.ale.act(action, strength)
+        self.record(action)
+        return self.take(action, strength)
 
     def restoreState(self, state):
         self.before = None
@@ -265,7 +265,7 @@ class Emulator:
     def save(self):
         if self.before is None or self.ale.getEpisodeFrameNumber() != self.first_frame + len(self.actions):
             raise NotSaved("ALE's emulator was not only reset and given actions since the episode began")
-        return self.before, bytes(self.actions)
+        return self.before, bytes(action.value for action in self.actions)
 
     def load(self, before, actions):
         import ale_py
