@@ -1,7 +1,10 @@
 //! The parts as a person starts them in terminals: joined by an endpoint alone, ended by signals.
 //! The launcher has no part in it.
 
+use std::fs;
+
 use driml_protocol::Waiting;
+use driml_tests::Process;
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
@@ -223,5 +226,26 @@ fn a_killed_learner_s_successor_goes_on() {
         .wait()
         .expect_code(1)
         .expect_said("resume with the settings it was made with");
+    server.stop().expect_code(0);
+}
+
+/// Whoever starts it, a part has the environment that candle and the C library read; what the user has set stays.
+#[test]
+fn a_part_by_hand_settles_its_environment() {
+    let system = system();
+    let flags = format!(
+        "replay-server --listen {} --env chain --preset smoke",
+        system.endpoint()
+    );
+    let mut command = system.command(&flags);
+    command
+        .env("CANDLE_NUM_THREADS", "3")
+        .env_remove("MALLOC_ARENA_MAX");
+    let mut server = Process::start(flags, command);
+    server.wait_for_stderr("replay server listens on ");
+    let environ = fs::read_to_string(format!("/proc/{}/environ", server.pid())).unwrap();
+    let has = |variable: &str| environ.split('\0').any(|it| it == variable);
+    assert!(has("MALLOC_ARENA_MAX=2") && has("MALLOC_TRIM_THRESHOLD_=10000000000"));
+    assert!(has("CANDLE_NUM_THREADS=3"));
     server.stop().expect_code(0);
 }

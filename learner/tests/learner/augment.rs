@@ -5,14 +5,14 @@ use driml_learner::{Augment, AugmentSettings, augment::View};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-const NOTHING: AugmentSettings = AugmentSettings {
+pub(crate) const NOTHING: AugmentSettings = AugmentSettings {
     crop_side: 1.0,
     brightness: 0.0,
     contrast: 0.0,
     saturation: 0.0,
     hue: 0.0,
 };
-const PAPER: AugmentSettings = AugmentSettings {
+pub(crate) const PAPER: AugmentSettings = AugmentSettings {
     crop_side: 0.8,
     brightness: 0.4,
     contrast: 0.4,

@@ -17,6 +17,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     agents,
+    augment::{NOTHING, PAPER},
     checkpoint::{Folder, change_state},
     made_up::{CPC, CURL, DIM},
 };
@@ -121,21 +122,6 @@ fn served_with(config: &LearnerConfig, seed: u64, change: impl Fn(&mut [RowScala
     batch
 }
 
-const STRONG: AugmentSettings = AugmentSettings {
-    crop_side: 0.8,
-    brightness: 0.4,
-    contrast: 0.4,
-    saturation: 0.4,
-    hue: 0.4,
-};
-const NOTHING: AugmentSettings = AugmentSettings {
-    crop_side: 1.0,
-    brightness: 0.0,
-    contrast: 0.0,
-    saturation: 0.0,
-    hue: 0.0,
-};
-
 #[test]
 fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
     for objective in [DIM, CPC] {
@@ -147,7 +133,7 @@ fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
                 .update(&batch)
                 .unwrap()
         };
-        let (plain, identity, strong) = (report(None), report(Some(NOTHING)), report(Some(STRONG)));
+        let (plain, identity, strong) = (report(None), report(Some(NOTHING)), report(Some(PAPER)));
         // The augmented states go through a pass of their own, so the sum of gradients may round otherwise.
         assert_eq!(
             (plain.c51_kl, &plain.losses),
@@ -169,7 +155,7 @@ fn an_augmenting_run_resumes_bit_for_bit() {
             std::process::id()
         ));
         let _ = fs::remove_dir_all(&folder);
-        let config = config(objective, Some(STRONG));
+        let config = config(objective, Some(PAPER));
         let learn = |learner: &mut Learner, updates: std::ops::Range<u64>| {
             for seed in updates {
                 learner.update(&served(&config, seed)).unwrap();
@@ -208,7 +194,7 @@ fn an_augmenting_run_resumes_bit_for_bit() {
 #[test]
 fn a_curl_checkpoint_without_a_key_encoder_is_refused() {
     let folder = Folder::new("old-curl");
-    let config = config(CURL, Some(STRONG));
+    let config = config(CURL, Some(PAPER));
     let learner = Learner::new(config.clone(), &Compute::CPU).unwrap();
     learner.save(&folder.0).unwrap();
     let path = folder.0.join("checkpoint-000000000000");
@@ -233,7 +219,7 @@ fn a_curl_checkpoint_without_a_key_encoder_is_refused() {
 /// A refused batch leaves the generator where it was.
 #[test]
 fn a_refused_batch_draws_nothing() {
-    let config = config(CURL, Some(STRONG));
+    let config = config(CURL, Some(PAPER));
     let good = served(&config, 1);
     let bad = served_with(&config, 2, |rows| rows[0].action = 77);
     let mut learner = Learner::new(config.clone(), &Compute::CPU).unwrap();
@@ -258,7 +244,7 @@ fn augmentation_and_objective_belong_together() {
             .to_string()
     };
     assert!(said(CURL, None).contains("take the agent curl"));
-    let mut c51 = config(DIM, Some(STRONG)).learner;
+    let mut c51 = config(DIM, Some(PAPER)).learner;
     c51.update.objective = Objective::NONE;
     assert!(
         c51.validate()
@@ -266,7 +252,7 @@ fn augmentation_and_objective_belong_together() {
             .to_string()
             .contains("this agent has none")
     );
-    let wild = AugmentSettings { hue: 0.7, ..STRONG };
+    let wild = AugmentSettings { hue: 0.7, ..PAPER };
     assert_eq!(
         said(DIM, Some(wild)),
         "learner.augment.hue = 0.7 cannot work: it must lie between 0 and 0.5, half a turn either way"

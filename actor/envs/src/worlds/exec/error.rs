@@ -134,7 +134,7 @@ pub enum Fault {
     /// Its state is too long.
     #[error("wrote a state of {bytes} bytes; {max} are possible for all its copies together")]
     StateTooLarge {
-        /// Its length.
+        /// Its length, of all copies together.
         bytes: u64,
         /// The longest possible.
         max: u64,
