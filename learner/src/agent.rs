@@ -1,11 +1,10 @@
 //! One update: C51 plus the auxiliary objective, clipped, through Adam; then the target network's turn.
 //! It does not fetch batches, publish weights or keep checkpoints, and knows no process but its own.
 
-use std::{borrow::Cow, collections::HashMap};
+use std::collections::HashMap;
 
 use candle_core::Tensor;
-use driml_model::{Compute, DimHeads, HeadNoise, ModelConfig, Network, Parameters, StoredAs};
-use driml_protocol::NO_ACTION;
+use driml_model::{Compute, DimHeads, ModelConfig, Network, Parameters, StoredAs};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
@@ -14,20 +13,18 @@ use crate::{
         loss::{AuxiliaryLoss, LossInputs, OnlineFeatures, WeightedLoss},
     },
     batch::Batch,
+    bellman::{Bellman, BellmanTarget, distribution},
     error::UpdateError,
-    losses::{
-        c51::{kl_loss, row_kls, softmax},
-        projection::project,
-    },
+    losses::c51::{kl_loss, row_kls},
     noise::UpdateNoise,
     optimiser::{
         adam::Adam,
         gradients::{Gradients, clip_factor},
         target,
     },
-    repeats::{Distinct, EqualStates, State, one_after_another},
+    repeats::EqualStates,
     settings::LearnerSettings,
-    tensors::states,
+    tensors::{flat, states},
 };
 
 /// What one update did: the numbers of a row of metrics.
@@ -60,7 +57,8 @@ pub struct Evaluation {
     pub total: f32,
     /// Online logits [B, N] of the actions taken in s_t, without a graph.
     pub taken_logits: Tensor,
-    /// Greedy action in s_{t+n} [B]; [`NO_ACTION`] where the row does not bootstrap, as nothing is computed of that state.
+    /// Greedy action in s_{t+n} [B]; [`NO_ACTION`](driml_protocol::NO_ACTION) where the row does not bootstrap, as nothing is
+    /// computed of that state.
     pub next_greedy_action: Vec<u8>,
     /// Projected target distributions [B, N].
     pub target_projection: Vec<f32>,
@@ -294,7 +292,7 @@ impl Agent {
         self.check(batch)?;
         // Neither needs the other: what one does on a single thread falls into the other's products.
         let (target, features) = rayon::join(
-            || self.make_target(batch, noise),
+            || self.bellman().target(batch, noise),
             || {
                 OnlineFeatures::new(
                     &self.online_network,
@@ -306,7 +304,10 @@ impl Agent {
                 )
             },
         );
-        let (next_greedy_action, target_projection) = target?;
+        let BellmanTarget {
+            next_greedy_action,
+            projection: target_projection,
+        } = target?;
         let features = features?;
         let taken_logits = self.online_network.taken_logits(
             &features.now.f4,
@@ -364,9 +365,9 @@ impl Agent {
     /// # Errors
     /// States that do not fit the network.
     pub fn q_values_t(&self, batch: &Batch<'_>) -> Result<Vec<f32>, UpdateError> {
-        let states = self.states(batch.states_t)?;
+        let states = states(&self.model, batch.states_t, &self.compute.device)?;
         let logits = distribution(&self.online_network, &states, None)?;
-        flat(&self.online_network.q_values(&logits)?)
+        Ok(flat(&self.online_network.q_values(&logits)?)?)
     }
 
     /// Clips `gradients` and takes one step with them; moves the slow networks whose turn it is.
@@ -395,103 +396,15 @@ impl Agent {
         Ok(norm)
     }
 
-    /// Greedy actions in s_{t+n} [B] and their distributions one Bellman step earlier [B, N], without a graph.
-    ///
-    /// Rows without a bootstrap are left out of the pass: whatever s_{t+n} is, all of their mass goes to their return.
-    fn make_target(
-        &self,
-        batch: &Batch<'_>,
-        noise: &UpdateNoise,
-    ) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
-        let ModelConfig {
-            atoms,
-            v_min,
-            v_max,
-            ..
-        } = self.model;
-        let mut next_greedy = vec![NO_ACTION; batch.rows];
-        let mut probs = vec![0f32; batch.rows * atoms];
-        for probs in probs.chunks_exact_mut(atoms) {
-            probs[0] = 1.0;
+    const fn bellman(&self) -> Bellman<'_> {
+        Bellman {
+            model: &self.model,
+            compute: &self.compute,
+            online: &self.online_network,
+            target: &self.target_network,
+            double_dqn: self.settings.double_dqn,
+            equal_states: self.equal_states,
         }
-        let bootstraps: Vec<usize> = batch.bootstraps().collect();
-        if !bootstraps.is_empty() {
-            let (actions, logits) = self.next_greedy(batch, noise)?;
-            for ((&row, action), logits) in bootstraps
-                .iter()
-                .zip(actions)
-                .zip(logits.chunks_exact(atoms))
-            {
-                next_greedy[row] = action;
-                softmax(logits, &mut probs[row * atoms..][..atoms]);
-            }
-        }
-        if !probs.iter().all(|p| p.is_finite()) {
-            return Err(UpdateError::NonFinite {
-                what: "the target network's distribution".to_owned(),
-            });
-        }
-        let mut projected = vec![0f32; probs.len()];
-        project(
-            &probs,
-            batch.n_step_return,
-            batch.bootstrap_discount,
-            v_min,
-            v_max,
-            &mut projected,
-        );
-        Ok((next_greedy, projected))
-    }
-
-    /// Greedy actions in s_{t+n} of the rows that bootstrap [n], and the target network's logits [n, N] of them.
-    fn next_greedy(
-        &self,
-        batch: &Batch<'_>,
-        noise: &UpdateNoise,
-    ) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
-        let ModelConfig {
-            num_actions, atoms, ..
-        } = self.model;
-        let len = self.model.frame_len();
-        let frames: Vec<State<'_>> = batch.next_states(len).into_iter().map(Some).collect();
-        let once = self.equal_states.once_by(self.compute.kernels);
-        let distinct = once.then(|| Distinct::of(&frames)).flatten();
-        let states_n = match &distinct {
-            Some(distinct) => Cow::Owned(distinct.gather(&frames, len)),
-            None if batch.states_n.len() == frames.len() * len => Cow::Borrowed(batch.states_n),
-            None => Cow::Owned(one_after_another(frames.iter().copied(), len)),
-        };
-        let states_n = states(&self.model, states_n, &self.compute.device)?;
-        let target_logits = distribution(&self.target_network, &states_n, noise.target.as_ref())?;
-        let (network, values) = if self.settings.double_dqn {
-            let logits = distribution(&self.online_network, &states_n, noise.choice.as_ref())?;
-            ("online", self.online_network.q_values(&logits)?)
-        } else {
-            ("target", self.target_network.q_values(&target_logits)?)
-        };
-        let values = flat(&values)?;
-        if !values.iter().all(|q| q.is_finite()) {
-            return Err(UpdateError::NonFinite {
-                what: format!("the {network} network's value of an s_{{t+n}}"),
-            });
-        }
-        let of_state: Vec<u8> = values.chunks_exact(num_actions).map(greedy).collect();
-        let logits = flat(&target_logits)?;
-        let (mut actions, mut chosen) = (Vec::new(), Vec::with_capacity(frames.len() * atoms));
-        for row in 0..frames.len() {
-            let state = distinct
-                .as_ref()
-                .map_or(row, |it| it.places()[row] as usize);
-            let action = of_state[state];
-            let at = (state * num_actions + usize::from(action)) * atoms;
-            chosen.extend_from_slice(&logits[at..at + atoms]);
-            actions.push(action);
-        }
-        Ok((actions, chosen))
-    }
-
-    fn states(&self, bytes: &[u8]) -> candle_core::Result<Tensor> {
-        states(&self.model, bytes, &self.compute.device)
     }
 
     /// Puts back a state that [`Agent::online`], [`Agent::target`] and [`Adam`] had after `updates` updates.
@@ -506,31 +419,6 @@ impl Agent {
         self.updates = updates;
         Ok(())
     }
-}
-
-/// Logits [B, A, N] of `frames`, cut off from any graph.
-fn distribution(
-    network: &Network,
-    frames: &Tensor,
-    noise: Option<&HeadNoise>,
-) -> Result<Tensor, UpdateError> {
-    let f4 = network.features(frames)?.f4;
-    Ok(network.noisy_logits(&f4, noise)?.detach())
-}
-
-fn flat(tensor: &Tensor) -> Result<Vec<f32>, UpdateError> {
-    Ok(tensor.flatten_all()?.to_vec1()?)
-}
-
-/// Index of the first largest value.
-fn greedy(values: &[f32]) -> u8 {
-    let mut best = 0;
-    for (i, value) in values.iter().enumerate() {
-        if *value > values[best] {
-            best = i;
-        }
-    }
-    u8::try_from(best).expect("a model has at most 255 actions")
 }
 
 fn finite(what: &str, loss: &Tensor) -> Result<f32, UpdateError> {

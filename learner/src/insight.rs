@@ -9,7 +9,7 @@ use crate::{
     auxiliary::dim::{DIM, Dim, Vectors, dots_of},
     error::UpdateError,
     losses::c51::softmax,
-    tensors::states,
+    tensors::{flat, states},
 };
 
 /// An agent's online network, to be asked.
@@ -64,14 +64,14 @@ impl Insight {
             .features(&states(&self.model, bytes, &self.compute.device)?)?;
         let logits = self.network.logits(&features.f4)?;
         let q_values = self.network.q_values(&logits)?;
-        let logits = logits.flatten_all()?.to_vec1::<f32>()?;
+        let logits = flat(&logits)?;
         let mut probabilities = vec![0.0; logits.len()];
         let rows = probabilities.chunks_exact_mut(self.model.atoms);
         for (probabilities, logits) in rows.zip(logits.chunks_exact(self.model.atoms)) {
             softmax(logits, probabilities);
         }
         Ok(Seen {
-            q_values: q_values.flatten_all()?.to_vec1()?,
+            q_values: flat(&q_values)?,
             probabilities,
             features,
         })
@@ -105,7 +105,7 @@ impl Insight {
         let dots = dots_of(vectors.kernels, psi, phi)?;
         let scores = dim.scores(dots.rkhs);
         let (locations, rows, _) = dots.dots.dims3()?;
-        let dots = dots.dots.flatten_all()?.to_vec1::<f32>()?;
+        let dots = flat(&dots.dots)?;
         let mut matches = vec![0.0; rows * locations];
         for (index, candidates) in dots.chunks_exact(rows).enumerate() {
             let (location, row) = (index / rows, index % rows);

@@ -52,6 +52,7 @@ mod agent;
 pub mod augment;
 pub mod auxiliary;
 mod batch;
+mod bellman;
 pub mod checkpoint;
 mod config;
 pub mod cost;

@@ -20,6 +20,11 @@ pub(crate) fn states<'a>(
     }
 }
 
+/// All values of a tensor of f32, in their order.
+pub(crate) fn flat(tensor: &Tensor) -> candle_core::Result<Vec<f32>> {
+    tensor.flatten_all()?.to_vec1()
+}
+
 /// The f32 values of a contiguous tensor on the CPU.
 pub(crate) fn slice<'a>(
     storage: &'a CpuStorage,

@@ -41,8 +41,9 @@ mod wire;
 pub use client::{Announcer, PendingReply, RunClient, Sealed};
 pub use messages::{
     affinity::AffinityUpdate,
-    batch::{Batch, BatchHeader, BatchReply, NO_ACTION, POOL_BATCHES},
+    batch::{Batch, NO_ACTION},
     batch_frames::StackedFrames,
+    batch_header::{BatchHeader, BatchReply, POOL_BATCHES},
     batch_request::{BatchRequest, RequestId},
     batch_rows::{BatchStatesMut, RowScalars},
     chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES, transitions_max},

@@ -1,8 +1,6 @@
 //! What holds of the agents beside C51 and DIM: CPC's offsets, CURL's two views.
 //! The arithmetic's oracle is in `parity`; a learner of each agent is in `served`.
 
-use std::collections::BTreeMap;
-
 use driml_learner::{
     Agent, Batch, Lambda, LearnerSettings, NetworkParameters, Objective, UpdateError,
 };
@@ -10,7 +8,7 @@ use driml_model::{Compute, ModelConfig, Parameters};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::made_up::{ALL_DIM, CPC, CURL, DIM, NO_DIM, Rows, model, settings};
+use crate::made_up::{ALL_DIM, CPC, CURL, DIM, NO_DIM, Rows, Values, model, settings, values};
 
 pub(crate) const GLOBAL: Lambda = Lambda {
     l4t4: 1.0,
@@ -246,16 +244,6 @@ fn curl_compares_its_views_and_not_the_state() {
         ..curl(&other)
     };
     assert_ne!(loss(&batch), before, "the key's view");
-}
-
-type Values = BTreeMap<String, Vec<f32>>;
-
-fn values(parameters: &Parameters) -> Values {
-    let flat = |var: &candle_core::Var| var.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-    let named = parameters.iter();
-    named
-        .map(|(name, var)| (name.to_owned(), flat(var)))
-        .collect()
 }
 
 /// The part of `values` whose names pass `part`.

@@ -18,8 +18,8 @@ use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
 
 use crate::{
+    errors::diverged,
     made_up::{ACTIONS, ALL_DIM, CANDLE, Rows, agent, agent_on, model, settings},
-    update::diverged,
 };
 
 const SPEC: u64 = 0x0123_4567_89ab_cdef;

@@ -1,11 +1,14 @@
 //! Small networks, settings and batches for these tests.
 //! Nothing here is measured or asserted.
 
+use std::collections::HashMap;
+
+use candle_core::{Device, Tensor};
 use driml_learner::{
-    AdamSettings, Agent, Batch, Lambda, LearnerSettings, Objective,
+    AdamSettings, Agent, Batch, Lambda, LearnerSettings, NetworkParameters, Objective,
     auxiliary::{cpc, curl, dim},
 };
-use driml_model::{Compute, ConvLayer, HeadConfig, Kernels, ModelConfig};
+use driml_model::{Compute, ConvLayer, HeadConfig, Kernels, ModelConfig, Parameters};
 use driml_protocol::NO_ACTION;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -171,4 +174,45 @@ impl Rows {
             importance_weight: None,
         }
     }
+}
+
+pub(crate) type Values = HashMap<String, Vec<f32>>;
+
+/// All parameters, by name.
+pub(crate) fn values(parameters: &Parameters) -> Values {
+    let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    parameters
+        .iter()
+        .map(|(name, var)| (name.to_owned(), flat(var)))
+        .collect()
+}
+
+/// `agent` with its online parameters changed.
+pub(crate) fn changed(agent: &Agent, change: impl Fn(&str, &mut [f32])) -> Agent {
+    let tensors = |parameters: &Parameters, change: &dyn Fn(&str, &mut [f32])| {
+        let mut tensors = HashMap::new();
+        for (name, var) in parameters.iter() {
+            let mut values: Vec<f32> = var.flatten_all().unwrap().to_vec1().unwrap();
+            change(name, &mut values);
+            tensors.insert(
+                name.to_owned(),
+                Tensor::from_vec(values, var.dims(), &Device::Cpu).unwrap(),
+            );
+        }
+        tensors
+    };
+    let device = Device::Cpu;
+    let model = agent.model();
+    let online =
+        Parameters::from_tensors(model, tensors(agent.online(), &change), &device).unwrap();
+    let acting = model.without_dim();
+    let target =
+        Parameters::from_tensors(&acting, tensors(agent.target(), &|_, _| ()), &device).unwrap();
+    let parameters = NetworkParameters {
+        online,
+        target,
+        key: None,
+    };
+    let settings = agent.settings().clone();
+    Agent::from_parameters(model.clone(), settings, &Compute::CPU, parameters).unwrap()
 }

@@ -7,6 +7,7 @@ mod agents;
 mod augment;
 mod checkpoint;
 mod equal_states;
+mod errors;
 mod made_up;
 mod ranges;
 mod served;

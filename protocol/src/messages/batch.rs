@@ -3,242 +3,18 @@
 
 use std::borrow::Cow;
 
-use serde::{Deserialize, Serialize};
-
 use super::{
     batch_frames::StackedFrames,
-    batch_layout::{BatchLayout, Column},
+    batch_header::BatchHeader,
+    batch_layout::Column,
     batch_rows::{BatchStatesMut, RowScalars},
     priorities::{Origin, PriorityPart, PriorityUpdate},
-    status::Waiting,
     tally::Tally,
 };
-use crate::{
-    run_spec::RunSpec,
-    sampling::Sampling,
-    wire::{
-        buffers::Buffer,
-        codec::PAYLOAD_BYTES_MAX,
-        error::CodecError,
-        message::{Kind, Message, no_payload},
-        shared_memory,
-    },
-};
+use crate::wire::{buffers::Buffer, error::CodecError};
 
 /// Stands where a row has no next action: its transition ended the episode or the level.
 pub const NO_ACTION: u8 = 255;
-
-/// Batches that a replay server keeps in shared memory: those that are assembled, on their way, and being copied by the learner.
-pub const POOL_BATCHES: usize = 6;
-
-/// What a batch says of itself.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct BatchHeader {
-    /// Rows, B.
-    pub rows: u32,
-    /// Positives a row, P: 0 without DIM.
-    pub positives: u32,
-    /// Bytes of one state.
-    pub state_bytes: u32,
-    /// States s_{t+k} that travel: one for each positive that a row has, at most P for each row.
-    pub states_k: u32,
-    /// States s_{t+n} that travel: one for each row that bootstraps, at most B.
-    pub states_n: u32,
-    /// What the replay server that drew this had counted then, this batch included.
-    pub tally: Tally,
-    /// Transitions that it held.
-    pub held: u64,
-    /// Mean age of the rows, in transitions stored since.
-    pub mean_age: f64,
-    /// Version of the newest weights that chose an action of this batch, and of the oldest.
-    pub weights_versions: (u64, u64),
-    /// Who drew the rows, where they are drawn by priority; it travels as [`BatchReply::Prioritised`], and other batches have no
-    /// byte of it.
-    #[serde(skip)]
-    pub origin: Option<Origin>,
-    /// The frames that states are stacks of, each of which travels once; it travels as [`BatchReply::Stacked`], and batches whose
-    /// states are one frame each have no byte of it.
-    #[serde(skip)]
-    pub stacked: Option<StackedFrames>,
-}
-
-impl BatchHeader {
-    /// A batch of `rows` rows of this run, before any row is drawn: as large as one can be.
-    pub fn of(spec: &RunSpec, rows: u32) -> Self {
-        let positives = spec.horizon.positives() as u32;
-        Self {
-            rows,
-            positives,
-            state_bytes: spec.state_bytes() as u32,
-            states_k: rows.saturating_mul(positives),
-            states_n: rows,
-            tally: Tally::default(),
-            held: 0,
-            mean_age: 0.0,
-            weights_versions: (0, u64::MAX),
-            origin: None,
-            stacked: StackedFrames::of(spec, rows),
-        }
-    }
-
-    /// The same where rows are drawn by this rule.
-    #[must_use]
-    pub fn sampled_by(self, sampling: &Sampling) -> Self {
-        Self {
-            origin: sampling.is_prioritised().then(Origin::default),
-            ..self
-        }
-    }
-
-    /// Bytes of the shared memory in which a replay server keeps [`POOL_BATCHES`] such batches.
-    pub fn pool_bytes(&self) -> usize {
-        shared_memory::pool_bytes(POOL_BATCHES, self.payload_bytes())
-    }
-
-    /// Bytes of the payload of such a batch.
-    ///
-    /// # Panics
-    /// If they are more than the address space, which no batch of a run is.
-    pub fn payload_bytes(&self) -> usize {
-        self.layout()
-            .bytes()
-            .expect("a batch is far below the address space")
-    }
-
-    const fn layout(&self) -> BatchLayout {
-        BatchLayout {
-            rows: self.rows as usize,
-            positives: self.positives as usize,
-            state_bytes: self.state_bytes as usize,
-            states_k: self.states_k as usize,
-            states_n: self.states_n as usize,
-            is_prioritised: self.origin.is_some(),
-            stacked: self.stacked,
-        }
-    }
-
-    /// Checks that `payload` is as long as such a batch's, has as many states as its rows say, and that these are made of its frames.
-    fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
-        let layout = self.layout();
-        if layout.bytes() != Some(payload.len()) || self.rows == 0 {
-            let of_frames = self.stacked.map_or_else(String::new, |stacked| {
-                let StackedFrames {
-                    frames,
-                    frame_stack,
-                    frame_channels,
-                } = stacked;
-                format!(
-                    ", made of {frames} frames of {frame_channels} channels, {frame_stack} each,"
-                )
-            });
-            return Err(CodecError::Header(format!(
-                "{} rows with {} positives of {} bytes, {} and {} of them there{of_frames} do not fill {} bytes of payload",
-                self.rows,
-                self.positives,
-                self.state_bytes,
-                self.states_k,
-                self.states_n,
-                payload.len()
-            )));
-        }
-        if let Some(stacked) = self.stacked {
-            // What few frames may be made into, if many states have them.
-            let whole = BatchLayout {
-                stacked: None,
-                ..layout
-            };
-            if whole.bytes().is_none_or(|bytes| bytes > PAYLOAD_BYTES_MAX) {
-                return Err(CodecError::Header(format!(
-                    "{} rows whose states would fill more than {PAYLOAD_BYTES_MAX} bytes",
-                    self.rows
-                )));
-            }
-            let stacks = layout.range(Column::StatesT).start..layout.range(Column::StatesN).end;
-            if let Some(number) = stacked.first_unknown(&payload[stacks]) {
-                return Err(CodecError::Header(format!(
-                    "a state of frame {number}, of {} that travel",
-                    stacked.frames
-                )));
-            }
-        }
-        let rows = (layout.positives_there(payload), layout.bootstraps(payload));
-        let count = |there: &[bool]| there.iter().filter(|there| **there).count();
-        let counted = (count(&rows.0), count(&rows.1));
-        if counted != (layout.states_k, layout.states_n) {
-            return Err(CodecError::Header(format!(
-                "rows with {} positives and {} bootstraps come with {} and {} states",
-                counted.0, counted.1, self.states_k, self.states_n
-            )));
-        }
-        let (chances, _) = payload[layout.range(Column::Probability)].as_chunks();
-        let mut chances = chances.iter().map(|&chance| f32::from_le_bytes(chance));
-        if let Some(chance) = chances.find(|chance| !(*chance > 0.0 && *chance <= 1.0)) {
-            return Err(CodecError::Header(format!(
-                "a row that was drawn with the probability {chance}"
-            )));
-        }
-        Ok(())
-    }
-}
-
-/// The answer to a request.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub enum BatchReply {
-    /// The payload that follows is a batch.
-    Batch(BatchHeader),
-    /// Nothing yet: ask again.
-    Wait(Waiting),
-    /// All transitions are in and all their rows were sampled: stop.
-    Finished,
-    /// Never: the reason, for a person.
-    Refused {
-        /// The replay server's reason, a sentence.
-        why: String,
-    },
-    /// The payload that follows is a batch whose rows were drawn by priority, and who drew them.
-    Prioritised(BatchHeader, Origin),
-    /// The payload that follows is a batch whose states are stacks of these frames; and who drew its rows, if by priority.
-    Stacked(BatchHeader, StackedFrames, Option<Origin>),
-}
-
-impl BatchReply {
-    /// The reply with a batch of this header.
-    pub const fn of(header: BatchHeader) -> Self {
-        match (header.stacked, header.origin) {
-            (None, None) => Self::Batch(header),
-            (None, Some(origin)) => Self::Prioritised(header, origin),
-            (Some(stacked), origin) => Self::Stacked(header, stacked, origin),
-        }
-    }
-
-    /// The header of the batch, if it is one.
-    pub const fn header(&self) -> Option<BatchHeader> {
-        match *self {
-            Self::Batch(header) => Some(header),
-            Self::Prioritised(header, origin) => Some(BatchHeader {
-                origin: Some(origin),
-                ..header
-            }),
-            Self::Stacked(header, stacked, origin) => Some(BatchHeader {
-                stacked: Some(stacked),
-                origin,
-                ..header
-            }),
-            Self::Wait(_) | Self::Finished | Self::Refused { .. } => None,
-        }
-    }
-}
-
-impl Message for BatchReply {
-    const KIND: Kind = Kind::BatchReply;
-
-    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
-        match self.header() {
-            Some(header) => header.check_payload(payload),
-            None => no_payload(payload),
-        }
-    }
-}
 
 /// Rows (s_t, a_t, a_{t+1}, R_t, discount, s_{t+k}, s_{t+n}), as the replay server made them.
 ///
@@ -549,7 +325,7 @@ impl Batch {
         BatchStatesMut::new(self.header.layout(), &mut self.payload)
     }
 
-    /// Header and payload, to travel as [`BatchReply::of`] the header.
+    /// Header and payload, to travel as [`BatchReply::of`](super::batch_header::BatchReply::of) the header.
     pub fn into_payload(self) -> (BatchHeader, Buffer) {
         (self.header, self.payload)
     }

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{batch::BatchReply, tally::Tally};
+use super::{batch_header::BatchReply, tally::Tally};
 use crate::wire::message::{Keyed, Kind, Message, Request};
 
 /// The learner's request.

@@ -4,6 +4,7 @@
 pub(crate) mod affinity;
 pub(crate) mod batch;
 pub(crate) mod batch_frames;
+pub(crate) mod batch_header;
 mod batch_layout;
 pub(crate) mod batch_request;
 pub(crate) mod batch_rows;

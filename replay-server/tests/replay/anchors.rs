@@ -9,7 +9,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    exactly_once::{join, stored, wait},
+    calls::{join, stored, wait},
     history::{History, identity, spec, unlimited},
     law::ChiSquare,
 };

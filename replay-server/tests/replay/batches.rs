@@ -4,7 +4,8 @@
 use std::collections::{HashMap, HashSet};
 
 use driml_protocol::{
-    Batch, BatchHeader, ChunkHeader, Goodbye, Horizon, InsertReply, RunSpec, TimeoutRule, Waiting,
+    Batch, BatchHeader, Chunk, ChunkHeader, End, Goodbye, Horizon, InsertReply, RunSpec,
+    TimeoutRule, Waiting,
 };
 use driml_replay_server::{Compression, PackedBatch, Replay, ReproducedBug, Unready};
 use proptest::prelude::*;
@@ -12,7 +13,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    exactly_once::{join, stored},
+    calls::{header, join, small_spec, stored},
     history::{History, identity, spec, unlimited},
 };
 
@@ -200,7 +201,7 @@ proptest! {
                     actor.next.sequence = 1;
                     actor.next.first_transition = u64::from(streams);
                     if old.sequence > 0 {
-                        let stray = driml_protocol::Chunk::zeroed(old);
+                        let stray = Chunk::zeroed(old);
                         let answer = replay.insert(&stray);
                         prop_assert!(matches!(answer, InsertReply::Refused { .. }), "{:?}", answer);
                         refused += 1;
@@ -223,7 +224,7 @@ proptest! {
                 // A retry of a stored chunk.
                 2 if actor.next.sequence > 0 => {
                     let sequence = rng.random_range(0..actor.next.sequence);
-                    let chunk = driml_protocol::Chunk::zeroed(ChunkHeader { sequence, ..actor.next });
+                    let chunk = Chunk::zeroed(ChunkHeader { sequence, ..actor.next });
                     let stored = stored(history.inserted);
                     prop_assert_eq!(replay.insert(&chunk), stored);
                     retried += 1;
@@ -231,7 +232,7 @@ proptest! {
                 // A chunk that is ahead of its time.
                 3 => {
                     let sequence = actor.next.sequence + rng.random_range(1..4);
-                    let chunk = driml_protocol::Chunk::zeroed(ChunkHeader { sequence, ..actor.next });
+                    let chunk = Chunk::zeroed(ChunkHeader { sequence, ..actor.next });
                     let expected = InsertReply::OutOfOrder { expected: actor.next.sequence };
                     prop_assert_eq!(replay.insert(&chunk), expected);
                 }
@@ -279,4 +280,31 @@ proptest! {
         };
         prop_assert!(same, "{found:?} is not {mean_return:?}");
     }
+}
+
+/// The same seed and the same calls give the same batches; another seed gives others.
+#[test]
+fn batches_follow_from_the_seed() {
+    let batches = |seed| {
+        let spec = RunSpec {
+            seed,
+            horizon: Horizon::Uniform { k_max: 3 },
+            ..small_spec()
+        };
+        let mut replay = Replay::new(&spec, &unlimited(1000), 8).unwrap();
+        join(&mut replay, 0, 1);
+        let mut chunk = Chunk::zeroed(ChunkHeader {
+            steps: 100,
+            ..header(0, 1, 0, 0)
+        });
+        for row in 0..200 {
+            chunk.set(row, (row % 5) as u8, row as f32, End::Running);
+        }
+        replay.insert(&chunk);
+        [replay.sample(32).unwrap(), replay.sample(32).unwrap()]
+    };
+    assert_eq!(batches(1), batches(1));
+    assert_ne!(batches(1), batches(2));
+    let [first, second] = batches(1);
+    assert_ne!(first, second);
 }

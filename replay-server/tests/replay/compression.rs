@@ -8,7 +8,7 @@ use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    exactly_once::join,
+    calls::join,
     history::{spec, unlimited},
 };
 

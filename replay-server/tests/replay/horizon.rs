@@ -12,7 +12,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    exactly_once::join,
+    calls::join,
     history::{History, identity, spec, unlimited},
     law::ChiSquare,
 };

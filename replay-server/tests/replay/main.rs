@@ -4,6 +4,7 @@
 
 mod anchors;
 mod batches;
+mod calls;
 mod compression;
 mod config;
 mod durable;
@@ -13,6 +14,7 @@ mod exactly_once;
 mod history;
 mod horizon;
 mod law;
+mod limits;
 mod priorities;
 mod rate_limiter;
 mod resume;

@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batches::check_rows,
-    exactly_once::join,
+    calls::join,
     history::{History, StreamKey, identity, spec, unlimited},
     law::ChiSquare,
 };

@@ -4,7 +4,7 @@
 use driml_replay_server::{Config, Replay, Unready};
 
 use crate::{
-    exactly_once::{header, insert, small_spec, stored},
+    calls::{header, insert, small_spec, stored},
     history::unlimited,
 };
 

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, missing_docs)]
 
 mod conv;
+mod head;
 mod linear;
 mod network;
 mod parity;

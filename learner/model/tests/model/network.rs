@@ -8,8 +8,8 @@ use driml_model::{
 };
 
 use crate::support::{
-    DUELING, NOISY, NOISY_DUELING, assert_close, bits, frames, parameters, rng, small, small_with,
-    values, variable,
+    DUELING, NOISY, NOISY_DUELING, assert_close, bits, floats, frames, parameters, rng, small,
+    small_with, variable, with_biases,
 };
 
 /// out(relu(hidden(x))) + skip(x) by candle's operations, x [rows, in].
@@ -27,20 +27,6 @@ fn stock_block(parameters: &Parameters, name: &str, x: &Tensor) -> Result<Tensor
         }
     };
     layer("out", &layer("hidden", x)?.relu()?)? + layer("skip", x)?
-}
-
-/// Initial biases are 0; tests want them to matter.
-fn with_biases(config: &ModelConfig) -> Parameters {
-    let (parameters, rng) = (parameters(config, 7), &mut rng(8));
-    for (name, var) in parameters
-        .iter()
-        .filter(|(name, _)| name.ends_with(".bias") || name.ends_with(".bias_mu"))
-    {
-        let values = crate::support::floats(var.dims(), rng);
-        var.set(&values)
-            .unwrap_or_else(|error| panic!("{name}: {error}"));
-    }
-    parameters
 }
 
 /// Every output of the network for a batch, one after the other, and the gradients of their weighted sum.
@@ -66,7 +52,7 @@ fn outputs_and_gradients(
     ];
     let mut total = Tensor::new(0f32, &Device::Cpu)?;
     for (seed, output) in (10..).zip(&outputs[1..]) {
-        let weights = crate::support::floats(output.dims(), &mut rng(seed));
+        let weights = floats(output.dims(), &mut rng(seed));
         total = (total + (output * weights)?.sum_all()?)?;
     }
     Ok((outputs, Backward::of(&total)?))
@@ -221,78 +207,6 @@ fn the_same_bits_for_any_number_of_threads(precision: Precision, config: &ModelC
     }
 }
 
-/// Logits as the paper writes them, V + A - mean_a A after two products, and the same of one action a row.
-#[test]
-fn a_dueling_head_is_the_sum_of_its_streams() -> Result<()> {
-    let config = small_with(DUELING);
-    let parameters = with_biases(&config);
-    let network = Network::new(&config, &parameters).unwrap();
-    let f4 = crate::support::floats(&[6, config.hidden], &mut rng(4));
-    let stream = |name: &str, outputs: &[usize]| -> Result<Tensor> {
-        let weight = parameters.get(&format!("{name}.weight")).unwrap();
-        let bias = parameters.get(&format!("{name}.bias")).unwrap();
-        let outputs = [&[6], outputs].concat();
-        let y = f4.relu()?.matmul(&weight.t()?)?.broadcast_add(bias)?;
-        y.reshape(outputs)
-    };
-    let value = stream("head.value", &[1, 11])?;
-    let advantage = stream("head.advantage", &[5, 11])?;
-    let centred = advantage.broadcast_sub(&advantage.mean_keepdim(1)?)?;
-    let wanted = centred.broadcast_add(&value)?;
-    let found = network.logits(&f4).unwrap();
-    assert_close("logits", &found, &wanted, 1e-6);
-    let taken = [4u8, 0, 3, 3, 1, 2];
-    let found = values(&network.taken_logits(&f4, &taken, None).unwrap());
-    let wanted = values(&wanted);
-    for (row, action) in taken.into_iter().enumerate() {
-        let wanted = &wanted[(row * 5 + usize::from(action)) * 11..][..11];
-        for (found, wanted) in found[row * 11..].iter().zip(wanted) {
-            assert!((found - wanted).abs() < 1e-5, "{found} and {wanted}");
-        }
-    }
-    Ok(())
-}
-
-/// Each layer as the paper writes it: (mu + sigma * eps) x, with the same noise for all rows.
-#[test]
-fn a_noisy_layer_is_its_mean_and_its_scaled_noise() -> Result<()> {
-    let config = small_with(NOISY);
-    let parameters = with_biases(&config);
-    let network = Network::new(&config, &parameters).unwrap();
-    let f4 = crate::support::floats(&[6, config.hidden], &mut rng(4));
-    let noise = HeadNoise::draw(&config, &mut rng(5)).unwrap();
-    let (weight, bias) = noise.of_parameters(0);
-    let [weight, bias] =
-        [weight, bias].map(|it| it.into_iter().map(|it| it as f32).collect::<Vec<_>>());
-    let part = |part: &str| parameters.get(&format!("head.{part}")).unwrap();
-    // 0.5 / sqrt(19) everywhere, at the start of a run.
-    for sigma in ["weight_sigma", "bias_sigma"] {
-        let found = values(part(sigma));
-        assert!(
-            found
-                .iter()
-                .all(|&it| (it - 0.5 / 19f64.sqrt()).abs() < 1e-8)
-        );
-    }
-    let weight = Tensor::from_vec(weight, (55, 19), &Device::Cpu)?;
-    let bias = Tensor::from_vec(bias, 55, &Device::Cpu)?;
-    let weight = (part("weight_mu").as_tensor() + (weight * part("weight_sigma").as_tensor())?)?;
-    let bias = (part("bias_mu").as_tensor() + (bias * part("bias_sigma").as_tensor())?)?;
-    let layer = |weight: &Tensor, bias: &Tensor| {
-        let y = f4.relu()?.matmul(&weight.t()?)?.broadcast_add(bias)?;
-        y.reshape((6, 5, 11))
-    };
-    let found = network.noisy_logits(&f4, Some(&noise)).unwrap();
-    assert_close("noisy", &found, &layer(&weight, &bias)?, 1e-6);
-    // Without noise its means alone, which is what evaluation takes.
-    let mean = layer(part("weight_mu"), part("bias_mu"))?;
-    assert_close("means", &network.logits(&f4).unwrap(), &mean, 1e-6);
-    let plain = small();
-    let plain = Network::new(&plain, &crate::support::parameters(&plain, 1)).unwrap();
-    assert!(plain.noisy_logits(&f4, Some(&noise)).is_err());
-    Ok(())
-}
-
 #[test]
 fn a_network_follows_its_parameters() -> Result<()> {
     let config = small();
@@ -303,53 +217,6 @@ fn a_network_follows_its_parameters() -> Result<()> {
     bias.set(&(bias.as_tensor() + 1.0)?)?;
     assert_ne!(before, bits(&network.features(&batch).unwrap().f4));
     Ok(())
-}
-
-#[test]
-fn q_values_are_expectations_over_the_atoms() -> Result<()> {
-    let config = small();
-    let network = Network::new(&config, &parameters(&config, 1)).unwrap();
-    let logits = crate::support::floats(&[3, 5, 11], &mut rng(4));
-    let support = Tensor::from_vec(config.atoms_support(), 11, &Device::Cpu)?;
-    assert_eq!(config.atoms_support()[0], -2.0);
-    assert_eq!(config.atoms_support()[10], 3.0);
-    let wanted = candle_nn::ops::softmax(&logits, 2)?
-        .broadcast_mul(&support)?
-        .sum(2)?;
-    assert_close("values", &network.q_values(&logits).unwrap(), &wanted, 1e-6);
-    Ok(())
-}
-
-/// An offset of the support is one of the values, whatever computes them.
-#[test]
-fn values_over_a_support_far_from_0_are_those_near_it_moved() {
-    let near = ModelConfig {
-        v_min: 0.0,
-        v_max: 1.0,
-        ..small()
-    };
-    let logits = crate::support::floats(&[30, 5, 11], &mut rng(4));
-    let parameters = parameters(&near, 1);
-    let q_values = |config: &ModelConfig, kernels| {
-        let network = Network::with_kernels(config, &parameters, kernels).unwrap();
-        values(&network.q_values(&logits).unwrap())
-    };
-    let expected = q_values(&near, Kernels::FUSED);
-    for (offset, v_min) in [(0.0, 0.0f32), (1e3, 1e3), (-1e6, -1e6)] {
-        let far = ModelConfig {
-            v_min,
-            v_max: v_min + 1.0,
-            ..small()
-        };
-        for kernels in [Kernels::FUSED, Kernels::Candle] {
-            for (found, near) in q_values(&far, kernels).iter().zip(&expected) {
-                let error = (found - offset - near).abs();
-                // Half of a value's last place, and what the sums of f32 have by themselves.
-                let allowed = offset.abs() / 2f64.powi(24) + 4e-7;
-                assert!(error <= allowed, "{kernels:?} at {offset}: {error:e} off");
-            }
-        }
-    }
 }
 
 #[test]
@@ -397,47 +264,6 @@ fn heads_that_are_left_out_are_not_there() {
     );
 }
 
-/// Of the size that a head with PyTorch's first weights gives; an orthogonal head of gain sqrt(2) gives twice that.
-///
-/// A logit's variance is then v = (|relu(f4)|^2 + 1) / (3 * hidden), and for small logits that of a Q value is
-/// v * mean(z^2) / atoms.
-#[test]
-fn the_first_q_values_are_small() {
-    let config = ModelConfig {
-        num_actions: 15,
-        atoms: 51,
-        v_min: -10.0,
-        v_max: 10.0,
-        hidden: 512,
-        dim: DimHeads::NONE,
-        ..small()
-    };
-    let support = config.atoms_support();
-    let mean_square =
-        |values: &[f64]| values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64;
-    let support: Vec<f64> = support.into_iter().map(f64::from).collect();
-    let (mut found, mut expected) = (0.0, 0.0);
-    for seed in 0..8 {
-        let network = Network::new(&config, &parameters(&config, seed)).unwrap();
-        let f4 = network
-            .features(&frames(&config, 4, &mut rng(seed)))
-            .unwrap()
-            .f4;
-        let logits = network.logits(&f4).unwrap();
-        let relu = values(&f4.relu().unwrap());
-        let norm = relu.iter().map(|f| f * f).sum::<f64>() / 4.0;
-        let logit_variance = (norm + 1.0) / (3.0 * 512.0);
-        assert!(logit_variance < 0.5, "{logit_variance}: not small");
-        expected += logit_variance * mean_square(&support) / 51.0;
-        found += mean_square(&values(&network.q_values(&logits).unwrap()));
-    }
-    let ratio = found / expected;
-    assert!(
-        (0.6..1.6).contains(&ratio),
-        "Q^2 is {ratio} of what it should be"
-    );
-}
-
 #[test]
 fn inputs_that_do_not_fit_are_errors() {
     let config = small();
@@ -468,25 +294,6 @@ fn inputs_that_do_not_fit_are_errors() {
             .logits(&features.f4.narrow(1, 0, 5).unwrap())
             .is_err()
     );
-}
-
-#[test]
-fn a_support_begins_and_ends_where_it_says() {
-    for (v_min, v_max) in [
-        (-10.0, 10.0),
-        (0.1, 0.7),
-        (-9.174_887e29, -7.596_588_6),
-        (1e6, 1_000_001.0),
-    ] {
-        let config = ModelConfig {
-            v_min,
-            v_max,
-            ..small()
-        };
-        let support = config.atoms_support();
-        assert_eq!((support[0], support[10]), (v_min, v_max));
-        assert!(support.is_sorted(), "{support:?}");
-    }
 }
 
 #[test]
@@ -556,7 +363,7 @@ fn dot_products_and_their_gradients_are_candle_s() -> Result<()> {
         let ours = Kernels::FUSED.dot_products(&psi, &phi)?;
         let theirs = Kernels::Candle.dot_products(&psi, &phi)?;
         assert_close("dots", &ours, &theirs, 1e-6);
-        let grad = crate::support::floats(ours.dims(), rng);
+        let grad = floats(ours.dims(), rng);
         let (found, wanted) = (
             (ours * &grad)?.sum_all()?.backward()?,
             (theirs * &grad)?.sum_all()?.backward()?,

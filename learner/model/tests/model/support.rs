@@ -146,3 +146,17 @@ pub(crate) fn rounded(tensor: &Tensor, precision: Precision) -> Var {
     };
     Var::from_tensor(&rounded.detach()).unwrap()
 }
+
+/// Initial biases are 0; tests want them to matter.
+pub(crate) fn with_biases(config: &ModelConfig) -> Parameters {
+    let (parameters, rng) = (parameters(config, 7), &mut rng(8));
+    for (name, var) in parameters
+        .iter()
+        .filter(|(name, _)| name.ends_with(".bias") || name.ends_with(".bias_mu"))
+    {
+        let values = floats(var.dims(), rng);
+        var.set(&values)
+            .unwrap_or_else(|error| panic!("{name}: {error}"));
+    }
+    parameters
+}

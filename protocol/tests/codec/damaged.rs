@@ -1,0 +1,357 @@
+//! Damaged, foreign and hostile messages are refused, never a panic.
+//! What fuzzers find beyond these is `decoders`' business.
+
+use driml_protocol::{
+    AffinityUpdate, Batch, BatchHeader, Buffer, ChunkHeader, CodecError, EPISODES_MAX,
+    EndedEpisode, EpisodesReply, Hello, Kind, PROTOCOL_VERSION, Played, Tally, WeightsHeader,
+    WeightsUpload, WeightsVersion,
+    codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
+};
+use proptest::prelude::*;
+
+use crate::samples::{
+    ACTIONS, SPEC, Sample, batch, chunk, episodes, forge, forge_whole, join, read_chunk, samples,
+};
+
+#[test]
+fn episodes_that_did_not_end_are_refused() {
+    let fewer = EpisodesReply {
+        ended: 8,
+        ..episodes()
+    };
+    let bytes = codec::encode(SPEC, &fewer, &[]).unwrap();
+    let refused = codec::decode::<EpisodesReply>(&bytes, Some(SPEC)).unwrap_err();
+    assert!(matches!(refused, CodecError::Header(_)), "{refused}");
+    // The longest answer is one that can be sent.
+    let most = EndedEpisode {
+        frames: u64::MAX,
+        actor: u32::MAX,
+        copy: u32::MAX,
+        played: Some(Played {
+            episode_return: f64::MAX,
+            steps: u64::MAX,
+        }),
+    };
+    let longest = EpisodesReply {
+        ended: u64::MAX,
+        before: u64::MAX - EPISODES_MAX as u64,
+        episodes: vec![most; EPISODES_MAX],
+    };
+    assert!(codec::encode(SPEC, &longest, &[]).is_ok());
+}
+
+#[test]
+fn every_truncation_and_every_padding_is_refused() {
+    for Sample {
+        name, bytes, read, ..
+    } in samples()
+    {
+        for length in 0..bytes.len() {
+            let refused = read(&bytes[..length]).unwrap_err();
+            let need = if length < PREFIX_BYTES {
+                PREFIX_BYTES
+            } else {
+                bytes.len()
+            };
+            assert_eq!(
+                refused,
+                CodecError::Length { have: length, need },
+                "{name} cut to {length}"
+            );
+        }
+        let mut padded = bytes.clone();
+        padded.push(0);
+        let longer = CodecError::Length {
+            have: padded.len(),
+            need: bytes.len(),
+        };
+        assert_eq!(read(&padded), Err(longer), "{name}");
+    }
+}
+
+#[test]
+fn every_flipped_bit_is_refused() {
+    for Sample {
+        name,
+        mut bytes,
+        read,
+        ..
+    } in samples()
+    {
+        for bit in 0..8 * bytes.len() {
+            bytes[bit / 8] ^= 1 << (bit % 8);
+            let refused = read(&bytes).expect_err(&format!("{name} with bit {bit} flipped"));
+            let expected = match bit / 8 {
+                0..4 => refused == CodecError::Magic,
+                4..6 => matches!(
+                    refused,
+                    CodecError::Version {
+                        ours: PROTOCOL_VERSION,
+                        ..
+                    }
+                ),
+                16..28 => matches!(
+                    refused,
+                    CodecError::Length { .. } | CodecError::TooLarge { .. }
+                ),
+                _ => refused == CodecError::Checksum,
+            };
+            assert!(expected, "{name} with bit {bit} flipped: {refused}");
+            bytes[bit / 8] ^= 1 << (bit % 8);
+        }
+    }
+}
+
+#[test]
+fn each_mismatch_has_its_own_error() {
+    let header = [5u8];
+    let read = |bytes: &[u8], hash| codec::decode::<WeightsVersion>(bytes, hash).map(|_| ());
+    let good = forge_whole(Kind::WeightsVersion, &header, &[]);
+    assert_eq!(
+        good,
+        codec::encode(SPEC, &WeightsVersion { version: 5 }, &[]).unwrap()
+    );
+    assert_eq!(read(&good, Some(SPEC)), Ok(()));
+
+    let newer = forge(
+        PROTOCOL_VERSION + 1,
+        Kind::WeightsVersion as u16,
+        (1, 0),
+        &header,
+        &[],
+    );
+    let version = CodecError::Version {
+        theirs: PROTOCOL_VERSION + 1,
+        ours: PROTOCOL_VERSION,
+    };
+    assert_eq!(read(&newer, Some(SPEC)), Err(version));
+    for kind in [0, Kind::Goodbye as u16, 13, u16::MAX] {
+        let other = forge(PROTOCOL_VERSION, kind, (1, 0), &header, &[]);
+        let refused = CodecError::Kind {
+            theirs: kind,
+            ours: Kind::WeightsVersion as u16,
+        };
+        assert_eq!(read(&other, Some(SPEC)), Err(refused));
+    }
+    assert_eq!(
+        read(&good, Some(SPEC + 1)),
+        Err(CodecError::RunSpec {
+            theirs: SPEC,
+            ours: SPEC + 1
+        })
+    );
+    assert_eq!(read(&good, None), Ok(()), "where any run is welcome");
+    assert_eq!(
+        read(b"", Some(SPEC)),
+        Err(CodecError::Length {
+            have: 0,
+            need: PREFIX_BYTES
+        })
+    );
+    assert_eq!(read(&[0; 64], Some(SPEC)), Err(CodecError::Magic));
+    let longer = forge_whole(Kind::WeightsVersion, &[5, 0], &[]);
+    assert!(
+        matches!(read(&longer, Some(SPEC)), Err(CodecError::Header(_))),
+        "a byte after the header's end"
+    );
+}
+
+#[test]
+fn huge_lengths_are_refused_without_taking_memory() {
+    let read = |lengths| {
+        let bytes = forge(
+            PROTOCOL_VERSION,
+            Kind::WeightsVersion as u16,
+            lengths,
+            &[5],
+            &[],
+        );
+        codec::decode::<WeightsVersion>(&bytes, Some(SPEC)).unwrap_err()
+    };
+    let header = HEADER_BYTES_MAX as u32 + 1;
+    assert_eq!(
+        read((header, 0)),
+        CodecError::TooLarge {
+            have: header as usize,
+            max: HEADER_BYTES_MAX
+        }
+    );
+    assert_eq!(
+        read((u32::MAX, u64::MAX)),
+        CodecError::TooLarge {
+            have: u32::MAX as usize,
+            max: HEADER_BYTES_MAX
+        }
+    );
+    assert_eq!(
+        read((1, u64::MAX)),
+        CodecError::TooLarge {
+            have: usize::MAX,
+            max: PAYLOAD_BYTES_MAX
+        }
+    );
+    let need = PREFIX_BYTES + 1 + PAYLOAD_BYTES_MAX;
+    assert_eq!(
+        read((1, PAYLOAD_BYTES_MAX as u64)),
+        CodecError::Length {
+            have: PREFIX_BYTES + 1,
+            need
+        }
+    );
+    // A header that claims more elements than any header has room for.
+    let claim = [&[1u8, 3, 253][..], &u64::MAX.to_le_bytes()].concat();
+    let bytes = forge_whole(Kind::Affinity, &claim, &[]);
+    let refused = codec::decode::<AffinityUpdate>(&bytes, Some(SPEC)).unwrap_err();
+    assert!(matches!(refused, CodecError::Header(_)), "{refused}");
+    // The sender keeps to the limit too.
+    let hello = Hello {
+        config_toml: "x".repeat(HEADER_BYTES_MAX),
+        inserted_total: 0,
+        tally: Tally::default(),
+        after_updates: 0,
+        shard: (0, 1),
+        shared_memory: false,
+    };
+    let refused = codec::seal(SPEC, &hello, &[]).unwrap_err();
+    assert!(
+        matches!(
+            refused,
+            CodecError::TooLarge {
+                max: HEADER_BYTES_MAX,
+                ..
+            }
+        ),
+        "{refused}"
+    );
+}
+
+#[test]
+fn counts_that_do_not_fit_their_payload_are_refused() {
+    let header = chunk().header;
+    let payload = &join(chunk().seal(SPEC).unwrap())[..];
+    let payload = &payload[payload.len() - 6 * 11..];
+    let read = |header: ChunkHeader| read_chunk(&codec::encode(SPEC, &header, payload).unwrap());
+    assert_eq!(read(header), Ok(()));
+    let most = u32::MAX;
+    for wrong in [
+        ChunkHeader {
+            streams: 3,
+            ..header
+        },
+        ChunkHeader { steps: 0, ..header },
+        ChunkHeader {
+            frame_bytes: 4,
+            ..header
+        },
+        ChunkHeader {
+            streams: most,
+            steps: most,
+            frame_bytes: most,
+            ..header
+        },
+        ChunkHeader {
+            streams: 1 << 31,
+            steps: 1 << 31,
+            frame_bytes: 4,
+            ..header
+        },
+    ] {
+        assert!(
+            matches!(read(wrong), Err(CodecError::Header(_))),
+            "{wrong:?}"
+        );
+    }
+    let header = batch().header;
+    for wrong in [
+        BatchHeader { rows: 0, ..header },
+        BatchHeader { rows: 4, ..header },
+        BatchHeader {
+            positives: 0,
+            ..header
+        },
+        // As long, but other states than those of its rows.
+        BatchHeader {
+            states_k: 1,
+            states_n: 2,
+            ..header
+        },
+        BatchHeader {
+            states_k: most,
+            ..header
+        },
+        BatchHeader {
+            rows: most,
+            positives: most,
+            state_bytes: most,
+            states_k: most,
+            states_n: most,
+            ..header
+        },
+    ] {
+        let (_, payload) = batch().into_payload();
+        assert!(Batch::from_payload(wrong, payload).is_err(), "{wrong:?}");
+    }
+    assert!(
+        Batch::from_payload(BatchHeader { rows: 0, ..header }, Buffer::zeroed(0)).is_err(),
+        "no rows at all"
+    );
+}
+
+#[test]
+fn what_no_world_gives_is_refused() {
+    let decode = |change: &dyn Fn(&mut Vec<u8>)| {
+        let whole = join(chunk().seal(SPEC).unwrap());
+        let mut payload = whole[whole.len() - 6 * 11..].to_vec();
+        change(&mut payload);
+        read_chunk(&codec::encode(SPEC, &chunk().header, &payload).unwrap())
+    };
+    assert_eq!(decode(&|_| {}), Ok(()));
+    assert!(
+        decode(&|payload| payload[30 + 2] = ACTIONS as u8)
+            .unwrap_err()
+            .to_string()
+            .contains("action 15")
+    );
+    assert!(
+        decode(&|payload| payload[36 + 5] = 4)
+            .unwrap_err()
+            .to_string()
+            .contains("end 4")
+    );
+    for reward in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let refused =
+            decode(&|payload| payload[42 + 4..42 + 8].copy_from_slice(&reward.to_le_bytes()));
+        assert!(refused.unwrap_err().to_string().contains("row 1"));
+    }
+    let upload = WeightsUpload {
+        learner: 5,
+        weights: WeightsHeader::new(1, 1, b"these"),
+    };
+    let bytes = codec::encode(SPEC, &upload, b"those").unwrap();
+    assert!(matches!(
+        codec::decode::<WeightsUpload>(&bytes, Some(SPEC)),
+        Err(CodecError::Header(_))
+    ));
+}
+
+proptest! {
+    #[test]
+    fn random_bytes_are_refused(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
+        let after_magic = [b"DRML", &bytes[..]].concat();
+        for Sample { read, .. } in samples() {
+            prop_assert!(read(&bytes).is_err());
+            prop_assert!(read(&after_magic).is_err());
+        }
+    }
+
+    /// Bytes with a right prefix and checksum are read or refused, but never a panic.
+    #[test]
+    fn random_headers_and_payloads_do_no_harm(
+        header in prop::collection::vec(any::<u8>(), 0..80),
+        payload in prop::collection::vec(any::<u8>(), 0..80),
+    ) {
+        for Sample { kind, read, .. } in samples() {
+            let _ = read(&forge_whole(kind, &header, &payload));
+        }
+    }
+}

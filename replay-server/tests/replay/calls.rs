@@ -1,0 +1,63 @@
+//! What tests say to a replay, and its answers.
+//! It tests nothing.
+
+use driml_protocol::{ActorJoin, Chunk, ChunkHeader, Horizon, InsertReply, RunSpec};
+use driml_replay_server::Replay;
+
+use crate::history::spec;
+
+pub(crate) fn small_spec() -> RunSpec {
+    spec(3, 1, 1, Horizon::None)
+}
+
+pub(crate) fn header(
+    actor: u32,
+    incarnation: u64,
+    sequence: u64,
+    first_transition: u64,
+) -> ChunkHeader {
+    ChunkHeader {
+        actor,
+        incarnation,
+        sequence,
+        first_transition,
+        weights_version: 0,
+        leaving: false,
+        streams: 2,
+        steps: 3,
+        frame_bytes: small_spec().frame_bytes() as u32,
+    }
+}
+
+pub(crate) fn join(replay: &mut Replay, actor: u32, incarnation: u64) {
+    replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
+}
+
+/// Inserts a chunk; an actor that is new joins with it.
+pub(crate) fn insert(replay: &mut Replay, header: ChunkHeader) -> InsertReply {
+    if replay.actor_incarnation(header.actor).is_none() {
+        join(replay, header.actor, header.incarnation);
+    }
+    let reply = replay.insert(&Chunk::zeroed(header));
+    replay.check_valid();
+    reply
+}
+
+pub(crate) const fn stored(inserted_total: u64) -> InsertReply {
+    InsertReply::Stored {
+        inserted_total,
+        actors: 0,
+        waited: false,
+    }
+}
+
+pub(crate) const fn wait(inserted_total: u64) -> InsertReply {
+    InsertReply::Wait {
+        inserted_total,
+        kept: false,
+    }
+}
+
+pub(crate) fn is_refused(reply: &InsertReply) -> bool {
+    matches!(reply, InsertReply::Refused { .. })
+}

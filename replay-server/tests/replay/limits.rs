@@ -1,0 +1,216 @@
+//! What a replay refuses or lets wait, and where a run ends.
+//! It does not look at rows, and no message is lost or repeated.
+
+use driml_protocol::{
+    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, End, Goodbye, InsertReply, RunSpec, Waiting,
+};
+use driml_replay_server::{ACTORS_MAX, Replay, STREAMS_MAX, Unready};
+
+use crate::{
+    calls::{header, insert, is_refused, join, small_spec, stored, wait},
+    history::unlimited,
+};
+
+#[test]
+fn rewards_whose_sum_is_no_float_are_refused() {
+    let spec = RunSpec {
+        n_step: 7,
+        ..small_spec()
+    };
+    let mut replay = Replay::new(&spec, &unlimited(1000), 8).unwrap();
+    join(&mut replay, 0, 1);
+    let with = |reward| {
+        let mut chunk = Chunk::zeroed(header(0, 1, 0, 0));
+        chunk.set(4, 0, reward, End::Running);
+        chunk
+    };
+    for reward in [3e38, -3e38, f32::MAX] {
+        match replay.insert(&with(reward)) {
+            InsertReply::Refused { why } => {
+                assert!(why.contains("scale the world's rewards"), "{why}")
+            }
+            reply => panic!("{reply:?} for {reward}"),
+        }
+    }
+    assert_eq!(replay.insert(&with(f32::MAX / 7.0)), stored(6));
+}
+
+#[test]
+fn unfit_chunks_are_refused_with_a_reason() {
+    let mut replay = Replay::new(&small_spec(), &unlimited(100), 8).unwrap();
+    insert(&mut replay, header(0, 1, 0, 0));
+    let good = header(0, 1, 1, 6);
+    let unfit = [
+        (
+            "frames of 7 bytes",
+            ChunkHeader {
+                frame_bytes: 7,
+                ..good
+            },
+        ),
+        ("3 streams after 2", ChunkHeader { streams: 3, ..good }),
+        ("102 transitions", ChunkHeader { steps: 51, ..good }),
+        ("0 transitions", ChunkHeader { steps: 0, ..good }),
+        (
+            "counts that no run reaches",
+            ChunkHeader {
+                first_transition: u64::MAX,
+                ..good
+            },
+        ),
+        (
+            "counts that no run reaches",
+            ChunkHeader {
+                sequence: u64::MAX,
+                ..good
+            },
+        ),
+    ];
+    for (reason, header) in unfit {
+        match insert(&mut replay, header) {
+            InsertReply::Refused { why } => assert!(why.contains(reason), "{why}"),
+            reply => panic!("{reply:?} for {header:?}"),
+        }
+    }
+    let mut chunk = Chunk::zeroed(good);
+    chunk.set(2, 5, 0.0, End::Running);
+    assert!(is_refused(&replay.insert(&chunk)), "action 5 of 0..5");
+    assert_eq!(replay.status().messages_refused, unfit.len() as u64 + 1);
+    assert_eq!(insert(&mut replay, good), stored(12), "the actor goes on");
+}
+
+#[test]
+fn actors_and_streams_are_bounded() {
+    let mut replay = Replay::new(&small_spec(), &unlimited(1 << 15), 8).unwrap();
+    for actor in 0..ACTORS_MAX as u32 {
+        join(&mut replay, actor, 1);
+        assert!(matches!(
+            replay.insert(&Chunk::zeroed(header(actor, 1, 0, 0))),
+            InsertReply::Stored { .. }
+        ));
+    }
+    let one_more = ACTORS_MAX as u32;
+    let join = ActorJoin {
+        actor: one_more,
+        incarnation: 1,
+    };
+    assert!(replay.join_actor(join).is_err());
+    assert!(is_refused(
+        &replay.insert(&Chunk::zeroed(header(one_more, 1, 0, 0)))
+    ));
+    replay.goodbye(&Goodbye {
+        actor: one_more,
+        incarnation: 1,
+        produced: 6,
+    });
+    assert_eq!(replay.status().transitions_lost, 0);
+    let last = header(one_more - 1, 1, 1, 6);
+    assert!(
+        matches!(insert(&mut replay, last), InsertReply::Stored { .. }),
+        "the known ones go on"
+    );
+    let wide = ChunkHeader {
+        streams: STREAMS_MAX + 1,
+        steps: 1,
+        ..header(0, 1, 1, 6)
+    };
+    assert!(is_refused(&insert(&mut replay, wide)));
+}
+
+#[test]
+fn the_run_ends_when_all_is_in_and_sampled() {
+    let mut config = unlimited(1000);
+    (
+        config.replay_ratio,
+        config.slack_transitions,
+        config.warmup_transitions,
+    ) = (4.0, 6, 6);
+    config.transitions_max = Some(18);
+    let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
+    assert_eq!(replay.waiting(), Waiting::WarmUp { have: 0, need: 6 });
+    assert_eq!(
+        replay.sample(8),
+        Err(Unready::Wait(Waiting::WarmUp { have: 0, need: 6 }))
+    );
+    assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
+    assert_eq!(
+        replay.sample(8),
+        Err(Unready::Wait(Waiting::LearnerWaitsForActors))
+    );
+    assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(12));
+    assert_eq!(
+        insert(&mut replay, header(1, 1, 0, 0)),
+        stored(18),
+        "6 ahead, of a slack of 6"
+    );
+    assert!(replay.status().finished);
+    assert_eq!(
+        insert(&mut replay, header(0, 1, 1, 6)),
+        stored(18),
+        "a retry is still a retry"
+    );
+    assert_eq!(
+        insert(&mut replay, header(0, 1, 2, 12)),
+        InsertReply::Finished { inserted_total: 18 }
+    );
+    assert_eq!(
+        insert(&mut replay, header(0, 1, 7, 12)),
+        InsertReply::Finished { inserted_total: 18 }
+    );
+    for _ in 0..6 {
+        replay.sample(8).unwrap();
+    }
+    assert_eq!(replay.sample(8), Err(Unready::Finished));
+    assert_eq!(replay.waiting(), Waiting::Finished);
+    assert_eq!(
+        replay.status().replay_ratio(),
+        Some(4.0),
+        "48 rows of 12 transitions after the warm-up"
+    );
+    replay.goodbye(&Goodbye {
+        actor: 0,
+        incarnation: 1,
+        produced: 12,
+    });
+    assert_eq!(replay.status().transitions_lost, 0);
+}
+
+#[test]
+fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
+    let mut config = unlimited(1000);
+    (config.replay_ratio, config.slack_transitions) = (4.0, 2);
+    let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
+    assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
+    assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), wait(6));
+    assert_eq!(
+        insert(&mut replay, header(0, 1, 2, 12)),
+        InsertReply::OutOfOrder { expected: 1 }
+    );
+    assert_eq!(replay.waiting(), Waiting::ActorsWaitForLearner);
+    assert!(
+        matches!(replay.sample(9), Err(Unready::Refused { .. })),
+        "more than slack * ratio rows"
+    );
+    assert!(matches!(replay.sample(0), Err(Unready::Refused { .. })));
+    let leaving = ChunkHeader {
+        leaving: true,
+        ..header(1, 1, 0, 0)
+    };
+    assert_eq!(
+        insert(&mut replay, leaving),
+        stored(12),
+        "an actor that leaves does not wait"
+    );
+    for _ in 0..5 {
+        replay.sample(8).unwrap();
+    }
+    assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(18));
+    let foreign = AffinityUpdate {
+        learner: 1,
+        version: 1,
+        num_actions: 4,
+        matrix: vec![0.25; 16],
+    };
+    assert!(replay.set_affinity(&foreign).is_err());
+    assert_eq!(replay.status().messages_refused, 3);
+}
