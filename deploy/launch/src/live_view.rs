@@ -155,8 +155,12 @@ pub(crate) fn recovery(server: &str, progress: RecoveryProgress) -> String {
 /// Who waits for whom, and how many actors do.
 fn waiting(replay: &ReplayStatus) -> String {
     match (replay.waiting, replay.actors_waiting) {
-        (Waiting::ActorsWaitForLearner, waiting @ 1..) => {
+        (Waiting::ActorsWaitForLearner, waiting @ 1..) if waiting <= replay.actors => {
             format!("{waiting} of {} actors wait for learner", replay.actors)
+        }
+        // The chunk of an actor that has gone waits too.
+        (Waiting::ActorsWaitForLearner, waiting @ 1..) => {
+            format!("chunks of {waiting} actors wait for learner")
         }
         (waiting, _) => waiting.to_string(),
     }
@@ -228,6 +232,21 @@ mod tests {
                 )
                 .join("\n"),
         );
+    }
+
+    #[test]
+    fn an_actor_that_has_gone_is_none_of_those_connected() {
+        let with_connected = |actors| ReplayStatus {
+            waiting: Waiting::ActorsWaitForLearner,
+            actors,
+            actors_waiting: 2,
+            ..ReplayStatus::default()
+        };
+        let said = [2, 1].map(|actors| waiting(&with_connected(actors)));
+        expect![[r#"
+            2 of 2 actors wait for learner
+            chunks of 2 actors wait for learner"#]]
+        .assert_eq(&said.join("\n"));
     }
 
     #[test]
