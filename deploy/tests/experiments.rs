@@ -325,6 +325,8 @@ fn tradeoff() {
         "levels.csv",
         "pareto.png",
         "pareto.svg",
+        "pareto_training.png",
+        "pareto_training.svg",
         "runs.csv",
         "wall.png",
         "wall.svg",

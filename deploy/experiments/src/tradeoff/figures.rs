@@ -19,8 +19,13 @@ struct Placed {
 }
 
 /// Return against frames a second, a panel for each dial with its base, all over the same axes; a dashed line joins those points of
-/// all dials that no other beats in both.
-pub(super) fn pareto(results: &Results) -> Figure {
+/// all dials that no other beats in both. `returns` is which return, and `name` what it is called.
+pub(super) fn pareto(results: &Results, returns: Measure, name: &str) -> Figure {
+    let of_runs = results.points.values().flat_map(|it| it.values(returns));
+    let of_runs = of_runs.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
+        (low.min(value), high.max(value))
+    });
+    let place = |point: &PointResult| place(point, returns, of_runs);
     let placed: Vec<Placed> = results.points.values().filter_map(place).collect();
     let front: Vec<(f64, f64)> = front(&placed).map(|it| (it.speed, it.value)).collect();
     let speeds: Vec<f64> = placed.iter().map(|it| it.speed).collect();
@@ -28,6 +33,7 @@ pub(super) fn pareto(results: &Results) -> Figure {
         .iter()
         .flat_map(|it| [it.ends.0, it.ends.1])
         .collect();
+    let label = format!("{name} return");
     let panel = |dial: &[Named<'_>]| {
         let line = Series::line("", 0, front.clone());
         let mut series = vec![line.coloured(GREY).marked(Mark::Dashed)];
@@ -39,7 +45,7 @@ pub(super) fn pareto(results: &Results) -> Figure {
                     .marked(Mark::Bars),
             );
         }
-        let (x, y) = (Axis::linear("frames/s"), Axis::linear("greedy return"));
+        let (x, y) = (Axis::linear("frames/s"), Axis::linear(&label));
         (x.showing(&speeds), y.showing(&values), series)
     };
     let panels = by_dial(results).into_iter().map(|(dial, named)| {
@@ -47,10 +53,12 @@ pub(super) fn pareto(results: &Results) -> Figure {
         Panel::Chart(Chart::new(dial, x, y, series))
     });
     Figure {
-        title: format!("{}: return against speed", results.settings.common.env),
+        title: format!("{}: {label} against speed", results.settings.common.env),
         notes: vec![
-            "Greedy return, mean over seeds with its 95% interval, and frames a second of whole runs; to the upper right is better."
-                .into(),
+            format!(
+                "Return ({name}), mean over seeds, and frames a second of whole runs; to the upper right is better."
+            ),
+            "Bars: 95% intervals, cut at the least and the greatest return of any run.".into(),
             "The dashed line is the same in all: it joins the levels of all dials than which no other is better in both.".into(),
         ],
         columns: COLUMNS,
@@ -59,12 +67,14 @@ pub(super) fn pareto(results: &Results) -> Figure {
     }
 }
 
-fn place(point: &PointResult) -> Option<Placed> {
-    let value = point.mean(Measure::Greedy)?;
+/// Where a point stands; its interval is cut where no run's return is, as one of few seeds may be far wider than all there is.
+fn place(point: &PointResult, returns: Measure, (least, greatest): (f64, f64)) -> Option<Placed> {
+    let value = point.mean(returns)?;
+    let (low, high) = value.ends.unwrap_or((value.mean, value.mean));
     Some(Placed {
         speed: point.mean(Measure::FramesPerSecond)?.mean,
         value: value.mean,
-        ends: value.ends.unwrap_or((value.mean, value.mean)),
+        ends: (low.max(least), high.min(greatest)),
     })
 }
 

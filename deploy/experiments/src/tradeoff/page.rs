@@ -103,6 +103,7 @@ pub(super) fn page(results: &Results) -> anyhow::Result<Page> {
         )
         .when("dim_is_there", !equal.is_empty())
         .set("pareto", "pareto")
+        .set("pareto_training", "pareto_training")
         .set("wall", "wall")
         .items("dials", dials(results))
         .when("some_left_out", !results.left_out.is_empty())
@@ -149,15 +150,24 @@ fn found(results: &Results, of: &LevelOf) -> String {
     let frames = results.factor(of, Measure::FramesPerSecond);
     let frames = frames.map(|it| format!("x{it:.2} frames/s"));
     let gains: Vec<String> = speed.into_iter().chain(frames).collect();
-    let cost = results.difference(of, Measure::Greedy).map_or_else(
-        || "no return".to_owned(),
-        |it| format!("return {}{}", signed(&it), verdict(&it)),
-    );
+    let cost = |returns, name: &str| {
+        let found = results.difference(of, returns);
+        found.map(|it| format!("{name} {}{}", signed(&it), verdict(&it)))
+    };
+    let costs = [
+        cost(Measure::Greedy, "greedy return"),
+        cost(Measure::Training, "training return"),
+    ];
+    let costs: Vec<String> = costs.into_iter().flatten().collect();
     format!(
-        "{} ({}): {}; {cost}",
+        "{} ({}): {}; {}",
         of.name(),
         of.point.agent,
-        gains.join(", ")
+        gains.join(", "),
+        match &costs[..] {
+            [] => "no return".to_owned(),
+            costs => costs.join("; "),
+        }
     )
 }
 
@@ -169,9 +179,9 @@ fn verdict(difference: &Interval) -> &'static str {
         difference.mean > 0.0,
     ) {
         (None, ..) => " (one seed)",
-        (_, false, _) => ": these seeds cannot tell it from its base",
-        (_, true, true) => ": better than its base",
-        (_, true, false) => ": worse than its base",
+        (_, false, _) => "",
+        (_, true, true) => ", better than its base",
+        (_, true, false) => ", worse than its base",
     }
 }
 
@@ -227,14 +237,25 @@ fn table(header: &[&str], rows: Vec<Vec<String>>) -> Table {
 }
 
 fn gains(results: &Results) -> Table {
-    let greedy = |point: &PointResult| cell(point.mean(Measure::Greedy), |it| it.to_string());
+    let mean =
+        |point: &PointResult, returns| cell(point.mean(returns), |it: Interval| it.to_string());
+    let difference =
+        |of: &LevelOf, returns| cell(results.difference(of, returns), |it| signed(&it));
     let rows = by_level(
         results,
         |point| {
             let frames = cell(point.mean(Measure::FramesPerSecond), |it| {
                 format!("{:.0}", it.mean)
             });
-            vec!["1".into(), "1".into(), frames, greedy(point), String::new()]
+            vec![
+                "1".into(),
+                "1".into(),
+                frames,
+                mean(point, Measure::Greedy),
+                String::new(),
+                mean(point, Measure::Training),
+                String::new(),
+            ]
         },
         |of, point| {
             let speed = point.speed.as_ref();
@@ -244,8 +265,10 @@ fn gains(results: &Results) -> Table {
                 cell(results.factor(of, Measure::FramesPerSecond), |it| {
                     format!("x{it:.2}")
                 }),
-                greedy(point),
-                cell(results.difference(of, Measure::Greedy), |it| signed(&it)),
+                mean(point, Measure::Greedy),
+                difference(of, Measure::Greedy),
+                mean(point, Measure::Training),
+                difference(of, Measure::Training),
             ]
         },
     );
@@ -256,7 +279,9 @@ fn gains(results: &Results) -> Table {
         "rows/s alone",
         "acting",
         "frames/s",
-        "return",
+        "greedy return",
+        "difference",
+        "training return",
         "difference",
     ];
     table(&header, rows)
@@ -275,7 +300,6 @@ fn rest(results: &Results) -> Table {
             cell(speed, |it| format!("{:.2}", it.weights_bytes as f64 / 1e6)),
             mean(Measure::Memory, 0),
             mean(Measure::WallSeconds, 0),
-            mean(Measure::Training, 2),
             mean(Measure::Behind, 0),
             mean(Measure::BehindSeconds, 2),
         ]
@@ -290,7 +314,6 @@ fn rest(results: &Results) -> Table {
         "broadcast [MB]",
         "memory [MiB]",
         "run [s]",
-        "training return",
         "weights behind [updates]",
         "[s]",
     ];
@@ -451,9 +474,9 @@ mod tests {
     #[test]
     fn a_difference_is_put_into_words() {
         let of = |values: &[f64]| verdict(&Interval::of(values).unwrap());
-        assert_eq!(of(&[1.0, 1.1, 1.2]), ": better than its base");
-        assert_eq!(of(&[-1.0, -1.1, -1.2]), ": worse than its base");
-        assert!(of(&[-1.0, 1.0]).contains("cannot tell"));
+        assert_eq!(of(&[1.0, 1.1, 1.2]), ", better than its base");
+        assert_eq!(of(&[-1.0, -1.1, -1.2]), ", worse than its base");
+        assert_eq!(of(&[-1.0, 1.0]), "");
         assert_eq!(of(&[1.0]), " (one seed)");
     }
 }

@@ -23,7 +23,12 @@ const MEASURES: [(&str, Measure); 7] = [
 pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> {
     write_runs(&session, results)?;
     write_levels(&session, results)?;
-    session.figure("pareto", &figures::pareto(results))?;
+    for (stem, returns, name) in [
+        ("pareto", Measure::Greedy, "greedy"),
+        ("pareto_training", Measure::Training, "training"),
+    ] {
+        session.figure(stem, &figures::pareto(results, returns, name))?;
+    }
     session.figure("wall", &figures::wall(results)?)?;
     session.finish(&page::page(results)?)
 }
