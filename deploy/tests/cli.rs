@@ -94,6 +94,19 @@ fn values_that_cannot_work() {
     .assert_eq(&usage(&["local", "--config", "no-such.toml"]));
 }
 
+/// The sentence is that of the number's parser, and not that there is no flag -1.
+#[test]
+fn a_negative_number_is_a_number_out_of_range() {
+    for (flag, why) in [
+        ("--seed", "\"-1\" is no whole number; write one as"),
+        ("--frames", "\"-1\" is no whole number; write one as"),
+        ("--actors", "-1 is not in 1..=256"),
+    ] {
+        let text = usage(&["local", flag, "-1"]);
+        assert!(text.contains(why), "{text}");
+    }
+}
+
 /// It would have to forget what going on exactly needs.
 #[test]
 fn lockstep_keeps_its_replay_whole_or_says_so() {
