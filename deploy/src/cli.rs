@@ -24,6 +24,15 @@ use crate::commands::{
     watch::{self, WatchArgs},
 };
 
+/// What `driml local --help` ends with.
+const EXAMPLES: &str = "\
+Examples:
+  driml local --env chain --agent c51
+  driml local --env procgen:starpilot --frames 1e6 --seed 3 --run-dir runs/starpilot
+  driml local --resume runs/starpilot
+
+`driml presets --game starpilot --agent c51` prints what a preset sets: every setting with its source.";
+
 /// Deep Reinforcement and InfoMax Learning: actors, a replay server and a learner.
 #[derive(Debug, Parser)]
 #[command(name = "driml", version, max_term_width = 100)]
@@ -34,7 +43,7 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    #[command(visible_alias = "local")]
+    #[command(visible_alias = "local", after_help = EXAMPLES)]
     /// Train on this machine: start all parts, show how it goes, leave a run folder
     Train(TrainArgs),
     /// One actor of a run whose replay server is reached at ENDPOINT
@@ -128,5 +137,18 @@ mod tests {
     #[test]
     fn the_command_line_is_consistent() {
         Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn the_examples_are_commands() {
+        let examples: Vec<_> = EXAMPLES
+            .lines()
+            .filter_map(|line| line.strip_prefix("  "))
+            .collect();
+        assert_eq!(examples.len(), 3);
+        for example in examples {
+            let parsed = Cli::try_parse_from(example.split(' '));
+            assert!(parsed.is_ok(), "{example}: {:?}", parsed.err());
+        }
     }
 }

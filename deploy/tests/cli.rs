@@ -44,7 +44,7 @@ fn names_that_nothing_has() {
         error: --env: no world is named "procgen:bigfihs"; did you mean "procgen:bigfish"? (the worlds: procgen:GAME, mspacman, ising, chain, exec:COMMAND, libenv:PATH:GAME; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
     "#]].assert_eq(&usage(&["local", "--env", "procgen:bigfihs"]));
     expect![[r#"
-        error: --env: no world is named "pong"; did you mean "ising"? (the worlds: procgen:GAME, mspacman, ising, chain, exec:COMMAND, libenv:PATH:GAME; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
+        error: --env: no world is named "pong" (the worlds: procgen:GAME, mspacman, ising, chain, exec:COMMAND, libenv:PATH:GAME; GAME is one of bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball, fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder, starpilot)
     "#]].assert_eq(&usage(&["local", "--env", "pong"]));
     expect![[r#"
         error: there is no agent "driml"; --agent takes c51, rainbow, driml-fix, driml-ada, driml-randk, driml-noact, cpc, curl
@@ -92,6 +92,19 @@ fn values_that_cannot_work() {
         error: reading the settings no-such.toml: No such file or directory (os error 2)
     "#]]
     .assert_eq(&usage(&["local", "--config", "no-such.toml"]));
+}
+
+/// The sentence is that of the number's parser, and not that there is no flag -1.
+#[test]
+fn a_negative_number_is_a_number_out_of_range() {
+    for (flag, why) in [
+        ("--seed", "\"-1\" is no whole number; write one as"),
+        ("--frames", "\"-1\" is no whole number; write one as"),
+        ("--actors", "-1 is not in 1..=256"),
+    ] {
+        let text = usage(&["local", flag, "-1"]);
+        assert!(text.contains(why), "{text}");
+    }
 }
 
 /// It would have to forget what going on exactly needs.

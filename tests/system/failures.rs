@@ -47,14 +47,18 @@ fn a_second_interrupt_ends_at_once() {
     assert_eq!(system.run_folder("run").summary().outcome, "failed");
 }
 
-/// Kills one part of a run; the launcher must say which, and end the others.
+/// Kills one part of a run; the launcher must say which and how to go on, and end the others.
 fn dies(part: &str, name: &str) {
     let system = system();
     let process = launched(&system, 100);
     system.find_part(part).signal(Signal::SIGKILL);
-    process.wait().expect_code(1).expect_said(&format!(
-        "error: {name} was ended by signal 9 SIGKILL (log: "
-    ));
+    process
+        .wait()
+        .expect_code(1)
+        .expect_said(&format!(
+            "error: {name} was ended by signal 9 SIGKILL (log: "
+        ))
+        .expect_said("`driml local --resume run` goes on with it");
     assert_eq!(system.survivors(), []);
     assert_eq!(system.run_folder("run").summary().outcome, "failed");
 }

@@ -358,6 +358,18 @@ impl fmt::Display for WorldNameError {
         if let Some(name) = self.nearest {
             write!(f, "; did you mean \"{name}\"?")?;
         }
+        if is_gymnasium_name(&self.text) {
+            let flags = match self.text.starts_with("ALE/") {
+                true => "--atari",
+                false => "--pixels --size 64 --grey",
+            };
+            write!(
+                f,
+                "; a world of Gymnasium is \"exec:python3 deploy/python/driml_env.py {} {flags}\", \
+                 and deploy/python/README.md says what that needs",
+                self.text
+            )?;
+        }
         let mut names = Vec::new();
         let mut variants = String::new();
         for (kind, of) in KINDS {
@@ -384,7 +396,15 @@ impl fmt::Display for WorldNameError {
 
 impl std::error::Error for WorldNameError {}
 
-/// The world whose name is at most 3 edits from `text`; a variant may be named without its kind.
+/// Whether a name is made as Gymnasium's are: `ALE/Pong-v5`, `CartPole-v1`.
+fn is_gymnasium_name(text: &str) -> bool {
+    let version = text.rsplit_once("-v").map(|(_, version)| version);
+    let has_version =
+        version.is_some_and(|it| !it.is_empty() && it.bytes().all(|it| it.is_ascii_digit()));
+    !text.contains(':') && (has_version || text.contains('/'))
+}
+
+/// The world whose name is at most 3 edits, and a third of the letters, from `text`; a variant may be named without its kind.
 fn nearest(text: &str) -> Option<WorldName> {
     // A name is short: no use in comparing letter by letter with a text that is not.
     if text.chars().count() > 40 {
@@ -393,13 +413,15 @@ fn nearest(text: &str) -> Option<WorldName> {
     let letters = |text: &str| -> String { text.chars().filter(|c| c.is_alphanumeric()).collect() };
     let text = letters(&text.to_lowercase());
     let distance = |name: WorldName| {
-        let full = strsim::levenshtein(&text, &letters(&name.to_string()));
+        let full = strsim::osa_distance(&text, &letters(&name.to_string()));
         name.variant.map_or(full, |variant| {
-            full.min(strsim::levenshtein(&text, variant))
+            full.min(strsim::osa_distance(&text, variant))
         })
     };
     let name = WorldName::all().min_by_key(|&name| distance(name))?;
-    (distance(name) <= 3).then_some(name)
+    // All of a short name may be other letters: pong is not ising.
+    let most = (text.chars().count() / 3).min(3);
+    (distance(name) <= most).then_some(name)
 }
 
 #[cfg(test)]

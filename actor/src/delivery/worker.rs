@@ -331,6 +331,13 @@ impl DeliveryWorker {
                 self.client.send(claim, timeout)?
             } else {
                 let chunk = self.client.seal_with(&it.header, it.payload.clone())?;
+                let header = &it.header;
+                tracing::debug!(
+                    "chunk {} goes out: {} transitions by weights {}",
+                    header.sequence,
+                    header.transitions(),
+                    header.weights_version
+                );
                 self.client.send(chunk, timeout)?
             });
         }

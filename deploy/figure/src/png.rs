@@ -11,6 +11,9 @@ use super::{
     font,
 };
 
+/// Sides up to this are none to tiny-skia, in pixels; a unit is a pixel or more.
+const SIDE_MIN: f32 = 1.0 / 4096.0;
+
 /// The picture, `zoom` pixels to a unit; what no shape covers is transparent.
 ///
 /// # Errors
@@ -32,7 +35,7 @@ pub(super) fn encode(canvas: &Canvas, zoom: f32) -> Result<Vec<u8>, String> {
 /// Draws one shape, `scale` pixels to a unit.
 pub(super) fn draw(pixmap: &mut Pixmap, shape: &Shape, scale: Transform) {
     let mut fill = |path: Option<Path>, colour: Colour, smooth: bool, at: Transform| {
-        if let Some(path) = path {
+        if let Some(path) = path.filter(has_area) {
             let paint = paint(colour, smooth);
             pixmap.fill_path(&path, &paint, FillRule::Winding, at, None);
         }
@@ -67,6 +70,12 @@ pub(super) fn draw(pixmap: &mut Pixmap, shape: &Shape, scale: Transform) {
             fill(path, style.colour, true, place.post_concat(scale));
         }
     }
+}
+
+/// Whether there is anything to fill: tiny-skia warns of bars and bands that are flat.
+fn has_area(path: &Path) -> bool {
+    let bounds = path.bounds();
+    bounds.width().min(bounds.height()) > SIDE_MIN
 }
 
 fn stroke_path(pixmap: &mut Pixmap, path: Option<Path>, stroke: Stroke, scale: Transform) {
@@ -153,4 +162,17 @@ fn text_path((x, y): Point, text: &str, style: TextStyle) -> (Option<Path>, Tran
         place = place.post_rotate(-90.0);
     }
     (path.finish(), place.post_translate(x as f32, y as f32))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_flat_is_not_filled() {
+        let area = |points: &[Point]| polygon(points, true).is_some_and(|path| has_area(&path));
+        assert!(area(&[(0.0, 0.0), (9.0, 0.0), (9.0, 2.0)]));
+        assert!(!area(&[(0.0, 3.0), (9.0, 3.0), (5.0, 3.0)]));
+        assert!(!area(&[(4.0, 0.0), (4.0, 8.0), (4.0, 5.0)]));
+    }
 }

@@ -61,30 +61,45 @@ pub fn describe(error: &anyhow::Error) -> String {
     text
 }
 
-/// Sends the log to stderr. `DRIML_LOG` says what is logged, in the form of `RUST_LOG`.
+/// What is logged of zenoh and quinn, whatever is logged of driml.
 ///
 /// zenoh warns of each try to reach a process that is not there yet or any more, which is ours to judge: so only its errors are
 /// logged, and of those neither what its session says of messages that come while it closes, as at the end of every run, nor
 /// that no answer is wanted any more. Nor that it does not know a liveliness token any more (`Unknown token`, the only error of that
 /// module) which a part that leaves takes back while its link closes, over QUIC now and then: it is gone, as it should be. Nor what it
 /// says of connections over QUIC that did not come about, and what quinn warns of.
+const OF_OTHERS: &str = "zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off,\
+                         zenoh::net::routing::hat::broker::token=off,zenoh_link_commons::quic=off,quinn=error";
+
+/// The usual filter of the log, with driml's own crates at `level`.
+fn usual_filter(level: &str) -> String {
+    format!("warn,driml={level},{OF_OTHERS}")
+}
+
+/// The filter that `DRIML_LOG` asks for. A level alone is that of driml's own crates, whose lines zenoh's would bury. All else is
+/// taken as it is, `off` too: it is for everything.
+fn wanted_filter(wanted: &str) -> String {
+    let level = wanted.trim().to_ascii_lowercase();
+    match level.as_str() {
+        "trace" | "debug" | "info" | "warn" | "error" => usual_filter(&level),
+        _ => wanted.to_owned(),
+    }
+}
+
+/// Sends the log to stderr. `DRIML_LOG` says what is logged: a level of driml's own crates, or a filter in the form of `RUST_LOG`.
 ///
 /// With `guarded`, what zenoh says of those whom it refuses is heard too: [`tls::overhear`].
 pub fn log_to_stderr(guarded: bool) {
-    let usual = "warn,driml=info,zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off,\
-                 zenoh::net::routing::hat::broker::token=off,zenoh_link_commons::quic=off,quinn=error";
+    let usual = || EnvFilter::new(usual_filter("info"));
     let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
-    let filter = wanted.map_or_else(
-        || EnvFilter::new(usual),
-        |wanted| {
-            EnvFilter::try_new(&wanted).unwrap_or_else(|e| {
-                line(&format!(
-                    "DRIML_LOG={wanted} is no filter ({e}), so it is left out; take for example debug"
-                ));
-                EnvFilter::new(usual)
-            })
-        },
-    );
+    let filter = wanted.map_or_else(usual, |wanted| {
+        EnvFilter::try_new(wanted_filter(&wanted)).unwrap_or_else(|e| {
+            line(&format!(
+                "DRIML_LOG={wanted} is no filter ({e}), so it is left out; take for example debug"
+            ));
+            usual()
+        })
+    });
     let log = tracing_subscriber::fmt::layer()
         .with_writer(stderr)
         // It would say with `eprintln!`, which panics, that stderr cannot be written to.
@@ -292,6 +307,19 @@ mod tests {
         let error = io::Error::from_raw_os_error;
         assert!(is_gone(&error(nix::libc::EPIPE)) && is_gone(&error(nix::libc::EIO)));
         assert!(!is_gone(&error(nix::libc::ENOSPC)));
+    }
+
+    #[test]
+    fn a_level_alone_is_for_driml_s_own_crates() {
+        for (wanted, driml) in [("debug", "debug"), (" TRACE", "trace"), ("error", "error")] {
+            let filter = wanted_filter(wanted);
+            let begins = format!("warn,driml={driml},zenoh=error,");
+            assert!(filter.starts_with(&begins), "{filter}");
+            assert!(EnvFilter::try_new(&filter).is_ok(), "{filter}");
+        }
+        for raw in ["off", "debug,zenoh=info", "driml_actor=trace"] {
+            assert_eq!(wanted_filter(raw), raw);
+        }
     }
 
     #[test]

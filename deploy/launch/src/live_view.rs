@@ -34,6 +34,8 @@ pub struct Display {
     frames_max: u64,
     updates_max: u64,
     rates: Rates,
+    /// When the run began: a terminal's bar has a clock of its own.
+    began: Instant,
     plain_next: Instant,
 }
 
@@ -46,14 +48,22 @@ impl Display {
         resume_point: ResumePoint,
     ) -> Self {
         let mut rates = Rates::default();
-        rates.add(Instant::now(), resume_point.frames, resume_point.updates);
+        let began = Instant::now();
+        rates.add(began, resume_point.frames, resume_point.updates);
         Self {
             screen,
             frames_max,
             updates_max,
             rates,
-            plain_next: Instant::now() + PLAIN_PERIOD,
+            began,
+            plain_next: began + PLAIN_PERIOD,
         }
+    }
+
+    /// The view of a run that began at `began`.
+    pub(crate) fn since(mut self, began: Instant) -> Self {
+        self.began = began;
+        self
     }
 
     /// Shows the state of the run, and `notes` under it, such as who does not answer.
@@ -88,7 +98,7 @@ impl Display {
             Some(bar) => bar.set_message(texts.join("\n")),
             None if now >= self.plain_next => {
                 self.plain_next = now + PLAIN_PERIOD;
-                self.screen.line(&texts.join("  "));
+                self.screen.line(&plain(now - self.began, texts));
             }
             None => {}
         }
@@ -139,6 +149,11 @@ impl Display {
             ),
         ]
     }
+}
+
+/// The line of a view without a terminal, that long after the run began.
+fn plain(elapsed: Duration, texts: &[String]) -> String {
+    format!("{}  {}", duration(elapsed), texts.join("  "))
 }
 
 /// What to say of a part that was heard so long ago; nothing of one that was heard just now.
@@ -247,6 +262,13 @@ mod tests {
             2 of 2 actors wait for learner
             chunks of 2 actors wait for learner"#]]
         .assert_eq(&said.join("\n"));
+    }
+
+    #[test]
+    fn a_plain_line_begins_with_the_time() {
+        let texts = ["frames 1/2", "return 3"].map(str::to_owned);
+        let said = plain(Duration::from_secs(83), &texts);
+        assert_eq!(said, "1 min 23 s  frames 1/2  return 3");
     }
 
     #[test]

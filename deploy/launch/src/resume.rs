@@ -37,7 +37,7 @@ fn is_in_lockstep(checkpoint: &Path) -> Result<bool, CheckpointError> {
     checkpoint::companion(checkpoint).map(|it| it.is_some())
 }
 
-/// Says how an interrupted run goes on, if it can.
+/// Says how a run that was interrupted or failed goes on, if it can.
 pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
     if is_resumable(world, folder) {
         console::line(&format!(

@@ -36,19 +36,19 @@ pub enum Source {
 #[derive(Clone, Debug, Default, Args)]
 pub struct Flags {
     /// Actor processes [default: by cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=256))]
     pub actors: Option<u32>,
     /// Replay servers among which the actors and the memory are spread [default: 1]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=256))]
     pub replay_shards: Option<u32>,
     /// Copies of the world in each actor [default: 16]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub envs: Option<u32>,
     /// Frames of the whole run; it ends when they are in and their updates done
-    #[arg(long, value_name = "N", value_parser = whole_number::within(1..=i64::MAX as u64))]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = whole_number::within(1..=i64::MAX as u64))]
     pub frames: Option<u64>,
     /// Seed of every generator of the run
-    #[arg(long, value_name = "S", value_parser = whole_number::within(0..=i64::MAX as u64))]
+    #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = whole_number::within(0..=i64::MAX as u64))]
     pub seed: Option<u64>,
     /// Train with a known bug of the paper's published code, to see what it does
     #[arg(long, value_name = "BUG", value_parser = reproduced_bugs())]

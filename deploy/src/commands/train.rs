@@ -62,10 +62,10 @@ pub(crate) struct TrainArgs {
     pub(crate) tensorboard: bool,
     /// Play the newest checkpoint every so many updates, in a process of its own beside the run (which takes a core meanwhile), and
     /// keep the best: evaluations.csv, `driml evaluate RUN --checkpoint best`
-    #[arg(long, value_name = "UPDATES", value_parser = whole_number::within(1..=u64::MAX))]
+    #[arg(long, value_name = "UPDATES", allow_negative_numbers = true, value_parser = whole_number::within(1..=u64::MAX))]
     pub(crate) evaluate_every: Option<u64>,
     /// Whole episodes of each of these evaluations
-    #[arg(long, value_name = "N", default_value_t = 20, requires = "evaluate_every",
+    #[arg(long, value_name = "N", default_value_t = 20, requires = "evaluate_every", allow_negative_numbers = true,
           value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub(crate) evaluate_episodes: u32,
     /// All parts in one process in a fixed order: the same seed gives the same weights, also if the run is interrupted and resumed

@@ -150,7 +150,8 @@ impl ModelConfig {
             let Some(shape) = ConvShape::new(input, *layer) else {
                 let (height, width, _) = input;
                 return fail(format!(
-                    "conv[{index}].kernel {} exceeds its input {height}x{width}",
+                    "conv[{index}].kernel {} exceeds its input {height}x{width}: take a larger input.height or input.width, or fewer or \
+                     smaller layers in model.conv",
                     layer.kernel
                 ));
             };

@@ -223,6 +223,13 @@ impl Fetcher {
                     continue;
                 }
             };
+            if let Fetched::Batch(Batch { header, .. }) = &fetched {
+                let (newest, oldest) = header.weights_versions;
+                tracing::debug!(
+                    "a batch came: {} rows acted by weights {oldest} to {newest}",
+                    header.rows
+                );
+            }
             let last = !matches!(fetched, Fetched::Batch(_));
             if sender.send(fetched).is_err() || last {
                 return;

@@ -167,6 +167,11 @@ impl Outlets {
         status.weights_version = weights.header.version;
         status.weights_sha256 = weights.header.sha256_hex();
         drop(status);
+        tracing::debug!(
+            "weights {} are published, after {} updates",
+            weights.header.version,
+            weights.header.updates
+        );
         self.weights.put(weights);
     }
 

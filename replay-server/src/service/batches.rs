@@ -114,6 +114,12 @@ fn give_batch(responder: Responder<BatchReply>, drawn: Result<PackedBatch, Unrea
     match drawn {
         Ok(draft) => {
             let (header, payload) = draft.unpack().into_payload();
+            tracing::debug!(
+                "a batch goes out: {} rows, {} sampled so far of {} transitions stored",
+                header.rows,
+                header.tally.rows_sampled,
+                header.tally.inserted
+            );
             responder.reply_with(&BatchReply::of(header), payload.freeze());
         }
         Err(unready) => responder.reply(&unready.into()),

@@ -35,6 +35,23 @@ fn a_wrong_name_is_answered_with_the_nearest_and_the_list() {
         "{text}"
     );
     assert!(!error(&"x".repeat(10_000)).contains("did you mean"));
+    assert!(!error("pong").contains("did you mean"), "{}", error("pong"));
+}
+
+#[test]
+fn a_world_of_gymnasium_is_reached_by_exec() {
+    let error = |text: &str| text.parse::<WorldName>().unwrap_err().to_string();
+    for (text, flags) in [
+        ("ALE/Pong-v5", "--atari"),
+        ("CartPole-v1", "--pixels --size 64 --grey"),
+        ("my/world", "--pixels --size 64 --grey"),
+    ] {
+        let command = format!("\"exec:python3 deploy/python/driml_env.py {text} {flags}\"");
+        assert!(error(text).contains(&command), "{}", error(text));
+    }
+    for text in ["pong", "pong-v", "pong-vX", "libenv:/a.so:pong"] {
+        assert!(!error(text).contains("Gymnasium"), "{}", error(text));
+    }
 }
 
 #[test]

@@ -150,6 +150,7 @@ pub fn run(
         if let Err(e) = written {
             console::line(&console::describe(&e));
         }
+        resume::say_how(&config.world, run_dir);
         return Err(failed);
     }
     print(&summary.describe(run_dir))?;

@@ -90,13 +90,15 @@ impl Watched {
             // The view's clock is the run's. All copies of a bar are one.
             drop(bar.clone().with_elapsed(up));
         }
+        let display = Display::new(screen.clone(), config.frames(), config.updates(), now);
+        let began = start.checked_sub(up).unwrap_or(start);
         Ok(Self {
-            display: Display::new(screen.clone(), config.frames(), config.updates(), now),
+            display: display.since(began),
             config,
             after_updates,
             screen,
             recorder,
-            began: start.checked_sub(up).unwrap_or(start),
+            began,
             replay_heard: start,
             learner_heard: start,
             shards: Vec::new(),
