@@ -86,6 +86,13 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let Some(welcome) = join::as_actor(&client, join, shutdown)? else {
         return Ok(());
     };
+    if welcome.earlier_incarnations > 0 && !settings.world.is_resumable() {
+        tracing::warn!(
+            "actor {} takes the place of one that has ended: the ghosts of this run change as episodes pass, and it counts these from 0, \
+             so they are not what they would have been",
+            args.actor
+        );
+    }
     let activity = Activity::new("waits for the learner's first weights");
     reporter::start(
         vec![client.clone()],

@@ -103,6 +103,28 @@ fn a_dead_actor_is_started_again() {
     assert_eq!(system.survivors(), []);
 }
 
+/// Its successor would count the episodes anew, and have other ghosts than the run is to have.
+#[test]
+fn a_dead_actor_whose_ghosts_change_ends_the_run() {
+    let system = system();
+    let flags = "--env mspacman --agent c51 --preset smoke --frames 100000 --actors 1";
+    let process = system.start(&format!(
+        "local {flags} --set world.lethal_schedule={{episodes_per_task=5,order=[0,1]}} --run-dir run --listen {}",
+        system.endpoint()
+    ));
+    let client = system.connect();
+    client.wait_for_replay("some transitions", |replay| replay.transitions_inserted > 0);
+    system.find_part("actor").signal(Signal::SIGKILL);
+    drop(client);
+    process
+        .wait()
+        .expect_code(1)
+        .expect_said("error: actor-0 was ended by signal 9 SIGKILL (log: ")
+        .expect_said("actor-0 is not started again: the ghosts of this run change");
+    assert_eq!(system.survivors(), []);
+    assert_eq!(system.run_folder("run").summary().outcome, "failed");
+}
+
 #[test]
 fn a_dead_replay_server_ends_the_run() {
     dies("replay-server", "replay-server");

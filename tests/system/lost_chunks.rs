@@ -2,7 +2,7 @@
 //! The replay server is played by the test, around the real replay; the actors' side is the real one.
 
 use std::{
-    collections::BTreeSet,
+    collections::{BTreeMap, BTreeSet},
     sync::{
         Arc, Mutex,
         atomic::{AtomicU32, Ordering},
@@ -52,6 +52,8 @@ struct Server {
     replay: Mutex<Replay>,
     loses: Loses,
     messages: AtomicU32,
+    /// How often each actor has said goodbye.
+    goodbyes: Mutex<BTreeMap<u32, u32>>,
     /// What is never answered; a query that is dropped would tell the actor so at once.
     lost: Mutex<Vec<Query>>,
 }
@@ -70,11 +72,12 @@ impl Server {
             replay: Mutex::new(replay),
             loses,
             messages: AtomicU32::new(0),
+            goodbyes: Mutex::default(),
             lost: Mutex::default(),
         })
     }
 
-    /// Answers about chunks, and hears goodbyes, as a replay server does, but for what is lost.
+    /// Answers about chunks and goodbyes as a replay server does, but for what is lost.
     fn declare(self: &Arc<Self>, session: &Session, keys: &Keys) -> Vec<Queryable<()>> {
         let declare = |key, answer: fn(&Self, &[u8]) -> Option<Vec<u8>>| {
             let server = self.clone();
@@ -89,9 +92,14 @@ impl Server {
         };
         let goodbye = |server: &Self, payload: &[u8]| {
             let hash = spec().hash();
-            let goodbye = codec::decode::<Goodbye>(payload, Some(hash));
-            server.replay.lock().unwrap().goodbye(&goodbye.unwrap().0);
-            Some(codec::encode(hash, &Done, &[]).unwrap())
+            let goodbye = codec::decode::<Goodbye>(payload, Some(hash)).unwrap().0;
+            let tries = server.count_goodbye(goodbye.actor);
+            // The first does not arrive, and the answer to the second does not.
+            if tries > 1 {
+                let refused = server.replay.lock().unwrap().goodbye(&goodbye);
+                assert_eq!(refused, None);
+            }
+            (tries > 2).then(|| codec::encode(hash, &Done, &[]).unwrap())
         };
         let insert = |server: &Self, payload: &[u8]| {
             let chunk = Chunk::decode(payload, spec().hash(), 3).unwrap();
@@ -111,6 +119,14 @@ impl Server {
         .into()
     }
 
+    /// Counts a goodbye of this actor; gives how often it has said it.
+    fn count_goodbye(&self, actor: u32) -> u32 {
+        let mut goodbyes = self.goodbyes.lock().unwrap();
+        let tries = goodbyes.entry(actor).or_default();
+        *tries += 1;
+        *tries
+    }
+
     fn lossy(&self, judge: impl FnOnce(&mut Replay) -> InsertReply) -> Option<Vec<u8>> {
         let message = self.messages.fetch_add(1, Ordering::Relaxed);
         let (arrives, is_answered) = match self.loses {
@@ -119,6 +135,13 @@ impl Server {
         };
         let reply = arrives.then(|| judge(&mut self.replay.lock().unwrap()))?;
         is_answered.then(|| codec::encode(spec().hash(), &reply, &[]).unwrap())
+    }
+
+    /// Checks that each actor has said goodbye until it was answered.
+    fn check_goodbyes(&self) {
+        let goodbyes = self.goodbyes.lock().unwrap();
+        assert_eq!(goodbyes.len(), ACTORS as usize, "{goodbyes:?}");
+        assert!(goodbyes.values().all(|&tries| tries >= 3), "{goodbyes:?}");
     }
 
     /// Checks that the replay holds the numbers 0 to `TRANSITIONS`, each once.
@@ -202,6 +225,7 @@ fn chunks_and_answers_that_get_lost_leave_each_transition_stored_once() {
     let server = Server::new(Loses::TwoOfFive);
     deliver_all(&server, Duration::from_millis(100), false);
     server.check_numbers();
+    server.check_goodbyes();
     let retried = server.replay.lock().unwrap().status().chunks_retried;
     // Some answers were lost; how many chunks came again for it, and were not just asked about, is the machine's.
     assert!(retried > 0, "answers were to get lost");
@@ -213,4 +237,5 @@ fn an_actor_that_leaves_does_not_wait_for_long_before_it_sends_again() {
     let server = Server::new(Loses::First(3 * ACTORS));
     deliver_all(&server, Duration::from_secs(15), true);
     server.check_numbers();
+    server.check_goodbyes();
 }

@@ -24,8 +24,10 @@ const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(4);
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// How often a thread that waits for an answer looks whether the actor is to stop.
 const TICK: Duration = Duration::from_millis(50);
-/// How long the goodbye is tried.
+/// How long the goodbye is tried, without the time in which the replay server reads its replay back.
 const GOODBYE_MAX: Duration = Duration::from_secs(5);
+/// How long one try waits for its answer: several must fit, as a message may be lost.
+const GOODBYE_TRY_MAX: Duration = Duration::from_secs(1);
 
 /// A chunk that is not settled yet.
 struct Outgoing {
@@ -345,16 +347,23 @@ impl DeliveryWorker {
     }
 
     fn say_goodbye(&self, goodbye: Goodbye) {
-        let started = Instant::now();
+        let began = Instant::now();
+        let mut silent_since = began;
         loop {
-            match self.client.ask(&goodbye, GOODBYE_MAX) {
+            let e = match self.client.ask(&goodbye, GOODBYE_TRY_MAX) {
                 Ok(Done) => return,
-                Err(e) if started.elapsed() > GOODBYE_MAX => {
-                    tracing::warn!("the replay server did not hear the goodbye: {e}");
-                    return;
-                }
-                Err(_) => std::thread::sleep(RETRY_PAUSE),
+                Err(e) => e,
+            };
+            // Whoever told the actor to stop does not wait for long.
+            let may_wait = !self.shutdown.is_set() || began.elapsed() <= DRAIN_MAX;
+            if may_wait && matches!(e, SessionError::Recovering(_)) {
+                silent_since = Instant::now();
             }
+            if silent_since.elapsed() > GOODBYE_MAX {
+                tracing::warn!("the replay server did not hear the goodbye: {e}");
+                return;
+            }
+            std::thread::sleep(RETRY_PAUSE);
         }
     }
 }

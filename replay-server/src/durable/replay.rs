@@ -39,7 +39,7 @@ pub struct DurableReplay {
 pub(super) struct Log {
     journal: Journal,
     spec_hash: u64,
-    /// The last two marks, the newest last.
+    /// The last two marks that were not given up, the newest last.
     marks: VecDeque<Marked>,
     _folder: LogFolder,
 }
@@ -230,7 +230,7 @@ impl DurableReplay {
     }
 
     /// Marks this moment in the log, on the disk. The log can be opened there again, also after it went on: then all of the
-    /// replay is as it is now, to the last bit. The last two marks hold.
+    /// replay is as it is now, to the last bit. The last two marks hold, without those that were given up.
     ///
     /// # Errors
     /// A disk that refuses.
@@ -247,6 +247,14 @@ impl DurableReplay {
         log.marks.push_back(Marked { mark, oldest_row });
         log.prune(self.replay.oldest_row());
         Ok(Some(mark))
+    }
+
+    /// Nothing will go back to `mark`, as the checkpoint that was to name it could not be saved: it does not take the place of one
+    /// to which a checkpoint goes back.
+    pub fn give_up_mark(&mut self, mark: Mark) {
+        if let Some(log) = &mut self.log {
+            log.marks.retain(|it| it.mark != mark);
+        }
     }
 
     /// [`Replay::sample`], of which the log learns with the next mark: for whoever goes back to marks alone.

@@ -223,7 +223,7 @@ impl Replay {
     /// Takes what the replay's other shards have counted.
     ///
     /// # Errors
-    /// More transitions than the run can ever have; the reason, for a person.
+    /// More transitions than the run can ever have, or more rows than it gives for these; the reason, for a person.
     pub fn set_other_shards(&mut self, other_shards: Tally) -> Result<(), String> {
         let config = &self.config;
         // Each shard takes what its limiter allows until it hears of the others, at most what it holds.
@@ -234,6 +234,20 @@ impl Replay {
             return Err(format!(
                 "the other shards are said to have stored {} transitions; this run has at most {most}",
                 other_shards.inserted
+            ));
+        }
+        // Rows are given as the replay ratio allows them, or were, before it was lowered. Of others the learner would wait for
+        // transitions that never come.
+        let heard = self.limiter.other_shards();
+        let inserted = other_shards.inserted.max(heard.inserted);
+        let inserted = inserted.saturating_add(self.limiter.tally().inserted);
+        let allowed = config.replay_ratio * inserted as f64;
+        let ahead = config.replay_ratio * most(config.slack_transitions) as f64;
+        let most_rows = allowed.max(heard.rows_sampled as f64) + ahead;
+        if other_shards.rows_sampled as f64 > most_rows {
+            return Err(format!(
+                "the other shards are said to have given {} rows; for {inserted} transitions a run gives at most {most_rows:.0}",
+                other_shards.rows_sampled
             ));
         }
         self.limiter.set_other_shards(other_shards);

@@ -80,6 +80,36 @@ fn a_log_goes_back_to_its_last_two_marks() {
     }
 }
 
+/// Checkpoints that cannot be saved, one after the other, leave the newest that could its mark.
+#[test]
+fn marks_that_are_given_up_leave_the_one_before_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = unlimited(60);
+    let mut life = Life::begin(folder.path(), config, 600, 1);
+    for _ in 0..30 {
+        life.act();
+    }
+    let kept = life.replay.mark().unwrap().unwrap();
+    let before = state(&life.replay);
+    for _ in 0..4 {
+        for _ in 0..12 {
+            life.store(0);
+            life.store(1);
+        }
+        let mark = life.replay.mark().unwrap().unwrap();
+        life.replay.give_up_mark(mark);
+    }
+    let Life {
+        args,
+        config,
+        replay,
+        ..
+    } = life;
+    drop(replay);
+    let replay = at(&args, &config, kept).unwrap();
+    assert!(state(&replay) == before);
+}
+
 #[test]
 fn a_log_with_marks_holds_no_more_than_these_need() {
     let folder = tempfile::tempdir().unwrap();

@@ -2,7 +2,8 @@
 //! It does not look at rows, and no message is lost or repeated.
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, End, Goodbye, InsertReply, RunSpec, Waiting,
+    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, End, Goodbye, InsertReply, RunSpec, Tally,
+    Waiting,
 };
 use driml_replay_server::{ACTORS_MAX, Replay, STREAMS_MAX, Unready};
 
@@ -213,4 +214,62 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
     };
     assert!(replay.set_affinity(&foreign).is_err());
     assert_eq!(replay.status().messages_refused, 3);
+}
+
+#[test]
+fn what_other_shards_are_said_to_have_counted_is_bounded() {
+    let mut config = unlimited(1000);
+    (config.shards, config.replay_ratio) = (2, 4.0);
+    (config.slack_transitions, config.transitions_max) = (100, Some(5000));
+    let mut replay = Replay::shard(&small_spec(), &config, 8, 0).unwrap();
+    assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
+    let tally = |inserted, rows_sampled| Tally {
+        inserted,
+        rows_sampled,
+    };
+    // Rows: 4 for each of the 106 transitions that are stored, of a capacity of 1000 and of a slack of 100.
+    for (lie, bound) in [
+        (tally(6001, 0), "at most 6000"),
+        (tally(u64::MAX, u64::MAX), "at most 6000"),
+        (tally(100, 4825), "at most 4824"),
+        (tally(100, u64::MAX), "at most 4824"),
+    ] {
+        let why = replay.set_other_shards(lie).unwrap_err();
+        assert!(why.contains(bound), "{why}");
+    }
+    replay.set_other_shards(tally(100, 400)).unwrap();
+    replay.sample(8).expect("of the lies nothing was counted");
+    replay.set_other_shards(tally(100, 4824)).unwrap();
+    assert_eq!(
+        replay.sample(8),
+        Err(Unready::Wait(Waiting::LearnerWaitsForActors))
+    );
+    replay.check_valid();
+}
+
+#[test]
+fn a_version_of_the_affinity_that_no_run_reaches_is_refused() {
+    let mut replay = Replay::new(&small_spec(), &unlimited(1000), 8).unwrap();
+    insert(&mut replay, header(0, 1, 0, 0));
+    replay.sample(8).unwrap();
+    let affinity = |version| AffinityUpdate {
+        learner: 1,
+        version,
+        num_actions: 5,
+        matrix: vec![0.2; 25],
+    };
+    // 2^32 ahead of the rows.
+    let most: u64 = 8 + (1 << 32);
+    for version in [most + 1, u64::MAX] {
+        let why = replay.set_affinity(&affinity(version)).unwrap_err();
+        let why = why.to_string();
+        assert!(
+            why.contains("of the affinity, in a run that has served 8 rows"),
+            "{why}"
+        );
+    }
+    let status = replay.status();
+    assert_eq!((status.messages_refused, status.affinity_version), (2, 0));
+    replay.set_affinity(&affinity(most)).unwrap();
+    assert_eq!(replay.status().affinity_version, most);
 }

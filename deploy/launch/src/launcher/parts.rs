@@ -3,6 +3,7 @@
 
 use std::path::Path;
 
+use anyhow::bail;
 use driml_protocol::session;
 
 use super::{Launch, Outside};
@@ -103,15 +104,21 @@ impl Launch<'_> {
     /// Starts actors that have died again. What one had not delivered is gone with it; the run goes on.
     ///
     /// # Errors
-    /// The process cannot be started.
+    /// The process cannot be started, or would begin anew what goes on from episode to episode in this world.
     pub(super) fn revive_actors(&mut self) -> anyhow::Result<()> {
         for id in 0..self.processes.actors.len() {
             let actor = &mut self.processes.actors[id];
             if self.actor_restarts == ACTOR_RESTARTS_MAX || !actor.may_be_started_again() {
                 continue;
             }
-            self.actor_restarts += 1;
             let report = actor.exit_report();
+            if !self.config.world.is_resumable() {
+                bail!(
+                    "{report}\nactor-{id} is not started again: the ghosts of this run change as episodes pass, and a new process would \
+                     count these from 0"
+                );
+            }
+            self.actor_restarts += 1;
             self.screen.line(&format!(
                 "{report}\nactor-{id} is started again ({} of {ACTOR_RESTARTS_MAX} times in a run)",
                 self.actor_restarts

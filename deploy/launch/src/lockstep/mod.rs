@@ -72,13 +72,23 @@ pub fn run(
     let mut episodes = EndedEpisodes::default();
     let mut outcome = Outcome::Finished;
     let mut saved = resumed.map(|point| point.updates);
+    // After how many updates a save was last tried.
+    let mut tried = saved.unwrap_or(0);
     // A round may take several updates.
     let period = config.learner.checkpoint_period_updates;
     while lockstep.round()? {
-        if lockstep.updates() / period > saved.unwrap_or(0) / period {
-            saved = Some(lockstep.updates());
-            lockstep.save(&folder)?;
-            evaluations.play(lockstep.updates(), false, &screen)?;
+        let updates = lockstep.updates();
+        if updates / period > tried / period {
+            tried = updates;
+            // A disk that refuses once does not end the training; what cannot be saved in the end is an error.
+            if let Err(e) = lockstep.save(&folder) {
+                screen.line(&format!(
+                    "no checkpoint after {updates} updates, trying again at the next period: {e:#}"
+                ));
+            } else {
+                saved = Some(updates);
+                evaluations.play(updates, false, &screen)?;
+            }
         }
         let show = shown.elapsed() >= POLL;
         if show || lockstep.frames() / row_frames > row {

@@ -228,9 +228,18 @@ impl Lockstep {
     /// # Errors
     /// A file system that refuses.
     pub(super) fn save(&mut self, folder: &Path) -> anyhow::Result<()> {
-        let Some(replay) = self.replay.mark()? else {
+        let Some(mark) = self.replay.mark()? else {
             return Ok(self.learner.save(folder)?);
         };
+        let saved = self.save_at(mark, folder);
+        if saved.is_err() {
+            self.replay.give_up_mark(mark);
+        }
+        saved
+    }
+
+    /// [`Lockstep::save`] of a run whose replay is marked in its log.
+    fn save_at(&mut self, mark: Mark, folder: &Path) -> anyhow::Result<()> {
         let actors = self
             .actor_states()
             .context("saving the worlds for a checkpoint; at the run's start it could be done")?;
@@ -238,7 +247,7 @@ impl Lockstep {
             actors,
             next_actor: self.next_actor,
             unwanted: self.unwanted.clone(),
-            replay,
+            replay: mark,
             priorities: self.replay.saved_priorities(),
             status: self.status.clone(),
             acting: self.acting.clone(),
