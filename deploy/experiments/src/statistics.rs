@@ -53,12 +53,13 @@ impl fmt::Display for Spread {
     }
 }
 
-/// 0.975 quantiles of Student's t with 1, 2, .. degrees of freedom. Source: the tables of any textbook; beyond them the normal law's.
-const T: [f64; 15] = [
+/// 0.975 quantiles of Student's t with 1, 2, .. degrees of freedom. Source: the tables of any textbook; beyond them the last, which is
+/// 0.08 above the normal law's.
+const T: [f64; 30] = [
     12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160,
-    2.145, 2.131,
+    2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056,
+    2.052, 2.048, 2.045, 2.042,
 ];
-const NORMAL: f64 = 1.960;
 
 /// A mean over seeds and the interval in which it lies with 95% confidence if seeds are normal: Student's.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -75,7 +76,7 @@ impl Interval {
             mean, sd, count, ..
         } = Spread::of(values.iter().copied())?;
         let ends = (count > 1).then(|| {
-            let by = T.get(count - 2).unwrap_or(&NORMAL) * sd / (count as f64).sqrt();
+            let by = T[(count - 2).min(T.len() - 1)] * sd / (count as f64).sqrt();
             (mean - by, mean + by)
         });
         Some(Self { mean, ends })
@@ -99,7 +100,7 @@ impl Interval {
             sum => {
                 let each = a * a / (from.count - 1) as f64 + b * b / (to.count - 1) as f64;
                 let freedom = (sum * sum / each) as usize;
-                T.get(freedom.max(1) - 1).unwrap_or(&NORMAL) * sum.sqrt()
+                T[(freedom.max(1) - 1).min(T.len() - 1)] * sum.sqrt()
             }
         };
         Some(Self {
@@ -112,6 +113,37 @@ impl Interval {
     pub(super) fn is_apart_from_zero(&self) -> bool {
         self.ends.is_some_and(|(low, high)| low > 0.0 || high < 0.0)
     }
+}
+
+/// Values of which [`chance_of_difference`] tries all deals: at most 184,756.
+const DEALT_MAX: usize = 20;
+
+/// Chance that the means of `from` and `to` are at least so far apart if all of their values were dealt to the two at random:
+/// the exact permutation test, which asks nothing of how values are spread. None where either is empty, or of more than 20 values.
+pub(super) fn chance_of_difference(from: &[f64], to: &[f64]) -> Option<f64> {
+    let all = [from, to].concat();
+    if from.is_empty() || to.is_empty() || all.len() > DEALT_MAX {
+        return None;
+    }
+    let total: f64 = all.iter().sum();
+    let apart = |dealt: u32| {
+        let chosen = all
+            .iter()
+            .enumerate()
+            .filter(|(at, _)| dealt >> at & 1 == 1);
+        let sum: f64 = chosen.map(|(_, value)| value).sum();
+        (sum / to.len() as f64 - (total - sum) / from.len() as f64).abs()
+    };
+    let seen = apart(((1 << to.len()) - 1) << from.len());
+    // Sums in another order may differ in their last places.
+    let least = seen - 1e-9 * (1.0 + seen);
+    let deals = (0..1u32 << all.len()).filter(|it| it.count_ones() as usize == to.len());
+    let (mut far, mut count) = (0u32, 0u32);
+    for deal in deals {
+        count += 1;
+        far += u32::from(apart(deal) >= least);
+    }
+    Some(f64::from(far) / f64::from(count))
 }
 
 impl fmt::Display for Interval {
@@ -229,5 +261,23 @@ mod tests {
         // Of the six pairs 2 > 1, 4 > 1, 4 > 3 are in order, 2 < 3 is not, and 2 = 2, 4 > 2.
         assert_eq!(auc(&[2.0, 4.0], &[1.0, 3.0, 2.0]), Some(4.5 / 6.0));
         assert_eq!(auc(&[], &[1.0]), None);
+    }
+
+    #[test]
+    fn a_permutation_test_counts_deals() {
+        let is = |found: Option<f64>, chance: f64| (found.unwrap() - chance).abs() < 1e-12;
+        // Of the 10 deals of five values one is as far apart to this side, and one to the other.
+        let found = chance_of_difference(&[1.0, 2.0, 3.0], &[4.0, 5.0]);
+        assert!(is(found, 0.2), "{found:?}");
+        let found = chance_of_difference(&[1.0, 1.1, 0.9, 1.2, 0.8, 1.0], &[3.0, 3.1, 2.9]);
+        assert!(is(found, 1.0 / 84.0), "{found:?}");
+        // Three values that coincide with two of six: Welch's interval excludes 0, and dealing says that it is chance.
+        let (from, to) = ([2.0, 2.02, 0.0, 0.0, 0.0, 0.02], [2.0, 2.01, 2.04]);
+        let welch = Interval::of_difference(&from, &to).unwrap();
+        assert!(welch.is_apart_from_zero());
+        let found = chance_of_difference(&from, &to);
+        assert!(is(found, 9.0 / 84.0), "{found:?}");
+        assert_eq!(chance_of_difference(&[1.0], &[]), None);
+        assert_eq!(chance_of_difference(&[1.0; 20], &[2.0]), None);
     }
 }

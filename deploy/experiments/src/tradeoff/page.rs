@@ -1,5 +1,7 @@
 //! The page of a trade-off: a row for each level with what it gives and what it costs, and C51 beside DIM at equal frames and at equal time.
 
+use std::collections::BTreeSet;
+
 use driml_machine::units::rough_duration;
 
 use super::results::{LevelOf, Measure, PointResult, Results};
@@ -90,6 +92,7 @@ pub(super) fn page(results: &Results) -> anyhow::Result<Page> {
             "random",
             random.map_or("-".into(), |it| format!("{:.2}", it.mean)),
         )
+        .set("above_random", above_random(results))
         .set("gains", gains(results))
         .set("rest", rest(results))
         .set("errors", errors(results))
@@ -116,17 +119,29 @@ pub(super) fn page(results: &Results) -> anyhow::Result<Page> {
     ))
 }
 
+/// The bases, each once.
+fn bases(results: &Results) -> BTreeSet<&str> {
+    let all = results.levels.iter();
+    all.map(|of| of.base.key.as_str()).collect()
+}
+
+/// Whether an agent learns at all here, without which no level can cost anything.
+fn above_random(results: &Results) -> String {
+    let each = bases(results).into_iter().filter_map(|key| {
+        let above = results.above_random(&results.points[key])?;
+        let apart = match above.ends {
+            Some((low, _)) if low <= 0.0 => ": these seeds do not show that it has learned",
+            _ => "",
+        };
+        Some(format!("{key} {}{apart}", signed(&above)))
+    });
+    each.collect::<Vec<_>>().join("; ")
+}
+
 /// What whole runs of the bases did, so that a reader sees how long one is.
 fn load(results: &Results) -> String {
-    let mut bases: Vec<&str> = results
-        .levels
-        .iter()
-        .map(|of| of.base.key.as_str())
-        .collect();
-    bases.sort_unstable();
-    bases.dedup();
-    let each = bases.iter().filter_map(|key| {
-        let point = &results.points[*key];
+    let each = bases(results).into_iter().filter_map(|key| {
+        let point = &results.points[key];
         let seconds = Spread::of(point.values(Measure::WallSeconds))?;
         Some(format!(
             "{key} {} ({} to {})",
@@ -152,7 +167,8 @@ fn found(results: &Results, of: &LevelOf) -> String {
     let gains: Vec<String> = speed.into_iter().chain(frames).collect();
     let cost = |returns, name: &str| {
         let found = results.difference(of, returns);
-        found.map(|it| format!("{name} {}{}", signed(&it), verdict(&it)))
+        let is_apart = results.is_apart(of, returns);
+        found.map(|it| format!("{name} {}{}", signed(&it), verdict(&it, is_apart)))
     };
     let costs = [
         cost(Measure::Greedy, "greedy return"),
@@ -171,13 +187,9 @@ fn found(results: &Results, of: &LevelOf) -> String {
     )
 }
 
-/// What an interval of a difference says.
-fn verdict(difference: &Interval) -> &'static str {
-    match (
-        difference.ends,
-        difference.is_apart_from_zero(),
-        difference.mean > 0.0,
-    ) {
+/// What a difference says.
+fn verdict(difference: &Interval, is_apart: bool) -> &'static str {
+    match (difference.ends, is_apart, difference.mean > 0.0) {
         (None, ..) => " (one seed)",
         (_, false, _) => "",
         (_, true, true) => ", better than its base",
@@ -473,10 +485,10 @@ mod tests {
 
     #[test]
     fn a_difference_is_put_into_words() {
-        let of = |values: &[f64]| verdict(&Interval::of(values).unwrap());
-        assert_eq!(of(&[1.0, 1.1, 1.2]), ", better than its base");
-        assert_eq!(of(&[-1.0, -1.1, -1.2]), ", worse than its base");
-        assert_eq!(of(&[-1.0, 1.0]), "");
-        assert_eq!(of(&[1.0]), " (one seed)");
+        let of = |values: &[f64], is_apart| verdict(&Interval::of(values).unwrap(), is_apart);
+        assert_eq!(of(&[1.0, 1.1, 1.2], true), ", better than its base");
+        assert_eq!(of(&[-1.0, -1.1, -1.2], true), ", worse than its base");
+        assert_eq!(of(&[1.0, 1.1, 1.2], false), "");
+        assert_eq!(of(&[1.0], false), " (one seed)");
     }
 }

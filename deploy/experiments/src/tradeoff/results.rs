@@ -10,7 +10,7 @@ use super::{
 };
 use crate::{
     runs::FinishedRun,
-    statistics::{Interval, Spread},
+    statistics::{Interval, Spread, chance_of_difference},
 };
 
 /// A level of a dial and its base.
@@ -118,9 +118,27 @@ impl Results {
         Interval::of_difference(&base, &level)
     }
 
-    /// The level's mean over the base's.
+    /// Whether level and base are apart: by Welch's interval, and by the exact permutation test of few seeds at 5%, as these may
+    /// coincide.
+    pub(super) fn is_apart(&self, of: &LevelOf, measure: Measure) -> bool {
+        let [base, level] = [&of.base, &of.point].map(|it| self.points[&it.key].values(measure));
+        Interval::of_difference(&base, &level).is_some_and(|it| it.is_apart_from_zero())
+            && chance_of_difference(&base, &level).is_none_or(|it| it <= 0.05)
+    }
+
+    /// The level's mean over the base's, of the seeds that both have: a base's further seeds run at another time, beside other runs.
     pub(super) fn factor(&self, of: &LevelOf, measure: Measure) -> Option<f64> {
-        let [base, level] = [&of.base, &of.point].map(|it| self.points[&it.key].mean(measure));
-        Some(level?.mean / base?.mean)
+        let [base, level] = [&of.base, &of.point].map(|it| &self.points[&it.key]);
+        let mean = |point: &PointResult, other: &PointResult| {
+            let both = |it: &&SeedResult| other.seeds.iter().any(|of| of.seed == it.seed);
+            let values = point.seeds.iter().filter(both);
+            Spread::of(values.filter_map(|it| it.value(measure))).map(|it| it.mean)
+        };
+        Some(mean(level, base)? / mean(base, level)?)
+    }
+
+    /// What a base earns in training more than the random policy: Welch's interval, over seeds and over episodes of the latter.
+    pub(super) fn above_random(&self, base: &PointResult) -> Option<Interval> {
+        Interval::of_difference(&self.random, &base.values(Measure::Training))
     }
 }
