@@ -4,7 +4,7 @@
 use std::{
     fs,
     path::{Path, PathBuf},
-    time::Instant,
+    time::{Instant, SystemTime},
 };
 
 use anyhow::Context;
@@ -14,7 +14,10 @@ use driml_launch::{
     interrupts::Interrupts,
     run_folder::write_whole,
 };
-use driml_machine::error::{Interrupted, usage};
+use driml_machine::{
+    error::{Interrupted, usage},
+    resources,
+};
 use driml_settings::renamed;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
@@ -239,6 +242,23 @@ pub(super) fn settings_of<T: DeserializeOwned>(name: &str, flags: &ExperimentFla
 fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
     let default = || Path::new("experiments").join(name);
     flags.out.clone().unwrap_or_else(default)
+}
+
+/// Names this program and the processor it runs on, for [`Session::piece_of`]: the size of its file and when that was written.
+///
+/// # Errors
+/// A file that cannot be looked at.
+pub(super) fn program() -> anyhow::Result<String> {
+    let file = std::env::current_exe().context("finding this program's own file")?;
+    let about = fs::metadata(&file).with_context(|| format!("looking at {}", file.display()))?;
+    let written = about.modified().ok();
+    let written = written.and_then(|it| it.duration_since(SystemTime::UNIX_EPOCH).ok());
+    Ok(format!(
+        "{} bytes of {} s, {}",
+        about.len(),
+        written.map_or(0.0, |it| it.as_secs_f64()),
+        resources::processor()
+    ))
 }
 
 #[cfg(test)]

@@ -23,7 +23,7 @@ use self::{
 use crate::{
     flags::{self, ExperimentFlags, command_line},
     page::{Page, Table},
-    session::Session,
+    session::{self, Session},
     template::Values,
 };
 
@@ -84,12 +84,14 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let each: u64 = MENU.iter().map(|(_, units, _)| units).sum();
     let units = each * u64::from(settings.seeds) + 1;
     let mut session = Session::open(NAME, args, &settings, units)?;
+    // What another build of the routines kept says nothing of these.
+    let program = session::program()?;
     let mut rows: Vec<Row> = Vec::new();
     for (at, (family, units, check)) in MENU.into_iter().enumerate() {
         let mut of_family: Vec<Row> = Vec::new();
         for seed in 1..=settings.seeds {
             let key = format!("{family}-seed{seed}");
-            let found: Vec<Row> = session.piece(&key, units, |progress| {
+            let found: Vec<Row> = session.piece_of(&program, &key, units, |progress| {
                 let mut rng = ChaCha8Rng::seed_from_u64(seed.into());
                 rng.set_stream(at as u64);
                 let found = check(&mut Context {
@@ -109,7 +111,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
         }
         rows.extend(of_family);
     }
-    let (refusals, machine) = session.piece("refused", 1, |progress| {
+    let (refusals, machine) = session.piece_of(&program, "refused", 1, |progress| {
         progress.advance(1)?;
         Ok((refused::check()?, MachineNote::this()))
     })?;
