@@ -18,13 +18,13 @@ use super::{
 pub struct LearnedSettings {
     /// Hidden units, 1 to 4,096.
     pub hidden: usize,
-    /// Adam's learning rate, above 0.
+    /// Adam's learning rate, from 1e-30 to 1e38: with it parameters and their products are finite in f64 for as long as a run lasts.
     pub lr: f64,
     /// Adam's decay of the first moment, in [0, 1).
     pub beta1: f64,
     /// Adam's decay of the second moment, in [0, 1).
     pub beta2: f64,
-    /// Adam's addend outside the root, above 0.
+    /// Adam's addend outside the root, from 1e-30 to 1e30.
     pub eps: f64,
     /// Share of the old A that each update keeps, in [0, 1): A <- keep * A + (1 - keep) * row softmax of q.
     pub keep: f64,
@@ -64,7 +64,8 @@ impl LearnedSettings {
             eps,
             keep,
         } = *self;
-        let above_0 = |x: f64| (x > 0.0 && x.is_finite(), "above 0 and finite");
+        let rate = |x: f64| ((1e-30..=1e38).contains(&x), "within 1e-30 and 1e38");
+        let addend = |x: f64| ((1e-30..=1e30).contains(&x), "within 1e-30 and 1e30");
         let share = |x: f64| ((0.0..1.0).contains(&x), "at least 0 and below 1");
         if !(1..=HIDDEN_MAX).contains(&hidden) {
             return Err(AffinityError(format!(
@@ -72,8 +73,8 @@ impl LearnedSettings {
             )));
         }
         for (name, value, (is_fine, range)) in [
-            ("lr", lr, above_0(lr)),
-            ("eps", eps, above_0(eps)),
+            ("lr", lr, rate(lr)),
+            ("eps", eps, addend(eps)),
             ("beta1", beta1, share(beta1)),
             ("beta2", beta2, share(beta2)),
             ("keep", keep, share(keep)),

@@ -22,7 +22,7 @@ use super::{
 use crate::stability::{check::Refusal, small};
 
 /// Settings as `--set` takes them: the last part of the key is the name that the refusal must have.
-const SETTINGS: [(&str, &str, &[&str]); 27] = [
+const SETTINGS: [(&str, &str, &[&str]); 28] = [
     (
         "chain",
         "learner.update.tanh_clip",
@@ -64,9 +64,18 @@ const SETTINGS: [(&str, &str, &[&str]); 27] = [
     ),
     ("chain", "learner.affinity.exact.decay", &["0.0", "1.1"]),
     ("chain", "learner.affinity.learned.hidden", &["0", "5000"]),
+    ("chain", "learner.affinity.learned.beta1", &["-0.1", "1.0"]),
     ("chain", "learner.affinity.learned.beta2", &["-0.1", "1.0"]),
-    ("chain", "learner.affinity.learned.eps", &["0.0", "inf"]),
-    ("chain", "learner.affinity.learned.lr", &["0.0", "inf"]),
+    (
+        "chain",
+        "learner.affinity.learned.eps",
+        &["0.0", "1e-320", "inf"],
+    ),
+    (
+        "chain",
+        "learner.affinity.learned.lr",
+        &["0.0", "1e300", "inf"],
+    ),
     ("chain", "learner.affinity.learned.keep", &["-0.1", "1.0"]),
     ("chain", "run.gamma", &["-0.1", "1.1"]),
     ("chain", "run.n_step", &["0", "1001"]),
