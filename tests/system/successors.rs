@@ -93,7 +93,10 @@ fn a_learner_whose_replay_server_was_started_anew_saves_and_says_so() {
     let system = system();
     let (server, learner, client) = between_checkpoints(&system, "");
     let actor = system.start_actor(1);
-    client.wait_for_replay("a second actor", |replay| replay.actors == 1);
+    // One without weights would wait for these, and hear nothing of a new server.
+    client.wait_for_replay("a second actor", |replay| {
+        (replay.actors, replay.actors_acting) == (1, 2)
+    });
     drop(client);
     server.signal(Signal::SIGKILL);
     server.wait();

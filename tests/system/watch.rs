@@ -39,12 +39,14 @@ fn a_run_of_parts_by_hand_leaves_the_folder_of_a_launched_one() {
     wait_for("the folder", || {
         system.path("run/metrics.csv").exists().then_some(())
     });
+    // They begin together, with the first weights: one that came late would play hardly an episode.
+    let actors = [system.start_actor(0), system.start_actor(1)];
+    client.wait_for_replay("both actors", |replay| replay.actors == 2);
     // Into the same folder, which is then as good as a launched run's.
     let learner = run(
         &system,
         &format!("learner --connect {endpoint} --run-dir run"),
     );
-    let actors = [system.start_actor(0), system.start_actor(1)];
     let ended = watch.wait().expect_code(0);
     assert!(
         ended
