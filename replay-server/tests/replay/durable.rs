@@ -90,6 +90,12 @@ pub(crate) fn state(replay: &DurableReplay) -> Vec<u8> {
 }
 
 impl Life {
+    /// Ends it: what its successor begins with.
+    pub(crate) fn end(self) -> (DurableArgs, Config) {
+        drop(self.replay);
+        (self.args, self.config)
+    }
+
     pub(crate) fn begin(dir: &Path, config: Config, segment_bytes: u64, seed: u64) -> Self {
         let args = args(dir, segment_bytes);
         let (mut replay, recovery) = open(&args, &config).unwrap();
@@ -362,13 +368,7 @@ fn retries_are_recognised_after_a_restart() {
     let id = life.requests[0];
     assert!(life.draw(0).is_some());
     let served = life.replay.status();
-    let Life {
-        args,
-        config,
-        replay,
-        ..
-    } = life;
-    drop(replay);
+    let (args, config) = life.end();
 
     let (mut replay, recovery) = open(&args, &config).unwrap();
     assert!(recovery.found);
@@ -437,14 +437,8 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
     );
     life.replay.check_valid();
     assert!(life.draw(0).is_some());
-    let Life {
-        args,
-        config,
-        replay,
-        ..
-    } = life;
-    let before = state(&replay);
-    drop(replay);
+    let before = state(&life.replay);
+    let (args, config) = life.end();
     let (replay, _) = open(&args, &config).unwrap();
     assert_eq!(state(&replay), before);
     assert_eq!(replay.status().transitions_held, status.transitions_held);
@@ -465,14 +459,8 @@ fn a_resumed_run_goes_on_with_what_was_kept() {
         batches += 1;
     }
     assert!(batches > 80);
-    let Life {
-        mut args,
-        config,
-        replay,
-        ..
-    } = life;
-    let before = replay.status();
-    drop(replay);
+    let before = life.replay.status();
+    let (mut args, config) = life.end();
 
     // The learner saved after 50 updates: the rows beyond them are served again.
     args.after_updates = 50;

@@ -53,13 +53,7 @@ fn a_log_goes_back_to_its_last_two_marks() {
             life.store(1);
             next_draws(&mut life.replay);
         }
-        let Life {
-            args,
-            config,
-            replay,
-            ..
-        } = life;
-        drop(replay);
+        let (args, config) = life.end();
         for (mark, before, draws) in &marks {
             let copied = tempfile::tempdir().unwrap();
             copy(folder.path(), copied.path());
@@ -99,13 +93,7 @@ fn marks_that_are_given_up_leave_the_one_before_them() {
         let mark = life.replay.mark().unwrap().unwrap();
         life.replay.give_up_mark(mark);
     }
-    let Life {
-        args,
-        config,
-        replay,
-        ..
-    } = life;
-    drop(replay);
+    let (args, config) = life.end();
     let replay = at(&args, &config, kept).unwrap();
     assert!(state(&replay) == before);
 }
@@ -168,13 +156,7 @@ fn priorities_come_back_where_they_were_kept_beside_a_mark() {
         let mark = life.replay.mark().unwrap().unwrap();
         let kept = life.replay.saved_priorities();
         let draws = next_learned(&mut life.replay);
-        let Life {
-            args,
-            config,
-            replay,
-            ..
-        } = life;
-        drop(replay);
+        let (args, config) = life.end();
         let mut replay = at(&args, &config, mark).unwrap();
         replay.check_valid();
         let batch = replay.sample_between_marks(ROWS).unwrap();
