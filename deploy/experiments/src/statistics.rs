@@ -1,5 +1,5 @@
-//! Small statistics over seeds and pairs: mean and spread, rank correlation, area under the ROC curve.
-//! No test of significance: with a handful of seeds the spread itself says more.
+//! Small statistics over seeds and pairs: mean and spread, intervals, a permutation test, rank correlation, area under the ROC curve.
+//! It judges nothing: what is called apart is for each page to say.
 
 use std::fmt;
 
