@@ -110,12 +110,29 @@ impl Session {
         Self::open(name, flags, settings, units)
     }
 
-    /// Whether the piece of this name was made.
-    pub(super) fn has_piece(&self, key: &str) -> bool {
-        self.folder
-            .join(PIECES)
-            .join(format!("{key}.json"))
-            .is_file()
+    /// The piece of this name if it is there, whatever it was made of.
+    pub(super) fn kept_piece<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
+        let text = fs::read(self.piece_path(key)).ok()?;
+        let kept: Kept<T> = serde_json::from_slice(&text).ok()?;
+        Some(kept.result)
+    }
+
+    /// Keeps a piece that took no time.
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(super) fn keep<T: Serialize>(&self, key: &str, result: T) -> anyhow::Result<()> {
+        let kept = Kept {
+            of: String::new(),
+            seconds: 0.0,
+            result,
+        };
+        let text = serde_json::to_vec(&kept).context("keeping a piece")?;
+        write_whole(&self.piece_path(key), &text)
+    }
+
+    fn piece_path(&self, key: &str) -> PathBuf {
+        self.folder.join(PIECES).join(format!("{key}.json"))
     }
 
     /// Where everything goes.
@@ -158,7 +175,7 @@ impl Session {
         units: u64,
         make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
-        let path = self.folder.join(PIECES).join(format!("{key}.json"));
+        let path = self.piece_path(key);
         let found: Option<Kept<T>> = fs::read(&path)
             .ok()
             .and_then(|text| serde_json::from_slice(&text).ok());

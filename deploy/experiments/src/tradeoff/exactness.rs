@@ -7,7 +7,7 @@ use driml_learner::{
     Agent, Compute, NetworkParameters, checkpoint,
     parity::{
         deviation::{ErrorOfUpdate, QError},
-        float64::float64,
+        float64::{float64, q_values},
     },
 };
 use driml_model::PolicyNetwork;
@@ -16,8 +16,10 @@ use serde::{Deserialize, Serialize};
 
 use super::held::HeldBatch;
 
-/// Rows of a held batch: float64 takes seconds for them.
+/// Rows of the batch whose loss and gradient are compared, at most: float64 takes seconds for them.
 const ROWS_MAX: usize = 64;
+/// States whose values and greedy actions are compared, for each of these rows.
+const STATES_A_ROW: usize = 16;
 
 /// Errors of a level against float64, at the weights of one of its runs.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
@@ -27,14 +29,38 @@ pub(super) struct Exactness {
     /// Relative error of the gradient, and 1 - cosine of its angle to the reference.
     pub(super) gradient: f64,
     pub(super) angle: f64,
-    /// Of the learner's values of s_t, in units of return.
+    /// Of the learner's values, in units of return.
     pub(super) q_rms: f64,
     pub(super) q_max: f64,
-    /// Share of rows with the reference's greedy action: by the learner, and by an actor with the weights as they are published.
+    /// Share of states with the reference's greedy action: by the learner, and by an actor with the weights as they are published.
     pub(super) same_learner: f64,
     pub(super) same_actor: f64,
-    /// Of the actor's values of s_t.
+    /// Of the actor's values.
     pub(super) actor_q_rms: f64,
+}
+
+/// Of what the errors of a run with `config` are made, beside its weights.
+pub(super) fn method(config: &RunConfig) -> String {
+    format!(
+        "{} rows, {} states",
+        rows(config),
+        rows(config) * STATES_A_ROW
+    )
+}
+
+fn rows(config: &RunConfig) -> usize {
+    ROWS_MAX.min(config.learner.batch_size as usize)
+}
+
+/// An actor's values [B, A] of the rows' states.
+fn acted_values(
+    policy: &mut PolicyNetwork,
+    held: &HeldBatch,
+    num_actions: usize,
+) -> anyhow::Result<Vec<f32>> {
+    let mut values = vec![0.0; held.rows() * num_actions];
+    policy.q_values(&held.states_t, &mut values)?;
+    Ok(values)
 }
 
 /// Measures the newest checkpoint of a run of a level with `config`.
@@ -57,24 +83,29 @@ pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<
         target: restored.agent.target().copy()?,
         key: None,
     };
-    let agent = Agent::from_parameters(model.clone(), update.clone(), &compute, parameters)?;
+    let agent = Agent::from_parameters(model.clone(), update.clone(), &compute, parameters)?
+        .with_equal_states(config.learner.equal_states);
     let weights = agent.weights()?;
-    let rows = ROWS_MAX.min(config.learner.batch_size as usize);
+    let rows = rows(config);
     let held = HeldBatch::play(config, Some(&weights), rows)?;
     let reference = float64(&agent, &held.batch())?;
     let found = ErrorOfUpdate::of(&agent, &held.batch(), &reference)?;
     let published = agent.weights_as(config.learner.publish_as)?;
     let mut policy = PolicyNetwork::new(model, &published, config.actor.precision)?;
-    let mut values = vec![0.0; rows * model.num_actions];
-    policy.q_values(&held.states_t, &mut values)?;
-    let acting = QError::of(&values, &reference.q_values_t, model.num_actions);
+    let held = HeldBatch::play(config, Some(&weights), rows * STATES_A_ROW)?;
+    let expected = q_values(&agent, &held.states_t)?;
+    let [learning, acting] = [
+        agent.q_values_t(&held.batch())?,
+        acted_values(&mut policy, &held, model.num_actions)?,
+    ]
+    .map(|values| QError::of(&values, &expected, model.num_actions));
     Ok(Exactness {
         loss: found.loss,
         gradient: found.gradient,
         angle: found.angle,
-        q_rms: found.q_rms,
-        q_max: found.q_max,
-        same_learner: found.same_action,
+        q_rms: learning.rms,
+        q_max: learning.max,
+        same_learner: learning.same_action,
         same_actor: acting.same_action,
         actor_q_rms: acting.rms,
     })

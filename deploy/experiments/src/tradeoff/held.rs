@@ -1,5 +1,6 @@
 //! Held batches: rows of a world that no replay serves, on which the speed and the error of updates are measured.
-//! Frames, stacks and enlargement are the run's own; k is 1, and nothing is augmented.
+//! They are spread over 512 steps of 16 copies, so over whole episodes. Frames, stacks and enlargement are the run's own; k is 1, and
+//! nothing is augmented.
 
 use anyhow::Context;
 use driml_envs::{CutFrames, FewerActions, FrameStack, StepEnd};
@@ -12,8 +13,8 @@ use rand_chacha::ChaCha8Rng;
 
 /// Copies of the world that are played.
 const COPIES: usize = 16;
-/// Steps between two rows of a copy.
-const APART: usize = 8;
+/// Steps over which the rows of a copy are spread evenly.
+const SPAN: usize = 512;
 /// Share of random actions where a network chooses the others.
 const EPSILON: f64 = 0.1;
 /// Seed of the world and the actions: the same rows for every level of a dial that leaves the world alone.
@@ -34,7 +35,7 @@ pub(super) struct HeldBatch {
 
 /// What all copies saw and did at one step.
 struct Moment {
-    /// [N, H, W, C] at the network's size.
+    /// [N, H, W, C] at the network's size; empty where no row has them.
     states: Vec<u8>,
     actions: Vec<u8>,
     rewards: Vec<f32>,
@@ -52,8 +53,14 @@ impl HeldBatch {
         rows: usize,
     ) -> anyhow::Result<Self> {
         let (n, k) = (config.run.n_step as usize, 1);
-        let steps = rows.div_ceil(COPIES) * APART + n.max(k);
-        let history = history(config, weights, steps + 1)?;
+        let of_copy = rows.div_ceil(COPIES);
+        let apart = SPAN.div_ceil(of_copy);
+        let steps = of_copy * apart + n.max(k);
+        let wanted_at = |step: usize| {
+            let of_row = |offset: usize| step.checked_sub(offset).is_some_and(|t| t % apart == 0);
+            [0, k, n].into_iter().any(of_row)
+        };
+        let history = history(config, weights, steps + 1, wanted_at)?;
         let len = config.model.frame_len();
         let wanted = usize::from(config.run.horizon.positives() > 0);
         let mut batch = Self {
@@ -68,7 +75,7 @@ impl HeldBatch {
             positives: wanted,
         };
         for row in 0..rows {
-            let (env, t) = (row % COPIES, row / COPIES * APART);
+            let (env, t) = (row % COPIES, row / COPIES * apart);
             let state = |t: usize| &history[t].states[env * len..][..len];
             let mut n_step_return = 0.0;
             let mut discount = 1.0;
@@ -126,11 +133,12 @@ fn ends(end: StepEnd) -> bool {
     matches!(end, StepEnd::TimedOut | StepEnd::Terminal)
 }
 
-/// `steps` steps of all copies.
+/// `steps` steps of all copies, with the states of those that are `wanted_at`.
 fn history(
     config: &RunConfig,
     weights: Option<&[u8]>,
     steps: usize,
+    wanted_at: impl Fn(usize) -> bool,
 ) -> anyhow::Result<Vec<Moment>> {
     let mut rng = ChaCha8Rng::seed_from_u64(SEED);
     let actions = config.world.actions(config.actor.actions);
@@ -153,7 +161,7 @@ fn history(
     let mut frames = vec![0; frame.bytes() * COPIES];
     let mut first = vec![true; COPIES];
     let mut history = Vec::with_capacity(steps);
-    for _ in 0..steps {
+    for step in 0..steps {
         world.observe(&mut frames);
         stack.push(&frames, &first);
         let mut moment = Moment {
@@ -180,6 +188,9 @@ fn history(
             .iter()
             .map(|end| *end != StepEnd::Running)
             .collect();
+        if !wanted_at(step) {
+            moment.states = Vec::new();
+        }
         history.push(moment);
     }
     Ok(history)

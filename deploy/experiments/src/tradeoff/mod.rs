@@ -36,8 +36,12 @@ use crate::{
     statistics::Spread,
 };
 
+/// The piece that lists the calls.
+const CALLS: &str = "calls";
 /// Seed of the played episodes: the same for every level.
 const PLAY_SEED: u64 = 1;
+/// Seeds up to which finished runs are looked for.
+const SEEDS_FOUND_MAX: u32 = 64;
 /// A piece of measuring as a share of a run's work; only the estimate of the time left depends on it.
 const PIECE_SHARE: u64 = 20;
 /// What a run takes beside its updates and actions, as a factor: replay, messages, waiting for one another.
@@ -139,6 +143,7 @@ fn speeds(
 ) -> anyhow::Result<BTreeMap<String, Speed>> {
     let mut speeds = BTreeMap::new();
     let units = settings.common.frames / PIECE_SHARE;
+    let program = session::program()?;
     for dial in all_dials(settings)? {
         let base = dial.base_point();
         let asked = settings.dials.iter().any(|it| it.name == dial.name);
@@ -149,12 +154,16 @@ fn speeds(
                 continue;
             }
             let key = format!("speed-{}", point.key);
-            if (report_only || !asked) && !session.has_piece(&key) {
+            if report_only || !asked {
+                // Of whatever program made it: only what is asked for is made anew.
+                if let Some(speed) = session.kept_piece(&key) {
+                    speeds.insert(point.key, speed);
+                }
                 continue;
             }
             let config = settings.common.config(&point)?;
             session.work().1.again(units);
-            let speed = session.piece(&key, units, |progress| {
+            let speed = session.piece_of(&program, &key, units, |progress| {
                 let speed = speed::measure(&base_config, &config, effort)?;
                 progress.advance(units)?;
                 Ok(speed)
@@ -312,8 +321,9 @@ fn made(
     }
     let runs = Runs::open(session.folder())?;
     let mut wanted: Vec<(usize, u32, PlannedRun)> = Vec::new();
-    // Seed by seed, so that what was stopped has one seed of everything before it has two of anything.
-    for seed in 1..=settings.seeds_of(true) {
+    // Seed by seed, so that what was stopped has one seed of everything before it has two of anything. Further seeds that another call
+    // made are on the page too.
+    for seed in 1..=settings.seeds_of(true).max(SEEDS_FOUND_MAX) {
         for (at, (point, seeds)) in points.iter().enumerate() {
             let run = settings.common.run(point, seed);
             if seed <= *seeds || runs.finished(&run).is_some() {
@@ -327,7 +337,7 @@ fn made(
     session.work().1.again(work);
     let ran = queue::run_all(session, &plans, settings.common.jobs, args.queue.report)?;
     let mut results = Results {
-        command: command(args, session),
+        commands: commands(args, session)?,
         smoke: args.flags.smoke,
         levels: planned.iter().map(|it| it.of.clone()).collect(),
         points: BTreeMap::new(),
@@ -367,6 +377,7 @@ fn made(
                 let config = results.settings.common.config(point)?;
                 session.work().1.again(units);
                 let key = format!("exactness-{}", point.key);
+                let of = format!("{of}, {}", exactness::method(&config));
                 let made = session.piece_of(&of, &key, units, |progress| {
                     let made = exactness::measure(&config, &ran.folder)?;
                     progress.advance(units)?;
@@ -387,6 +398,11 @@ fn made(
         results.points.contains_key(&of.point.key) && results.points.contains_key(&of.base.key)
     };
     results.levels.retain(done);
+    if args.queue.report && !args.dials.is_empty() {
+        results
+            .levels
+            .retain(|of| args.dials.contains(&of.dial.name));
+    }
     let names: Vec<String> = results.levels.iter().map(LevelOf::name).collect();
     results.left_out.retain(|name| !names.contains(name));
     Ok(results)
@@ -396,6 +412,17 @@ fn played(ran: &FinishedRun, who: Who, episodes: u32) -> anyhow::Result<Vec<f64>
     let player = Player::load(&ran.folder)?;
     let returns = player.returns(who, Levels::Train, episodes, PLAY_SEED)?;
     Ok(returns.unwrap_or_default())
+}
+
+/// The calls that made the folder's runs, this one last unless it makes none.
+fn commands(args: &TradeoffArgs, session: &Session) -> anyhow::Result<Vec<String>> {
+    let mut all: Vec<String> = session.kept_piece(CALLS).unwrap_or_default();
+    let this = command(args, session);
+    if !all.contains(&this) && !args.queue.report {
+        all.push(this);
+        session.keep(CALLS, &all)?;
+    }
+    Ok(all)
 }
 
 fn command(args: &TradeoffArgs, session: &Session) -> String {

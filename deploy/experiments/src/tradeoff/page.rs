@@ -4,7 +4,10 @@ use std::collections::BTreeSet;
 
 use driml_machine::units::rough_duration;
 
-use super::results::{LevelOf, Measure, PointResult, Results};
+use super::{
+    exactness,
+    results::{LevelOf, Measure, PointResult, Results},
+};
 use crate::{
     page::{Page, Table},
     plot::{Over, Run},
@@ -31,6 +34,18 @@ pub(super) const ERRORS: [&str; 8] = [
     "same_action_learner",
     "same_action_actor",
     "actor_q_rms_error",
+];
+/// C51 beside an agent with DIM in training return, as the data has it.
+pub(super) const EQUAL_TIME: [&str; 9] = [
+    "agent",
+    "base",
+    "equal_seconds",
+    "minus_base_at_equal_frames",
+    "minus_base_at_equal_frames_low",
+    "minus_base_at_equal_frames_high",
+    "minus_base_at_equal_time",
+    "minus_base_at_equal_time_low",
+    "minus_base_at_equal_time_high",
 ];
 /// The dial that turns DIM on.
 const DIM: &str = "DIM";
@@ -87,7 +102,8 @@ pub(super) fn page(results: &Results) -> anyhow::Result<Page> {
         .when("some_missing", !results.missing.is_empty())
         .set("missing", results.missing.join(", "))
         .set("episodes", common.episodes)
-        .set("seeds", results.settings.seeds)
+        .set("seeds", seeds(results))
+        .set("rows", error_rows(results)?)
         .set(
             "random",
             random.map_or("-".into(), |it| format!("{:.2}", it.mean)),
@@ -114,8 +130,29 @@ pub(super) fn page(results: &Results) -> anyhow::Result<Page> {
     Ok(Page::new(
         include_str!("page.md"),
         values,
-        &results.command,
+        &results.commands.join("`, then `"),
         results.smoke,
+    ))
+}
+
+/// How many seeds the intervals are over, in words.
+fn seeds(results: &Results) -> String {
+    let counts = |it: Option<(usize, usize)>| match it {
+        None => "no".to_owned(),
+        Some((low, high)) if low == high => low.to_string(),
+        Some((low, high)) => format!("{low} to {high}"),
+    };
+    let [bases, levels] = results.seeds().map(counts);
+    format!("{levels} seeds of a level and {bases} of a base")
+}
+
+/// Rows and states of the errors of a base.
+fn error_rows(results: &Results) -> anyhow::Result<String> {
+    let Some(of) = results.levels.first() else {
+        return Ok(String::new());
+    };
+    Ok(exactness::method(
+        &results.settings.common.config(&of.base)?,
     ))
 }
 
@@ -202,6 +239,11 @@ fn signed(it: &Interval) -> String {
         None => format!("{:+.2}", it.mean),
         Some((low, high)) => format!("{:+.2} [{low:+.2}, {high:+.2}]", it.mean),
     }
+}
+
+/// A number of a file of data, empty if there is none.
+pub(super) fn cell_of_data(value: Option<f64>) -> String {
+    value.map_or(String::new(), |value| format!("{value:.4}"))
 }
 
 fn cell<T>(value: Option<T>, text: impl Fn(T) -> String) -> String {
@@ -380,14 +422,16 @@ fn dials(results: &Results) -> Vec<String> {
 }
 
 /// C51 beside an agent with DIM, seed by seed.
-struct EqualTime {
+pub(super) struct EqualTime {
     agent: String,
     in_words: String,
     row: Vec<String>,
+    /// The cells of [`EQUAL_TIME`].
+    pub(super) cells: Vec<String>,
 }
 
 /// C51 and the agents with DIM at equal frames and at equal wall-clock time: when runs of the faster of the two are done.
-fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
+pub(super) fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
     let mut all = Vec::new();
     for of in results.levels.iter().filter(|of| of.dial.name == DIM) {
         let base = training_curves(&results.points[&of.base.key])?;
@@ -417,6 +461,17 @@ fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
         };
         let mean = |values: &[f64]| cell(Interval::of(values), |it| it.to_string());
         let agent = of.point.agent.clone();
+        let numbers = |it: &Interval| {
+            let ends = it.ends;
+            let each = [Some(it.mean), ends.map(|it| it.0), ends.map(|it| it.1)];
+            each.map(cell_of_data)
+        };
+        let mut cells = vec![
+            agent.clone(),
+            of.base.agent.clone(),
+            format!("{seconds:.3}"),
+        ];
+        cells.extend([&frames, &time].into_iter().flat_map(numbers));
         all.push(EqualTime {
             in_words: format!(
                 "{agent} minus {}, training return: {} at equal frames, {} at equal wall-clock time ({seconds:.0} s)",
@@ -433,6 +488,7 @@ fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
                 signed(&time),
             ],
             agent,
+            cells,
         });
     }
     Ok(all)

@@ -2,7 +2,7 @@
 
 use super::{
     figures, page,
-    results::{Measure, PointResult, Results},
+    results::{LevelOf, Measure, PointResult, Results},
 };
 use crate::session::Session;
 
@@ -23,6 +23,7 @@ const MEASURES: [(&str, Measure); 7] = [
 pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> {
     write_runs(&session, results)?;
     write_levels(&session, results)?;
+    write_equal_time(&session, results)?;
     for (stem, returns, name) in [
         ("pareto", Measure::Greedy, "greedy"),
         ("pareto_training", Measure::Training, "training"),
@@ -78,29 +79,53 @@ fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
                 .map(|end| format!("{name}{end}")),
         );
     }
-    let rows = results.levels.iter().map(|of| {
-        let point: &PointResult = &results.points[&of.point.key];
-        let mut row = vec![
-            of.dial.name.clone(),
-            of.level.clone(),
-            of.dial.base.clone(),
-            point.seeds.len().to_string(),
-        ];
-        row.extend(page::speed_cells(point));
-        row.extend(page::error_cells(point));
-        for (_, measure) in MEASURES {
-            for found in [point.mean(measure), results.difference(of, measure)] {
-                let ends = found.and_then(|it| it.ends);
-                let numbers = [
-                    found.map(|it| it.mean),
-                    ends.map(|it| it.0),
-                    ends.map(|it| it.1),
-                ];
-                row.extend(numbers.map(|it| it.map_or(String::new(), |it| format!("{it:.4}"))));
-            }
+    let mut rows = Vec::new();
+    let mut last = "";
+    for of in &results.levels {
+        if of.dial.name != last {
+            last = &of.dial.name;
+            rows.push(row(results, of, true));
         }
-        row
-    });
+        rows.push(row(results, of, false));
+    }
     let header: Vec<&str> = header.iter().map(String::as_str).collect();
     session.csv("levels", &header, rows)
+}
+
+/// A level, or the base that it is compared with.
+fn row(results: &Results, of: &LevelOf, is_base: bool) -> Vec<String> {
+    let (key, level) = match is_base {
+        true => (&of.base.key, &of.dial.base),
+        false => (&of.point.key, &of.level),
+    };
+    let point: &PointResult = &results.points[key];
+    let mut row = vec![
+        of.dial.name.clone(),
+        level.clone(),
+        of.dial.base.clone(),
+        point.seeds.len().to_string(),
+    ];
+    row.extend(page::speed_cells(point));
+    row.extend(page::error_cells(point));
+    for (_, measure) in MEASURES {
+        let difference = match is_base {
+            true => None,
+            false => results.difference(of, measure),
+        };
+        for found in [point.mean(measure), difference] {
+            let ends = found.and_then(|it| it.ends);
+            let numbers = [
+                found.map(|it| it.mean),
+                ends.map(|it| it.0),
+                ends.map(|it| it.1),
+            ];
+            row.extend(numbers.map(page::cell_of_data));
+        }
+    }
+    row
+}
+
+fn write_equal_time(session: &Session, results: &Results) -> anyhow::Result<()> {
+    let rows = page::equal_time(results)?.into_iter().map(|it| it.cells);
+    session.csv("equal_time", &page::EQUAL_TIME, rows)
 }

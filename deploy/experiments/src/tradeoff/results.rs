@@ -57,7 +57,8 @@ pub(super) struct Results {
     pub(super) left_out: Vec<String>,
     /// Runs that failed.
     pub(super) missing: Vec<String>,
-    pub(super) command: String,
+    /// The calls that made it.
+    pub(super) commands: Vec<String>,
     pub(super) smoke: bool,
 }
 
@@ -112,6 +113,17 @@ impl PointResult {
 }
 
 impl Results {
+    /// Fewest and most seeds of the bases and of the levels that are none.
+    pub(super) fn seeds(&self) -> [Option<(usize, usize)>; 2] {
+        [true, false].map(|bases| {
+            let is_base = |key: &str| self.levels.iter().any(|of| of.base.key == key);
+            let all = self.points.iter();
+            let counts = all.filter(|(key, _)| is_base(key) == bases);
+            let counts: Vec<usize> = counts.map(|(_, point)| point.seeds.len()).collect();
+            Some((*counts.iter().min()?, *counts.iter().max()?))
+        })
+    }
+
     /// Level minus base, with its interval. Seeds are not paired: through real processes no two runs of a seed are alike.
     pub(super) fn difference(&self, of: &LevelOf, measure: Measure) -> Option<Interval> {
         let [base, level] = [&of.base, &of.point].map(|it| self.points[&it.key].values(measure));

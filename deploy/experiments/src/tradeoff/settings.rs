@@ -256,6 +256,28 @@ mod tests {
     }
 
     #[test]
+    fn a_preset_as_a_level_is_that_preset() {
+        let world: WorldName = "mspacman".parse().unwrap();
+        let common = common(world, false);
+        for name in ["preset", "preset with DIM"] {
+            let found = dials::chosen(dials::dials(world), &[name.to_owned()]);
+            let dial = &found.unwrap()[0];
+            let base = dial.base_point();
+            let named = |preset: &str| Common {
+                preset: preset.to_owned(),
+                ..common.clone()
+            };
+            let whole = named(&dial.base).config(&base).unwrap();
+            assert_eq!(common.config(&base).unwrap(), whole);
+            for level in &dial.levels {
+                let point = dial.point(level);
+                let whole = named(&level.name).config(&base).unwrap();
+                assert_eq!(common.config(&point).unwrap(), whole, "{}", point.key);
+            }
+        }
+    }
+
+    #[test]
     fn a_folder_keeps_its_length() {
         let args = TradeoffArgs::of("mspacman", false);
         let first = of(&args, None).unwrap();

@@ -72,7 +72,8 @@ impl Side {
             config.learner.update.clone(),
             &Compute::cpu(config.learner.precision),
             &mut ChaCha8Rng::seed_from_u64(1),
-        )?;
+        )?
+        .with_equal_states(config.learner.equal_states);
         let weights = agent.weights_as(config.learner.publish_as)?;
         let policy = PolicyNetwork::new(&config.model, &weights, config.actor.precision)?;
         let copies = config.actor.envs as usize;

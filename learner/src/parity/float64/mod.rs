@@ -43,6 +43,27 @@ pub fn float64(agent: &Agent, batch: &Batch<'_>) -> Result<Float64, UpdateError>
     float64_with(agent, batch, &agent.noise())
 }
 
+/// Online values [B, A] of `states` [B, H, W, C] in float64, by the means of noisy layers.
+///
+/// # Errors
+/// States that do not fit the network.
+pub fn q_values(agent: &Agent, states: &[u8]) -> Result<Vec<f64>, UpdateError> {
+    /// States at once: what is between the layers is in memory.
+    const ROWS: usize = 64;
+    let len = agent.model().frame_len();
+    if !states.len().is_multiple_of(len) {
+        let what = format!("{} bytes are no states of {len} bytes each", states.len());
+        return Err(UpdateError::Batch(what));
+    }
+    let online = Net::of(agent.model(), agent.online())?;
+    let mut values = Vec::with_capacity(states.len() / len * agent.model().num_actions);
+    for some in states.chunks(ROWS * len) {
+        let f4 = online.features(some)?.global.detach();
+        values.extend(online.q_values(&online.logits(&f4, None)?)?);
+    }
+    Ok(values)
+}
+
 /// [`float64`] with this noise of noisy layers.
 fn float64_with(
     agent: &Agent,
