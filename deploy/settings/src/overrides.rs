@@ -45,6 +45,19 @@ impl Override {
         })
     }
 
+    /// A flag's number for the setting at `path`.
+    ///
+    /// # Errors
+    /// More than TOML's whole numbers hold.
+    pub(crate) fn number(path: &str, number: u64) -> Result<Self, Usage> {
+        let whole = i64::try_from(number)
+            .map_err(|_| usage!("{path} = {number}: the largest number is {}", i64::MAX))?;
+        Ok(Self {
+            path: path.to_owned(),
+            value: Value::Integer(whole),
+        })
+    }
+
     /// Puts the value into `table`; returns whether the key was not there before.
     ///
     /// A new key is accepted in a table that exists: whether it means anything is for the reader of that table to say.
@@ -226,6 +239,15 @@ mod tests {
             .assert_eq(&said("seed=1"));
         expect![[r#"there is no setting "ruin.seeds" (did you mean "run.seed"?); the settings have the tables learner, run"#]]
             .assert_eq(&said("ruin.seeds=1"));
+    }
+
+    #[test]
+    fn a_flag_s_number_takes_the_place_of_a_setting() {
+        let mut table = settings();
+        let set = |number| Override::number("run.seed", number);
+        set(7).unwrap().apply(&mut table).unwrap();
+        assert_eq!(table["run"]["seed"], Value::Integer(7));
+        assert!(set(u64::MAX).is_err());
     }
 
     #[test]

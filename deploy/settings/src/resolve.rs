@@ -130,7 +130,7 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
     ];
     for (path, value) in by_flag {
         if let Some(value) = value {
-            Override::parse(&format!("{path}={value}"))?.apply(&mut table)?;
+            Override::number(path, value)?.apply(&mut table)?;
         }
     }
     set_reproduced_bug(&mut table, flags.reproduce_bug)?;
@@ -145,7 +145,7 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
     if let Source::Layers(preset, ..) = source
         && preset.is_priced
     {
-        let given_up = presets::prices::given_up(&table).into_iter();
+        let given_up = presets::prices::given_up(preset.name, &table).into_iter();
         config
             .notes
             .extend(given_up.map(|it| format!("{} gives up {it}", preset.name)));

@@ -31,6 +31,9 @@ pub(crate) struct InspectArgs {
     /// The agent in every world, a Markdown table
     #[arg(long, conflicts_with_all = ["env", "config", "run", "json"])]
     pub(crate) worlds: bool,
+    /// With --worlds: as CSV, in bytes and FLOPs
+    #[arg(long, requires = "worlds")]
+    pub(crate) csv: bool,
     /// Print it as JSON
     #[arg(long)]
     pub(crate) json: bool,
@@ -80,7 +83,10 @@ fn in_every_world(args: &InspectArgs) -> anyhow::Result<String> {
         };
         configs.push((config, played));
     }
-    worlds::markdown(&configs)
+    match args.csv {
+        true => worlds::csv(&configs),
+        false => worlds::markdown(&configs),
+    }
 }
 
 /// The settings of a run.

@@ -187,7 +187,7 @@ mod tests {
             let world = driml_settings::presets::world(name).unwrap();
             world_base(world).map(|base| (base.frames, base.sets.len()))
         };
-        assert_eq!(frames("procgen:dodgeball").unwrap(), (40_000, 2));
+        assert_eq!(frames("procgen:fruitbot").unwrap(), (30_000, 5));
         assert_eq!(frames("procgen:coinrun").unwrap(), (30_000, 1));
         let said = frames("ising").unwrap_err().to_string();
         assert!(

@@ -172,7 +172,7 @@ mod tests {
 
     #[test]
     fn every_level_of_every_dial_is_a_run_that_can_be_made() {
-        for name in ["mspacman", "procgen:coinrun", "procgen:dodgeball", "chain"] {
+        for name in ["mspacman", "procgen:coinrun", "procgen:fruitbot", "chain"] {
             let world: WorldName = name.parse().unwrap();
             for smoke in [false, true] {
                 let common = common(world, smoke);

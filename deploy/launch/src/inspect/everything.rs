@@ -2,16 +2,19 @@
 //! No agent is so; it is what an agent would cost that left nothing out.
 
 use driml_learner::{Lambda, auxiliary::loss::Passes, cost::UpdateShape};
-use driml_model::{DimHeads, ModelConfig};
+use driml_model::{DimHeads, HeadConfig, ModelConfig};
 use driml_protocol::{Horizon, RunSpec};
 use driml_settings::config::RunConfig;
 
 /// What the second column of every table stands for.
-pub(super) const EVERYTHING: &str = "all that the agents of the menu have, at once: five heads and a key encoder, four pairs of levels at \
-     five positives a row, augmented, double DQN, all weights broadcast as f32; frames whole, stacked and enlarged where they are made";
+pub(super) const EVERYTHING: &str = "all that the agents of the menu have, at once: five heads of DIM and a key encoder, \
+     a dueling head of noisy layers, four pairs of levels at five positives a row, augmented, double DQN, all weights broadcast as f32; frames whole, stacked and enlarged where they are made";
 
 /// Positives of a row if everything is on: those of the agent that has most, cpc.
 const EVERY_POSITIVES: usize = 5;
+
+/// Rainbow's; no size depends on it.
+const NOISY_SIGMA: f64 = 0.5;
 
 /// The same world and sizes with everything on.
 pub(super) struct Everything {
@@ -33,6 +36,10 @@ impl Everything {
                 psi4: true,
                 phi4: true,
                 action: true,
+            },
+            head: HeadConfig {
+                dueling: true,
+                noisy_sigma: Some(NOISY_SIGMA),
             },
             ..config.model.clone()
         };

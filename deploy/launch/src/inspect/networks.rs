@@ -13,12 +13,13 @@ fn sum(layers: &[LayerCost], part: &str, cost: fn(&LayerCost) -> u64) -> u64 {
     of_part.map(cost).sum()
 }
 
-/// The units in which layers are shown: a residual block is one.
+/// The units in which layers are shown: a residual block is one, and so is C51's head, of one layer or two.
 fn units(model: &ModelConfig) -> Vec<String> {
     let mut units: Vec<String> = Vec::new();
     for layer in model.layer_costs() {
         let unit = match layer.name.split('.').collect::<Vec<_>>()[..] {
             ["dim", block, _] => format!("dim.{block}"),
+            ["head", ..] => "head".to_owned(),
             _ => layer.name,
         };
         if units.last() != Some(&unit) {
@@ -38,11 +39,11 @@ pub(super) fn parameters(config: &RunConfig, every: &Everything) -> Vec<Line> {
         Line::new(name, is, everything, why)
     };
     let mut lines: Vec<Line> = units(&every.model).into_iter().map(unit).collect();
-    let value = scalars(&layers, "torso") + scalars(&layers, "head");
+    let value = |layers| scalars(layers, "torso") + scalars(layers, "head");
     lines.push(Line::new(
         "target network",
-        value,
-        value,
+        value(&layers),
+        value(&all),
         "torso and head again: s_{t+n} is judged by weights that stand still",
     ));
     let shape = UpdateShape::of(&config.learner, config.run.horizon.positives());
@@ -84,8 +85,7 @@ fn why_layer(config: &RunConfig, name: &str) -> String {
     };
     match name {
         "torso.fc" => format!("f4, {} numbers of the last map", model.hidden),
-        "head.value" => format!("C51: the state's value, {} atoms", model.atoms),
-        "head" | "head.advantage" => {
+        "head" => {
             let all = config.world.num_actions();
             let of = if model.num_actions == all {
                 String::new()
@@ -93,12 +93,15 @@ fn why_layer(config: &RunConfig, name: &str) -> String {
                 format!(" of {all} (actor.actions)")
             };
             let (actions, atoms) = (model.num_actions, model.atoms);
-            let what = if name == "head" {
-                ""
-            } else {
-                "the advantage of "
+            let what = match model.head.dueling {
+                true => "the state's value, and the advantage of ",
+                false => "",
             };
-            format!("C51: {what}{actions} actions{of}, {atoms} atoms each")
+            let noisy = match model.head.noisy_sigma {
+                Some(_) => "; noisy: a scale beside each mean",
+                None => "",
+            };
+            format!("C51: {what}{actions} actions{of}, {atoms} atoms each{noisy}")
         }
         "dim.action" if heads.embeds_action() => "psi is given a_t (condition_on_action)".into(),
         "dim.action" if heads == DimHeads::NONE => "not built: there is no psi".into(),
@@ -151,8 +154,7 @@ pub(super) fn decision_flops(config: &RunConfig, every: &Everything) -> Vec<Line
     let share = 100.0 * decided_share(config);
     let lines = units(&config.model.without_dim()).into_iter().map(|name| {
         let why = match name.as_str() {
-            "head" | "head.advantage" => "Q of every action, of which the largest is taken".into(),
-            "head.value" => "added to the weight of head.advantage once, not to every state".into(),
+            "head" => "Q of every action, of which the largest is taken".into(),
             "torso.conv1" => {
                 format!("for {share:.1}% of states; in the others chance decides (epsilon)")
             }

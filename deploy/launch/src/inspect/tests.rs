@@ -158,7 +158,17 @@ fn a_world_that_needs_nothing_is_played() {
     assert!(shares.without_bootstrap > 0.2 && shares.without_positive > 0.02);
     assert!(shares.absent_bytes > 0.05 && shares.absent_bytes < 0.5);
     assert!(shares.repeated_online > 0.5 && shares.repeated_target > 0.0);
-    let text = worlds::markdown(&[(config, Some(shares))]).unwrap();
+    let played = [(config, Some(shares))];
+    let data = worlds::csv(&played).unwrap();
+    let mut reader = csv::Reader::from_reader(data.as_bytes());
+    let rows: Vec<csv::StringRecord> = reader.records().collect::<Result<_, _>>().unwrap();
+    assert_eq!(rows.len(), 1);
+    assert_eq!(
+        (&rows[0][0], &rows[0][1], &rows[0][5]),
+        ("chain", "12", "150")
+    );
+    assert_eq!(&rows[0][19], "400");
+    let text = worlds::markdown(&played).unwrap();
     assert_eq!(text.lines().count(), 3);
     assert!(text.contains("| chain | 12x12 | 150 | "), "{text}");
 }

@@ -1,9 +1,14 @@
-//! What a preset gives up for speed, with its measured gain and price: `presets/variant/prices.toml`.
-//! A test holds that each setting in which such a preset differs from `exact` has its row.
+//! What a preset gives up for speed, with its measured gain and price: `presets/variant/prices.toml` and the figures of the experiments.
+//! A test holds that each setting in which such a preset differs from `exact` has its row. It measures nothing.
+
+mod measured;
+
+use std::collections::BTreeMap;
 
 use serde::Deserialize;
 use toml::{Table, Value};
 
+use self::measured::{Measured, Number, Page};
 use crate::overrides::inline;
 
 const PRICES: &str = include_str!("../../presets/variant/prices.toml");
@@ -12,26 +17,36 @@ const PRICES: &str = include_str!("../../presets/variant/prices.toml");
 #[serde(deny_unknown_fields)]
 struct File {
     price: Vec<Price>,
+    /// The settings that each preset gives up.
+    whole: BTreeMap<String, Vec<String>>,
+    together: Vec<Together>,
 }
 
 /// A setting that is faster and less exact.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Price {
-    /// Its dotted path.
+    /// Its dotted path, which is the dial's name too.
     setting: String,
     value: String,
     /// What `exact` has instead.
     exact: String,
-    gain: String,
-    cost: String,
+    gain: Number,
+    error: Number,
 }
 
-fn prices() -> Vec<Price> {
-    let file: File = toml::from_str(PRICES).unwrap_or_else(|e| {
+/// A dial whose levels are whole presets.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Together {
+    dial: String,
+    text: String,
+}
+
+fn file() -> File {
+    toml::from_str(PRICES).unwrap_or_else(|e| {
         panic!("presets/variant/prices.toml is built in, and a test reads it: {e}")
-    });
-    file.price
+    })
 }
 
 impl Price {
@@ -44,22 +59,65 @@ impl Price {
         let value: Option<&Value> = inner.and_then(|table| table.get(key));
         value.is_some_and(|value| inline(value) == self.value)
     }
+
+    fn line(&self, pages: &[Page]) -> String {
+        let Self {
+            setting,
+            value,
+            exact,
+            gain,
+            error,
+        } = self;
+        let each = |text: fn(&Measured<'_>, &Number) -> Option<String>, number: &Number| {
+            let found = pages.iter().filter_map(|page| {
+                let measured = page.measured(setting, value)?;
+                Some(format!("{}: {}", page.name, text(&measured, number)?))
+            });
+            found.collect::<Vec<_>>().join("; ")
+        };
+        format!(
+            "{setting} = {value} instead of {exact}. Gain: {}. Price: {}. Training return: {}.",
+            each(Measured::text, gain),
+            each(Measured::text, error),
+            each(|measured, _| measured.training_return(), gain),
+        )
+    }
 }
 
-/// What `settings` give up, a line each: what it gains and what it costs.
-pub(crate) fn given_up(settings: &Table) -> Vec<String> {
-    let prices = prices().into_iter();
-    let paid = prices.filter(|price| price.is_paid(settings));
-    let line = |Price {
-                    setting,
-                    value,
-                    exact,
-                    gain,
-                    cost,
-                }: Price| {
-        format!("{setting} = {value} instead of {exact}. Gain: {gain}. Price: {cost}.")
-    };
-    paid.map(line).collect()
+impl Together {
+    /// What the preset `level` as a whole does; nothing if it was never run.
+    fn line(&self, level: &str, pages: &[Page]) -> Option<String> {
+        let each = pages.iter().filter_map(|page| {
+            let measured = page.measured(&self.dial, level)?;
+            let (learning, acting) = (measured.factor("rows_gain")?, measured.factor("act_gain")?);
+            Some(format!(
+                "{}: {learning} times the rows learned from a second, {acting} times the actions, training return {}",
+                page.name,
+                measured.training_return()?
+            ))
+        });
+        let each: Vec<String> = each.collect();
+        (!each.is_empty()).then(|| format!("{}. {}.", self.text, each.join("; ")))
+    }
+}
+
+/// What `settings`, by the preset of this name, give up: a line for each setting with its gain and its price, and what they do together
+/// where all of the preset's are as it has them.
+pub(crate) fn given_up(preset: &str, settings: &Table) -> Vec<String> {
+    let (file, pages) = (file(), measured::pages());
+    let mut paid = file.price;
+    paid.retain(|price| price.is_paid(settings));
+    let mut lines: Vec<String> = paid.iter().map(|price| price.line(&pages)).collect();
+    let is_paid = |setting: &String| paid.iter().any(|price| price.setting == *setting);
+    if file
+        .whole
+        .get(preset)
+        .is_some_and(|all| all.iter().all(is_paid))
+    {
+        let together = file.together.iter();
+        lines.extend(together.filter_map(|it| it.line(preset, &pages)));
+    }
+    lines
 }
 
 #[cfg(test)]
@@ -86,7 +144,7 @@ mod tests {
 
     #[test]
     fn every_setting_that_is_given_up_has_its_price() {
-        let prices = prices();
+        let File { price, whole, .. } = file();
         for world in WorldName::all() {
             for agent in 0..AGENTS.len() {
                 let mut exact = Vec::new();
@@ -96,9 +154,13 @@ mod tests {
                     let mut found = Vec::new();
                     leaves(&table, "", &mut found);
                     found.retain(|leaf| !exact.contains(leaf));
-                    assert!(!found.is_empty(), "{name} gives up nothing");
+                    let mut paths: Vec<&String> = found.iter().map(|(path, _)| path).collect();
+                    let mut said: Vec<&String> = whole[name].iter().collect();
+                    paths.sort();
+                    said.sort();
+                    assert_eq!(paths, said, "{name} in {world}");
                     for (path, value) in &found {
-                        let row = prices
+                        let row = price
                             .iter()
                             .find(|it| it.setting == *path && it.value == *value);
                         let row =
@@ -106,22 +168,40 @@ mod tests {
                         let there = (path.clone(), row.exact.clone());
                         assert!(exact.contains(&there), "{there:?} is not what exact has");
                     }
-                    assert_eq!(given_up(&table).len(), found.len(), "{name} in {world}");
+                    let given_up = given_up(name, &table);
+                    for path in paths {
+                        let of = format!("{path} = ");
+                        assert!(given_up.iter().any(|line| line.starts_with(&of)), "{of}");
+                    }
                 }
-                assert!(given_up(&settings("exact", world, agent)).is_empty());
+                assert!(given_up("exact", &settings("exact", world, agent)).is_empty());
             }
         }
     }
 
     #[test]
-    fn every_price_is_measured() {
-        for price in prices() {
-            for text in [&price.gain, &price.cost] {
-                assert!(
-                    text.contains(|c: char| c.is_ascii_digit()),
-                    "{price:?} has no number"
-                );
+    fn every_price_is_measured_on_every_page() {
+        for price in file().price {
+            for page in measured::pages() {
+                let measured = page.measured(&price.setting, &price.value).unwrap();
+                for number in [&price.gain, &price.error] {
+                    let text = measured.text(number).unwrap();
+                    assert!(!text.contains(['{', '}']), "{text}");
+                }
+                assert!(measured.training_return().is_some(), "{}", page.name);
             }
         }
+    }
+
+    #[test]
+    fn a_preset_that_is_not_whole_says_nothing_of_the_whole() {
+        let mut table = settings("fast", WorldName::MsPacman, 0);
+        let together = |table: &Table| {
+            let lines = given_up("fast", table).into_iter();
+            lines.filter(|line| line.starts_with("all of it")).count()
+        };
+        assert!(together(&table) > 0);
+        table["learner"]["precision"] = "f32".into();
+        assert_eq!(together(&table), 0);
     }
 }
