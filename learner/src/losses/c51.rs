@@ -12,7 +12,7 @@ pub const ENTRY_ERROR: f64 = 6.1e-8;
 /// Largest error of a slope beside [`ENTRY_ERROR`], where probability and target cancel in f64.
 pub const SLOPE_ERROR: f64 = 1e-15;
 /// Largest error of a row's divergence, as a share of `10 + sum_i target_i (max logit - logit_i)`.
-pub const KL_ERROR: f64 = 1e-13;
+pub const KL_ERROR: f64 = 1e-14;
 
 /// Mean over rows of `KL(target || softmax(logits))`, and its gradient.
 ///

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::{candle, scalar_op::scalar_op, scores::Scores};
 
 /// Largest error of the loss, as a share of 10 plus the largest score, in nats.
-pub const LOSS_ERROR: f64 = 1e-13;
+pub const LOSS_ERROR: f64 = 2e-14;
 
 /// Largest error of a slope: 1e-7 of itself, an f32's last place, and what the rounding of scores up to `largest` leaves open of a
 /// probability. `weight` is 1 / (L valid rows).

@@ -12,8 +12,9 @@ use crate::{error::UpdateError, tensors::slice};
 /// Elements a thread sums at a time.
 const CHUNK: usize = 1 << 14;
 
-/// Largest error of the norm of up to 2^32 gradients, as a share of it.
-pub const NORM_ERROR: f64 = 1e-12;
+/// Largest error of the norm of up to ten million gradients, as a share of it: 2,048 additions follow each other within a chunk and
+/// 640 from chunk to chunk, each of which may lose half of an f64's last place the same way; the root halves what they lose.
+pub const NORM_ERROR: f64 = 1.5e-13;
 
 /// Gradients of one loss, by parameter name. A parameter that the loss does not touch has none.
 #[derive(Debug)]
@@ -42,7 +43,7 @@ impl Gradients {
         self.by_name.get(name)
     }
 
-    /// Global 2-norm of all gradients together, accumulated in f64: right to [`NORM_ERROR`] for any finite gradients.
+    /// Global 2-norm of all gradients together, accumulated in f64: right to [`NORM_ERROR`] for any finite gradients on the CPU.
     ///
     /// # Errors
     /// [`UpdateError::NonFinite`] with the first parameter whose gradient is infinite or NaN.
