@@ -6,11 +6,11 @@
 use rand::Rng;
 
 /// Largest error of the stationary law, a probability, for any alpha and up to 1e6 states.
-pub(crate) const LAW_ERROR: f64 = 1e-12;
+pub(crate) const LAW_ERROR: f64 = 2e-15;
 /// Largest error of the mutual information, in nats, for any alpha and up to 1e6 states.
 pub(crate) const MUTUAL_INFORMATION_ERROR: f64 = 1e-12;
 /// Largest error of the spectral gap, as a share of it, for any alpha and up to 1e8 states.
-pub(crate) const GAP_ERROR: f64 = 1e-13;
+pub(crate) const GAP_ERROR: f64 = 5e-15;
 
 /// A biased random walk on a line of states, whose transition ratio is known in closed form.
 #[derive(Clone, Debug)]

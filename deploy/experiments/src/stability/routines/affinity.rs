@@ -21,8 +21,10 @@ const LEARNED: Routine = Routine {
     name: "affinity, learned",
     range: "any pairs of 1 to 255 actions",
 };
-/// How far the sum of a row of A may be from 1.
-const ROW_SUM: f64 = 1e-6;
+/// How far the sum of a row of A may be from 1: four times half of an f32's last place.
+const ROW_SUM: f64 = 2.5e-7;
+/// How far an entry may be from 1 / actions where no pair says anything: a quarter of an f32's last place at 1, as 1 / 15 has.
+const UNIFORM_ERROR: f64 = 3e-8;
 
 /// Ways in which actions are used.
 const USES: [&str; 5] = [
@@ -158,7 +160,7 @@ pub(super) fn check(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
         LEARNED,
         "always the same action",
         "distance of an entry from 1 / actions: one pair says nothing of how actions follow each other",
-        1e-6,
+        UNIFORM_ERROR,
     );
     // The preset's numbers.
     let settings = LearnedSettings {
