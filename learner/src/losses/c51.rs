@@ -20,8 +20,9 @@ pub const KL_ERROR: f64 = 1e-14;
 /// Loss: `1/B * sum_b sum_i target * (ln target - ln softmax)`, with `0 ln 0 = 0`, in nats.
 /// `gradient` [B, N] is overwritten with the derivative by the logits: `(softmax - target) / B`. The arithmetic is f64 and shifts by
 /// the largest logit, so any finite logits are fine: the loss is right to [`KL_ERROR`], its slopes to [`ENTRY_ERROR`] and
-/// [`SLOPE_ERROR`]. A loss beyond the finite f32 needs logits that differ by more than 1e38. A logit that is not finite gives a loss
-/// that is not, which the update refuses.
+/// [`SLOPE_ERROR`]. A loss beyond the finite f32 needs logits that differ by more than 1e38. A logit that is
+/// not finite, or a target that is no number, gives a loss that is not finite, which the update refuses; a logit of -inf under a target
+/// of 0 adds nothing to the loss, as `0 ln 0` does, and has a slope of 0.
 /// Source: Bellemare et al. 2017, equation 7.
 ///
 /// # Panics
@@ -48,7 +49,8 @@ pub fn kl(logits: &[f32], target: &[f32], atoms: usize, gradient: &mut [f32]) ->
         let mass: f64 = target.iter().map(|&t| f64::from(t)).sum();
         for ((&logit, &t), gradient) in logits.iter().zip(target).zip(gradient) {
             let (log_p, t) = (log_p.at(logit), f64::from(t));
-            if t > 0.0 {
+            // Not t > 0, which would leave a NaN out of the loss.
+            if t != 0.0 {
                 total += t * (t.ln() - log_p);
             }
             *gradient = ((mass * log_p.exp() - t) / rows as f64) as f32;
@@ -208,6 +210,24 @@ mod tests {
                 gradient[i]
             );
         }
+    }
+
+    #[test]
+    fn a_target_that_is_no_number_is_not_left_out_of_the_loss() {
+        let mut gradient = [0f32; 3];
+        let loss = kl(&[0.0; 3], &[f32::NAN, 0.0, 0.0], ATOMS, &mut gradient);
+        assert!(loss.is_nan(), "{loss}");
+    }
+
+    #[test]
+    fn an_atom_without_probability_costs_nothing_where_the_target_has_none() {
+        let mut gradient = [f32::NAN; 3];
+        let logits = [0.0, f32::NEG_INFINITY, 0.0];
+        let loss = kl(&logits, &[0.5, 0.0, 0.5], ATOMS, &mut gradient);
+        assert!(loss.abs() < 1e-15, "{loss}");
+        assert_eq!(gradient[1], 0.0);
+        let loss = kl(&logits, &[0.5, 0.5, 0.0], ATOMS, &mut gradient);
+        assert_eq!(loss, f64::INFINITY);
     }
 
     #[test]

@@ -164,7 +164,52 @@ pub(super) fn projection(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> 
         see_projection(&mut drawn_entry, &mut drawn_mass, &step);
         Ok(())
     })?;
-    Ok(vec![entry, mass, drawn_entry, drawn_mass])
+    let no_number = no_number(context)?;
+    Ok(vec![entry, mass, drawn_entry, drawn_mass, no_number])
+}
+
+/// Between two good rows, one whose return, discount or probability is no number: the batch's check refuses the first two by name, and
+/// what comes here all the same must show.
+fn no_number(context: &mut Context<'_>) -> anyhow::Result<Row> {
+    let mut row = Row::new(
+        PROJECTION,
+        "return, discount or a probability is no number",
+        "rows that hide it, and other rows whose bits it changes",
+        0.0,
+    );
+    context.draw(0.1, |_, rng| {
+        let atoms = rng.random_range(2..60);
+        let (v_min, v_max) = support(rng);
+        let mut probs: Vec<f32> = (0..3).flat_map(|_| law(atoms, rng)).collect();
+        let mut rewards: [f32; 3] = std::array::from_fn(|_| finite(rng));
+        let mut discounts: [f32; 3] = std::array::from_fn(|_| probability(rng));
+        let (mut good, mut bad) = (vec![0.0; 3 * atoms], vec![0.0; 3 * atoms]);
+        project(&probs, &rewards, &discounts, v_min, v_max, &mut good);
+        let which = match rng.random_range(0..3) {
+            0 => {
+                rewards[1] = f32::NAN;
+                "return"
+            }
+            1 => {
+                discounts[1] = f32::NAN;
+                "discount"
+            }
+            _ => {
+                probs[atoms + rng.random_range(0..atoms)] = f32::NAN;
+                "probability"
+            }
+        };
+        project(&probs, &rewards, &discounts, v_min, v_max, &mut bad);
+        let shows = bad[atoms..2 * atoms].iter().any(|p| p.is_nan());
+        let kept = (0..3 * atoms)
+            .filter(|at| at / atoms != 1)
+            .all(|at| good[at].to_bits() == bad[at].to_bits());
+        row.must(shows && kept, || {
+            format!("{which}, {atoms} atoms on [{v_min:e}, {v_max:e}]")
+        });
+        Ok(())
+    })?;
+    Ok(row)
 }
 
 /// exp(x - max) / sum of a row, without a logarithm.
@@ -316,6 +361,14 @@ pub(super) fn kl(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
         "cases in which the loss is finite all the same",
         0.0,
     );
+    let [mut blocked_loss, mut blocked_slope] =
+        rows("drawn; logits of -inf under targets of 0; targets sum to 0.5 to 1.5");
+    let mut hidden_under_0 = Row::new(
+        KL,
+        "+inf or no number under a target of 0; a target that is no number",
+        "cases in which the loss is finite all the same",
+        0.0,
+    );
     context.draw(1.0, |_, rng| {
         let (rows, atoms) = (rng.random_range(1..4), rng.random_range(2..60));
         let mut batch = Batch {
@@ -333,7 +386,50 @@ pub(super) fn kl(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
         let mut gradient = vec![0.0; batch.logits.len()];
         let loss = product_kl(&batch.logits, &batch.target, atoms, &mut gradient);
         hidden.must(!loss.is_finite(), || format!("{bad} at {at}"));
+        // One row, in which some atoms have no probability on either side, and the first always has one.
+        let mut target = law(atoms, rng);
+        let mut logits = finites(atoms, rng);
+        target[0] = 0.5;
+        for i in 1..atoms {
+            if i == at || rng.random_bool(0.3) {
+                (logits[i], target[i]) = (f32::NEG_INFINITY, 0.0);
+            }
+        }
+        let mut batch = Batch {
+            atoms,
+            logits,
+            target,
+        };
+        see_kl(&mut blocked_loss, &mut blocked_slope, &batch);
+        // And with what is no probability at all, in one of these places or another.
+        let at = rng.random_range(1..atoms);
+        let bad = match rng.random_range(0..3) {
+            0 => {
+                (batch.logits[at], batch.target[at]) = (f32::INFINITY, 0.0);
+                "a logit of +inf"
+            }
+            1 => {
+                (batch.logits[at], batch.target[at]) = (f32::NAN, 0.0);
+                "a logit that is no number"
+            }
+            _ => {
+                batch.target[at] = f32::NAN;
+                "a target that is no number"
+            }
+        };
+        let mut gradient = vec![0.0; atoms];
+        let loss = product_kl(&batch.logits, &batch.target, atoms, &mut gradient);
+        hidden_under_0.must(!loss.is_finite(), || format!("{bad} at {at} of {atoms}"));
         Ok(())
     })?;
-    Ok(vec![loss, slope, drawn_loss, drawn_slope, hidden])
+    Ok(vec![
+        loss,
+        slope,
+        drawn_loss,
+        drawn_slope,
+        hidden,
+        blocked_loss,
+        blocked_slope,
+        hidden_under_0,
+    ])
 }

@@ -248,6 +248,16 @@ fn data() -> anyhow::Result<Vec<Refusal>> {
             evaluate(0.1, f32::INFINITY, 0.9),
         ),
         refusal(
+            "return NaN",
+            "a return that is no number, in a batch",
+            evaluate(0.1, f32::NAN, 0.9),
+        ),
+        refusal(
+            "discount NaN",
+            "a discount that is no number, in a batch",
+            evaluate(0.1, 0.0, f32::NAN),
+        ),
+        refusal(
             "discount 1.1",
             "a discount of 1.1 in a batch",
             evaluate(0.1, 0.0, 1.1),
