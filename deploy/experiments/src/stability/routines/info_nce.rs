@@ -187,5 +187,78 @@ pub(super) fn check(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
         see(&mut drawn_loss, &mut drawn_slope, &batch);
         Ok(())
     })?;
-    Ok(vec![loss, slope, drawn_loss, drawn_slope])
+    let [invalid, endless, no_number] = not_finite(context)?;
+    Ok(vec![
+        loss,
+        slope,
+        drawn_loss,
+        drawn_slope,
+        invalid,
+        endless,
+        no_number,
+    ])
+}
+
+/// The loss, and the bits of its slopes.
+fn bits(dots: &[f32], valid: &[u8]) -> (f64, Vec<u32>) {
+    let mut gradient = vec![f32::NAN; dots.len()];
+    let loss = info_nce(dots, valid, Scores::new(64, 20.0), &mut gradient);
+    (loss, gradient.iter().map(|slope| slope.to_bits()).collect())
+}
+
+/// Dot products that are not finite: in rows that do not count, and in those that do.
+fn not_finite(context: &mut Context<'_>) -> anyhow::Result<[Row; 3]> {
+    let row = |extreme: &str, promise: &str| Row::new(INFO_NCE, extreme, promise, 0.0);
+    let mut invalid = row(
+        "no number or infinite in rows and columns that are not valid",
+        "cases in which the loss or a slope has other bits for it",
+    );
+    let mut endless = row(
+        "an infinite dot product of two valid rows",
+        "cases in which the loss or a slope has other bits than at 3.4e38, where a score is at its bound",
+    );
+    let mut no_number = row(
+        "a dot product of two valid rows is no number",
+        "cases in which the loss is finite all the same",
+    );
+    context.draw(0.1, |_, rng| {
+        let count = rng.random_range(2..12);
+        // The first row is valid, the last is not.
+        let valid: Vec<u8> = (0..count)
+            .map(|row| u8::from(row == 0 || (row < count - 1 && rng.random_bool(0.7))))
+            .collect();
+        let dots = finites(count * count, rng);
+        let before = bits(&dots, &valid);
+        let mut other = dots.clone();
+        for (at, dot) in other.iter_mut().enumerate() {
+            if valid[at / count] == 0 || valid[at % count] == 0 {
+                *dot = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY][rng.random_range(0..3)];
+            }
+        }
+        let input = || format!("valid {valid:?}, dots {}", shown(&dots));
+        let after = bits(&other, &valid);
+        invalid.must(
+            before.0.to_bits() == after.0.to_bits() && before.1 == after.1,
+            input,
+        );
+        let there: Vec<usize> = (0..count).filter(|&row| valid[row] != 0).collect();
+        let (i, j) = (
+            there[rng.random_range(0..there.len())],
+            there[rng.random_range(0..there.len())],
+        );
+        let mut with = |dot: f32| {
+            other[i * count + j] = dot;
+            bits(&other, &valid)
+        };
+        for (large, without_end) in [(f32::MAX, f32::INFINITY), (f32::MIN, f32::NEG_INFINITY)] {
+            let (large, without_end) = (with(large), with(without_end));
+            endless.must(
+                large.0.to_bits() == without_end.0.to_bits() && large.1 == without_end.1,
+                input,
+            );
+        }
+        no_number.must(!with(f32::NAN).0.is_finite(), input);
+        Ok(())
+    })?;
+    Ok([invalid, endless, no_number])
 }
