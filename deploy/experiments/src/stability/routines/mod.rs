@@ -9,6 +9,7 @@ mod horizon;
 mod info_nce;
 mod ising;
 mod losses;
+mod policy;
 mod products;
 pub(super) mod refused;
 mod returns;

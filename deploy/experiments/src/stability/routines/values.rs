@@ -1,4 +1,4 @@
-//! Expected returns of logits over the atoms.
+//! Expected returns of logits over the atoms, and the actions that are chosen by them.
 
 use candle_core::{Device, Tensor};
 use driml_model::{EXPECTED_RETURN_ERROR, Network, Parameters};
@@ -8,6 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::stability::{
     check::{Context, Routine, Row},
     edges::{exact_sum, finites, shown, support, widened},
+    routines::policy,
     small,
 };
 
@@ -105,5 +106,7 @@ pub(super) fn check(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
         let support = support(rng);
         see(&mut drawn, &Case { support, rows })
     })?;
-    Ok(vec![listed, drawn])
+    let mut rows = vec![listed, drawn];
+    rows.extend(policy::check(context)?);
+    Ok(rows)
 }
