@@ -3,6 +3,7 @@
 
 mod adam;
 mod affinity;
+mod capacity;
 mod counters;
 mod gradients;
 mod horizon;

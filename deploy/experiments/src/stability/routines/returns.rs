@@ -1,4 +1,4 @@
-//! N-step returns and discounts, as batches of a whole replay have them.
+//! N-step returns and discounts, as batches of a whole replay have them, be it of few transitions.
 
 use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
@@ -7,6 +7,7 @@ use driml_replay_server::{Compression, Config, RETURN_ERROR, Replay, return_sum_
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
+use super::capacity;
 use crate::stability::{
     check::{Context, Routine, Row},
     edges::{exact_sum, finite, finites, shown},
@@ -37,8 +38,17 @@ pub(super) fn spec(n_step: u32, gamma: f64, timeout: TimeoutRule) -> RunSpec {
 
 /// A replay in which nobody waits, and which actor 0 has joined.
 pub(super) fn replay(spec: &RunSpec, rows: u32) -> anyhow::Result<Replay> {
+    replay_of(spec, rows, 4096)
+}
+
+/// [`replay`] that holds so many transitions.
+pub(super) fn replay_of(
+    spec: &RunSpec,
+    rows: u32,
+    capacity_transitions: u64,
+) -> anyhow::Result<Replay> {
     let config = Config {
-        capacity_transitions: 4096,
+        capacity_transitions,
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
@@ -226,5 +236,7 @@ pub(super) fn check(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
             },
         )
     })?;
-    Ok(vec![listed, drawn])
+    let mut rows = vec![listed, drawn];
+    rows.extend(capacity::check(context)?);
+    Ok(rows)
 }
