@@ -2,7 +2,7 @@
 
 use driml_actor::{Incarnation, Schedule};
 use driml_learner::{AffinityEstimator, Alphabet, LearnedAffinity, LearnedSettings};
-use driml_protocol::{End, InsertReply, Tally, TimeoutRule};
+use driml_protocol::{Chunk, End, InsertReply, Tally, TimeoutRule};
 use driml_replay_server::RateLimiter;
 use rand::Rng;
 
@@ -165,6 +165,49 @@ fn resumed() -> anyhow::Result<Row> {
     Ok(row)
 }
 
+/// What an actor counts, on its way into a replay.
+fn headers() -> anyhow::Result<Row> {
+    let mut row = row(
+        "sequence, first_transition and weights_version of a chunk, 2^31 to 2^48",
+        "counts that are others once decoded, stored or sampled",
+    );
+    let spec = spec(3, 0.99, TimeoutRule::Terminal);
+    for count in LARGE.map(|count| count.min((1 << 48) - 40)) {
+        let mut all = chunk(&[(1.0, End::Running); 40]);
+        all.header.sequence = count;
+        all.header.first_transition = count;
+        all.header.weights_version = count;
+        let (head, payload) = all.seal(7)?;
+        let decoded = Chunk::decode(&[head.as_slice(), payload].concat(), 7, 2)?;
+        row.must(decoded.header == all.header, || {
+            format!("decoded: {:?}", decoded.header)
+        });
+        let mut fresh = replay(&spec, 32)?;
+        // A number that lost its upper half would be the one that is expected, or an earlier one.
+        let reply = fresh.insert(&all);
+        let is_refused = matches!(reply, InsertReply::OutOfOrder { expected: 0 });
+        row.must(is_refused, || format!("sequence {count}: {reply:?}"));
+        let mut acted = chunk(&[(1.0, End::Running); 40]);
+        acted.header.weights_version = count;
+        fresh.insert(&acted);
+        let found = fresh.sample(32).map(|batch| batch.header.weights_versions);
+        row.must(matches!(found, Ok(both) if both == (count, count)), || {
+            format!("weights_version {count}: {found:?}")
+        });
+        let mut late = replay(&spec, 32)?;
+        let mut first = chunk(&[(1.0, End::Running); 40]);
+        first.header.first_transition = count;
+        // What the replay server logs of it would look like a fault.
+        let silence = tracing::subscriber::NoSubscriber::default();
+        tracing::subscriber::with_default(silence, || late.insert(&first));
+        let lost = late.status().transitions_lost;
+        row.must(lost == count, || {
+            format!("first_transition {count}: {lost} lost")
+        });
+    }
+    Ok(row)
+}
+
 /// Seeds of a run that is resumed late.
 fn seeds() -> Row {
     let mut row = row(
@@ -235,6 +278,12 @@ fn affinity(context: &mut Context<'_>) -> anyhow::Result<Row> {
 
 pub(super) fn check(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
     let mut rows = epsilon(context)?;
-    rows.extend([limiter(context)?, resumed()?, seeds(), affinity(context)?]);
+    rows.extend([
+        limiter(context)?,
+        resumed()?,
+        headers()?,
+        seeds(),
+        affinity(context)?,
+    ]);
     Ok(rows)
 }
