@@ -322,6 +322,7 @@ fn tradeoff() {
     assert_eq!(summary("c51-seed1").unwrap(), first, "it was not run again");
     let files = data(&folder);
     let names = [
+        "equal_time.csv",
         "levels.csv",
         "pareto.png",
         "pareto.svg",
@@ -333,8 +334,9 @@ fn tradeoff() {
     ];
     assert_eq!(files.keys().collect::<Vec<_>>(), names);
     let rows = |name: &str| String::from_utf8_lossy(&files[name]).lines().count() - 1;
-    // Of the base two seeds, of each level one.
-    assert_eq!((rows("levels.csv"), rows("runs.csv")), (3, 2 + 3));
+    // Of the base two seeds, of each level one; each dial's base has a row of its own.
+    assert_eq!((rows("levels.csv"), rows("runs.csv")), (2 + 3, 2 + 3));
+    assert_eq!(rows("equal_time.csv"), 2);
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     for part in [
         "smoke length",
@@ -342,6 +344,8 @@ fn tradeoff() {
         "| DIM | driml-ada | driml-ada |",
         "at equal wall-clock time",
         "against float64",
+        "over 1 seed of a level and 2 of a base",
+        "--dials 'learner.precision' --out t`, then `driml tradeoff --env chain",
     ] {
         assert!(page.contains(part), "{part}\n{page}");
     }
@@ -351,6 +355,19 @@ fn tradeoff() {
         "{again}"
     );
     assert_eq!(data(&folder), files);
+
+    // Seeds of another call are on the page, and a report of one dial has that alone.
+    call(&[&precision[..], &["--seeds", "2"]].concat());
+    call(&["--report"]);
+    let rows = |name: &str| {
+        String::from_utf8_lossy(&data(&folder)[name])
+            .lines()
+            .count()
+            - 1
+    };
+    assert_eq!((rows("levels.csv"), rows("runs.csv")), (2 + 3, 4 + 4));
+    call(&[&precision[..], &["--report"]].concat());
+    assert_eq!(rows("levels.csv"), 2);
 }
 
 /// A killed experiment takes its runs with it, and goes on at the next call.

@@ -315,6 +315,12 @@ mod tests {
             (of("x", 1), of("x", 2), of("y", 3), of("y", 4)),
             (1, 1, 3, 3)
         );
+        // Read whatever it was made of.
+        assert_eq!(session.kept_piece::<u32>("played"), Some(3));
+        assert_eq!(session.kept_piece::<u32>("never"), None);
+        session.keep("calls", ["driml tradeoff"]).unwrap();
+        let calls: Option<Vec<String>> = session.kept_piece("calls");
+        assert_eq!(calls.unwrap(), ["driml tradeoff"]);
         assert!(report().is_ok());
     }
 }

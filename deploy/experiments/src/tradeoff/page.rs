@@ -143,7 +143,8 @@ fn seeds(results: &Results) -> String {
         Some((low, high)) => format!("{low} to {high}"),
     };
     let [bases, levels] = results.seeds().map(counts);
-    format!("{levels} seeds of a level and {bases} of a base")
+    let seeds = if levels == "1" { "seed" } else { "seeds" };
+    format!("{levels} {seeds} of a level and {bases} of a base")
 }
 
 /// Rows and states of the errors of a base.
