@@ -61,7 +61,9 @@ fn check(name: &str, files: &[&str]) {
     assert_eq!(first.keys().collect::<Vec<_>>(), files, "{name}");
     for (file, bytes) in &first {
         assert!(bytes.len() > 50, "{file} is all but empty");
-        assert!(!String::from_utf8_lossy(bytes).contains("NaN"), "{file}");
+        // What is refused is said with its value.
+        let has_nan = String::from_utf8_lossy(bytes).contains("NaN");
+        assert!(!has_nan || file == "refused.csv", "{file}");
     }
 
     // Elsewhere: the same bytes. Again, with one piece lost: that one is made anew, to the same bytes.

@@ -172,7 +172,13 @@ mod tests {
 
     #[test]
     fn every_level_of_every_dial_is_a_run_that_can_be_made() {
-        for name in ["mspacman", "procgen:coinrun", "procgen:fruitbot", "chain"] {
+        for name in [
+            "mspacman",
+            "procgen:coinrun",
+            "procgen:fruitbot",
+            "procgen:dodgeball",
+            "chain",
+        ] {
             let world: WorldName = name.parse().unwrap();
             for smoke in [false, true] {
                 let common = common(world, smoke);
@@ -263,16 +269,22 @@ mod tests {
             let found = dials::chosen(dials::dials(world), &[name.to_owned()]);
             let dial = &found.unwrap()[0];
             let base = dial.base_point();
-            let named = |preset: &str| Common {
-                preset: preset.to_owned(),
-                ..common.clone()
+            let of = |preset: &str, point: &Point| {
+                let common = Common {
+                    preset: preset.to_owned(),
+                    ..common.clone()
+                };
+                // A priced preset says in its notes what it gives up.
+                RunConfig {
+                    notes: Vec::new(),
+                    ..common.config(point).unwrap()
+                }
             };
-            let whole = named(&dial.base).config(&base).unwrap();
-            assert_eq!(common.config(&base).unwrap(), whole);
+            assert_eq!(of(PRESET, &base), of(&dial.base, &base));
             for level in &dial.levels {
                 let point = dial.point(level);
-                let whole = named(&level.name).config(&base).unwrap();
-                assert_eq!(common.config(&point).unwrap(), whole, "{}", point.key);
+                let whole = of(&level.name, &base);
+                assert_eq!(of(PRESET, &point), whole, "{}", point.key);
             }
         }
     }

@@ -39,15 +39,15 @@ fn the_paper_s_agent_is_described() {
         torso.conv2                         32,832          32,832  14x14x32 to 6x6x64, kernel 4, stride 2
         torso.conv3                         36,928          36,928  6x6x64 to 4x4x64, kernel 3, stride 1
         torso.fc                           524,800         524,800  f4, 512 numbers of the last map
-        head                               392,445         392,445  C51: 15 actions, 51 atoms each
+        head                               392,445         837,216  C51: 15 actions, 51 atoms each
         dim.action                           6,208           6,208  psi is given a_t (condition_on_action)
         dim.psi3                                 0         394,240  not built: lambda 3t3 and 3t4 are 0
         dim.phi3                                 0         328,704  not built: lambda 3t3 and 4t3 are 0
         dim.psi4                           852,992         852,992  lambda 4t4 above 0
         dim.phi4                           787,456         787,456  lambda 4t4 above 0
-        target network                     993,181         993,181  torso and head again: s_{t+n} is judged by weights that stand still
+        target network                     993,181       1,437,952  torso and head again: s_{t+n} is judged by weights that stand still
         key encoder                              0       1,453,728  not built: the objective has no key encoder, only curl has
-        all                              3,633,018       5,809,690  63% of everything
+        all                              3,633,018       6,699,232  54% of everything
 
         FLOPs of an update                      is      everything  why
         s_t, torso                   4,756,340,736   4,938,792,960  256 rows forward and backward; at most, as equal states are computed once where it pays
@@ -75,9 +75,9 @@ fn the_paper_s_agent_is_described() {
           s_t and s_{t+n}                5,529,600       6,291,456  one frame each
           s_{t+k}                        2,764,800      15,728,640  1 a row: what driml-ada is served
           numbers                            3,072           5,120  returns, discounts, actions, k
-        a broadcast                      3,973,556      13,454,228  torso and head, as f32: what acts has no other layer
+        a broadcast                      3,973,556      15,233,880  torso and head, as f32: what acts has no other layer
 
-        everything: all that the agents of the menu have, at once: five heads and a key encoder, four pairs of levels at five positives a row, augmented, double DQN, all weights broadcast as f32; frames whole, stacked and enlarged where they are made
+        everything: all that the agents of the menu have, at once: five heads of DIM and a key encoder, a dueling head of noisy layers, four pairs of levels at five positives a row, augmented, double DQN, all weights broadcast as f32; frames whole, stacked and enlarged where they are made
     "#]].assert_eq(&inspection.describe());
     let json: serde_json::Value = serde_json::from_str(&inspection.json().unwrap()).unwrap();
     assert_eq!(json["bytes"][0]["what"], "a transition in a chunk");

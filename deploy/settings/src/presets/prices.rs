@@ -68,19 +68,40 @@ impl Price {
             gain,
             error,
         } = self;
-        let each = |text: fn(&Measured<'_>, &Number) -> Option<String>, number: &Number| {
-            let found = pages.iter().filter_map(|page| {
-                let measured = page.measured(setting, value)?;
-                Some(format!("{}: {}", page.name, text(&measured, number)?))
-            });
-            found.collect::<Vec<_>>().join("; ")
+        let measured: Vec<(&str, Measured<'_>)> = pages
+            .iter()
+            .filter_map(|page| Some((page.name, page.measured(setting, value)?)))
+            .collect();
+        let each = |text: &dyn Fn(&Measured<'_>) -> Option<String>| {
+            measured.iter().filter_map(|(_, it)| text(it)).collect()
+        };
+        let in_words = |number: &Number| {
+            let of_level = joined(each(&|it| it.level(number)));
+            let of_base = joined(each(&|it| it.base(number)));
+            let text = number.text.replace("{}", &of_level);
+            text.replace("{base}", &of_base)
         };
         format!(
-            "{setting} = {value} instead of {exact}. Gain: {}. Price: {}. Training return: {}.",
-            each(Measured::text, gain),
-            each(Measured::text, error),
-            each(|measured, _| measured.training_return(), gain),
+            "{setting} = {value} instead of {exact}. On {}. Gain: {}. Price: {}; training return {}.",
+            joined(
+                measured
+                    .iter()
+                    .map(|(name, _)| (*name).to_owned())
+                    .collect()
+            ),
+            in_words(gain),
+            in_words(error),
+            joined(each(&|it| it.training_return())),
         )
+    }
+}
+
+/// "a, b and c".
+fn joined(mut items: Vec<String>) -> String {
+    match (items.pop(), items.is_empty()) {
+        (None, _) => String::new(),
+        (Some(only), true) => only,
+        (Some(last), false) => format!("{} and {last}", items.join(", ")),
     }
 }
 
@@ -185,8 +206,8 @@ mod tests {
             for page in measured::pages() {
                 let measured = page.measured(&price.setting, &price.value).unwrap();
                 for number in [&price.gain, &price.error] {
-                    let text = measured.text(number).unwrap();
-                    assert!(!text.contains(['{', '}']), "{text}");
+                    assert!(number.text.contains("{}"), "{number:?}");
+                    assert!(measured.level(number).is_some() && measured.base(number).is_some());
                 }
                 assert!(measured.training_return().is_some(), "{}", page.name);
             }
@@ -195,7 +216,7 @@ mod tests {
 
     #[test]
     fn a_preset_that_is_not_whole_says_nothing_of_the_whole() {
-        let mut table = settings("fast", WorldName::MsPacman, 0);
+        let mut table = settings("fast", "mspacman".parse().unwrap(), 0);
         let together = |table: &Table| {
             let lines = given_up("fast", table).into_iter();
             lines.filter(|line| line.starts_with("all of it")).count()

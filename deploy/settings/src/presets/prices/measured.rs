@@ -21,14 +21,20 @@ const PAGES: [(&str, &str); 3] = [
     ),
 ];
 
-/// One number of a level in words: "{}" in its text is the number, "{base}" that of the level's base.
+/// One number of a level in words: "{}" in its text is that of each world, "{base}" those of its bases.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Number {
-    text: String,
+    pub(super) text: String,
     column: String,
     #[serde(rename = "as")]
     form: Form,
+}
+
+impl Number {
+    fn write(&self, row: &BTreeMap<String, String>) -> Option<String> {
+        Some(self.form.write(value(row, &self.column)?))
+    }
 }
 
 /// How a number is written.
@@ -98,17 +104,14 @@ pub(super) struct Measured<'a> {
 }
 
 impl Measured<'_> {
-    /// The number in words; nothing if it was not measured.
-    pub(super) fn text(&self, number: &Number) -> Option<String> {
-        let [own, base] = [self.level, self.base].map(|row| {
-            let found = value(row, &number.column)?;
-            Some(number.form.write(found))
-        });
-        let text = number.text.replace("{}", &own?);
-        Some(match base {
-            Some(base) => text.replace("{base}", &base),
-            None => text,
-        })
+    /// A number of the level in words; nothing if it was not measured.
+    pub(super) fn level(&self, number: &Number) -> Option<String> {
+        number.write(self.level)
+    }
+
+    /// The same number of the base.
+    pub(super) fn base(&self, number: &Number) -> Option<String> {
+        number.write(self.base)
     }
 
     /// A column that is a factor of the base.
@@ -121,7 +124,7 @@ impl Measured<'_> {
         let of = |end: &str| value(self.level, &format!("training_return_minus_base{end}"));
         let (mean, low, high) = (of("")?, of("_low")?, of("_high")?);
         Some(format!(
-            "{mean:+.2} [{low:+.2}, {high:+.2}] of {:.2} ({} seeds)",
+            "{mean:+.2} [{low:+.2}, {high:+.2}] from {:.2} ({} seeds)",
             value(self.base, "training_return")?,
             self.level["seeds"]
         ))
@@ -164,10 +167,11 @@ mod tests {
         let number: Number =
             toml::from_str("text = \"{}, not {base}\"\ncolumn = \"rows_gain\"\nas = \"factor\"")
                 .unwrap();
-        assert_eq!(measured.text(&number).unwrap(), "1.50, not 1.00");
+        assert_eq!(measured.level(&number).unwrap(), "1.50");
+        assert_eq!(measured.base(&number).unwrap(), "1.00");
         assert_eq!(
             measured.training_return().unwrap(),
-            "-0.20 [-0.30, +0.10] of 0.90 (3 seeds)"
+            "-0.20 [-0.30, +0.10] from 0.90 (3 seeds)"
         );
         assert!(page.measured("p", "f64").is_none());
     }
