@@ -4,7 +4,7 @@ use driml_protocol::{End, TimeoutRule};
 use driml_replay_server::{Replay, Unready};
 use rand::Rng;
 
-use super::returns::{chunk, replay_of, spec};
+use super::replays::{chunk, replay_of, spec};
 use crate::stability::check::{Context, Routine, Row};
 
 const CAPACITY: Routine = Routine {

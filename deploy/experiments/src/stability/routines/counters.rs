@@ -6,7 +6,7 @@ use driml_protocol::{Chunk, End, InsertReply, Tally, TimeoutRule};
 use driml_replay_server::RateLimiter;
 use rand::Rng;
 
-use super::returns::{chunk, replay, spec};
+use super::replays::{chunk, replay, spec};
 use crate::stability::check::{Context, Routine, Row};
 
 const EPSILON: Routine = Routine {

@@ -13,6 +13,7 @@ mod losses;
 mod policy;
 mod products;
 pub(super) mod refused;
+mod replays;
 mod returns;
 mod stored;
 mod target;
@@ -25,7 +26,7 @@ use super::check::{Context, Row};
 pub(super) type Check = fn(&mut Context<'_>) -> anyhow::Result<Vec<Row>>;
 
 /// Each family: its name, about the share of the time that it takes, and its check. The order is the page's.
-pub(super) const MENU: [(&str, u64, Check); 17] = [
+pub(super) const MENU: [(&str, u64, Check); 18] = [
     ("projection", 4, losses::projection),
     ("softmax", 1, losses::softmax),
     ("kl", 2, losses::kl),
@@ -39,7 +40,8 @@ pub(super) const MENU: [(&str, u64, Check); 17] = [
     ("stored", 1, stored::check),
     ("affinity", 12, affinity::check),
     ("horizon", 8, horizon::check),
-    ("returns", 4, returns::check),
+    ("returns", 3, returns::check),
+    ("capacity", 1, capacity::check),
     ("counters", 2, counters::check),
     ("random-walk", 4, walk::check),
     ("ising", 4, ising::check),

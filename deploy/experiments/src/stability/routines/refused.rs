@@ -17,7 +17,7 @@ use driml_settings::{
 
 use super::{
     gradients::gradients,
-    returns::{chunk, replay, spec},
+    replays::{chunk, replay, spec},
 };
 use crate::stability::{check::Refusal, small};
 
