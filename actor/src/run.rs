@@ -16,7 +16,7 @@ use crate::{
     collect::{Collector, Incarnation},
     config::ActorSettings,
     delivery::{Delivery, DeliveryLimits},
-    weights::WeightsSource,
+    weights::{NewestWeights, WeightsSource},
 };
 
 /// How long an actor waits for a learner with weights.
@@ -135,6 +135,51 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         args.actor,
         config.envs
     );
+    // At the start not all are connected yet.
+    let chunk_steps = |actors: u32| config.chunk_steps(actors.max(actors_planned));
+    let played = play(
+        &mut collector,
+        chunk_steps,
+        &newest,
+        &delivery,
+        &activity,
+        shutdown,
+    );
+    if played.is_err() {
+        // What was played before the world failed is delivered too, without a wait for the rate limiter.
+        shutdown.set();
+    }
+    let produced = collector.produced();
+    activity.begin("delivers its last chunks");
+    let delivered = delivery.finish();
+    played?;
+    let unwanted = delivered?;
+    tracing::info!(
+        "actor {} leaves: {} transitions delivered",
+        args.actor,
+        produced - unwanted
+    );
+    drop(alive);
+    client
+        .session()
+        .close()
+        .wait()
+        .map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+}
+
+/// Plays and queues what was played until `shutdown`, or until nobody wants more. `chunk_steps` says how many steps a chunk has,
+/// of the number of actors in the run.
+///
+/// # Errors
+/// A world that fails; what was queued before is still to be delivered.
+fn play(
+    collector: &mut Collector,
+    chunk_steps: impl Fn(u32) -> u32,
+    newest: &NewestWeights,
+    delivery: &Delivery,
+    activity: &Activity,
+    shutdown: &Shutdown,
+) -> anyhow::Result<()> {
     while !shutdown.is_set() && !delivery.is_finished() {
         let newer = newest.take_within(delivery.fresh_weights_max());
         if let Some(Weights {
@@ -148,9 +193,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
                 header.version
             );
         }
-        // At the start not all are connected yet.
-        let steps = config.chunk_steps(delivery.actors().max(actors_planned));
         activity.begin("plays");
+        let steps = chunk_steps(delivery.actors());
         let chunk = collector.collect(delivery.inserted_total(), steps)?;
         if let Some(waits) = delivery.waits_in_words() {
             activity.begin(waits);
@@ -159,18 +203,5 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             break;
         }
     }
-    let produced = collector.produced();
-    activity.begin("delivers its last chunks");
-    let unwanted = delivery.finish()?;
-    tracing::info!(
-        "actor {} leaves: {} transitions delivered",
-        args.actor,
-        produced - unwanted
-    );
-    drop(alive);
-    client
-        .session()
-        .close()
-        .wait()
-        .map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+    Ok(())
 }

@@ -191,6 +191,18 @@ fn a_world_that_fails_ends_the_run_with_a_sentence() {
     }
 }
 
+/// Chunks are of eight steps of four copies; the last waits for thousands of updates when the world fails.
+#[test]
+fn what_was_played_before_a_world_failed_is_stored() {
+    let system = system();
+    let slow = "--set replay.replay_ratio=8192 --set replay.warmup_transitions=32 --set replay.slack_transitions=32";
+    let args = format!("local {SMALL} {slow} --agent c51 --frames 100000 --run-dir run");
+    start(&system, &args, &numbered("raise 25"))
+        .wait()
+        .expect_code(1);
+    assert_eq!(system.run_folder("run").summary().frames, 3 * 8 * 4);
+}
+
 #[test]
 fn a_command_that_is_no_world_is_refused_before_anything_starts() {
     let system = system();
