@@ -37,7 +37,9 @@ pub fn main() -> ExitCode {
     if let Err(e) = settled {
         tracing::warn!("this process goes on without the environment that makes it fast: {e}");
     }
-    match cli.command.run() {
+    let ran = cli.command.run();
+    panics::process_ends();
+    match ran {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) if e.is::<Interrupted>() => ExitCode::from(EXIT_INTERRUPTED),
         Err(e) => {
