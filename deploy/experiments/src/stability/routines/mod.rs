@@ -17,6 +17,7 @@ mod replays;
 mod returns;
 mod stored;
 mod target;
+mod update;
 mod values;
 mod walk;
 
@@ -26,7 +27,7 @@ use super::check::{Context, Row};
 pub(super) type Check = fn(&mut Context<'_>) -> anyhow::Result<Vec<Row>>;
 
 /// Each family: its name, about the share of the time that it takes, and its check. The order is the page's.
-pub(super) const MENU: [(&str, u64, Check); 18] = [
+pub(super) const MENU: [(&str, u64, Check); 19] = [
     ("projection", 4, losses::projection),
     ("softmax", 1, losses::softmax),
     ("kl", 2, losses::kl),
@@ -37,6 +38,7 @@ pub(super) const MENU: [(&str, u64, Check); 18] = [
     ("adam", 12, adam::check),
     ("target", 6, target::check),
     ("products", 8, products::check),
+    ("update", 8, update::check),
     ("stored", 1, stored::check),
     ("affinity", 12, affinity::check),
     ("horizon", 8, horizon::check),

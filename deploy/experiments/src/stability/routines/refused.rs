@@ -7,7 +7,7 @@ use driml_learner::{
     optimiser::adam::{Adam, AdamSettings},
 };
 use driml_machine::resources::Machine;
-use driml_model::{ModelConfig, Parameters, StoredAs};
+use driml_model::{ModelConfig, Parameters, PolicyNetwork, Precision, StoredAs};
 use driml_protocol::{AffinityUpdate, Chunk, End, InsertReply, TimeoutRule};
 use driml_replay_server::horizon::Affinity;
 use driml_settings::{
@@ -230,6 +230,9 @@ fn data() -> anyhow::Result<Vec<Refusal>> {
     let last = bytes.len() - 4;
     bytes[last..].copy_from_slice(&f32::INFINITY.to_le_bytes());
     let loaded = Parameters::load_safetensors(&config, &bytes, &Device::Cpu);
+    bytes[last..].copy_from_slice(&f32::NAN.to_le_bytes());
+    let acting = Precision::ALL.map(|precision| PolicyNetwork::new(&config, &bytes, precision));
+    let [acting_f32, acting_bf16] = acting;
     Ok(vec![
         refusal(
             "reward",
@@ -285,5 +288,11 @@ fn data() -> anyhow::Result<Vec<Refusal>> {
             left,
         ),
         refusal("inf", "an infinite weight in a file", loaded),
+        refusal("NaN", "a weight that is no number, in an actor", acting_f32),
+        refusal(
+            "NaN",
+            "a weight that is no number, in an actor that computes in bf16",
+            acting_bf16,
+        ),
     ])
 }

@@ -1,0 +1,255 @@
+//! Losses and gradients of a whole update, C51 with DIM, on this project's kernels and on candle's own.
+
+use driml_envs::WorldName;
+use driml_learner::{
+    Agent, Batch, Compute, Kernels, Lambda, LearnerSettings, NetworkParameters,
+    parity::{deviation::ErrorOfUpdate, float64::float64},
+};
+use driml_machine::resources::Machine;
+use driml_model::{ConvLayer, HeadConfig, ModelConfig, Parameters};
+use driml_protocol::NO_ACTION;
+use driml_settings::{
+    presets,
+    resolve::{Flags, Source, resolve},
+};
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::stability::{
+    check::{Context, Routine, Row},
+    small,
+};
+
+const UPDATE: Routine = Routine {
+    name: "whole update",
+    range: "f32; weights, returns and supports of any size whose losses are finite",
+};
+const ACTIONS: usize = 4;
+
+/// What an update computes with, beside its weights and rows.
+struct Setting {
+    /// What initial weights are multiplied by.
+    scale: f32,
+    support: (f32, f32),
+    tanh_clip: f64,
+    /// The size of returns.
+    returns: f32,
+    /// Whether all states are one.
+    is_still: bool,
+}
+
+impl Setting {
+    fn drawn(scale: f32, rng: &mut ChaCha8Rng) -> Self {
+        let supports = [
+            (-10.0, 10.0),
+            (0.0, 1e-3),
+            (1000.0, 1001.0),
+            (-1e6, 1e6),
+            (-1e30, 1e30),
+        ];
+        Self {
+            scale,
+            support: supports[rng.random_range(0..5)],
+            tanh_clip: [1e-30, 1e-3, 1.0, 20.0, 1e9, 1e30][rng.random_range(0..6)],
+            returns: [0.0, 1e-40, 1.0, 1e6, 1e30, 3e38][rng.random_range(0..6)],
+            is_still: rng.random_bool(0.2),
+        }
+    }
+
+    fn shown(&self) -> String {
+        let Self {
+            scale,
+            support,
+            tanh_clip,
+            returns,
+            is_still,
+        } = self;
+        let still = if *is_still { ", one state" } else { "" };
+        format!(
+            "weights x {scale:e}, support {support:?}, tanh_clip {tanh_clip:e}, returns within {returns:e}{still}"
+        )
+    }
+}
+
+fn settings() -> anyhow::Result<LearnerSettings> {
+    let world: WorldName = "chain".parse()?;
+    let source = Source::Layers(&presets::PRESETS[0], world, "driml-fix");
+    let settings = resolve(&source, &Flags::default(), &Machine::this())?;
+    Ok(LearnerSettings {
+        lambda: Lambda {
+            l3t3: 0.5,
+            l3t4: 0.5,
+            l4t3: 0.5,
+            l4t4: 1.0,
+        },
+        ..settings.learner.update
+    })
+}
+
+fn model(settings: &LearnerSettings, (v_min, v_max): (f32, f32)) -> ModelConfig {
+    let layer = |out, kernel, stride| ConvLayer {
+        out,
+        kernel,
+        stride,
+    };
+    ModelConfig {
+        height: 20,
+        width: 20,
+        channels: 2,
+        num_actions: ACTIONS,
+        atoms: 51,
+        v_min,
+        v_max,
+        conv: vec![layer(8, 4, 2), layer(8, 3, 1)],
+        hidden: 32,
+        rkhs: 16,
+        action_embed: 4,
+        dim: settings.dim_heads(ACTIONS),
+        head: HeadConfig::PLAIN,
+    }
+}
+
+/// Initial weights times the scale.
+fn weights(model: &ModelConfig, scale: f32, rng: &mut ChaCha8Rng) -> anyhow::Result<Parameters> {
+    let drawn = Parameters::init(model, rng, &candle_core::Device::Cpu)?;
+    let mut values = small::values(model, &drawn)?;
+    values.iter_mut().for_each(|value| *value *= scale);
+    Ok(small::parameters(model, &values)?)
+}
+
+/// The planes of a batch whose rows have every state.
+struct Planes {
+    states: [Vec<u8>; 3],
+    action: Vec<u8>,
+    next_action: Vec<u8>,
+    n_step_return: Vec<f32>,
+    bootstrap_discount: Vec<f32>,
+    positive_valid: Vec<u8>,
+}
+
+impl Planes {
+    fn drawn(model: &ModelConfig, setting: &Setting, rng: &mut ChaCha8Rng) -> Self {
+        let rows = rng.random_range(2..24);
+        let len = model.frame_len();
+        let mut states = || -> Vec<u8> {
+            match setting.is_still {
+                true => vec![200; rows * len],
+                false => (0..rows * len).map(|_| rng.random()).collect(),
+            }
+        };
+        let states = [states(), states(), states()];
+        let mut each = |draw: &dyn Fn(&mut ChaCha8Rng) -> u8| -> Vec<u8> {
+            (0..rows).map(|_| draw(rng)).collect()
+        };
+        let action = |rng: &mut ChaCha8Rng| rng.random_range(0..ACTIONS as u8);
+        Self {
+            states,
+            action: each(&action),
+            next_action: each(&|rng| match rng.random_bool(0.1) {
+                true => NO_ACTION,
+                false => action(rng),
+            }),
+            positive_valid: each(&|rng| rng.random_bool(0.8).into()),
+            n_step_return: (0..rows)
+                .map(|_| setting.returns * rng.random_range(-1.0..1.0))
+                .collect(),
+            bootstrap_discount: (0..rows)
+                .map(|_| [0.0, 0.93, 1.0][rng.random_range(0..3)])
+                .collect(),
+        }
+    }
+
+    fn batch(&self) -> Batch<'_> {
+        let [states_t, states_k, states_n] = &self.states;
+        Batch {
+            rows: self.action.len(),
+            states_t,
+            anchors: None,
+            positives: 1,
+            states_k,
+            states_n,
+            action: &self.action,
+            next_action: &self.next_action,
+            n_step_return: &self.n_step_return,
+            bootstrap_discount: &self.bootstrap_discount,
+            positive_valid: &self.positive_valid,
+            importance_weight: None,
+        }
+    }
+}
+
+/// Errors of one update: of the loss, as a share of 1 + loss, and of all gradients together, as a share of their norm; none of the
+/// gradient where of two values that are nearly the same another is the larger, after which the target is another too.
+fn errors(
+    kernels: Kernels,
+    setting: &Setting,
+    rng: &mut ChaCha8Rng,
+) -> anyhow::Result<(f64, Option<f64>)> {
+    let settings = LearnerSettings {
+        tanh_clip: setting.tanh_clip,
+        ..settings()?
+    };
+    let model = model(&settings, setting.support);
+    let parameters = NetworkParameters {
+        online: weights(&model, setting.scale, rng)?,
+        target: weights(&model, setting.scale, rng)?.without_dim()?,
+        key: None,
+    };
+    let compute = Compute {
+        kernels,
+        ..Compute::CPU
+    };
+    let agent = Agent::from_parameters(model.clone(), settings, &compute, parameters)?;
+    let planes = Planes::drawn(&model, setting, rng);
+    let expected = float64(&agent, &planes.batch())?;
+    let found = ErrorOfUpdate::of(&agent, &planes.batch(), &expected)?;
+    let loss = found.loss * expected.total.abs() / (1.0 + expected.total.abs());
+    let is_same = found.same_next_action == 1.0;
+    Ok((loss, is_same.then_some(found.gradient)))
+}
+
+/// The middle one; NaN, which is the largest, of none.
+fn median(mut errors: Vec<f64>) -> f64 {
+    errors.sort_by(f64::total_cmp);
+    errors.get(errors.len() / 2).copied().unwrap_or(f64::NAN)
+}
+
+fn of_kernels(
+    context: &mut Context<'_>,
+    kernels: Kernels,
+    whose: &str,
+) -> anyhow::Result<[Row; 2]> {
+    let mut losses = Row::new(
+        UPDATE,
+        &format!(
+            "{whose}: initial weights times 1e-6 to 100; returns 0 to 3e38; supports 1e-3 to 2e30 wide; tanh_clip 1e-30 to 1e30; equal states"
+        ),
+        "error of the loss, as a share of 1 + loss",
+        1e-4,
+    );
+    let mut gradients = Row::new(
+        UPDATE,
+        "the same, each size of weights",
+        "median error of the gradient, as a share of its norm: a ReLU whose input is 0 but for rounding is open in one and closed in the other",
+        1e-4,
+    );
+    for scale in [1e-6, 1e-3, 0.1, 1.0, 3.0, 10.0, 100.0] {
+        let mut found = Vec::new();
+        context.draw(0.0015, |_, rng| {
+            let setting = Setting::drawn(scale, rng);
+            let (loss, gradient) = errors(kernels, &setting, rng)?;
+            losses.see(loss, || setting.shown());
+            found.extend(gradient);
+            Ok(())
+        })?;
+        gradients.see(median(found), || format!("weights x {scale:e}"));
+        context.progress.advance(0)?;
+    }
+    Ok([losses, gradients])
+}
+
+pub(super) fn check(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
+    let mut rows = Vec::from(of_kernels(context, Kernels::FUSED, "our kernels")?);
+    rows.extend(of_kernels(context, Kernels::Candle, "candle's operations")?);
+    Ok(rows)
+}
