@@ -1,6 +1,8 @@
 //! How exact a level's arithmetic is: losses, gradients and values of its own run's weights on held rows, against float64.
 //! It says nothing of what is learned: a level may be exact and learn less.
 
+use std::fmt;
+
 use anyhow::Context;
 use driml_launch::run_folder::RunFolder;
 use driml_learner::{
@@ -39,17 +41,29 @@ pub(super) struct Exactness {
     pub(super) actor_q_rms: f64,
 }
 
-/// Of what the errors of a run with `config` are made, beside its weights.
-pub(super) fn method(config: &RunConfig) -> String {
-    format!(
-        "{} rows, {} states",
-        rows(config),
-        rows(config) * STATES_A_ROW
-    )
+/// Of what the errors are made, beside a run's weights.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Sizes {
+    /// Whose loss and gradient are compared.
+    pub(super) rows: usize,
+    /// Whose values and greedy actions are.
+    pub(super) states: usize,
 }
 
-fn rows(config: &RunConfig) -> usize {
-    ROWS_MAX.min(config.learner.batch_size as usize)
+impl Sizes {
+    pub(super) fn of(config: &RunConfig) -> Self {
+        let rows = ROWS_MAX.min(config.learner.batch_size as usize);
+        Self {
+            rows,
+            states: rows * STATES_A_ROW,
+        }
+    }
+}
+
+impl fmt::Display for Sizes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} rows, {} states", self.rows, self.states)
+    }
 }
 
 /// An actor's values [B, A] of the rows' states.
@@ -86,13 +100,13 @@ pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<
     let agent = Agent::from_parameters(model.clone(), update.clone(), &compute, parameters)?
         .with_equal_states(config.learner.equal_states);
     let weights = agent.weights()?;
-    let rows = rows(config);
+    let Sizes { rows, states } = Sizes::of(config);
     let held = HeldBatch::play(config, Some(&weights), rows)?;
     let reference = float64(&agent, &held.batch())?;
     let found = ErrorOfUpdate::of(&agent, &held.batch(), &reference)?;
     let published = agent.weights_as(config.learner.publish_as)?;
     let mut policy = PolicyNetwork::new(model, &published, config.actor.precision)?;
-    let held = HeldBatch::play(config, Some(&weights), rows * STATES_A_ROW)?;
+    let held = HeldBatch::play(config, Some(&weights), states)?;
     let expected = q_values(&agent, &held.states_t)?;
     let [learning, acting] = [
         agent.q_values_t(&held.batch())?,

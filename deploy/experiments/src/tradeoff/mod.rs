@@ -377,7 +377,7 @@ fn made(
                 let config = results.settings.common.config(point)?;
                 session.work().1.again(units);
                 let key = format!("exactness-{}", point.key);
-                let of = format!("{of}, {}", exactness::method(&config));
+                let of = format!("{of}, {}", exactness::Sizes::of(&config));
                 let made = session.piece_of(&of, &key, units, |progress| {
                     let made = exactness::measure(&config, &ran.folder)?;
                     progress.advance(units)?;

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 
+use anyhow::Context;
 use driml_machine::units::rough_duration;
 
 use super::{
@@ -88,6 +89,7 @@ pub(super) fn page(results: &Results) -> anyhow::Result<Page> {
     let common = &results.settings.common;
     let random = Spread::of(results.random.iter().copied());
     let equal = equal_time(results)?;
+    let sizes = error_sizes(results)?;
     let mut got: Vec<String> = results.levels.iter().map(|of| found(results, of)).collect();
     got.extend(equal.iter().map(|it| it.in_words.clone()));
     let mut values = Values::default();
@@ -103,7 +105,8 @@ pub(super) fn page(results: &Results) -> anyhow::Result<Page> {
         .set("missing", results.missing.join(", "))
         .set("episodes", common.episodes)
         .set("seeds", seeds(results))
-        .set("rows", error_rows(results)?)
+        .set("rows", sizes.rows)
+        .set("states", sizes.states)
         .set(
             "random",
             random.map_or("-".into(), |it| format!("{:.2}", it.mean)),
@@ -148,12 +151,11 @@ fn seeds(results: &Results) -> String {
 }
 
 /// Rows and states of the errors of a base.
-fn error_rows(results: &Results) -> anyhow::Result<String> {
-    let Some(of) = results.levels.first() else {
-        return Ok(String::new());
-    };
-    Ok(exactness::method(
-        &results.settings.common.config(&of.base)?,
+fn error_sizes(results: &Results) -> anyhow::Result<exactness::Sizes> {
+    let point = results.levels.first().map(|of| &of.base);
+    let point = point.context("a page has a level")?;
+    Ok(exactness::Sizes::of(
+        &results.settings.common.config(point)?,
     ))
 }
 
