@@ -1,6 +1,6 @@
 //! What a run leaves that never was, for tests.
 
-use driml_launch::run_folder::{Outcome, RunFolder, RunRecorder, Summary};
+use driml_launch::run_folder::{Outcome, Recorded, RunFolder, RunRecorder, Summary};
 use driml_protocol::{Horizon, LearnerStatus, ReplayStatus, RunSpec, TimeoutRule};
 
 pub(crate) fn spec() -> RunSpec {
@@ -23,7 +23,8 @@ pub(crate) fn spec() -> RunSpec {
 /// What a run leaves that did nothing.
 pub(crate) fn summary() -> Summary {
     let folder = tempfile::tempdir().unwrap();
-    let recorder = RunRecorder::create(&RunFolder::new(folder.path()), "", &[], &[]).unwrap();
+    let recorder =
+        RunRecorder::create(&RunFolder::new(folder.path()), Recorded::default()).unwrap();
     let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
     recorder.summarise(Outcome::Finished, &spec(), &replay, &learner)
 }

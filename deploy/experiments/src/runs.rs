@@ -142,7 +142,7 @@ mod tests {
 
     use super::*;
     use crate::made_up;
-    use driml_launch::run_folder::RunRecorder;
+    use driml_launch::run_folder::{Recorded, RunRecorder};
 
     #[test]
     fn a_run_counts_for_the_plan_that_made_it_alone() {
@@ -159,7 +159,7 @@ mod tests {
         };
         let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
         let folder = RunFolder::new(runs.root.join("run"));
-        let mut recorder = RunRecorder::create(&folder, "", &[], &[]).unwrap();
+        let mut recorder = RunRecorder::create(&folder, Recorded::default()).unwrap();
         recorder.record(std::slice::from_ref(&replay), &learner, &[]);
         let summary = recorder.summarise(Outcome::Finished, &made_up::spec(), &replay, &learner);
         summary.write(&folder).unwrap();

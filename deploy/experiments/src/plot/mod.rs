@@ -244,6 +244,7 @@ fn words(column: &str) -> (String, String) {
         "updates_per_second" => ("Learning speed", "updates per second"),
         "mean_age" => ("Age of sampled rows", "transitions"),
         "grad_norm" => ("Gradient before clipping", "global 2-norm"),
+        "epsilon" => ("Epsilon", "probability of a random action"),
         _ => {
             let text = column.replace('_', " ");
             let label = if column.starts_with("rss_mib_") {

@@ -27,7 +27,7 @@ use crate::{
     meeting::Meeting,
     processes::{Processes, Revived, stop},
     resume,
-    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
+    run_folder::{Outcome, Recorded, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     status_client::Statuses,
 };
 
@@ -73,17 +73,10 @@ pub fn run(
     let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
     let servers = server_names(config.replay.shards);
     let names = process_names(config);
-    let (text, losses) = (config.to_toml(), config.learner.update.objective.losses());
+    let recorded = Recorded::of(config, names.clone());
     let mut recorder = match resumed {
-        Some(resume_point) => RunRecorder::go_on(
-            run_dir,
-            &text,
-            losses,
-            &names,
-            resume_point,
-            config.frames(),
-        )?,
-        None => RunRecorder::create(run_dir, &text, losses, &names)?,
+        Some(point) => RunRecorder::go_on(run_dir, recorded, point, config.frames())?,
+        None => RunRecorder::create(run_dir, recorded)?,
     };
     if config.local.tensorboard {
         recorder.write_events(run_dir)?;

@@ -24,7 +24,7 @@ use crate::{
     evaluate::{self, Which},
     live_view::{Display, TEMPLATE},
     resume,
-    run_folder::{Evaluated, Outcome, ResumePoint, RunFolder, RunRecorder},
+    run_folder::{Evaluated, Outcome, Recorded, ResumePoint, RunFolder, RunRecorder},
 };
 use parts::Lockstep;
 
@@ -44,10 +44,10 @@ pub fn run(
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(exit_with_parent).context("listening for signals")?;
-    let (text, losses) = (config.to_toml(), config.learner.update.objective.losses());
+    let recorded = Recorded::of(config, Vec::new());
     let mut recorder = match resumed {
-        Some(point) => RunRecorder::go_on(run_dir, &text, losses, &[], point, config.frames())?,
-        None => RunRecorder::create(run_dir, &text, losses, &[])?,
+        Some(point) => RunRecorder::go_on(run_dir, recorded, point, config.frames())?,
+        None => RunRecorder::create(run_dir, recorded)?,
     };
     if config.local.tensorboard {
         recorder.write_events(run_dir)?;

@@ -41,6 +41,7 @@ pub(super) fn header(losses: &[&str], processes: &[String]) -> Vec<String> {
         "affinity_version",
         "actors",
         "waiting",
+        "epsilon",
     ];
     let rss = processes
         .iter()
@@ -64,6 +65,8 @@ pub(super) struct Moment<'a> {
     pub(super) k: Option<(f64, f64)>,
     pub(super) replay: &'a ReplayStatus,
     pub(super) learner: &'a LearnerStatus,
+    /// How likely all actors act at random; none where they differ in that.
+    pub(super) epsilon: Option<f64>,
     /// The names of the agent's auxiliary losses.
     pub(super) losses: &'a [&'static str],
     /// Resident memory of each process, MiB; none for one that ended.
@@ -103,6 +106,7 @@ impl Moment<'_> {
             replay.affinity_version.to_string(),
             replay.actors.to_string(),
             replay.waiting.to_string(),
+            some(self.epsilon),
         ]);
         let rss = self.rss_mib.iter();
         row.extend(rss.map(|mib| mib.map_or(String::new(), |mib| format!("{mib:.1}"))));

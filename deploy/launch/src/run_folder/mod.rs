@@ -19,7 +19,7 @@ pub use self::{
     evaluations::{Evaluated, sweep},
     folder::{RunFolder, write_whole},
     metrics::{Progress, progress},
-    recorder::RunRecorder,
+    recorder::{Recorded, RunRecorder},
     resume_point::ResumePoint,
     summary::{Outcome, Summary},
 };

@@ -7,7 +7,9 @@ use std::{
 };
 
 use anyhow::Context;
+use driml_actor::Schedule;
 use driml_protocol::{EpisodesReply, LearnerStatus, ReplayStatus, RunSpec};
+use driml_settings::config::RunConfig;
 
 use super::{
     columns::Columns,
@@ -25,6 +27,33 @@ const fn none(header: Vec<String>) -> Columns {
     Columns {
         header,
         rows: Vec::new(),
+    }
+}
+
+/// What a recorder knows of a run before it begins.
+#[derive(Clone, Debug, Default)]
+pub struct Recorded {
+    /// The settings, as `config.toml` has them.
+    pub config_toml: String,
+    /// The names of the agent's auxiliary losses.
+    pub losses: &'static [&'static str],
+    /// The processes whose memory is recorded.
+    pub processes: Vec<String>,
+    /// How likely all actors act at random; none where they differ in that.
+    pub epsilon: Option<Schedule>,
+}
+
+impl Recorded {
+    /// Of a run with these settings and processes.
+    pub(crate) fn of(config: &RunConfig, processes: Vec<String>) -> Self {
+        let is_common = config.actor.epsilon_ladder.is_none();
+        Self {
+            config_toml: config.to_toml(),
+            losses: config.learner.update.objective.losses(),
+            processes,
+            // Without a ladder it is every actor's.
+            epsilon: Schedule::new(&config.actor, 0).ok().filter(|_| is_common),
+        }
     }
 }
 
@@ -46,41 +75,26 @@ pub struct RunRecorder {
     episodes: TrainingEpisodes,
     /// The next episodes that are heard had ended before.
     is_late: bool,
-    losses: &'static [&'static str],
-    processes: Vec<String>,
+    run: Recorded,
     rss_max: Vec<Option<f64>>,
     started: Instant,
     rates: Rates,
 }
 
 impl RunRecorder {
-    /// Makes the folder and writes the settings; the clock starts. `losses` are the agent's auxiliary losses,
-    /// `processes` those whose memory is recorded.
+    /// Makes the folder and writes the settings; the clock starts.
     ///
     /// # Errors
     /// A folder in which something lies, or a file system that refuses.
-    pub fn create(
-        folder: &RunFolder,
-        config_toml: &str,
-        losses: &'static [&'static str],
-        processes: &[String],
-    ) -> anyhow::Result<Self> {
+    pub fn create(folder: &RunFolder, run: Recorded) -> anyhow::Result<Self> {
         folder.check_free()?;
         fs::create_dir_all(folder.path())
             .with_context(|| format!("making the run folder {}", folder.display()))?;
         let lock = folder.lock()?;
-        folder.write_config(config_toml)?;
-        let rows = none(header(losses, processes));
+        folder.write_config(&run.config_toml)?;
+        let rows = none(header(run.losses, &run.processes));
         let episodes = TrainingEpisodes::create(folder)?;
-        Self::begin(
-            folder,
-            losses,
-            processes,
-            lock,
-            rows,
-            episodes,
-            ResumePoint::default(),
-        )
+        Self::begin(folder, run, lock, rows, episodes, ResumePoint::default())
     }
 
     /// Goes on from `resume_point` to `frames_max` frames in the folder of an interrupted run: the rows of metrics up
@@ -90,14 +104,12 @@ impl RunRecorder {
     /// A run that is still going on, metrics of other columns, or a file system that refuses.
     pub(crate) fn go_on(
         folder: &RunFolder,
-        config_toml: &str,
-        losses: &'static [&'static str],
-        processes: &[String],
+        run: Recorded,
         resume_point: ResumePoint,
         frames_max: u64,
     ) -> anyhow::Result<Self> {
         let lock = folder.lock()?;
-        let head = header(losses, processes);
+        let head = header(run.losses, &run.processes);
         let rows = match resume_point.updates {
             0 => none(head),
             _ => rows_up_to(&folder.metrics(), head, resume_point, frames_max)?,
@@ -106,22 +118,13 @@ impl RunRecorder {
         let frames = rows.last("frames").unwrap_or(0);
         let episodes = TrainingEpisodes::go_on(folder, frames, is_known)?;
         Summary::remove(folder)?;
-        folder.write_config(config_toml)?;
-        Self::begin(
-            folder,
-            losses,
-            processes,
-            lock,
-            rows,
-            episodes,
-            resume_point,
-        )
+        folder.write_config(&run.config_toml)?;
+        Self::begin(folder, run, lock, rows, episodes, resume_point)
     }
 
     fn begin(
         folder: &RunFolder,
-        losses: &'static [&'static str],
-        processes: &[String],
+        run: Recorded,
         lock: File,
         rows: Columns,
         episodes: TrainingEpisodes,
@@ -147,9 +150,8 @@ impl RunRecorder {
             events: None,
             episodes,
             is_late: false,
-            losses,
-            processes: processes.to_vec(),
-            rss_max: vec![None; processes.len()],
+            rss_max: vec![None; run.processes.len()],
+            run,
             started: Instant::now(),
             rates: Rates::default(),
         };
@@ -227,7 +229,7 @@ impl RunRecorder {
         if resumed && (updates <= self.resume_point.updates || frames < self.frames_before) {
             return Vec::new();
         }
-        let processes = 0..self.processes.len();
+        let processes = 0..self.run.processes.len();
         let moment = Moment {
             seconds: self.seconds(),
             rates: self.rates.per_second(),
@@ -235,7 +237,8 @@ impl RunRecorder {
             k: self.k(replay, updates),
             replay,
             learner,
-            losses: self.losses,
+            epsilon: self.run.epsilon.map(|it| it.epsilon(frames)),
+            losses: self.run.losses,
             rss_mib: processes
                 .map(|i| rss_mib.get(i).copied().flatten())
                 .collect(),
@@ -275,7 +278,7 @@ impl RunRecorder {
         // A resumed run that did not get anywhere still has what was done before.
         let frames = replay.transitions_inserted.max(self.resume_point.frames);
         let updates = learner.updates.max(self.resume_point.updates);
-        let rss = self.processes.iter().zip(&self.rss_max);
+        let rss = self.run.processes.iter().zip(&self.rss_max);
         let of_whole_run = Summary::of(
             outcome,
             run,

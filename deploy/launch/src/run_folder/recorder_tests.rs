@@ -50,17 +50,24 @@ fn statuses() -> (ReplayStatus, LearnerStatus) {
     (replay, learner)
 }
 
+fn recorded(processes: &[&str]) -> Recorded {
+    Recorded {
+        config_toml: "[run]\n".into(),
+        losses: &LOSSES,
+        processes: processes.iter().map(ToString::to_string).collect(),
+        epsilon: Some(Schedule::Falling {
+            start: 0.5,
+            end: 0.1,
+            decay_frames: 4_000,
+        }),
+    }
+}
+
 #[test]
 fn a_run_leaves_settings_metrics_and_a_summary() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
-    let mut recorder = RunRecorder::create(
-        &run,
-        "[run]\n",
-        &LOSSES,
-        &["replay-server".into(), "actor-0".into()],
-    )
-    .unwrap();
+    let mut recorder = RunRecorder::create(&run, recorded(&["replay-server", "actor-0"])).unwrap();
     let (replay, learner) = statuses();
     let nothing = ReplayStatus::default();
     let said = recorder.record(&[nothing], &LearnerStatus::default(), &[]);
@@ -98,9 +105,12 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
 
     let csv = fs::read_to_string(run.metrics()).unwrap();
     let columns: Vec<_> = csv.lines().map(|line| line.split(',').count()).collect();
-    assert_eq!(columns, [26, 26, 26], "{csv}");
-    expect!["seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,mean_return_of,c51_kl,dim_3t3,dim_3t4,dim_4t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,sd_k,mean_age,weights_version,affinity_version,actors,waiting,rss_mib_replay_server,rss_mib_actor_0"]
+    assert_eq!(columns, [27, 27, 27], "{csv}");
+    expect!["seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,mean_return_of,c51_kl,dim_3t3,dim_3t4,dim_4t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,sd_k,mean_age,weights_version,affinity_version,actors,waiting,epsilon,rss_mib_replay_server,rss_mib_actor_0"]
         .assert_eq(csv.lines().next().unwrap());
+    let table = Columns::parse(csv.as_bytes()).unwrap();
+    let epsilons = table.rows.iter().map(|row| table.value(row, "epsilon"));
+    assert_eq!(epsilons.collect::<Vec<_>>(), [Some(0.5), Some(0.3)]);
 
     let json: serde_json::Value =
         serde_json::from_slice(&fs::read(run.summary()).unwrap()).unwrap();
@@ -131,8 +141,8 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
 fn a_resumed_run_goes_on_in_its_metrics() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
-    let processes = ["replay-server".into()];
-    let mut recorder = RunRecorder::create(&run, "[run]\n", &LOSSES, &processes).unwrap();
+    let processes = ["replay-server"];
+    let mut recorder = RunRecorder::create(&run, recorded(&processes)).unwrap();
     let (mut replay, mut learner) = statuses();
     // Mean k is 1.5 before the run is resumed, and 2 since.
     for (frames, updates, episodes) in [(1_000, 0, 1), (2_000, 31, 7), (3_000, 62, 9)] {
@@ -145,7 +155,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
         frames: 2_000,
         replay_is_kept: false,
     };
-    let said = RunRecorder::go_on(&run, "", &LOSSES, &processes, resume_point, 9_999).unwrap_err();
+    let said = RunRecorder::go_on(&run, recorded(&processes), resume_point, 9_999).unwrap_err();
     assert!(said.to_string().contains("is still going on"), "{said}");
     let summary = recorder.summarise(Outcome::Interrupted, &spec(), &replay, &learner);
     summary.write(&run).unwrap();
@@ -155,11 +165,10 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, format!("{text}9.0,40")).unwrap();
 
-    let other = ["replay-server".into(), "actor-0".into()];
-    let said = RunRecorder::go_on(&run, "", &LOSSES, &other, resume_point, 9_999).unwrap_err();
+    let other = ["replay-server", "actor-0"];
+    let said = RunRecorder::go_on(&run, recorded(&other), resume_point, 9_999).unwrap_err();
     assert!(said.to_string().contains("has other columns"), "{said}");
-    let mut recorder =
-        RunRecorder::go_on(&run, "[new]\n", &LOSSES, &processes, resume_point, 9_999).unwrap();
+    let mut recorder = RunRecorder::go_on(&run, recorded(&processes), resume_point, 9_999).unwrap();
     assert!(!run.summary().exists());
     // While the replay fills again nothing is new.
     (replay.transitions_inserted, replay.episodes) = (1_500, 1);
@@ -178,8 +187,15 @@ fn a_resumed_run_goes_on_in_its_metrics() {
         updates: 99,
         ..resume_point
     };
-    let read =
-        |frames_max| rows_up_to(&path, header(&LOSSES, &processes), all, frames_max).unwrap();
+    let read = |frames_max| {
+        rows_up_to(
+            &path,
+            header(&LOSSES, &recorded(&processes).processes),
+            all,
+            frames_max,
+        )
+        .unwrap()
+    };
     assert_eq!(read(2_050).rows.len(), 2);
     let rows = read(9_999);
     let column = |name| -> Vec<f64> {

@@ -10,7 +10,7 @@ use driml_settings::config::RunConfig;
 
 use crate::{
     launcher::process_names,
-    run_folder::{Columns, ResumePoint, RunFolder, RunRecorder},
+    run_folder::{Columns, Recorded, ResumePoint, RunFolder, RunRecorder},
 };
 
 /// How far a run is when it is found.
@@ -29,17 +29,15 @@ pub(super) struct Found<'a> {
 /// # Errors
 /// A folder of something else, or into which somebody else writes; a file system that refuses.
 pub(super) fn record(folder: &RunFolder, run: &Found<'_>) -> anyhow::Result<RunRecorder> {
-    let (text, names) = (run.config.to_toml(), process_names(run.config));
-    let losses = run.config.learner.update.objective.losses();
+    let recorded = Recorded::of(run.config, process_names(run.config));
     // A learner may have just begun there.
     let is_run_s = folder.config().exists() || folder.checkpoints().is_dir();
     let mut recorder = match is_run_s {
-        false => RunRecorder::create(folder, &text, losses, &names)?,
+        false => RunRecorder::create(folder, recorded)?,
         true => {
             check_same(folder, run.config)?;
             let point = resume_point(folder, run)?;
-            RunRecorder::go_on(folder, &text, losses, &names, point, u64::MAX)
-                .map_err(|e| in_use(folder, e))?
+            RunRecorder::go_on(folder, recorded, point, u64::MAX).map_err(|e| in_use(folder, e))?
         }
     };
     recorder.count_seconds_from(run.up_s);

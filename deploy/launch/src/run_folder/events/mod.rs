@@ -169,7 +169,7 @@ fn tag(column: &str) -> String {
         "mean_k" | "sd_k" => "k",
         "frames_per_second" | "updates_per_second" => "speed",
         "seconds" | "updates" | "replay_ratio" | "mean_age" | "weights_version"
-        | "affinity_version" | "actors" => "run",
+        | "affinity_version" | "actors" | "epsilon" => "run",
         _ if column.starts_with("rss_mib") => "memory",
         // The auxiliary losses have the agents' own names.
         _ => "learning",
