@@ -82,9 +82,14 @@ mod tests {
             if says == "ends" {
                 process_ends();
             }
-            std::thread::spawn(|| panic!("too late"));
-            std::thread::sleep(Duration::from_millis(300));
-            std::process::exit(3);
+            let thread = std::thread::spawn(|| panic!("too late"));
+            if says == "ends" {
+                std::thread::sleep(Duration::from_millis(300));
+                std::process::exit(3);
+            }
+            // A backtrace may take longer.
+            let _ = thread.join();
+            std::process::exit(4);
         }
         let child = |says: &str| {
             let name = "panics::tests::a_panic_while_the_process_ends_does_not_change_how";
