@@ -9,7 +9,7 @@ use std::{
 use crate::{
     client::RunClient,
     messages::report::{Life, Report, Warning},
-    process::{activity::Activity, last_warning, shutdown::Shutdown},
+    process::{activity::Activity, fault, last_warning, shutdown::Shutdown},
 };
 
 /// How often a part reports although nothing has changed.
@@ -56,6 +56,7 @@ pub fn start(
     let work = move || {
         let mut said: Option<(String, Instant)> = None;
         loop {
+            fault::point("reporter");
             let (doing, since) = activity.get();
             let is_old = |(said, at): &(String, Instant)| *said != doing || at.elapsed() > PERIOD;
             if said.as_ref().is_none_or(is_old) {
@@ -68,6 +69,6 @@ pub fn start(
         }
     };
     std::thread::Builder::new()
-        .name("report".into())
+        .name("reporter".into())
         .spawn(work)
 }

@@ -4,10 +4,10 @@
 use driml_protocol::fault;
 use driml_tests::{Ended, TestSystem};
 
-use crate::{LONG, system};
+use crate::{LONG, PRIORITISED, system};
 
-/// The threads of the parts: the part as the launcher calls it, and the point that the thread passes.
-const THREADS: [(&str, &str); 19] = [
+/// The threads of the parts of an ordinary run: the part as the launcher calls it, and the point that the thread passes.
+const THREADS: [(&str, &str); 22] = [
     ("replay-server", "insert"),
     ("replay-server", "claim"),
     ("replay-server", "admit"),
@@ -21,6 +21,9 @@ const THREADS: [(&str, &str); 19] = [
     ("replay-server", "weights-upload"),
     ("replay-server", "weights"),
     ("replay-server", "status"),
+    ("replay-server", "report"),
+    ("replay-server", "episodes"),
+    ("replay-server", "missing"),
     ("learner", "batches"),
     ("learner", "weights-sender"),
     ("learner", "affinity-sender"),
@@ -29,9 +32,16 @@ const THREADS: [(&str, &str); 19] = [
     ("actor-0", "delivery"),
 ];
 
+/// Those that other runs have, with the flags that make them.
+const FURTHER_THREADS: [(&str, &str, &str); 3] = [
+    ("replay-server", "priorities", PRIORITISED),
+    ("learner", "priorities-sender", PRIORITISED),
+    ("replay-server", "replay-fsync", "--durable"),
+];
+
 /// Runs with a panic at `point`, to the end.
-fn panicking(system: &TestSystem, point: &str) -> Ended {
-    let run = format!("local --agent driml-ada {LONG} --run-dir run");
+fn panicking(system: &TestSystem, point: &str, flags: &str) -> Ended {
+    let run = format!("local --agent driml-ada {LONG} {flags} --run-dir run");
     let ended = system.start_with(fault::VARIABLE, point, &run).wait();
     assert_eq!(system.survivors(), [], "{point}");
     let said = format!("error: the thread {point}");
@@ -45,9 +55,9 @@ fn panicking(system: &TestSystem, point: &str) -> Ended {
 }
 
 /// A thread of a part that panics at `point`, after which the launcher names the part.
-fn ends_the_run(part: &str, point: &str) {
+fn ends_the_run((part, point, flags): (&str, &str, &str)) {
     let system = system();
-    let ended = panicking(&system, point);
+    let ended = panicking(&system, point, flags);
     assert_eq!(ended.code, Some(1), "{point}: {ended:#?}");
     for said in [
         format!("{part}: error: the thread {point}"),
@@ -72,29 +82,29 @@ fn a_panic_in_a_part_ends_it_and_the_launcher_names_it() {
         return;
     }
     // These runs wait for each other's ends more than they compute.
+    let ordinary = THREADS.map(|(part, point)| (part, point, ""));
+    let all = [&ordinary[..], &FURTHER_THREADS].concat();
     std::thread::scope(|scope| {
-        for some in THREADS.chunks(5) {
-            let run = move || {
-                some.iter()
-                    .for_each(|(part, point)| ends_the_run(part, point))
-            };
-            scope.spawn(run);
+        for some in all.chunks(5) {
+            scope.spawn(|| some.iter().copied().for_each(ends_the_run));
         }
     });
 }
 
-/// Every part has this thread, so any may be the first.
+/// More than one part has these threads, so any may be the first.
 #[test]
-fn a_panic_where_signals_are_heard_ends_a_part() {
-    if skipped("a_panic_where_signals_are_heard_ends_a_part") {
+fn a_panic_in_a_thread_of_several_parts_ends_the_run() {
+    if skipped("a_panic_in_a_thread_of_several_parts_ends_the_run") {
         return;
     }
-    let ended = panicking(&system(), "signals");
-    assert_eq!(ended.code, Some(1), "{ended:#?}");
-    assert!(
-        ended.stderr.contains("was ended by signal 6 SIGABRT"),
-        "{ended:#?}"
-    );
+    for point in ["signals", "reporter"] {
+        let ended = panicking(&system(), point, "");
+        assert_eq!(ended.code, Some(1), "{point}: {ended:#?}");
+        assert!(
+            ended.stderr.contains("was ended by signal 6 SIGABRT"),
+            "{point}: {ended:#?}"
+        );
+    }
 }
 
 /// The launcher itself, after whose death the parts end by themselves.

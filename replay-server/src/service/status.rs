@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use driml_protocol::{
     AffinityUpdate, Done, EpisodesRequest, Goodbye, Incoming, PartName, PartsStatus,
-    PriorityUpdate, ReplayStatus, Report, Responder,
+    PriorityUpdate, ReplayStatus, Report, Responder, fault,
 };
 
 use super::{accounts::own_warning, server::Service};
@@ -132,6 +132,7 @@ impl Service {
         // Who, since when, and after how long it is said next: ever more seldom.
         let mut missing: Option<(&str, Instant, Duration)> = None;
         while !self.shutdown.wait_timeout(LOOK) {
+            fault::point("missing");
             let state = self.state();
             let now = state.accounts.missing(state.replay.all_in());
             drop(state);
