@@ -3,10 +3,10 @@
 
 use std::process::Command;
 
-use driml_tests::wait_for;
+use driml_tests::{Process, wait_for};
 use nix::sys::signal::Signal;
 
-use crate::{SHORT, launched, system};
+use crate::{LONG, SHORT, launched, system};
 
 #[test]
 fn an_interrupt_saves_and_ends_all_parts() {
@@ -143,6 +143,46 @@ fn parts_end_with_their_launcher() {
         !system.run_folder("run").checkpoints().is_empty(),
         "the learner saved"
     );
+}
+
+/// They all hear of it at once: the replay server stays until the others have delivered what they have and left.
+#[test]
+fn parts_whose_launcher_died_deliver_what_they_have() {
+    /// A launcher of three parts; each writes into a file what it says.
+    const LAUNCHER: &str = "
+        driml=$1 endpoint=$2; shift 2
+        $driml replay-server --listen $endpoint $* --exit-with-parent $$ 2> server &
+        $driml learner --connect $endpoint --run-dir run --exit-with-parent $$ 2> learner &
+        $driml actor --connect $endpoint --id 0 --exit-with-parent $$ 2> actor &
+        wait";
+    let system = system();
+    let command = system.command(&format!("{} --agent c51 {LONG}", system.endpoint()));
+    let mut launcher = Command::new("sh");
+    launcher.args(["-c", LAUNCHER, "sh"]);
+    launcher.arg(command.get_program()).args(command.get_args());
+    launcher.envs(
+        command
+            .get_envs()
+            .filter_map(|(name, value)| Some((name, value?))),
+    );
+    launcher.current_dir(system.path(""));
+    let launcher = Process::start("a launcher".into(), launcher);
+    let client = system.connect();
+    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    drop(client);
+    launcher.signal(Signal::SIGKILL);
+    wait_for("the end of all parts", || {
+        system.survivors().is_empty().then_some(())
+    });
+    let said = |part: &str| std::fs::read_to_string(system.path(part)).unwrap();
+    for (part, words) in [
+        ("actor", "actor 0 leaves: "),
+        ("learner", "finished after "),
+        ("server", "this process is to end, and 0 parts are left"),
+    ] {
+        assert!(said(part).contains(words), "{}", said(part));
+    }
+    assert!(!said("actor").contains("did not hear the goodbye"));
 }
 
 #[test]

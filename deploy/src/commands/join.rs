@@ -84,11 +84,25 @@ impl TlsFlags {
 /// # Errors
 /// A namespace that is none.
 pub(super) fn join(flags: &JoinFlags) -> anyhow::Result<Shutdown> {
+    prepare(flags)?;
+    Shutdown::on_signals(flags.exit_with_parent).context("listening for signals")
+}
+
+/// [`join`] of a process that the others need while they end: [`Shutdown::in_two_steps`].
+///
+/// # Errors
+/// As there.
+pub(super) fn join_in_two_steps(flags: &JoinFlags) -> anyhow::Result<(Shutdown, Shutdown)> {
+    prepare(flags)?;
+    Shutdown::in_two_steps(flags.exit_with_parent).context("listening for signals")
+}
+
+fn prepare(flags: &JoinFlags) -> Result<(), Usage> {
     Keys::new(&flags.namespace).map_err(Usage)?;
     if flags.exit_with_parent.is_none() {
         session::sweep_shared_memory();
     }
-    Shutdown::on_signals(flags.exit_with_parent).context("listening for signals")
+    Ok(())
 }
 
 /// What a process does when it has ended, well or not: nothing of it is left outside the run folder.

@@ -4,11 +4,11 @@ use std::path::PathBuf;
 
 use clap::Args;
 use driml_launch::endpoint::{check_endpoints, check_listening};
-use driml_machine::resources::Machine;
+use driml_machine::{error::usage, resources::Machine};
 use driml_protocol::tls::Role;
 use driml_settings::flags::{self, RunFlags};
 
-use super::join::{JoinFlags, NetworkFlag, StayFlag, TlsFlags, clean_up_after, join};
+use super::join::{JoinFlags, NetworkFlag, StayFlag, TlsFlags, clean_up_after, join_in_two_steps};
 
 #[derive(Debug, Args)]
 pub(crate) struct ReplayServerArgs {
@@ -50,7 +50,13 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::ReplayServer)?;
     let (config, _) = flags::resolve(&args.run, &Machine::this())?;
-    let shutdown = join(&args.join)?;
+    if args.replay_dir.is_none() {
+        config
+            .replay
+            .check_in_memory("--replay-dir DIR")
+            .map_err(|e| usage!("{e}"))?;
+    }
+    let (ending, shutdown) = join_in_two_steps(&args.join)?;
     for note in &config.notes {
         tracing::warn!("{note}");
     }
@@ -64,6 +70,7 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
         weights_bytes_max: config.weights_bytes()?,
         dir: args.replay_dir,
         stay: args.until.stay,
+        ending,
         config_toml: config.to_toml(),
     };
     clean_up_after(driml_replay_server::run(run, &shutdown))

@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::end_signs;
+use super::end_signs::{self, EndSign};
 
 /// A flag that is raised once and never lowered; clones share it.
 #[derive(Clone, Debug, Default)]
@@ -63,6 +63,26 @@ impl Shutdown {
             ControlFlow::Break(())
         })?;
         Ok(shutdown)
+    }
+
+    /// Two flags for a process that others need while they end: the first is raised at any sign that it should end, the second when it
+    /// is asked to, and not when its parent has died, which the others hear as it does.
+    ///
+    /// # Errors
+    /// As [`end_signs::listen`].
+    pub fn in_two_steps(parent: Option<u32>) -> std::io::Result<(Self, Self)> {
+        let (ending, now) = (Self::default(), Self::default());
+        let raised = (ending.clone(), now.clone());
+        end_signs::listen("signals", parent, move |sign| {
+            raised.0.set();
+            // Without a parent it is the only one that hears of it.
+            if sign == EndSign::Abandoned && parent.is_some() {
+                return ControlFlow::Continue(());
+            }
+            raised.1.set();
+            ControlFlow::Break(())
+        })?;
+        Ok((ending, now))
     }
 }
 

@@ -96,7 +96,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let client = RunClient::new(session, keys, spec.hash());
     let declaring =
         |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
-    let reading = Reading::begin(shutdown.clone());
+    let reading = Reading::begin(args.ending.clone());
     let entrance = Arc::new(Entrance::closed(reading, args.config_toml.clone()));
     let Answers {
         queryables,
@@ -156,7 +156,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     if let Some(reports) = reports {
         threads.push(service.clone().start_hearing(reports)?);
     }
-    service.wait_until_over(args.stay);
+    service.wait_until_over(&args.ending, args.stay);
     // Threads of its own wait for that.
     shutdown.set();
     service.changed.notify_all();

@@ -2,7 +2,7 @@
 
 use std::{path::PathBuf, sync::Arc};
 
-use driml_protocol::tls::Credentials;
+use driml_protocol::{Shutdown, tls::Credentials};
 
 /// What a replay server is told at its start.
 #[derive(Clone, Debug)]
@@ -25,6 +25,9 @@ pub struct RunArgs {
     pub dir: Option<PathBuf>,
     /// Stay when the run is over, to be asked, until `shutdown`.
     pub stay: bool,
+    /// Raised when this process is to end, but not before its parts have delivered what they have and left: its launcher has died,
+    /// which ends them too. What is to end it at once raises this and `shutdown`.
+    pub ending: Shutdown,
     /// The run's resolved settings, which it hands to whoever joins.
     pub config_toml: String,
 }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use driml_protocol::{
     AffinityUpdate, Done, EpisodesRequest, Goodbye, Incoming, PartName, PartsStatus,
-    PriorityUpdate, ReplayStatus, Report, Responder, fault,
+    PriorityUpdate, ReplayStatus, Report, Responder, Shutdown, fault,
 };
 
 use super::{accounts::own_warning, server::Service};
@@ -14,6 +14,8 @@ use super::{accounts::own_warning, server::Service};
 const LOOK: Duration = Duration::from_secs(1);
 /// How long a replay server stays for parts that do not leave when the run is over.
 const FAREWELL_MAX: Duration = Duration::from_secs(30);
+/// How long it stays when its launcher has died, for parts that hear of that as it does and deliver what they have.
+const ABANDONED_MAX: Duration = Duration::from_secs(10);
 /// How long somebody may be missing before it is said.
 const SILENT_MAX: Duration = Duration::from_secs(10);
 
@@ -149,23 +151,25 @@ impl Service {
         }
     }
 
-    /// Waits until the run is over and nobody is left who would ask, or for the end from outside; with `stay` for that alone.
-    pub(super) fn wait_until_over(&self, stay: bool) {
-        if stay {
-            return self.shutdown.wait();
-        }
+    /// Waits until the run is over or this process `ending`, and nobody is left who would ask; or for the end from outside. With `stay`
+    /// a run that is over does not end it.
+    pub(super) fn wait_until_over(&self, ending: &Shutdown, stay: bool) {
         let mut over_since: Option<Instant> = None;
         while !self.shutdown.wait_timeout(LOOK) {
             let state = self.state();
             let (is_over, connected) = (state.accounts.is_over(), state.accounts.connected());
             drop(state);
-            if !is_over {
+            let (why, farewell_max) = match ending.is_set() {
+                true => ("this process is to end", ABANDONED_MAX),
+                false => ("the run is over", FAREWELL_MAX),
+            };
+            if !ending.is_set() && (stay || !is_over) {
                 over_since = None;
                 continue;
             }
             let since = over_since.get_or_insert_with(Instant::now);
-            if connected == 0 || since.elapsed() > FAREWELL_MAX {
-                return tracing::info!("the run is over, and {connected} parts are left");
+            if connected == 0 || since.elapsed() > farewell_max {
+                return tracing::info!("{why}, and {connected} parts are left");
             }
         }
     }
