@@ -122,6 +122,31 @@ fn lockstep_keeps_its_replay_whole_or_says_so() {
     );
 }
 
+/// A setting without an effect is a mistake, and is said before the plan.
+#[test]
+fn what_is_for_a_replay_on_disk_needs_one() {
+    for set in ["replay.fsync_ms=100", "replay.disk_bytes_max=100000000"] {
+        for (args, flag) in [
+            (&["local"][..], "--durable"),
+            (
+                &["replay-server", "--listen", "tcp/127.0.0.1:0"],
+                "--replay-dir DIR",
+            ),
+        ] {
+            let args = [args, &["--env", "chain", "--set", set]].concat();
+            let text = usage(&args);
+            let why = format!(
+                "cannot work: this replay is in memory alone; add {flag} to keep it on disk"
+            );
+            assert!(text.contains(&why), "{text}");
+            assert!(
+                text.contains("replay.") && !text.contains("trains "),
+                "{text}"
+            );
+        }
+    }
+}
+
 #[test]
 fn clap_s_own_refusals_are_usage_too() {
     for args in [

@@ -124,6 +124,28 @@ pub(crate) const fn reach(spec: &RunSpec) -> u32 {
 }
 
 impl Config {
+    /// Checks that nothing is set that needs a replay on disk, for one that is in memory alone; `to_keep_it` are the flags that would
+    /// change that.
+    ///
+    /// # Errors
+    /// The first key that would have no effect.
+    pub fn check_in_memory(&self, to_keep_it: &str) -> Result<(), ConfigError> {
+        let keys = [
+            ("replay.disk_bytes_max", self.disk_bytes_max),
+            ("replay.fsync_ms", self.fsync_ms),
+        ];
+        match keys.into_iter().find_map(|(key, set)| Some((key, set?))) {
+            Some((key, value)) => Err(ConfigError::Key {
+                key,
+                value: value.to_string(),
+                why: format!(
+                    "this replay is in memory alone; add {to_keep_it} to keep it on disk, or leave the setting out"
+                ),
+            }),
+            None => Ok(()),
+        }
+    }
+
     /// Checks every value, alone and against `batch_size`, the rows of the learner's batches.
     ///
     /// The run cannot stall if slack_transitions * replay_ratio >= batch_size: inserts then wait only while a whole batch

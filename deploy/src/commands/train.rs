@@ -140,6 +140,14 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
         .into());
     }
     check_ladder(&config)?;
+    if args.lockstep {
+        check_lockstep(&config)?;
+    } else if !config.local.durable {
+        config
+            .replay
+            .check_in_memory("--durable")
+            .map_err(|e| usage!("{e}"))?;
+    }
     let run_dir = match args.resume {
         Some(folder) => RunFolder::new(folder),
         None => {
@@ -159,19 +167,6 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     ))?;
     config.world.install(&mut console::line)?;
     if args.lockstep {
-        if shards > 1 {
-            return Err(usage!(
-                "--lockstep runs everything in one process, with one replay: leave --replay-shards out"
-            )
-            .into());
-        }
-        if let Some(max) = config.replay.disk_bytes_max {
-            return Err(usage!(
-                "--lockstep keeps the whole replay in the run folder, so that the run can be resumed exactly, and cannot keep it within \
-                 replay.disk_bytes_max = {max}: leave that out, or lower replay.capacity_transitions"
-            )
-            .into());
-        }
         lockstep::run(&config, &run_dir, resume_point, args.exit_with_parent)
     } else {
         launcher::run(
@@ -185,6 +180,22 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             },
             args.exit_with_parent,
         )
+    }
+}
+
+/// Everything is in one process, and its replay is kept whole.
+fn check_lockstep(config: &RunConfig) -> Result<(), Usage> {
+    if config.replay.shards > 1 {
+        return Err(usage!(
+            "--lockstep runs everything in one process, with one replay: leave --replay-shards out"
+        ));
+    }
+    match config.replay.disk_bytes_max {
+        Some(max) => Err(usage!(
+            "--lockstep keeps the whole replay in the run folder, so that the run can be resumed exactly, and cannot keep it within \
+             replay.disk_bytes_max = {max}: leave that out, or lower replay.capacity_transitions"
+        )),
+        None => Ok(()),
     }
 }
 
