@@ -9,6 +9,7 @@ use std::{
 use anyhow::Context;
 use driml_machine::error::{Usage, usage};
 use driml_protocol::{lock_file, whole_file};
+use nix::unistd::{AccessFlags, access};
 
 /// The folder of a run, which need not be there yet.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -82,7 +83,7 @@ impl RunFolder {
         self.path.join("logs")
     }
 
-    /// Refuses a folder in which something lies.
+    /// Refuses a folder in which something lies, and one that cannot be made.
     ///
     /// # Errors
     /// Says what to do.
@@ -97,7 +98,25 @@ impl RunFolder {
                 self.display()
             ));
         }
-        Ok(())
+        self.check_writable()
+    }
+
+    /// Refuses a folder into which nothing could be written, before it is made.
+    fn check_writable(&self) -> Result<(), Usage> {
+        let whole = std::path::absolute(&self.path).unwrap_or_else(|_| self.path.clone());
+        let Some(there) = whole.ancestors().find(|it| it.exists()) else {
+            return Ok(());
+        };
+        let why = match access(there, AccessFlags::W_OK | AccessFlags::X_OK) {
+            _ if !there.is_dir() => "is no folder".to_owned(),
+            Err(e) => format!("cannot be written: {}", e.desc()),
+            Ok(()) => return Ok(()),
+        };
+        Err(usage!(
+            "the run folder {} cannot be made: {} {why}; choose another --run-dir",
+            self.display(),
+            there.display()
+        ))
     }
 
     /// Keeps other launchers out as long as the file is held.
@@ -137,6 +156,8 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
     use super::*;
 
     #[test]
@@ -151,5 +172,35 @@ mod tests {
             "{said}"
         );
         assert!(check_free(&folder.path().join("x")).is_err());
+    }
+
+    #[test]
+    fn a_folder_that_cannot_be_made_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let refused = |path: &Path| {
+            let said = RunFolder::new(path).check_free().unwrap_err();
+            said.to_string()
+        };
+        let file = folder.path().join("file");
+        fs::write(&file, "").unwrap();
+        let said = refused(&file.join("runs/one"));
+        let why = format!("{} is no folder; choose another --run-dir", file.display());
+        assert!(said.contains(&why), "{said}");
+        let closed = folder.path().join("closed");
+        fs::create_dir(&closed).unwrap();
+        fs::set_permissions(&closed, fs::Permissions::from_mode(0o555)).unwrap();
+        // Root may write everywhere.
+        if !nix::unistd::geteuid().is_root() {
+            let said = refused(&closed.join("one"));
+            assert!(
+                said.contains("cannot be written: Permission denied"),
+                "{said}"
+            );
+        }
+        assert!(
+            RunFolder::new(folder.path().join("a/b/c"))
+                .check_free()
+                .is_ok()
+        );
     }
 }
