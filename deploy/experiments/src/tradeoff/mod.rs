@@ -2,7 +2,9 @@
 //! one dial turned at a time, and benches of single updates beside them.
 //! The menu of dials is in `dials`, what fits a budget in `plan`, data, figures and page in `report`.
 
+mod cells;
 mod dials;
+mod equal_time;
 mod exactness;
 mod figures;
 mod held;

@@ -6,12 +6,13 @@ use anyhow::Context;
 use driml_machine::units::rough_duration;
 
 use super::{
+    cells::{cell, signed, table},
+    equal_time::{dim_table, equal_time},
     exactness,
     results::{LevelOf, Measure, PointResult, Results},
 };
 use crate::{
     page::{Page, Table},
-    plot::{Over, Run},
     statistics::{Interval, Spread},
     template::Values,
 };
@@ -36,21 +37,6 @@ pub(super) const ERRORS: [&str; 8] = [
     "same_action_actor",
     "actor_q_rms_error",
 ];
-/// C51 beside an agent with DIM in training return, as the data has it.
-pub(super) const EQUAL_TIME: [&str; 9] = [
-    "agent",
-    "base",
-    "equal_seconds",
-    "minus_base_at_equal_frames",
-    "minus_base_at_equal_frames_low",
-    "minus_base_at_equal_frames_high",
-    "minus_base_at_equal_time",
-    "minus_base_at_equal_time_low",
-    "minus_base_at_equal_time_high",
-];
-/// The dial that turns DIM on.
-const DIM: &str = "DIM";
-
 /// The cells of [`SPEEDS`].
 pub(super) fn speed_cells(point: &PointResult) -> [String; 6] {
     let Some(speed) = &point.speed else {
@@ -237,22 +223,6 @@ fn verdict(difference: &Interval, is_apart: bool) -> &'static str {
     }
 }
 
-fn signed(it: &Interval) -> String {
-    match it.ends {
-        None => format!("{:+.2}", it.mean),
-        Some((low, high)) => format!("{:+.2} [{low:+.2}, {high:+.2}]", it.mean),
-    }
-}
-
-/// A number of a file of data, empty if there is none.
-pub(super) fn cell_of_data(value: Option<f64>) -> String {
-    value.map_or(String::new(), |value| format!("{value:.4}"))
-}
-
-fn cell<T>(value: Option<T>, text: impl Fn(T) -> String) -> String {
-    value.map_or_else(|| "-".into(), text)
-}
-
 /// Rows of levels, each dial's base first.
 fn by_level(
     results: &Results,
@@ -284,13 +254,6 @@ fn by_level(
         );
     }
     rows
-}
-
-fn table(header: &[&str], rows: Vec<Vec<String>>) -> Table {
-    Table {
-        header: header.iter().map(|&it| it.to_owned()).collect(),
-        rows,
-    }
 }
 
 fn gains(results: &Results) -> Table {
@@ -424,123 +387,9 @@ fn dials(results: &Results) -> Vec<String> {
     said
 }
 
-/// C51 beside an agent with DIM, seed by seed.
-pub(super) struct EqualTime {
-    agent: String,
-    in_words: String,
-    row: Vec<String>,
-    /// The cells of [`EQUAL_TIME`].
-    pub(super) cells: Vec<String>,
-}
-
-/// C51 and the agents with DIM at equal frames and at equal wall-clock time: when runs of the faster of the two are done.
-pub(super) fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
-    let mut all = Vec::new();
-    for of in results.levels.iter().filter(|of| of.dial.name == DIM) {
-        let base = training_curves(&results.points[&of.base.key])?;
-        let level = training_curves(&results.points[&of.point.key])?;
-        let ends = |curves: &[Vec<(f64, f64)>], of: fn(&(f64, f64)) -> f64| -> Vec<f64> {
-            curves
-                .iter()
-                .filter_map(|curve| curve.last().map(of))
-                .collect()
-        };
-        let means = [&base, &level].map(|it| Interval::of(&ends(it, |end| end.0)));
-        let [Some(one), Some(other)] = means else {
-            continue;
-        };
-        let seconds = one.mean.min(other.mean);
-        let then = |curves: &[Vec<(f64, f64)>]| -> Vec<f64> {
-            curves
-                .iter()
-                .filter_map(|curve| at(curve, seconds))
-                .collect()
-        };
-        let (of_base, of_level) = (then(&base), then(&level));
-        let frames = Interval::of_difference(&ends(&base, |end| end.1), &ends(&level, |end| end.1));
-        let time = Interval::of_difference(&of_base, &of_level);
-        let (Some(frames), Some(time)) = (frames, time) else {
-            continue;
-        };
-        let mean = |values: &[f64]| cell(Interval::of(values), |it| it.to_string());
-        let agent = of.point.agent.clone();
-        let numbers = |it: &Interval| {
-            let ends = it.ends;
-            let each = [Some(it.mean), ends.map(|it| it.0), ends.map(|it| it.1)];
-            each.map(cell_of_data)
-        };
-        let mut cells = vec![
-            agent.clone(),
-            of.base.agent.clone(),
-            format!("{seconds:.3}"),
-        ];
-        cells.extend([&frames, &time].into_iter().flat_map(numbers));
-        all.push(EqualTime {
-            in_words: format!(
-                "{agent} minus {}, training return: {} at equal frames, {} at equal wall-clock time ({seconds:.0} s)",
-                of.base.agent,
-                signed(&frames),
-                signed(&time),
-            ),
-            row: vec![
-                agent.clone(),
-                signed(&frames),
-                format!("{seconds:.0}"),
-                mean(&of_base),
-                mean(&of_level),
-                signed(&time),
-            ],
-            agent,
-            cells,
-        });
-    }
-    Ok(all)
-}
-
-/// Training return over seconds, of each run.
-fn training_curves(point: &PointResult) -> anyhow::Result<Vec<Vec<(f64, f64)>>> {
-    let each = point
-        .seeds
-        .iter()
-        .map(|it| Ok(Run::read(&it.ran.folder)?.values_over(Over::Seconds, "mean_return")?));
-    each.collect()
-}
-
-/// The value at a time: the last one before it.
-fn at(curve: &[(f64, f64)], seconds: f64) -> Option<f64> {
-    let before = curve.iter().take_while(|(x, _)| *x <= seconds).last();
-    before.map(|(_, value)| *value)
-}
-
-fn dim_table(all: &[EqualTime]) -> String {
-    let header = [
-        "agent",
-        "minus C51 at equal frames",
-        "equal time [s]",
-        "C51 then",
-        "agent then",
-        "minus C51 at equal time",
-    ];
-    let names: Vec<&str> = all.iter().map(|it| it.agent.as_str()).collect();
-    let rows = all.iter().map(|it| it.row.clone()).collect();
-    format!(
-        "C51 beside {} in training return, at equal frames and at equal wall-clock time.\n\n{}",
-        names.join(" and "),
-        table(&header, rows)
-    )
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_curve_is_read_at_a_time() {
-        let curve = [(1.0, 0.5), (2.0, 0.6), (4.0, 0.9)];
-        assert_eq!(at(&curve, 3.0), Some(0.6));
-        assert_eq!(at(&curve, 0.5), None);
-        assert_eq!(at(&curve, 9.0), Some(0.9));
-    }
 
     #[test]
     fn a_difference_is_put_into_words() {

@@ -1,6 +1,8 @@
 //! Data, figures and page of a trade-off.
 
 use super::{
+    cells::cell_of_data,
+    equal_time::{EQUAL_TIME, equal_time},
     figures, page,
     results::{LevelOf, Measure, PointResult, Results},
 };
@@ -119,13 +121,13 @@ fn row(results: &Results, of: &LevelOf, is_base: bool) -> Vec<String> {
                 ends.map(|it| it.0),
                 ends.map(|it| it.1),
             ];
-            row.extend(numbers.map(page::cell_of_data));
+            row.extend(numbers.map(cell_of_data));
         }
     }
     row
 }
 
 fn write_equal_time(session: &Session, results: &Results) -> anyhow::Result<()> {
-    let rows = page::equal_time(results)?.into_iter().map(|it| it.cells);
-    session.csv("equal_time", &page::EQUAL_TIME, rows)
+    let rows = equal_time(results)?.into_iter().map(|it| it.cells);
+    session.csv("equal_time", &EQUAL_TIME, rows)
 }

@@ -1,0 +1,87 @@
+//! What a figure of runs says: titles and labels of columns, and what was done to the numbers.
+//! It draws nothing.
+
+use super::{
+    flags::{Band, PlotArgs},
+    groups::Group,
+    runs,
+};
+
+/// The column of what checkpoints earned when they were played.
+pub(super) const EVALUATED: &str = "evaluated_return";
+
+/// Title and label of a column's chart, with its unit.
+pub(super) fn words(column: &str) -> (String, String) {
+    let (title, label) = match column {
+        "mean_return" => ("Return", "mean of the last 100 episodes"),
+        EVALUATED => (
+            "Return of checkpoints, played greedily",
+            "mean over episodes",
+        ),
+        "c51_kl" => ("C51 loss", "KL divergence [nats]"),
+        "total_loss" => ("Total loss", "[nats]"),
+        "mean_k" => (
+            "How far ahead: k, mean since the start",
+            "k [environment steps]",
+        ),
+        "replay_ratio" => ("Replay ratio", "rows sampled per transition"),
+        "frames_per_second" => ("Acting speed", "frames per second"),
+        "updates_per_second" => ("Learning speed", "updates per second"),
+        "mean_age" => ("Age of sampled rows", "transitions"),
+        "grad_norm" => ("Gradient before clipping", "global 2-norm"),
+        "epsilon" => ("Epsilon", "probability of a random action"),
+        _ => {
+            let text = column.replace('_', " ");
+            let label = if column.starts_with("rss_mib_") {
+                "resident memory [MiB]".into()
+            } else {
+                text.clone()
+            };
+            return (text, label);
+        }
+    };
+    (title.into(), label.into())
+}
+
+/// What is compared.
+pub(super) fn title(groups: &[Group<'_>]) -> String {
+    match groups {
+        [only] => only.name.clone(),
+        _ => format!("{} configurations compared", groups.len()),
+    }
+}
+
+/// What was done to the numbers.
+pub(super) fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -> Vec<String> {
+    let mut notes = Vec::new();
+    if groups.iter().any(|group| group.runs.len() > 1) {
+        notes.push(format!(
+            "Runs that differ in their seed alone are one line, their mean; the band is {}.",
+            match args.band {
+                Band::Range => "their smallest and largest value",
+                Band::Sd => "one standard deviation to each side",
+                Band::Ci => "the 95% bootstrap interval of that mean over the choice of runs",
+            }
+        ));
+    }
+    let spread = groups.iter().flat_map(|group| &group.runs);
+    if columns.iter().any(|column| column == "mean_k")
+        && spread.clone().any(|run| run.has_values(runs::SPREAD_OF_K))
+    {
+        notes.push(
+            "The band around k is one standard deviation of k itself to each side, cut at 1."
+                .into(),
+        );
+    }
+    match args.smooth {
+        Some(width) => notes.push(format!(
+            "Smoothed: each point is the mean over the {width} {} before it.",
+            args.x.column()
+        )),
+        None => notes.push("Not smoothed.".into()),
+    }
+    if let Some(episodes) = args.random {
+        notes.push(format!("Random policy: mean of {episodes} whole episodes."));
+    }
+    notes
+}
