@@ -10,6 +10,12 @@ const COLOUR_BITS: u32 = 12;
 /// Weights of neighbouring pixels are whole multiples of 1/256.
 const WHOLE: u16 = 256;
 
+/// Largest error of a byte of a crop that is resized to the whole: half for its rounding, and two weights that are off by a 512th.
+pub const CROP_ERROR: f64 = 0.5 + 2.0 * 255.0 / 512.0;
+
+/// Largest error of a recoloured byte: half for its rounding, and three coefficients and what is added to them off by 2^-13.
+pub const COLOUR_ERROR: f64 = 0.5 + (3.0 * 255.0 + 1.0) / 8192.0;
+
 /// The `[learner.augment]` table: how strongly states are changed. A state's frames are all changed alike.
 ///
 /// `crop_side` at 1 and the others at 0 leave every byte as it was.

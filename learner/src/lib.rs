@@ -59,7 +59,7 @@ pub mod cost;
 #[cfg(test)]
 mod edges;
 mod error;
-mod importance;
+pub mod importance;
 pub mod insight;
 mod learner;
 pub mod losses;

@@ -93,7 +93,7 @@ pub use sampling::{
     assemble::{RETURN_ERROR, return_sum_error},
     horizon,
     packed_batch::PackedBatch,
-    prioritised::{PRIORITY_MIN, PriorityCounts, SavedPriorities},
+    prioritised::{CHANCE_ERROR, PRIORITY_MIN, PriorityCounts, SavedPriorities},
 };
 pub use service::{RunArgs, run};
 pub use storage::frame_store::{PackedChunk, Packer};

@@ -21,6 +21,10 @@ use crate::storage::ring::{Link, Ring};
 /// add as much to the loss.
 pub const PRIORITY_MIN: f64 = 1e-10;
 
+/// Largest error of the chance that a batch says of a row, as a share of it: half of an f32's last place. One below 1.2e-38 is said to
+/// be that.
+pub const CHANCE_ERROR: f64 = 6.1e-8;
+
 /// The highest priority before the first is known, as in Dopamine: any would do, as all are equal then.
 const FIRST_PRIORITY: f64 = 1.0;
 

@@ -5,6 +5,7 @@ use driml_learner::{AffinityEstimator, Alphabet, LearnedAffinity, LearnedSetting
 use driml_protocol::{Chunk, End, InsertReply, Tally, TimeoutRule};
 use driml_replay_server::RateLimiter;
 use rand::Rng;
+use rand_chacha::ChaCha8Rng;
 
 use super::replays::{chunk, replay, spec};
 use crate::stability::check::{Context, Routine, Row};
@@ -106,7 +107,7 @@ const LARGE: [u64; 6] = [
 /// What the rate limiter says, against integers.
 fn limiter(context: &mut Context<'_>) -> anyhow::Result<Row> {
     let mut row = row(
-        "rate limiter, up to 2^50 transitions at a replay ratio of 8",
+        "rate limiter, up to 2^50 transitions at a replay ratio of 8, in one shard and in several",
         "batches and chunks that pass or wait and should not",
     );
     let slack = 1000u64;
@@ -117,13 +118,20 @@ fn limiter(context: &mut Context<'_>) -> anyhow::Result<Row> {
         };
         let credit = rng.random_range(-20_000i64..20_000);
         let rows_sampled = (8 * inserted).saturating_add_signed(-credit);
-        let limiter = RateLimiter::new(8.0, 0, slack, None).resumed_at(
-            Tally {
-                inserted,
-                rows_sampled,
-            },
-            Tally::default(),
-        );
+        // What the other shards have of it.
+        let part = |count: u64, rng: &mut ChaCha8Rng| match number % 2 {
+            0 => 0,
+            _ => rng.random_range(0..=count),
+        };
+        let others = Tally {
+            inserted: part(inserted, rng),
+            rows_sampled: part(rows_sampled, rng),
+        };
+        let own = Tally {
+            inserted: inserted - others.inserted,
+            rows_sampled: rows_sampled - others.rows_sampled,
+        };
+        let limiter = RateLimiter::new(8.0, 0, slack, None).resumed_at(own, others);
         for rows in [
             1u32,
             32,

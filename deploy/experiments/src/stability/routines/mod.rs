@@ -3,6 +3,7 @@
 
 mod adam;
 mod affinity;
+mod augment;
 mod capacity;
 mod counters;
 mod gradients;
@@ -11,6 +12,7 @@ mod info_nce;
 mod ising;
 mod losses;
 mod policy;
+mod prioritised;
 mod products;
 pub(super) mod refused;
 mod replays;
@@ -27,7 +29,7 @@ use super::check::{Context, Row};
 pub(super) type Check = fn(&mut Context<'_>) -> anyhow::Result<Vec<Row>>;
 
 /// Each family: its name, about the share of the time that it takes, and its check. The order is the page's.
-pub(super) const MENU: [(&str, u64, Check); 19] = [
+pub(super) const MENU: [(&str, u64, Check); 21] = [
     ("projection", 4, losses::projection),
     ("softmax", 1, losses::softmax),
     ("kl", 2, losses::kl),
@@ -39,9 +41,11 @@ pub(super) const MENU: [(&str, u64, Check); 19] = [
     ("target", 6, target::check),
     ("products", 8, products::check),
     ("update", 8, update::check),
+    ("augment", 2, augment::check),
     ("stored", 1, stored::check),
     ("affinity", 12, affinity::check),
     ("horizon", 8, horizon::check),
+    ("prioritised", 3, prioritised::check),
     ("returns", 3, returns::check),
     ("capacity", 1, capacity::check),
     ("counters", 2, counters::check),

@@ -33,7 +33,12 @@ pub(super) fn replay_of(
     rows: u32,
     capacity_transitions: u64,
 ) -> anyhow::Result<Replay> {
-    let config = Config {
+    replay_with(spec, rows, &config(capacity_transitions))
+}
+
+/// Of a replay in which nobody waits and rows are drawn uniformly.
+pub(super) const fn config(capacity_transitions: u64) -> Config {
+    Config {
         capacity_transitions,
         shards: 1,
         compression: Compression::None,
@@ -46,8 +51,12 @@ pub(super) fn replay_of(
         slack_transitions: 1 << 40,
         transitions_max: None,
         reproduced_bug: None,
-    };
-    let mut replay = Replay::new(spec, &config, rows)?;
+    }
+}
+
+/// A replay which actor 0 has joined.
+pub(super) fn replay_with(spec: &RunSpec, rows: u32, config: &Config) -> anyhow::Result<Replay> {
+    let mut replay = Replay::new(spec, config, rows)?;
     let join = ActorJoin {
         actor: 0,
         incarnation: 1,
