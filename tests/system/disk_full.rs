@@ -67,10 +67,13 @@ impl Filler {
     }
 }
 
-/// A run on the disk, without checkpoints before its end, that has learned something.
-fn started(system: &TestSystem) -> Process {
+/// Updates between two checkpoints of a run that ends before the first.
+const NEVER: u32 = 100_000_000;
+
+/// A run on the disk, with a checkpoint after so many updates, that has learned something.
+fn started(system: &TestSystem, checkpoint_period: u32) -> Process {
     let process = system.start(&format!(
-        "local --agent c51 {LONG} --set learner.checkpoint_period_updates=100000000 --listen {} --run-dir disk/run",
+        "local --agent c51 {LONG} --set learner.checkpoint_period_updates={checkpoint_period} --listen {} --run-dir disk/run",
         system.endpoint()
     ));
     let client = system.connect();
@@ -90,7 +93,7 @@ fn a_run_goes_on_while_the_disk_is_full() {
     let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
         return;
     };
-    let mut process = started(&system);
+    let mut process = started(&system, NEVER);
     let filler = disk.fill();
     process.wait_for_stderr("metrics.csv cannot be written: No space left");
     process.wait_for_stderr("episodes.csv cannot be written: No space left");
@@ -130,7 +133,7 @@ fn the_first_error_is_the_one_shown() {
     let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
         return;
     };
-    let mut process = started(&system);
+    let mut process = started(&system, NEVER);
     let filler = disk.fill();
     process.wait_for_stderr("metrics.csv cannot be written: No space left");
     process.signal(Signal::SIGINT);
@@ -158,6 +161,34 @@ fn the_first_error_is_the_one_shown() {
     }
     filler.remove();
     check_nothing_is_left(&system, &system.path("disk/run"));
+}
+
+#[test]
+fn a_checkpoint_that_finds_no_room_is_tried_again() {
+    let system = system();
+    let name = "a_checkpoint_that_finds_no_room_is_tried_again";
+    let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
+        return;
+    };
+    let mut process = started(&system, 200);
+    let filler = disk.fill();
+    process.wait_for_stderr("trying again at the next period: ");
+    let client = system.connect();
+    let then = client.learner().unwrap().updates;
+    client.wait_for_learner("more updates", |learner| learner.updates > then + 600);
+    let run = system.path("disk/run");
+    filler.remove();
+    let now = client.learner().unwrap().updates;
+    wait_for("a checkpoint after that", || {
+        let names = fs::read_dir(run.join("checkpoints")).unwrap();
+        let names = names.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut saved = names.filter_map(|name| name.strip_prefix("checkpoint-")?.parse().ok());
+        saved.any(|updates: u64| updates > now).then_some(())
+    });
+    process.signal(Signal::SIGINT);
+    process.wait().expect_code(130);
+    system.run_folder("disk/run").check("interrupted");
+    check_nothing_is_left(&system, &run);
 }
 
 /// No process and no half of a file.
