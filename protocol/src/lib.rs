@@ -68,7 +68,7 @@ pub use process::{
     activity::Activity,
     end_signs, fault, last_warning, lock_file,
     seldom::{Seldom, SeldomEach},
-    shutdown::{Shutdown, join_within},
+    shutdown::{Shutdown, TwoSteps, join_within},
     whole_file,
 };
 pub use query_workers::{Incoming, QueryWorkers, Responder};

@@ -165,6 +165,7 @@ fn parts_whose_launcher_died_deliver_what_they_have() {
             .get_envs()
             .filter_map(|(name, value)| Some((name, value?))),
     );
+    launcher.env_remove("DRIML_LOG");
     launcher.current_dir(system.path(""));
     let launcher = Process::start("a launcher".into(), launcher);
     let client = system.connect();
@@ -183,6 +184,23 @@ fn parts_whose_launcher_died_deliver_what_they_have() {
         assert!(said(part).contains(words), "{}", said(part));
     }
     assert!(!said("actor").contains("did not hear the goodbye"));
+}
+
+#[test]
+fn a_frozen_part_does_not_keep_a_replay_server_whose_launcher_died() {
+    let system = system();
+    let process = launched(&system, 100);
+    let [server, actor] = ["replay-server", "actor"].map(|part| system.find_part(part));
+    actor.signal(Signal::SIGSTOP);
+    process.signal(Signal::SIGKILL);
+    process.wait();
+    wait_for("the replay server's end", || {
+        (!system.survivors().contains(&server)).then_some(())
+    });
+    actor.signal(Signal::SIGKILL);
+    wait_for("the end of all parts", || {
+        system.survivors().is_empty().then_some(())
+    });
 }
 
 #[test]

@@ -10,7 +10,7 @@ use driml_launch::{
 };
 use driml_machine::error::Usage;
 use driml_protocol::{
-    Keys, Shutdown, session,
+    Keys, Shutdown, TwoSteps, session,
     tls::{Credentials, Role},
 };
 
@@ -88,13 +88,13 @@ pub(super) fn join(flags: &JoinFlags) -> anyhow::Result<Shutdown> {
     Shutdown::on_signals(flags.exit_with_parent).context("listening for signals")
 }
 
-/// [`join`] of a process that the others need while they end: [`Shutdown::in_two_steps`].
+/// [`join`] of a process that the others need while they end.
 ///
 /// # Errors
 /// As there.
-pub(super) fn join_in_two_steps(flags: &JoinFlags) -> anyhow::Result<(Shutdown, Shutdown)> {
+pub(super) fn join_in_two_steps(flags: &JoinFlags) -> anyhow::Result<TwoSteps> {
     prepare(flags)?;
-    Shutdown::in_two_steps(flags.exit_with_parent).context("listening for signals")
+    TwoSteps::on_signals(flags.exit_with_parent).context("listening for signals")
 }
 
 fn prepare(flags: &JoinFlags) -> Result<(), Usage> {

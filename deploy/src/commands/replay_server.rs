@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use driml_launch::endpoint::{check_endpoints, check_listening};
 use driml_machine::{error::usage, resources::Machine};
-use driml_protocol::tls::Role;
+use driml_protocol::{TwoSteps, tls::Role};
 use driml_settings::flags::{self, RunFlags};
 
 use super::join::{JoinFlags, NetworkFlag, StayFlag, TlsFlags, clean_up_after, join_in_two_steps};
@@ -56,7 +56,7 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
             .check_in_memory("--replay-dir DIR")
             .map_err(|e| usage!("{e}"))?;
     }
-    let (ending, shutdown) = join_in_two_steps(&args.join)?;
+    let TwoSteps { ending, now } = join_in_two_steps(&args.join)?;
     for note in &config.notes {
         tracing::warn!("{note}");
     }
@@ -73,5 +73,5 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
         ending,
         config_toml: config.to_toml(),
     };
-    clean_up_after(driml_replay_server::run(run, &shutdown))
+    clean_up_after(driml_replay_server::run(run, &now))
 }

@@ -142,7 +142,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     check_ladder(&config)?;
     if args.lockstep {
         check_lockstep(&config)?;
-    } else if !config.local.durable {
+    } else if args.resume.is_none() && !config.local.durable {
         config
             .replay
             .check_in_memory("--durable")

@@ -64,25 +64,35 @@ impl Shutdown {
         })?;
         Ok(shutdown)
     }
+}
 
-    /// Two flags for a process that others need while they end: the first is raised at any sign that it should end, the second when it
-    /// is asked to, and not when its parent has died, which the others hear as it does.
+/// When a process that others need while they end is to end itself.
+#[derive(Clone, Debug, Default)]
+pub struct TwoSteps {
+    /// Once the others have left.
+    pub ending: Shutdown,
+    /// At once.
+    pub now: Shutdown,
+}
+
+impl TwoSteps {
+    /// The first flag is raised at any sign that this process should end, the second at SIGINT and SIGTERM, and without a `parent` at
+    /// any sign. With one, its death, SIGHUP or a stderr that nobody reads raise the first alone: the others end then as well.
     ///
     /// # Errors
     /// As [`end_signs::listen`].
-    pub fn in_two_steps(parent: Option<u32>) -> std::io::Result<(Self, Self)> {
-        let (ending, now) = (Self::default(), Self::default());
-        let raised = (ending.clone(), now.clone());
+    pub fn on_signals(parent: Option<u32>) -> std::io::Result<Self> {
+        let steps = Self::default();
+        let raised = steps.clone();
         end_signs::listen("signals", parent, move |sign| {
-            raised.0.set();
-            // Without a parent it is the only one that hears of it.
+            raised.ending.set();
             if sign == EndSign::Abandoned && parent.is_some() {
                 return ControlFlow::Continue(());
             }
-            raised.1.set();
+            raised.now.set();
             ControlFlow::Break(())
         })?;
-        Ok((ending, now))
+        Ok(steps)
     }
 }
 

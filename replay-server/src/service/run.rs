@@ -48,7 +48,7 @@ const SPARE_MAX: usize = 8;
 /// How long the threads may take to end.
 const THREADS_END_MAX: Duration = Duration::from_secs(2);
 
-/// Runs the replay server until `shutdown`.
+/// Runs the replay server until its run is over, `args.ending` or `shutdown`.
 ///
 /// # Errors
 /// Settings that cannot work, memory that the system does not grant, an endpoint that cannot be listened on.

@@ -23,10 +23,10 @@ pub struct RunArgs {
     pub weights_bytes_max: usize,
     /// The folder in which the replay is kept, if it is kept on disk; of several shards each has a folder of its own there.
     pub dir: Option<PathBuf>,
-    /// Stay when the run is over, to be asked, until `shutdown`.
+    /// Stay when the run is over, to be asked, until `ending` or `shutdown`.
     pub stay: bool,
     /// Raised when this process is to end, but not before its parts have delivered what they have and left: its launcher has died,
-    /// which ends them too. What is to end it at once raises this and `shutdown`.
+    /// which ends them too. It waits for them for at most 10 s. What is to end it at once raises this and `shutdown`.
     pub ending: Shutdown,
     /// The run's resolved settings, which it hands to whoever joins.
     pub config_toml: String,

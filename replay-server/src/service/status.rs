@@ -154,20 +154,26 @@ impl Service {
     /// Waits until the run is over or this process `ending`, and nobody is left who would ask; or for the end from outside. With `stay`
     /// a run that is over does not end it.
     pub(super) fn wait_until_over(&self, ending: &Shutdown, stay: bool) {
-        let mut over_since: Option<Instant> = None;
+        let mut waits: Option<(bool, Instant)> = None;
         while !self.shutdown.wait_timeout(LOOK) {
+            // Read once, as it may be raised at any moment.
+            let is_ending = ending.is_set();
             let state = self.state();
             let (is_over, connected) = (state.accounts.is_over(), state.accounts.connected());
             drop(state);
-            let (why, farewell_max) = match ending.is_set() {
+            if !is_ending && (stay || !is_over) {
+                waits = None;
+                continue;
+            }
+            let (why, farewell_max) = match is_ending {
                 true => ("this process is to end", ABANDONED_MAX),
                 false => ("the run is over", FAREWELL_MAX),
             };
-            if !ending.is_set() && (stay || !is_over) {
-                over_since = None;
-                continue;
-            }
-            let since = over_since.get_or_insert_with(Instant::now);
+            let since = match waits {
+                Some((before, since)) if before == is_ending => since,
+                _ => Instant::now(),
+            };
+            waits = Some((is_ending, since));
             if connected == 0 || since.elapsed() > farewell_max {
                 return tracing::info!("{why}, and {connected} parts are left");
             }
