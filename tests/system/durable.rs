@@ -415,6 +415,32 @@ fn a_resumed_run_goes_on_with_its_replay() {
     assert!(!log.contains("WARN"), "{log}");
 }
 
+/// Its parts still end while the next launcher starts: the replay server, which waits for a frozen actor, holds replay and endpoint.
+#[test]
+fn a_run_whose_launcher_was_killed_goes_on() {
+    let system = system();
+    let listen = format!("--listen {}", system.endpoint());
+    let process = system.start(&format!(
+        "local --durable --agent c51 {LONG} {listen} --run-dir run"
+    ));
+    let client = system.connect();
+    client.wait_for_learner("some updates", |learner| learner.updates > 1_000);
+    let frames = client.replay().unwrap().transitions_inserted + 20_000;
+    drop(client);
+    let actor = system.find_part("actor");
+    actor.signal(Signal::SIGSTOP);
+    process.signal(Signal::SIGKILL);
+    process.wait();
+    system
+        .run(&format!("local --resume run --frames {frames} {listen}"))
+        .expect_code(0)
+        .expect_said("processes of the run in run still end: waiting");
+    actor.signal(Signal::SIGKILL);
+    let run = system.run_folder("run");
+    run.check_finished();
+    check_exactly_once(&run);
+}
+
 /// While there is no room nothing is taken and nothing served; then all goes on, and nothing was lost.
 #[test]
 fn a_full_disk_makes_everybody_wait_until_there_is_room() {

@@ -55,6 +55,11 @@ impl Meeting {
         Ok(Self { folder, lock })
     }
 
+    /// The folder.
+    pub(crate) fn path(&self) -> &Path {
+        self.folder.path()
+    }
+
     /// Where a process of this name listens.
     pub(crate) fn endpoint(&self, name: &str) -> String {
         let path = self.folder.path().join(format!("{name}.sock"));
@@ -100,6 +105,12 @@ fn is_unused(folder: &Path) -> bool {
     lock.is_ok_and(|lock| matches!(lock_file::try_lock(&lock), Ok(true)))
 }
 
+/// Whether a process still uses the folder at `path`.
+pub(crate) fn is_used(path: &Path) -> bool {
+    let lock = File::open(path.join(IN_USE));
+    lock.is_ok_and(|lock| matches!(lock_file::try_lock(&lock), Ok(false)))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -128,9 +139,11 @@ mod tests {
         fs::write(path.join("learner.sock"), "").unwrap();
         drop(lock);
         sweep(place.path());
-        assert!(path.exists());
+        assert!(path.exists() && is_used(&path));
         drop(part);
+        assert!(!is_used(&path));
         sweep(place.path());
+        assert!(!is_used(&path), "it is gone");
         assert!(!path.exists());
         assert_eq!(folders(place.path()), 2);
     }

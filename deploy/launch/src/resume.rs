@@ -2,6 +2,8 @@
 //! It changes nothing in the run's folder, and waits until an earlier learner has saved there.
 
 use std::{
+    ffi::OsStr,
+    os::unix::ffi::OsStrExt,
     path::Path,
     time::{Duration, Instant},
 };
@@ -16,12 +18,16 @@ use driml_settings::{
 };
 
 use crate::{
-    console,
+    console, meeting,
     run_folder::{ResumePoint, RunFolder, Summary},
 };
 
 /// How long the learner of a launcher that was killed may take to save.
 const SAVING_MAX: Duration = Duration::from_secs(120);
+/// How long its other processes may then take to end; a replay server stays for 10 s where one of them is frozen.
+const ENDING_MAX: Duration = Duration::from_secs(20);
+/// How often it is looked whether they have.
+const LOOK: Duration = Duration::from_millis(250);
 
 /// Whether the run in `folder`, which is in this world, can be resumed: it has a checkpoint, which holds nothing of a world's own
 /// progress.
@@ -47,7 +53,7 @@ pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
     }
 }
 
-/// Waits until the learner of the run in `folder` has saved, if the run was ended.
+/// Waits until the learner of the run in `folder` has saved and its other processes have ended, if the run was ended.
 ///
 /// # Errors
 /// The run is still going on, or its learner takes too long.
@@ -65,13 +71,29 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
                         checkpoints.display()
                     ));
                 }
-                std::thread::sleep(Duration::from_millis(250));
+                std::thread::sleep(LOOK);
             }
             locked => {
                 locked?;
                 break;
             }
         }
+    }
+    // The replay server is the last: it holds its replay, and where it listens.
+    let is_used = || {
+        let place = std::fs::read(folder.meeting());
+        place.is_ok_and(|place| meeting::is_used(Path::new(OsStr::from_bytes(&place))))
+    };
+    let saved = Instant::now();
+    let mut said = false;
+    while is_used() && saved.elapsed() < ENDING_MAX {
+        if !std::mem::replace(&mut said, true) {
+            console::line(&format!(
+                "processes of the run in {} still end: waiting",
+                folder.display()
+            ));
+        }
+        std::thread::sleep(LOOK);
     }
     Ok(())
 }

@@ -92,6 +92,8 @@ pub fn run(
         endpoints[0].clone_from(listen);
     }
     write_whole(&run_dir.endpoints(), endpoints.join("\n").as_bytes())?;
+    let place = meeting.path().as_os_str().as_encoded_bytes();
+    write_whole(&run_dir.meeting(), place)?;
     let screen = Screen::new(config.frames(), TEMPLATE);
     let display = Display::new(
         screen.clone(),
@@ -134,9 +136,11 @@ pub fn run(
     {
         evaluator.finish(&launch.screen, &|| launch.interrupts.count() > 0);
     }
-    // Nobody is there any more who could be asked; where this file is left, the lock tells.
-    if let Err(e) = std::fs::remove_file(run_dir.endpoints()) {
-        tracing::debug!("removing {}: {e}", run_dir.endpoints().display());
+    // Nobody is there any more who could be asked; where these files are left, locks tell.
+    for path in [run_dir.endpoints(), run_dir.meeting()] {
+        if let Err(e) = std::fs::remove_file(&path) {
+            tracing::debug!("removing {}: {e}", path.display());
+        }
     }
     if let Err(failed) = ran.and(ended) {
         // It is what the run is remembered by; that the disk is full too is said before.

@@ -58,6 +58,11 @@ impl RunFolder {
         self.path.join("endpoints")
     }
 
+    /// The folder in which the processes of `driml local` meet, while it runs here.
+    pub(crate) fn meeting(&self) -> PathBuf {
+        self.path.join("meeting")
+    }
+
     /// What checkpoints earned when they were played.
     pub fn evaluations(&self) -> PathBuf {
         self.path.join("evaluations.csv")
