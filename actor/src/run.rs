@@ -152,6 +152,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let produced = collector.produced();
     activity.begin("delivers its last chunks");
     let delivered = delivery.finish();
+    if let (Err(_), Err(e)) = (&played, &delivered) {
+        tracing::warn!("not all that was played before could be delivered: {e}");
+    }
     played?;
     let unwanted = delivered?;
     tracing::info!(
