@@ -20,6 +20,8 @@ pub fn end_the_process() {
             .get()
             .is_some_and(|it| *it != std::thread::current().id())
         {
+            #[cfg(test)]
+            tests::STOPPED.store(true, std::sync::atomic::Ordering::Release);
             loop {
                 std::thread::park();
             }
@@ -68,9 +70,17 @@ fn line(panic: &PanicHookInfo<'_>, thread: Option<&str>) -> String {
 
 #[cfg(test)]
 mod tests {
-    use std::{os::unix::process::ExitStatusExt, process::Command, time::Duration};
+    use std::{
+        os::unix::process::ExitStatusExt,
+        process::Command,
+        sync::atomic::{AtomicBool, Ordering},
+        time::{Duration, Instant},
+    };
 
     use super::*;
+
+    /// A thread that panicked was stopped.
+    pub(super) static STOPPED: AtomicBool = AtomicBool::new(false);
 
     /// Set where this test is the process that panics, to what it says before.
     const CHILD: &str = "DRIML_TEST_PANICS";
@@ -83,9 +93,12 @@ mod tests {
                 process_ends();
             }
             let thread = std::thread::spawn(|| panic!("too late"));
-            if says == "ends" {
-                std::thread::sleep(Duration::from_millis(300));
-                std::process::exit(3);
+            let started = Instant::now();
+            while says == "ends" && started.elapsed() < Duration::from_secs(60) {
+                if STOPPED.load(Ordering::Acquire) {
+                    std::process::exit(3);
+                }
+                std::thread::yield_now();
             }
             // A backtrace may take longer.
             let _ = thread.join();
