@@ -117,5 +117,6 @@ mod tests {
         }
         let drawn: Vec<String> = charts(&names).flat_map(|(_, some)| some.to_vec()).collect();
         assert_eq!(drawn, names);
+        assert!(charts(&names).all(|(_, some)| !some.is_empty()));
     }
 }

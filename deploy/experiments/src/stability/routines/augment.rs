@@ -11,19 +11,21 @@ const AUGMENT: Routine = Routine {
     range: "crops of a pixel and more; brightness, contrast and saturation 0 to 2, hue -0.5 to 0.5 turns",
 };
 
-/// States [height, width, 3 stack] and a crop of each side.
+/// States [height, width, stack * frame channels] and a crop of each side.
 struct Picture {
     size: (usize, usize, usize),
+    frame_channels: usize,
     crop_side: f64,
     state: Vec<u8>,
 }
 
 impl Picture {
     fn drawn(rng: &mut ChaCha8Rng) -> Self {
+        let frame_channels = [1, 3][rng.random_range(0..2)];
         let size = (
             rng.random_range(1..14),
             rng.random_range(1..14),
-            3 * rng.random_range(1..=4),
+            frame_channels * rng.random_range(1..=4),
         );
         let count = size.0 * size.1 * size.2;
         // Of all bytes, or of the two ends alone.
@@ -35,6 +37,7 @@ impl Picture {
         };
         Self {
             size,
+            frame_channels,
             crop_side: rng.random_range(0.01..=1.0),
             state,
         }
@@ -48,7 +51,7 @@ impl Picture {
             saturation: 1.0,
             hue: 0.5,
         };
-        Augment::new(strongest, self.size, 3)
+        Augment::new(strongest, self.size, self.frame_channels)
     }
 
     fn seen(&self, augment: &Augment, view: &View) -> Vec<u8> {
@@ -96,14 +99,20 @@ impl Picture {
         let mean = bytes.sum::<f64>() / self.state.len() as f64;
         let (sin, cos) = (view.hue * std::f64::consts::TAU).sin_cos();
         let mut error: f64 = 0.0;
-        for (pixel, found) in self.state.chunks_exact(3).zip(seen.chunks_exact(3)) {
-            let colour = [pixel[0], pixel[1], pixel[2]].map(f64::from);
-            let grey = colour.iter().sum::<f64>() / 3.0;
-            let d = colour.map(|channel| channel - grey);
+        let pixels = self.state.chunks_exact(self.frame_channels);
+        for (pixel, found) in pixels.zip(seen.chunks_exact(self.frame_channels)) {
+            let channels = pixel.iter().map(|&channel| f64::from(channel));
+            let grey = channels.clone().sum::<f64>() / pixel.len() as f64;
+            let d: Vec<f64> = channels.map(|channel| channel - grey).collect();
             for (i, &found) in found.iter().enumerate() {
-                // A turn about the axis of greys, by Rodrigues' formula.
-                let cross = (d[(i + 2) % 3] - d[(i + 1) % 3]) / 3f64.sqrt();
-                let coloured = grey + view.saturation * (d[i] * cos + cross * sin);
+                let coloured = match d.as_slice() {
+                    // A turn about the axis of greys, by Rodrigues' formula.
+                    [_, _, _] => {
+                        let cross = (d[(i + 2) % 3] - d[(i + 1) % 3]) / 3f64.sqrt();
+                        grey + view.saturation * (d[i] * cos + cross * sin)
+                    }
+                    _ => grey,
+                };
                 let expected = view.brightness * (mean + view.contrast * (coloured - mean));
                 error = error.max((f64::from(found) - expected.clamp(0.0, 255.0)).abs());
             }
@@ -131,13 +140,13 @@ fn drawn_view(picture: &Picture, rng: &mut ChaCha8Rng) -> View {
 pub(super) fn check(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
     let mut crop = Row::new(
         AUGMENT,
-        "states of 1 to 13 pixels a side, 1 to 4 frames; crops resized to the whole, drawn",
+        "states of 1 to 13 pixels a side, 1 to 4 frames in colour or grey; crops resized to the whole, drawn",
         "error of a byte",
         CROP_ERROR,
     );
     let mut colour = Row::new(
         AUGMENT,
-        "the same states recoloured, factors and turns drawn and at the ends of their ranges",
+        "the same states recoloured, factors and turns at the ends of their ranges and between, drawn",
         "error of a byte",
         COLOUR_ERROR,
     );

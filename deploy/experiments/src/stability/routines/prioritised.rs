@@ -141,7 +141,7 @@ fn draws(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
 fn weights(context: &mut Context<'_>) -> anyhow::Result<Row> {
     let mut row = Row::new(
         WEIGHT,
-        "2 to 64 rows, chances 1.2e-38 to 1 and equal ones, beta 0, 1 and drawn",
+        "2 to 64 rows, chances 1.2e-38 to 1 and equal ones, beta 0, 1 and between, drawn",
         "error of a weight, as a share of it; the least likely row's is 1",
         WEIGHT_ERROR,
     );
