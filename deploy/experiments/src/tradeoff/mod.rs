@@ -100,6 +100,13 @@ pub(super) fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
         )
         .into());
     }
+    if results.levels.is_empty() {
+        queue::check_made(&missing, report_only)?;
+        return Err(usage!(
+            "no level has a finished run beside its base's, and none fits into the budget: there is nothing to report"
+        )
+        .into());
+    }
     report::report(session, &results)?;
     queue::check_made(&missing, report_only)
 }
