@@ -7,6 +7,13 @@ use candle_core::{D, DType, Device, Tensor, Var};
 use candle_nn::ops::softmax;
 use driml_model::{HeadNoise, ModelConfig, Parameters};
 
+/// max(x, 0), whose slope at 0 is 0, as in PyTorch and in our kernels. Candle's own has 1 there, which an input of exact zeros meets:
+/// a place of a map where no channel is open, and initial biases, which are 0.
+fn relu(x: &Tensor) -> candle_core::Result<Tensor> {
+    let open = x.detach().gt(0.0)?.to_dtype(x.dtype())?;
+    x * open
+}
+
 /// A network's parameters in float64.
 pub(super) struct Net<'a> {
     pub(super) model: &'a ModelConfig,
@@ -61,7 +68,7 @@ impl<'a> Net<'a> {
             let bias = self.vars[&format!("{name}.bias")].reshape((1, (), 1, 1))?;
             let weight = self.vars[&format!("{name}.weight")].as_tensor();
             let convolved = convolution(&maps, weight, layer.stride)?;
-            maps = convolved.broadcast_add(&bias)?.relu()?;
+            maps = relu(&convolved.broadcast_add(&bias)?)?;
         }
         Ok(Levels {
             global: self.linear("torso.fc", &maps.flatten_from(1)?)?,
@@ -76,7 +83,7 @@ impl<'a> Net<'a> {
         noise: Option<&HeadNoise>,
     ) -> candle_core::Result<Tensor> {
         let (actions, atoms) = (self.model.num_actions, self.model.atoms);
-        let active = f4.relu()?;
+        let active = relu(f4)?;
         let of_actions = |name: &str, number: usize| {
             let y = self.head_layer(
                 name,
@@ -129,7 +136,7 @@ impl<'a> Net<'a> {
 
     /// A DIM head: out(relu(hidden(x))) + skip(x).
     pub(super) fn head(&self, name: &str, x: &Tensor) -> candle_core::Result<Tensor> {
-        let hidden = self.linear(&format!("{name}.hidden"), x)?.relu()?;
+        let hidden = relu(&self.linear(&format!("{name}.hidden"), x)?)?;
         self.linear(&format!("{name}.out"), &hidden)? + self.linear(&format!("{name}.skip"), x)?
     }
 
