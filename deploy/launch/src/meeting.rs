@@ -55,7 +55,7 @@ impl Meeting {
         Ok(Self { folder, lock })
     }
 
-    /// The folder.
+    /// Where the folder lies: written into the run folder, so that `--resume` can see whether it is still used.
     pub(crate) fn path(&self) -> &Path {
         self.folder.path()
     }

@@ -91,7 +91,7 @@ pub(super) fn join(flags: &JoinFlags) -> anyhow::Result<Shutdown> {
 /// [`join`] of a process that the others need while they end.
 ///
 /// # Errors
-/// As there.
+/// A namespace that is none, or signals that cannot be listened for.
 pub(super) fn join_in_two_steps(flags: &JoinFlags) -> anyhow::Result<TwoSteps> {
     prepare(flags)?;
     TwoSteps::on_signals(flags.exit_with_parent).context("listening for signals")

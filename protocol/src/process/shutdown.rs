@@ -69,9 +69,9 @@ impl Shutdown {
 /// When a process that others need while they end is to end itself.
 #[derive(Clone, Debug, Default)]
 pub struct TwoSteps {
-    /// Once the others have left.
+    /// Raised when it should end as soon as the others have left.
     pub ending: Shutdown,
-    /// At once.
+    /// Raised when it should end without waiting for anybody.
     pub now: Shutdown,
 }
 
