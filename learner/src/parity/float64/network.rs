@@ -210,6 +210,16 @@ pub(super) fn support(model: &ModelConfig) -> Vec<f64> {
 mod tests {
     use super::*;
 
+    #[test]
+    fn the_slope_of_relu_at_zero_is_zero() {
+        let x = Var::new(&[-1.0, -0.0, 0.0, 1e-300, 2.0], &Device::Cpu).unwrap();
+        let y = relu(&x).unwrap();
+        assert_eq!(y.to_vec1::<f64>().unwrap(), [0.0, 0.0, 0.0, 1e-300, 2.0]);
+        let gradients = y.sum_all().unwrap().backward().unwrap();
+        let slopes: Vec<f64> = gradients.get(&x).unwrap().to_vec1().unwrap();
+        assert_eq!(slopes, [0.0, 0.0, 0.0, 1.0, 1.0]);
+    }
+
     /// Sizes at which a stride leaves over more rows than columns, as on Ms. PacMan at 42 x 38.
     #[test]
     fn a_convolution_may_leave_over_what_it_likes() {
