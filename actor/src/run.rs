@@ -106,6 +106,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let Some(first) = source.first(WEIGHTS_WAIT_MAX, shutdown)? else {
         return Ok(());
     };
+    // The learner has joined by now, and with it the replay server knows where a resumed run stands.
+    let Some(hello) = join::hello(client.session(), client.keys(), shutdown)? else {
+        return Ok(());
+    };
     let limits = DeliveryLimits::of(&settings.actor);
     let config = settings.actor.clone();
     let actors_planned = settings.actors_planned;
@@ -125,7 +129,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let newest = source.watch(first.header.version, shutdown.clone())?;
     let delivery = Delivery::start(
         client.clone(),
-        welcome.inserted_total,
+        hello.inserted_total,
         limits,
         pool,
         shutdown.clone(),

@@ -19,6 +19,7 @@ use crate::{
     config::{ConfigError, LearnerConfig},
     error::UpdateError,
     importance::importance_weights,
+    progress::Progress,
 };
 
 /// What the seed of noisy layers' noise is drawn for.
@@ -64,6 +65,7 @@ pub struct Learner {
     /// What the auxiliary objective sees of the last batch, if that is not the plain states: memory to use again.
     seen: [Vec<u8>; 2],
     weights_version: u64,
+    progress: Progress,
 }
 
 impl Learner {
@@ -109,6 +111,7 @@ impl Learner {
             augment,
             seen: Default::default(),
             weights_version: 0,
+            progress: Progress::default(),
             config,
         })
     }
@@ -142,6 +145,7 @@ impl Learner {
             return Err(LearnerError::OtherAffinity(folder.to_owned()));
         }
         this.weights_version = restored.weights_version;
+        this.progress = restored.progress;
         this.agent = restored
             .agent
             .with_equal_states(this.config.learner.equal_states)
@@ -169,6 +173,16 @@ impl Learner {
     /// Updates taken since the run began, those before a restart included.
     pub const fn updates(&self) -> u64 {
         self.agent.updates()
+    }
+
+    /// What the run has done beside its updates.
+    pub const fn progress(&self) -> &Progress {
+        &self.progress
+    }
+
+    /// The same, for whoever counts: [`Learner::update`] does not know where a batch comes from.
+    pub const fn progress_mut(&mut self) -> &mut Progress {
+        &mut self.progress
     }
 
     /// Learns from one batch: the network and the affinity.
@@ -317,6 +331,7 @@ impl Learner {
             affinity: self.affinity.as_ref(),
             rng: &self.rng,
             weights_version: self.weights_version,
+            progress: &self.progress,
             run_spec_hash: self.spec_hash,
             companion,
         };

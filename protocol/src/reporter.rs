@@ -19,10 +19,11 @@ const TICK: Duration = Duration::from_millis(250);
 /// How long one report may take.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Tells the replay servers of `clients` once that the part of `who` in the run is done, whatever comes of it.
-pub fn say_finished(clients: &[RunClient], who: Life) {
+/// Tells the replay servers of `clients` once that `who`, the learner, has finished the run after so many
+/// updates, whatever comes of it.
+pub fn say_finished(clients: &[RunClient], who: Life, updates: u64) {
     let finished = Report {
-        finished: true,
+        finished: Some(updates),
         ..report(who, "has finished", Duration::ZERO)
     };
     send(clients, &finished);

@@ -69,6 +69,7 @@ fn filled(frame_stack: u32) -> (Replay, Chunk) {
         sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
+        since: None,
         reproduced_bug: None,
         replay_ratio: 1e9,
         warmup_transitions: 0,

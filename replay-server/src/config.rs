@@ -83,9 +83,25 @@ pub struct Config {
     /// the death of the process it always survives. 0 flushes before each answer. Without it 1,000.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fsync_ms: Option<u64>,
+    /// The point from which `replay_ratio` holds, if it or the batch size was changed when the run was resumed; without it the end of the
+    /// warm-up.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub since: Option<Since>,
     /// A known bug to train with, chosen by `--reproduce-bug`; none in every other run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reproduced_bug: Option<ReproducedBug>,
+}
+
+/// A point in a run: what was counted when it was resumed with other settings. `driml train --resume` writes it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Since {
+    /// Transitions stored.
+    pub transitions: u64,
+    /// Rows learned.
+    pub rows: u64,
+    /// Updates done.
+    pub updates: u64,
 }
 
 /// Why settings were refused.
@@ -244,7 +260,7 @@ impl Config {
                 why,
             );
         }
-        if let Some(max) = self.transitions_max {
+        if let (Some(max), None) = (self.transitions_max, self.since) {
             let batch = (f64::from(batch_size) / ratio).ceil();
             let least = self.warmup_transitions as f64 + batch;
             if (max as f64) < least {

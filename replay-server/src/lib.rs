@@ -43,6 +43,7 @@
 //!     warmup_transitions: 10,
 //!     slack_transitions: 100,
 //!     transitions_max: None,
+//!     since: None,
 //!     reproduced_bug: None,
 //! };
 //! let mut replay = Replay::new(&spec, &config, 4)?;
@@ -75,25 +76,26 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
+mod admission;
 mod config;
-mod durable;
 mod ledger;
+mod persist;
 mod rate_limiter;
 mod replay;
 mod sampling;
 mod service;
 mod storage;
 
-pub use config::{Compression, Config, ConfigError, ReproducedBug};
-pub use durable::{DurableArgs, DurableError, DurableReplay, KeptReplay, Mark, Reading, Recovery};
+pub use config::{Compression, Config, ConfigError, ReproducedBug, Since};
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
+pub use persist::{KeptReplay, Mark, PersistArgs, PersistError, Reading, Recovery};
 pub use rate_limiter::RateLimiter;
 pub use replay::{Replay, Unready};
 pub use sampling::{
     assemble::{RETURN_ERROR, return_sum_error},
     horizon,
     packed_batch::PackedBatch,
-    prioritised::{CHANCE_ERROR, PRIORITY_MIN, PriorityCounts, SavedPriorities},
+    rows::prioritised::{CHANCE_ERROR, PRIORITY_MIN, PriorityCounts},
 };
 pub use service::{RunArgs, run};
 pub use storage::frame_store::{PackedChunk, Packer};

@@ -2,6 +2,7 @@
 //! It does not wait itself, keep time or know what is stored.
 
 use driml_protocol::{Tally, Waiting};
+use serde::{Deserialize, Serialize};
 
 /// Counts transitions in and rows out, and keeps rows / transitions after the warm-up at the replay ratio.
 ///
@@ -16,9 +17,21 @@ pub struct RateLimiter {
     warmup_transitions: u64,
     slack_transitions: u64,
     transitions_max: Option<u64>,
-    this_shard: Tally,
-    /// What the replay's other shards have counted, as far as heard.
-    other_shards: Tally,
+    /// The point from which the ratio holds: no row for the transitions before it beyond those sampled then.
+    since: Tally,
+    counts: Counts,
+}
+
+/// What a limiter counts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Counts {
+    pub(crate) this_shard: Tally,
+    /// What the replay's other shards have counted, as the learner said last.
+    pub(crate) other_shards: Tally,
+    /// Transitions of this shard that filled its memory again after a resume; they are not in its tally.
+    pub(crate) refilled: u64,
+    /// How many more are to come before rows are sampled.
+    pub(crate) refill_left: u64,
 }
 
 impl RateLimiter {
@@ -34,79 +47,117 @@ impl RateLimiter {
             warmup_transitions,
             slack_transitions,
             transitions_max,
-            this_shard: Tally::default(),
-            other_shards: Tally::default(),
+            since: Tally {
+                inserted: warmup_transitions,
+                rows_sampled: 0,
+            },
+            counts: Counts::default(),
         }
     }
 
-    /// The same, in a run that goes on after so much was counted here and in the replay's other shards.
+    /// The same with a ratio that holds from this point on, as it was another before.
     #[must_use]
-    pub fn resumed_at(self, this_shard: Tally, other_shards: Tally) -> Self {
-        Self {
-            this_shard,
-            other_shards,
-            ..self
-        }
+    pub const fn since(self, since: Tally) -> Self {
+        Self { since, ..self }
+    }
+
+    /// The same after so much was counted here and in the replay's other shards.
+    #[must_use]
+    pub const fn counting_on(mut self, this_shard: Tally, other_shards: Tally) -> Self {
+        (self.counts.this_shard, self.counts.other_shards) = (this_shard, other_shards);
+        self
+    }
+
+    pub(crate) const fn counts(&self) -> Counts {
+        self.counts
+    }
+
+    pub(crate) const fn set_counts(&mut self, counts: Counts) {
+        self.counts = counts;
     }
 
     /// Transitions stored in all shards.
     pub const fn inserted_total(&self) -> u64 {
-        self.this_shard
-            .inserted
-            .saturating_add(self.other_shards.inserted)
+        let Counts {
+            this_shard,
+            other_shards,
+            ..
+        } = &self.counts;
+        this_shard.inserted.saturating_add(other_shards.inserted)
     }
 
     /// Rows sampled from all shards.
     pub const fn rows_sampled_total(&self) -> u64 {
-        self.this_shard
-            .rows_sampled
-            .saturating_add(self.other_shards.rows_sampled)
+        let Counts {
+            this_shard,
+            other_shards,
+            ..
+        } = &self.counts;
+        let rows = this_shard.rows_sampled;
+        rows.saturating_add(other_shards.rows_sampled)
     }
 
-    /// Takes what the other shards have counted; counts never fall.
-    pub fn set_other_shards(&mut self, other_shards: Tally) {
-        let Tally {
-            inserted,
-            rows_sampled,
-        } = &mut self.other_shards;
-        *inserted = other_shards.inserted.max(*inserted);
-        *rows_sampled = other_shards.rows_sampled.max(*rows_sampled);
+    /// Takes what the other shards had counted at a learner's checkpoint, in place of what was heard before.
+    pub(crate) const fn adopt_other_shards(&mut self, others: Tally) {
+        self.counts.other_shards = others;
     }
 
-    /// What the other shards have counted, as far as heard.
-    pub(crate) const fn other_shards(&self) -> Tally {
-        self.other_shards
-    }
-
-    fn after_warmup(&self) -> u64 {
-        self.inserted_total()
-            .saturating_sub(self.warmup_transitions)
-    }
-
-    /// Rows allowed so far, whether sampled or not.
-    fn rows_allowed(&self) -> f64 {
-        self.replay_ratio * self.after_warmup() as f64
+    /// Takes what the other shards have counted.
+    ///
+    /// # Errors
+    /// More transitions than the run can ever have, or more rows than it gives for these; the reason, for a person. `held_max` are
+    /// the transitions that a shard may store before it hears of the others.
+    pub fn set_other_shards(&mut self, others: Tally, held_max: u64) -> Result<(), String> {
+        let before = self.counts.other_shards;
+        let max = self.transitions_max.unwrap_or(u64::MAX);
+        let most = max.max(before.inserted).saturating_add(held_max);
+        if others.inserted > most {
+            return Err(format!(
+                "the other shards are said to have stored {} transitions; this run has at most {most}",
+                others.inserted
+            ));
+        }
+        // Of more rows the learner would wait for transitions that never come.
+        let inserted = others.inserted.max(before.inserted);
+        let inserted = inserted.saturating_add(self.counts.this_shard.inserted);
+        let allowed = self.since.rows_sampled as f64 + self.replay_ratio * inserted as f64;
+        let ahead = self.slack_transitions.saturating_add(held_max) as f64 * self.replay_ratio;
+        let most_rows = allowed.max(before.rows_sampled as f64) + ahead;
+        if others.rows_sampled as f64 > most_rows {
+            return Err(format!(
+                "the other shards are said to have given {} rows; for {inserted} transitions a run gives at most {most_rows:.0}",
+                others.rows_sampled
+            ));
+        }
+        self.counts.other_shards = others;
+        Ok(())
     }
 
     fn credit(&self) -> f64 {
-        let Tally { rows_sampled, .. } = self.this_shard + self.other_shards;
-        self.rows_allowed() - rows_sampled as f64
+        let after = self.inserted_total().saturating_sub(self.since.inserted);
+        let allowed = self.since.rows_sampled as f64 + self.replay_ratio * after as f64;
+        allowed - self.rows_sampled_total() as f64
     }
 
     /// Whether a chunk may be stored now; chunks are stored whole, so inserts may overshoot by one chunk.
     pub fn may_insert(&self) -> bool {
-        !self.all_in() && self.credit() <= self.slack_transitions as f64 * self.replay_ratio
+        let is_ahead = self.credit() > self.slack_transitions as f64 * self.replay_ratio;
+        !self.all_in() && (self.counts.refill_left > 0 || !is_ahead)
     }
 
     /// Whether `rows` rows may be sampled now.
     pub fn may_sample(&self, rows: u32) -> bool {
-        self.inserted_total() >= self.warmup_transitions && f64::from(rows) <= self.credit()
+        self.counts.refill_left == 0
+            && self.inserted_total() >= self.warmup_transitions
+            && f64::from(rows) <= self.credit()
     }
 
     /// Whether all transitions of the run are in.
     pub fn all_in(&self) -> bool {
-        self.transitions_max
-            .is_some_and(|max| self.inserted_total() >= max)
+        self.counts.refill_left == 0
+            && self
+                .transitions_max
+                .is_some_and(|max| self.inserted_total() >= max)
     }
 
     /// Whether all transitions are in and no further batch of `rows` is allowed.
@@ -121,36 +172,58 @@ impl RateLimiter {
 
     /// Counts `transitions` stored.
     pub fn inserted(&mut self, transitions: u64) {
-        self.this_shard.inserted += transitions;
+        let counts = &mut self.counts;
+        let refilled = transitions.min(counts.refill_left);
+        counts.refill_left -= refilled;
+        counts.refilled += refilled;
+        counts.this_shard.inserted += transitions - refilled;
     }
 
     /// Counts `rows` sampled.
     pub fn sampled(&mut self, rows: u32) {
         debug_assert!(self.may_sample(rows), "{rows} rows beyond the replay ratio");
-        self.this_shard.rows_sampled += u64::from(rows);
-    }
-
-    /// Counts `rows` that were sampled before, whatever the replay ratio allowed then.
-    pub(crate) fn sampled_before(&mut self, rows: u64) {
-        let sampled = &mut self.this_shard.rows_sampled;
-        *sampled = sampled.saturating_add(rows);
+        self.counts.this_shard.rows_sampled += u64::from(rows);
     }
 
     /// Counts `rows` that were sampled, and of which nothing was learned, as not sampled.
     pub fn refund(&mut self, rows: u64) {
-        let rows_sampled = &mut self.this_shard.rows_sampled;
+        let rows_sampled = &mut self.counts.this_shard.rows_sampled;
         *rows_sampled = rows_sampled.saturating_sub(rows);
     }
 
-    /// What was counted here since the start.
+    /// So many rows were sampled here since the start of the run.
+    pub(crate) const fn set_rows_sampled(&mut self, rows: u64) {
+        self.counts.this_shard.rows_sampled = rows;
+    }
+
+    /// The run is resumed after `counted` in this shard, of which nothing is held any more: `refill` transitions come in before the
+    /// next row is sampled, unless nothing is left to sample batches of `rows` rows for.
+    pub(crate) fn resume_empty(&mut self, counted: Tally, refill: u64, rows: u32) {
+        self.counts.this_shard = counted;
+        if !self.finished(rows) {
+            self.counts.refill_left = refill;
+        }
+    }
+
+    /// What was counted here since the start of the run.
     pub const fn tally(&self) -> Tally {
-        self.this_shard
+        self.counts.this_shard
     }
 
     /// Who waits, for batches of `rows`.
     pub fn waiting(&self, rows: u32) -> Waiting {
+        let Counts {
+            refilled,
+            refill_left,
+            ..
+        } = self.counts;
         if self.finished(rows) {
             Waiting::Finished
+        } else if refill_left > 0 {
+            Waiting::WarmUp {
+                have: refilled,
+                need: refilled + refill_left,
+            }
         } else if self.inserted_total() < self.warmup_transitions {
             Waiting::WarmUp {
                 have: self.inserted_total(),

@@ -58,6 +58,7 @@ fn replay(compression: Compression, frame_stack: u32) -> Replay {
         sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
+        since: None,
         reproduced_bug: None,
         replay_ratio: 1e9,
         warmup_transitions: 0,

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, InsertReply, Keyed, Keys, LearnerJoin, LearnerStatus,
-    ReplayStatus, RunClient, RunSpec, Shutdown, codec,
+    ReplayStatus, RunClient, RunSpec, Shutdown, Tally, codec,
     config::Settings,
     join,
     session::{self, Endpoints, SessionError},
@@ -30,6 +30,24 @@ pub struct Client {
     pub spec: RunSpec,
     /// The run's resolved settings.
     pub config_toml: String,
+}
+
+/// How a learner joins that has learned nothing yet.
+pub const fn new_learner(learner: u64) -> LearnerJoin {
+    LearnerJoin {
+        learner,
+        run: learner,
+        updates: 0,
+        tally: Tally {
+            inserted: 0,
+            rows_sampled: 0,
+        },
+        other_shards: Tally {
+            inserted: 0,
+            rows_sampled: 0,
+        },
+        restart: false,
+    }
 }
 
 impl Client {
@@ -131,17 +149,13 @@ impl Client {
         join::as_actor(&self.run(), join, &never).unwrap();
     }
 
-    /// Takes part as the learner, which has learned from so many rows.
+    /// Takes part as the learner, which has learned nothing yet.
     ///
     /// # Panics
     /// If the replay server does not take it.
-    pub fn join_as_learner(&self, learner: u64, rows_sampled: u64) {
-        let join = LearnerJoin {
-            learner,
-            rows_sampled,
-        };
+    pub fn join_as_learner(&self, learner: u64) {
         let never = Shutdown::default();
-        join::as_learner(&self.run(), join, &never).unwrap();
+        join::as_learner(&self.run(), new_learner(learner), &never).unwrap();
     }
 
     /// Sends a chunk as an actor would.

@@ -19,7 +19,7 @@ mod system;
 mod waiting;
 
 pub use certificates::{Certificates, Valid, skipped_without_openssl};
-pub use client::Client;
+pub use client::{Client, new_learner};
 pub use network::Network;
 pub use process::{Ended, Process};
 pub use run_folder::{EpisodeRow, RunFolder, Summary};

@@ -22,6 +22,7 @@ pub struct Summary {
     pub frames: u64,
     pub updates: u64,
     pub transitions_inserted: u64,
+    pub transitions_refilled: u64,
     pub transitions_lost: u64,
     pub transitions_duplicated: u64,
     pub rows_sampled: u64,
@@ -227,11 +228,11 @@ impl RunFolder {
             false => summary.resumed_after_updates,
         };
         let rows_before = before * self.setting("learner.batch_size") as u64;
-        assert_eq!(
-            rows_before + summary.k_histogram.iter().sum::<u64>(),
-            summary.rows_sampled + summary.rows_unlearned,
-            "{said}"
-        );
+        let known = rows_before + summary.k_histogram.iter().sum::<u64>();
+        let served = summary.rows_sampled + summary.rows_unlearned;
+        // A server that was killed has forgotten the k of what it served since its last snapshot.
+        let may_lack = summary.resumed_after_updates > 0 || summary.replay_servers_restarted > 0;
+        assert!(known == served || may_lack && known < served, "{said}");
         assert!(
             summary.wall_seconds > 0.0 && summary.frames_per_second > 0.0,
             "{said}"

@@ -184,10 +184,27 @@ impl TestSystem {
 
     /// The process that runs `part` (`learner`, `actor`, `replay-server`), once it is there.
     pub fn find_part(&self, part: &str) -> Survivor {
+        wait_for(&format!("a process {part}"), || self.find_part_now(part))
+    }
+
+    /// The first process that plays `part`, if there is one now.
+    pub fn find_part_now(&self, part: &str) -> Option<Survivor> {
         let is_part = |it: &Survivor| it.args.first().is_some_and(|first| first == part);
-        wait_for(&format!("a process {part}"), || {
-            self.survivors().into_iter().find(is_part)
-        })
+        self.survivors().into_iter().find(is_part)
+    }
+
+    /// Waits until no process that the program has started here is left.
+    pub fn wait_until_all_have_ended(&self) {
+        wait_for("the end of all processes", || {
+            self.survivors().is_empty().then_some(())
+        });
+    }
+
+    /// Kills all processes that the program has started here, however they came about.
+    pub fn kill_parts(&self) {
+        self.survivors()
+            .iter()
+            .for_each(|it| it.signal(Signal::SIGKILL));
     }
 }
 

@@ -3,7 +3,7 @@
 
 use driml_protocol::{
     AffinityUpdate, BatchReply, BatchRequest, Chunk, ChunkHeader, End, Goodbye, InsertReply,
-    PROTOCOL_VERSION, RequestId, codec,
+    Learned, PROTOCOL_VERSION, RequestId, codec,
 };
 use driml_tests::{Client, Process, TestSystem};
 
@@ -25,7 +25,7 @@ fn served() -> Served {
     let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
     let client = system.connect();
     client.join_as_actor(0, INCARNATION);
-    client.join_as_learner(LEARNER, 0);
+    client.join_as_learner(LEARNER);
     Served {
         client,
         _server: server,
@@ -225,6 +225,7 @@ fn everything_else_that_a_replay_server_takes() {
                 id: RequestId::first(7),
                 rows: 16,
                 shared_memory: false,
+                learned: Learned::default(),
                 other_shards: None,
             },
             &[],
@@ -247,6 +248,7 @@ fn everything_else_that_a_replay_server_takes() {
                 id: RequestId::first(7),
                 rows,
                 shared_memory: false,
+                learned: Learned::default(),
                 other_shards: None,
             },
             &[],

@@ -3,7 +3,7 @@
 
 use driml_learner::{Compute, Learner, LearnerConfig};
 use driml_protocol::{
-    Hello, Keys, PROTOCOL_VERSION, Tally, WeightsHeader, WeightsUpload, WeightsVersion, codec,
+    Hello, Keys, PROTOCOL_VERSION, WeightsHeader, WeightsUpload, WeightsVersion, codec,
     session::{self, Endpoints},
 };
 use driml_tests::Client;
@@ -76,7 +76,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     let mut actor = system.start_actor(0);
     actor.wait_for_stderr("waiting for the learner's first weights");
     learner.refused(upload(1, &good, hash, LEARNER), "it has not joined");
-    client.join_as_learner(LEARNER, 0);
+    client.join_as_learner(LEARNER);
     learner.refused(upload(1, &good, hash ^ 1, LEARNER), "of another run");
     assert_eq!(client.replay().unwrap().transitions_inserted, 0);
     learner.send(1, &good);
@@ -134,7 +134,7 @@ fn parts_of_another_protocol_version_do_not_join() {
     let hello = Hello {
         config_toml: String::new(),
         inserted_total: 0,
-        tally: Tally::default(),
+        has_learner: true,
         after_updates: 0,
         shard: (0, 1),
         shared_memory: false,

@@ -5,17 +5,19 @@ use std::{collections::BTreeSet, fs, process::Command, time::Duration};
 
 use driml_actor::{Delivery, DeliveryLimits};
 use driml_protocol::{
-    Batch, BatchReply, BatchRequest, Buffer, BufferPool, Chunk, ChunkHeader, End, Keys, RequestId,
-    RunClient, RunSpec, Shutdown,
+    Batch, BatchReply, BatchRequest, Buffer, BufferPool, Chunk, ChunkHeader, End, Keys, Learned,
+    RequestId, RunClient, RunSpec, Shutdown,
     config::Settings,
     session::{self, Endpoints},
 };
-use driml_replay_server::{Config, DurableArgs, DurableReplay};
+use driml_replay_server::{Config, PersistArgs, Replay};
 use driml_tests::{Process, RunFolder, TestSystem, skip, wait_for};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, disk_full::Disk, system};
 
+/// Batches that may have been on their way to a learner that ended.
+const IN_FLIGHT: u64 = 8;
 /// Actors that number their transitions, chunks of each, and transitions of a chunk.
 const ACTORS: u32 = 3;
 const CHUNKS: u64 = 40;
@@ -85,12 +87,16 @@ fn learn(run: &RunClient, learner: u64) -> u64 {
     let pool = BufferPool::new(2);
     let mut batches = 0;
     let mut id = RequestId::first(learner);
-    let ask = |id| {
+    let ask = |id, batches: u64| {
         let request = BatchRequest {
             learner,
             id,
             rows: ROWS,
             shared_memory: false,
+            learned: Learned {
+                rows_received: batches * u64::from(ROWS),
+                ..Learned::default()
+            },
             other_shards: None,
         };
         let asked = run.send(run.seal(&request)?, Duration::from_secs(2))?;
@@ -98,7 +104,7 @@ fn learn(run: &RunClient, learner: u64) -> u64 {
     };
     loop {
         id = id.again();
-        match ask(id) {
+        match ask(id, batches) {
             Ok((
                 reply @ (BatchReply::Batch(_)
                 | BatchReply::Prioritised(..)
@@ -126,14 +132,13 @@ fn numbers_in(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSe
         .table("replay")
         .unwrap();
     config.replay_ratio = 1e6;
-    let args = DurableArgs {
+    let args = PersistArgs {
         dir: system.path("replay"),
         shard: 0,
-        after_updates: 0,
         segment_bytes: None,
         mark: None,
     };
-    let (mut replay, recovery) = DurableReplay::open(&args, spec, &config, ROWS).unwrap();
+    let (mut replay, recovery) = Replay::open(&args, spec, &config, ROWS).unwrap();
     assert!(
         recovery.found && recovery.warnings.is_empty(),
         "{recovery:?}"
@@ -165,7 +170,7 @@ fn a_killed_server_loses_and_doubles_no_transition_and_no_batch() {
     for actor in 0..ACTORS {
         client.join_as_actor(actor, 1);
     }
-    client.join_as_learner(7, 0);
+    client.join_as_learner(7);
     let (spec_hash, frame_bytes) = (client.spec.hash(), client.spec.frame_bytes() as u32);
     let run = || {
         RunClient::new(
@@ -455,7 +460,7 @@ fn a_full_disk_makes_everybody_wait_until_there_is_room() {
     let client = system.connect();
     client.wait_for_learner("some updates", |learner| learner.updates > 100);
     let filler = disk.fill();
-    server.wait_for_stderr("cannot be written: No space left on device (os error 28); nothing is taken or served until it can");
+    server.wait_for_stderr("cannot be written: No space left on device (os error 28); nothing more is stored until it can");
     let stopped = client.replay().unwrap();
     let ask = format!("status --connect {}", system.endpoint());
     wait_for("a status that says it", || {
@@ -489,10 +494,16 @@ fn a_full_disk_makes_everybody_wait_until_there_is_room() {
     kill(server);
     let server = system.start_replay_server(&flags);
     let after = wait_for("the server", || client.replay());
-    assert_eq!(
-        (after.transitions_inserted, after.rows_sampled),
-        (before.transitions_inserted, before.rows_sampled)
-    );
+    assert_eq!(after.transitions_inserted, before.transitions_inserted);
+    // Whatever was served while the disk was full was learned.
+    let learner = system.start_learner("run");
+    let rows = "rows that the learner's checkpoint has";
+    let after = client.wait_for_replay(rows, |replay| {
+        replay.rows_sampled >= before.rows_sampled - 16 * IN_FLIGHT
+    });
+    assert_eq!(after.updates_relearned, 0, "{after:#?}");
+    client.wait_for_learner("the learner", |_| true);
+    learner.stop().expect_code(0);
     drop(client);
     server.stop().expect_code(0);
 }

@@ -5,11 +5,11 @@ use std::{fs, time::Duration};
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Alive, BatchReply, BatchRequest, Chunk, ChunkHeader, Claim,
-    CodecError, Goodbye, InsertReply, JoinReply, LearnerJoin, Message, Origin, PriorityPart,
-    PriorityUpdate, ReplayStatus, RequestId, Tally, WeightsHeader, WeightsReply, WeightsRequest,
-    WeightsUpload, WeightsVersion, codec, session,
+    CodecError, Goodbye, InsertReply, JoinReply, Learned, LearnerJoin, Message, Origin,
+    PriorityPart, PriorityUpdate, ReplayStatus, RequestId, Tally, WeightsHeader, WeightsReply,
+    WeightsRequest, WeightsUpload, WeightsVersion, codec, session,
 };
-use driml_tests::{Client, Process, TestSystem};
+use driml_tests::{Client, Process, TestSystem, new_learner};
 use zenoh::{Wait, qos::Priority};
 
 use crate::{LONG, PRIORITISED, launched, system};
@@ -104,8 +104,11 @@ fn of_joining() {
     let (client, before) = (&lied.client, lied.status());
     for rows_sampled in [0, 1 << 60, u64::MAX] {
         let learner = LearnerJoin {
-            learner: LEARNER,
-            rows_sampled,
+            tally: Tally {
+                inserted: 0,
+                rows_sampled,
+            },
+            ..new_learner(LEARNER)
         };
         let key = client.keys.of::<LearnerJoin>();
         let reply: JoinReply = lied.reply(&key, sealed(client, &learner));
@@ -281,6 +284,7 @@ fn of_batches_and_affinity() {
             id: RequestId::first(u64::MAX),
             rows,
             shared_memory: true,
+            learned: Learned::default(),
             other_shards,
         };
         let key = client.keys.of::<BatchRequest>();

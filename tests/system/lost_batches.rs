@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-use driml_learner::remote::batch_source::{BatchSource, Next, Requests};
+use driml_learner::remote::batch_source::{BatchSource, Counters, Next, Requests, Served};
 use driml_protocol::{
     BatchReply, BatchRequest, Buffer, Horizon, InsertReply, Keys, ReplayStatus, RunClient, RunSpec,
     Shutdown, codec,
@@ -86,18 +86,25 @@ fn declare(
     declared.wait().unwrap()
 }
 
-/// Fetches all batches of a run from `shards` shards, of which some get lost.
-fn every_batch_comes_once(shards: u32) {
+/// Replay servers of these shards, of which some batches get lost, and a learner's end of them.
+struct Shards {
+    replays: Vec<Arc<Mutex<Replay>>>,
+    drawn: Arc<AtomicU32>,
+    source: BatchSource,
+    _served: (Vec<(Session, [Queryable<()>; 2])>, tempfile::TempDir),
+}
+
+fn serve(shards: Vec<Replay>) -> Shards {
     let folder = tempfile::tempdir().unwrap();
     let keys = Keys::new("lossy").unwrap();
     let hash = spec().hash();
     let drawn = Arc::<AtomicU32>::default();
     let (mut replays, mut declared, mut clients) = (vec![], vec![], vec![]);
-    for shard in 0..shards {
+    for (shard, replay) in shards.into_iter().enumerate() {
         let endpoint = format!("unixsock-stream/{}/{shard}.sock", folder.path().display());
         let open = |listen, connect| session::open(&Endpoints { listen, connect }).unwrap();
         let server = open(vec![endpoint.clone()], vec![]);
-        let replay = Arc::new(Mutex::new(full(shard, shards)));
+        let replay = Arc::new(Mutex::new(replay));
         let (asked, count) = (replay.clone(), drawn.clone());
         let batches = declare(&server, keys.of::<BatchRequest>(), move |query| {
             answer(query, &asked, &count)
@@ -111,7 +118,7 @@ fn every_batch_comes_once(shards: u32) {
         let session = open(vec![], vec![endpoint]);
         clients.push(RunClient::new(session, keys.clone(), hash));
         replays.push(replay);
-        declared.push((server, batches, status));
+        declared.push((server, [batches, status]));
     }
     let requests = Requests {
         learner: 1,
@@ -121,18 +128,42 @@ fn every_batch_comes_once(shards: u32) {
         unreachable_max: Duration::from_secs(60),
     };
     let stop = Shutdown::default();
-    let mut source = BatchSource::start(&clients, requests, &stop).unwrap();
-    let mut batches = 0;
-    loop {
-        match source.next(Duration::from_secs(60)).unwrap() {
-            Next::Batch(batch) => {
-                assert_eq!(batch.rows(), ROWS as usize);
-                batches += 1;
-            }
-            Next::Finished => break,
-            Next::NotYet(_) => panic!("no batch in a minute, after {batches}"),
+    let counters = Counters::at_start(clients.len());
+    let source = BatchSource::start(&clients, requests, &counters, &stop).unwrap();
+    Shards {
+        replays,
+        drawn,
+        source,
+        _served: (declared, folder),
+    }
+}
+
+impl Shards {
+    /// The next batch; none at the end of the run.
+    fn next(&mut self) -> Option<Served> {
+        match self.source.next(Duration::from_secs(60)).unwrap() {
+            Next::Batch(served) => Some(served),
+            Next::Finished => None,
+            Next::NotYet(waiting) => panic!("no batch in a minute: {waiting}"),
         }
     }
+}
+
+/// Fetches all batches of a run from `shards` shards, of which some get lost.
+fn every_batch_comes_once(shards: u32) {
+    let mut served = serve((0..shards).map(|shard| full(shard, shards)).collect());
+    let mut batches = 0;
+    while let Some(Served { batch, parts }) = served.next() {
+        assert_eq!(batch.rows(), ROWS as usize);
+        assert_eq!(parts.iter().map(|it| it.rows).sum::<u32>(), ROWS);
+        batches += 1;
+    }
+    let Shards {
+        replays,
+        drawn,
+        source,
+        ..
+    } = served;
     assert_eq!(batches * u64::from(ROWS), TRANSITIONS);
     let statuses: Vec<_> = replays
         .iter()
@@ -151,7 +182,6 @@ fn every_batch_comes_once(shards: u32) {
         "of so many batches as there are, some were to get lost: {lost}"
     );
     assert_eq!(retried, u64::from(lost));
-    drop(declared);
     source.end();
 }
 
@@ -163,4 +193,44 @@ fn lost_batches_do_not_count() {
 #[test]
 fn lost_parts_of_batches_do_not_count() {
     every_batch_comes_once(3);
+}
+
+/// A shard that held nothing when batches began, as its actors started late, is drawn from once it holds something, although the others
+/// never make the learner wait.
+#[test]
+fn a_shard_that_fills_late_is_asked() {
+    let spec = spec();
+    let config = Config {
+        transitions_max: None,
+        ..config(2)
+    };
+    let mut shards: Vec<_> = (0..2)
+        .map(|shard| Replay::shard(&spec, &config, ROWS, shard).unwrap())
+        .collect();
+    let fill = |replay: &mut Replay, sequences: std::ops::Range<u64>| {
+        for sequence in sequences {
+            let stored = replay.insert(&tiny_replay::chunk(&spec, 0, sequence, 8));
+            assert!(matches!(stored, InsertReply::Stored { .. }), "{stored:?}");
+        }
+    };
+    shards
+        .iter_mut()
+        .for_each(|replay| tiny_replay::join(replay, 0));
+    fill(&mut shards[0], 0..8);
+    let mut served = serve(shards);
+    for batches in 0..1_000 {
+        let parts = served.next().unwrap().parts;
+        if parts.iter().any(|part| part.shard == 1) {
+            assert!(batches > 3, "it held nothing");
+            served.source.end();
+            return;
+        }
+        let replays: Vec<_> = served.replays.iter().map(|it| it.lock().unwrap()).collect();
+        let [mut first, mut second] = <[_; 2]>::try_from(replays).ok().unwrap();
+        fill(&mut first, 8 + 2 * batches..10 + 2 * batches);
+        if batches == 3 {
+            fill(&mut second, 0..8);
+        }
+    }
+    panic!("a shard that holds something is never drawn from");
 }

@@ -31,6 +31,7 @@ mod python;
 mod recovering;
 mod repo_rules;
 mod resume;
+mod resume_fuzz;
 mod roles;
 mod several_machines;
 mod soak;

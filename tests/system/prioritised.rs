@@ -68,7 +68,10 @@ fn a_replay_server_that_dies_goes_on_with_equal_priorities() {
     let run = system.run_folder("run");
     run.check("finished");
     let log = run.log("replay-server");
-    assert!(log.contains("priorities are not kept on disk"), "{log}");
+    assert!(
+        log.contains("priorities are those of the last checkpoint"),
+        "{log}"
+    );
     assert!(said(&log)[0] > 0, "{log}");
 }
 

@@ -4,13 +4,13 @@
 use std::{borrow::Cow, fs, path::Path, time::Duration};
 
 use driml_protocol::{
-    ActorJoin, BatchRequest, Chunk, ChunkHeader, End, Hello, InsertReply, Keys, LearnerJoin,
+    ActorJoin, BatchRequest, Chunk, ChunkHeader, End, Hello, InsertReply, Keys, Learned,
     ReplayStatus, RequestId, RunClient, RunSpec, WeightsHeader, WeightsUpload,
     config::Settings,
     session::{self, Endpoints, SessionError},
 };
-use driml_replay_server::{Config, DurableArgs, DurableReplay};
-use driml_tests::{Process, SlowMachine, TestSystem, wait_for};
+use driml_replay_server::{Config, PersistArgs, Replay};
+use driml_tests::{Process, SlowMachine, TestSystem, new_learner, wait_for};
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
@@ -43,14 +43,13 @@ fn keep(folder: &Path, config_toml: &str) -> RunSpec {
     let mut config: Config = settings.table("replay").unwrap();
     // So that the learner need not follow.
     (config.slack_transitions, config.transitions_max) = (1 << 40, None);
-    let args = DurableArgs {
+    let args = PersistArgs {
         dir: folder.to_owned(),
         shard: 0,
-        after_updates: 0,
         segment_bytes: Some(1 << 18),
         mark: None,
     };
-    let (mut replay, _) = DurableReplay::open(&args, &spec, &config, 16).unwrap();
+    let (mut replay, _) = Replay::open(&args, &spec, &config, 16).unwrap();
     let join = ActorJoin {
         actor: 9,
         incarnation: 1,
@@ -126,15 +125,13 @@ fn check_put_off(system: &TestSystem, spec: &RunSpec) {
         actor: 5,
         incarnation: 1,
     };
-    let learner = LearnerJoin {
-        learner: 99,
-        rows_sampled: 0,
-    };
+    let learner = new_learner(99);
     let request = BatchRequest {
         learner: 99,
         id: RequestId::first(1),
         rows: 16,
         shared_memory: false,
+        learned: Learned::default(),
         other_shards: None,
     };
     let upload = WeightsUpload {

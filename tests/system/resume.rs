@@ -28,7 +28,11 @@ fn resumes(system: &TestSystem) -> Summary {
     assert!(ended.stdout.contains(&from), "{}", ended.stdout);
     let summary = run.check_finished();
     assert_eq!(summary.resumed_after_updates, updates);
-    assert_eq!(summary.updates, updates + 156);
+    // The last chunk is stored whole, which are up to 16 updates.
+    assert!(
+        (updates + 156..updates + 172).contains(&summary.updates),
+        "{summary:#?}"
+    );
     assert!(summary.episodes > 0);
 
     let (header, rows) = run.metrics();
@@ -68,10 +72,12 @@ fn an_interrupted_run_goes_on() {
     assert_eq!((before.mean_return_of, summary.mean_return_of), (100, 100));
     // And once more, as it is finished now and longer runs may be wished for.
     assert_eq!(resumes(&system).mean_return_of, 100);
-    system
-        .run("local --resume run")
-        .expect_code(64)
-        .expect_said("to train on, add --frames with more than these");
+    let ended = system.run("local --resume run").expect_code(0);
+    assert!(
+        ended.stdout.contains("nothing is left to do"),
+        "{}",
+        ended.stdout
+    );
 }
 
 /// Runs of earlier versions recorded whole frames where a border of them is cut today.
@@ -132,10 +138,12 @@ fn what_cannot_be_resumed() {
     refused("local --resume run --agent c51", "cannot be used with");
     let run = format!("local --agent c51 {SHORT} --run-dir run");
     system.run(&run).expect_code(0);
-    refused(
-        "local --resume run",
-        "is finished, 540 updates for 1280 frames",
-    );
+    for less in ["", "--frames 700"] {
+        let ended = system.run(&format!("local --resume run {less}"));
+        let said = &ended.expect_code(0).stdout;
+        let nothing = "nothing is left to do: the run in run has done 540 updates and 1280 frames";
+        assert!(said.contains(nothing), "{less}: {said}");
+    }
     // One that was cut off when all was learned: only its end is missing.
     let summary = fs::read_to_string(system.path("run/summary.json")).unwrap();
     let cut_off = summary.replace("\"finished\"", "\"failed\"");
@@ -148,23 +156,4 @@ fn what_cannot_be_resumed() {
 
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
     refused("local --resume run --frames 2000", "there is no checkpoint");
-}
-
-#[test]
-fn a_replay_server_goes_on_after_no_more_than_was_learned() {
-    let system = system();
-    let flags = format!("--agent c51 {SHORT} --after-updates 50");
-    let _server = system.start_replay_server(&flags);
-    let connect = system.endpoint();
-    system
-        .run(&format!("learner --connect {connect} --run-dir elsewhere"))
-        .expect_code(1)
-        .expect_said(
-            "goes on after 50 updates, the newest checkpoint in elsewhere/checkpoints has 0",
-        );
-    let status = system.connect().replay().unwrap();
-    assert_eq!(
-        (status.rows_sampled, status.transitions_inserted),
-        (50 * 16, 100)
-    );
 }

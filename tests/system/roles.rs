@@ -11,10 +11,10 @@ use std::{
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Alive, BatchRequest, Chunk, ChunkHeader, Claim, Goodbye, Hello,
-    InsertReply, LearnerJoin, LearnerStatus, ReplayStatus, RequestId, WeightsHeader,
+    InsertReply, Learned, LearnerJoin, LearnerStatus, ReplayStatus, RequestId, WeightsHeader,
     WeightsRequest, WeightsUpload, WeightsVersion, codec, session, tls::Role,
 };
-use driml_tests::{Client, Process};
+use driml_tests::{Client, Process, new_learner};
 use zenoh::{Wait, qos::Priority, query::Query, sample::Locality};
 
 use crate::{LONG, tls::TlsSystem};
@@ -112,6 +112,7 @@ fn an_actor_asks_for_nothing_but_its_own() {
         id: RequestId::first(1),
         rows: 16,
         shared_memory: false,
+        learned: Learned::default(),
         other_shards: None,
     };
     let affinity = AffinityUpdate {
@@ -120,10 +121,7 @@ fn an_actor_asks_for_nothing_but_its_own() {
         num_actions: 3,
         matrix: vec![1.0; 9],
     };
-    let learner = LearnerJoin {
-        learner: 1,
-        rows_sampled: 0,
-    };
+    let learner = new_learner(1);
     let upload = WeightsUpload {
         learner: 1,
         weights,
@@ -293,10 +291,7 @@ fn an_observer_only_looks() {
     assert!(observer.replay().is_some() && observer.learner().is_some());
     let (keys, hash) = (observer.keys.clone(), observer.spec.hash());
     let request = codec::encode(hash, &WeightsRequest::NewerThan(0), &[]).unwrap();
-    let learner = LearnerJoin {
-        learner: 1,
-        rows_sampled: 0,
-    };
+    let learner = new_learner(1);
     let learner = codec::encode(hash, &learner, &[]).unwrap();
     let join = ActorJoin {
         actor: 1,

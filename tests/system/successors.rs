@@ -87,9 +87,10 @@ fn a_learner_whose_replay_server_is_gone_saves() {
     assert!(newest_checkpoint(&system) > 75);
 }
 
-/// A new replay server at the same place knows nothing of the run: nobody may go on with it as if it were the old one.
+/// A new replay server at the same place knows nothing of the run: those that took part in it end, and a learner with its checkpoint
+/// goes on with the counts of the run.
 #[test]
-fn a_learner_whose_replay_server_was_started_anew_saves_and_says_so() {
+fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     let system = system();
     let (server, learner, client) = between_checkpoints(&system, "");
     let actor = system.start_actor(1);
@@ -106,7 +107,7 @@ fn a_learner_whose_replay_server_was_started_anew_saves_and_says_so() {
     learner
         .wait()
         .expect_code(1)
-        .expect_said("this replay server does not know the learner: it was started anew");
+        .expect_said("this replay server does not know the learner: it was started again");
     let saved = newest_checkpoint(&system);
     assert!(saved > 75);
     actor
@@ -114,15 +115,59 @@ fn a_learner_whose_replay_server_was_started_anew_saves_and_says_so() {
         .expect_code(1)
         .expect_said("does not know this life of actor 1: it was started anew");
 
-    // Its successor would count the updates twice, and says what to do.
+    let learner = system.start_learner("run");
+    let actor = system.start_actor(0);
+    let client = system.connect();
+    client.wait_for_learner("more updates", |it| it.updates > saved);
+    let replay = client.replay().unwrap();
+    assert_eq!(replay.transitions_refilled, 200, "the warm-up: {replay:#?}");
+    assert!(replay.transitions_inserted > 200 + 2 * saved, "{replay:#?}");
+    assert!(replay.rows_sampled >= 16 * saved, "{replay:#?}");
+    assert_eq!(replay.updates_relearned, 0, "{replay:#?}");
+    for process in [actor, learner, server] {
+        process.stop().expect_code(0);
+    }
+}
+
+/// A learner without a checkpoint of the run: where updates were learned it is rejected with a sentence, unless it is told to restart;
+/// a finished run admits nobody.
+#[test]
+fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
+    let system = system();
+    let (server, learner, client) = between_checkpoints(&system, "");
+    learner.signal(Signal::SIGKILL);
+    learner.wait();
+    let stranger = |flags: &str| {
+        let connect = system.endpoint();
+        format!("learner --connect {connect} --run-dir elsewhere {flags}")
+    };
     system
-        .run(&format!(
-            "learner --stay --connect {} --run-dir run",
-            system.endpoint()
-        ))
+        .run(&stranger(""))
         .expect_code(1)
-        .expect_said(&format!(
-            "start the replay server with --after-updates {saved}"
-        ));
+        .expect_said("and the learner has no checkpoint of it: start the learner with the --run-dir that holds its checkpoints");
+    let before = client.replay().unwrap();
+    assert!(before.updates > 75, "{before:#?}");
+    let restarted = system.start(&stranger("--stay --restart"));
+    let replay = client.wait_for_replay("updates that are learned again", |replay| {
+        replay.updates_relearned > 75
+    });
+    assert!(replay.rows_unlearned >= 16 * 75, "{replay:#?}");
+    restarted.stop().expect_code(0);
+    server.stop().expect_code(0);
+    drop(client);
+
+    let server = system.start_replay_server(&format!("--agent c51 {SHORT}"));
+    let connect = system.endpoint();
+    let learner = system.start(&format!("learner --connect {connect} --run-dir short"));
+    let actor = system.start_actor(0);
+    let client = system.connect();
+    let replay = client.wait_for_replay("the run's end", |replay| replay.learner_finished);
+    assert_eq!(replay.updates, 540);
+    system
+        .run(&stranger(""))
+        .expect_code(1)
+        .expect_said("the run is finished, with 540 updates");
+    learner.wait().expect_code(0);
+    actor.wait().expect_code(0);
     server.stop().expect_code(0);
 }

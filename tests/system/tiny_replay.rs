@@ -35,6 +35,7 @@ pub(crate) fn config(transitions: u64) -> Config {
         warmup_transitions: 0,
         slack_transitions: transitions,
         transitions_max: None,
+        since: None,
         reproduced_bug: None,
     }
 }

@@ -9,7 +9,7 @@ use std::{
 };
 
 use anyhow::{Context, bail, ensure};
-use driml_protocol::{Batch, BatchRequest, BufferPool, InsertReply, RequestId};
+use driml_protocol::{Batch, BatchRequest, BufferPool, InsertReply, Learned, RequestId};
 use nix::fcntl::{PosixFadviseAdvice, posix_fadvise};
 
 use crate::{
@@ -172,6 +172,7 @@ fn ask_one_by_one(run: &mut Run, effort: &Effort) -> anyhow::Result<Vec<f64>> {
             id,
             rows: run.learner.learner.batch_size,
             shared_memory: true,
+            learned: Learned::default(),
             other_shards: None,
         };
         id = id.next();

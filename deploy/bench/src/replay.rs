@@ -16,7 +16,7 @@ use driml_launch::{
 };
 use driml_learner::{
     LearnerConfig,
-    remote::batch_source::{BatchSource, Next, Requests},
+    remote::batch_source::{BatchSource, Counters, Next, Requests, Served},
 };
 use driml_protocol::{
     BufferPool, Keys, RunClient, Shutdown, join,
@@ -287,10 +287,11 @@ impl Run {
                 shared_memory: transport.shared_memory,
                 unreachable_max: ANSWER_MAX,
             },
+            &Counters::at_start(1),
             &shutdown,
         )?;
         let rate = effort.rate_overall(|| match source.next(ANSWER_MAX)? {
-            Next::Batch(batch) => {
+            Next::Batch(Served { batch, .. }) => {
                 let planes = [batch.states_t(), batch.states_k(), batch.states_n()];
                 black_box(planes.map(|plane| touched(&plane)));
                 Ok(())

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use driml_protocol::{
-    ActorJoin, Alive, LearnerJoin, RunClient, Shutdown, WeightsHeader, WeightsUpload, join,
+    ActorJoin, Alive, LearnerJoin, RunClient, Shutdown, Tally, WeightsHeader, WeightsUpload, join,
 };
 use zenoh::liveliness::LivelinessToken;
 
@@ -39,7 +39,11 @@ pub(super) fn join_as_learner(client: &RunClient) -> anyhow::Result<LivelinessTo
     let alive = alive(client, Alive::learner(LEARNER))?;
     let join = LearnerJoin {
         learner: LEARNER,
-        rows_sampled: 0,
+        run: LEARNER,
+        updates: 0,
+        tally: Tally::default(),
+        other_shards: Tally::default(),
+        restart: false,
     };
     join::as_learner(client, join, &Shutdown::default())?
         .context("nobody told this client to stop")?;

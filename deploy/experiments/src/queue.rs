@@ -13,7 +13,7 @@ use std::{
 use anyhow::Context;
 use driml_launch::{
     managed_process::exit_with_this_process,
-    resume,
+    resume::{self, Found},
     run_folder::{Progress as RunProgress, progress as how_far},
 };
 use driml_machine::{
@@ -261,7 +261,11 @@ impl Queue {
             return Ok(false);
         }
         match resume::find(&folder, &Flags::default(), &Machine::this()) {
-            Ok(_) => {
+            Ok(Found::Nothing(sentence)) => {
+                progress.line(&sentence);
+                Ok(false)
+            }
+            Ok(Found::Resumed(_)) => {
                 progress.line(&format!("{} goes on from its checkpoint", folder.display()));
                 Ok(true)
             }

@@ -55,7 +55,8 @@ pub fn describe(
         max.saturating_add(held * COMPRESSED_FIELDS_BYTES)
     });
     let bytes = compressed.min(held * replay_bytes_each(run));
-    let left = 1.0 - resume_point.updates as f64 / config.updates().max(1) as f64;
+    let done = resume_point.updates as f64 / config.updates().max(1) as f64;
+    let left = (1.0 - done).max(0.0);
     let processes = if lockstep {
         "one, all parts in lockstep".into()
     } else {

@@ -12,6 +12,7 @@ use anyhow::Context;
 use driml_envs::WorldConfig;
 use driml_learner::checkpoint::{self, CheckpointError};
 use driml_machine::{error::usage, resources::Machine};
+use driml_replay_server::Since;
 use driml_settings::{
     config::RunConfig,
     resolve::{Flags, Source, resolve},
@@ -98,6 +99,15 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// How a run is resumed.
+#[derive(Debug)]
+pub enum Found {
+    /// Nothing is left to do; a sentence that says so, and what else can be done.
+    Nothing(String),
+    /// Something is, or the run has all its updates and did not come to its end.
+    Resumed(Box<Resumed>),
+}
+
 /// How a run goes on.
 #[derive(Debug)]
 pub struct Resumed {
@@ -105,15 +115,15 @@ pub struct Resumed {
     pub config: RunConfig,
     /// From where.
     pub point: ResumePoint,
-    /// All its parts are in one process, in a fixed order.
+    /// All its processes are one, in a fixed order.
     pub lockstep: bool,
 }
 
 /// The settings with which the run in `folder` goes on, and from which point.
 ///
 /// # Errors
-/// A folder that is no run's, settings that cannot work, no checkpoint, nothing left to do, a run that is still going on.
-pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Result<Resumed> {
+/// A folder that is no run's, settings that cannot work, no checkpoint, a run that is still going on.
+pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Result<Found> {
     let path = folder.config();
     let name = path.display().to_string();
     let text = std::fs::read_to_string(&path).map_err(|e| {
@@ -123,54 +133,59 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
     })?;
     // First, as a run that is still ending holds memory.
     wait_until_free(folder)?;
+    let before = RunConfig::parse(&name, &text)?;
     let flags = Flags {
-        reproduce_bug: RunConfig::parse(&name, &text)?.replay.reproduced_bug,
+        reproduce_bug: before.replay.reproduced_bug,
         ..flags.clone()
     };
-    let config = resolve(&Source::File(name, text), &flags, machine)?;
+    let mut config = resolve(&Source::File(name, text), &flags, machine)?;
     let checkpoints = folder.checkpoints();
     let all = checkpoint::list(&checkpoints).context("looking for checkpoints")?;
-    let Some((updates, newest)) = all.last() else {
+    let Some((_, newest)) = all.last() else {
         return Err(usage!(
-            "there is no checkpoint in {}: start the run anew, in another folder",
+            "there is no checkpoint in {}: start the run again, in another folder",
             checkpoints.display()
         )
         .into());
     };
-    let updates = *updates;
+    let (updates, progress) = checkpoint::progress(newest)?;
     let lockstep = is_in_lockstep(newest)?;
     if !lockstep && !config.world.is_resumable() {
         return Err(usage!(
-            "the ghosts of the run in {} change as episodes pass, and a checkpoint does not hold how far they are: start it anew",
+            "the ghosts of the run in {} change as episodes pass, and a checkpoint does not hold how far they are: start it again",
             folder.display()
         )
         .into());
     }
-    // One that has all its updates and did not come to its end does so now.
-    if updates >= config.updates() && Summary::is_finished(folder) {
-        return Err(usage!(
-            "the run in {} is finished, {updates} updates for {} frames: to train on, add --frames with more than these",
-            folder.display(),
-            config.frames()
-        )
-        .into());
+    let (frames, rows) = (progress.frames(), progress.rows());
+    let has_other_pace = before.learner.batch_size != config.learner.batch_size
+        || before.replay.replay_ratio != config.replay.replay_ratio
+        || before.replay.warmup_transitions != config.replay.warmup_transitions;
+    if has_other_pace {
+        config.replay.since = Some(Since {
+            transitions: frames,
+            rows,
+            updates,
+        });
+    }
+    let is_complete = updates >= config.updates();
+    if is_complete && (config.frames() < frames || Summary::is_finished(folder)) {
+        let run = folder.display();
+        return Ok(Found::Nothing(format!(
+            "nothing is left to do: the run in {run} has done {updates} updates and {frames} frames.\n\
+             `driml evaluate {run}` plays it; `driml train --resume {run} --frames N` trains on, up to N frames"
+        )));
     }
     let replay_is_kept = lockstep || config.local.durable && folder.replay().is_dir();
     let point = ResumePoint {
         updates,
-        frames: match updates {
-            0 => 0,
-            _ => {
-                let rows = updates as f64 * f64::from(config.learner.batch_size);
-                let after_warmup = (rows / config.replay.replay_ratio).ceil() as u64;
-                config.replay.warmup_transitions + after_warmup
-            }
-        },
+        rows,
+        frames,
         replay_is_kept: replay_is_kept && (lockstep || updates > 0),
     };
-    Ok(Resumed {
+    Ok(Found::Resumed(Box::new(Resumed {
         config,
         point,
         lockstep,
-    })
+    })))
 }

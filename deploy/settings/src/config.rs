@@ -222,11 +222,15 @@ impl RunConfig {
         self.replay.transitions_max.unwrap_or(u64::MAX)
     }
 
-    /// Updates that belong to all transitions, at the replay ratio.
+    /// Updates of the whole run, at the replay ratio: those done before it was resumed with other settings, and those that the rest of
+    /// its transitions allow.
     pub fn updates(&self) -> u64 {
-        let after = self.frames().saturating_sub(self.replay.warmup_transitions);
-        (after as f64 * self.replay.replay_ratio / f64::from(self.learner.batch_size)).floor()
-            as u64
+        let (transitions, before) = match self.replay.since {
+            Some(since) => (since.transitions, since.updates),
+            None => (self.replay.warmup_transitions, 0),
+        };
+        let rows = self.frames().saturating_sub(transitions) as f64 * self.replay.replay_ratio;
+        before + (rows / f64::from(self.learner.batch_size)) as u64
     }
 
     /// Checks what each part checks of its own table, then what spans two tables.

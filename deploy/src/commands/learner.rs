@@ -14,9 +14,12 @@ pub(crate) struct LearnerArgs {
     /// Endpoint of the replay server, such as quic/10.0.0.1:7447; once for each of the run's replay shards
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) connect: Vec<String>,
-    /// Where checkpoints go: DIR/checkpoints
+    /// Where checkpoints go, DIR/checkpoints; a learner resumes from the newest one there
     #[arg(long, value_name = "DIR")]
     pub(crate) run_dir: PathBuf,
+    /// Begin again from the first update, where an earlier learner has learned and its checkpoints are lost
+    #[arg(long)]
+    pub(crate) restart: bool,
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
     #[command(flatten)]
@@ -42,6 +45,7 @@ pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
         namespace: args.join.namespace,
         run_dir: args.run_dir,
         device: args.on.device,
+        restart: args.restart,
         stay: args.until.stay,
     };
     clean_up_after(driml_learner::run(run, &shutdown))

@@ -22,10 +22,7 @@ pub(crate) struct ReplayServerArgs {
     /// Which of the run's --replay-shards this is
     #[arg(long, value_name = "I", default_value_t = 0)]
     pub(crate) shard: u32,
-    /// Go on after so many updates: those of the newest checkpoint in the learner's run folder
-    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=u64::from(u32::MAX)))]
-    pub(crate) after_updates: u64,
-    /// Keep the replay on disk in this folder, and go on with the one that is there: a server that died is started again with the
+    /// Keep the replay on disk in this folder, and resume with the one that is there: a server that died is started again with the
     /// same flags [default: in memory alone]
     #[arg(long, value_name = "DIR")]
     pub(crate) replay_dir: Option<PathBuf>,
@@ -66,7 +63,6 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
         credentials,
         namespace: args.join.namespace,
         shard: args.shard,
-        after_updates: args.after_updates,
         weights_bytes_max: config.weights_bytes()?,
         dir: args.replay_dir,
         stay: args.until.stay,

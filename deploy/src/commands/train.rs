@@ -7,7 +7,8 @@ use clap::Args;
 use driml_launch::{
     console::{self, print},
     endpoint::check_listening,
-    launcher, lockstep, plan, resume,
+    launcher, lockstep, plan,
+    resume::{self, Found},
     run_folder::RunFolder,
 };
 use driml_learner::DeviceName;
@@ -112,7 +113,10 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     }
     let (config, from, resume_point) = match &args.resume {
         Some(folder) => {
-            let found = resume::find(&RunFolder::new(folder), &args.run.over, &machine)?;
+            let found = match resume::find(&RunFolder::new(folder), &args.run.over, &machine)? {
+                Found::Nothing(sentence) => return print(&format!("{sentence}\n")),
+                Found::Resumed(found) => found,
+            };
             args.lockstep = found.lockstep;
             let from = format!("its checkpoint after {} updates", found.point.updates);
             (found.config, from, Some(found.point))

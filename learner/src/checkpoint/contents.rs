@@ -6,10 +6,12 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::affinity::AffinityEstimator;
+use crate::{
+    affinity::AffinityEstimator,
+    progress::{COUNT_MAX, Progress},
+};
 
-/// 2: CURL's key encoder has a file of its own. All else is as in 1.
-pub(super) const FORMAT: u32 = 2;
+pub(super) const FORMAT: u32 = 3;
 /// The online network.
 pub(super) const ONLINE: &str = "online.safetensors";
 /// The target network.
@@ -24,8 +26,6 @@ pub(super) const COMPANION: &str = "companion.bin";
 pub(super) const STATE: &str = "state.json";
 /// The SHA-256 of [`STATE`], which has those of the other files.
 pub(super) const STATE_SUM: &str = "state.json.sha256";
-/// Largest count in a state: no run comes near it, and what is added to counts cannot overflow.
-const COUNT_MAX: u64 = 1 << 53;
 
 /// The contents of `state.json`: all of a checkpoint that is not a tensor.
 #[derive(Debug, Serialize, Deserialize)]
@@ -36,6 +36,7 @@ pub(super) struct StateFile {
     pub(super) updates: u64,
     pub(super) adam_step: u64,
     pub(super) weights_version: u64,
+    pub(super) progress: Progress,
     pub(super) rng: ChaCha8Rng,
     pub(super) affinity: Option<AffinityEstimator>,
     /// SHA-256 of the other files, by name.
@@ -54,9 +55,8 @@ impl StateFile {
     /// Reads the file's text and checks what it holds.
     pub(super) fn read(text: &[u8]) -> Result<Self, String> {
         let state: Self = serde_json::from_slice(text).map_err(|e| e.to_string())?;
-        if !(1..=FORMAT).contains(&state.format) {
-            let format = state.format;
-            return Err(format!("its format is {format}, not 1 to {FORMAT}"));
+        if state.format != FORMAT {
+            return Err(format!("its format is {}, not {FORMAT}", state.format));
         }
         state.check_valid()?;
         Ok(state)
@@ -72,6 +72,12 @@ impl StateFile {
             if count > COUNT_MAX {
                 return Err(format!("{name} is {count}, more than {COUNT_MAX}"));
             }
+        }
+        if !self.progress.is_sane() {
+            return Err(format!(
+                "{:?} are counts that no run reaches",
+                self.progress
+            ));
         }
         let valid = self.affinity.as_ref().map(AffinityEstimator::check_valid);
         valid.transpose().map_err(|why| why.to_string())?;

@@ -1,9 +1,10 @@
 //! What a checkpoint's networks say of themselves in safetensors' metadata, so that a file alone can be loaded elsewhere.
-//! Nothing of this program reads it: a checkpoint without it is as good.
+//! This program reads it to say which setting of a checkpoint differs; one without it is as good.
 
 use driml_model::{InputSize, ModelConfig};
 use driml_protocol::RunSpec;
 use serde::Serialize;
+use serde_json::Value;
 
 /// The metadata's one key.
 pub(super) const KEY: &str = "driml";
@@ -51,4 +52,29 @@ pub fn describe(run: &RunSpec, model: &ModelConfig, input: &InputSize) -> String
         run,
     };
     serde_json::to_string(&description).expect("plain values are JSON")
+}
+
+/// Sizes of the network in a safetensors file, as its description says; none if it has none.
+pub(super) fn model_in(safetensors: &[u8]) -> Option<Value> {
+    let (_, header) = safetensors::SafeTensors::read_metadata(safetensors).ok()?;
+    let text = header.metadata().as_ref()?.get(KEY)?;
+    let description: Value = serde_json::from_str(text).ok()?;
+    description.get("model").cloned()
+}
+
+/// The path of the first value that differs, under `name`, and both values.
+pub(super) fn difference(
+    name: &str,
+    one: &Value,
+    other: &Value,
+) -> Option<(String, String, String)> {
+    if one == other {
+        return None;
+    }
+    if let (Value::Object(ones), Value::Object(others)) = (one, other) {
+        let keys = ones.keys().chain(others.keys());
+        let at = |key: &String| difference(&format!("{name}.{key}"), &one[key], &other[key]);
+        return keys.into_iter().find_map(at);
+    }
+    Some((name.into(), one.to_string(), other.to_string()))
 }

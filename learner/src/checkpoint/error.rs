@@ -44,12 +44,21 @@ pub enum CheckpointError {
         /// Hash of this run.
         expected: String,
     },
-    /// The checkpoint was written before its agent was what it is now.
+    /// The checkpoint's network is another one.
     #[error(
-        "{} was saved by an earlier version, in which CURL's keys came from the target network; now a moving average of its \
-         own encodes them, which this checkpoint lacks: go on with the earlier version, or begin anew in another folder", .0.display()
+        "the checkpoint {} was saved with {key} = {found}, this run has {key} = {expected}: \
+         resume with the settings it was made with, or choose another folder", folder.display()
     )]
-    WithoutKeyEncoder(PathBuf),
+    OtherModel {
+        /// The folder of the checkpoint.
+        folder: PathBuf,
+        /// The setting that differs.
+        key: String,
+        /// Its value in the checkpoint.
+        found: String,
+        /// Its value in this run.
+        expected: String,
+    },
     /// The learner's state is not one to go on from.
     #[error("nothing is saved, and the newest checkpoint stays the newest: {0}")]
     Unsound(UpdateError),

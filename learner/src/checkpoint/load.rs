@@ -10,12 +10,14 @@ use super::{
     contents::{
         COMPANION, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of, sha256_of,
     },
+    description,
     error::{CheckpointError, damaged},
     folder::{list, read},
 };
 use crate::{
     affinity::AffinityEstimator,
     agent::{Agent, NetworkParameters},
+    progress::Progress,
     settings::LearnerSettings,
 };
 
@@ -30,6 +32,8 @@ pub struct Restored {
     pub rng: ChaCha8Rng,
     /// Newest version of the weights that had been published.
     pub weights_version: u64,
+    /// What the run had done.
+    pub progress: Progress,
 }
 
 /// Loads the newest checkpoint in `folder` onto the device of `compute`; `None` if there is none. A damaged one is an error, not skipped.
@@ -71,9 +75,7 @@ pub fn load(
         });
     }
     let has_key = settings.auxiliary()?.key_tau().is_some();
-    if state.format == 1 && has_key {
-        return Err(CheckpointError::WithoutKeyEncoder(path.to_owned()));
-    }
+    check_model(path, model)?;
     let tensors = |name: &str| read_file(path, &state, name);
     let parameters = |model: &ModelConfig, part: fn(&str) -> bool, name: &str| {
         let loaded = Parameters::load_part(model, part, &tensors(name)?, &compute.device);
@@ -97,7 +99,34 @@ pub fn load(
         affinity: state.affinity,
         rng: state.rng,
         weights_version: state.weights_version,
+        progress: state.progress,
     })
+}
+
+/// Checks that a checkpoint's network has the sizes of `model`, as far as its description says.
+fn check_model(path: &Path, model: &ModelConfig) -> Result<(), CheckpointError> {
+    let Some(saved) = description::model_in(&read(&path.join(ONLINE))?) else {
+        return Ok(());
+    };
+    let ours = serde_json::to_value(model).unwrap_or_default();
+    match description::difference("model", &saved, &ours) {
+        None => Ok(()),
+        Some((key, found, expected)) => Err(CheckpointError::OtherModel {
+            folder: path.to_owned(),
+            key,
+            found,
+            expected,
+        }),
+    }
+}
+
+/// Updates of the checkpoint at `path`, and what the run had done by then; no tensor is read.
+///
+/// # Errors
+/// A file that is missing or is not what was written.
+pub fn progress(path: &Path) -> Result<(u64, Progress), CheckpointError> {
+    let state = read_state(path)?;
+    Ok((state.updates, state.progress))
 }
 
 /// What whoever drove the learner kept with the checkpoint at `path`; none if it kept nothing.

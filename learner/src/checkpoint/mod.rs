@@ -12,5 +12,5 @@ pub use contents::check_state;
 pub use description::describe;
 pub use error::CheckpointError;
 pub use folder::{FOLDER, list, lock};
-pub use load::{Restored, companion, load, load_latest};
+pub use load::{Restored, companion, load, load_latest, progress};
 pub use save::{RunState, save};

@@ -18,7 +18,7 @@ use super::{
     error::{CheckpointError, io_error},
     folder::{PREFIX, list, put_in_place, remove_if_there, sync, tidy, write_durably},
 };
-use crate::{affinity::AffinityEstimator, agent::Agent, error::UpdateError};
+use crate::{affinity::AffinityEstimator, agent::Agent, error::UpdateError, progress::Progress};
 
 /// What a checkpoint holds, borrowed for saving.
 #[derive(Clone, Copy, Debug)]
@@ -31,6 +31,8 @@ pub struct RunState<'a> {
     pub rng: &'a ChaCha8Rng,
     /// Newest version of the weights that was published.
     pub weights_version: u64,
+    /// What the run has done.
+    pub progress: &'a Progress,
     /// Hash of the run's specification.
     pub run_spec_hash: u64,
     /// What [`describe`](super::describe) says, for the networks' metadata.
@@ -87,6 +89,7 @@ fn write(aside: &Path, state: &RunState<'_>) -> Result<(), CheckpointError> {
         updates: agent.updates(),
         adam_step: agent.adam.step_count(),
         weights_version: state.weights_version,
+        progress: state.progress.clone(),
         rng: state.rng.clone(),
         affinity: state.affinity.cloned(),
         sha256,

@@ -2,15 +2,19 @@
 //! It does not reorder or keep batches: what arrives first is learned from first.
 
 use std::{
-    sync::{Arc, Mutex, PoisonError, mpsc},
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicU64, Ordering},
+        mpsc,
+    },
     thread::JoinHandle,
     time::{Duration, Instant},
 };
 
 use driml_protocol::{
-    Batch, BatchHeader, BatchReply, BatchRequest, BufferPool, PendingReply, ReplayStatus,
-    RequestId, RunClient, Seldom, Shutdown, Tally, Waiting, fault, join_within,
-    session::SessionError, shared_memory::Trust,
+    Batch, BatchReply, BatchRequest, BufferPool, Learned, PendingReply, ReplayStatus, RequestId,
+    RunClient, Seldom, Shutdown, Tally, Waiting, fault, join_within, session::SessionError,
+    shared_memory::Trust,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -19,6 +23,7 @@ use super::{
     error::BatchError,
     shards::{self, Count},
 };
+use crate::progress::{Progress, ServedPart};
 
 /// One request; the replay server answers within a second, if only to say that there is nothing yet.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
@@ -27,6 +32,8 @@ const RETRY_PAUSE: Duration = Duration::from_millis(200);
 
 /// Pause before shards that hold nothing are asked again.
 const LOOK_AGAIN: Duration = Duration::from_millis(50);
+/// How long the last batch is waited for once all transitions are in.
+const LAST_BATCH_MAX: Duration = Duration::from_secs(30);
 /// How long the threads may take to end.
 const THREADS_END_MAX: Duration = Duration::from_secs(2);
 
@@ -45,9 +52,55 @@ pub struct Requests {
     pub unreachable_max: Duration,
 }
 
+/// How far the learner is, which it tells with each request.
+#[derive(Debug)]
+pub struct Counters {
+    /// Updates done.
+    pub updates: AtomicU64,
+    /// Updates in the newest checkpoint.
+    pub saved_updates: AtomicU64,
+    /// Rows received from each shard.
+    received: Vec<AtomicU64>,
+}
+
+impl Counters {
+    /// Those of a learner after so many updates, all of which are saved.
+    pub fn of(updates: u64, progress: &Progress) -> Arc<Self> {
+        let shards = progress.shards.iter();
+        Arc::new(Self {
+            updates: updates.into(),
+            saved_updates: updates.into(),
+            received: shards.map(|it| it.rows_sampled.into()).collect(),
+        })
+    }
+
+    /// Those of a learner that has learned nothing.
+    pub fn at_start(shards: usize) -> Arc<Self> {
+        let mut progress = Progress::default();
+        progress.spread_over(shards);
+        Self::of(0, &progress)
+    }
+
+    fn learned(&self, shard: usize) -> Learned {
+        Learned {
+            updates: self.updates.load(Ordering::Acquire),
+            saved_updates: self.saved_updates.load(Ordering::Acquire),
+            rows_received: self.received[shard].load(Ordering::Acquire),
+        }
+    }
+}
+
+/// A batch, and where its rows are from.
+pub struct Served {
+    /// The batch.
+    pub batch: Batch,
+    /// Its rows by shard.
+    pub parts: Vec<ServedPart>,
+}
+
 /// What a fetching thread says.
 enum Fetched {
-    Batch(Batch),
+    Batch(Served),
     Finished,
     Failed(BatchError),
 }
@@ -66,7 +119,7 @@ pub struct BatchSource {
 /// What the learner gets when it asks for its next batch.
 pub enum Next {
     /// A batch to learn from.
-    Batch(Batch),
+    Batch(Served),
     /// No batch came within the time given; ask again. The replay server says who waits for whom.
     NotYet(Waiting),
     /// The run is over: no further batch will come.
@@ -81,6 +134,7 @@ impl BatchSource {
     pub fn start(
         clients: &[RunClient],
         requests: Requests,
+        counters: &Arc<Counters>,
         shutdown: &Shutdown,
     ) -> std::io::Result<Self> {
         let (sender, fetched) = mpsc::sync_channel(0);
@@ -98,6 +152,7 @@ impl BatchSource {
                 id: RequestId::first(rng.random()),
                 rng,
                 requests,
+                counters: counters.clone(),
                 pool: pool.clone(),
                 trust: Trust::default(),
                 said: Seldom::default(),
@@ -134,7 +189,7 @@ impl BatchSource {
         while self.fetching > 0 {
             let left = deadline.saturating_duration_since(Instant::now());
             match self.fetched.recv_timeout(left) {
-                Ok(Fetched::Batch(batch)) => return Ok(Next::Batch(batch)),
+                Ok(Fetched::Batch(served)) => return Ok(Next::Batch(served)),
                 Ok(Fetched::Finished) => self.fetching -= 1,
                 Ok(Fetched::Failed(e)) => return Err(e),
                 Err(mpsc::RecvTimeoutError::Timeout) => {
@@ -164,6 +219,12 @@ struct PartialBatch {
     /// The request for a part that each shard gets next.
     ids: Vec<RequestId>,
     parts: Vec<Batch>,
+    /// The shard of each part.
+    from: Vec<ServedPart>,
+    /// All transitions of the run are in.
+    all_in: bool,
+    /// When the last batch was whole.
+    whole_at: Instant,
 }
 
 impl PartialBatch {
@@ -174,6 +235,9 @@ impl PartialBatch {
             shares: vec![0.0; shards],
             ids: vec![RequestId::first(rand::random()); shards],
             parts: Vec::new(),
+            from: Vec::new(),
+            all_in: false,
+            whole_at: Instant::now(),
         }
     }
 }
@@ -185,6 +249,7 @@ struct Fetcher {
     id: RequestId,
     rng: ChaCha8Rng,
     requests: Requests,
+    counters: Arc<Counters>,
     pool: BufferPool,
     /// Whether batches may come through shared memory.
     trust: Trust,
@@ -223,7 +288,8 @@ impl Fetcher {
                     continue;
                 }
             };
-            if let Fetched::Batch(Batch { header, .. }) = &fetched {
+            if let Fetched::Batch(Served { batch, .. }) = &fetched {
+                let header = &batch.header;
                 let (newest, oldest) = header.weights_versions;
                 tracing::debug!(
                     "a batch came: {} rows acted by weights {oldest} to {newest}",
@@ -248,11 +314,25 @@ impl Fetcher {
         let answer = self.answer(asked)?;
         self.id = self.id.next();
         Ok(match answer {
-            Answer::Batch(batch) => Some(Fetched::Batch(batch)),
+            Answer::Batch(batch) => {
+                let parts = vec![self.received(0, &batch)];
+                Some(Fetched::Batch(Served { batch, parts }))
+            }
             Answer::Wait => None,
             Answer::Finished => Some(Fetched::Finished),
             Answer::Refused(why) => Some(Fetched::Failed(BatchError::Refused(why))),
         })
+    }
+
+    /// Counts what has come from a shard.
+    fn received(&self, shard: usize, part: &Batch) -> ServedPart {
+        let rows = part.header.rows;
+        self.counters.received[shard].fetch_add(rows.into(), Ordering::AcqRel);
+        ServedPart {
+            shard,
+            rows,
+            inserted: part.header.tally.inserted,
+        }
     }
 
     /// One batch, put together from what the shards give. One is put together at a time: each shard is told what the others
@@ -260,25 +340,28 @@ impl Fetcher {
     fn fetch_from_shards(&mut self) -> Result<Option<Fetched>, BatchError> {
         let partial = self.partial.clone();
         let mut partial = partial.lock().unwrap_or_else(PoisonError::into_inner);
+        if partial.parts.is_empty() && partial.pending.iter().all(|&rows| rows == 0) {
+            self.recount(&mut partial, |count, now| count.is_old(now))?;
+            match shards::split(self.requests.rows, &partial.counts, &mut self.rng) {
+                Some(split) => {
+                    partial.pending = split;
+                    partial.shares = shards::shares(&partial.counts);
+                }
+                None => {
+                    self.shutdown.wait_timeout(LOOK_AGAIN);
+                    return Ok(None);
+                }
+            }
+        }
         let PartialBatch {
             counts,
             pending,
             shares,
             ids,
             parts,
+            from,
+            ..
         } = &mut *partial;
-        if parts.is_empty() && pending.iter().all(|&rows| rows == 0) {
-            match shards::split(self.requests.rows, counts, &mut self.rng) {
-                Some(split) => {
-                    *pending = split;
-                    *shares = shards::shares(counts);
-                }
-                None => {
-                    self.shutdown.wait_timeout(LOOK_AGAIN);
-                    return self.recount(counts).map(|()| None);
-                }
-            }
-        }
         let mut asked = Vec::new();
         for shard in (0..pending.len()).filter(|&shard| pending[shard] > 0) {
             let other_shards = shards::other_shards(counts, pending, shard);
@@ -299,15 +382,14 @@ impl Fetcher {
             ids[shard] = ids[shard].next();
             match answer {
                 Answer::Batch(mut part) => {
-                    let BatchHeader {
-                        tally,
-                        held,
-                        origin,
-                        ..
-                    } = part.header;
-                    counts[shard] = Count { tally, held };
+                    counts[shard] = Count {
+                        tally: part.header.tally,
+                        held: part.header.held,
+                        heard: Some(Instant::now()),
+                    };
+                    from.push(self.received(shard, &part));
                     pending[shard] = 0;
-                    if origin.is_some() {
+                    if part.header.origin.is_some() {
                         part.scale_probabilities(shares[shard] as f32);
                     }
                     parts.push(part);
@@ -325,18 +407,42 @@ impl Fetcher {
         if pending.iter().all(|&rows| rows == 0) {
             let header = Batch::merged_header(parts).ok_or(BatchError::DifferentShards)?;
             let memory = self.pool.take_own(header.payload_bytes());
-            let whole = Batch::merge(parts, memory);
+            let batch = Batch::merge(parts, memory);
             parts.clear();
-            return Ok(Some(Fetched::Batch(whole)));
+            let parts = std::mem::take(from);
+            partial.whole_at = Instant::now();
+            return Ok(Some(Fetched::Batch(Served { batch, parts })));
         }
-        self.recount(counts)?;
+        self.recount(&mut partial, |_, _| true)?;
         // A shard that has given its part knows of the others' transitions what they had then: it may be wrong about the end.
-        Ok((finished && parts.is_empty()).then_some(Fetched::Finished))
+        let is_over = finished && partial.parts.is_empty();
+        if !is_over && partial.all_in && partial.whole_at.elapsed() > LAST_BATCH_MAX {
+            let left = partial.pending.iter().enumerate();
+            let left = left.filter(|(_, rows)| **rows > 0);
+            let left: Vec<_> = left
+                .map(|(shard, rows)| format!("{rows} rows of shard {shard}"))
+                .collect();
+            tracing::warn!(
+                "all transitions are in, and the last batch lacks {} since {} s: it is left out",
+                left.join(" and "),
+                LAST_BATCH_MAX.as_secs()
+            );
+            return Ok(Some(Fetched::Finished));
+        }
+        Ok(is_over.then_some(Fetched::Finished))
     }
 
-    /// Asks all shards what they have counted.
-    fn recount(&self, counts: &mut [Count]) -> Result<(), BatchError> {
-        for (client, count) in self.clients.iter().zip(counts) {
+    /// Asks the shards for which `is_due` says so what they have counted.
+    fn recount(
+        &self,
+        partial: &mut PartialBatch,
+        is_due: impl Fn(&Count, Instant) -> bool,
+    ) -> Result<(), BatchError> {
+        let now = Instant::now();
+        for (client, count) in self.clients.iter().zip(&mut partial.counts) {
+            if !is_due(count, now) {
+                continue;
+            }
             let status: ReplayStatus = client.fetch(REQUEST_TIMEOUT).map_err(BatchError::Status)?;
             *count = Count {
                 tally: Tally {
@@ -344,7 +450,9 @@ impl Fetcher {
                     rows_sampled: status.rows_sampled,
                 },
                 held: status.transitions_held,
+                heard: Some(Instant::now()),
             };
+            partial.all_in |= status.finished;
         }
         Ok(())
     }
@@ -362,6 +470,7 @@ impl Fetcher {
             id,
             rows,
             shared_memory: self.requests.shared_memory && self.trust.ask(),
+            learned: self.counters.learned(shard),
             other_shards,
         };
         let client = &self.clients[shard];

@@ -3,19 +3,19 @@
 
 use std::{
     path::{Path, PathBuf},
-    sync::Arc,
+    sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
 };
 
 use anyhow::Context;
 use driml_model::DeviceName;
 use driml_protocol::{
-    Activity, BatchHeader, Keys, Life, Shutdown, reporter, shared_memory, tls::Credentials,
-    whole_file,
+    Activity, BatchHeader, Keys, Life, ReplayStatus, Shutdown, reporter, shared_memory,
+    tls::Credentials, whole_file,
 };
 
 use super::{
-    batch_source::{BatchSource, Next, Requests},
+    batch_source::{BatchSource, Counters, Next, Requests, Served},
     publish::Outlets,
     shards::Shards,
 };
@@ -25,6 +25,8 @@ use crate::{
     learner::{Learner, LearnerError},
 };
 
+/// How long a replay server may take to say what it has stored in the end.
+const LAST_COUNT_MAX: Duration = Duration::from_secs(1);
 /// How long a learner that was told to stop stays to be asked for its last status.
 const LAST_WORD_MAX: Duration = Duration::from_secs(3);
 /// How long a batch may take before a person hears what it is waited for.
@@ -45,6 +47,8 @@ pub struct RunArgs {
     pub run_dir: PathBuf,
     /// The device on which updates are computed.
     pub device: DeviceName,
+    /// Begin the run again from the first update, where an earlier learner has learned and this one has no checkpoint of it.
+    pub restart: bool,
     /// Stay when the run is over, to be asked, until `shutdown`.
     pub stay: bool,
 }
@@ -85,24 +89,21 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let sampling = config.sampling;
     let mut learner = Learner::resume(config, &compute, &folder)?;
     let updates = learner.updates();
-    let after_updates = shards.after_updates;
     anyhow::ensure!(
-        updates >= after_updates,
-        "the replay server goes on after {after_updates} updates, the newest checkpoint in {} has {updates}: start the replay \
-         server with --after-updates {updates}, or choose the folder of the run",
-        folder.display(),
-    );
-    let counted = shards.updates_counted(rows);
-    anyhow::ensure!(
-        updates <= counted,
-        "the replay server has served the batches of {counted} updates, the newest checkpoint in {} has {updates}: to go on with \
-         that run, start the replay server with --after-updates {updates}; to begin another, choose another folder",
+        !args.restart || updates == 0,
+        "--restart begins again from the first update, and {} holds a checkpoint after {updates}: choose an empty --run-dir",
         folder.display(),
     );
     let spec_hash = learner.spec_hash();
-    let learned = updates.saturating_mul(rows.into());
     let clients = shards.clients(&keys, spec_hash);
-    let part_in_run = shards.take_part(&clients, requests.learner, learned, shutdown)?;
+    let progress = learner.progress_mut();
+    progress.spread_over(clients.len());
+    if progress.run == 0 {
+        progress.run = rand::random();
+    }
+    let progress = (updates, &*progress);
+    let part_in_run =
+        shards.take_part(&clients, requests.learner, progress, args.restart, shutdown)?;
     let Some(membership) = part_in_run else {
         return Ok(());
     };
@@ -123,13 +124,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         activity.clone(),
         shutdown.clone(),
     )?;
-    let mut batches = BatchSource::start(&clients, requests, shutdown)?;
+    let counters = Counters::of(updates, learner.progress());
+    let mut batches = BatchSource::start(&clients, requests, &counters, shutdown)?;
     tracing::info!(
         "learning on {} from batches of {rows} rows, run {spec_hash:016x}",
         args.device,
     );
 
-    let mut saving = Saving::new(folder);
+    let mut saving = Saving::new(folder, counters.clone());
     let learned = learn(
         &mut learner,
         &mut batches,
@@ -142,6 +144,15 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         tracing::error!("ends after {} updates: {e:#}", learner.updates());
     }
     activity.begin("saves its last checkpoint");
+    // What was stored since the last batch counts too.
+    for (shard, client) in clients.iter().enumerate() {
+        match client.fetch::<ReplayStatus>(LAST_COUNT_MAX) {
+            Ok(status) => learner
+                .progress_mut()
+                .note_inserted(shard, status.transitions_inserted),
+            Err(e) => tracing::debug!("the last count of shard {shard}: {e}"),
+        }
+    }
     let saved = saving.finish(&learner);
     if learned.is_ok() && !learner.publication_is_due() {
         outlets.publish(learner.next_weights()?);
@@ -155,7 +166,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     }
     outlets.wait_until_heard(LAST_WORD_MAX);
     if !shutdown.is_set() {
-        reporter::say_finished(&clients, Life::Learner(requests.learner));
+        let updates = learner.updates();
+        reporter::say_finished(&clients, Life::Learner(requests.learner), updates);
     }
     drop(membership);
     let closed = shards.close();
@@ -178,8 +190,8 @@ fn learn(
     // A wait is said after some seconds, then ever more seldom.
     let (mut waiting_since, mut said_next) = (Instant::now(), SILENT_MAX);
     while !shutdown.is_set() {
-        let batch = match batches.next(TICK)? {
-            Next::Batch(batch) => batch,
+        let Served { batch, parts } = match batches.next(TICK)? {
+            Next::Batch(served) => served,
             Next::NotYet(waiting) => {
                 activity.begin("waits for a batch");
                 let since = waiting_since.elapsed();
@@ -196,6 +208,9 @@ fn learn(
         said_next = SILENT_MAX;
         let started = Instant::now();
         let report = learner.update(&batch)?;
+        learner.progress_mut().note(&parts);
+        let counters = &saving.counters;
+        counters.updates.store(learner.updates(), Ordering::Release);
         // Numbered by updates, which no life of the learner counts backwards.
         let (by, number) = (outlets.learner(), learner.updates());
         if let Some(priorities) = batch.priority_update(by, number, &report.row_kls) {
@@ -225,6 +240,7 @@ fn learn(
 /// cannot be saved in the end is an error.
 struct Saving {
     folder: PathBuf,
+    counters: Arc<Counters>,
     /// Updates in the newest checkpoint that was saved here.
     saved: Option<u64>,
     /// The first failure since then.
@@ -232,9 +248,10 @@ struct Saving {
 }
 
 impl Saving {
-    const fn new(folder: PathBuf) -> Self {
+    const fn new(folder: PathBuf, counters: Arc<Counters>) -> Self {
         Self {
             folder,
+            counters,
             saved: None,
             failed: None,
         }
@@ -244,6 +261,8 @@ impl Saving {
         match learner.save(&self.folder) {
             Ok(()) => {
                 self.saved = Some(learner.updates());
+                let saved = &self.counters.saved_updates;
+                saved.store(learner.updates(), Ordering::Release);
                 self.failed = None;
             }
             Err(e) => {

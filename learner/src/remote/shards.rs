@@ -1,6 +1,8 @@
 //! The replay's shards as the learner sees them: joining them all, and which rows of a batch come from which.
 //! It fetches nothing: `batch_source` does.
 
+use std::time::{Duration, Instant};
+
 use anyhow::{Context, ensure};
 use driml_protocol::{
     Alive, Hello, Keys, LearnerJoin, RunClient, Shutdown, Tally, join,
@@ -10,14 +12,16 @@ use driml_protocol::{
 use rand::Rng;
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
+use crate::progress::Progress;
+
+/// Age up to which a shard's counts are used, and that of one that holds nothing.
+const AGE_MAX: Duration = Duration::from_millis(500);
+const EMPTY_AGE_MAX: Duration = Duration::from_millis(50);
+
 /// Sessions with all shards of a run, in the order of the endpoints, and what the run's settings are.
 pub(crate) struct Shards {
     pub(crate) sessions: Vec<Session>,
     pub(crate) config_toml: String,
-    /// Updates after which the run goes on; 0 in a run from its start.
-    pub(crate) after_updates: u64,
-    /// Rows that each shard has served.
-    served: Vec<u64>,
 }
 
 /// The learner's part in a run, which ends when this is dropped.
@@ -53,17 +57,10 @@ impl Shards {
             sessions.push(session);
             hellos.push(hello);
         }
-        let Hello {
-            config_toml,
-            after_updates,
-            ..
-        } = one_run(connect, &hellos)?.clone();
-        let served = hellos.iter().map(|hello| hello.tally.rows_sampled);
+        let config_toml = one_run(connect, &hellos)?.config_toml.clone();
         Ok(Some(Self {
-            served: served.collect(),
             sessions,
             config_toml,
-            after_updates,
         }))
     }
 
@@ -73,36 +70,35 @@ impl Shards {
         self.sessions.iter().map(client).collect()
     }
 
-    /// Updates for which rows were served, of batches of `rows` rows.
-    pub(crate) fn updates_counted(&self, rows: u32) -> u64 {
-        self.served.iter().sum::<u64>() / u64::from(rows.max(1))
-    }
-
-    /// Takes part as the run's one learner, `learner`, that has learned from `rows` rows: what was served beyond them, to one
-    /// that died, does not count any more. `None` if told to stop before.
+    /// Takes part as the run's one learner, `learner`, which is after `updates` and has counted `progress`; `restart` begins the run
+    /// again. `None` if told to stop before.
     ///
     /// # Errors
-    /// Another learner takes part, or a replay server refuses.
+    /// Another learner takes part, or a replay server rejects this one.
     pub(crate) fn take_part(
         &self,
         clients: &[RunClient],
         learner: u64,
-        rows: u64,
+        (updates, progress): (u64, &Progress),
+        restart: bool,
         shutdown: &Shutdown,
     ) -> anyhow::Result<Option<Membership>> {
         let mut membership = Membership {
             weights_version: 0,
             _alive: Vec::new(),
         };
-        let learned = learned(&self.served, rows);
-        for (client, rows_sampled) in clients.iter().zip(learned) {
+        for (shard, client) in clients.iter().enumerate() {
             // Before it joins, so that no other learner can take its place from then on.
             let alive = client.declare_alive(Alive::learner(learner));
             let alive = alive.map_err(|e| anyhow::anyhow!("declaring the learner alive: {e}"))?;
             membership._alive.push(alive);
             let join = LearnerJoin {
                 learner,
-                rows_sampled,
+                run: progress.run,
+                updates,
+                tally: progress.shards[shard],
+                other_shards: progress.other_shards(shard),
+                restart,
             };
             let joined = join::as_learner(client, join, shutdown)?;
             let Some(welcome) = joined else {
@@ -137,13 +133,6 @@ fn one_run<'a>(connect: &[String], hellos: &'a [Hello]) -> anyhow::Result<&'a He
             "{endpoint} and {} are replay servers of runs with different settings: start both with the same",
             connect[0]
         );
-        ensure!(
-            hello.after_updates == first.after_updates,
-            "{} and {endpoint} go on after {} and after {} updates: start both with the same --after-updates",
-            connect[0],
-            first.after_updates,
-            hello.after_updates
-        );
         if let Some(earlier) = hellos[..at].iter().position(|it| it.shard.0 == shard) {
             anyhow::bail!(
                 "{} and {endpoint} are both shard {shard}: start each replay server with its own --shard, and give each endpoint once",
@@ -160,29 +149,26 @@ fn one_run<'a>(connect: &[String], hellos: &'a [Hello]) -> anyhow::Result<&'a He
     Ok(first)
 }
 
-/// How many of the rows that each shard has `served` were learned from, if `rows` were in all. Only the sum matters: the shards'
-/// limiters decide by it.
-fn learned(served: &[u64], rows: u64) -> Vec<u64> {
-    let mut unlearned = served.iter().sum::<u64>().saturating_sub(rows);
-    let mut learned = Vec::new();
-    for &served in served {
-        let here = unlearned.min(served);
-        unlearned -= here;
-        learned.push(served - here);
-    }
-    // More than were served: the replay server will say so.
-    if let Some(first) = learned.first_mut() {
-        *first += rows.saturating_sub(served.iter().sum());
-    }
-    learned
-}
-
 /// What is known of one shard.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Count {
     pub(crate) tally: Tally,
     /// Transitions that it holds.
     pub(crate) held: u64,
+    /// When it said so; none before it is asked first.
+    pub(crate) heard: Option<Instant>,
+}
+
+impl Count {
+    /// Whether it is to be asked again: others must not decide by what is old, and one that held nothing may hold something now.
+    pub(crate) fn is_old(&self, now: Instant) -> bool {
+        let age_max = if self.held == 0 {
+            EMPTY_AGE_MAX
+        } else {
+            AGE_MAX
+        };
+        self.heard.is_none_or(|heard| now - heard > age_max)
+    }
 }
 
 /// How many of `rows` rows come from each shard: each row's shard is drawn in proportion to what the shards hold, so that
@@ -242,6 +228,7 @@ mod tests {
                 rows_sampled,
             },
             held,
+            heard: None,
         }
     }
 
@@ -277,11 +264,19 @@ mod tests {
     }
 
     #[test]
-    fn what_was_served_and_not_learned_is_taken_from_the_shards() {
-        assert_eq!(learned(&[10, 20, 30], 60), [10, 20, 30]);
-        assert_eq!(learned(&[10, 20, 30], 45), [0, 15, 30]);
-        assert_eq!(learned(&[10, 20, 30], 0), [0, 0, 0]);
-        assert_eq!(learned(&[10, 20], 31), [11, 20]);
+    fn a_shard_is_asked_again_and_sooner_if_it_held_nothing() {
+        let now = Instant::now();
+        let is_old = |held, age_ms| {
+            let heard = now.checked_sub(Duration::from_millis(age_ms));
+            Count {
+                heard,
+                ..count(held, 0, 0)
+            }
+            .is_old(now)
+        };
+        assert!(count(9, 0, 0).is_old(now), "it was never asked");
+        assert!(!is_old(9, 400) && is_old(9, 600));
+        assert!(!is_old(0, 40) && is_old(0, 60));
     }
 
     #[test]
@@ -309,7 +304,7 @@ mod tests {
         let hello = |config: &str, shard| Hello {
             config_toml: config.into(),
             inserted_total: 0,
-            tally: Tally::default(),
+            has_learner: false,
             after_updates: 0,
             shard,
             shared_memory: true,
@@ -322,8 +317,5 @@ mod tests {
         assert!(said(&[hello("x", (0, 2))]).contains("has 2 shards"));
         let whole = [hello("x", (1, 2)), hello("x", (0, 2))];
         assert_eq!(one_run(&connect, &whole).unwrap().config_toml, "x");
-        let mut resumed = whole.clone();
-        resumed[1].after_updates = 7;
-        assert!(said(&resumed).contains("after 0 and after 7 updates"));
     }
 }

@@ -9,10 +9,11 @@ use std::{
 use candle_core::{Device, Tensor};
 use driml_learner::{
     AffinityEstimator, Agent, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity,
-    LearnedSettings,
-    checkpoint::{CheckpointError, RunState, list, load_latest, lock, save},
+    LearnedSettings, Progress,
+    checkpoint::{self, CheckpointError, RunState, list, load_latest, lock, save},
 };
-use driml_model::{Compute, Parameters, Precision};
+use driml_model::{Compute, ModelConfig, Parameters, Precision};
+use driml_protocol::Tally;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
@@ -89,6 +90,7 @@ impl Run {
             affinity: Some(affinity),
             rng,
             weights_version: 7,
+            progress: &progress(),
             run_spec_hash: SPEC,
             description: DESCRIPTION,
             companion: None,
@@ -99,6 +101,7 @@ impl Run {
     fn resume(folder: &Path) -> Self {
         let restored = load(folder).unwrap().expect("a checkpoint");
         assert_eq!(restored.weights_version, 7);
+        assert_eq!(restored.progress, progress());
         let affinity = restored.affinity.expect("an estimate");
         Self {
             agent: restored.agent,
@@ -113,6 +116,18 @@ impl Run {
     }
 }
 
+/// A run of two shards.
+fn progress() -> Progress {
+    let tally = |inserted, rows_sampled| Tally {
+        inserted,
+        rows_sampled,
+    };
+    Progress {
+        run: u64::MAX,
+        shards: vec![tally(100, 200), tally(7, 0)],
+    }
+}
+
 /// What the metadata says is for others: here it is any text.
 const DESCRIPTION: &str = r#"{"format":1}"#;
 
@@ -124,6 +139,42 @@ fn load(folder: &Path) -> Result<Option<driml_learner::checkpoint::Restored>, Ch
         &Compute::CPU,
         SPEC,
     )
+}
+
+/// A network of other sizes is no damage: the setting that differs is named.
+#[test]
+fn a_checkpoint_of_another_network_says_which_setting_differs() {
+    let folder = Folder::new("model");
+    let run = Run::new();
+    let ours = model(ALL_DIM);
+    let state = RunState {
+        agent: &run.agent,
+        affinity: None,
+        rng: &run.rng,
+        weights_version: 7,
+        progress: &progress(),
+        run_spec_hash: SPEC,
+        description: &serde_json::json!({ "model": ours }).to_string(),
+        companion: None,
+    };
+    let path = save(&folder.0, &state, 1).unwrap();
+    let load = |model: &ModelConfig| {
+        checkpoint::load(&path, model, &settings(ALL_DIM), &Compute::CPU, SPEC)
+    };
+    assert!(load(&ours).is_ok());
+    let other = ModelConfig {
+        hidden: ours.hidden + 1,
+        ..ours.clone()
+    };
+    let said = load(&other).unwrap_err().to_string();
+    let differs = format!(
+        "was saved with model.hidden = {}, this run has model.hidden = {}",
+        ours.hidden, other.hidden
+    );
+    assert!(
+        said.contains(&differs) && !said.contains("damaged"),
+        "{said}"
+    );
 }
 
 #[test]
@@ -322,26 +373,14 @@ pub(crate) fn change_state(path: &Path, change: impl Fn(&mut serde_json::Value))
 }
 
 #[test]
-fn a_checkpoint_of_the_first_format_is_read_bit_for_bit() {
-    let folder = Folder::new("first-format");
-    let mut run = Run::new();
-    run.updates(2);
-    let path = run.save(&folder.0, 1);
-    assert!(
-        !path.join("key.safetensors").exists(),
-        "DIM has no key encoder"
-    );
-    change_state(&path, |state| state["format"] = 1.into());
-    let mut old = Run::resume(&folder.0);
-    assert!(old.bytes() == run.bytes());
-    run.updates(2);
-    old.updates(2);
-    assert!(old.bytes() == run.bytes());
-    for unknown in [0, 3] {
+fn a_checkpoint_of_another_format_is_rejected() {
+    let folder = Folder::new("format");
+    let path = Run::new().save(&folder.0, 1);
+    for unknown in [0, 2, 4] {
         change_state(&path, |state| state["format"] = unknown.into());
         let said = load(&folder.0).unwrap_err().to_string();
         assert!(
-            said.contains(&format!("its format is {unknown}, not 1 to 2")),
+            said.contains(&format!("its format is {unknown}, not 3")),
             "{said}"
         );
     }
@@ -359,6 +398,7 @@ fn a_state_that_is_not_finite_is_not_saved() {
             let state = RunState {
                 agent: &run.agent,
                 affinity: None,
+                progress: &progress(),
                 rng: &run.rng,
                 weights_version: 8,
                 run_spec_hash: SPEC,

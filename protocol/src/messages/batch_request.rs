@@ -17,8 +17,22 @@ pub struct BatchRequest {
     pub rows: u32,
     /// Whether the batch may come through shared memory.
     pub shared_memory: bool,
+    /// What the learner has done so far.
+    pub learned: Learned,
     /// Where the replay has several shards: what all the others have counted together, and these rows are part of a batch.
     pub other_shards: Option<Tally>,
+}
+
+/// How far a learner is. It alone knows; a replay server that was started again learns it from here.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Learned {
+    /// Updates since the start of the run.
+    pub updates: u64,
+    /// Updates in its newest checkpoint.
+    pub saved_updates: u64,
+    /// Rows of this shard that it has received since the start of the run, without those learned after its checkpoint by a learner
+    /// before it.
+    pub rows_received: u64,
 }
 
 impl Message for BatchRequest {

@@ -3,7 +3,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::tally::Tally;
 use crate::wire::message::{Keyed, Kind, Message};
 
 /// What a joining part needs: the run's resolved settings, from the replay server.
@@ -13,9 +12,9 @@ pub struct Hello {
     pub config_toml: String,
     /// Transitions that the run has stored, for the exploration schedule.
     pub inserted_total: u64,
-    /// What this replay server has counted by itself.
-    pub tally: Tally,
-    /// Updates after which the run goes on, if it was resumed; 0 in a run from its start.
+    /// Whether a learner has joined.
+    pub has_learner: bool,
+    /// Updates after which the run was resumed, which its learner says; 0 in a run from its start.
     pub after_updates: u64,
     /// Which of the replay's shards this is, from 0, and how many there are.
     pub shard: (u32, u32),

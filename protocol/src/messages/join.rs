@@ -3,6 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::tally::Tally;
 use crate::wire::message::{Keyed, Kind, Message, Request};
 
 /// An actor starts: from now on the replay server takes its chunks. The same one may be sent any number of times.
@@ -36,8 +37,16 @@ impl Request for ActorJoin {
 pub struct LearnerJoin {
     /// Which learner: a random number, drawn anew at each start. All its messages carry it.
     pub learner: u64,
-    /// Rows of this shard that it has learned from. Rows served beyond them, to a learner that died, are served again.
-    pub rows_sampled: u64,
+    /// Which run its checkpoint is of: a random number that the run's first learner drew. One without a checkpoint draws another.
+    pub run: u64,
+    /// Updates in its checkpoint; 0 without one.
+    pub updates: u64,
+    /// What this shard had counted at the checkpoint: transitions stored, and rows that the learner learned from.
+    pub tally: Tally,
+    /// The same of all other shards together.
+    pub other_shards: Tally,
+    /// Begin again from the first update, where an earlier learner of the run has learned already.
+    pub restart: bool,
 }
 
 impl Message for LearnerJoin {

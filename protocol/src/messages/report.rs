@@ -50,8 +50,8 @@ pub struct Report {
     pub since_s: f64,
     /// The last warning or error in its log.
     pub last_warning: Option<Warning>,
-    /// Its part in the run is done: the learner has learned from every batch, and has saved.
-    pub finished: bool,
+    /// Updates after which the run is finished: the learner has learned from every batch, and has saved.
+    pub finished: Option<u64>,
 }
 
 /// A line of a part's log.
@@ -81,7 +81,7 @@ impl Report {
             doing: cut(doing, DOING_MAX),
             since_s,
             last_warning,
-            finished: false,
+            finished: None,
         }
     }
 }
@@ -154,7 +154,7 @@ mod tests {
                 text: text.into(),
                 age_s,
             }),
-            finished: false,
+            finished: None,
         };
         let long = "x".repeat(401);
         assert!(

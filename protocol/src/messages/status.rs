@@ -87,8 +87,10 @@ impl Quantiles {
 /// The replay server's account of itself.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ReplayStatus {
-    /// Transitions stored since the start.
+    /// Transitions stored since the start of the run, without those in `transitions_refilled`.
     pub transitions_inserted: u64,
+    /// Transitions that filled the memory again after the run was resumed without its replay.
+    pub transitions_refilled: u64,
     /// Transitions held now.
     pub transitions_held: u64,
     /// Bytes of memory that their frames take.
@@ -109,6 +111,10 @@ pub struct ReplayStatus {
     pub rows_sampled: u64,
     /// Rows served to a learner that died before it saved what it learned from them; they do not count as sampled.
     pub rows_unlearned: u64,
+    /// Updates since the start of the run, as the learner said last.
+    pub updates: u64,
+    /// Updates that were learned again, as a learner came back with an older checkpoint.
+    pub updates_relearned: u64,
     /// Transitions stored before the first row could be sampled.
     pub warmup_transitions: u64,
     /// Episodes that ended.
@@ -146,6 +152,8 @@ pub struct ReplayStatus {
     pub affinity_version: u64,
     /// All transitions are in.
     pub finished: bool,
+    /// The learner has learned from every batch, and has saved.
+    pub learner_finished: bool,
 }
 
 impl Message for ReplayStatus {
@@ -173,6 +181,7 @@ impl ReplayStatus {
             // All by name, so that a new one is not forgotten.
             let Self {
                 transitions_inserted,
+                transitions_refilled,
                 transitions_held,
                 frame_bytes_held,
                 transitions_lost,
@@ -183,6 +192,8 @@ impl ReplayStatus {
                 connections_refused,
                 rows_sampled,
                 rows_unlearned,
+                updates,
+                updates_relearned,
                 // Every shard has the whole run's.
                 warmup_transitions: _,
                 episodes,
@@ -203,10 +214,14 @@ impl ReplayStatus {
                 weights_behind_updates,
                 affinity_version,
                 finished,
+                learner_finished,
             } = it;
             sum.transitions_inserted = sum
                 .transitions_inserted
                 .saturating_add(*transitions_inserted);
+            sum.transitions_refilled = sum
+                .transitions_refilled
+                .saturating_add(*transitions_refilled);
             sum.transitions_held = sum.transitions_held.saturating_add(*transitions_held);
             sum.frame_bytes_held = sum.frame_bytes_held.saturating_add(*frame_bytes_held);
             sum.transitions_lost = sum.transitions_lost.saturating_add(*transitions_lost);
@@ -219,6 +234,9 @@ impl ReplayStatus {
             sum.connections_refused = sum.connections_refused.saturating_add(*connections_refused);
             sum.rows_sampled = sum.rows_sampled.saturating_add(*rows_sampled);
             sum.rows_unlearned = sum.rows_unlearned.saturating_add(*rows_unlearned);
+            // Each hears of them with its next request.
+            sum.updates = sum.updates.max(*updates);
+            sum.updates_relearned = sum.updates_relearned.max(*updates_relearned);
             sum.episodes = sum.episodes.saturating_add(*episodes);
             sum.returns.known = sum.returns.known.saturating_add(returns.known);
             sum.returns.newest.extend(&returns.newest);
@@ -237,6 +255,7 @@ impl ReplayStatus {
             sum.affinity_version = sum.affinity_version.min(*affinity_version);
             // Each knows of the others what the learner told it; the one that knows of the end is right.
             sum.finished |= finished;
+            sum.learner_finished |= learner_finished;
             if *waiting == Waiting::Finished || sum.waiting == Waiting::Nobody {
                 sum.waiting = *waiting;
             }
@@ -337,6 +356,7 @@ mod tests {
         };
         ReplayStatus {
             transitions_inserted: n,
+            transitions_refilled: 26 * n,
             transitions_held: 2 * n,
             frame_bytes_held: 3 * n,
             transitions_lost: 4 * n,
@@ -347,6 +367,8 @@ mod tests {
             connections_refused: 9 * n,
             rows_sampled: 9 * n,
             rows_unlearned: 19 * n,
+            updates: 27 * n,
+            updates_relearned: 28 * n,
             warmup_transitions: 1_000,
             episodes: 10 * n,
             returns: Returns {
@@ -371,6 +393,7 @@ mod tests {
             weights_behind_updates: quantiles(25),
             affinity_version: 18 * n,
             finished: n == 2,
+            learner_finished: n == 2,
         }
     }
 
@@ -397,11 +420,14 @@ mod tests {
             waiting: Waiting::Finished,
             // The shard that has the older matrix.
             affinity_version: 18,
+            updates: 54,
+            updates_relearned: 56,
             answer_ms: worst(22),
             insert_ms: worst(23),
             weights_behind_s: worst(24),
             weights_behind_updates: worst(25),
             finished: true,
+            learner_finished: true,
             ..full(3)
         };
         assert_eq!(merged, expected);

@@ -58,6 +58,7 @@ fn grant(keys: &Keys, role: Role) -> Grant {
                 keys.of::<AffinityUpdate>(),
                 keys.of::<PriorityUpdate>(),
                 keys.of::<WeightsUpload>(),
+                keys.of::<ReplayStatus>(),
                 keys.of_learner::<Report>(),
             ]);
             answers.push(keys.of::<LearnerStatus>());

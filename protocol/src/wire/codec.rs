@@ -13,7 +13,7 @@ use super::{
 };
 
 /// The version of every message in this crate; parts of different versions refuse each other.
-pub const PROTOCOL_VERSION: u16 = 6;
+pub const PROTOCOL_VERSION: u16 = 7;
 
 /// Length of the fixed prefix, bytes.
 pub const PREFIX_BYTES: usize = Prefix::BYTES;

@@ -3,7 +3,7 @@
 
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, Buffer, ChunkHeader, CodecError, EPISODES_MAX,
-    EndedEpisode, EpisodesReply, Hello, Kind, PROTOCOL_VERSION, Played, Tally, WeightsHeader,
+    EndedEpisode, EpisodesReply, Hello, Kind, PROTOCOL_VERSION, Played, WeightsHeader,
     WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
@@ -207,7 +207,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
     let hello = Hello {
         config_toml: "x".repeat(HEADER_BYTES_MAX),
         inserted_total: 0,
-        tally: Tally::default(),
+        has_learner: false,
         after_updates: 0,
         shard: (0, 1),
         shared_memory: false,

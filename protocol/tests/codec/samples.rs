@@ -6,11 +6,11 @@ use std::fmt::Debug;
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, Chunk,
     ChunkHeader, Claim, CodecError, Done, End, EndedEpisode, EpisodesReply, EpisodesRequest,
-    Goodbye, Hello, InsertReply, JoinReply, Kind, LearnerJoin, LearnerStatus, Life, LogStatus,
-    Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus, PartsStatus, Played,
-    PriorityPart, PriorityUpdate, Recovering, RecoveryProgress, ReplayStatus, Report, RequestId,
-    Returns, RowScalars, StackedFrames, Tally, Waiting, Warning, WeightsHeader, WeightsReply,
-    WeightsRequest, WeightsUpload, WeightsVersion,
+    Goodbye, Hello, InsertReply, JoinReply, Kind, Learned, LearnerJoin, LearnerStatus, Life,
+    LogStatus, Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus, PartsStatus,
+    Played, PriorityPart, PriorityUpdate, Recovering, RecoveryProgress, ReplayStatus, Report,
+    RequestId, Returns, RowScalars, StackedFrames, Tally, Waiting, Warning, WeightsHeader,
+    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
     codec::{self},
 };
 
@@ -311,7 +311,7 @@ pub(crate) fn samples() -> Vec<Sample> {
     let hello = Hello {
         config_toml: "[run]\nseed = 1\n".into(),
         inserted_total: 12,
-        tally: Tally::default(),
+        has_learner: true,
         after_updates: 3,
         shard: (1, 2),
         shared_memory: true,
@@ -349,6 +349,11 @@ pub(crate) fn samples() -> Vec<Sample> {
             id: RequestId::first(u64::MAX).again(),
             rows: 256,
             shared_memory: true,
+            learned: Learned {
+                updates: 4,
+                saved_updates: 2,
+                rows_received: 64,
+            },
             other_shards: Some(Tally::default()),
         }),
         Sample::of(&affinity),
@@ -366,7 +371,14 @@ pub(crate) fn samples() -> Vec<Sample> {
         }),
         Sample::of(&LearnerJoin {
             learner: 5,
-            rows_sampled: 9,
+            run: 1 << 60,
+            updates: 9,
+            tally: Tally {
+                inserted: 7,
+                rows_sampled: 8,
+            },
+            other_shards: Tally::default(),
+            restart: true,
         }),
         Sample::of(&Claim {
             actor: 1,

@@ -4,7 +4,6 @@
 use std::{cmp::Ordering, collections::VecDeque};
 
 use driml_protocol::RequestId;
-use serde::{Deserialize, Serialize};
 
 /// Clients that are remembered; a learner has one for each batch on its way, and nothing is taken back from one forgotten.
 const CLIENTS_MAX: usize = 1024;
@@ -19,15 +18,12 @@ pub(crate) enum Dedup {
 }
 
 /// The last request of each client, of the one whose request is oldest first.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct Requests {
     last: VecDeque<Request>,
-    /// How often this has changed, in this process.
-    #[serde(skip)]
-    changes: u64,
 }
 
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug)]
 struct Request {
     id: RequestId,
     /// The k of each row that it was given; none before.
@@ -44,7 +40,6 @@ impl Requests {
         if known.is_some_and(|at| self.last[at].id == id && self.last[at].given.is_none()) {
             return Dedup::Fresh(Vec::new());
         }
-        self.changes += 1;
         let mut request = known
             .and_then(|at| self.last.remove(at))
             .unwrap_or(Request { id, given: None });
@@ -72,33 +67,7 @@ impl Requests {
     pub(crate) fn complete(&mut self, client_id: u64, ks: Vec<u32>) {
         if let Some(request) = self.last.iter_mut().find(|it| it.id.client_id == client_id) {
             request.given = Some(ks);
-            self.changes += 1;
         }
-    }
-
-    /// Why these cannot be the requests of a replay that has served so many rows of each k; none if they can.
-    pub(crate) fn unfit(&self, served: &[u64]) -> Option<&'static str> {
-        if self.last.len() > CLIENTS_MAX {
-            return Some("a state with more requests than are remembered");
-        }
-        let mut left = served.to_vec();
-        for &k in self
-            .last
-            .iter()
-            .filter_map(|it| it.given.as_ref())
-            .flatten()
-        {
-            match left.get_mut(k as usize) {
-                Some(left @ 1..) => *left -= 1,
-                _ => return Some("a state in which more rows were given than were served"),
-            }
-        }
-        None
-    }
-
-    /// How often this has changed, in this process.
-    pub(crate) const fn changes(&self) -> u64 {
-        self.changes
     }
 }
 

@@ -6,6 +6,8 @@ use std::collections::VecDeque;
 use driml_protocol::{EPISODES_MAX, EndedEpisode, EpisodesReply, RETURNS_OF, Returns};
 use serde::{Deserialize, Serialize};
 
+use super::actors::Difference;
+
 /// Ended episodes that are kept for whoever asks for them; of more the oldest are let go.
 const EPISODES_KEPT_MAX: usize = 4 * EPISODES_MAX;
 /// The same in what a log keeps of a moment, where somebody records them: those for which he has not asked yet.
@@ -20,9 +22,11 @@ pub(crate) struct Statistics {
     pub(crate) batches_retried: u64,
     /// Rows served to a learner that died before it saved what it learned from them.
     pub(crate) rows_unlearned: u64,
+    /// Updates learned again by a learner with an older checkpoint.
+    pub(crate) updates_relearned: u64,
     pub(crate) messages_refused: u64,
     /// Messages by which an actor's own count differed.
-    pub(crate) differences: u64,
+    differences: u64,
     pub(crate) episodes: u64,
     /// The newest of them.
     newest: VecDeque<EndedEpisode>,
@@ -54,6 +58,26 @@ impl Statistics {
         (self.chunks_retried, self.messages_refused, self.actors) = (0, 0, 0);
         (self.learner_waited_s, self.actors_waited_s) = (0.0, 0.0);
         self
+    }
+
+    /// What is counted of transitions stored, without what is counted of rows drawn.
+    pub(crate) fn of_stored(self) -> Self {
+        let mut stored = self.of_changes();
+        stored.k_histogram.fill(0);
+        (stored.batches_retried, stored.rows_unlearned) = (0, 0);
+        (stored.updates_relearned, stored.mean_age) = (0, 0.0);
+        stored
+    }
+
+    /// Counts how an actor's count differs from ours; whether this is worth a line in the log: ever more seldom.
+    pub(crate) fn count(&mut self, Difference { lost, duplicated }: Difference) -> bool {
+        if lost == 0 && duplicated == 0 {
+            return false;
+        }
+        self.differences += 1;
+        self.transitions_lost = self.transitions_lost.saturating_add(lost);
+        self.transitions_duplicated = self.transitions_duplicated.saturating_add(duplicated);
+        self.differences.is_power_of_two()
     }
 
     /// Counts rows served with these `ks`.

@@ -1,11 +1,9 @@
 //! From the transitions held to a batch: anchors, the episode around each, the row made of it, and k.
 //! Nothing here changes what is stored or decides whether a batch may be served.
 
-pub(crate) mod anchors;
 pub(crate) mod assemble;
 pub(crate) mod episodes;
 pub mod horizon;
 pub(crate) mod needed_frames;
 pub(crate) mod packed_batch;
-pub(crate) mod prioritised;
-pub(crate) mod sum_tree;
+pub(crate) mod rows;

@@ -104,7 +104,8 @@ impl Accounts {
             return false;
         };
         // One that was under way meanwhile does not undo it.
-        report.finished |= account.report.as_ref().is_some_and(|(it, _)| it.finished);
+        let said = account.report.as_ref().and_then(|(it, _)| it.finished);
+        report.finished = report.finished.or(said);
         account.report = Some((report, now));
         true
     }
@@ -136,7 +137,7 @@ impl Accounts {
     pub(super) fn is_over(&self) -> bool {
         let learner = self.parts.get(&PartName::Learner);
         let report = learner.and_then(|account| account.report.as_ref());
-        report.is_some_and(|(report, _)| report.finished)
+        report.is_some_and(|(report, _)| report.finished.is_some())
     }
 
     /// Parts that are connected.

@@ -9,7 +9,10 @@ use super::{
     parked::ParkedRequest,
     server::{Service, State},
 };
-use crate::{durable::DurableReplay, replay::Unready, sampling::packed_batch::PackedBatch};
+use crate::{
+    replay::{Replay, Unready},
+    sampling::packed_batch::PackedBatch,
+};
 
 /// How long a request waits before it is told to come back: far below every learner's time-out.
 const HOLD_MAX: Duration = Duration::from_secs(1);
@@ -32,7 +35,7 @@ impl Service {
         let mut state = self.state();
         let is_allowed = state.check_learner(request.learner);
         let is_allowed = is_allowed.and_then(|()| self.check_rows(request.rows));
-        let heard = is_allowed.and_then(|()| self.hear_of_others(&mut state.replay, &request));
+        let heard = is_allowed.and_then(|()| self.hear_learner(&mut state.replay, &request));
         if let Err(why) = heard {
             state.replay.note_refused_message();
             state.say(
@@ -68,12 +71,9 @@ impl Service {
         }
     }
 
-    /// Takes what the learner says of the other shards.
-    fn hear_of_others(
-        &self,
-        replay: &mut DurableReplay,
-        request: &BatchRequest,
-    ) -> Result<(), String> {
+    /// Takes what the learner says of itself and of the other shards.
+    fn hear_learner(&self, replay: &mut Replay, request: &BatchRequest) -> Result<(), String> {
+        replay.note_learned(request.learned)?;
         let (_, shards) = self.shard;
         match request.other_shards {
             None if shards > 1 => Err(format!(

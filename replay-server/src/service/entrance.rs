@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 use driml_protocol::Recovering;
 
 use super::server::Service;
-use crate::durable::Reading;
+use crate::persist::Reading;
 
 /// What stands between the questions and the service.
 pub(super) struct Entrance {

@@ -28,14 +28,15 @@ impl Service {
 
     pub(super) fn hello(&self, responder: Responder<Hello>) {
         let state = self.state();
-        let (inserted_total, tally) = (state.replay.inserted_total(), state.replay.tally());
-        let after_updates = state.replay.after_updates();
+        let inserted_total = state.replay.inserted_total();
+        let has_learner = state.replay.learner().is_some();
+        let after_updates = state.replay.resumed_after();
         let shared_memory = self.shared_memory && state.accounts.actor_lives() < SHARED_LIVES_MAX;
         drop(state);
         let hello = Hello {
             config_toml: self.config_toml.clone(),
             inserted_total,
-            tally,
+            has_learner,
             after_updates,
             shard: self.shard,
             shared_memory,
@@ -120,9 +121,8 @@ impl State {
         match self.replay.learner() {
             Some(served) if served == learner => Ok(()),
             Some(_) => Err("another learner has joined the run since this one did: a run has one learner".into()),
-            None => Err("this replay server does not know the learner: it was started anew since the learner joined, and what it \
-                         held is gone. To go on with the run, start it with --after-updates and the number of the newest checkpoint, \
-                         and then the learner and the actors again"
+            None => Err("this replay server does not know the learner: it was started again since the learner joined, and what it held \
+                         is gone. Start the learner and the actors again: the learner resumes from its newest checkpoint"
                 .into()),
         }
     }
@@ -153,20 +153,28 @@ impl State {
 
     fn join_learner(&mut self, join: LearnerJoin) -> Result<u32, Rejection> {
         let LearnerJoin {
-            learner,
-            rows_sampled,
+            learner, updates, ..
         } = join;
         let other = self.replay.learner().filter(|&other| other != learner);
+        if other.is_some() && self.accounts.is_over() {
+            let done = self.replay.status().updates;
+            return Err(Rejection::Refused(format!(
+                "the run is finished, with {done} updates; to train on, resume it with more --frames"
+            )));
+        }
         let connected = |other| self.members.connected.contains(&Alive::learner(other));
         if other.is_some_and(connected) {
             let why = "another learner takes part in this run, which has one alone";
             return Err(Rejection::Taken(why.into()));
         }
-        // The same one asks again when it has not heard the answer.
-        if self.replay.learner() != Some(learner) {
-            self.replay
-                .learner_starts(learner, rows_sampled)
-                .map_err(Rejection::Refused)?;
+        let is_new = self.replay.learner() != Some(learner);
+        let again = self.replay.join_learner(join).map_err(Rejection::Refused)?;
+        if again > 0 {
+            tracing::warn!(
+                "the learner resumes from its checkpoint after {updates} updates: the {again} updates since then are learned again"
+            );
+        }
+        if is_new {
             self.requests.keep_only(learner);
             self.open_account(Alive::learner(learner));
         }

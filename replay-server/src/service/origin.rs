@@ -1,5 +1,5 @@
 //! Where a replay server's replay comes from: nowhere, as it begins, or a folder, which is read back in a second step.
-//! How a log is read is `durable`'s.
+//! How a log is read is `persist`'s.
 
 use std::path::{Path, PathBuf};
 
@@ -8,14 +8,14 @@ use driml_protocol::RunSpec;
 use super::{run_args::RunArgs, weights_store::WeightsStore};
 use crate::{
     config::Config,
-    durable::{DurableArgs, DurableError, DurableReplay, KeptReplay, Reading, shard_dir},
+    persist::{KeptReplay, PersistArgs, PersistError, Reading, shard_dir},
     replay::Replay,
 };
 
 /// Where the replay comes from.
 pub(super) enum Origin {
     /// It begins empty, and is kept in memory alone.
-    Memory(Box<DurableReplay>),
+    Memory(Box<Replay>),
     /// It is kept in this folder, and not read yet.
     Folder(PathBuf, Box<KeptReplay>),
 }
@@ -30,24 +30,19 @@ impl Origin {
         spec: &RunSpec,
         config: &Config,
         batch_size: u32,
-    ) -> Result<Self, DurableError> {
+    ) -> Result<Self, PersistError> {
         let Some(dir) = &args.dir else {
-            let mut replay = Replay::shard(spec, config, batch_size, args.shard)?;
-            if args.after_updates > 0 {
-                replay = replay.resumed_at(args.after_updates, args.shard);
-            }
-            let replay = DurableReplay::in_memory(replay, args.after_updates);
+            let replay = Replay::shard(spec, config, batch_size, args.shard)?;
             return Ok(Self::Memory(Box::new(replay)));
         };
         let dir = shard_dir(dir, args.shard, config.shards);
-        let durable = DurableArgs {
+        let kept = PersistArgs {
             dir: dir.clone(),
             shard: args.shard,
-            after_updates: args.after_updates,
             segment_bytes: None,
             mark: None,
         };
-        let kept = KeptReplay::find(&durable, spec, config, batch_size)?;
+        let kept = KeptReplay::find(&kept, spec, config, batch_size)?;
         Ok(Self::Folder(dir, Box::new(kept)))
     }
 
@@ -59,7 +54,7 @@ impl Origin {
         self,
         reading: &Reading,
         spec_hash: u64,
-    ) -> Result<(DurableReplay, WeightsStore), DurableError> {
+    ) -> Result<(Replay, WeightsStore), PersistError> {
         match self {
             Self::Memory(replay) => Ok((*replay, WeightsStore::default())),
             Self::Folder(dir, kept) => {
@@ -71,11 +66,7 @@ impl Origin {
 }
 
 /// Reads the replay that is kept in `dir`, and says what was found.
-fn read_kept(
-    dir: &Path,
-    kept: KeptReplay,
-    reading: &Reading,
-) -> Result<DurableReplay, DurableError> {
+fn read_kept(dir: &Path, kept: KeptReplay, reading: &Reading) -> Result<Replay, PersistError> {
     let (replay, recovery) = kept.read(reading)?;
     for warning in &recovery.warnings {
         tracing::warn!("{}: {warning}", dir.display());
@@ -93,7 +84,7 @@ fn read_kept(
         );
         if replay.priority_counts().is_some() {
             tracing::info!(
-                "priorities are not kept on disk: each transition has the highest one until it is learned from"
+                "priorities are those of the last checkpoint: each transition that came later has the highest one"
             );
         }
     } else {

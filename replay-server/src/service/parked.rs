@@ -226,7 +226,7 @@ impl<Q> ParkedRequests<Q> {
 mod tests {
     use std::borrow::Cow;
 
-    use driml_protocol::{Chunk, RequestId};
+    use driml_protocol::{Chunk, Learned, RequestId};
 
     use super::*;
     use crate::{config::Compression, storage::frame_store::Packer};
@@ -335,6 +335,7 @@ mod tests {
                 id: RequestId::first(client_id),
                 rows: 1,
                 shared_memory: false,
+                learned: Learned::default(),
                 other_shards: None,
             },
             question,

@@ -30,8 +30,8 @@ use super::{
 };
 use crate::{
     config::Config,
-    durable::{DurableError, Reading},
-    sampling::prioritised::PriorityCounts,
+    persist::{PersistError, Reading},
+    sampling::rows::prioritised::PriorityCounts,
 };
 
 /// Threads that make batches: one assembles while another's reply is being sent.
@@ -116,7 +116,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             let closed = client.session().close().wait();
             join_within(threads, THREADS_END_MAX);
             return match e {
-                DurableError::Stopped => {
+                PersistError::Stopped => {
                     tracing::info!("replay server stops: {e}");
                     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
                 }

@@ -17,8 +17,6 @@ pub struct RunArgs {
     pub namespace: String,
     /// Which of the replay's shards this is, from 0.
     pub shard: u32,
-    /// Updates of the learner after which the run goes on; 0 starts it.
-    pub after_updates: u64,
     /// Bytes of a version of the weights, of which the replay server itself knows nothing; longer uploads are refused.
     pub weights_bytes_max: usize,
     /// The folder in which the replay is kept, if it is kept on disk; of several shards each has a folder of its own there.

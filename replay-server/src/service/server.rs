@@ -19,7 +19,7 @@ use super::{
     timings::Timings,
     weights_store::WeightsStore,
 };
-use crate::{durable::DurableReplay, storage::frame_store::Packer};
+use crate::{replay::Replay, storage::frame_store::Packer};
 
 /// What all threads share.
 pub(super) struct Service {
@@ -45,7 +45,7 @@ pub(super) struct Service {
 
 /// What changes, under one lock.
 pub(super) struct State {
-    pub(super) replay: DurableReplay,
+    pub(super) replay: Replay,
     pub(super) members: Members,
     pub(super) accounts: Accounts,
     pub(super) chunks: ParkedChunks<Question>,

@@ -94,8 +94,13 @@ impl Service {
             return;
         };
         let mut state = self.state();
+        let finished = report.finished;
         // That of a part which has been replaced, or is about to join.
-        if !state.accounts.reported(report, Instant::now()) {
+        if state.accounts.reported(report, Instant::now()) {
+            if let Some(updates) = finished {
+                state.replay.note_updates(updates);
+            }
+        } else {
             tracing::debug!("a report of a part that does not take part");
         }
         drop(state);
@@ -194,6 +199,7 @@ impl Service {
         let state = self.state();
         let mut status = state.replay.status();
         status.connections_refused = state.connections_refused;
+        status.learner_finished = state.accounts.is_over();
         status.actors_acting = state.members.actors_acting();
         status.actors_waiting = state.chunks.len() as u32;
         status.answer_ms = state.timings.answer_ms();

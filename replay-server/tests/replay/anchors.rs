@@ -113,6 +113,7 @@ fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
         sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
+        since: None,
         reproduced_bug: None,
         replay_ratio: 64.0,
         warmup_transitions: 0,

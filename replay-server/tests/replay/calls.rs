@@ -1,7 +1,9 @@
 //! What tests say to a replay, and its answers.
 //! It tests nothing.
 
-use driml_protocol::{ActorJoin, Chunk, ChunkHeader, Horizon, InsertReply, RunSpec};
+use driml_protocol::{
+    ActorJoin, Chunk, ChunkHeader, Horizon, InsertReply, LearnerJoin, RunSpec, Tally,
+};
 use driml_replay_server::Replay;
 
 use crate::history::spec;
@@ -60,4 +62,19 @@ pub(crate) const fn wait(inserted_total: u64) -> InsertReply {
 
 pub(crate) fn is_refused(reply: &InsertReply) -> bool {
     matches!(reply, InsertReply::Refused { .. })
+}
+
+/// A learner of run 1 that has learned so many rows in so many updates, when `inserted` transitions were stored.
+pub(crate) fn learner(learner: u64, updates: u64, rows: u64, inserted: u64) -> LearnerJoin {
+    LearnerJoin {
+        learner,
+        run: 1,
+        updates,
+        tally: Tally {
+            inserted,
+            rows_sampled: rows,
+        },
+        other_shards: Tally::default(),
+        restart: false,
+    }
 }

@@ -15,6 +15,7 @@ fn good() -> Config {
         sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
+        since: None,
         reproduced_bug: None,
         replay_ratio: 8.0,
         warmup_transitions: 1000,

@@ -3,7 +3,8 @@
 //! It does not look at rows.
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Buffer, ChunkHeader, Claim, Goodbye, Horizon, InsertReply, RequestId,
+    ActorJoin, AffinityUpdate, Buffer, ChunkHeader, Claim, Goodbye, Horizon, InsertReply, Learned,
+    LearnerJoin, RequestId,
 };
 use driml_replay_server::{Replay, Unready};
 use proptest::prelude::*;
@@ -11,7 +12,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::{header, insert, is_refused, join, small_spec, stored},
+    calls::{header, insert, is_refused, join, learner, small_spec, stored},
     history::{spec, unlimited},
 };
 
@@ -303,7 +304,7 @@ fn rows_that_nobody_learned_from_do_not_count() {
     for sequence in 0..3 {
         insert(&mut replay, header(0, 1, sequence, 6 * sequence));
     }
-    replay.learner_starts(0).unwrap();
+    replay.join_learner(learner(1, 0, 0, 0)).unwrap();
     for _ in 0..9 {
         replay.sample(8).unwrap();
     }
@@ -315,12 +316,18 @@ fn rows_that_nobody_learned_from_do_not_count() {
         matrix: vec![p; 25],
     };
     replay.set_affinity(&affinity(9, 0.5)).unwrap();
-    assert!(replay.learner_starts(73).is_err(), "more than were served");
+    let learned = Learned {
+        updates: 8,
+        saved_updates: 5,
+        rows_received: 72,
+    };
+    replay.note_learned(learned).unwrap();
 
-    replay.learner_starts(40).unwrap();
+    assert_eq!(replay.join_learner(learner(2, 5, 40, 18)), Ok(3));
     replay.check_valid();
     let status = replay.status();
     assert_eq!((status.rows_sampled, status.rows_unlearned), (40, 32));
+    assert_eq!((status.updates, status.updates_relearned), (5, 3));
     replay.set_affinity(&affinity(6, 0.25)).unwrap();
     assert_eq!(
         replay.status().affinity_version,
@@ -334,4 +341,55 @@ fn rows_that_nobody_learned_from_do_not_count() {
     }
     assert_eq!(replay.sample(8), Err(Unready::Finished));
     replay.check_valid();
+}
+
+/// Who may take the place of a learner that has done 8 updates, and how many of these are learned again.
+#[test]
+fn a_learner_needs_a_checkpoint_of_the_run_or_the_word_to_restart() {
+    let rejected = "the run has learned 8 updates, and the learner has no checkpoint of it: start the learner with the --run-dir \
+                    that holds its checkpoints, or with --restart to begin again from the first update";
+    let other_run = |updates, rows| LearnerJoin {
+        run: 2,
+        ..learner(2, updates, rows, 18)
+    };
+    let restarted = LearnerJoin {
+        restart: true,
+        ..other_run(0, 0)
+    };
+    let cases = [
+        ("of this run", learner(2, 5, 40, 18), Ok(3)),
+        ("that has learned more", learner(2, 9, 72, 18), Ok(0)),
+        ("without a checkpoint", other_run(0, 0), Err(rejected)),
+        ("of another run", other_run(5, 40), Err(rejected)),
+        ("that begins again", restarted, Ok(8)),
+        ("that asks again", learner(1, 0, 0, 0), Ok(0)),
+    ];
+    for (which, join, expected) in cases {
+        let mut config = unlimited(1000);
+        (config.replay_ratio, config.slack_transitions) = (4.0, 100);
+        let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
+        for sequence in 0..3 {
+            insert(&mut replay, header(0, 1, sequence, 6 * sequence));
+        }
+        // A run in which nothing was learned takes any learner.
+        replay.join_learner(learner(0, 0, 0, 0)).unwrap();
+        replay.join_learner(learner(1, 0, 0, 0)).unwrap();
+        for _ in 0..8 {
+            replay.sample(8).unwrap();
+        }
+        let learned = Learned {
+            updates: 8,
+            saved_updates: 5,
+            rows_received: 64,
+        };
+        replay.note_learned(learned).unwrap();
+        let joined = replay.join_learner(join);
+        assert_eq!(joined, expected.map_err(String::from), "a learner {which}");
+        let rows = match (joined.is_ok(), join.learner) {
+            (true, 2) => join.tally.rows_sampled,
+            _ => 64,
+        };
+        assert_eq!(replay.tally().rows_sampled, rows, "a learner {which}");
+        replay.check_valid();
+    }
 }

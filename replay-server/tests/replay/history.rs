@@ -75,6 +75,7 @@ pub(crate) fn unlimited(capacity_transitions: u64) -> Config {
         sampling: Sampling::Uniform,
         disk_bytes_max: None,
         fsync_ms: None,
+        since: None,
         reproduced_bug: None,
         replay_ratio: 1e6,
         warmup_transitions: 0,

@@ -327,35 +327,6 @@ fn what_was_never_stored_or_drawn_is_refused_or_ignored() {
     assert_eq!(uniform.priority_counts(), None);
 }
 
-/// Saved and taken back by a replay that holds the same: the same draws from there on. By one that does not: a sentence.
-#[test]
-fn what_is_saved_comes_back() {
-    let run = |saved_at: usize| {
-        let mut setup = Setup::new(80, 0.5, 4, Horizon::Uniform { k_max: 3 });
-        let mut saved = None;
-        for round in 0..12 {
-            setup.insert(0, 2, 5);
-            if round == saved_at {
-                saved = setup.replay.saved_priorities();
-                let mut fresh = Setup::new(80, 0.5, 4, Horizon::Uniform { k_max: 3 });
-                fresh.insert(0, 2, 5);
-                let other = fresh.replay.restore_priorities(saved.as_ref());
-                let said = other.unwrap_err();
-                assert!(said.contains("transitions, where 10 are held"), "{said}");
-                setup.learn();
-                setup.replay.restore_priorities(saved.as_ref()).unwrap();
-                assert_eq!(setup.replay.saved_priorities(), saved);
-                let none = setup.replay.restore_priorities(None).unwrap_err();
-                assert!(none.contains("another rule"), "{none}");
-            }
-            setup.learn();
-        }
-        assert!(saved.is_some());
-    };
-    run(3);
-    run(10);
-}
-
 proptest! {
     /// Chunks of several actors and shapes, learned from in between: after each step exactly the anchors have a mass, and rows are
     /// those of the reference.

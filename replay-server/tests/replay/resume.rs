@@ -1,69 +1,196 @@
-//! A run that goes on after updates of an earlier life: what it counts, and what it waits for.
-//! That all parts go on together is an end-to-end test.
+//! A run that goes on where its learner's checkpoint stands, in a replay that is empty: what it counts, and what it waits for.
+//! That all processes go on together is an end-to-end test.
 
-use driml_replay_server::{Config, Replay, Unready};
+use driml_protocol::{InsertReply, LearnerJoin, Tally};
+use driml_replay_server::{Config, Replay, Since, Unready};
 
 use crate::{
-    calls::{header, insert, small_spec, stored},
+    calls::{header, insert, learner, small_spec},
     history::unlimited,
 };
 
-#[test]
-fn a_resumed_run_counts_on_and_fills_its_replay_first() {
+fn config() -> Config {
     let mut config = unlimited(1000);
     (config.replay_ratio, config.warmup_transitions) = (4.0, 60);
     (config.slack_transitions, config.transitions_max) = (12, Some(180));
-    let spec = small_spec();
-    // Updates of 8 rows, 2 transitions each: 60 + 2 * 30 = 120 of 180 transitions were in.
-    let mut replay = Replay::new(&spec, &config, 8).unwrap().resumed_at(30, 0);
-    let status = replay.status();
-    assert_eq!(
-        (status.transitions_inserted, status.rows_sampled),
-        (60, 240)
-    );
-    let (mut batches, mut sequence) = (0, 0);
-    loop {
-        let inserted = replay.inserted_total();
-        match replay.sample(8) {
-            Ok(_) => {
-                assert!(inserted > 120, "only what is new lets the learner go on");
-                batches += 1;
-                continue;
-            }
-            Err(Unready::Finished) => break,
-            Err(e) => assert!(matches!(e, Unready::Wait(_)), "{e:?}"),
-        }
-        let reply = insert(&mut replay, header(0, 1, sequence, 6 * sequence));
-        assert_eq!(reply, stored(inserted + 6));
-        sequence += 1;
-    }
-    assert_eq!(
-        sequence, 20,
-        "60 transitions to fill the replay, 60 to go on"
-    );
-    assert_eq!(batches, 30, "with those before, all of (180 - 60) * 4 / 8");
-    let status = replay.status();
-    assert_eq!(
-        (status.transitions_inserted, status.rows_sampled),
-        (180, 480)
-    );
-    assert_eq!((status.transitions_lost, status.transitions_held), (0, 120));
+    config
 }
 
+/// Plays to the end of the run: the chunks of 6 transitions that were stored, and the batches of `rows` that were served.
+fn play(replay: &mut Replay, rows: u32) -> (u64, u64) {
+    let (mut batches, mut sequence) = (0, 0);
+    loop {
+        match replay.sample(rows) {
+            Ok(_) => batches += 1,
+            Err(Unready::Finished) => return (sequence, batches),
+            Err(Unready::Wait(_)) => {
+                let reply = insert(replay, header(0, 1, sequence, 6 * sequence));
+                assert!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
+                sequence += 1;
+            }
+            Err(e) => panic!("{e:?}"),
+        }
+    }
+}
+
+/// 60 transitions warm up, 120 allow 480 rows: 60 updates of 8. What the checkpoint has, and what is left of it, in chunks and batches.
 #[test]
-fn shards_share_what_a_resumed_run_has_behind_it() {
+fn a_resumed_run_counts_on_and_fills_its_replay_first() {
+    let changed = Since {
+        transitions: 120,
+        rows: 232,
+        updates: 29,
+    };
+    let cases = [
+        (
+            "from the start",
+            config(),
+            learner(1, 0, 0, 0),
+            8,
+            (30, 60),
+            0,
+        ),
+        (
+            "same settings",
+            config(),
+            learner(1, 29, 232, 120),
+            8,
+            (20, 31),
+            60,
+        ),
+        (
+            "all frames, not all updates",
+            config(),
+            learner(1, 55, 440, 180),
+            8,
+            (10, 5),
+            60,
+        ),
+        (
+            "nothing left",
+            config(),
+            learner(1, 60, 480, 180),
+            8,
+            (0, 0),
+            0,
+        ),
+        (
+            "fewer frames",
+            Config {
+                transitions_max: Some(100),
+                ..config()
+            },
+            learner(1, 30, 240, 120),
+            8,
+            (0, 0),
+            0,
+        ),
+        (
+            "another ratio: 60 transitions allow 120 rows",
+            Config {
+                replay_ratio: 2.0,
+                since: Some(changed),
+                ..config()
+            },
+            learner(1, 29, 232, 120),
+            8,
+            (20, 15),
+            60,
+        ),
+        (
+            "another batch size: 240 rows",
+            Config {
+                since: Some(changed),
+                ..config()
+            },
+            learner(1, 29, 232, 120),
+            16,
+            (20, 15),
+            60,
+        ),
+    ];
+    for (what, config, join, rows, expected, refilled) in cases {
+        let mut replay = Replay::new(&small_spec(), &config, rows).unwrap();
+        assert_eq!(replay.join_learner(join), Ok(0), "{what}");
+        assert_eq!(play(&mut replay, rows), expected, "{what}");
+        let status = replay.status();
+        let stored = 6 * expected.0;
+        assert_eq!(status.transitions_refilled, refilled, "{what}");
+        let inserted = join.tally.inserted + stored - refilled;
+        assert_eq!(status.transitions_inserted, inserted, "{what}");
+        let served = expected.1 * u64::from(rows);
+        assert_eq!(
+            status.rows_sampled,
+            join.tally.rows_sampled + served,
+            "{what}"
+        );
+        assert_eq!(status.transitions_held, stored, "{what}");
+        assert_eq!(replay.resumed_after(), join.updates, "{what}");
+    }
+}
+
+/// Each shard fills again by its share, and counts on from what the learner says of it.
+#[test]
+fn shards_of_a_resumed_run_count_on_each_for_itself() {
     let config = Config {
         shards: 3,
-        replay_ratio: 4.0,
-        ..unlimited(1000)
+        ..config()
     };
-    let spec = small_spec();
-    let behind = |shard| {
-        let replay = Replay::shard(&spec, &config, 8, shard).unwrap();
-        let replay = replay.resumed_at(100, shard);
-        assert_eq!(replay.inserted_total(), 200, "each knows of the others");
+    for (shard, refill) in [(0, 20), (2, 20)] {
+        let mut replay = Replay::shard(&small_spec(), &config, 8, shard).unwrap();
+        let tally = Tally {
+            inserted: 30 + u64::from(shard),
+            rows_sampled: 80,
+        };
+        let other_shards = Tally {
+            inserted: 90 - u64::from(shard),
+            rows_sampled: 152,
+        };
+        let join = LearnerJoin {
+            tally,
+            other_shards,
+            ..learner(1, 29, 0, 0)
+        };
+        replay.join_learner(join).unwrap();
+        assert_eq!(replay.inserted_total(), 120);
+        for sequence in 0..4 {
+            insert(&mut replay, header(0, 1, sequence, 6 * sequence));
+        }
         let status = replay.status();
-        (status.transitions_inserted, status.rows_sampled)
+        assert_eq!(status.transitions_refilled, refill);
+        assert_eq!(status.transitions_inserted, tally.inserted + 24 - refill);
+    }
+}
+
+/// A learner that comes back tells what each shard has of its epoch: a count that was heard before, and is higher, does not stay.
+#[test]
+fn what_another_shard_had_given_to_a_learner_that_died_is_forgotten() {
+    let config = Config {
+        shards: 2,
+        slack_transitions: 1000,
+        ..config()
     };
-    assert_eq!([0, 1, 2].map(behind), [(67, 267), (67, 267), (66, 266)]);
+    let mut replay = Replay::shard(&small_spec(), &config, 8, 0).unwrap();
+    replay.join_learner(learner(1, 0, 0, 0)).unwrap();
+    let others = |inserted, rows_sampled| Tally {
+        inserted,
+        rows_sampled,
+    };
+    for sequence in 0..15 {
+        insert(&mut replay, header(0, 1, sequence, 6 * sequence));
+    }
+    // All rows of 90 + 90 transitions were given by the other shard; the learner saved after 200 of them.
+    replay.set_other_shards(others(90, 480)).unwrap();
+    assert_eq!(replay.sample(8), Err(Unready::Finished));
+    let join = LearnerJoin {
+        other_shards: others(80, 200),
+        ..learner(2, 25, 0, 90)
+    };
+    replay.join_learner(join).unwrap();
+    replay.set_other_shards(others(90, 200)).unwrap();
+    let mut batches = 0;
+    while replay.sample(8).is_ok() {
+        batches += 1;
+    }
+    assert_eq!((batches, replay.sample(8)), (35, Err(Unready::Finished)));
 }

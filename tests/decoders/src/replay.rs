@@ -2,7 +2,8 @@
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon, InsertReply,
-    Origin, PriorityPart, PriorityUpdate, RequestId, RunSpec, Sampling, Tally, TimeoutRule,
+    Learned, LearnerJoin, Origin, PriorityPart, PriorityUpdate, RequestId, RunSpec, Sampling,
+    Tally, TimeoutRule,
 };
 use driml_replay_server::{Compression, Config, Replay};
 
@@ -80,6 +81,7 @@ fn config(shards: u32, sampling: Sampling) -> Config {
         warmup_transitions: 8,
         slack_transitions: 16,
         transitions_max: (shards == 1).then_some(4096),
+        since: None,
         reproduced_bug: None,
     }
 }
@@ -164,7 +166,23 @@ fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
         _ => {
             let byte = numbers.byte()?;
             if byte % 2 == 0 {
-                let _ = replay.learner_starts(numbers.count()?);
+                let tally = |inserted, rows_sampled| Tally {
+                    inserted,
+                    rows_sampled,
+                };
+                let _ = replay.join_learner(LearnerJoin {
+                    learner: numbers.count()?,
+                    run: numbers.byte()?.into(),
+                    updates: numbers.count()?,
+                    tally: tally(numbers.count()?, numbers.count()?),
+                    other_shards: tally(numbers.count()?, numbers.count()?),
+                    restart: byte % 8 == 0,
+                });
+                let _ = replay.note_learned(Learned {
+                    updates: numbers.count()?,
+                    saved_updates: numbers.count()?,
+                    rows_received: numbers.count()?,
+                });
             } else if byte % 4 == 1 {
                 let origin = Origin {
                     shard: u32::from(byte / 4 % 2),

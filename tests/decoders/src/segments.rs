@@ -10,9 +10,9 @@ use std::{
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Buffer, Chunk, ChunkHeader, End, Goodbye, Horizon, InsertReply,
-    RequestId, RunSpec, Sampling, TimeoutRule, codec,
+    LearnerJoin, RequestId, RunSpec, Sampling, Tally, TimeoutRule, codec,
 };
-use driml_replay_server::{Compression, Config, DurableArgs, DurableReplay};
+use driml_replay_server::{Compression, Config, PersistArgs, Replay};
 
 /// Bytes of a frame: its number, which is never 0.
 const FRAME_BYTES: usize = 4;
@@ -76,19 +76,19 @@ fn config() -> Config {
         warmup_transitions: 0,
         slack_transitions: 1 << 40,
         transitions_max: None,
+        since: None,
         reproduced_bug: None,
     }
 }
 
-fn open(dir: &Path) -> Result<DurableReplay, String> {
-    let args = DurableArgs {
+fn open(dir: &Path) -> Result<Replay, String> {
+    let args = PersistArgs {
         dir: dir.to_owned(),
         shard: 0,
-        after_updates: 0,
         segment_bytes: Some(SEGMENT_BYTES),
         mark: None,
     };
-    DurableReplay::open(&args, &spec(), &config(), ROWS)
+    Replay::open(&args, &spec(), &config(), ROWS)
         .map(|(replay, _)| replay)
         .map_err(|e| e.to_string())
 }
@@ -130,10 +130,10 @@ pub(crate) fn segments(bytes: &[u8]) {
     let status = replay.status();
     assert!(status.transitions_held <= status.transitions_inserted.min(CAPACITY));
     draw(&mut replay, &stored);
-    let before = replay.state_bytes().unwrap();
+    let before = replay.stored_bytes().unwrap();
     drop(replay);
     let mut replay = open(dir.path()).unwrap();
-    assert_eq!(replay.state_bytes().unwrap(), before);
+    assert_eq!(replay.stored_bytes().unwrap(), before);
     // It goes on.
     let actor = 1000;
     let join = ActorJoin {
@@ -152,7 +152,7 @@ pub(crate) fn segments(bytes: &[u8]) {
     replay.check_valid();
 }
 
-fn draw(replay: &mut DurableReplay, stored: &HashSet<Step>) {
+fn draw(replay: &mut Replay, stored: &HashSet<Step>) {
     for client in 0..BATCHES {
         let id = RequestId::first(1_000 + client);
         let Ok(batch) = replay.draw_for(id, ROWS, Buffer::zeroed) else {
@@ -312,7 +312,15 @@ fn log(chunks: u64) -> Vec<u8> {
         let incarnation = 1;
         replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
     }
-    replay.learner_starts(7, 0).unwrap();
+    let join = LearnerJoin {
+        learner: 7,
+        run: 7,
+        updates: 0,
+        tally: Tally::default(),
+        other_shards: Tally::default(),
+        restart: false,
+    };
+    replay.join_learner(join).unwrap();
     let mut affinity = AffinityUpdate {
         learner: 7,
         version: 1,

@@ -10,7 +10,7 @@ use std::{
 use driml_actor::{ActorSettings, Delivery, DeliveryLimits, WeightsSource};
 use driml_learner::{
     LearnerConfig,
-    remote::batch_source::{BatchSource, Next, Requests},
+    remote::batch_source::{BatchSource, Counters, Next, Requests},
 };
 use driml_protocol::{Keys, RunClient, Shutdown};
 use driml_settings::config::RunConfig;
@@ -147,7 +147,8 @@ impl Learner<'_> {
             unreachable_max: ANSWER_MAX,
         };
         let weights = vec![0; self.weights_bytes];
-        let mut source = BatchSource::start(&clients, requests, stop)?;
+        let mut source =
+            BatchSource::start(&clients, requests, &Counters::at_start(clients.len()), stop)?;
         let mut due = Instant::now();
         let mut updates = 0;
         while !stop.wait_timeout(due.saturating_duration_since(Instant::now())) {

@@ -211,7 +211,7 @@ impl Launch<'_> {
         let logs = self.run_dir.logs();
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
         for shard in 0..self.servers.len() {
-            let server = self.start_server(shard, self.resume_point.updates)?;
+            let server = self.start_server(shard)?;
             self.processes.replay_servers.push(server);
         }
         let mut sessions = Vec::new();

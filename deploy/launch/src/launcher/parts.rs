@@ -129,14 +129,10 @@ impl Launch<'_> {
         Ok(())
     }
 
-    /// Starts the replay server of one shard, in a run that goes on after so many updates.
-    pub(super) fn start_server(
-        &self,
-        shard: usize,
-        after_updates: u64,
-    ) -> anyhow::Result<ManagedProcess> {
+    /// Starts the replay server of one shard.
+    pub(super) fn start_server(&self, shard: usize) -> anyhow::Result<ManagedProcess> {
         let config = self.run_dir.config().display().to_string();
-        let (number, after) = (shard.to_string(), after_updates.to_string());
+        let number = shard.to_string();
         let mut args = words(&[
             "replay-server",
             "--stay",
@@ -144,8 +140,6 @@ impl Launch<'_> {
             &self.endpoints[shard],
             "--shard",
             &number,
-            "--after-updates",
-            &after,
             "--config",
             &config,
         ]);
@@ -184,8 +178,7 @@ impl Launch<'_> {
                 self.servers[shard], self.restarts
             ));
             session::sweep_shared_memory();
-            // What the learner has learned meanwhile, the log knows.
-            let server = self.start_server(shard, self.resume_point.updates)?;
+            let server = self.start_server(shard)?;
             self.processes.replay_servers[shard] = server;
         }
         Ok(())

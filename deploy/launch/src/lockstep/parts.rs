@@ -5,13 +5,13 @@ use std::path::Path;
 
 use anyhow::{Context, bail};
 use driml_actor::{ActError, ActorSettings, Collector, CollectorState, Incarnation};
-use driml_learner::{Learner, LearnerConfig};
+use driml_learner::{Learner, LearnerConfig, ServedPart};
 use driml_machine::error::usage;
 use driml_protocol::{
     ActorJoin, Batch, BufferPool, EpisodesReply, Goodbye, InsertReply, LearnerStatus, ReplayStatus,
     Weights,
 };
-use driml_replay_server::{DurableArgs, DurableReplay, Mark, Replay, Unready};
+use driml_replay_server::{Mark, PersistArgs, Replay, Unready};
 use driml_settings::config::RunConfig;
 
 use super::saved::SavedParts;
@@ -23,20 +23,15 @@ const INCARNATION: u64 = 1;
 const LEARNER: u64 = 1;
 
 /// The replay of a run, kept in its folder; with a mark, as it was there.
-fn open(
-    config: &RunConfig,
-    run_dir: &RunFolder,
-    mark: Option<Mark>,
-) -> anyhow::Result<DurableReplay> {
-    let args = DurableArgs {
+fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::Result<Replay> {
+    let args = PersistArgs {
         dir: run_dir.replay(),
         shard: 0,
-        after_updates: 0,
         segment_bytes: None,
         mark,
     };
     let batch_size = config.learner.batch_size;
-    let (replay, recovery) = DurableReplay::open(&args, &config.run, &config.replay, batch_size)?;
+    let (replay, recovery) = Replay::open(&args, &config.run, &config.replay, batch_size)?;
     // A part of it would do for a server that goes on, but not for a run that is to be the same.
     match recovery.warnings.first() {
         Some(why) if mark.is_some() => Err(usage!(
@@ -51,7 +46,7 @@ fn open(
 pub(super) struct Lockstep {
     actors: Vec<Collector>,
     next_actor: usize,
-    replay: DurableReplay,
+    replay: Replay,
     learner: Learner,
     status: LearnerStatus,
     batch_size: u32,
@@ -143,7 +138,7 @@ impl Lockstep {
             unwanted: vec![0; actors.len()],
             actors,
             next_actor: 0,
-            replay: DurableReplay::in_memory(replay, 0),
+            replay,
             learner,
             status,
             batch_size,
@@ -188,8 +183,6 @@ impl Lockstep {
             actor.set_weights(saved.acting.header.version, &saved.acting.safetensors)?;
             actor.go_on_from(state)?;
         }
-        let restored = self.replay.restore_priorities(saved.priorities.as_ref());
-        restored.map_err(anyhow::Error::msg)?;
         self.next_actor = saved.next_actor;
         self.unwanted = saved.unwanted;
         self.status = saved.status;
@@ -228,6 +221,8 @@ impl Lockstep {
     /// # Errors
     /// A file system that refuses.
     pub(super) fn save(&mut self, folder: &Path) -> anyhow::Result<()> {
+        let inserted = self.replay.tally().inserted;
+        self.learner.progress_mut().note_inserted(0, inserted);
         let Some(mark) = self.replay.mark()? else {
             return Ok(self.learner.save(folder)?);
         };
@@ -248,7 +243,6 @@ impl Lockstep {
             next_actor: self.next_actor,
             unwanted: self.unwanted.clone(),
             replay: mark,
-            priorities: self.replay.saved_priorities(),
             status: self.status.clone(),
             acting: self.acting.clone(),
             published: self.published,
@@ -264,8 +258,7 @@ impl Lockstep {
         loop {
             match self.replay.insert(&chunk) {
                 InsertReply::Stored { .. } => break,
-                InsertReply::Wait { .. } => match self.replay.sample_between_marks(self.batch_size)
-                {
+                InsertReply::Wait { .. } => match self.replay.sample(self.batch_size) {
                     Ok(batch) => self.learn(&batch)?,
                     Err(_) if self.replay.is_refused_by_disk() => {
                         bail!(
@@ -288,7 +281,7 @@ impl Lockstep {
             }
         }
         loop {
-            match self.replay.sample_between_marks(self.batch_size) {
+            match self.replay.sample(self.batch_size) {
                 Ok(batch) => self.learn(&batch)?,
                 Err(Unready::Wait(_)) => return Ok(true),
                 Err(Unready::Finished) => return Ok(false),
@@ -299,6 +292,11 @@ impl Lockstep {
 
     fn learn(&mut self, batch: &Batch) -> anyhow::Result<()> {
         let report = self.learner.update(batch)?;
+        self.learner.progress_mut().note(&[ServedPart {
+            shard: 0,
+            rows: batch.header.rows,
+            inserted: batch.header.tally.inserted,
+        }]);
         let number = self.learner.updates();
         if let Some(priorities) = batch.priority_update(LEARNER, number, &report.row_kls) {
             let set = self.replay.set_priorities(&priorities);

@@ -6,15 +6,13 @@ use driml_actor::CollectorState;
 use driml_learner::checkpoint;
 use driml_machine::error::usage;
 use driml_protocol::{LearnerStatus, Weights, WeightsHeader, codec};
-use driml_replay_server::{Mark, SavedPriorities};
+use driml_replay_server::Mark;
 use serde::{Deserialize, Serialize};
 
 use crate::run_folder::RunFolder;
 
-/// How it is written; another way is refused.
-const FORMAT: u32 = 1;
-/// The same with priorities after it: of a run that draws by them.
-const FORMAT_PRIORITISED: u32 = 2;
+/// How it is written; another way is rejected.
+const FORMAT: u32 = 3;
 
 /// How the parts of a run in lockstep stand, without the learner.
 pub(super) struct SavedParts {
@@ -22,8 +20,6 @@ pub(super) struct SavedParts {
     pub(super) next_actor: usize,
     pub(super) unwanted: Vec<u64>,
     pub(super) replay: Mark,
-    /// Where rows are drawn by priority: the replay's log does not have them.
-    pub(super) priorities: Option<SavedPriorities>,
     pub(super) status: LearnerStatus,
     pub(super) acting: Weights,
     pub(super) published: u64,
@@ -60,15 +56,8 @@ impl SavedParts {
             acting: (*header, safetensors.clone()),
             published: self.published,
         };
-        let (format, value) = match &self.priorities {
-            None => (FORMAT, codec::encode_value(&written)),
-            Some(priorities) => {
-                let value = codec::encode_value(&(&written, priorities));
-                (FORMAT_PRIORITISED, value)
-            }
-        };
-        let mut bytes = format.to_le_bytes().to_vec();
-        bytes.extend(value.context("writing how the parts stand")?);
+        let mut bytes = FORMAT.to_le_bytes().to_vec();
+        bytes.extend(codec::encode_value(&written).context("writing how the processes stand")?);
         Ok(bytes)
     }
 
@@ -82,28 +71,20 @@ impl SavedParts {
         let bytes = checkpoint::companion(path)?
             .with_context(|| format!("{} is not of a run in lockstep", path.display()))?;
         let reading = || format!("reading the parts in {}", path.display());
-        let (written, priorities) = if let Some(content) = bytes.strip_prefix(&FORMAT.to_le_bytes())
-        {
-            let written: Written = codec::decode_value(content).with_context(reading)?;
-            (written, None)
-        } else if let Some(content) = bytes.strip_prefix(&FORMAT_PRIORITISED.to_le_bytes()) {
-            let (written, priorities) =
-                codec::decode_value::<(Written, _)>(content).with_context(reading)?;
-            (written, Some(priorities))
-        } else {
+        let Some(content) = bytes.strip_prefix(&FORMAT.to_le_bytes()) else {
             return Err(usage!(
-                "{} holds the parts of a run in lockstep in the form of another version of driml: go on with that one",
+                "{} holds the processes of a run in lockstep in the form of another version of driml: resume it with that one",
                 path.display()
             )
             .into());
         };
+        let written: Written = codec::decode_value(content).with_context(reading)?;
         let (header, safetensors) = written.acting;
         Ok(Self {
             actors: written.actors,
             next_actor: written.next_actor,
             unwanted: written.unwanted,
             replay: written.replay,
-            priorities,
             status: written.status,
             acting: Weights {
                 header,

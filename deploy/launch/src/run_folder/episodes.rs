@@ -6,13 +6,16 @@
 //! played it, and in which copy of its world; `return`, undiscounted, and `length` in steps, both empty if a part of it was lost.
 //! Of more than the replay server keeps between two looks the oldest are missing, and so are their numbers.
 
-use std::{collections::VecDeque, fs, io::ErrorKind};
+use std::collections::VecDeque;
 
-use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{EndedEpisode, EpisodesReply, Played, RETURNS_OF, ReplayStatus};
 
-use super::{columns::Columns, folder::RunFolder, growing_csv::GrowingCsv};
+use super::{
+    columns::{Columns, set_aside},
+    folder::RunFolder,
+    growing_csv::GrowingCsv,
+};
 
 const HEADER: [&str; 7] = [
     "seconds", "frames", "episode", "actor", "copy", "return", "length",
@@ -68,8 +71,7 @@ impl TrainingEpisodes {
         Self::begin(folder, &[], false)
     }
 
-    /// Of a run that goes on: with what was heard until it had `frames_max` frames; `is_known` if its replay knows of them. A run that began with an older version has
-    /// no such file, and begins one.
+    /// Of a run that goes on: with what was heard until it had `frames_max` frames; `is_known` if its replay knows of them. The others are set aside in another file, which is said.
     ///
     /// # Errors
     /// A file that is none of this kind, a file system that refuses.
@@ -79,20 +81,17 @@ impl TrainingEpisodes {
         is_known: bool,
     ) -> anyhow::Result<Self> {
         let path = folder.episodes();
-        let reading = || format!("reading {}", path.display());
-        let text = match fs::read(&path) {
-            Err(e) if e.kind() == ErrorKind::NotFound => Vec::new(),
-            read => read.with_context(reading)?,
-        };
-        let mut rows = Vec::new();
-        for row in Columns::parse(&text).with_context(reading)?.rows {
+        let (mut rows, mut aside) = (Vec::new(), Vec::new());
+        for row in Columns::read(&path)?.rows {
             let (frames, ..) = read(&row)
                 .ok_or_else(|| usage!("{}: {row:?} is no row of episodes", path.display()))?;
             // A replay that was kept says itself how far it is, once it is heard.
-            if is_known || frames <= frames_max {
-                rows.push(row);
+            match is_known || frames <= frames_max {
+                true => rows.push(row),
+                false => aside.push(row),
             }
         }
+        set_aside(&path, &HEADER.map(String::from), &aside)?;
         Self::begin(folder, &rows, is_known)
     }
 
@@ -170,12 +169,13 @@ impl TrainingEpisodes {
         said
     }
 
-    /// Takes back the episodes that ended after the run had so many frames: what came after a checkpoint is done again.
+    /// Sets aside the episodes that ended after the run had so many frames: what came after is done again.
     fn cut(&mut self, frames_max: u64) -> anyhow::Result<()> {
         let rows = std::mem::take(&mut self.rows);
-        let is_kept = |row: &&csv::StringRecord| read(row).is_some_and(|it| it.0 <= frames_max);
-        let kept: Vec<_> = rows.iter().filter(is_kept).cloned().collect();
-        if kept.len() < rows.len() {
+        let is_kept = |row: &csv::StringRecord| read(row).is_some_and(|it| it.0 <= frames_max);
+        let (kept, aside): (Vec<_>, Vec<_>) = rows.into_iter().partition(is_kept);
+        if !aside.is_empty() {
+            set_aside(&self.folder.episodes(), &HEADER.map(String::from), &aside)?;
             let heard = std::mem::take(&mut self.heard);
             *self = Self {
                 heard,
@@ -227,6 +227,11 @@ impl TrainingEpisodes {
             mean: sum / of as f64,
             of,
         })
+    }
+
+    /// Number of the newest episode.
+    pub(super) const fn count(&self) -> u64 {
+        self.episode
     }
 
     /// What is missing in the file.

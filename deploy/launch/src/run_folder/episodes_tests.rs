@@ -1,5 +1,7 @@
 //! The table of episodes: each has one row, of every shard, over resumptions and where the server has let some go.
 
+use std::fs;
+
 use super::*;
 
 /// A shard in which so many episodes have ended, and those after the first `heard` of them; their returns are their numbers from

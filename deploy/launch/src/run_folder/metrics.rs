@@ -2,16 +2,20 @@
 //! It writes no file: the recorder does.
 
 use std::{
-    fs::{self, File},
-    io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom},
+    fs::File,
+    io::{BufRead, BufReader, Read, Seek, SeekFrom},
     path::Path,
 };
 
-use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{LearnerStatus, ReplayStatus};
 
-use super::{columns::Columns, episodes::Episodes, folder::RunFolder, resume_point::ResumePoint};
+use super::{
+    columns::{Columns, set_aside},
+    episodes::Episodes,
+    folder::RunFolder,
+    resume_point::ResumePoint,
+};
 
 /// Bytes at the end of the file in which its last row lies.
 const LAST_ROW_BYTES: u64 = 4096;
@@ -123,44 +127,47 @@ fn number(value: f64) -> String {
     }
 }
 
-/// The rows of an interrupted run up to `resume_point`, of no more than `frames_max` frames; none where there is no
-/// such file.
+/// The rows of an interrupted run up to `resume_point`, of no more than `frames_max` frames, under this header; none where there is no
+/// such file. The others, which contradict what the run will do, are set aside in another file, which is said.
+///
+/// # Errors
+/// A file of something else, or a file system that refuses.
 pub(super) fn rows_up_to(
     path: &Path,
     header: Vec<String>,
     resume_point: ResumePoint,
     frames_max: u64,
 ) -> anyhow::Result<Columns> {
-    let reading = || format!("reading {}", path.display());
-    let none = |header| Columns {
-        header,
-        rows: Vec::new(),
-    };
-    let text = match fs::read(path) {
-        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(none(header)),
-        read => read.with_context(reading)?,
-    };
-    let found = Columns::parse(&text).with_context(reading)?;
-    if !found.header.is_empty() && found.header != header {
-        return Err(usage!(
-            "{} has other columns than a run of several processes by this version of driml: go on with the version that began it; a \
-             run in --lockstep whose world cannot be saved is repeated, not resumed",
-            path.display()
-        )
-        .into());
-    }
-    let mut kept = none(header);
+    let found = Columns::read(path)?;
+    let place = |name: &String| found.place(name);
+    let places: Vec<_> = header.iter().map(place).collect();
+    let (mut kept, mut aside) = (Vec::new(), Vec::new());
     for row in found.rows {
-        let count = |name| kept.value::<u64>(&row, name);
+        let count = |name: &str| {
+            let at = found.header.iter().position(|it| it == name)?;
+            row.get(at)?.parse::<u64>().ok()
+        };
         let (Some(updates), Some(frames)) = (count("updates"), count("frames")) else {
             return Err(usage!("{}: {row:?} is no row of metrics", path.display()).into());
         };
         // Actors run ahead: without the second condition a run that now ends sooner would end before its rows.
         if updates <= resume_point.updates && frames <= frames_max {
-            kept.rows.push(row);
+            let cell = |place: &Option<usize>| place.and_then(|at| row.get(at)).unwrap_or("");
+            kept.push(places.iter().map(cell).collect());
+        } else {
+            aside.push(row);
         }
     }
-    Ok(kept)
+    set_aside(path, &found.header, &aside)?;
+    Ok(Columns { header, rows: kept })
+}
+
+/// Seconds that the run in `folder` has taken by its metrics, those rows included that a resumption makes again.
+pub(super) fn seconds_of(folder: &RunFolder) -> f64 {
+    let found = Columns::read(&folder.metrics()).unwrap_or_default();
+    let seconds = found.rows.iter();
+    let seconds = seconds.filter_map(|row| found.value::<f64>(row, "seconds"));
+    seconds.fold(0.0, f64::max)
 }
 
 /// How far a run is.
@@ -194,6 +201,8 @@ pub fn progress(folder: &RunFolder) -> Option<Progress> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]

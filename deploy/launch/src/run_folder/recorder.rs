@@ -17,18 +17,11 @@ use super::{
     events::Events,
     folder::RunFolder,
     growing_csv::GrowingCsv,
-    metrics::{Moment, header, rows_up_to},
+    metrics::{Moment, header, rows_up_to, seconds_of},
     resume_point::ResumePoint,
     summary::{Outcome, Summary},
 };
 use crate::rates::Rates;
-
-const fn none(header: Vec<String>) -> Columns {
-    Columns {
-        header,
-        rows: Vec::new(),
-    }
-}
 
 /// What a recorder knows of a run before it begins.
 #[derive(Clone, Debug, Default)]
@@ -92,7 +85,10 @@ impl RunRecorder {
             .with_context(|| format!("making the run folder {}", folder.display()))?;
         let lock = folder.lock()?;
         folder.write_config(&run.config_toml)?;
-        let rows = none(header(run.losses, &run.processes));
+        let rows = Columns {
+            header: header(run.losses, &run.processes),
+            rows: Vec::new(),
+        };
         let episodes = TrainingEpisodes::create(folder)?;
         Self::begin(folder, run, lock, rows, episodes, ResumePoint::default())
     }
@@ -110,16 +106,15 @@ impl RunRecorder {
     ) -> anyhow::Result<Self> {
         let lock = folder.lock()?;
         let head = header(run.losses, &run.processes);
-        let rows = match resume_point.updates {
-            0 => none(head),
-            _ => rows_up_to(&folder.metrics(), head, resume_point, frames_max)?,
-        };
+        let seconds = seconds_of(folder);
+        let rows = rows_up_to(&folder.metrics(), head, resume_point, frames_max)?;
         let is_known = resume_point.replay_is_kept;
-        let frames = rows.last("frames").unwrap_or(0);
-        let episodes = TrainingEpisodes::go_on(folder, frames, is_known)?;
+        let episodes = TrainingEpisodes::go_on(folder, resume_point.frames, is_known)?;
         Summary::remove(folder)?;
         folder.write_config(&run.config_toml)?;
-        Self::begin(folder, run, lock, rows, episodes, resume_point)
+        let mut this = Self::begin(folder, run, lock, rows, episodes, resume_point)?;
+        this.count_seconds(seconds);
+        Ok(this)
     }
 
     fn begin(
@@ -131,19 +126,18 @@ impl RunRecorder {
         resume_point: ResumePoint,
     ) -> anyhow::Result<Self> {
         // A replay that was kept knows of all the run's episodes and k.
-        let before = |column| match resume_point.replay_is_kept {
-            true => None,
-            false => rows.last(column),
+        let is_kept = resume_point.replay_is_kept;
+        let before = |column| rows.last(column).filter(|_| !is_kept);
+        let episodes_before = match is_kept {
+            true => 0,
+            false => rows.last("episodes").unwrap_or(0).max(episodes.count()),
         };
         let mut this = Self {
             _lock: lock,
             resume_point,
             seconds_before: rows.last("seconds").unwrap_or(0.0),
-            frames_before: rows.last("frames").unwrap_or(0),
-            episodes_before: rows
-                .last("episodes")
-                .filter(|_| !resume_point.replay_is_kept)
-                .unwrap_or(0),
+            frames_before: resume_point.frames,
+            episodes_before,
             k_before: before("mean_k").zip(before("sd_k")),
             metrics: GrowingCsv::create(&folder.metrics(), &rows.header, &rows.rows)?,
             header: rows.header,
@@ -173,17 +167,21 @@ impl RunRecorder {
     /// The run has been going on for at least so many seconds, in which nobody recorded it.
     pub(crate) fn count_seconds_from(&mut self, seconds: f64) {
         self.is_late = true;
+        self.count_seconds(seconds);
+    }
+
+    fn count_seconds(&mut self, seconds: f64) {
         self.seconds_before = self.seconds_before.max(seconds);
     }
 
-    /// Mean and standard deviation of k over all `updates` of the run, before it was resumed too.
-    fn k(&self, replay: &ReplayStatus, updates: u64) -> Option<(f64, f64)> {
+    /// Mean and standard deviation of k over all rows of the run, before it was resumed too.
+    fn k(&self, replay: &ReplayStatus) -> Option<(f64, f64)> {
         let since = replay.mean_k().zip(replay.sd_k());
         let (Some(before), Some(since)) = (self.k_before, since) else {
             return since.or(self.k_before);
         };
-        // All updates are of as many rows.
-        let share = self.resume_point.updates as f64 / updates.max(1) as f64;
+        let rows = replay.rows_sampled.max(self.resume_point.rows).max(1);
+        let share = self.resume_point.rows as f64 / rows as f64;
         let mixed = |before: f64, since: f64| share * before + (1.0 - share) * since;
         let square = |(mean, sd): (f64, f64)| mean * mean + sd * sd;
         let mean = mixed(before.0, since.0);
@@ -234,7 +232,7 @@ impl RunRecorder {
             seconds: self.seconds(),
             rates: self.rates.per_second(),
             episodes: self.episodes(replay),
-            k: self.k(replay, updates),
+            k: self.k(replay),
             replay,
             learner,
             epsilon: self.run.epsilon.map(|it| it.epsilon(frames)),
@@ -293,7 +291,7 @@ impl RunRecorder {
             updates,
             frames_per_second: frames as f64 / wall_seconds,
             updates_per_second: updates as f64 / wall_seconds,
-            mean_k: self.k(replay, updates).map(|(mean, _)| mean),
+            mean_k: self.k(replay).map(|(mean, _)| mean),
             rss_mib_max: rss
                 .map(|(name, mib)| (name.clone(), mib.map(f64::round).into()))
                 .collect(),

@@ -152,6 +152,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     }
     let resume_point = ResumePoint {
         updates: 31,
+        rows: 31 * 16,
         frames: 2_000,
         replay_is_kept: false,
     };
@@ -165,17 +166,16 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, format!("{text}9.0,40")).unwrap();
 
-    let other = ["replay-server", "actor-0"];
-    let said = RunRecorder::go_on(&run, recorded(&other), resume_point, 9_999).unwrap_err();
-    assert!(said.to_string().contains("has other columns"), "{said}");
     let mut recorder = RunRecorder::go_on(&run, recorded(&processes), resume_point, 9_999).unwrap();
     assert!(!run.summary().exists());
     // While the replay fills again nothing is new.
-    (replay.transitions_inserted, replay.episodes) = (1_500, 1);
+    (replay.transitions_inserted, replay.episodes) = (2_000, 1);
+    replay.rows_sampled = 31 * 16;
     learner.updates = 31;
     recorder.record(std::slice::from_ref(&replay), &learner, &[]);
     (replay.transitions_inserted, replay.episodes) = (2_100, 2);
     replay.k_histogram = vec![0, 0, 5];
+    replay.rows_sampled = 62 * 16;
     learner.updates = 62;
     recorder.record(std::slice::from_ref(&replay), &learner, &[]);
     let summary = recorder.summarise(Outcome::Finished, &spec(), &replay, &learner);
@@ -208,4 +208,62 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     // Squares: 2.5 and 4 are 3.25 in the mean, 1.75^2 is 3.0625.
     assert_eq!(column("sd_k"), [0.5, 0.5, 0.433013]);
     assert!(column("seconds").is_sorted());
+}
+
+/// What is there stays where it agrees with the checkpoint, under the columns of the processes that there are now; what does not is set
+/// aside, and the seconds that it took count.
+#[test]
+fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
+    let episodes = "seconds,frames,episode,actor,copy,return,length\n1.0,900,1,0,0,1,3\n2.0,2000,2,0,1,1,3\n3.0,2400,3,0,2,1,3\n";
+    let metrics = "seconds,frames,updates,episodes,rss_mib_actor_7\n1.0,900,10,1,5\n2.5,2000,31,2,5\n29.7,2400,50,3,5\n";
+    let cases = [
+        ("both", Some(metrics), 29.0, 2),
+        ("no metrics", None, 0.0, 0),
+    ];
+    for (what, metrics, seconds, kept) in cases {
+        let folder = tempfile::tempdir().unwrap();
+        let run = RunFolder::new(folder.path());
+        fs::write(run.episodes(), episodes).unwrap();
+        metrics
+            .iter()
+            .for_each(|text| fs::write(run.metrics(), text).unwrap());
+        let point = ResumePoint {
+            updates: 31,
+            rows: 31 * 16,
+            frames: 2_000,
+            replay_is_kept: false,
+        };
+        let recorder = RunRecorder::go_on(&run, recorded(&["actor-0"]), point, 9_999).unwrap();
+        let rows = |name: &str| {
+            let text = fs::read(run.path().join(name)).unwrap_or_default();
+            Columns::parse(&text).unwrap().rows.len()
+        };
+        assert_eq!(rows("episodes.csv"), 2, "{what}");
+        assert_eq!(rows("episodes.aside-1.csv"), 1, "{what}");
+        assert_eq!(
+            (rows("metrics.csv"), rows("metrics.aside-1.csv")),
+            (kept, kept / 2),
+            "{what}"
+        );
+        let nothing = ReplayStatus::default();
+        assert_eq!(recorder.episodes(&nothing).count, 2, "{what}");
+        let summary = recorder.summarise(
+            Outcome::Finished,
+            &spec(),
+            &nothing,
+            &LearnerStatus::default(),
+        );
+        assert!(
+            summary.wall_seconds >= seconds,
+            "{what}: {}",
+            summary.wall_seconds
+        );
+        assert_eq!(summary.frames, 2_000, "{what}");
+        drop(recorder);
+
+        // A run resumed twice from there sets aside beside what was set aside before.
+        fs::write(run.episodes(), episodes).unwrap();
+        RunRecorder::go_on(&run, recorded(&["actor-0"]), point, 9_999).unwrap();
+        assert_eq!(rows("episodes.aside-2.csv"), 1, "{what}");
+    }
 }

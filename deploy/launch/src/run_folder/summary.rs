@@ -43,6 +43,9 @@ pub struct Summary {
     pub updates: u64,
     /// Transitions that the replay has stored.
     pub transitions_inserted: u64,
+    /// Transitions that filled the replay again since the run was resumed last; they are in no other count.
+    #[serde(default)]
+    pub transitions_refilled: u64,
     /// Transitions that actors produced and that never arrived.
     pub transitions_lost: u64,
     /// Transitions stored twice.
@@ -57,6 +60,9 @@ pub struct Summary {
     /// not say.
     #[serde(default)]
     pub rows_unlearned: u64,
+    /// Updates that a learner with an older checkpoint has learned again.
+    #[serde(default)]
+    pub updates_relearned: u64,
     /// Mean undiscounted return of the last 100 training episodes, also over a resumption.
     pub mean_return: Option<f64>,
     /// Of how many episodes that is: of fewer than 100 only if there were fewer. Older runs do not say.
@@ -128,10 +134,12 @@ impl Summary {
             frames,
             updates,
             transitions_inserted: replay.transitions_inserted,
+            transitions_refilled: replay.transitions_refilled,
             transitions_lost: replay.transitions_lost,
             transitions_duplicated: replay.transitions_duplicated,
             rows_sampled: replay.rows_sampled,
             rows_unlearned: replay.rows_unlearned,
+            updates_relearned: replay.updates_relearned,
             replay_ratio: replay.replay_ratio(),
             episodes: episodes.count,
             mean_return: episodes.mean_return.map(|it| it.mean),

@@ -27,7 +27,7 @@ const ANSWER_MAX: Duration = Duration::from_secs(3);
 pub struct Connection {
     /// The run's settings.
     pub config: RunConfig,
-    /// Updates after which the run goes on, if it was resumed; none before the first replay server has read its replay back.
+    /// Updates after which the run goes on, if it was resumed; none before its learner has joined.
     pub after_updates: Option<u64>,
     /// Each with its endpoint.
     servers: Vec<(String, RunClient)>,
@@ -71,7 +71,10 @@ impl Connection {
                         codec::decode::<Hello>(&hello.to_bytes(), None).with_context(|| {
                             format!("the greeting of the replay server on {endpoint}")
                         })?;
-                    (hello.config_toml, Some(hello.after_updates))
+                    (
+                        hello.config_toml,
+                        hello.has_learner.then_some(hello.after_updates),
+                    )
                 }
                 Err(SessionError::Recovering(Recovering {
                     config_toml: Some(config_toml),
@@ -171,7 +174,8 @@ impl Connection {
         let first = first.filter(|_| servers[0].replay.is_some());
         if let (None, Some((_, client))) = (self.after_updates, first) {
             let hello = client.fetch::<Hello>(ANSWER_MAX);
-            self.after_updates = hello.ok().map(|it| it.after_updates);
+            let known = hello.ok().filter(|it| it.has_learner);
+            self.after_updates = known.map(|it| it.after_updates);
         }
         let learner = first.and_then(|(_, client)| client.fetch::<LearnerStatus>(ANSWER_MAX).ok());
         let answered: Vec<_> = servers.iter().filter_map(|it| it.replay.clone()).collect();

@@ -98,6 +98,7 @@ fn resume_point(folder: &RunFolder, run: &Found<'_>) -> anyhow::Result<ResumePoi
             0 => updates,
             _ => updates.min(now),
         },
+        rows: run.replay.rows_sampled,
         frames: run.replay.transitions_inserted,
         replay_is_kept: run.after_updates == 0,
     })

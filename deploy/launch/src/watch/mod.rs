@@ -51,7 +51,7 @@ pub fn once(mut connection: Connection, outputs: &Outputs, json: bool) -> anyhow
 ///
 /// # Errors
 /// One that has died instead and does not come back; [`Interrupted`].
-fn wait_until_recovered(
+fn wait_until_known(
     connection: &mut Connection,
     interrupts: &Interrupts,
 ) -> anyhow::Result<Snapshot> {
@@ -62,7 +62,7 @@ fn wait_until_recovered(
         if snapshot.is_answered() && connection.after_updates.is_some() {
             return Ok(snapshot);
         }
-        if snapshot.recovering().next().is_some() {
+        if snapshot.is_answered() || snapshot.recovering().next().is_some() {
             heard = Instant::now();
         }
         let is_another_run = snapshot.servers.iter().any(|it| it.is_another_run);
@@ -72,6 +72,9 @@ fn wait_until_recovered(
         if said.due().is_some() {
             for (server, progress) in snapshot.recovering() {
                 console::line(&recovery(&server.endpoint, progress));
+            }
+            if snapshot.is_answered() {
+                console::line("no learner has joined the run yet: waiting for it");
             }
         }
         if interrupts.wait_timeout(POLL) > 0 {
@@ -92,9 +95,10 @@ pub fn run(mut connection: Connection, outputs: &Outputs) -> anyhow::Result<()> 
     if let Some(failed) = file.as_mut().and_then(|it| it.write(&snapshot)) {
         return Err(usage!("--prometheus: {failed}").into());
     }
-    if snapshot.recovering().next().is_some() {
+    let is_unknown = outputs.run_dir.is_some() && connection.after_updates.is_none();
+    if is_unknown || snapshot.recovering().next().is_some() {
         // What the run has done so far is not known before.
-        snapshot = wait_until_recovered(&mut connection, &interrupts)?;
+        snapshot = wait_until_known(&mut connection, &interrupts)?;
     }
     let mut watched = Watched::new(&connection, &snapshot, outputs)?;
     let ended = loop {

@@ -81,6 +81,7 @@ impl Watched {
         let screen = Screen::new(config.frames(), TEMPLATE);
         let now = ResumePoint {
             updates: learner.updates.max(after_updates),
+            rows: snapshot.replay.rows_sampled,
             frames: snapshot.replay.transitions_inserted,
             replay_is_kept: true,
         };

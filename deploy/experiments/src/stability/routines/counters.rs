@@ -2,7 +2,7 @@
 
 use driml_actor::{Incarnation, Schedule};
 use driml_learner::{AffinityEstimator, Alphabet, LearnedAffinity, LearnedSettings};
-use driml_protocol::{Chunk, End, InsertReply, Tally, TimeoutRule};
+use driml_protocol::{Chunk, End, InsertReply, LearnerJoin, Tally, TimeoutRule};
 use driml_replay_server::RateLimiter;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -131,7 +131,7 @@ fn limiter(context: &mut Context<'_>) -> anyhow::Result<Row> {
             inserted: inserted - others.inserted,
             rows_sampled: rows_sampled - others.rows_sampled,
         };
-        let limiter = RateLimiter::new(8.0, 0, slack, None).resumed_at(own, others);
+        let limiter = RateLimiter::new(8.0, 0, slack, None).counting_on(own, others);
         for rows in [
             1u32,
             32,
@@ -158,8 +158,20 @@ fn resumed() -> anyhow::Result<Row> {
     );
     for updates in [1 << 31, 1 << 32, 10_000_000_000, 1 << 40, 1 << 48] {
         let spec = spec(3, 0.99, TimeoutRule::Terminal);
-        let mut replay = replay(&spec, 32)?.resumed_at(updates, 0);
+        let mut replay = replay(&spec, 32)?;
         let before = updates * 32 / 8;
+        let join = LearnerJoin {
+            learner: 1,
+            run: 1,
+            updates,
+            tally: Tally {
+                inserted: before,
+                rows_sampled: updates * 32,
+            },
+            other_shards: Tally::default(),
+            restart: false,
+        };
+        replay.join_learner(join).map_err(anyhow::Error::msg)?;
         let stored = replay.insert(&chunk(&[(1.0, End::Running); 40]));
         let found = match stored {
             InsertReply::Stored { inserted_total, .. } => inserted_total,

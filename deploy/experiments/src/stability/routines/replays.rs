@@ -50,6 +50,7 @@ pub(super) const fn config(capacity_transitions: u64) -> Config {
         warmup_transitions: 0,
         slack_transitions: 1 << 40,
         transitions_max: None,
+        since: None,
         reproduced_bug: None,
     }
 }

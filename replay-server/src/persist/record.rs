@@ -1,5 +1,5 @@
 //! The bytes of the log: records one after the other, each with its number, its length and a checksum.
-//! What a record means is for `event` and `segment`; where a segment ends is for `recovery`.
+//! What a record means is for `snapshot` and `segment`; where a segment ends is for `recovery`.
 //!
 //! A record is a head of 32 bytes, little-endian, and a body:
 //! magic u32, kind u32, ordinal u64, length of the body u64, bytes of the body that the checksum covers u32, crc32 u32.
@@ -32,8 +32,8 @@ const READ_BYTES: usize = 1 << 18;
 pub(super) enum RecordKind {
     /// The first of a segment: which one it is, and the replay's state where it begins.
     Segment = 1,
-    /// An event.
-    Event = 2,
+    /// Who came or went.
+    Note = 2,
     /// A chunk that was stored.
     Chunk = 3,
     /// The last of a segment that another one follows.
@@ -44,7 +44,7 @@ impl RecordKind {
     const fn of(number: u32) -> Option<Self> {
         Some(match number {
             1 => Self::Segment,
-            2 => Self::Event,
+            2 => Self::Note,
             3 => Self::Chunk,
             4 => Self::Closed,
             _ => return None,

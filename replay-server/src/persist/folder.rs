@@ -10,7 +10,7 @@ use std::{
 use driml_protocol::{lock_file, whole_file};
 
 use super::{
-    error::DurableError,
+    error::PersistError,
     segment::{self, FORMAT, LogId},
 };
 
@@ -27,9 +27,9 @@ pub(super) struct LogFolder {
 pub(super) fn io_error(
     doing: &'static str,
     path: &Path,
-) -> impl FnOnce(io::Error) -> DurableError + use<> {
+) -> impl FnOnce(io::Error) -> PersistError + use<> {
     let path = path.to_owned();
-    move |source| DurableError::Io {
+    move |source| PersistError::Io {
         doing,
         path,
         source,
@@ -38,12 +38,12 @@ pub(super) fn io_error(
 
 impl LogFolder {
     /// Makes the folder if it is not there, and keeps other servers out of it.
-    pub(super) fn open(path: &Path) -> Result<Self, DurableError> {
+    pub(super) fn open(path: &Path) -> Result<Self, PersistError> {
         fs::create_dir_all(path).map_err(io_error("making", path))?;
         let lock = path.join(".lock");
         let lock = lock_file::create(&lock, "start no other replay server there")
             .map_err(io_error("locking", &lock))?
-            .ok_or_else(|| DurableError::InUse(path.to_owned()))?;
+            .ok_or_else(|| PersistError::InUse(path.to_owned()))?;
         Ok(Self {
             path: path.to_owned(),
             _lock: lock,
@@ -51,13 +51,13 @@ impl LogFolder {
     }
 
     /// Number of the first segment of a new log: none that is there has it.
-    pub(super) fn first_number(&self) -> Result<u64, DurableError> {
+    pub(super) fn first_number(&self) -> Result<u64, PersistError> {
         let segments = segment::list(&self.path).map_err(io_error("listing", &self.path))?;
         Ok(segments.last().map_or(0, |it| it.number + 1))
     }
 
     /// Which log is in the folder; none if it is a new one.
-    pub(super) fn read_id(&self) -> Result<Option<LogId>, DurableError> {
+    pub(super) fn read_id(&self) -> Result<Option<LogId>, PersistError> {
         let path = self.path.join(ID);
         let text = match fs::read_to_string(&path) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -65,12 +65,12 @@ impl LogFolder {
         };
         toml::from_str(&text).map(Some).map_err(|e| {
             let why = e.message().to_owned();
-            DurableError::State { path, why }
+            PersistError::State { path, why }
         })
     }
 
     /// Says which log is in the folder.
-    pub(super) fn write_id(&self, id: &LogId) -> Result<(), DurableError> {
+    pub(super) fn write_id(&self, id: &LogId) -> Result<(), PersistError> {
         let path = self.path.join(ID);
         let text = toml::to_string(id).expect("a struct of numbers is TOML");
         let text =
@@ -79,10 +79,10 @@ impl LogFolder {
     }
 
     /// Checks that `found` is the log of the run and shard of `ours`.
-    pub(super) fn check(&self, found: &LogId, ours: &LogId) -> Result<(), DurableError> {
+    pub(super) fn check(&self, found: &LogId, ours: &LogId) -> Result<(), PersistError> {
         let folder = self.path.clone();
         if found.format != FORMAT {
-            return Err(DurableError::Format {
+            return Err(PersistError::Format {
                 folder,
                 theirs: found.format,
                 ours: FORMAT,
@@ -99,6 +99,6 @@ impl LogFolder {
         } else {
             return Ok(());
         };
-        Err(DurableError::Foreign { folder, why })
+        Err(PersistError::Foreign { folder, why })
     }
 }

@@ -7,15 +7,15 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use driml_protocol::PriorityPart;
-use rand::Rng;
+use driml_protocol::{Origin, PriorityPart, PriorityUpdate};
+use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{
-    episodes::{Episodes, Window},
-    sum_tree::SumTree,
+use super::{Held, RowSampler, RowsState, sum_tree::SumTree};
+use crate::{
+    sampling::episodes::Window,
+    storage::ring::{Link, Ring},
 };
-use crate::storage::ring::{Link, Ring};
 
 /// What is added to a priority before its power is taken, so that each transition can still be drawn. Castro et al. 2018, Dopamine,
 /// add as much to the loss.
@@ -39,9 +39,9 @@ pub struct PriorityCounts {
     pub repeated: u64,
 }
 
-/// What cannot be told from the transitions held: for a run that is to go on exactly.
+/// What cannot be told from the transitions held.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct SavedPriorities {
+pub(crate) struct SavedPriorities {
     /// The highest priority seen.
     highest: f64,
     /// Of each transition held, the oldest first, its mass.
@@ -50,8 +50,18 @@ pub struct SavedPriorities {
     counts: PriorityCounts,
 }
 
+impl SavedPriorities {
+    /// Why these cannot be the priorities of `held` transitions; none if they can.
+    pub(super) fn unfit(&self, held: u64) -> Option<&'static str> {
+        let is_mass = |mass: &f64| mass.is_finite() && *mass >= 0.0;
+        let are_masses = self.masses.iter().chain([&self.highest]).all(is_mass);
+        let fits = self.masses.len() as u64 == held && are_masses;
+        (!fits).then_some("a state with priorities of other transitions, or with one below 0")
+    }
+}
+
 /// The priorities of the transitions held, those that can be anchors alone.
-pub(crate) struct Priorities {
+pub(super) struct Priorities {
     alpha: f64,
     capacity: u64,
     /// Steps that must follow an anchor in its episode.
@@ -74,7 +84,7 @@ impl Priorities {
     ///
     /// # Errors
     /// The system refuses to reserve that much memory: the bytes asked for.
-    pub(crate) fn new(alpha: f64, capacity: u64, reach: u32) -> Result<Self, u64> {
+    pub(super) fn new(alpha: f64, capacity: u64, reach: u32) -> Result<Self, u64> {
         Ok(Self {
             alpha,
             capacity,
@@ -96,9 +106,38 @@ impl Priorities {
         (priority + PRIORITY_MIN).powf(self.alpha)
     }
 
-    /// A run of consecutive transitions of one stream was stored, those from `first` on; `link` was the first one's.
+    /// Whether an update of this number comes from `learner` for the first time; if so, it is remembered as the last.
+    fn is_new(&mut self, learner: u64, number: u64) -> bool {
+        let is_new = self
+            .last
+            .is_none_or(|last| last.0 != learner || number > last.1);
+        if is_new {
+            self.last = Some((learner, number));
+        }
+        is_new
+    }
+
+    /// Sets the priorities of rows that were drawn from `ring`. Of one transition that was drawn twice the last counts.
+    fn set(&mut self, ring: &Ring, part: &PriorityPart) {
+        for (&index, &priority) in part.transitions.iter().zip(&part.priorities) {
+            let slot = self.slot(index);
+            let is_held = (ring.oldest()..ring.inserted()).contains(&index);
+            // What is no anchor has none.
+            if !is_held || self.masses.get(slot) == 0.0 {
+                self.counts.gone += 1;
+                continue;
+            }
+            let priority = f64::from(priority);
+            self.highest = self.highest.max(priority);
+            self.masses.set(slot, self.mass(priority));
+            self.counts.set += 1;
+        }
+    }
+}
+
+impl RowSampler for Priorities {
     /// Whichever can be anchors now get the highest priority seen.
-    pub(crate) fn stored(&mut self, ring: &Ring, episodes: &Episodes, first: u64, link: Link) {
+    fn stored(&mut self, Held { ring, episodes }: Held<'_>, first: u64, link: Link) {
         self.forget(ring);
         let waiting = match link {
             Link::Within { after } | Link::LevelStart { after } => self.open.remove(&after),
@@ -124,8 +163,8 @@ impl Priorities {
         }
     }
 
-    /// Transitions were let go: those before the oldest that is held are drawn no more.
-    pub(crate) fn forget(&mut self, ring: &Ring) {
+    /// Those before the oldest that is held are drawn no more.
+    fn forget(&mut self, ring: &Ring) {
         let oldest = ring.oldest();
         let from = self.oldest.max(oldest.saturating_sub(self.capacity));
         for index in from..oldest {
@@ -140,12 +179,10 @@ impl Priorities {
         }
     }
 
-    /// Leaves the window of an anchor, drawn by its priority, in `window`; false if there is none.
-    pub(crate) fn draw(
+    fn draw(
         &mut self,
-        ring: &Ring,
-        episodes: &Episodes,
-        rng: &mut impl Rng,
+        Held { ring, episodes }: Held<'_>,
+        rng: &mut ChaCha8Rng,
         window: &mut Window,
     ) -> bool {
         while let Some(slot) = self.masses.draw(rng) {
@@ -160,90 +197,86 @@ impl Priorities {
         false
     }
 
-    /// The chance with which each draw gives the anchor `index`.
-    pub(crate) fn chance(&self, index: u64) -> f64 {
-        self.masses.get(self.slot(index)) / self.masses.total()
+    fn probability(&self, index: u64) -> Option<f64> {
+        Some(self.masses.get(self.slot(index)) / self.masses.total())
     }
 
-    /// Whether an update of this number comes from `learner` for the first time; if so, it is remembered as the last.
-    pub(crate) fn is_new(&mut self, learner: u64, number: u64) -> bool {
-        let is_new = self
-            .last
-            .is_none_or(|last| last.0 != learner || number > last.1);
-        if is_new {
-            self.last = Some((learner, number));
-        }
-        is_new
-    }
-
-    /// Sets the priorities of rows that were drawn from `ring`. Of one transition that was drawn twice the last counts.
-    pub(crate) fn update(&mut self, ring: &Ring, part: &PriorityPart) {
-        for (&index, &priority) in part.transitions.iter().zip(&part.priorities) {
-            let slot = self.slot(index);
-            let is_held = (ring.oldest()..ring.inserted()).contains(&index);
-            // What is no anchor has none.
-            if !is_held || self.masses.get(slot) == 0.0 {
-                self.counts.gone += 1;
-                continue;
+    /// An update that has come before changes nothing, nor does a row whose transition was overwritten meanwhile: both are counted.
+    /// Those of other shards do not count.
+    fn update(
+        &mut self,
+        ring: &Ring,
+        update: &PriorityUpdate,
+        origin: Origin,
+    ) -> Result<(), String> {
+        let own = || {
+            let parts = update.parts.iter();
+            parts.filter(|part| part.origin.shard == origin.shard)
+        };
+        let stored = ring.inserted();
+        let drawn_here = own().filter(|part| part.origin == origin);
+        for index in drawn_here.flat_map(|part| &part.transitions) {
+            if *index >= stored {
+                return Err(format!(
+                    "a priority of transition {index}, where {stored} were stored"
+                ));
             }
-            let priority = f64::from(priority);
-            self.highest = self.highest.max(priority);
-            self.masses.set(slot, self.mass(priority));
-            self.counts.set += 1;
         }
+        let is_new = self.is_new(update.learner, update.number);
+        for part in own() {
+            let rows = part.transitions.len() as u64;
+            if !is_new {
+                self.counts.repeated += rows;
+            } else if part.origin == origin {
+                self.set(ring, part);
+            } else {
+                self.counts.gone += rows;
+            }
+        }
+        Ok(())
     }
 
-    /// Counts rows of an update that has come before.
-    pub(crate) fn note_repeated(&mut self, rows: usize) {
-        self.counts.repeated += rows as u64;
+    fn priority_counts(&self) -> Option<PriorityCounts> {
+        Some(self.counts)
     }
 
-    /// Counts rows that an earlier life drew.
-    pub(crate) fn note_gone(&mut self, rows: usize) {
-        self.counts.gone += rows as u64;
-    }
-
-    pub(crate) const fn counts(&self) -> PriorityCounts {
-        self.counts
-    }
-
-    /// What a run that is to go on exactly keeps.
-    pub(crate) fn saved(&self, ring: &Ring) -> SavedPriorities {
+    fn state(&self, ring: &Ring) -> RowsState {
         let held = ring.oldest()..ring.inserted();
-        SavedPriorities {
+        RowsState::Prioritised(SavedPriorities {
             highest: self.highest,
             masses: held.map(|i| self.masses.get(self.slot(i))).collect(),
             last: self.last,
             counts: self.counts,
-        }
+        })
     }
 
-    /// Takes back what was kept of a ring that holds what `ring` does.
-    ///
-    /// # Errors
-    /// It held something else, or these are no masses; the reason, for a person.
-    pub(crate) fn restore(&mut self, ring: &Ring, saved: &SavedPriorities) -> Result<(), String> {
-        let held = ring.oldest()..ring.inserted();
-        let (kept, count) = (saved.masses.len() as u64, held.end - held.start);
-        if kept != count {
-            return Err(format!(
-                "priorities of {kept} transitions, where {count} are held"
-            ));
-        }
-        let is_mass = |mass: &f64| mass.is_finite() && *mass >= 0.0;
-        if !saved.masses.iter().chain([&saved.highest]).all(is_mass) {
-            return Err("a priority that is no number from 0 on".into());
-        }
-        for (index, &mass) in held.zip(&saved.masses) {
-            self.masses.set(self.slot(index), mass);
+    fn restore(
+        &mut self,
+        Held { ring, episodes }: Held<'_>,
+        oldest: u64,
+        state: &RowsState,
+        _: &mut Window,
+    ) {
+        // Of a run that drew by another rule: each transition keeps the highest.
+        let RowsState::Prioritised(saved) = state else {
+            return;
+        };
+        for (index, &mass) in (oldest..).zip(&saved.masses) {
+            let slot = self.slot(index);
+            if !(ring.oldest()..ring.inserted()).contains(&index) {
+                continue;
+            }
+            // Where steps that followed it are gone, it is no anchor any more.
+            let lacks_steps = self.masses.get(slot) == 0.0 && episodes.is_whole(ring, index);
+            if !lacks_steps {
+                self.masses.set(slot, mass);
+            }
         }
         (self.highest, self.last, self.counts) = (saved.highest, saved.last, saved.counts);
-        Ok(())
     }
 
-    /// Checks that exactly the anchors have a mass, but for those whose stack was cut; panics at the first that is wrong. Slow: for
-    /// tests.
-    pub(crate) fn check_valid(&self, ring: &Ring, episodes: &Episodes) {
+    /// Exactly the anchors have a mass, but for those whose stack was cut.
+    fn check_valid(&self, Held { ring, episodes }: Held<'_>) {
         self.masses.check_valid();
         let mut window = Window::default();
         let mut anchors = 0;

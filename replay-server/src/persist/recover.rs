@@ -10,16 +10,14 @@ use std::{
 use driml_protocol::{BufferPool, Chunk, codec};
 
 use super::{
-    error::DurableError,
+    error::PersistError,
     folder::{LogFolder, io_error},
     progress::Reading,
     record::{self, Broken, Record, RecordKind, RecordReader},
     segment::{self, LogId, Mark, SegmentFile, SegmentHeader},
+    snapshot::Note,
 };
-use crate::{
-    replay::{Replay, events::Event},
-    storage::frame_store::Packer,
-};
+use crate::{replay::Replay, storage::frame_store::Packer};
 
 /// How often it is logged how far the reading is.
 const SAY: Duration = Duration::from_secs(5);
@@ -32,8 +30,6 @@ pub(super) struct Recovered {
     pub(super) number: u64,
     /// Number of the next record.
     pub(super) ordinal: u64,
-    pub(super) learner: Option<u64>,
-    pub(super) after_updates: u64,
     /// Bytes of the records that were read.
     pub(super) bytes: u64,
     /// What a person should know: damage, and what came of it.
@@ -42,13 +38,11 @@ pub(super) struct Recovered {
 
 impl Recovered {
     /// Nothing was found: a log begins with segment `number`.
-    pub(super) const fn nothing(number: u64, after_updates: u64) -> Self {
+    pub(super) const fn nothing(number: u64) -> Self {
         Self {
             segments: Vec::new(),
             number,
             ordinal: 0,
-            learner: None,
-            after_updates,
             bytes: 0,
             warnings: Vec::new(),
         }
@@ -74,20 +68,19 @@ struct Recovery<'a> {
     found: Recovered,
     /// Number of the next record; none before the first.
     expected: Option<u64>,
-    are_listed: bool,
     /// The oldest transition that was held, as far as records say.
     oldest: u64,
     /// Whether which transitions are held follows from their number, as it did before.
     same_capacity: bool,
-    /// The last that the log says, if it is a mark.
+    /// The last that the log says, if it is a mark: then all is brought back.
     mark: Option<Mark>,
 }
 
 /// Removes what the log in `folder` says after `mark`.
-pub(super) fn go_back(folder: &LogFolder, mark: Mark) -> Result<(), DurableError> {
+pub(super) fn go_back(folder: &LogFolder, mark: Mark) -> Result<(), PersistError> {
     let files = segment::list(&folder.path).map_err(io_error("listing", &folder.path))?;
     let Some(marked) = files.iter().find(|it| it.number == mark.segment()) else {
-        return Err(DurableError::NoMark(segment::path(
+        return Err(PersistError::NoMark(segment::path(
             &folder.path,
             mark.segment(),
         )));
@@ -99,7 +92,7 @@ pub(super) fn go_back(folder: &LogFolder, mark: Mark) -> Result<(), DurableError
         Some(Ok(record)) if record.kind == RecordKind::Segment
     );
     if !begins {
-        return Err(DurableError::NoMark(marked.path.clone()));
+        return Err(PersistError::NoMark(marked.path.clone()));
     }
     // The newest first: whatever is left then is a log that ends earlier.
     for later in files.iter().rev() {
@@ -111,7 +104,7 @@ pub(super) fn go_back(folder: &LogFolder, mark: Mark) -> Result<(), DurableError
 }
 
 /// Ends a segment's file at byte `at`.
-fn cut_off(file: &SegmentFile, at: u64) -> Result<(), DurableError> {
+fn cut_off(file: &SegmentFile, at: u64) -> Result<(), PersistError> {
     fs::File::options()
         .write(true)
         .open(&file.path)
@@ -128,10 +121,11 @@ pub(super) fn recover(
     replay: &mut Replay,
     mark: Option<Mark>,
     reading: &Reading,
-) -> Result<Option<Recovered>, DurableError> {
+) -> Result<Option<Recovered>, PersistError> {
     let files = segment::list(&folder.path).map_err(io_error("listing", &folder.path))?;
     let number = files.last().map_or(0, |it| it.number + 1);
     let packer = replay.packer();
+    replay.quiet = true;
     let mut recovery = Recovery {
         folder,
         id,
@@ -143,13 +137,10 @@ pub(super) fn recover(
             segments: Vec::new(),
             number,
             ordinal: 0,
-            learner: None,
-            after_updates: 0,
             bytes: 0,
             warnings: Vec::new(),
         },
         expected: None,
-        are_listed: false,
         oldest: 0,
         same_capacity: false,
         mark,
@@ -171,7 +162,7 @@ pub(super) fn recover(
             tracing::info!("reads the replay in {dir}: {}", reading.progress());
         }
         if reading.is_stopped() {
-            return Err(DurableError::Stopped);
+            return Err(PersistError::Stopped);
         }
         let of_it = bytes(file);
         recovery.read_segment(file, at == last)?;
@@ -181,7 +172,7 @@ pub(super) fn recover(
 }
 
 /// Which log the newest segment in `folder` that can be read is of; none if there is none.
-pub(super) fn find_id(folder: &LogFolder) -> Result<Option<LogId>, DurableError> {
+pub(super) fn find_id(folder: &LogFolder) -> Result<Option<LogId>, PersistError> {
     let files = segment::list(&folder.path).map_err(io_error("listing", &folder.path))?;
     for file in files.iter().rev() {
         let mut reader = RecordReader::open(&file.path).map_err(io_error("reading", &file.path))?;
@@ -200,7 +191,7 @@ impl Recovery<'_> {
         self.found.warnings.push(text);
     }
 
-    fn read_segment(&mut self, file: &SegmentFile, is_last: bool) -> Result<(), DurableError> {
+    fn read_segment(&mut self, file: &SegmentFile, is_last: bool) -> Result<(), PersistError> {
         let name = file_name(&file.path);
         let reading = || io_error("reading", &file.path);
         let mut reader = RecordReader::open(&file.path).map_err(reading())?;
@@ -219,7 +210,7 @@ impl Recovery<'_> {
             self.set_aside(file, "its beginning is damaged");
             return Ok(());
         };
-        let state = header.state;
+        let snapshot = header.snapshot;
         if header.log != self.id {
             self.warn(format!("{name} is not of this log and was left as it is"));
             return Ok(());
@@ -229,30 +220,27 @@ impl Recovery<'_> {
             return Ok(());
         }
         let is_mark = self.mark.is_some_and(|mark| mark.segment() == file.number);
-        let stored = self.replay.next_row();
-        let first_row = state.replay.inserted;
-        match self.expected {
-            Some(expected) if expected == ordinal && !is_mark => {}
-            expected => {
-                self.oldest = state.replay.oldest;
-                self.same_capacity = state.replay.capacity == self.replay.capacity()
-                    && self.replay.holds_by_number();
-                self.are_listed = state.replay.are_listed;
-                (self.found.learner, self.found.after_updates) =
-                    (state.learner, state.after_updates);
-                let gap = self.replay.restore(state.replay).map_err(|why| {
-                    let path = file.path.clone();
-                    DurableError::State { path, why }
-                })?;
-                if expected.is_some() && first_row > stored {
-                    self.are_listed = false;
-                    self.warn(format!(
-                        "the transitions {stored} to {} are gone ({gap} of those that were held): something before {name} is damaged or missing. \
-                         All others are there, and all counts are right",
-                        first_row - 1
-                    ));
-                }
-            }
+        if is_mark && !self.replay.draws_by_rule_of(&snapshot.rows) {
+            return Err(PersistError::State {
+                path: file.path.clone(),
+                why: "replay.sampling is another rule than it was".into(),
+            });
+        }
+        let (stored, first_row) = (self.replay.ring.inserted(), snapshot.inserted);
+        let is_first = self.expected.is_none();
+        self.oldest = snapshot.oldest;
+        self.same_capacity = snapshot.capacity == self.replay.ring.capacity()
+            && self.replay.config.compressed_bytes_max.is_none();
+        let gap = self.replay.restore(snapshot).map_err(|why| {
+            let path = file.path.clone();
+            PersistError::State { path, why }
+        })?;
+        if !is_first && first_row > stored {
+            self.warn(format!(
+                "the transitions {stored} to {} are gone ({gap} of those that were held): something before {name} is damaged or missing. \
+                 All others are there, and all counts are right",
+                first_row - 1
+            ));
         }
         self.expected = Some(ordinal + 1);
         self.found.segments.push((file.clone(), first_row));
@@ -283,7 +271,7 @@ impl Recovery<'_> {
         at: u64,
         cut: u64,
         broken: &Broken,
-    ) -> Result<(), DurableError> {
+    ) -> Result<(), PersistError> {
         let name = file_name(&file.path);
         match broken {
             // Nobody was told that it is stored.
@@ -349,60 +337,30 @@ impl Recovery<'_> {
                 let (hash, len) = (self.id.spec_hash, record.body.len());
                 let chunk = Chunk::receive([record.body], len, &self.pool, hash, self.num_actions)
                     .map_err(|e| e.to_string())?;
+                if let Some(why) = self.replay.unfit(&chunk) {
+                    return Err(why);
+                }
+                self.replay.actors.check_known(&chunk.header)?;
                 let packed = self.packer.pack(std::borrow::Cow::Owned(chunk));
-                self.are_listed = false;
-                self.replay.apply_chunk(&packed)
+                self.replay.store(&packed);
+                Ok(())
             }
-            RecordKind::Event => {
-                let event = codec::decode_value(record.body).map_err(|e| e.to_string())?;
-                self.apply_event(event)
+            RecordKind::Note => {
+                match codec::decode_value(record.body).map_err(|e| e.to_string())? {
+                    Note::ActorJoined(join) => self.replay.join_actor(join).map(drop),
+                    Note::Goodbye(goodbye) => self.replay.goodbye(&goodbye).map_or(Ok(()), Err),
+                    Note::LearnerJoined(join) => self.replay.join_learner(join).map(drop),
+                }
             }
         }
     }
 
-    fn apply_event(&mut self, event: Event) -> Result<(), String> {
-        match event {
-            Event::ActorJoined(join) => self.replay.join_actor(join).map(drop),
-            Event::Goodbye(goodbye) => self.replay.goodbye(&goodbye).map_or(Ok(()), Err),
-            Event::LearnerStarted {
-                learner,
-                rows_sampled,
-            } => {
-                self.found.learner = Some(learner);
-                self.replay.learner_starts(rows_sampled)
-            }
-            Event::Affinity(update) => self.replay.set_affinity(&update).map_err(|e| e.to_string()),
-            Event::OtherShards(tally) => {
-                self.replay.apply_other_shards(tally);
-                Ok(())
-            }
-            Event::Drawn(drawn) => {
-                self.are_listed = self.replay.apply_drawn(&drawn)?;
-                Ok(())
-            }
-            Event::Forgotten { oldest } => {
-                self.are_listed = false;
-                self.oldest = self.oldest.max(oldest);
-                self.replay.forget_before(oldest);
-                Ok(())
-            }
-            Event::ServedBefore { rows } => {
-                self.replay.count_served_before(rows);
-                Ok(())
-            }
-            Event::ActorsForgotten(actors) => {
-                self.replay.forget_actors(&actors);
-                Ok(())
-            }
-        }
-    }
-
-    fn finish(mut self) -> Result<Option<Recovered>, DurableError> {
+    fn finish(mut self) -> Result<Option<Recovered>, PersistError> {
         let Some(ordinal) = self.expected else {
             if !self.found.warnings.is_empty() {
                 let why = self.found.warnings.join("; ");
                 let path = self.folder.path.clone();
-                return Err(DurableError::State {
+                return Err(PersistError::State {
                     path,
                     why: format!(
                         "no segment can be read ({why}): to begin a new replay there, remove them"
@@ -412,15 +370,16 @@ impl Recovery<'_> {
             return Ok(None);
         };
         // Older segments are removed once none of their transitions is held.
-        let (first, end) = (self.replay.first_row(), self.replay.next_row());
-        let held_from = self.oldest.max(end.saturating_sub(self.replay.capacity()));
+        let ring = &self.replay.ring;
+        let (first, end) = (ring.first(), ring.inserted());
+        let held_from = self.oldest.max(end.saturating_sub(ring.capacity()));
         if self.same_capacity && held_from < first {
             self.warn(format!(
                 "the transitions {held_from} to {} are gone: the oldest segments are missing. All others are there, and all counts are right",
                 first - 1
             ));
         }
-        self.replay.restored(self.are_listed);
+        self.replay.recovered(self.mark.is_some());
         self.found.ordinal = ordinal;
         Ok(Some(self.found))
     }

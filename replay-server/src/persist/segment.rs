@@ -8,10 +8,10 @@ use std::{
 
 use serde::{Deserialize, Serialize};
 
-use crate::replay::snapshot::Snapshot;
+use super::snapshot::Snapshot;
 
 /// Form of the log; one of another form is refused.
-pub(super) const FORMAT: u32 = 2;
+pub(super) const FORMAT: u32 = 3;
 const PREFIX: &str = "segment-";
 const SUFFIX: &str = ".log";
 
@@ -25,7 +25,7 @@ pub(super) struct SegmentHeader {
     /// Number of the segment, from 0.
     pub(super) number: u64,
     /// The state before its first record.
-    pub(super) state: DurableState,
+    pub(super) snapshot: Snapshot,
 }
 
 /// A moment in the life of a replay that is kept on disk: the segment that begins there.
@@ -52,16 +52,6 @@ pub(super) struct LogId {
     pub(super) spec_hash: u64,
     /// Which of the replay's shards it is, and how many there are.
     pub(super) shard: (u32, u32),
-}
-
-/// Everything that is kept beside the transitions.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct DurableState {
-    pub(super) replay: Snapshot,
-    /// The learner that is served.
-    pub(super) learner: Option<u64>,
-    /// Updates after which the run went on when the log was begun.
-    pub(super) after_updates: u64,
 }
 
 /// A segment of the log as it lies in the folder.

@@ -9,13 +9,13 @@ use std::{
 use driml_protocol::{RunSpec, Shutdown, TRANSITION_BYTES};
 
 use super::{
-    error::DurableError,
+    error::PersistError,
     folder::LogFolder,
     journal::{Journal, Limits, Place},
     progress::Reading,
-    recovery::{Recovered, find_id, go_back, recover},
-    replay::{DurableReplay, Log, Marked},
-    segment::{DurableState, FORMAT, LogId, Mark},
+    recover::{Recovered, find_id, go_back, recover},
+    segment::{FORMAT, LogId, Mark},
+    {Log, Marked},
 };
 use crate::{
     config::{Config, SEGMENT_BYTES_MIN},
@@ -31,13 +31,11 @@ const SEGMENTS: u64 = 16;
 
 /// Where a replay is kept, and which part of the run it is.
 #[derive(Clone, Debug)]
-pub struct DurableArgs {
+pub struct PersistArgs {
     /// The folder, for this replay alone.
     pub dir: PathBuf,
     /// Which of the replay's shards it is.
     pub shard: u32,
-    /// Updates of the learner after which the run goes on; 0 starts it.
-    pub after_updates: u64,
     /// Size from which a segment is followed by another, if not what suits the ring.
     pub segment_bytes: Option<u64>,
     /// Go back to this mark: what the log says after it is removed.
@@ -57,17 +55,17 @@ pub struct Recovery {
     pub warnings: Vec<String>,
 }
 
-impl DurableReplay {
+impl Replay {
     /// The replay of a run that is kept in a folder: as it was, if it was kept there before, else an empty one.
     ///
     /// # Errors
     /// Those of [`KeptReplay::find`] and [`KeptReplay::read`].
     pub fn open(
-        args: &DurableArgs,
+        args: &PersistArgs,
         spec: &RunSpec,
         config: &Config,
         batch_size: u32,
-    ) -> Result<(Self, Recovery), DurableError> {
+    ) -> Result<(Self, Recovery), PersistError> {
         let kept = KeptReplay::find(args, spec, config, batch_size)?;
         kept.read(&Reading::begin(Shutdown::default()))
     }
@@ -75,9 +73,8 @@ impl DurableReplay {
 
 /// The folder of a replay, which nobody else uses any more and which is this run's. What is kept there is not read yet.
 pub struct KeptReplay {
-    args: DurableArgs,
+    args: PersistArgs,
     config: Config,
-    batch_size: u32,
     num_actions: u32,
     /// Of this run and shard, if the log is new.
     id: LogId,
@@ -93,11 +90,11 @@ impl KeptReplay {
     /// # Errors
     /// Settings that cannot work; a folder that cannot be written, is in use, or holds the replay of another run.
     pub fn find(
-        args: &DurableArgs,
+        args: &PersistArgs,
         spec: &RunSpec,
         config: &Config,
         batch_size: u32,
-    ) -> Result<Self, DurableError> {
+    ) -> Result<Self, PersistError> {
         let replay = Replay::shard(spec, config, batch_size, args.shard)?;
         let folder = LogFolder::open(&args.dir)?;
         let ours = LogId {
@@ -115,7 +112,6 @@ impl KeptReplay {
         Ok(Self {
             args: args.clone(),
             config: config.clone(),
-            batch_size,
             num_actions: spec.num_actions,
             id,
             is_new: known.is_none(),
@@ -128,14 +124,13 @@ impl KeptReplay {
     /// Reads what is kept: the replay as it was, or an empty one.
     ///
     /// # Errors
-    /// A folder that cannot be read or written; [`DurableError::Stopped`] if `reading` is told so. Damage is no error: what is left is
+    /// A folder that cannot be read or written; [`PersistError::Stopped`] if `reading` is told so. Damage is no error: what is left is
     /// used, and what was lost is said.
-    pub fn read(self, reading: &Reading) -> Result<(DurableReplay, Recovery), DurableError> {
+    pub fn read(self, reading: &Reading) -> Result<(Replay, Recovery), PersistError> {
         let started = Instant::now();
         let Self {
             args,
             config,
-            batch_size,
             num_actions,
             id,
             is_new,
@@ -150,28 +145,18 @@ impl KeptReplay {
             false => recover(&folder, id, num_actions, &mut replay, args.mark, reading)?,
             true => None,
         };
-        let mut recovery = Recovery::default();
-        let (found, is_new) = match found {
-            Some(found) => (found, false),
+        let mut recovery = Recovery {
+            found: found.is_some(),
+            ..Recovery::default()
+        };
+        let found = match found {
+            Some(found) => found,
             None => {
-                let next = folder.first_number()?;
-                (Recovered::nothing(next, args.after_updates), true)
+                folder.write_id(&id)?;
+                Recovered::nothing(folder.first_number()?)
             }
         };
-        if is_new {
-            folder.write_id(&id)?;
-            if args.after_updates > 0 {
-                replay = replay.resumed_at(args.after_updates, args.shard);
-            }
-        }
-        recovery.found = !is_new;
-        recovery.bytes = found.bytes;
-        recovery.warnings = found.warnings;
-        let state = DurableState {
-            replay: replay.snapshot(),
-            learner: found.learner,
-            after_updates: found.after_updates,
-        };
+        (recovery.bytes, recovery.warnings) = (found.bytes, found.warnings);
         let fsync = config.fsync_ms.map_or(FSYNC_DEFAULT, Duration::from_millis);
         let journal = Journal::begin(
             Place {
@@ -183,21 +168,24 @@ impl KeptReplay {
             &found.segments,
             limits,
             fsync,
-            state,
+            &replay.snapshot(),
         )?;
-        let oldest_row = replay.oldest_row();
+        let oldest_row = replay.ring.oldest();
         let marked = args.mark.map(|mark| Marked { mark, oldest_row });
-        let log = Log::new(journal, id.spec_hash, folder).marked(marked);
-        let mut this = DurableReplay::with_log(replay, log, found.learner, found.after_updates);
-        this.catch_up(args.after_updates, batch_size, config.shards);
-        this.tidy();
+        replay.log = Some(Log {
+            journal,
+            spec_hash: id.spec_hash,
+            marks: marked.into_iter().collect(),
+            _folder: folder,
+        });
+        replay.tidy();
         recovery.took = started.elapsed();
-        Ok((this, recovery))
+        Ok((replay, recovery))
     }
 }
 
 /// How large a segment is, and what all may take.
-fn limits(args: &DurableArgs, spec: &RunSpec, config: &Config) -> Limits {
+fn limits(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Limits {
     let shards = u64::from(config.shards);
     let disk_bytes_max = config.disk_bytes_max.map(|max| max / shards);
     let row_bytes = spec.frame_bytes() as u64 + TRANSITION_BYTES as u64;

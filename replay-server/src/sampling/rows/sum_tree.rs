@@ -7,7 +7,7 @@
 use rand::Rng;
 
 /// Numbers that are not negative, at places `0..capacity`; 0 at first.
-pub(crate) struct SumTree {
+pub(super) struct SumTree {
     /// Places, rounded up to a power of two.
     leaves: usize,
     /// The root at 1, the parts of node i at 2 i and 2 i + 1, the numbers from `leaves` on.
@@ -19,7 +19,7 @@ impl SumTree {
     ///
     /// # Errors
     /// The system refuses to reserve that much memory: the bytes asked for.
-    pub(crate) fn new(capacity: u64) -> Result<Self, u64> {
+    pub(super) fn new(capacity: u64) -> Result<Self, u64> {
         let leaves = capacity.checked_next_power_of_two().unwrap_or(u64::MAX);
         let asked = leaves.saturating_mul(2 * size_of::<f64>() as u64);
         let leaves = usize::try_from(leaves).map_err(|_| asked)?;
@@ -33,17 +33,17 @@ impl SumTree {
     }
 
     /// The sum of all numbers.
-    pub(crate) fn total(&self) -> f64 {
+    pub(super) fn total(&self) -> f64 {
         self.nodes[1]
     }
 
     /// The number at `place`.
-    pub(crate) fn get(&self, place: usize) -> f64 {
+    pub(super) fn get(&self, place: usize) -> f64 {
         self.nodes[self.leaves + place]
     }
 
     /// Sets the number at `place`, which is finite and not negative.
-    pub(crate) fn set(&mut self, place: usize, number: f64) {
+    pub(super) fn set(&mut self, place: usize, number: f64) {
         debug_assert!(number.is_finite() && number >= 0.0, "{number}");
         let mut node = self.leaves + place;
         if self.nodes[node] == number {
@@ -57,7 +57,7 @@ impl SumTree {
     }
 
     /// A place, each as likely as its share of the sum, those of number 0 never; none if the sum is 0.
-    pub(crate) fn draw(&self, rng: &mut impl Rng) -> Option<usize> {
+    pub(super) fn draw(&self, rng: &mut impl Rng) -> Option<usize> {
         if self.total() <= 0.0 {
             return None;
         }
@@ -75,7 +75,7 @@ impl SumTree {
     }
 
     /// Checks every sum; panics at the first that is wrong. Slow: for tests.
-    pub(crate) fn check_valid(&self) {
+    pub(super) fn check_valid(&self) {
         for node in 1..self.leaves {
             let sum = self.nodes[2 * node] + self.nodes[2 * node + 1];
             assert_eq!(self.nodes[node], sum, "node {node}");

@@ -1,23 +1,25 @@
 //! Going back to a mark in the log of a replay: all is as it was there, whatever came after it.
-//! That a log without marks brings everything back is tested in `durable`.
+//! What comes back without a mark is tested in `persist`.
 
-use driml_replay_server::{Config, DurableArgs, DurableError, DurableReplay, Mark};
+use driml_replay_server::{Config, Mark, PersistArgs, PersistError, Replay};
 
 use crate::{
-    durable::{Life, ROWS, copy, open, segments, state},
     history::unlimited,
+    persist::{Life, ROWS, copy, open, segments, test_spec},
     priorities::prioritised,
 };
 
-/// What is drawn next, of which the log learns nothing.
-fn next_draws(replay: &mut DurableReplay) -> Vec<driml_protocol::Batch> {
-    (0..5)
-        .map(|_| replay.sample_between_marks(ROWS).unwrap())
-        .collect()
+fn state(replay: &Replay) -> Vec<u8> {
+    replay.state_bytes().unwrap()
 }
 
-fn at(args: &DurableArgs, config: &Config, mark: Mark) -> Result<DurableReplay, DurableError> {
-    let args = DurableArgs {
+/// What is drawn next, of which the log learns nothing.
+fn next_draws(replay: &mut Replay) -> Vec<driml_protocol::Batch> {
+    (0..5).map(|_| replay.sample(ROWS).unwrap()).collect()
+}
+
+fn at(args: &PersistArgs, config: &Config, mark: Mark) -> Result<Replay, PersistError> {
+    let args = PersistArgs {
         mark: Some(mark),
         ..args.clone()
     };
@@ -57,7 +59,7 @@ fn a_log_goes_back_to_its_last_two_marks() {
         for (mark, before, draws) in &marks {
             let copied = tempfile::tempdir().unwrap();
             copy(folder.path(), copied.path());
-            let args = DurableArgs {
+            let args = PersistArgs {
                 dir: copied.path().to_owned(),
                 ..args.clone()
             };
@@ -70,7 +72,7 @@ fn a_log_goes_back_to_its_last_two_marks() {
         // Who goes back to the older one gives the newer one up.
         at(&args, &config, marks[0].0).unwrap();
         let gone = at(&args, &config, marks[1].0).map(drop).unwrap_err();
-        assert!(matches!(gone, DurableError::NoMark(_)), "{gone}");
+        assert!(matches!(gone, PersistError::NoMark(_)), "{gone}");
     }
 }
 
@@ -119,16 +121,14 @@ fn a_log_with_marks_holds_no_more_than_these_need() {
 
 #[test]
 fn a_replay_in_memory_has_no_marks() {
-    let replay =
-        driml_replay_server::Replay::new(&crate::durable::test_spec(), &unlimited(60), ROWS);
-    let mut replay = DurableReplay::in_memory(replay.unwrap(), 0);
+    let mut replay = Replay::new(&test_spec(), &unlimited(60), ROWS).unwrap();
     assert_eq!(replay.mark().unwrap(), None);
 }
 
 /// What is drawn next by priority, and learned from.
-fn next_learned(replay: &mut DurableReplay) -> Vec<driml_protocol::Batch> {
+fn next_learned(replay: &mut Replay) -> Vec<driml_protocol::Batch> {
     let learned = |_| {
-        let batch = replay.sample_between_marks(ROWS).unwrap();
+        let batch = replay.sample(ROWS).unwrap();
         let found: Vec<f32> = batch.states_t().iter().map(|&byte| byte.into()).collect();
         let update =
             batch.priority_update(77, replay.tally().rows_sampled, &found[..ROWS as usize]);
@@ -138,9 +138,8 @@ fn next_learned(replay: &mut DurableReplay) -> Vec<driml_protocol::Batch> {
     (0..5).map(learned).collect()
 }
 
-/// The log has no priorities: kept beside a mark they come back with it, and without them every anchor is as likely as another.
 #[test]
-fn priorities_come_back_where_they_were_kept_beside_a_mark() {
+fn priorities_come_back_with_a_mark() {
     for seed in 0..8 {
         let folder = tempfile::tempdir().unwrap();
         let config = prioritised(60, 0.5);
@@ -154,20 +153,9 @@ fn priorities_come_back_where_they_were_kept_beside_a_mark() {
             life.store(1);
         }
         let mark = life.replay.mark().unwrap().unwrap();
-        let kept = life.replay.saved_priorities();
         let draws = next_learned(&mut life.replay);
         let (args, config) = life.end();
         let mut replay = at(&args, &config, mark).unwrap();
-        replay.check_valid();
-        let batch = replay.sample_between_marks(ROWS).unwrap();
-        let chances = batch.probabilities().unwrap();
-        assert!(
-            chances.iter().all(|&chance| chance == chances[0]),
-            "{chances:?}"
-        );
-        drop(replay);
-        let mut replay = at(&args, &config, mark).unwrap();
-        replay.restore_priorities(kept.as_ref()).unwrap();
         replay.check_valid();
         assert!(next_learned(&mut replay) == draws, "seed {seed}");
     }

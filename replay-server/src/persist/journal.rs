@@ -14,13 +14,13 @@ use std::{
 use driml_protocol::{LogStatus, Seldom, codec};
 
 use super::{
-    error::DurableError,
+    error::PersistError,
     folder::io_error,
     record::{self, RecordKind},
-    segment::{self, DurableState, LogId, Mark, SegmentHeader},
+    segment::{self, LogId, Mark, SegmentHeader},
+    snapshot::{Note, Snapshot},
     sync::Syncer,
 };
-use crate::replay::events::Event;
 
 /// One segment of the log that is in the folder.
 struct Segment {
@@ -76,7 +76,7 @@ struct Failing {
 }
 
 impl Journal {
-    /// Goes on after `older` segments, each with its first transition, in a new one that begins with `state`.
+    /// Goes on after `older` segments, each with its first transition, in a new one that begins with `snapshot`.
     ///
     /// # Errors
     /// A file system that refuses.
@@ -85,8 +85,8 @@ impl Journal {
         older: &[(segment::SegmentFile, u64)],
         limits: Limits,
         fsync: Duration,
-        state: DurableState,
-    ) -> Result<Self, DurableError> {
+        snapshot: &Snapshot,
+    ) -> Result<Self, PersistError> {
         let Place {
             folder,
             id,
@@ -108,8 +108,8 @@ impl Journal {
             .and_then(|opened| Syncer::start(opened, fsync))
             .map_err(io_error("opening", &folder))?;
         let path = segment::path(&folder, number);
-        let first_row = state.replay.inserted;
-        let head = header_record(id, number, ordinal, state)?;
+        let first_row = snapshot.inserted;
+        let head = header_record(id, number, ordinal, snapshot)?;
         let file = new_file(&path, &head).map_err(io_error("writing", &path))?;
         segments.push_back(Segment {
             number,
@@ -174,10 +174,10 @@ impl Journal {
         }
     }
 
-    /// Appends an event that has happened; if the disk refuses, it is the first to be written later.
-    pub(super) fn append_event(&mut self, event: &Event) -> Result<(), DurableError> {
-        let body = codec::encode_value(event)?;
-        let record = record::head(RecordKind::Event, self.ordinal, &body, 0);
+    /// Appends a note of what has happened; if the disk refuses, it is the first to be written later.
+    pub(super) fn append_note(&mut self, note: &Note) -> Result<(), PersistError> {
+        let body = codec::encode_value(note)?;
+        let record = record::head(RecordKind::Note, self.ordinal, &body, 0);
         self.ordinal += 1;
         if !self.is_ready() {
             self.pending.extend_from_slice(&record);
@@ -248,7 +248,7 @@ impl Journal {
         failing.why = e.to_string();
         if let Some(more) = failing.said.due() {
             tracing::error!(
-                "the replay's log in {} cannot be written: {e}; nothing is taken or served until it can: make room or make it writable{more}",
+                "the replay's log in {} cannot be written: {e}; nothing more is stored until it can: make room or make it writable{more}",
                 self.folder.display()
             );
         }
@@ -287,13 +287,13 @@ impl Journal {
         keep
     }
 
-    /// Begins another segment with `state`. If the disk refuses, the newest one grows.
-    pub(super) fn rotate(&mut self, state: DurableState) -> Result<(), DurableError> {
+    /// Begins another segment with `snapshot`. If the disk refuses, the newest one grows.
+    pub(super) fn rotate(&mut self, snapshot: &Snapshot) -> Result<(), PersistError> {
         let number = self.newest().number + 1;
         let path = segment::path(&self.folder, number);
-        let first_row = state.replay.inserted;
+        let first_row = snapshot.inserted;
         // The record that closes the old one comes first.
-        let head = header_record(self.id, number, self.ordinal + 1, state)?;
+        let head = header_record(self.id, number, self.ordinal + 1, snapshot)?;
         match new_file(&path, &head) {
             Ok(file) => {
                 let closed = record::head(RecordKind::Closed, self.ordinal, &[], 0);
@@ -319,14 +319,14 @@ impl Journal {
         Ok(())
     }
 
-    /// Begins another segment with `state`, which is on the disk when this returns.
+    /// Begins another segment with `snapshot`, which is on the disk when this returns.
     ///
     /// # Errors
     /// A disk that refuses.
-    pub(super) fn mark(&mut self, state: DurableState) -> Result<Mark, DurableError> {
+    pub(super) fn mark(&mut self, snapshot: &Snapshot) -> Result<Mark, PersistError> {
         let before = self.newest().number;
         if self.is_ready() {
-            self.rotate(state)?;
+            self.rotate(snapshot)?;
         }
         let number = self.newest().number;
         if number == before {
@@ -363,9 +363,13 @@ fn header_record(
     log: LogId,
     number: u64,
     ordinal: u64,
-    state: DurableState,
-) -> Result<Vec<u8>, DurableError> {
-    let body = codec::encode_value(&SegmentHeader { log, number, state })?;
+    snapshot: &Snapshot,
+) -> Result<Vec<u8>, PersistError> {
+    let body = codec::encode_value(&SegmentHeader {
+        log,
+        number,
+        snapshot: snapshot.clone(),
+    })?;
     Ok(record::head(RecordKind::Segment, ordinal, &body, 0))
 }
 

@@ -7,7 +7,7 @@ use std::{
 };
 
 use driml_protocol::{Buffer, Chunk, ChunkHeader, InsertReply, RequestId};
-use driml_replay_server::{Config, DurableArgs, DurableReplay, Recovery};
+use driml_replay_server::{Config, PersistArgs, Recovery, Replay};
 
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
@@ -15,17 +15,17 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batches::{check_batch, check_rows},
-    durable::{Life, ROWS, args, open, segments, state, test_spec},
     history::{History, unlimited},
+    persist::{Life, ROWS, args, open, segments, stored, test_spec},
 };
 
 /// A log of a dozen segments of some transitions each, and what is in it.
 struct Kept {
     _root: tempfile::TempDir,
-    args: DurableArgs,
+    args: PersistArgs,
     config: Config,
     history: History,
-    state: Vec<u8>,
+    stored: Vec<u8>,
     produced: u64,
 }
 
@@ -49,14 +49,14 @@ impl Kept {
             history,
             ..
         } = life;
-        let state = state(&replay);
+        let stored = stored(&replay);
         Self {
             _root: root,
             args,
             config,
             produced: history.inserted,
             history,
-            state,
+            stored,
         }
     }
 
@@ -64,12 +64,12 @@ impl Kept {
         segments(&self.args.dir)
     }
 
-    fn open(&self) -> (DurableReplay, Recovery) {
+    fn open(&self) -> (Replay, Recovery) {
         open(&self.args, &self.config).unwrap()
     }
 
     /// Checks batches of what came back, which holds `held` transitions or more: nothing of what is gone is in them.
-    fn check(&self, replay: &mut DurableReplay) {
+    fn check(&self, replay: &mut Replay) {
         replay.check_valid();
         for client in 0..200 {
             let drawn = replay.draw_for(RequestId::first(1_000 + client), ROWS, Buffer::zeroed);
@@ -135,10 +135,10 @@ proptest! {
             let Ok(batch) = drawn else { break };
             check_rows(&batch.unpack(), &kept.history);
         }
-        let before = state(&replay);
+        let before = stored(&replay);
         drop(replay);
         let (replay, _) = kept.open();
-        prop_assert_eq!(state(&replay), before);
+        prop_assert_eq!(stored(&replay), before);
     }
 }
 
@@ -219,7 +219,7 @@ fn missing_segments_are_said_wherever_they_are() {
         said(&recovery, "the oldest segments are missing"),
         "{recovery:?}"
     );
-    assert_eq!(state(&replay).len(), kept.state.len());
+    assert_eq!(stored(&replay).len(), kept.stored.len());
     kept.check(&mut replay);
 
     let kept = Kept::new(10_000);
@@ -237,7 +237,7 @@ fn missing_segments_are_said_wherever_they_are() {
     let kept = Kept::new(100);
     let (mut replay, recovery) = kept.open();
     assert_eq!(recovery.warnings, [""; 0]);
-    assert_eq!(state(&replay), kept.state);
+    assert_eq!(stored(&replay), kept.stored);
     kept.check(&mut replay);
 }
 
@@ -288,11 +288,11 @@ fn after_a_loss_an_actor_goes_on_and_the_loss_is_counted() {
         (lost, 0)
     );
     replay.check_valid();
-    let after = state(&replay);
+    let after = stored(&replay);
     drop(replay);
     let (replay, recovery) = kept.open();
     assert_eq!(recovery.warnings, [""; 0]);
-    assert_eq!(state(&replay), after);
+    assert_eq!(stored(&replay), after);
 }
 
 #[test]
@@ -304,7 +304,7 @@ fn a_power_cut_that_leaves_zeros_is_a_torn_write() {
     fs::write(&newest, &bytes).unwrap();
     let (replay, recovery) = kept.open();
     assert_eq!(recovery.warnings, [""; 0]);
-    assert_eq!(state(&replay), kept.state);
+    assert_eq!(stored(&replay), kept.stored);
     assert!(fs::metadata(&newest).unwrap().len() < bytes.len() as u64);
     drop(replay);
     // A segment that was just begun.
@@ -313,7 +313,7 @@ fn a_power_cut_that_leaves_zeros_is_a_torn_write() {
     fs::write(&next, &bytes[..20]).unwrap();
     let (replay, recovery) = kept.open();
     assert_eq!(recovery.warnings, [""; 0]);
-    assert_eq!(state(&replay), kept.state);
+    assert_eq!(stored(&replay), kept.stored);
 }
 
 #[test]
@@ -326,7 +326,7 @@ fn what_is_not_of_this_log_is_left_alone() {
         said(&recovery, "segment-000000000500.log is not of this log"),
         "{recovery:?}"
     );
-    assert_eq!(state(&replay), kept.state);
+    assert_eq!(stored(&replay), kept.stored);
     assert!(foreign.exists());
     drop(replay);
     fs::remove_file(&foreign).unwrap();
@@ -342,20 +342,20 @@ fn what_is_not_of_this_log_is_left_alone() {
         said(&recovery, "is not the segment that belongs here"),
         "{recovery:?}"
     );
-    assert_eq!(state(&replay), kept.state);
+    assert_eq!(stored(&replay), kept.stored);
     drop(replay);
 
     // Who it is is known from the segments, too.
     fs::remove_file(kept.args.dir.join("log.toml")).unwrap();
     let (replay, recovery) = kept.open();
     assert_eq!(recovery.warnings, [""; 0]);
-    assert_eq!(state(&replay), kept.state);
+    assert_eq!(stored(&replay), kept.stored);
 }
 
 #[test]
 fn a_folder_is_one_servers_and_one_runs() {
     let kept = Kept::new(10_000);
-    let error = |args: &DurableArgs, config: &Config| {
+    let error = |args: &PersistArgs, config: &Config| {
         let opened = open(args, config).map(|_| ());
         opened.unwrap_err().to_string()
     };
@@ -381,7 +381,7 @@ fn a_folder_is_one_servers_and_one_runs() {
 
     let mut other = test_spec();
     other.seed += 1;
-    let opened = DurableReplay::open(&kept.args, &other, &kept.config, ROWS).map(|_| ());
+    let opened = Replay::open(&kept.args, &other, &kept.config, ROWS).map(|_| ());
     let said = opened.unwrap_err().to_string();
     assert!(said.contains("its run spec has the hash"), "{said}");
 
@@ -393,10 +393,10 @@ fn a_folder_is_one_servers_and_one_runs() {
     );
 
     let text = fs::read_to_string(&file).unwrap();
-    fs::write(&file, text.replace("format = 2", "format = 3")).unwrap();
+    fs::write(&file, text.replace("format = 3", "format = 4")).unwrap();
     let said = error(&kept.args, &kept.config);
     assert!(
-        said.contains("a replay of format 3, this version reads 2"),
+        said.contains("a replay of format 4, this version reads 3"),
         "{said}"
     );
 }

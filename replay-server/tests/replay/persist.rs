@@ -8,12 +8,11 @@ use std::{
 };
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Buffer, ChunkHeader, Goodbye, Horizon, InsertReply, RequestId,
-    RunSpec, Shutdown,
+    ActorJoin, AffinityUpdate, Buffer, ChunkHeader, Goodbye, Horizon, InsertReply, Learned,
+    RequestId, RunSpec, Shutdown,
 };
 use driml_replay_server::{
-    Compression, Config, DurableArgs, DurableError, DurableReplay, KeptReplay, Reading, Recovery,
-    Unready,
+    Compression, Config, KeptReplay, PersistArgs, PersistError, Reading, Recovery, Replay,
 };
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
@@ -21,6 +20,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batches::check_batch,
+    calls::learner,
     history::{History, spec, unlimited},
 };
 
@@ -32,9 +32,9 @@ const LENGTH_AT: usize = 16;
 
 /// A replay in a folder, everything that was stored in it, and those that talk to it.
 pub(crate) struct Life {
-    pub(crate) args: DurableArgs,
+    pub(crate) args: PersistArgs,
     pub(crate) config: Config,
-    pub(crate) replay: DurableReplay,
+    pub(crate) replay: Replay,
     pub(crate) history: History,
     pub(crate) rng: ChaCha8Rng,
     /// By their numbers: incarnation, next chunk, transitions produced.
@@ -48,18 +48,17 @@ pub(crate) fn test_spec() -> RunSpec {
 }
 
 pub(crate) fn open(
-    args: &DurableArgs,
+    args: &PersistArgs,
     config: &Config,
-) -> Result<(DurableReplay, Recovery), DurableError> {
-    DurableReplay::open(args, &test_spec(), config, ROWS)
+) -> Result<(Replay, Recovery), PersistError> {
+    Replay::open(args, &test_spec(), config, ROWS)
 }
 
 /// A replay of this capacity that is kept in `dir`, in segments of about `segment_bytes`.
-pub(crate) fn args(dir: &Path, segment_bytes: u64) -> DurableArgs {
-    DurableArgs {
+pub(crate) fn args(dir: &Path, segment_bytes: u64) -> PersistArgs {
+    PersistArgs {
         dir: dir.to_owned(),
         shard: 0,
-        after_updates: 0,
         segment_bytes: Some(segment_bytes),
         mark: None,
     }
@@ -85,13 +84,14 @@ pub(crate) fn copy(from: &Path, to: &Path) {
     }
 }
 
-pub(crate) fn state(replay: &DurableReplay) -> Vec<u8> {
-    replay.state_bytes().unwrap()
+/// What a log brings back of a server that died.
+pub(crate) fn stored(replay: &Replay) -> Vec<u8> {
+    replay.stored_bytes().unwrap()
 }
 
 impl Life {
     /// Ends it: what its successor begins with.
-    pub(crate) fn end(self) -> (DurableArgs, Config) {
+    pub(crate) fn end(self) -> (PersistArgs, Config) {
         drop(self.replay);
         (self.args, self.config)
     }
@@ -107,7 +107,7 @@ impl Life {
             };
             replay.join_actor(join).unwrap();
         }
-        replay.learner_starts(77, 0).unwrap();
+        replay.join_learner(learner(77, 0, 0, 0)).unwrap();
         let mut history = History::new(&test_spec(), config.capacity_transitions);
         // What compresses badly may leave earlier than the reference thinks.
         history.ends = true;
@@ -211,9 +211,8 @@ impl Life {
             }
             18 => {
                 let served = self.replay.tally().rows_sampled;
-                self.replay
-                    .learner_starts(self.rng.random(), served - served.min(3))
-                    .unwrap();
+                let join = learner(self.rng.random(), 1, served - served.min(3), 0);
+                self.replay.join_learner(join).unwrap();
             }
             _ => {
                 // One that nobody can answer yet, or ever.
@@ -230,43 +229,26 @@ fn record_end(bytes: &[u8], at: u64) -> u64 {
     at + HEAD_BYTES + u64::from_le_bytes(length.try_into().unwrap())
 }
 
-/// Both serve the same batches from now on, bit for bit, and store the same.
-fn check_same_future(mut one: Life, mut other: DurableReplay) {
-    let packer = other.packer();
-    for round in 0..12 {
-        let id = RequestId::first(1000 + round % 3 + 3 * (round / 5));
-        let drawn = one
-            .replay
-            .draw_for(id, ROWS, Buffer::zeroed)
-            .map(|it| it.unpack());
-        let again = other
-            .draw_for(id, ROWS, Buffer::zeroed)
-            .map(|it| it.unpack());
-        assert_eq!(drawn, again);
-        if round % 4 == 3 {
-            let (incarnation, sequence, produced) = one.actors[0];
-            let header = ChunkHeader {
-                actor: 0,
-                incarnation,
-                sequence,
-                first_transition: produced,
-                weights_version: 1,
-                leaving: false,
-                streams: 2,
-                steps: 3,
-                frame_bytes: test_spec().frame_bytes() as u32,
-            };
-            let chunk = one.history.next_chunk(header, 0, &mut one.rng);
-            let packed = packer.pack(Cow::Borrowed(&chunk));
-            assert_eq!(
-                one.replay.insert_packed(&packed),
-                other.insert_packed(&packed)
-            );
-            one.actors[0] = (incarnation, sequence + 1, produced + 6);
+/// The log of a replay that died is used: what the learner says it has counts, and rows are right.
+fn check_goes_on(life: &Life, mut replay: Replay) {
+    let rows = life.replay.tally().rows_sampled;
+    let learned = Learned {
+        rows_received: rows,
+        ..Learned::default()
+    };
+    replay.note_learned(learned).unwrap();
+    assert_eq!(replay.tally(), life.replay.tally());
+    let is_held_by_number =
+        life.config.compressed_bytes_max.is_none() && life.config.disk_bytes_max.is_none();
+    for client in 0..6 {
+        let id = RequestId::first(1000 + client);
+        if let Ok(batch) = replay.draw_for(id, ROWS, Buffer::zeroed)
+            && is_held_by_number
+        {
+            check_batch(&batch.unpack(), &life.history);
         }
     }
-    assert_eq!(state(&one.replay), state(&other));
-    other.check_valid();
+    replay.check_valid();
 }
 
 fn configs() -> impl Strategy<Value = Config> {
@@ -297,11 +279,11 @@ proptest! {
         for _ in 0..actions {
             life.act();
         }
-        let (before, known) = (state(&life.replay), segments(&life.args.dir));
+        let (before, known) = (stored(&life.replay), segments(&life.args.dir));
         let newest = known.last().unwrap().clone();
         let length = fs::metadata(&newest).unwrap().len();
         life.act();
-        let after = state(&life.replay);
+        let after = stored(&life.replay);
         life.replay.check_valid();
 
         // The process dies now: all is there.
@@ -309,7 +291,7 @@ proptest! {
         copy(&life.args.dir, &dead);
         let (replay, recovery) = open(&args(&dead, segment_bytes), &life.config).unwrap();
         prop_assert!(recovery.found && recovery.warnings.is_empty(), "{:?}", recovery.warnings);
-        prop_assert_eq!(state(&replay), after.clone());
+        prop_assert_eq!(stored(&replay), after.clone());
         replay.check_valid();
         drop(replay);
 
@@ -334,15 +316,14 @@ proptest! {
             }
             let (replay, recovery) = open(&args(&torn, segment_bytes), &life.config).unwrap();
             prop_assert!(recovery.warnings.is_empty(), "{:?}", recovery.warnings);
-            prop_assert_eq!(state(&replay), before);
+            prop_assert_eq!(stored(&replay), before);
             replay.check_valid();
         }
 
-        // The living one and the one that came back have the same future; it comes back from the start after a start, too.
-        let again = root.path().join("again");
-        copy(&dead, &again);
-        let (replay, _) = open(&args(&again, segment_bytes), &life.config).unwrap();
-        check_same_future(life, replay);
+        // It comes back from the start after a start, too.
+        let (replay, _) = open(&args(&dead, segment_bytes), &life.config).unwrap();
+        prop_assert_eq!(stored(&replay), after);
+        check_goes_on(&life, replay);
     }
 }
 
@@ -385,17 +366,18 @@ fn retries_are_recognised_after_a_restart() {
             waited: false
         }
     );
-    // The same attempt is a copy that was on its way; the learner's next one is the one that counts.
-    let copy = replay.draw_for(id, ROWS, Buffer::zeroed);
-    assert!(matches!(copy, Err(Unready::Wait(_))));
-    assert_eq!(replay.status().rows_sampled, served.rows_sampled);
+    // The learner says how many rows it has; the batch that did not reach it is not among them.
+    let learned = Learned {
+        rows_received: served.rows_sampled - u64::from(ROWS),
+        ..Learned::default()
+    };
+    replay.note_learned(learned).unwrap();
     assert!(replay.draw_for(id.again(), ROWS, Buffer::zeroed).is_ok());
+    replay.note_learned(learned).unwrap();
     let status = replay.status();
-    assert_eq!(
-        (status.rows_sampled, status.batches_retried),
-        (served.rows_sampled, 1)
-    );
+    assert_eq!(status.rows_sampled, served.rows_sampled);
     assert_eq!(status.transitions_inserted, served.transitions_inserted);
+    replay.check_valid();
 }
 
 #[test]
@@ -437,10 +419,10 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
     );
     life.replay.check_valid();
     assert!(life.draw(0).is_some());
-    let before = state(&life.replay);
+    let before = stored(&life.replay);
     let (args, config) = life.end();
     let (replay, _) = open(&args, &config).unwrap();
-    assert_eq!(state(&replay), before);
+    assert_eq!(stored(&replay), before);
     assert_eq!(replay.status().transitions_held, status.transitions_held);
 }
 
@@ -462,37 +444,33 @@ fn a_resumed_run_goes_on_with_what_was_kept() {
     let before = life.replay.status();
     let (mut args, config) = life.end();
 
-    // The learner saved after 50 updates: the rows beyond them are served again.
-    args.after_updates = 50;
-    let (mut replay, _) = open(&args, &config).unwrap();
-    assert_eq!(replay.after_updates(), 0, "the replay is of the whole run");
-    replay.learner_starts(78, 50 * u64::from(ROWS)).unwrap();
-    let status = replay.status();
-    assert_eq!(status.transitions_inserted, before.transitions_inserted);
-    assert_eq!(status.rows_sampled, 50 * u64::from(ROWS));
-    drop(replay);
+    // The learner saved after 50 updates: the rows beyond them are served again. Or it knows of more than the log does, whose end went
+    // with the machine's power.
+    for (number, updates) in [(78, 50), (79, 70)] {
+        let (mut replay, _) = open(&args, &config).unwrap();
+        let rows = updates * u64::from(ROWS);
+        replay
+            .join_learner(learner(number, updates, rows, 60))
+            .unwrap();
+        let status = replay.status();
+        assert_eq!(status.transitions_inserted, before.transitions_inserted);
+        assert_eq!(
+            (status.rows_sampled, status.transitions_refilled),
+            (rows, 0)
+        );
+        assert_eq!(replay.resumed_after(), 0, "the replay is of the whole run");
+        replay.check_valid();
+    }
 
-    // It knows of more than the log does, whose end went with the machine's power.
-    args.after_updates = 70;
-    let (mut replay, _) = open(&args, &config).unwrap();
-    replay.learner_starts(79, 70 * u64::from(ROWS)).unwrap();
-    assert_eq!(replay.status().rows_sampled, 70 * u64::from(ROWS));
-    replay.check_valid();
-    drop(replay);
-
-    // One that was begun by a run that was resumed without a replay counts from there.
+    // A folder in which a run goes on that kept no replay before counts from its checkpoint, also after a restart.
     args.dir = root.path().join("fresh");
-    let (replay, _) = open(&args, &config).unwrap();
-    assert_eq!(
-        (replay.after_updates(), replay.tally().rows_sampled),
-        (70, 280)
-    );
+    let (mut replay, _) = open(&args, &config).unwrap();
+    replay.join_learner(learner(80, 70, 280, 90)).unwrap();
     drop(replay);
     let (replay, _) = open(&args, &config).unwrap();
-    assert_eq!(
-        (replay.after_updates(), replay.tally().rows_sampled),
-        (70, 280)
-    );
+    assert_eq!(replay.resumed_after(), 70);
+    let tally = replay.tally();
+    assert_eq!((tally.inserted, tally.rows_sampled), (90, 280));
 }
 
 /// Reading can be watched and broken off; what is kept is then what it was.
@@ -503,7 +481,7 @@ fn reading_says_how_far_it_is_and_can_be_broken_off() {
     for _ in 0..60 {
         life.act();
     }
-    let (before, args, config) = (state(&life.replay), life.args.clone(), life.config.clone());
+    let (before, args, config) = (stored(&life.replay), life.args.clone(), life.config.clone());
     drop(life);
     let bytes = || -> u64 {
         let lengths = segments(root.path()).into_iter();
@@ -516,7 +494,7 @@ fn reading_says_how_far_it_is_and_can_be_broken_off() {
     let reading = Reading::begin(stop);
     let broken_off = kept.read(&reading).map(drop);
     assert!(
-        matches!(broken_off, Err(DurableError::Stopped)),
+        matches!(broken_off, Err(PersistError::Stopped)),
         "{broken_off:?}"
     );
     let progress = reading.progress();
@@ -525,7 +503,7 @@ fn reading_says_how_far_it_is_and_can_be_broken_off() {
 
     let kept = find();
     assert!(
-        matches!(open(&args, &config), Err(DurableError::InUse(_))),
+        matches!(open(&args, &config), Err(PersistError::InUse(_))),
         "the folder is taken before it is read"
     );
     let reading = Reading::begin(Shutdown::default());
@@ -533,5 +511,5 @@ fn reading_says_how_far_it_is_and_can_be_broken_off() {
     assert!(recovery.found && recovery.warnings.is_empty());
     let progress = reading.progress();
     assert_eq!((progress.bytes_read, progress.bytes), (all, all));
-    assert_eq!(state(&replay), before);
+    assert_eq!(stored(&replay), before);
 }

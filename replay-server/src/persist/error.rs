@@ -8,7 +8,7 @@ use crate::config::ConfigError;
 
 /// What keeps a replay from its folder.
 #[derive(Debug, thiserror::Error)]
-pub enum DurableError {
+pub enum PersistError {
     /// A file or folder that cannot be read or written.
     #[error("{doing} {}: {source}; --replay-dir needs a folder with room that this process may write", path.display())]
     Io {

@@ -1,0 +1,111 @@
+//! What a run has done so far, as its learner counts it. The checkpoint keeps it: no other process knows what was learned.
+//! It derives nothing: every number was counted.
+
+use driml_protocol::Tally;
+use serde::{Deserialize, Serialize};
+
+/// Largest count: no run comes near it, and what is added to counts cannot overflow.
+pub(crate) const COUNT_MAX: u64 = 1 << 53;
+
+/// What a run has done so far, beside its updates.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Progress {
+    /// Which run it is: a random number that its first learner drew; 0 before.
+    pub run: u64,
+    /// Of each shard of the replay: transitions stored, as heard last, and rows learned.
+    pub shards: Vec<Tally>,
+}
+
+/// Rows of a batch that came from one shard.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ServedPart {
+    /// Which shard.
+    pub shard: usize,
+    /// How many rows.
+    pub rows: u32,
+    /// Transitions that the shard had stored by then.
+    pub inserted: u64,
+}
+
+impl Progress {
+    /// Frames of the run: transitions stored, in all shards.
+    pub fn frames(&self) -> u64 {
+        self.shards.iter().map(|it| it.inserted).sum()
+    }
+
+    /// Rows learned from all shards.
+    pub fn rows(&self) -> u64 {
+        self.shards.iter().map(|it| it.rows_sampled).sum()
+    }
+
+    /// The same for a replay of so many shards: counts of another number of them are spread evenly.
+    pub fn spread_over(&mut self, shards: usize) {
+        if self.shards.len() == shards {
+            return;
+        }
+        let (frames, rows, of) = (self.frames(), self.rows(), shards as u64);
+        let share = |all: u64, at: u64| all / of + u64::from(at < all % of);
+        self.shards = (0..of)
+            .map(|at| Tally {
+                inserted: share(frames, at),
+                rows_sampled: share(rows, at),
+            })
+            .collect();
+    }
+
+    /// Counts a batch that was learned from.
+    pub fn note(&mut self, parts: &[ServedPart]) {
+        for part in parts {
+            self.note_inserted(part.shard, part.inserted);
+            self.shards[part.shard].rows_sampled += u64::from(part.rows);
+        }
+    }
+
+    /// A shard has stored so many transitions by now.
+    pub fn note_inserted(&mut self, shard: usize, inserted: u64) {
+        if self.shards.len() <= shard {
+            self.shards.resize(shard + 1, Tally::default());
+        }
+        let known = &mut self.shards[shard].inserted;
+        *known = inserted.max(*known);
+    }
+
+    /// What all shards but `this` have counted together.
+    pub fn other_shards(&self, this: usize) -> Tally {
+        let others = self.shards.iter().enumerate();
+        let others = others.filter(|(at, _)| *at != this);
+        others.fold(Tally::default(), |sum, (_, tally)| sum + *tally)
+    }
+
+    /// Whether no count is one that no run reaches.
+    pub(crate) fn is_sane(&self) -> bool {
+        let counts = self.shards.iter();
+        let mut counts = counts.flat_map(|it| [it.inserted, it.rows_sampled]);
+        counts.all(|count| count <= COUNT_MAX) && self.shards.len() <= 1 << 16
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_of_other_shards_are_spread_and_none_is_lost() {
+        let part = |shard, rows, inserted| ServedPart {
+            shard,
+            rows,
+            inserted,
+        };
+        let mut progress = Progress::default();
+        progress.note(&[part(0, 200, 5_000), part(1, 56, 1_001)]);
+        progress.note(&[part(1, 256, 1_000)]);
+        assert_eq!((progress.frames(), progress.rows()), (6_001, 512));
+        assert_eq!(progress.other_shards(0).rows_sampled, 312);
+        for shards in [3, 1, 7, 2] {
+            progress.spread_over(shards);
+            assert_eq!(progress.shards.len(), shards);
+            assert_eq!((progress.frames(), progress.rows()), (6_001, 512));
+        }
+    }
+}

@@ -1,0 +1,96 @@
+//! Draws anchors, each valid one equally likely.
+//! It does not decide what is valid: that is `episodes`.
+
+use driml_protocol::{Origin, PriorityUpdate};
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+use super::{Held, RowSampler, RowsState, prioritised::PriorityCounts};
+use crate::{
+    sampling::episodes::Window,
+    storage::ring::{Link, Ring},
+};
+
+/// Draws that may hit an invalid transition before all valid ones are listed instead; either way the law is uniform.
+const TRIES_MAX: u32 = 64;
+
+/// The list of all valid anchors, kept for as long as the ring does not change.
+#[derive(Default)]
+pub(super) struct Uniform {
+    valid: Vec<u64>,
+    /// Transitions the ring had stored when `valid` was listed; 0 before the first.
+    listed_at: u64,
+    /// The oldest one that it held then.
+    listed_from: u64,
+}
+
+impl Uniform {
+    /// Whether the list is that of the ring.
+    const fn are_listed(&self, ring: &Ring) -> bool {
+        self.listed_at == ring.inserted() && self.listed_from == ring.oldest()
+    }
+
+    fn list(&mut self, Held { ring, episodes }: Held<'_>, window: &mut Window) {
+        self.valid.clear();
+        let held = ring.oldest()..ring.inserted();
+        self.valid
+            .extend(held.filter(|&t| episodes.walk(ring, t, window)));
+        (self.listed_at, self.listed_from) = (ring.inserted(), ring.oldest());
+    }
+}
+
+impl RowSampler for Uniform {
+    fn stored(&mut self, _: Held<'_>, _: u64, _: Link) {}
+
+    fn forget(&mut self, _: &Ring) {}
+
+    /// By rejection; after [`TRIES_MAX`] misses by listing, which takes time proportional to the transitions held.
+    fn draw(&mut self, held: Held<'_>, rng: &mut ChaCha8Rng, window: &mut Window) -> bool {
+        let Held { ring, episodes } = held;
+        if ring.oldest() == ring.inserted() {
+            return false;
+        }
+        if !self.are_listed(ring) {
+            for _ in 0..TRIES_MAX {
+                let t = rng.random_range(ring.oldest()..ring.inserted());
+                if episodes.walk(ring, t, window) {
+                    return true;
+                }
+            }
+            self.list(held, window);
+        }
+        if self.valid.is_empty() {
+            return false;
+        }
+        let t = self.valid[rng.random_range(0..self.valid.len())];
+        let valid = episodes.walk(ring, t, window);
+        assert!(valid, "{t} was valid and the ring has not changed");
+        valid
+    }
+
+    fn probability(&self, _: u64) -> Option<f64> {
+        None
+    }
+
+    fn update(&mut self, _: &Ring, _: &PriorityUpdate, _: Origin) -> Result<(), String> {
+        Err("priorities, in a run that draws uniformly".into())
+    }
+
+    fn priority_counts(&self) -> Option<PriorityCounts> {
+        None
+    }
+
+    fn state(&self, ring: &Ring) -> RowsState {
+        RowsState::Uniform {
+            are_listed: self.are_listed(ring),
+        }
+    }
+
+    fn restore(&mut self, held: Held<'_>, _: u64, state: &RowsState, window: &mut Window) {
+        if *state == (RowsState::Uniform { are_listed: true }) {
+            self.list(held, window);
+        }
+    }
+
+    fn check_valid(&self, _: Held<'_>) {}
+}

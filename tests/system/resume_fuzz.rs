@@ -1,0 +1,274 @@
+//! Resumes at random: a run is stopped at any moment in any way, goes on with other settings, and its counts are those that the actors'
+//! logs, its checkpoint and the settings give by themselves.
+//! What is said where a run cannot be resumed is tested in `resume`.
+
+use std::{fmt::Write as _, fs, time::Duration};
+
+use driml_tests::{RunFolder, TestSystem};
+use nix::sys::signal::Signal;
+use rand::{Rng, SeedableRng, seq::IndexedRandom};
+use rand_chacha::ChaCha8Rng;
+use serde_json::Value;
+
+use crate::system;
+
+/// Frames of the first life, those that warm it up, and its settings.
+const FRAMES: u64 = 2_400;
+const WARMUP: u64 = 200;
+const ROWS: u64 = 16;
+const RATIO: u64 = 8;
+
+/// How the first life ends.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Stop {
+    /// By itself.
+    End,
+    /// Ctrl-C.
+    Interrupt,
+    /// The launcher is killed; its processes end by themselves.
+    KillLauncher,
+    /// All processes are killed.
+    KillAll,
+    /// The learner is killed, with which the run fails.
+    KillLearner,
+    /// A replay server is killed; one that is kept on disk is started again, else the run fails.
+    KillServer,
+}
+
+/// Settings of the second life.
+#[derive(Clone, Copy, Debug)]
+struct Change {
+    frames: u64,
+    rows: u64,
+    ratio: u64,
+    actors: u32,
+}
+
+/// What a checkpoint says of the run.
+#[derive(Clone, Copy, Debug)]
+struct Saved {
+    updates: u64,
+    frames: u64,
+    rows: u64,
+}
+
+/// The newest checkpoint; none before the first.
+fn saved(run: &RunFolder) -> Option<Saved> {
+    let entries = fs::read_dir(run.path().join("checkpoints")).ok()?;
+    // What a kill has cut off is no checkpoint.
+    let whole = entries.map(|it| it.unwrap().path()).filter(|path| {
+        let name = path.file_name().unwrap().to_str().unwrap();
+        name.starts_with("checkpoint-") && !name.ends_with(".tmp")
+    });
+    let newest = whole.max()?;
+    let state: Value =
+        serde_json::from_slice(&fs::read(newest.join("state.json")).unwrap()).unwrap();
+    let shards = state["progress"]["shards"].as_array().unwrap().clone();
+    let sum = |key: &str| shards.iter().map(|it| it[key].as_u64().unwrap()).sum();
+    Some(Saved {
+        updates: state["updates"].as_u64().unwrap(),
+        frames: sum("inserted"),
+        rows: sum("rows_sampled"),
+    })
+}
+
+/// Transitions that actors have delivered in all lives so far, by their own logs.
+fn delivered(run: &RunFolder) -> u64 {
+    // A run in lockstep has none.
+    let logs = fs::read_dir(run.path().join("logs")).into_iter().flatten();
+    let logs = logs.map(|entry| entry.unwrap().path());
+    let actors = logs.filter(|path| {
+        path.file_name()
+            .unwrap()
+            .to_str()
+            .unwrap()
+            .starts_with("actor")
+    });
+    actors
+        .map(|path| delivered_by(&fs::read_to_string(path).unwrap()))
+        .sum()
+}
+
+fn delivered_by(log: &str) -> u64 {
+    let lines = log
+        .lines()
+        .filter_map(|line| line.strip_suffix(" transitions delivered"));
+    let counts = lines.map(|line| line.rsplit(' ').next().unwrap().parse::<u64>().unwrap());
+    counts.sum()
+}
+
+/// Starts a run, stops it, resumes it, and checks the counts.
+fn resume_once(seed: u64) {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let system = system();
+    let store = *["", "--durable", "--lockstep"].choose(&mut rng).unwrap();
+    let stops = [
+        Stop::End,
+        Stop::Interrupt,
+        Stop::Interrupt,
+        Stop::KillLauncher,
+        Stop::KillAll,
+        Stop::KillLearner,
+        Stop::KillServer,
+    ];
+    // In lockstep there is one process.
+    let kinds = if store == "--lockstep" {
+        5
+    } else {
+        stops.len()
+    };
+    let stop = *stops[..kinds].choose(&mut rng).unwrap();
+    let shards = if store == "--lockstep" {
+        1
+    } else {
+        rng.random_range(1..3)
+    };
+    let mut change = Change {
+        frames: *[FRAMES, FRAMES, FRAMES / 2, FRAMES + 1_000]
+            .choose(&mut rng)
+            .unwrap(),
+        rows: *[ROWS, ROWS, 8, 24].choose(&mut rng).unwrap(),
+        ratio: *[RATIO, RATIO, 4].choose(&mut rng).unwrap(),
+        actors: 2,
+    };
+    if store != "--lockstep" {
+        change.actors = rng.random_range(2..4);
+    }
+    let about = format!("seed {seed}: {store} {shards} shards, {stop:?}, {change:?}");
+    let first = format!(
+        "local --agent c51 --env chain --preset smoke --frames {FRAMES} --set replay.replay_ratio={RATIO} \
+         --set learner.batch_size={ROWS} --set learner.checkpoint_period_updates=50 --actors 2 --replay-shards {shards} {store} --run-dir run"
+    );
+    let run = system.run_folder("run");
+    first_life(
+        &system,
+        &run,
+        &first,
+        stop,
+        Duration::from_millis(rng.random_range(0..1_500)),
+    );
+    let Some(before) = saved(&run) else {
+        // Nothing was saved yet, and that is said.
+        system
+            .run("local --resume run")
+            .expect_code(64)
+            .expect_said("there is no checkpoint");
+        return;
+    };
+    let delivered_before = delivered(&run);
+    let is_graceful = matches!(stop, Stop::End | Stop::Interrupt);
+    if is_graceful && store != "--lockstep" {
+        assert_eq!(before.frames, delivered_before, "{about}: {before:?}");
+    }
+
+    let mut flags = format!("local --resume run --frames {}", change.frames);
+    for (key, value, first) in [
+        ("learner.batch_size", change.rows, ROWS),
+        ("replay.replay_ratio", change.ratio, RATIO),
+    ] {
+        if value != first {
+            write!(flags, " --set {key}={value}").unwrap();
+        }
+    }
+    if change.actors != 2 {
+        write!(flags, " --set local.actors={}", change.actors).unwrap();
+    }
+    let ended = system.run(&flags).expect_code(0);
+    let has_other_pace = change.rows != ROWS || change.ratio != RATIO;
+    let planned = |frames: u64| match has_other_pace {
+        true => before.updates + frames.saturating_sub(before.frames) * change.ratio / change.rows,
+        false => (frames - WARMUP) * RATIO / ROWS,
+    };
+    if ended.stdout.contains("nothing is left to do") {
+        assert!(
+            planned(change.frames) <= before.updates,
+            "{about}: {before:?}\n{}",
+            ended.stdout
+        );
+        return;
+    }
+    let after = run.summary();
+    let said = format!("{about}\n{before:?}\n{after:#?}");
+    assert_eq!(after.outcome, "finished", "{said}");
+    assert_eq!(
+        (after.transitions_lost, after.transitions_duplicated),
+        (0, 0),
+        "{said}"
+    );
+    assert!(after.frames >= change.frames.max(before.frames), "{said}");
+    assert_eq!(after.updates, planned(after.frames), "{said}");
+    let learned = (after.updates - before.updates) * change.rows;
+    assert_eq!(after.rows_sampled, before.rows + learned, "{said}");
+    if store != "--lockstep" {
+        let delivered = delivered(&run) - delivered_before;
+        let counted = after.frames + after.transitions_refilled;
+        match (is_graceful, store) {
+            (true, _) | (false, "") => assert_eq!(counted, before.frames + delivered, "{said}"),
+            // The log holds what came after the checkpoint, too.
+            (false, _) => assert!(counted >= before.frames + delivered, "{said}"),
+        }
+        assert!(store == "" || after.transitions_refilled == 0, "{said}");
+    }
+    let episodes = run.episodes();
+    assert!(
+        episodes.is_sorted_by_key(|row| (row.episode, row.frames)),
+        "{said}"
+    );
+    assert!(
+        episodes.iter().all(|row| row.frames <= after.frames),
+        "{said}"
+    );
+}
+
+fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, moment: Duration) {
+    if stop == Stop::End {
+        system.run(flags).expect_code(0);
+        return;
+    }
+    let process = system.start(flags);
+    driml_tests::wait_for("the run's settings", || {
+        run.path().join("config.toml").exists().then_some(())
+    });
+    std::thread::sleep(moment);
+    match stop {
+        Stop::End => {}
+        Stop::Interrupt => {
+            process.signal(Signal::SIGINT);
+            let ended = process.wait();
+            assert!(matches!(ended.code, Some(0 | 130)), "{ended:?}");
+        }
+        Stop::KillLauncher => {
+            process.signal(Signal::SIGKILL);
+            process.wait();
+            system.wait_until_all_have_ended();
+        }
+        Stop::KillLearner | Stop::KillServer => {
+            let part = match stop {
+                Stop::KillLearner => "learner",
+                _ => "replay-server",
+            };
+            // There is none before the launcher has started it, and after the run's end.
+            if let Some(part) = system.find_part_now(part) {
+                part.signal(Signal::SIGKILL);
+            }
+            process.wait();
+            system.wait_until_all_have_ended();
+        }
+        Stop::KillAll => {
+            system.kill_parts();
+            process.signal(Signal::SIGKILL);
+            process.wait();
+        }
+    }
+}
+
+#[test]
+fn runs_stopped_anywhere_count_on_right() {
+    (0..8).for_each(resume_once);
+}
+
+#[test]
+#[ignore = "takes a quarter of an hour"]
+fn two_hundred_runs_stopped_anywhere_count_on_right() {
+    (1_000..1_200).for_each(resume_once);
+}
