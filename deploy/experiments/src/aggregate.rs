@@ -1,48 +1,28 @@
-//! Scores over games and seeds as the field reports them: interquartile mean and probability of improvement, each with a
-//! stratified bootstrap interval. Source: Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the
-//! Statistical Precipice". It normalises nothing. Besides, the score by which the paper sums up its table 1.
+//! Scores over games and seeds as the field reports them: interquartile mean and probability of improvement. Source: Agarwal et al.
+//! 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice". Their bootstrap intervals are for more seeds than
+//! runs of days allow; these are Student's. It normalises nothing. Besides, the score by which the paper sums up its table 1.
 
-use std::fmt;
-
-use rand::{Rng, SeedableRng};
-use rand_chacha::ChaCha8Rng;
-
-/// Resamples of a bootstrap.
-const RESAMPLES: usize = 2_000;
-/// Share of the resamples in an interval.
-const COVERED: f64 = 0.95;
+use crate::statistics::{Interval, interval};
 
 /// Scores by game and seed: `scores[game][seed]`, each game with at least one seed.
 pub(super) type Scores = Vec<Vec<f64>>;
 
-/// A number and the interval in which it lies with 95% confidence, over the choice of seeds.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Estimate {
-    pub(super) value: f64,
-    pub(super) low: f64,
-    pub(super) high: f64,
-}
-
-impl fmt::Display for Estimate {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:.3} [{:.3}, {:.3}]", self.value, self.low, self.high)
-    }
-}
-
 /// Mean of the middle half of all scores, and its interval; none of no score.
-pub(super) fn iqm(scores: &Scores) -> Option<Estimate> {
+pub(super) fn iqm(scores: &Scores) -> Option<Interval> {
     estimate(&[scores], |it| interquartile_mean(it[0].iter().flatten()))
 }
 
 /// Probability that a run of `x` does better than one of `y` in a game drawn at random, and its interval; none of no game.
 ///
 /// `1/M sum_m 1/(N_x N_y) sum_ij [x_mi > y_mj] + [x_mi = y_mj] / 2` over the M games; both have the same games.
-pub(super) fn improvement(x: &Scores, y: &Scores) -> Option<Estimate> {
+pub(super) fn improvement(x: &Scores, y: &Scores) -> Option<Interval> {
     assert_eq!(x.len(), y.len(), "the same games");
-    estimate(&[x, y], |it| {
+    let found = estimate(&[x, y], |it| {
         let games = it[0].iter().zip(&it[1]);
         games.map(|(x, y)| better(x, y)).sum::<f64>() / it[0].len() as f64
-    })
+    })?;
+    let ends = found.ends.map(|(low, high)| (low.max(0.0), high.min(1.0)));
+    Some(Interval { ends, ..found })
 }
 
 /// Mean over games of each agent's place between the game's worst agent, 0, and its best, 1, divided by the place of the
@@ -87,37 +67,36 @@ fn better(x: &[f64], y: &[f64]) -> f64 {
     wins.sum::<f64>() / (x.len() * y.len()) as f64
 }
 
-/// `of` the groups, and the percentiles of `of` their resamples: seeds drawn with replacement within each game.
-fn estimate(groups: &[&Scores], of: impl Fn(&[Scores]) -> f64) -> Option<Estimate> {
-    if groups.iter().any(|scores| scores.is_empty()) {
-        return None;
-    }
-    let whole: Vec<Scores> = groups.iter().map(|&scores| scores.clone()).collect();
-    let value = of(&whole);
-    // One fixed seed: the same runs give the same page.
-    let mut rng = ChaCha8Rng::seed_from_u64(0);
-    let mut drawn = whole.clone();
-    let mut values: Vec<f64> = (0..RESAMPLES)
-        .map(|_| {
-            for (to, from) in drawn.iter_mut().flatten().zip(whole.iter().flatten()) {
-                to.iter_mut()
-                    .for_each(|score| *score = from[rng.random_range(0..from.len())]);
-            }
-            of(&drawn)
-        })
-        .collect();
-    values.sort_by(f64::total_cmp);
-    let outside = (1.0 - COVERED) / 2.0;
-    let at = |share: f64| values[(share * (RESAMPLES - 1) as f64).round() as usize];
-    Some(Estimate {
-        value,
-        low: at(outside),
-        high: at(1.0 - outside),
-    })
+/// `of` the groups, and its interval over seeds by the jackknife: Student's interval of the pseudo-values
+/// `p_i = n v - (n - 1) v_i`, where `v` is of all scores and `v_i` of those without seed i of each game. No ends where a game has a
+/// single seed; of the games' further seeds only `v` knows. Source: Tukey 1958. For a mean it is Student's interval itself.
+fn estimate(groups: &[&Scores], of: impl Fn(&[Scores]) -> f64) -> Option<Interval> {
+    let all: Vec<Scores> = groups.iter().map(|&scores| scores.clone()).collect();
+    let seeds = all.iter().flatten().map(Vec::len).min()?;
+    let mean = of(&all);
+    let pseudo_value = |seed: usize| {
+        let mut others = all.clone();
+        others.iter_mut().flatten().for_each(|scores| {
+            scores.remove(seed);
+        });
+        seeds as f64 * mean - (seeds - 1) as f64 * of(&others)
+    };
+    let ends = match seeds {
+        0 | 1 => None,
+        _ => {
+            let found = interval(&(0..seeds).map(pseudo_value).collect::<Vec<_>>())?;
+            let around = |end: f64| mean + end - found.mean;
+            found.ends.map(|(low, high)| (around(low), around(high)))
+        }
+    };
+    Some(Interval { mean, ends })
 }
 
 #[cfg(test)]
 mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
     use super::*;
 
     #[test]
@@ -135,27 +114,50 @@ mod tests {
         let y = vec![vec![2.0, 3.0], vec![4.0]];
         // First game: 1 < 2, 1 < 3, 3 > 2, 3 = 3: 1.5 of 4. Second: 1.
         let found = improvement(&x, &y).unwrap();
-        assert_eq!(found.value, (1.5 / 4.0 + 1.0) / 2.0);
+        assert_eq!(found.mean, (1.5 / 4.0 + 1.0) / 2.0);
         let other = improvement(&y, &x).unwrap();
-        assert!((found.value + other.value - 1.0).abs() < 1e-12);
-        assert!(found.low <= found.value && found.value <= found.high);
+        assert!((found.mean + other.mean - 1.0).abs() < 1e-12);
+        assert_eq!(found.ends, None, "of one game there is one seed");
         assert_eq!(improvement(&vec![], &vec![]), None);
     }
 
     #[test]
-    fn the_interval_covers_the_truth_about_as_often_as_it_says() {
+    fn the_interval_has_the_truth_about_as_often_as_it_says() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let (mut covered, rounds) = (0, 200);
-        for _ in 0..rounds {
-            // Uniform scores around 0.5 in four games, twelve seeds each.
-            let scores: Scores = (0..4)
-                .map(|_| (0..12).map(|_| rng.random::<f64>()).collect())
-                .collect();
-            let found = iqm(&scores).unwrap();
-            covered += usize::from((found.low..=found.high).contains(&0.5));
+        let rounds = 1_000;
+        for seeds in [3, 4, 12] {
+            let (mut of_iqm, mut of_improvement) = (0, 0);
+            for _ in 0..rounds {
+                // Uniform scores around 0.5 in four games: one agent is as good as the other.
+                let mut scores = || -> Scores {
+                    let mut game = || (0..seeds).map(|_| rng.random::<f64>()).collect();
+                    (0..4).map(|_| game()).collect()
+                };
+                let (x, y) = (scores(), scores());
+                let has = |found: Interval| {
+                    let (low, high) = found.ends.unwrap();
+                    u32::from((low..=high).contains(&0.5))
+                };
+                of_iqm += has(iqm(&x).unwrap());
+                of_improvement += has(improvement(&x, &y).unwrap());
+            }
+            for count in [of_iqm, of_improvement] {
+                let share = f64::from(count) / f64::from(rounds);
+                assert!((0.92..0.98).contains(&share), "{seeds} seeds: {share}");
+            }
         }
-        // 95% of 200 is 190; the bootstrap of a dozen seeds is a little narrow.
-        assert!((170..=200).contains(&covered), "{covered} of {rounds}");
+    }
+
+    #[test]
+    fn of_one_game_without_a_cut_the_interval_is_students() {
+        let values = vec![1.0, 2.0, 4.0];
+        let (found, expected) = (iqm(&vec![values.clone()]), interval(&values));
+        let numbers = |it: Option<Interval>| {
+            let it = it.unwrap();
+            [it.mean, it.ends.unwrap().0, it.ends.unwrap().1]
+        };
+        let pairs = numbers(found).into_iter().zip(numbers(expected));
+        pairs.for_each(|(found, expected)| assert!((found - expected).abs() < 1e-12));
     }
 
     #[test]
@@ -170,8 +172,8 @@ mod tests {
     }
 
     #[test]
-    fn one_seed_each_has_no_spread() {
+    fn one_seed_each_has_no_interval() {
         let found = iqm(&vec![vec![0.1], vec![0.3]]).unwrap();
-        assert_eq!((found.low, found.high), (found.value, found.value));
+        assert_eq!((found.mean, found.ends), (0.2, None));
     }
 }

@@ -1,7 +1,10 @@
-//! Small statistics over seeds and pairs: mean and spread, intervals, a permutation test, rank correlation, area under the ROC curve.
-//! It judges nothing: what is called apart is for each page to say.
+//! Small statistics over seeds and pairs: mean and spread, 95% intervals, when two means are apart, rank correlation, area under the
+//! ROC curve. Every interval of seeds that is printed or drawn is made here. It normalises nothing.
 
 use std::fmt;
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
 /// Mean and standard deviation (n - 1) over seeds.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -61,66 +64,114 @@ const T: [f64; 30] = [
     2.052, 2.048, 2.045, 2.042,
 ];
 
-/// A mean over seeds and the interval in which it lies with 95% confidence if seeds are normal: Student's.
+/// The quantile for this many degrees of freedom, at least 1.
+fn quantile(freedom: usize) -> f64 {
+    T[(freedom.max(1) - 1).min(T.len() - 1)]
+}
+
+/// A mean and the interval in which it lies with 95% confidence if values are normal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Interval {
     pub(super) mean: f64,
-    /// Both none for a single seed, of which nothing is known.
+    /// Both none for a single value: it does not tell how far others would spread.
     pub(super) ends: Option<(f64, f64)>,
 }
 
 impl Interval {
-    /// Of these values; none of no value.
-    pub(super) fn of(values: &[f64]) -> Option<Self> {
-        let Spread {
-            mean, sd, count, ..
-        } = Spread::of(values.iter().copied())?;
-        let ends = (count > 1).then(|| {
-            let by = T[(count - 2).min(T.len() - 1)] * sd / (count as f64).sqrt();
-            (mean - by, mean + by)
-        });
-        Some(Self { mean, ends })
-    }
-
-    /// Of the mean of `to` minus that of `from`, of runs that have nothing in common: Welch's, with his degrees of freedom rounded down.
-    /// No ends where either has a single value.
-    pub(super) fn of_difference(from: &[f64], to: &[f64]) -> Option<Self> {
-        let (from, to) = (
-            Spread::of(from.iter().copied())?,
-            Spread::of(to.iter().copied())?,
-        );
-        let mean = to.mean - from.mean;
-        if from.count < 2 || to.count < 2 {
-            return Some(Self { mean, ends: None });
-        }
-        let square = |it: &Spread| it.sd.powi(2) / it.count as f64;
-        let (a, b) = (square(&from), square(&to));
-        let by = match a + b {
-            0.0 => 0.0,
-            sum => {
-                let each = a * a / (from.count - 1) as f64 + b * b / (to.count - 1) as f64;
-                let freedom = (sum * sum / each) as usize;
-                T[(freedom.max(1) - 1).min(T.len() - 1)] * sum.sqrt()
-            }
-        };
-        Some(Self {
-            mean,
-            ends: Some((mean - by, mean + by)),
-        })
-    }
-
-    /// Whether 0 is outside of it.
-    pub(super) fn is_apart_from_zero(&self) -> bool {
-        self.ends.is_some_and(|(low, high)| low > 0.0 || high < 0.0)
+    /// Mean, low and high end as a file of data has them; empty where there is none.
+    pub(super) fn cells(&self) -> [String; 3] {
+        let ends = self.ends;
+        let numbers = [Some(self.mean), ends.map(|it| it.0), ends.map(|it| it.1)];
+        numbers.map(|it| it.map_or(String::new(), |it| format!("{it:.4}")))
     }
 }
 
+/// Student's interval of the mean; none of no value.
+///
+/// A bootstrap of so few values as there are seeds is too narrow: of three, its 95% interval has the mean in 75% of cases.
+pub(super) fn interval(values: &[f64]) -> Option<Interval> {
+    let Spread {
+        mean, sd, count, ..
+    } = Spread::of(values.iter().copied())?;
+    let ends = (count > 1).then(|| {
+        let by = quantile(count - 1) * sd / (count as f64).sqrt();
+        (mean - by, mean + by)
+    });
+    Some(Interval { mean, ends })
+}
+
+/// The mean of some values minus that of others which have nothing in common with them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Difference {
+    /// Welch's interval, with his degrees of freedom rounded down. No ends where either side has a single value.
+    pub(super) interval: Interval,
+    /// Whether 0 is outside of the interval, and the exact permutation test finds a chance of at most 5%: few values may coincide, and
+    /// their interval is then too narrow. Of more than 20 values the interval alone decides.
+    pub(super) is_apart: bool,
+}
+
+/// The mean of `to` minus that of `from`; none where either is empty.
+pub(super) fn difference(from: &[f64], to: &[f64]) -> Option<Difference> {
+    let interval = welch(from, to)?;
+    let excludes_zero = |(low, high)| low > 0.0 || high < 0.0;
+    let is_apart = interval.ends.is_some_and(excludes_zero)
+        && chance_of_difference(from, to).is_none_or(|it| it <= CHANCE_MAX);
+    Some(Difference { interval, is_apart })
+}
+
+fn welch(from: &[f64], to: &[f64]) -> Option<Interval> {
+    let (from, to) = (
+        Spread::of(from.iter().copied())?,
+        Spread::of(to.iter().copied())?,
+    );
+    let mean = to.mean - from.mean;
+    if from.count < 2 || to.count < 2 {
+        return Some(Interval { mean, ends: None });
+    }
+    let square = |it: &Spread| it.sd.powi(2) / it.count as f64;
+    let (a, b) = (square(&from), square(&to));
+    let by = match a + b {
+        0.0 => 0.0,
+        sum => {
+            let each = a * a / (from.count - 1) as f64 + b * b / (to.count - 1) as f64;
+            quantile((sum * sum / each) as usize) * sum.sqrt()
+        }
+    };
+    Some(Interval {
+        mean,
+        ends: Some((mean - by, mean + by)),
+    })
+}
+
+/// Samples of [`apart_by_chance`].
+const SAMPLES: usize = 2_000;
+
+/// How often [`difference`] calls two samples of these sizes apart that are of one normal law.
+pub(super) fn apart_by_chance(from: usize, to: usize) -> f64 {
+    // One fixed seed: the same sizes give the same page.
+    let mut rng = ChaCha8Rng::seed_from_u64(0);
+    let mut sample = |count: usize| -> Vec<f64> { (0..count).map(|_| normal(&mut rng)).collect() };
+    let apart = (0..SAMPLES).filter(|_| {
+        let found = difference(&sample(from), &sample(to));
+        found.is_some_and(|it| it.is_apart)
+    });
+    apart.count() as f64 / SAMPLES as f64
+}
+
+/// A number of the standard normal law. Source: Box and Muller 1958.
+fn normal(rng: &mut impl Rng) -> f64 {
+    let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
+    radius * (std::f64::consts::TAU * rng.random::<f64>()).cos()
+}
+
+/// Chance of the permutation test up to which means count as apart.
+const CHANCE_MAX: f64 = 0.05;
 /// Values of which [`chance_of_difference`] tries all deals: at most 184,756.
 const DEALT_MAX: usize = 20;
 
 /// Chance that the means of `from` and `to` are at least so far apart if all of their values were dealt to the two at random:
 /// the exact permutation test, which asks nothing of how values are spread. None where either is empty, or of more than 20 values.
-pub(super) fn chance_of_difference(from: &[f64], to: &[f64]) -> Option<f64> {
+fn chance_of_difference(from: &[f64], to: &[f64]) -> Option<f64> {
     let all = [from, to].concat();
     if from.is_empty() || to.is_empty() || all.len() > DEALT_MAX {
         return None;
@@ -150,7 +201,7 @@ impl fmt::Display for Interval {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let decimals = f.precision().unwrap_or(2);
         match self.ends {
-            None => write!(f, "{:.decimals$}", self.mean),
+            None => write!(f, "{:.decimals$} (one seed)", self.mean),
             Some((low, high)) => write!(
                 f,
                 "{:.decimals$} [{low:.decimals$}, {high:.decimals$}]",
@@ -218,27 +269,54 @@ mod tests {
     #[test]
     fn an_interval_is_students() {
         // By hand: mean 2, standard deviation 1, 4.303 / sqrt(3) = 2.484.
-        let found = Interval::of(&[1.0, 2.0, 3.0]).unwrap();
+        let found = interval(&[1.0, 2.0, 3.0]).unwrap();
         let (low, high) = found.ends.unwrap();
         assert!((low + 0.484).abs() < 1e-3 && (high - 4.484).abs() < 1e-3);
-        assert!(!found.is_apart_from_zero());
-        assert!(Interval::of(&[3.0, 3.1, 3.2]).unwrap().is_apart_from_zero());
-        let one = Interval::of(&[3.0]).unwrap();
-        assert_eq!((one.ends, one.is_apart_from_zero()), (None, false));
-        assert_eq!(format!("{one} {found:.1}"), "3.00 2.0 [-0.5, 4.5]");
-        assert_eq!(Interval::of(&[]), None);
+        let one = interval(&[3.0]).unwrap();
+        assert_eq!(one.ends, None);
+        assert_eq!(
+            format!("{one} {found:.1}"),
+            "3.00 (one seed) 2.0 [-0.5, 4.5]"
+        );
+        assert_eq!(interval(&[]), None);
+    }
+
+    #[test]
+    fn an_interval_of_few_values_has_the_mean_as_often_as_it_says() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        for count in [2, 3, 5, 10] {
+            let rounds = 4_000;
+            let has_it = (0..rounds).filter(|_| {
+                let values: Vec<f64> = (0..count).map(|_| 7.0 + 3.0 * normal(&mut rng)).collect();
+                let (low, high) = interval(&values).unwrap().ends.unwrap();
+                (low..=high).contains(&7.0)
+            });
+            let share = has_it.count() as f64 / f64::from(rounds);
+            // Three standard errors of 4,000 rounds are 0.010.
+            assert!((0.93..0.97).contains(&share), "{count} values: {share}");
+        }
+    }
+
+    #[test]
+    fn a_difference_is_welchs() {
         // By hand: both of variance 1 and three values, so 4 degrees of freedom, and 2.776 * sqrt(2 / 3) = 2.267.
-        let apart = Interval::of_difference(&[1.0, 2.0, 3.0], &[4.0, 5.0, 6.0]).unwrap();
-        let (low, high) = apart.ends.unwrap();
-        assert!(apart.mean == 3.0 && (low - 0.733).abs() < 1e-3 && (high - 5.267).abs() < 1e-3);
-        assert_eq!(
-            Interval::of_difference(&[1.0], &[4.0, 5.0]).unwrap().ends,
-            None
-        );
-        assert_eq!(
-            Interval::of_difference(&[1.0; 2], &[2.0; 2]).unwrap().ends,
-            Some((1.0, 1.0))
-        );
+        let found = difference(&[1.0, 2.0, 3.0], &[4.0, 5.0, 6.0]).unwrap();
+        let (low, high) = found.interval.ends.unwrap();
+        assert!((low - 0.733).abs() < 1e-3 && (high - 5.267).abs() < 1e-3);
+        assert_eq!(found.interval.mean, 3.0);
+        let one = difference(&[1.0], &[4.0, 5.0]).unwrap();
+        assert_eq!((one.interval.ends, one.is_apart), (None, false));
+        let equal = difference(&[1.0; 2], &[2.0; 2]).unwrap();
+        assert_eq!(equal.interval.ends, Some((1.0, 1.0)));
+        assert_eq!(difference(&[], &[1.0]), None);
+    }
+
+    #[test]
+    fn two_tests_call_fewer_apart_by_chance_than_one() {
+        // Of three values and six 84 deals are possible, and 4 of 84 is the largest chance up to 5%.
+        let chance = apart_by_chance(6, 3);
+        assert!((0.018..0.036).contains(&chance), "{chance}");
+        assert_eq!(apart_by_chance(6, 1), 0.0);
     }
 
     #[test]
@@ -273,8 +351,8 @@ mod tests {
         assert!(is(found, 1.0 / 84.0), "{found:?}");
         // Three values that coincide with two of six: Welch's interval excludes 0, and dealing says that it is chance.
         let (from, to) = ([2.0, 2.02, 0.0, 0.0, 0.0, 0.02], [2.0, 2.01, 2.04]);
-        let welch = Interval::of_difference(&from, &to).unwrap();
-        assert!(welch.is_apart_from_zero());
+        let judged = difference(&from, &to).unwrap();
+        assert!(judged.interval.ends.unwrap().0 > 0.0 && !judged.is_apart);
         let found = chance_of_difference(&from, &to);
         assert!(is(found, 9.0 / 84.0), "{found:?}");
         assert_eq!(chance_of_difference(&[1.0], &[]), None);

@@ -20,7 +20,7 @@ use crate::{
     queue,
     runs::{FinishedRun, PlannedRun},
     session::Session,
-    statistics::Spread,
+    statistics::{Spread, interval},
 };
 
 /// Most letters of a cell in the name of a run's folder.
@@ -227,6 +227,8 @@ impl Table {
             "seeds",
             "mean_return",
             "sd",
+            "ci_low",
+            "ci_high",
             "lowest",
             "highest",
             "updates_per_second",
@@ -236,7 +238,12 @@ impl Table {
         let row = |(at, cell): (usize, &Cell)| {
             let runs: Vec<&FinishedRun> =
                 ran.iter().skip(at).step_by(cells.len()).flatten().collect();
-            let returns = Spread::of(runs.iter().filter_map(|run| run.summary.mean_return));
+            let returns: Vec<f64> = runs
+                .iter()
+                .filter_map(|run| run.summary.mean_return)
+                .collect();
+            let (found, returns) = (interval(&returns), Spread::of(returns));
+            let ends = found.and_then(|it| it.ends);
             let of = |value: fn(&FinishedRun) -> f64| Spread::of(runs.iter().map(|run| value(run)));
             let number = |value: Option<f64>, decimals: usize| {
                 value.map_or(String::new(), |value| format!("{value:.decimals$}"))
@@ -245,6 +252,8 @@ impl Table {
                 runs.len().to_string(),
                 number(returns.map(|it| it.mean), 3),
                 number(returns.filter(|it| it.count > 1).map(|it| it.sd), 3),
+                number(ends.map(|it| it.0), 3),
+                number(ends.map(|it| it.1), 3),
                 number(returns.map(|it| it.min), 3),
                 number(returns.map(|it| it.max), 3),
                 number(
@@ -286,7 +295,7 @@ impl Table {
             text += padded.join("  ").trim_end();
             text.push('\n');
         }
-        text + "mean_return: of each run's last 100 training episodes, then over seeds; sd over seeds\n"
+        text + "mean_return: of each run's last 100 training episodes, then over seeds; sd over seeds, ci_low and ci_high the mean's 95% interval (Student's t)\n"
     }
 }
 

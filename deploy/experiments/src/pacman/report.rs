@@ -12,7 +12,7 @@ use super::{
 use crate::{
     page::{Page, Table},
     session::Session,
-    statistics::{Spread, rank_correlation},
+    statistics::{Spread, interval, rank_correlation},
     template::Values,
 };
 
@@ -224,6 +224,16 @@ fn got_losses(losses: &[Loss]) -> Vec<String> {
     lines.collect()
 }
 
+/// The mean with its interval, and of how many seeds it is.
+fn with_interval(values: impl Iterator<Item = f64>) -> Option<String> {
+    let values: Vec<f64> = values.collect();
+    let found = interval(&values)?;
+    Some(match values.len() {
+        1 => format!("{found:.3}"),
+        seeds => format!("{found:.3} (95% interval over {seeds} seeds)"),
+    })
+}
+
 fn got_tasks(
     panel: &str,
     continual: &Continual,
@@ -236,7 +246,7 @@ fn got_tasks(
         let own = traces.iter().filter(|trace| trace.agent == *agent);
         let gains = own
             .filter_map(|trace| Some(trace.task(continual, last)?.0 - trace.task(continual, 0)?.0));
-        if let Some(gain) = Spread::of(gains) {
+        if let Some(gain) = with_interval(gains) {
             lines.push(format!(
                 "{panel} `{agent}`: return at the end of the last task minus that of the first: {gain}."
             ));
@@ -255,7 +265,7 @@ fn got_tasks(
             let apart = seeds.filter_map(|seed| {
                 Some(mean_over_tasks(agent, seed)? - mean_over_tasks(first, seed)?)
             });
-            if let Some(apart) = Spread::of(apart) {
+            if let Some(apart) = with_interval(apart) {
                 lines.push(format!(
                     "{panel} `{agent}` minus `{first}`, return over all tasks, seed by seed: {apart}."
                 ));

@@ -3,22 +3,19 @@
 
 use std::collections::VecDeque;
 
-use rand::{Rng, SeedableRng};
-use rand_chacha::ChaCha8Rng;
-
 use super::{
     names,
     runs::{Over, Run, SPREAD_OF_K},
 };
-use crate::plot::flags::Band;
+use crate::{
+    plot::flags::Band,
+    statistics::{Spread, interval},
+};
 
 /// Points of a curve over several runs.
 const GRID_POINTS: usize = 240;
 /// Most points of a single run's curve; of a longer one every second, third, ... is drawn.
 const POINTS_MAX: usize = 600;
-/// Resamples of a bootstrap, and how many of them lie outside the interval at each end: 95% are in it.
-const RESAMPLES: usize = 2_000;
-const OUTSIDE: usize = RESAMPLES / 40;
 /// k is an environment step or more.
 const K_MIN: f64 = 1.0;
 
@@ -160,26 +157,19 @@ fn together(curves: &[Vec<(f64, f64)>], band: Band) -> Curve {
     if start > end {
         return curve;
     }
-    let resamples = match band {
-        Band::Ci => resamples(curves.len()),
-        Band::Range | Band::Sd => Vec::new(),
-    };
     for i in 0..=GRID_POINTS {
         let x = start + (end - start) * i as f64 / GRID_POINTS as f64;
         let values: Vec<f64> = curves.iter().map(|points| between(points, x)).collect();
-        let n = values.len() as f64;
-        let mean = values.iter().sum::<f64>() / n;
+        let Some(spread) = Spread::of(values.iter().copied()) else {
+            break;
+        };
+        let mean = spread.mean;
         let (low, high) = match band {
-            Band::Range => (
-                values.iter().copied().fold(f64::INFINITY, f64::min),
-                values.iter().copied().fold(f64::NEG_INFINITY, f64::max),
-            ),
-            Band::Sd => {
-                let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-                let sd = (squares / (n - 1.0)).sqrt();
-                (mean - sd, mean + sd)
-            }
-            Band::Ci => interval(&values, &resamples),
+            Band::Range => (spread.min, spread.max),
+            Band::Sd => (mean - spread.sd, mean + spread.sd),
+            Band::Ci => interval(&values)
+                .and_then(|it| it.ends)
+                .unwrap_or((mean, mean)),
         };
         curve.points.push((x, mean));
         curve.band.push((x, low, high));
@@ -188,24 +178,6 @@ fn together(curves: &[Vec<(f64, f64)>], band: Band) -> Curve {
         }
     }
     curve
-}
-
-/// Which of so many curves each resample has, drawn with replacement: the same at every x, and for the same runs.
-fn resamples(curves: usize) -> Vec<Vec<usize>> {
-    let mut rng = ChaCha8Rng::seed_from_u64(0);
-    let mut one = || (0..curves).map(|_| rng.random_range(0..curves)).collect();
-    (0..RESAMPLES).map(|_| one()).collect()
-}
-
-/// The interval in which the mean of the values lies with 95% confidence: the percentiles of the resamples' means.
-fn interval(values: &[f64], resamples: &[Vec<usize>]) -> (f64, f64) {
-    let mean = |drawn: &Vec<usize>| {
-        let sum: f64 = drawn.iter().map(|&at| values[at]).sum();
-        sum / drawn.len() as f64
-    };
-    let mut means: Vec<f64> = resamples.iter().map(mean).collect();
-    means.sort_by(f64::total_cmp);
-    (means[OUTSIDE], means[RESAMPLES - 1 - OUTSIDE])
 }
 
 /// The value at `x` on the line through `points`, which are in the order of x and not empty; beyond its ends, theirs.
@@ -244,18 +216,11 @@ mod tests {
     }
 
     #[test]
-    fn a_bootstrap_interval_lies_within_the_range_and_around_the_mean() {
-        // Of two curves a resample has twice the lower one in a quarter of the cases, more than the 2.5% outside.
-        let two = [vec![(0.0, 1.0), (9.0, 1.0)], vec![(0.0, 3.0), (9.0, 3.0)]];
-        assert_eq!(together(&two, Band::Ci).band[0], (0.0, 1.0, 3.0));
-        // Twenty normal-like values: by the law of large numbers near mean +- 1.96 sd / sqrt(20), which is 9.5 +- 2.5.
-        let many: Vec<_> = (0..20)
-            .map(|i| vec![(0.0, f64::from(i)), (1.0, 0.0)])
-            .collect();
-        let (_, low, high) = together(&many, Band::Ci).band[0];
-        assert!(
-            (low - 7.0).abs() < 0.3 && (high - 12.0).abs() < 0.3,
-            "{low} {high}"
-        );
+    fn the_interval_of_three_seeds_is_students() {
+        // By hand: standard deviation 1, and 4.303 / sqrt(3) = 2.484.
+        let three = [1.0, 2.0, 3.0].map(|y| vec![(0.0, y), (9.0, y)]);
+        let (_, low, high) = together(&three, Band::Ci).band[0];
+        assert!((low + 0.484).abs() < 1e-3, "{low}");
+        assert!((high - 4.484).abs() < 1e-3, "{high}");
     }
 }

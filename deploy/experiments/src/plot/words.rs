@@ -60,7 +60,7 @@ pub(super) fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -
             match args.band {
                 Band::Range => "their smallest and largest value",
                 Band::Sd => "one standard deviation to each side",
-                Band::Ci => "the 95% bootstrap interval of that mean over the choice of runs",
+                Band::Ci => "the 95% interval of that mean (Student's t)",
             }
         ));
     }

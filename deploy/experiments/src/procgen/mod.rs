@@ -131,8 +131,7 @@ fn report(session: Session, results: &Results) -> anyhow::Result<()> {
     let aggregates = scores::of(results);
     let rows = aggregates.iter().map(|it| {
         let head = [it.measure, it.kind.name(), &it.agent].map(String::from);
-        let numbers = [it.estimate.value, it.estimate.low, it.estimate.high];
-        let numbers = numbers.map(|number| format!("{number:.4}"));
+        let numbers = it.interval.cells();
         head.into_iter()
             .chain([it.games.to_string()])
             .chain(numbers)

@@ -23,8 +23,6 @@ const TEMPLATE: &str = include_str!("page.md");
 const PAPER_FRAMES: f64 = 50e6;
 /// Standard errors from which on a mean return counts as different from the random policy's.
 const ERRORS: f64 = 2.0;
-/// Seeds a game from which on a bootstrap over them says something.
-const SEEDS_MIN: u32 = 5;
 
 /// The page of table 1: what the runs gave beside the paper's numbers.
 pub(super) fn page(results: &Results, aggregates: &[Aggregate], adaptive: bool) -> Page {
@@ -61,9 +59,7 @@ pub(super) fn page(results: &Results, aggregates: &[Aggregate], adaptive: bool) 
         .when("sequential", settings.preset != "split")
         .set("games", games)
         .when("no_games", games == 0)
-        .when("some_games", (1..16).contains(&games))
-        .when("few_seeds", settings.seeds < SEEDS_MIN)
-        .set("seeds_min", SEEDS_MIN);
+        .when("some_games", (1..16).contains(&games));
     let summaries = results.cells.iter().map(|cell| &cell.ran.summary);
     resumed(&summaries.collect::<Vec<_>>(), &mut values);
     values
@@ -143,7 +139,9 @@ fn scores(results: &Results, aggregates: &[Aggregate]) -> Table {
                 .iter()
                 .filter(|it| it.measure == measure && it.kind == kind);
             let found = here.find(|it| it.agent == agent);
-            found.map_or("-".into(), |it| format!("{} ({})", it.estimate, it.games))
+            found.map_or("-".into(), |it| {
+                format!("{:.3} ({})", it.interval, it.games)
+            })
         });
         [format!("`{agent}`")].into_iter().chain(cells).collect()
     };

@@ -6,7 +6,10 @@ use super::{
     published,
     results::{Kind, Results},
 };
-use crate::aggregate::{self, Estimate, Scores};
+use crate::{
+    aggregate::{self, Scores},
+    statistics::Interval,
+};
 
 /// Scores over all games.
 pub(super) struct Aggregate {
@@ -14,7 +17,7 @@ pub(super) struct Aggregate {
     pub(super) kind: Kind,
     pub(super) agent: String,
     pub(super) games: usize,
-    pub(super) estimate: Estimate,
+    pub(super) interval: Interval,
 }
 
 /// The agent that the others are compared with.
@@ -45,12 +48,12 @@ pub(super) fn of(results: &Results) -> Vec<Aggregate> {
                         .collect()
                 })
                 .collect();
-            all.extend(aggregate::iqm(&scores).map(|estimate| Aggregate {
+            all.extend(aggregate::iqm(&scores).map(|interval| Aggregate {
                 measure: "interquartile mean",
                 kind,
                 agent: agent.to_owned(),
                 games: scores.len(),
-                estimate,
+                interval,
             }));
         }
     }
@@ -66,12 +69,12 @@ pub(super) fn of(results: &Results) -> Vec<Aggregate> {
             });
             let both = pairs.filter(|(x, y)| !x.is_empty() && !y.is_empty());
             let (x, y): (Scores, Scores) = both.unzip();
-            all.extend(aggregate::improvement(&x, &y).map(|estimate| Aggregate {
+            all.extend(aggregate::improvement(&x, &y).map(|interval| Aggregate {
                 measure: "probability of improvement",
                 kind,
                 agent: agent.to_owned(),
                 games: x.len(),
-                estimate,
+                interval,
             }));
         }
     }
@@ -123,8 +126,8 @@ pub(super) fn figure(results: &Results, aggregates: &[Aggregate]) -> Figure {
                     0.0
                 };
                 let x = place as f64 + aside;
-                points.push((x, it.estimate.value));
-                band.push((x, it.estimate.low, it.estimate.high));
+                points.push((x, it.interval.mean));
+                band.extend(it.interval.ends.map(|(low, high)| (x, low, high)));
             }
             if !points.is_empty() {
                 series.push(
@@ -164,7 +167,7 @@ pub(super) fn figure(results: &Results, aggregates: &[Aggregate]) -> Figure {
     Figure {
         title: "Over all games".into(),
         notes: vec![
-            "Bars: 95% of stratified bootstrap resamples over seeds. Normalised: 0 and 1 are the published minimum and maximum \
+            "Bars: 95% intervals over seeds (jackknife, Student's t). Normalised: 0 and 1 are the published minimum and maximum \
              of each game in mode easy (Cobbe et al. 2020, appendix C), an episode a level."
                 .into(),
         ],

@@ -1,18 +1,17 @@
 //! Cells of the tables of a trade-off: numbers as a page and a file of data have them.
 
-use crate::{page::Table, statistics::Interval};
+use crate::{
+    page::Table,
+    statistics::{Difference, Interval},
+};
 
 /// A difference, with its sign.
-pub(super) fn signed(it: &Interval) -> String {
-    match it.ends {
-        None => format!("{:+.2}", it.mean),
-        Some((low, high)) => format!("{:+.2} [{low:+.2}, {high:+.2}]", it.mean),
+pub(super) fn signed(it: &Difference) -> String {
+    let Interval { mean, ends } = it.interval;
+    match ends {
+        None => format!("{mean:+.2} (one seed)"),
+        Some((low, high)) => format!("{mean:+.2} [{low:+.2}, {high:+.2}]"),
     }
-}
-
-/// A number of a file of data, empty if there is none.
-pub(super) fn cell_of_data(value: Option<f64>) -> String {
-    value.map_or(String::new(), |value| format!("{value:.4}"))
 }
 
 /// A cell of a page, a dash if there is nothing.

@@ -2,12 +2,13 @@
 //! Runs that ended alone are compared; the time is that at which those of the faster agent were done.
 
 use super::{
-    cells::{cell, cell_of_data, signed, table},
+    cells::{cell, signed, table},
+    page::verdict,
     results::{PointResult, Results},
 };
 use crate::{
     plot::{Over, Run},
-    statistics::Interval,
+    statistics::{difference, interval},
 };
 
 /// C51 beside an agent with DIM in training return, as the data has it.
@@ -47,7 +48,7 @@ pub(super) fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
                 .filter_map(|curve| curve.last().map(of))
                 .collect()
         };
-        let means = [&base, &level].map(|it| Interval::of(&ends(it, |end| end.0)));
+        let means = [&base, &level].map(|it| interval(&ends(it, |end| end.0)));
         let [Some(one), Some(other)] = means else {
             continue;
         };
@@ -59,30 +60,31 @@ pub(super) fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
                 .collect()
         };
         let (of_base, of_level) = (then(&base), then(&level));
-        let frames = Interval::of_difference(&ends(&base, |end| end.1), &ends(&level, |end| end.1));
-        let time = Interval::of_difference(&of_base, &of_level);
+        let frames = difference(&ends(&base, |end| end.1), &ends(&level, |end| end.1));
+        let time = difference(&of_base, &of_level);
         let (Some(frames), Some(time)) = (frames, time) else {
             continue;
         };
-        let mean = |values: &[f64]| cell(Interval::of(values), |it| it.to_string());
+        let mean = |values: &[f64]| cell(interval(values), |it| it.to_string());
         let agent = of.point.agent.clone();
-        let numbers = |it: &Interval| {
-            let ends = it.ends;
-            let each = [Some(it.mean), ends.map(|it| it.0), ends.map(|it| it.1)];
-            each.map(cell_of_data)
-        };
         let mut cells = vec![
             agent.clone(),
             of.base.agent.clone(),
             format!("{seconds:.3}"),
         ];
-        cells.extend([&frames, &time].into_iter().flat_map(numbers));
+        cells.extend(
+            [frames, time]
+                .into_iter()
+                .flat_map(|it| it.interval.cells()),
+        );
         all.push(EqualTime {
             in_words: format!(
-                "{agent} minus {}, training return: {} at equal frames, {} at equal wall-clock time ({seconds:.0} s)",
+                "{agent} minus {}, training return: {} at equal frames{}; {} at equal wall-clock time ({seconds:.0} s){}",
                 of.base.agent,
                 signed(&frames),
+                verdict(&frames),
                 signed(&time),
+                verdict(&time),
             ),
             row: vec![
                 agent.clone(),

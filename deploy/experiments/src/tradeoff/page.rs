@@ -1,6 +1,6 @@
 //! The page of a trade-off: a row for each level with what it gives and what it costs, and C51 beside DIM at equal frames and at equal time.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use anyhow::Context;
 use driml_machine::units::rough_duration;
@@ -13,7 +13,7 @@ use super::{
 };
 use crate::{
     page::{Page, Table},
-    statistics::{Interval, Spread},
+    statistics::{Difference, Interval, Spread, apart_by_chance},
     template::Values,
 };
 
@@ -76,6 +76,7 @@ pub(super) fn page(results: &Results) -> anyhow::Result<Page> {
     let random = Spread::of(results.random.iter().copied());
     let equal = equal_time(results)?;
     let sizes = error_sizes(results)?;
+    let (judged, by_chance) = by_chance(results);
     let mut got: Vec<String> = results.levels.iter().map(|of| found(results, of)).collect();
     got.extend(equal.iter().map(|it| it.in_words.clone()));
     let mut values = Values::default();
@@ -91,6 +92,9 @@ pub(super) fn page(results: &Results) -> anyhow::Result<Page> {
         .set("missing", results.missing.join(", "))
         .set("episodes", common.episodes)
         .set("seeds", seeds(results))
+        .when("is_judged", judged > 0)
+        .set("judged", judged)
+        .set("by_chance", format!("{by_chance:.1}"))
         .set("rows", sizes.rows)
         .set("states", sizes.states)
         .set(
@@ -155,8 +159,9 @@ fn bases(results: &Results) -> BTreeSet<&str> {
 fn above_random(results: &Results) -> String {
     let each = bases(results).into_iter().filter_map(|key| {
         let above = results.above_random(&results.points[key])?;
-        let apart = match above.ends {
-            Some((low, _)) if low <= 0.0 => ": these seeds do not show that it has learned",
+        let is_above = above.is_apart && above.interval.mean > 0.0;
+        let apart = match above.interval.ends {
+            Some(_) if !is_above => ": these seeds do not show that it has learned",
             _ => "",
         };
         Some(format!("{key} {}{apart}", signed(&above)))
@@ -193,8 +198,7 @@ fn found(results: &Results, of: &LevelOf) -> String {
     let gains: Vec<String> = speed.into_iter().chain(frames).collect();
     let cost = |returns, name: &str| {
         let found = results.difference(of, returns);
-        let is_apart = results.is_apart(of, returns);
-        found.map(|it| format!("{name} {}{}", signed(&it), verdict(&it, is_apart)))
+        found.map(|it| format!("{name} {}{}", signed(&it), verdict(&it)))
     };
     let costs = [
         cost(Measure::Greedy, "greedy return"),
@@ -214,13 +218,30 @@ fn found(results: &Results, of: &LevelOf) -> String {
 }
 
 /// What a difference says.
-fn verdict(difference: &Interval, is_apart: bool) -> &'static str {
-    match (difference.ends, is_apart, difference.mean > 0.0) {
-        (None, ..) => " (one seed)",
-        (_, false, _) => "",
-        (_, true, true) => ", better than its base",
-        (_, true, false) => ", worse than its base",
+pub(super) fn verdict(difference: &Difference) -> &'static str {
+    match (difference.is_apart, difference.interval.mean > 0.0) {
+        (false, _) => "",
+        (true, true) => ", better than its base",
+        (true, false) => ", worse than its base",
     }
+}
+
+/// How many differences of the page's returns are judged, and how many of them would be called better or worse if no level changed
+/// anything and returns were normal.
+fn by_chance(results: &Results) -> (usize, f64) {
+    let mut known = BTreeMap::new();
+    let each = results.levels.iter().flat_map(|of| {
+        let points = [&of.base, &of.point].map(|it| &results.points[&it.key]);
+        [Measure::Greedy, Measure::Training].map(|it| points.map(|point| point.values(it).len()))
+    });
+    let judged = each.filter(|counts| counts.iter().all(|&it| it > 1));
+    let chances = judged.map(|counts| {
+        let [base, level] = counts;
+        *known
+            .entry(counts)
+            .or_insert_with(|| apart_by_chance(base, level))
+    });
+    chances.fold((0, 0.0), |(count, sum), chance| (count + 1, sum + chance))
 }
 
 /// Rows of levels, each dial's base first.
@@ -390,13 +411,20 @@ fn dials(results: &Results) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::statistics::difference;
 
     #[test]
     fn a_difference_is_put_into_words() {
-        let of = |values: &[f64], is_apart| verdict(&Interval::of(values).unwrap(), is_apart);
-        assert_eq!(of(&[1.0, 1.1, 1.2], true), ", better than its base");
-        assert_eq!(of(&[-1.0, -1.1, -1.2], true), ", worse than its base");
-        assert_eq!(of(&[1.0, 1.1, 1.2], false), "");
-        assert_eq!(of(&[1.0], false), " (one seed)");
+        let base = [0.0, 0.01, 0.02, 0.03];
+        let said = |values: &[f64]| {
+            let found = difference(&base, values).unwrap();
+            format!("{}{}", signed(&found), verdict(&found))
+        };
+        let better = said(&[1.0, 1.1, 1.2, 1.3]);
+        assert!(better.ends_with("], better than its base"), "{better}");
+        let worse = said(&[-1.0, -1.1, -1.2, -1.3]);
+        assert!(worse.ends_with("], worse than its base"), "{worse}");
+        assert!(said(&[-1.0, 1.0, 0.0]).ends_with(']'));
+        assert_eq!(said(&[1.0]), "+0.98 (one seed)");
     }
 }

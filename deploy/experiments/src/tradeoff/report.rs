@@ -1,7 +1,6 @@
 //! Data, figures and page of a trade-off.
 
 use super::{
-    cells::cell_of_data,
     equal_time::{EQUAL_TIME, equal_time},
     figures, page,
     results::{LevelOf, Measure, PointResult, Results},
@@ -112,16 +111,10 @@ fn row(results: &Results, of: &LevelOf, is_base: bool) -> Vec<String> {
     for (_, measure) in MEASURES {
         let difference = match is_base {
             true => None,
-            false => results.difference(of, measure),
+            false => results.difference(of, measure).map(|it| it.interval),
         };
         for found in [point.mean(measure), difference] {
-            let ends = found.and_then(|it| it.ends);
-            let numbers = [
-                found.map(|it| it.mean),
-                ends.map(|it| it.0),
-                ends.map(|it| it.1),
-            ];
-            row.extend(numbers.map(cell_of_data));
+            row.extend(found.map_or_else(Default::default, |it| it.cells()));
         }
     }
     row

@@ -10,7 +10,7 @@ use super::{
 };
 use crate::{
     runs::FinishedRun,
-    statistics::{Interval, Spread, chance_of_difference},
+    statistics::{Difference, Interval, Spread, difference, interval},
 };
 
 /// A level of a dial and its base.
@@ -108,7 +108,7 @@ impl PointResult {
 
     /// The mean over seeds, with its interval.
     pub(super) fn mean(&self, measure: Measure) -> Option<Interval> {
-        Interval::of(&self.values(measure))
+        interval(&self.values(measure))
     }
 }
 
@@ -125,17 +125,9 @@ impl Results {
     }
 
     /// Level minus base, with its interval. Seeds are not paired: through real processes no two runs of a seed are alike.
-    pub(super) fn difference(&self, of: &LevelOf, measure: Measure) -> Option<Interval> {
+    pub(super) fn difference(&self, of: &LevelOf, measure: Measure) -> Option<Difference> {
         let [base, level] = [&of.base, &of.point].map(|it| self.points[&it.key].values(measure));
-        Interval::of_difference(&base, &level)
-    }
-
-    /// Whether level and base are apart: by Welch's interval, and by the exact permutation test of few seeds at 5%, as these may
-    /// coincide.
-    pub(super) fn is_apart(&self, of: &LevelOf, measure: Measure) -> bool {
-        let [base, level] = [&of.base, &of.point].map(|it| self.points[&it.key].values(measure));
-        Interval::of_difference(&base, &level).is_some_and(|it| it.is_apart_from_zero())
-            && chance_of_difference(&base, &level).is_none_or(|it| it <= 0.05)
+        difference(&base, &level)
     }
 
     /// The level's mean over the base's, of the seeds that both have: a base's further seeds run at another time, beside other runs.
@@ -149,8 +141,8 @@ impl Results {
         Some(mean(level, base)? / mean(base, level)?)
     }
 
-    /// What a base earns in training more than the random policy: Welch's interval, over seeds and over episodes of the latter.
-    pub(super) fn above_random(&self, base: &PointResult) -> Option<Interval> {
-        Interval::of_difference(&self.random, &base.values(Measure::Training))
+    /// What a base earns in training more than the random policy, over seeds and over episodes of the latter.
+    pub(super) fn above_random(&self, base: &PointResult) -> Option<Difference> {
+        difference(&self.random, &base.values(Measure::Training))
     }
 }
