@@ -1,4 +1,4 @@
-//! A list of shapes in figure units: what a figure is before it becomes SVG or PNG.
+//! A list of shapes in figure units: what a figure is before it becomes SVG, PDF or PNG.
 //! It knows no axis and no file.
 
 use super::{

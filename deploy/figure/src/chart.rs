@@ -202,9 +202,13 @@ impl Chart {
         }
     }
 
-    pub(super) fn draw(&self, canvas: &mut Canvas, place: Rect) {
-        let place = titled(canvas, place, &self.title);
-        let place = self.legend(canvas, place);
+    pub(super) fn draw(&self, canvas: &mut Canvas, mut place: Rect, title: bool, legend: bool) {
+        if title {
+            place = titled(canvas, place, &self.title);
+        }
+        if legend {
+            place = self.legend(canvas, place);
+        }
         let points = || self.series.iter().flat_map(|series| &series.points);
         let bands = || self.series.iter().flat_map(|series| &series.band);
         let xs = points().map(|point| point.0);

@@ -9,7 +9,7 @@ use crate::{
     font::{self, Weight},
     heat::Heat,
     lattice::Lattice,
-    png, svg,
+    pdf, png, svg,
 };
 
 /// Pixels of a PNG for one unit of the figure: sharp on a dense screen and in print.
@@ -50,7 +50,7 @@ pub struct Figure {
 #[derive(Debug, thiserror::Error)]
 pub enum FigureError {
     /// The name asks for no kind of picture that there is.
-    #[error("{} has no extension of a picture: take a name that ends in .svg or .png", .0.display())]
+    #[error("{} has no extension of a picture: take a name that ends in .svg, .pdf or .png", .0.display())]
     Extension(PathBuf),
     /// The picture has no area, or is too large for memory.
     #[error("drawing {}: {why}", .path.display())]
@@ -89,6 +89,8 @@ pub enum FigureError {
 pub enum Format {
     /// Scalable, with text as text.
     Svg,
+    /// Scalable, with text as outlines.
+    Pdf,
     /// Pixels, with the font that comes along.
     Png,
 }
@@ -97,14 +99,24 @@ impl Format {
     /// By the file's extension.
     ///
     /// # Errors
-    /// Any but `.svg` and `.png`.
+    /// Any but `.svg`, `.pdf` and `.png`.
     pub fn of(path: &Path) -> Result<Self, FigureError> {
         match path.extension().and_then(|extension| extension.to_str()) {
             Some("svg") => Ok(Self::Svg),
+            Some("pdf") => Ok(Self::Pdf),
             Some("png") => Ok(Self::Png),
             _ => Err(FigureError::Extension(path.to_owned())),
         }
     }
+}
+
+/// What stands around the panels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Look {
+    /// A card with title and notes; each chart has its legend: for a screen, where nothing else says what is seen.
+    Card,
+    /// The panels alone, and a legend in the first: for a paper, whose caption says the rest.
+    Plain,
 }
 
 impl Figure {
@@ -113,10 +125,19 @@ impl Figure {
     /// # Errors
     /// Another extension, a file that cannot be written.
     pub fn save(&self, path: &Path) -> Result<(), FigureError> {
+        self.save_as(path, Look::Card)
+    }
+
+    /// [`Figure::save`] with another look.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn save_as(&self, path: &Path, look: Look) -> Result<(), FigureError> {
         let format = Format::of(path)?;
-        let canvas = self.draw();
+        let canvas = self.draw(look);
         let bytes = match format {
             Format::Svg => svg::encode(&canvas).into_bytes(),
+            Format::Pdf => pdf::encode(&canvas).map_err(|e| FigureError::Encode(e.to_string()))?,
             Format::Png => {
                 let drawn = png::encode(&canvas, PNG_ZOOM);
                 let path = path.to_owned();
@@ -137,7 +158,7 @@ impl Figure {
         self.save(&path("png"))
     }
 
-    fn draw(&self) -> Canvas {
+    fn draw(&self, look: Look) -> Canvas {
         let columns = self.columns.clamp(1, self.panels.len().max(1));
         let rows = self.panels.len().div_ceil(columns);
         let (panel_width, panel_height) = self.panel_size;
@@ -147,10 +168,41 @@ impl Figure {
             .iter()
             .flat_map(|note| font::wrap(note, NOTE_SIZE, width - 2.0 * MARGIN))
             .collect();
-        let head = MARGIN + TITLE_SIZE + 16.0 + notes.len() as f64 * NOTE_LEADING;
+        let head = match look {
+            Look::Card => MARGIN + TITLE_SIZE + 16.0 + notes.len() as f64 * NOTE_LEADING,
+            Look::Plain => MARGIN,
+        };
         let height = head + rows as f64 * (panel_height + MARGIN) + 4.0;
 
         let mut canvas = Canvas::new(width, height);
+        match look {
+            Look::Card => self.head(&mut canvas, &notes),
+            Look::Plain => canvas.rects(vec![Rect::new(0.0, 0.0, width, height)], CARD),
+        }
+        for (index, panel) in self.panels.iter().enumerate() {
+            let (row, column) = ((index / columns) as f64, (index % columns) as f64);
+            let place = Rect::new(
+                MARGIN + column * (panel_width + MARGIN),
+                head + row * (panel_height + MARGIN),
+                panel_width,
+                panel_height,
+            );
+            match panel {
+                Panel::Chart(chart) => {
+                    let legend = look == Look::Card || index == 0;
+                    let title = look == Look::Card || self.panels.len() > 1;
+                    chart.draw(&mut canvas, place, title, legend);
+                }
+                Panel::Heat(heat) => heat.draw(&mut canvas, place),
+                Panel::Lattice(lattice) => lattice.draw(&mut canvas, place),
+            }
+        }
+        canvas
+    }
+
+    /// The card, the title and the notes.
+    fn head(&self, canvas: &mut Canvas, notes: &[String]) {
+        let (width, height) = (canvas.width, canvas.height);
         canvas.card(
             Rect::new(0.5, 0.5, width - 1.0, height - 1.0),
             CARD,
@@ -177,21 +229,6 @@ impl Figure {
                 style(NOTE_SIZE, Weight::Regular, INK_SOFT),
             );
         }
-        for (index, panel) in self.panels.iter().enumerate() {
-            let (row, column) = ((index / columns) as f64, (index % columns) as f64);
-            let place = Rect::new(
-                MARGIN + column * (panel_width + MARGIN),
-                head + row * (panel_height + MARGIN),
-                panel_width,
-                panel_height,
-            );
-            match panel {
-                Panel::Chart(chart) => chart.draw(&mut canvas, place),
-                Panel::Heat(heat) => heat.draw(&mut canvas, place),
-                Panel::Lattice(lattice) => lattice.draw(&mut canvas, place),
-            }
-        }
-        canvas
     }
 }
 
@@ -243,6 +280,54 @@ mod tests {
     }
 
     #[test]
+    fn a_pdf_is_one_page_whose_table_finds_its_objects() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.pdf");
+        figure().save(&path).unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        assert!(bytes.starts_with(b"%PDF-1.4\n") && bytes.ends_with(b"%%EOF\n"));
+        let text = String::from_utf8_lossy(&bytes);
+        let start: usize = text.lines().rev().nth(1).unwrap().parse().unwrap();
+        let table = String::from_utf8(bytes[start..].to_vec()).unwrap();
+        let places = table
+            .lines()
+            .filter_map(|line| line.strip_suffix(" 00000 n "));
+        for (number, place) in (1..).zip(places) {
+            let object = &bytes[place.parse::<usize>().unwrap()..];
+            assert!(object.starts_with(format!("{number} 0 obj").as_bytes()));
+        }
+        assert!(text.contains("/MediaBox [0 0 520.50 "), "{}", &text[..300]);
+    }
+
+    #[test]
+    fn a_plain_figure_is_its_panels_and_one_legend() {
+        let folder = tempfile::tempdir().unwrap();
+        let svg = |look, name: &str| {
+            let path = folder.path().join(name);
+            let chart = |title: &str| {
+                let line = Series::line("driml-ada", 0, vec![(0.0, 1.0), (1.0, 3.0)]);
+                let (x, y) = (Axis::linear("frames"), Axis::linear("return"));
+                Panel::Chart(Chart::new(title, x, y, vec![line]))
+            };
+            let panels = vec![chart("first"), chart("second")];
+            Figure { panels, ..figure() }.save_as(&path, look).unwrap();
+            std::fs::read_to_string(path).unwrap()
+        };
+        let (card, plain) = (svg(Look::Card, "a.svg"), svg(Look::Plain, "b.svg"));
+        let count = |svg: &str, word: &str| svg.matches(word).count();
+        for (word, in_card, in_plain) in [
+            ("A figure", 1, 0),
+            ("made up", 1, 0),
+            ("rx=", 1, 0),
+            ("driml-ada", 2, 1),
+            ("second", 1, 1),
+        ] {
+            let found = (count(&card, word), count(&plain, word));
+            assert_eq!(found, (in_card, in_plain), "{word}");
+        }
+    }
+
+    #[test]
     fn text_is_drawn_without_a_font_of_the_machine() {
         let canvas = |text: &str| {
             let mut canvas = Canvas::new(80.0, 30.0);
@@ -262,7 +347,7 @@ mod tests {
 
     #[test]
     fn other_extensions_are_refused() {
-        for name in ["a.pdf", "a", "svg"] {
+        for name in ["a.eps", "a", "svg"] {
             let said = figure().save(Path::new(name)).unwrap_err();
             assert!(matches!(said, FigureError::Extension(_)), "{name}");
         }

@@ -1,4 +1,4 @@
-//! Figures: charts, heat maps and lattices on a light card, written as SVG or PNG from one description.
+//! Figures: charts, heat maps and lattices on a light card, written as SVG, PDF or PNG from one description.
 //!
 //! Start with [`Figure`]: a title, notes, and panels in a grid, each a [`Chart`], a [`Heat`] map or a [`Lattice`]. The same
 //! figure gives the same bytes on every machine, as the font comes along. A [`Film`] is [`Picture`]s in turn, as a GIF. It knows no run
@@ -38,6 +38,7 @@ mod film;
 mod font;
 mod heat;
 mod lattice;
+mod pdf;
 mod picture;
 mod png;
 mod svg;
@@ -46,7 +47,7 @@ mod ticks;
 pub use crate::{
     chart::{Axis, Chart, Mark, Series},
     colours::{Colour, GREY},
-    figure::{Figure, FigureError, Format, Panel},
+    figure::{Figure, FigureError, Format, Look, Panel},
     film::Film,
     heat::{Field, Heat, Outline},
     lattice::Lattice,

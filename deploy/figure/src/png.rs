@@ -103,7 +103,7 @@ fn paint(colour: Colour, smooth: bool) -> Paint<'static> {
     paint
 }
 
-fn polygon(points: &[Point], closed: bool) -> Option<Path> {
+pub(super) fn polygon(points: &[Point], closed: bool) -> Option<Path> {
     let mut path = PathBuilder::new();
     for (index, &(x, y)) in points.iter().enumerate() {
         match index {
@@ -129,7 +129,7 @@ fn path_rect(rect: Rect) -> tiny_skia::Rect {
     .unwrap_or_else(|| tiny_skia::Rect::from_xywh(0.0, 0.0, 0.0, 0.0).expect("0 is finite"))
 }
 
-fn rounded(rect: Rect) -> Option<Path> {
+pub(super) fn rounded(rect: Rect) -> Option<Path> {
     let r = CARD_RADIUS as f32;
     let (left, top) = (rect.x as f32, rect.y as f32);
     let (right, bottom) = (rect.right() as f32, rect.bottom() as f32);
@@ -148,7 +148,7 @@ fn rounded(rect: Rect) -> Option<Path> {
 }
 
 /// Outlines of a text from (0, 0), and where they go.
-fn text_path((x, y): Point, text: &str, style: TextStyle) -> (Option<Path>, Transform) {
+pub(super) fn text_path((x, y): Point, text: &str, style: TextStyle) -> (Option<Path>, Transform) {
     let mut path = PathBuilder::new();
     font::outline(text, style.size, style.weight, &mut path);
     let width = font::width(text, style.size, style.weight) as f32;

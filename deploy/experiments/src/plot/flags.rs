@@ -13,7 +13,8 @@ pub struct PlotArgs {
     /// Folders of runs; those that differ in their seed alone become one line with a band, and what is no run's folder is left out
     #[arg(value_name = "RUN", required = true)]
     pub(crate) runs: Vec<PathBuf>,
-    /// Column of metrics.csv, one chart each; may be given several times [default: return, losses, k, speed]
+    /// Column of metrics.csv, one chart each; may be given several times. "return", "loss", "k" and "speed" stand for mean_return,
+    /// c51_kl, mean_k and frames_per_second [default: these, the auxiliary losses, and more]
     #[arg(long, value_name = "COLUMN")]
     pub(crate) column: Vec<String>,
     /// What the curves are drawn over
@@ -35,7 +36,10 @@ pub struct PlotArgs {
     /// The action affinity A of each run's newest checkpoint as a heat map, instead of charts
     #[arg(long, conflicts_with_all = ["column", "x", "smooth", "band", "separate", "random"])]
     pub(crate) affinity: bool,
-    /// Picture to write, .svg or .png
+    /// For a paper: the charts alone, without card, title and notes, and one legend
+    #[arg(long)]
+    pub(crate) plain: bool,
+    /// Picture to write, .svg, .pdf or .png
     #[arg(long, value_name = "FILE", default_value = "plot.svg")]
     pub(crate) out: PathBuf,
 }
@@ -52,6 +56,7 @@ impl PlotArgs {
             separate: false,
             random: None,
             affinity: false,
+            plain: false,
             out,
         }
     }
@@ -64,6 +69,6 @@ pub enum Band {
     Range,
     /// One standard deviation to each side of the mean
     Sd,
-    /// 95% bootstrap interval of the mean, over the choice of runs
+    /// 95% interval of the mean (Student's t), wide where there are few seeds
     Ci,
 }

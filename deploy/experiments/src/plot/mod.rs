@@ -1,4 +1,4 @@
-//! `driml plot`: what runs recorded, drawn beside each other over frames, as SVG or PNG.
+//! `driml plot`: what runs recorded, drawn beside each other over frames, as SVG, PDF or PNG.
 //! It reads run folders and changes nothing in them; whatever it does to the numbers stands in the picture.
 
 mod affinity;
@@ -10,7 +10,7 @@ mod words;
 
 use std::{collections::BTreeSet, path::PathBuf};
 
-use driml_figure::{Axis, Chart, Figure, Format, GREY, Mark, Panel, Series};
+use driml_figure::{Axis, Chart, Figure, Format, GREY, Look, Mark, Panel, Series};
 use driml_launch::{
     console::{self, print},
     evaluate::{mean_and_deviation, random_returns},
@@ -35,6 +35,13 @@ use crate::plot::flags::PlotArgs;
 const CHART_SIZE: (f64, f64) = (460.0, 310.0);
 /// The column over which a random policy is a line.
 const RETURN: &str = "mean_return";
+/// Words for columns, as `--column` takes them too.
+const WORDS: [(&str, &str); 4] = [
+    ("return", RETURN),
+    ("loss", C51_LOSS),
+    ("k", "mean_k"),
+    ("speed", "frames_per_second"),
+];
 /// Columns that are drawn if none is asked for, those that the runs have values of; auxiliary losses follow [`C51_LOSS`].
 const OVERVIEW: [&str; 7] = [
     RETURN,
@@ -57,7 +64,8 @@ pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
     } else {
         charts(args)?
     };
-    figure.save(&args.out)?;
+    let look = if args.plain { Look::Plain } else { Look::Card };
+    figure.save_as(&args.out, look)?;
     print(&format!("{}\n", args.out.display()))
 }
 
@@ -119,7 +127,11 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
     let columns = if args.column.is_empty() {
         overview(&runs)
     } else {
-        args.column.clone()
+        let named = |column: &String| {
+            let word = WORDS.iter().find(|(word, _)| word == column);
+            word.map_or_else(|| column.clone(), |(_, column)| (*column).to_owned())
+        };
+        args.column.iter().map(named).collect()
     };
     let groups = groups::of(&runs, !args.separate);
     let way = Way {
@@ -153,9 +165,14 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         if !args.column.is_empty() && drawn.iter().all(|curve| curve.points.is_empty()) {
             return Err(usage!("none of these runs has a value of {column:?} yet").into());
         }
+        if column == RETURN || !(args.column.is_empty() || is_loss) {
+            absent(column, &runs)
+                .iter()
+                .for_each(|line| console::line(line));
+        }
         let mut series = series(&groups, drawn);
         if column == RETURN || column == EVALUATED {
-            series.extend(lines(&random, &series));
+            series.extend(lines(&random, &series, groups.len()));
         }
         panels.push(Panel::Chart(chart(column, is_loss, args.x, series)));
     }
@@ -173,6 +190,22 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         },
         panels,
     })
+}
+
+/// A line about each run that has no value of a column which is drawn.
+fn absent(column: &str, runs: &[Run]) -> Vec<String> {
+    let why = match column {
+        RETURN => "no episode has ended in it",
+        _ => "it has no value yet",
+    };
+    let absent = runs.iter().filter(|run| !run.has_values(column));
+    let line = |run: &Run| {
+        format!(
+            "{} is not in the chart of {column}: {why}",
+            run.folder.display()
+        )
+    };
+    absent.map(line).collect()
 }
 
 /// The curves that have points, each in the colour of its group.
@@ -209,20 +242,19 @@ fn at_random(runs: &[Run], episodes: usize) -> anyhow::Result<Vec<(String, f64)>
     Ok(worlds)
 }
 
-/// Level lines from the start to where the longest curve ends.
-fn lines(random: &[(String, f64)], curves: &[Series]) -> Vec<Series> {
+/// Level lines from the start to where the longest curve ends; those of several worlds in colours that no run has.
+fn lines(random: &[(String, f64)], curves: &[Series], groups: usize) -> Vec<Series> {
     let xs = curves.iter().flat_map(|it| &it.points);
     let last = xs.map(|point| point.0).fold(0.0, f64::max);
-    let line = |(world, mean): &(String, f64)| {
-        let name = match random {
-            [_] => "random policy".into(),
-            _ => format!("random policy, {world}"),
+    let line = |(at, (world, mean)): (usize, &(String, f64))| {
+        let ends = vec![(0.0, *mean), (last, *mean)];
+        let line = match random {
+            [_] => Series::line("random policy", 0, ends).coloured(GREY),
+            _ => Series::line(&format!("random policy, {world}"), groups + at, ends),
         };
-        Series::line(&name, 0, vec![(0.0, *mean), (last, *mean)])
-            .marked(Mark::Dashed)
-            .coloured(GREY)
+        line.marked(Mark::Dashed)
     };
-    random.iter().map(line).collect()
+    random.iter().enumerate().map(line).collect()
 }
 
 #[cfg(test)]

@@ -20,7 +20,7 @@ const WORDS: [&str; 1] = ["waiting"];
 /// The metrics of one run, and its settings.
 #[derive(Debug)]
 pub(crate) struct Run {
-    folder: RunFolder,
+    pub(super) folder: RunFolder,
     /// The folder's name.
     pub(super) name: String,
     /// World and agent, if the settings say.

@@ -208,6 +208,43 @@ fn a_random_policy_is_a_line() {
 }
 
 #[test]
+fn random_policies_of_two_worlds_are_two_lines_that_can_be_told_apart() {
+    let curve = Series::line("chain c51", 0, vec![(0.0, 1.0), (30.0, 2.0)]);
+    let worlds = [("chain".to_owned(), 0.5), ("ising".to_owned(), 0.6)];
+    let drawn = lines(&worlds, std::slice::from_ref(&curve), 1);
+    let names: Vec<_> = drawn.iter().map(|it| it.name.as_str()).collect();
+    assert_eq!(names, ["random policy, chain", "random policy, ising"]);
+    assert_ne!(drawn[0].colour, drawn[1].colour);
+    assert!(drawn.iter().all(|it| it.colour != curve.colour));
+    assert_eq!(lines(&worlds[..1], &[curve], 1)[0].colour, GREY);
+}
+
+#[test]
+fn a_run_without_an_episode_is_named() {
+    let root = tempfile::tempdir().unwrap();
+    let a = run_folder(root.path(), "a", "c51", 1, METRICS);
+    let empty = run_folder(root.path(), "e", "c51", 1, "frames,mean_return\n9,\n");
+    let runs = [&a, &empty].map(|run| Run::read(&RunFolder::new(run)).unwrap());
+    let said = absent(RETURN, &runs);
+    let expected = format!(
+        "{} is not in the chart of mean_return: no episode has ended in it",
+        empty.display()
+    );
+    assert_eq!(said, [expected]);
+}
+
+#[test]
+fn a_column_goes_by_the_word_that_the_help_has() {
+    let root = tempfile::tempdir().unwrap();
+    let a = run_folder(root.path(), "a", "c51", 1, METRICS);
+    let out = root.path().join("p.pdf");
+    let mut args = args(&[&a], &["return", "k"], out.clone());
+    args.plain = true;
+    run(&args).unwrap();
+    assert!(std::fs::read(out).unwrap().starts_with(b"%PDF"));
+}
+
+#[test]
 fn what_cannot_be_drawn_is_said() {
     let root = tempfile::tempdir().unwrap();
     let a = run_folder(root.path(), "a", "c51", 1, METRICS);
@@ -233,7 +270,7 @@ fn what_cannot_be_drawn_is_said() {
     );
     assert!(said(&args(&[&empty], &[], out.clone())).contains("recorded a value yet"));
     assert!(said(&args(&[&none], &[], out.clone())).contains("is not the folder of a run"));
-    assert!(said(&args(&[&a], &[], root.path().join("p.pdf"))).contains(".svg or .png"));
+    assert!(said(&args(&[&a], &[], root.path().join("p.eps"))).contains(".svg, .pdf or .png"));
     let mut affinity = args(&[&a], &[], out);
     affinity.affinity = true;
     assert!(said(&affinity).contains("no checkpoint"));
