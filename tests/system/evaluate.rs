@@ -3,6 +3,7 @@
 
 use std::fs;
 
+use driml_launch::keep::SELECTION_SEED;
 use driml_tests::TestSystem;
 
 use crate::{SHORT, system};
@@ -28,7 +29,7 @@ fn it_prints_the_agent_beside_a_random_policy() {
     assert_eq!(lines.len(), 3, "{lines:?}");
     assert_eq!(
         lines[0],
-        "chain as trained on, 7 episodes each, weights after 540 updates, seed 2"
+        "chain as trained on, 7 episodes each, f32 weights after 540 updates played in f32, seed 2"
     );
     for (line, policy) in lines[1..].iter().zip(["driml-fix", "random"]) {
         assert!(
@@ -139,7 +140,9 @@ fn it_plays_checkpoints_while_the_run_goes_on() {
         let best = rows.iter().find(|row| row[4] == most).unwrap();
         // Played again with the same seed, the best earns the same.
         let again = system
-            .run(&format!("evaluate {name} --checkpoint best --episodes 4"))
+            .run(&format!(
+                "evaluate {name} --checkpoint best --episodes 4 --seed {SELECTION_SEED}"
+            ))
             .expect_code(0);
         assert!(
             again
@@ -173,6 +176,11 @@ fn an_evaluation_can_be_kept_by_hand() {
     system
         .run("evaluate run --checkpoint best --episodes 1")
         .expect_code(0);
+    // The episodes that choose are none that anybody asks for.
+    system
+        .run(&format!("{keep} --seed 0"))
+        .expect_code(64)
+        .expect_said("'--keep' cannot be used with");
     system
         .run("evaluate run --checkpoint bset")
         .expect_code(64)
@@ -183,6 +191,71 @@ fn an_evaluation_can_be_kept_by_hand() {
         ))
         .expect_code(64)
         .expect_said("local.evaluation.every_updates = 150: checkpoints are played");
+}
+
+/// A checkpoint is compared with the best over as many episodes as that was played for, or more.
+#[test]
+fn fewer_episodes_do_not_displace_the_best() {
+    let system = with_run();
+    let oldest = system.run_folder("run").checkpoints().remove(0);
+    let updates = oldest.display().to_string();
+    let updates = updates.rsplit('-').next().unwrap();
+    let keep = |flags: &str| {
+        let ended = system.run(&format!("evaluate run --keep {flags}"));
+        ended.expect_code(0).stdout
+    };
+    let rows = || {
+        let text = fs::read_to_string(system.path("run/evaluations.csv")).unwrap();
+        let column = |row: &str, at: usize| row.split(',').nth(at).unwrap().to_owned();
+        let rows = text.lines().skip(1);
+        rows.map(|row| (column(row, 2), column(row, 3)))
+            .collect::<Vec<_>>()
+    };
+    keep("--episodes 3");
+    let said = keep(&format!("--episodes 1 --checkpoint {updates}"));
+    assert!(
+        said.ends_with(
+            "; the best stays: it was played for 3 episodes, and fewer do not compare\n"
+        ),
+        "{said}"
+    );
+    // Over more episodes the best is played again, as it was played for fewer.
+    keep(&format!("--episodes 5 --checkpoint {updates}"));
+    let row = |updates: &str, episodes: &str| (updates.to_owned(), episodes.to_owned());
+    let expected = [
+        row("540", "3"),
+        row(updates, "1"),
+        row("540", "5"),
+        row(updates, "5"),
+    ];
+    assert_eq!(rows(), expected);
+}
+
+/// An evaluation plays the weights that actors of the run get, rounded as these are, unless it is told otherwise.
+#[test]
+fn it_plays_in_the_precision_of_the_run() {
+    let system = system();
+    system
+        .run(&format!(
+            "local --lockstep --agent c51 {SHORT} --set learner.publish_as=bf16 --set actor.precision=bf16 --run-dir run"
+        ))
+        .expect_code(0);
+    for (flags, words) in [
+        ("", "bf16 weights after 540 updates played in bf16"),
+        ("--exact", "f32 weights after 540 updates played in f32"),
+    ] {
+        let said = system.run(&format!("evaluate run --episodes 2 {flags}"));
+        let said = said.expect_code(0).stdout;
+        assert!(said.contains(words), "{said}");
+    }
+    let json = system
+        .run("evaluate run --episodes 2 --json")
+        .expect_code(0);
+    let told: serde_json::Value = serde_json::from_str(&json.stdout).unwrap();
+    assert_eq!(
+        (&told["weights"], &told["arithmetic"]),
+        (&"bf16".into(), &"bf16".into())
+    );
 }
 
 #[test]

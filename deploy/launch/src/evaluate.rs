@@ -18,12 +18,12 @@ use driml_machine::{
     error::{Usage, usage},
     whole_number,
 };
-use driml_model::Enlarge;
+use driml_model::{Enlarge, Precision, StoredAs};
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::run_folder::{Candidate, Evaluated, RunFolder};
+use crate::run_folder::RunFolder;
 
 /// Probability of a random action. Source: section 2 of the project's specification, after rlpyt.
 const EPSILON: f64 = 0.001;
@@ -85,7 +85,7 @@ pub enum Who {
 pub struct Player {
     /// The settings of the run that trained them.
     pub config: RunConfig,
-    /// The network's parameters, a safetensors file.
+    /// The network's parameters as it plays with them, a safetensors file.
     weights: Vec<u8>,
     agent: Agent,
     /// Updates behind its weights.
@@ -110,7 +110,8 @@ impl Player {
         Self::read(config, &checkpoint_at(folder, which)?)
     }
 
-    fn read(config: RunConfig, checkpoint: &Path) -> anyhow::Result<Self> {
+    /// Its weights as the learner published them: an actor of the run plays no others.
+    pub(crate) fn read(config: RunConfig, checkpoint: &Path) -> anyhow::Result<Self> {
         let restored = checkpoint::load(
             checkpoint,
             &config.model,
@@ -118,7 +119,7 @@ impl Player {
             &Compute::CPU,
             config.run.hash(),
         )?;
-        let weights = restored.agent.weights()?;
+        let weights = restored.agent.weights_as(config.learner.publish_as)?;
         let updates = restored.agent.updates();
         Ok(Self {
             config,
@@ -126,6 +127,17 @@ impl Player {
             updates,
             agent: restored.agent,
         })
+    }
+
+    /// The same with f32 weights and arithmetic, whatever the actors of the run have.
+    ///
+    /// # Errors
+    /// A weight that is not finite.
+    pub fn exact(mut self) -> anyhow::Result<Self> {
+        self.weights = self.agent.weights()?;
+        self.config.learner.publish_as = StoredAs::F32;
+        self.config.actor.precision = Precision::F32;
+        Ok(self)
     }
 
     /// Returns of whole episodes on the levels asked for; none if the world does not have them.
@@ -250,35 +262,8 @@ const fn sent(config: &RunConfig) -> (usize, usize) {
     (spec.frame_height as usize, spec.frame_width as usize)
 }
 
-/// Plays a checkpoint of a run on the levels trained on, adds what it earned to the run's table, and keeps it where it earned
-/// more than all before. Says what it earned, and whether it is the best.
-///
-/// # Errors
-/// As [`Player::load_at`] and [`Player::play`], and a file system that refuses.
-pub fn keep(
-    folder: &RunFolder,
-    which: Which,
-    episodes: u32,
-    seed: u64,
-) -> anyhow::Result<(Evaluated, bool)> {
-    let config = config_of(folder)?;
-    let path = checkpoint_at(folder, which)?;
-    let candidate = Candidate::hold(folder, &path)?;
-    let player = Player::read(config, &path)?;
-    let world = levels(&player.config.world, Levels::Train)?;
-    let returns = player.play(Who::Agent, &world, episodes as usize, seed)?;
-    let earned = Evaluated::at(
-        folder,
-        player.updates,
-        episodes,
-        mean_and_deviation(&returns),
-    );
-    let is_best = candidate.judge(folder, &earned)?;
-    Ok((earned, is_best))
-}
-
 /// The settings of the run in `folder`.
-fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
+pub(crate) fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
     let path = folder.config();
     let text = std::fs::read_to_string(&path).map_err(|e| {
         usage!(
@@ -291,7 +276,7 @@ fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
 }
 
 /// The folder of a checkpoint.
-fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<PathBuf> {
+pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<PathBuf> {
     let updates = match which {
         Which::Newest => None,
         Which::After(updates) => Some(updates),

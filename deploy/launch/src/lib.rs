@@ -28,6 +28,7 @@ pub mod evaluate;
 mod evaluator;
 pub mod inspect;
 pub mod interrupts;
+pub mod keep;
 pub mod launcher;
 pub mod live_view;
 pub mod lockstep;

@@ -1,6 +1,8 @@
 //! The scalars of a weights file: f32, or half of it for weights that travel often.
 //! It knows no parameter by name.
 
+use std::fmt;
+
 use half::{bf16, f16};
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
@@ -16,6 +18,17 @@ pub enum StoredAs {
     F16,
     /// 8 bits of significand, up to 3.4e38, 2 bytes each.
     Bf16,
+}
+
+impl fmt::Display for StoredAs {
+    /// As settings have it.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::F32 => "f32",
+            Self::F16 => "f16",
+            Self::Bf16 => "bf16",
+        })
+    }
 }
 
 impl StoredAs {

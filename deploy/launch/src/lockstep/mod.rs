@@ -21,7 +21,8 @@ use driml_settings::config::{EvaluationConfig, RunConfig};
 use crate::{
     console::{self, Screen, print},
     ended_episodes::EndedEpisodes,
-    evaluate::{self, Which},
+    evaluate::Which,
+    keep::keep,
     live_view::{Display, TEMPLATE},
     resume,
     run_folder::{Evaluated, Outcome, Recorded, ResumePoint, RunFolder, RunRecorder},
@@ -172,8 +173,8 @@ impl<'a> Evaluations<'a> {
         if config.is_due(updates, self.newest, is_last) {
             self.newest = updates;
             let which = Which::After(updates);
-            let (earned, _) = evaluate::keep(self.run_dir, which, config.episodes, 0)?;
-            screen.line(&earned.describe());
+            let judged = keep(self.run_dir, which, config.episodes)?;
+            screen.line(&judged.earned.describe());
         }
         Ok(())
     }

@@ -27,7 +27,7 @@ const HELD: &str = ".playing-";
 /// What a checkpoint earned over whole episodes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Evaluated {
-    /// Seconds of the run at the checkpoint, by the row of metrics at or before it; none without metrics.
+    /// Seconds of the run at the checkpoint, by the metrics; none without them.
     pub seconds: Option<f64>,
     /// Frames of the run, likewise.
     pub frames: Option<u64>,
@@ -82,7 +82,19 @@ impl Evaluated {
         Ok(all.iter().map(|it| it.updates).max().unwrap_or(0))
     }
 
-    /// A checkpoint of so many updates, with the run's time and frames at it.
+    /// The kept best checkpoint and what it earned when it was played for the most episodes; none of a folder that has none.
+    ///
+    /// # Errors
+    /// As [`Evaluated::all`].
+    pub(crate) fn best(folder: &RunFolder) -> anyhow::Result<Option<Self>> {
+        let kept = driml_learner::checkpoint::list(&folder.best())?;
+        let played = Self::all(folder)?.into_iter();
+        let of_best = played.filter(|it| kept.last().is_some_and(|(best, _)| *best == it.updates));
+        Ok(of_best.max_by_key(|it| it.episodes))
+    }
+
+    /// A checkpoint of so many updates, with the run's time and frames at it: those of the row of metrics at or before it, or of the
+    /// first row, which is written within a second or so, where it was saved before that.
     pub(crate) fn at(
         folder: &RunFolder,
         updates: u64,
@@ -93,11 +105,12 @@ impl Evaluated {
         let metrics = metrics
             .and_then(|text| Columns::parse(&text).ok())
             .unwrap_or_default();
-        let row = metrics.rows.iter().rev().find(|row| {
+        let before = metrics.rows.iter().rev().find(|row| {
             metrics
                 .value::<u64>(row, "updates")
                 .is_some_and(|at| at <= updates)
         });
+        let row = before.or(metrics.rows.first());
         Self {
             seconds: row.and_then(|row| metrics.value(row, "seconds")),
             frames: row.and_then(|row| metrics.value(row, "frames")),
@@ -117,7 +130,10 @@ impl Evaluated {
     }
 
     /// Adds it to the run's table, which is made where there is none.
-    fn add(&self, folder: &RunFolder) -> anyhow::Result<()> {
+    ///
+    /// # Errors
+    /// A file system that refuses.
+    pub(crate) fn add(&self, folder: &RunFolder) -> anyhow::Result<()> {
         let path = folder.evaluations();
         let doing = || format!("writing {}", path.display());
         let mut file = File::options()
@@ -180,13 +196,21 @@ impl Candidate {
         Ok(this)
     }
 
-    /// Adds what it earned to the run's table, and keeps it if nothing earned as much before. Says whether it is the best.
+    /// Adds what it earned to the run's table, and keeps it if it earned more than the best before it, over at least as many episodes.
+    /// Says whether it is the best.
     ///
     /// # Errors
-    /// A file system that refuses, or a table that cannot be read.
-    pub(crate) fn judge(self, folder: &RunFolder, earned: &Evaluated) -> anyhow::Result<bool> {
-        let before = Evaluated::all(folder)?;
-        let is_best = before.iter().all(|it| it.mean_return < earned.mean_return);
+    /// A file system that refuses.
+    pub(crate) fn judge(
+        self,
+        folder: &RunFolder,
+        earned: &Evaluated,
+        best: Option<&Evaluated>,
+    ) -> anyhow::Result<bool> {
+        let is_best = best.is_none_or(|best| {
+            best.updates == earned.updates
+                || earned.episodes >= best.episodes && earned.mean_return > best.mean_return
+        });
         if is_best {
             let path = self.best.join(&self.name);
             let doing = || format!("keeping {}", path.display());
@@ -254,17 +278,19 @@ mod tests {
         )
         .unwrap();
         assert_eq!(Evaluated::all(&folder).unwrap(), []);
-        let judge = |updates, mean| {
+        let judge = |updates, mean, episodes| {
             let path = checkpoint(&folder, updates);
             let candidate = Candidate::hold(&folder, &path).unwrap();
             // The learner clears it away while it is played.
             fs::remove_dir_all(path).unwrap();
-            let earned = Evaluated::at(&folder, updates, 4, (mean, 0.5));
-            candidate.judge(&folder, &earned).unwrap()
+            let earned = Evaluated::at(&folder, updates, episodes, (mean, 0.5));
+            let best = Evaluated::best(&folder).unwrap();
+            candidate.judge(&folder, &earned, best.as_ref()).unwrap()
         };
-        assert!(judge(10, -1.0));
-        assert!(judge(20, 3.0));
-        assert!(!judge(30, 3.0), "the first of equals stays");
+        assert!(judge(10, -1.0, 4));
+        assert!(judge(20, 3.0, 4));
+        assert!(!judge(30, 3.0, 4), "the first of equals stays");
+        assert!(!judge(40, 9.0, 1), "one episode is luck");
         let best = driml_learner::checkpoint::list(&folder.best()).unwrap();
         assert_eq!(best.len(), 1);
         assert_eq!(fs::read_to_string(best[0].1.join("weights")).unwrap(), "20");
@@ -289,7 +315,8 @@ mod tests {
             [
                 (Some(300), 10, -1.0),
                 (Some(300), 20, 3.0),
-                (Some(500), 30, 3.0)
+                (Some(500), 30, 3.0),
+                (Some(500), 40, 9.0)
             ]
         );
         fs::write(folder.evaluations(), "a,b\n1,2\n").unwrap();
@@ -299,6 +326,16 @@ mod tests {
                 .to_string()
                 .contains("is no table of evaluations")
         );
+    }
+
+    #[test]
+    fn a_checkpoint_from_before_the_first_row_has_that_row_s_frames() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        let metrics = "seconds,frames,updates\n1.0,300,120\n2.0,500,240\n";
+        fs::write(folder.metrics(), metrics).unwrap();
+        let earned = Evaluated::at(&folder, 100, 1, (2.0, 0.0));
+        assert_eq!((earned.frames, earned.seconds), (Some(300), Some(1.0)));
     }
 
     #[test]

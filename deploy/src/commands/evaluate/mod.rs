@@ -11,7 +11,8 @@ use clap::Args;
 use driml_figure::Film;
 use driml_launch::{
     console::print,
-    evaluate::{self, Levels, Player, Which, Who, levels, mean_and_deviation},
+    evaluate::{Levels, Player, Which, Who, levels, mean_and_deviation},
+    keep::{Judged, keep},
     run_folder::{RunFolder, sweep},
 };
 use driml_machine::error::{EXIT_INTERRUPTED, usage};
@@ -40,8 +41,11 @@ pub(crate) struct EvaluateArgs {
     #[arg(long, value_name = "UPDATES", default_value = "newest")]
     pub(crate) checkpoint: Which,
     /// Add the agent's mean return to the run's evaluations.csv, and keep the checkpoint as the run's best if it earned most
-    #[arg(long, conflicts_with_all = ["levels", "returns", "json", "record"])]
+    #[arg(long, conflicts_with_all = ["levels", "seed", "exact", "returns", "json", "record"])]
     pub(crate) keep: bool,
+    /// Play with f32 weights and arithmetic, also where the run's actors played with bf16 or f16
+    #[arg(long)]
+    pub(crate) exact: bool,
     /// Write every episode's return into this file, as CSV: who played, number of the episode, return
     #[arg(long, value_name = "FILE")]
     pub(crate) returns: Option<PathBuf>,
@@ -68,11 +72,17 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     let folder = RunFolder::new(folder);
     if args.keep {
         end_when_asked(folder.clone(), args.exit_with_parent)?;
-        let (earned, is_best) = evaluate::keep(&folder, args.checkpoint, args.episodes, args.seed)?;
-        let best = if is_best { ", the most so far" } else { "" };
-        return print(&format!("{}{best}\n", earned.describe()));
+        let judged = keep(&folder, args.checkpoint, args.episodes)?;
+        return print(&format!(
+            "{}{}\n",
+            judged.earned.describe(),
+            verdict(&judged)
+        ));
     }
-    let player = Player::load_at(&folder, args.checkpoint)?;
+    let mut player = Player::load_at(&folder, args.checkpoint)?;
+    if args.exact {
+        player = player.exact()?;
+    }
     // Before an hour of playing.
     let table = args.returns.as_deref().map(report::Table::begin);
     let mut table = table.transpose()?;
@@ -86,8 +96,13 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     };
     let said = |text: &str| if args.json { Ok(()) } else { print(text) };
     said(&format!(
-        "{} {which}, {} episodes each, weights after {} updates, seed {}\n",
-        spec.world, args.episodes, player.updates, args.seed
+        "{} {which}, {} episodes each, {} weights after {} updates played in {}, seed {}\n",
+        spec.world,
+        args.episodes,
+        player.config.learner.publish_as,
+        player.updates,
+        player.config.actor.precision,
+        args.seed
     ))?;
     let returns = player.play_watched(
         Who::Agent,
@@ -138,6 +153,18 @@ fn end_when_asked(folder: RunFolder, parent: Option<u32>) -> anyhow::Result<()> 
         })
         .context("starting a thread")?;
     Ok(())
+}
+
+/// What an evaluation says of the run's best checkpoint.
+fn verdict(judged: &Judged) -> String {
+    match &judged.best_before {
+        _ if judged.is_best => ", the most so far".into(),
+        Some(best) if best.episodes > judged.earned.episodes => format!(
+            "; the best stays: it was played for {} episodes, and fewer do not compare",
+            best.episodes
+        ),
+        _ => String::new(),
+    }
 }
 
 fn describe(name: &str, returns: &[f64]) -> String {

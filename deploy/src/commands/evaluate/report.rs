@@ -78,6 +78,8 @@ pub(super) fn json(
         "world": spec.world,
         "agent": spec.agent,
         "updates": player.updates,
+        "weights": player.config.learner.publish_as,
+        "arithmetic": player.config.actor.precision,
         "levels": levels.map(|it| it.get_name().to_owned()),
         "seed": seed,
         "policies": policies,
