@@ -150,11 +150,14 @@ impl<'a> Batch<'a> {
 
     /// The pairs (a_t, a_{t+1}) of the rows that have both.
     pub fn action_pairs(&self) -> Vec<(u8, u8)> {
-        let pairs = self
-            .action
-            .iter()
-            .copied()
-            .zip(self.next_action.iter().copied());
+        self.action_pairs_of(0..self.action.len())
+    }
+
+    /// The same of these rows, of which some may come twice.
+    pub fn action_pairs_of(&self, rows: impl IntoIterator<Item = usize>) -> Vec<(u8, u8)> {
+        let pairs = rows
+            .into_iter()
+            .map(|row| (self.action[row], self.next_action[row]));
         pairs.filter(|&(_, next)| next != NO_ACTION).collect()
     }
 }

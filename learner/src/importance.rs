@@ -1,5 +1,7 @@
-//! Importance weights of rows that were not drawn equally likely.
-//! It does not draw: the chance of each row comes with its batch.
+//! What is made good where rows were not drawn equally likely: importance weights, and rows drawn anew as if they had been.
+//! The chance of each row comes with its batch.
+
+use rand::{Rng, distr::Distribution, distr::weighted::WeightedIndex};
 
 /// Largest error of an importance weight, as a share of it: half of an f32's last place.
 pub const WEIGHT_ERROR: f64 = 6.1e-8;
@@ -15,9 +17,51 @@ pub fn importance_weights(probabilities: &[f32], beta: f64) -> Vec<f32> {
     probabilities.iter().map(weight).collect()
 }
 
+/// As many rows as there are, each drawn anew with a chance in proportion to 1 / P: they follow the law of rows that are drawn equally
+/// likely, but for an error of the order of 1 / B.
+///
+/// `probabilities` [B], from 1.2e-38 to 1, B at least 1. Result [B], in 0..B. Source: Rubin 1987, sampling importance resampling.
+pub fn drawn_evenly(probabilities: &[f32], rng: &mut impl Rng) -> Vec<usize> {
+    let weights = probabilities.iter().map(|&p| 1.0 / f64::from(p));
+    let rows = WeightedIndex::new(weights).expect("chances are above 0, of one row at least");
+    (0..probabilities.len()).map(|_| rows.sample(rng)).collect()
+}
+
 #[cfg(test)]
 mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
     use super::*;
+
+    #[test]
+    fn rows_drawn_by_priority_and_then_evenly_are_equally_likely() {
+        // Eight kinds of transitions, one of a kind as likely to be in the replay as the other; priorities from 1 to 64.
+        let priorities: Vec<f64> = (0..8).map(|kind| f64::from(1 + kind * 9)).collect();
+        let sum: f64 = priorities.iter().sum();
+        let by_priority = WeightedIndex::new(&priorities).unwrap();
+        let mut rng = ChaCha8Rng::seed_from_u64(11);
+        let (mut drawn, mut even) = ([0f64; 8], [0f64; 8]);
+        let batches = 8_000;
+        for _ in 0..batches {
+            let kinds: Vec<usize> = (0..256).map(|_| by_priority.sample(&mut rng)).collect();
+            let chance = |&kind: &usize| (priorities[kind] / sum) as f32;
+            let chances: Vec<f32> = kinds.iter().map(chance).collect();
+            // One of each batch, as those of one batch depend on each other.
+            drawn[kinds[0]] += 1.0;
+            even[kinds[drawn_evenly(&chances, &mut rng)[0]]] += 1.0;
+        }
+        let chi_square = |counts: [f64; 8]| {
+            let expected = f64::from(batches) / 8.0;
+            counts
+                .map(|it| (it - expected).powi(2) / expected)
+                .iter()
+                .sum::<f64>()
+        };
+        // 7 degrees of freedom: above 24.3 in one of a thousand.
+        assert!(chi_square(drawn) > 1_000.0);
+        assert!(chi_square(even) < 24.3, "{even:?}");
+    }
 
     #[test]
     fn weights_are_the_paper_s() {

@@ -18,7 +18,7 @@ use crate::{
     checkpoint::{self, CheckpointError, RunState},
     config::{ConfigError, LearnerConfig},
     error::UpdateError,
-    importance::importance_weights,
+    importance::{drawn_evenly, importance_weights},
     progress::Progress,
 };
 
@@ -227,8 +227,10 @@ impl Learner {
         }
         let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
         let beta = self.config.sampling.beta(self.agent.updates());
-        let weights = batch.probabilities();
-        let weights = weights.map(|probabilities| importance_weights(&probabilities, beta));
+        let probabilities = batch.probabilities();
+        let weights = probabilities
+            .as_ref()
+            .map(|it| importance_weights(it, beta));
         let batch = Batch {
             rows: batch.rows(),
             states_t,
@@ -246,7 +248,12 @@ impl Learner {
         self.agent.check(&batch)?;
         let mut affinity = self.affinity.clone();
         if let Some(affinity) = &mut affinity {
-            affinity.observe(&batch.action_pairs(), &mut rng)?;
+            // Of rows drawn by priority it would be the affinity of surprising transitions.
+            let pairs = match &probabilities {
+                None => batch.action_pairs(),
+                Some(it) => batch.action_pairs_of(drawn_evenly(it, &mut rng)),
+            };
+            affinity.observe(&pairs, &mut rng)?;
         }
         let report = self.agent.update(&batch)?;
         (self.rng, self.affinity) = (rng, affinity);
