@@ -2,7 +2,7 @@
 
 use driml_envs::WorldName;
 use driml_learner::{
-    Agent, Batch, Compute, Kernels, Lambda, LearnerSettings, NetworkParameters,
+    Agent, Batch, Compute, EqualStates, Kernels, Lambda, LearnerSettings, NetworkParameters,
     parity::{deviation::ErrorOfUpdate, float64::float64},
 };
 use driml_machine::resources::Machine;
@@ -25,6 +25,8 @@ const UPDATE: Routine = Routine {
     range: "f32; weights, returns and supports of any size whose losses are finite",
 };
 const ACTIONS: usize = 4;
+/// Largest error of a gradient, as a share of its norm.
+const GRADIENT_ERROR_MAX: f64 = 1e-1;
 
 /// What an update computes with, beside its weights and rows.
 struct Setting {
@@ -34,8 +36,8 @@ struct Setting {
     tanh_clip: f64,
     /// The size of returns.
     returns: f32,
-    /// Whether all states are one.
-    is_still: bool,
+    /// Different states at most.
+    distinct: usize,
 }
 
 impl Setting {
@@ -52,7 +54,7 @@ impl Setting {
             support: supports[rng.random_range(0..5)],
             tanh_clip: [1e-30, 1e-3, 1.0, 20.0, 1e9, 1e30][rng.random_range(0..6)],
             returns: [0.0, 1e-40, 1.0, 1e6, 1e30, 3e38][rng.random_range(0..6)],
-            is_still: rng.random_bool(0.2),
+            distinct: [1, 4, usize::MAX][rng.random_range(0..3)],
         }
     }
 
@@ -62,11 +64,14 @@ impl Setting {
             support,
             tanh_clip,
             returns,
-            is_still,
+            distinct,
         } = self;
-        let still = if *is_still { ", one state" } else { "" };
+        let equal = match *distinct {
+            usize::MAX => String::new(),
+            count => format!(", different states: {count}"),
+        };
         format!(
-            "weights x {scale:e}, support {support:?}, tanh_clip {tanh_clip:e}, returns within {returns:e}{still}"
+            "weights x {scale:e}, support {support:?}, tanh_clip {tanh_clip:e}, returns within {returns:e}{equal}"
         )
     }
 }
@@ -131,11 +136,12 @@ impl Planes {
     fn drawn(model: &ModelConfig, setting: &Setting, rng: &mut ChaCha8Rng) -> Self {
         let rows = rng.random_range(2..24);
         let len = model.frame_len();
+        let drawn: Vec<Vec<u8>> = (0..setting.distinct.min(3 * rows))
+            .map(|_| (0..len).map(|_| rng.random()).collect())
+            .collect();
         let mut states = || -> Vec<u8> {
-            match setting.is_still {
-                true => vec![200; rows * len],
-                false => (0..rows * len).map(|_| rng.random()).collect(),
-            }
+            let each = (0..rows).map(|_| &drawn[rng.random_range(0..drawn.len())][..]);
+            each.collect::<Vec<_>>().concat()
         };
         let states = [states(), states(), states()];
         let mut each = |draw: &dyn Fn(&mut ChaCha8Rng) -> u8| -> Vec<u8> {
@@ -178,8 +184,9 @@ impl Planes {
     }
 }
 
-/// Errors of one update: of the loss, as a share of 1 + loss, and of all gradients together, as a share of their norm; none of the
-/// gradient where of two values that are nearly the same another is the larger, after which the target is another too.
+/// Errors of one update, the larger of those with equal states each and once: of the loss, as a share of 1 + loss, and of all
+/// gradients together, as a share of their norm; none of the gradient where of two values that are nearly the same another is the
+/// larger, after which the target is another too.
 fn errors(
     kernels: Kernels,
     setting: &Setting,
@@ -199,13 +206,24 @@ fn errors(
         kernels,
         ..Compute::CPU
     };
-    let agent = Agent::from_parameters(model.clone(), settings, &compute, parameters)?;
+    let mut agent = Agent::from_parameters(model.clone(), settings, &compute, parameters)?;
     let planes = Planes::drawn(&model, setting, rng);
     let expected = float64(&agent, &planes.batch())?;
-    let found = ErrorOfUpdate::of(&agent, &planes.batch(), &expected)?;
-    let loss = found.loss * expected.total.abs() / (1.0 + expected.total.abs());
-    let is_same = found.same_next_action == 1.0;
-    Ok((loss, is_same.then_some(found.gradient)))
+    let (mut loss, mut gradient) = (0.0, Some(0.0));
+    for equal_states in [EqualStates::Each, EqualStates::Once] {
+        agent = agent.with_equal_states(equal_states);
+        let found = ErrorOfUpdate::of(&agent, &planes.batch(), &expected)?;
+        let share = expected.total.abs() / (1.0 + expected.total.abs());
+        loss = larger(loss, found.loss * share);
+        let of_gradient = (found.same_next_action == 1.0).then_some(found.gradient);
+        gradient = gradient.zip(of_gradient).map(|(a, b)| larger(a, b));
+    }
+    Ok((loss, gradient))
+}
+
+/// The larger; NaN is the largest.
+fn larger(a: f64, b: f64) -> f64 {
+    if a.is_nan() || a > b { a } else { b }
 }
 
 /// The middle one; NaN, which is the largest, of none.
@@ -218,11 +236,11 @@ fn of_kernels(
     context: &mut Context<'_>,
     kernels: Kernels,
     whose: &str,
-) -> anyhow::Result<[Row; 2]> {
+) -> anyhow::Result<[Row; 3]> {
     let mut losses = Row::new(
         UPDATE,
         &format!(
-            "{whose}: initial weights times 1e-6 to 100; returns 0 to 3e38; supports 1e-3 to 2e30 wide; tanh_clip 1e-30 to 1e30; equal states"
+            "{whose}: initial weights times 1e-6 to 100; returns 0 to 3e38; supports 1e-3 to 2e30 wide; tanh_clip 1e-30 to 1e30; one state, four or all that differ, equal ones computed each and once"
         ),
         "error of the loss, as a share of 1 + loss",
         1e-4,
@@ -233,23 +251,69 @@ fn of_kernels(
         "median error of the gradient, as a share of its norm",
         1e-4,
     );
+    let mut worst = Row::new(
+        UPDATE,
+        "the same",
+        "error of the gradient, as a share of its norm",
+        GRADIENT_ERROR_MAX,
+    );
     for scale in [1e-6, 1e-3, 0.1, 1.0, 3.0, 10.0, 100.0] {
         let mut found = Vec::new();
         context.draw(0.0015, |_, rng| {
             let setting = Setting::drawn(scale, rng);
             let (loss, gradient) = errors(kernels, &setting, rng)?;
             losses.see(loss, || setting.shown());
-            found.extend(gradient);
+            if let Some(gradient) = gradient {
+                worst.see(gradient, || setting.shown());
+                found.push(gradient);
+            }
             Ok(())
         })?;
         gradients.see(median(found), || format!("weights x {scale:e}"));
         context.progress.advance(0)?;
     }
-    Ok([losses, gradients])
+    Ok([losses, gradients, worst])
 }
 
 pub(super) fn check(context: &mut Context<'_>) -> anyhow::Result<Vec<Row>> {
     let mut rows = Vec::from(of_kernels(context, Kernels::FUSED, "our kernels")?);
     rows.extend(of_kernels(context, Kernels::Candle, "candle's operations")?);
     Ok(rows)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+
+    use super::*;
+
+    #[test]
+    fn rows_of_equal_states_are_computed_once_and_differ_from_each_in_rounding_alone() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        for distinct in [1, 4] {
+            let setting = Setting {
+                scale: 1.0,
+                support: (-10.0, 10.0),
+                tanh_clip: 20.0,
+                returns: 1.0,
+                distinct,
+            };
+            let model = model(&settings().unwrap(), setting.support);
+            let planes = Planes::drawn(&model, &setting, &mut rng);
+            let mut states: Vec<&[u8]> = planes
+                .states
+                .iter()
+                .flat_map(|it| it.chunks(model.frame_len()))
+                .collect();
+            let count = states.len();
+            states.sort_unstable();
+            states.dedup();
+            assert!(states.len() <= distinct && EqualStates::pays(count - states.len(), count));
+            let (loss, gradient) = errors(Kernels::FUSED, &setting, &mut rng).unwrap();
+            assert!(
+                loss < 1e-4 && gradient.is_none_or(|it| it < 1e-2),
+                "{loss} {gradient:?}"
+            );
+        }
+    }
 }
