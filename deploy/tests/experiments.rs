@@ -11,6 +11,8 @@ use std::{
     time::{Duration, Instant},
 };
 
+use driml_protocol::fault;
+
 fn driml(folder: &Path, args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_driml"))
         .args(args)
@@ -376,6 +378,7 @@ fn tradeoff() {
 #[test]
 fn killed_and_resumed() {
     let root = tempfile::tempdir().unwrap();
+    let go = root.path().join("go");
     let mut args = vec![
         "experiment",
         "procgen",
@@ -389,19 +392,23 @@ fn killed_and_resumed() {
     let mut child = Command::new(env!("CARGO_BIN_EXE_driml"))
         .args(&args)
         .current_dir(root.path())
+        // Its run is not over before it is killed.
+        .env(fault::HOLD, format!("100 {}", go.display()))
         .spawn()
         .unwrap();
     let run = root.path().join("x/runs/mspacman-c51-seed1");
-    let deadline = Instant::now() + Duration::from_secs(60);
+    let deadline = Instant::now() + Duration::from_secs(180);
     let has_learned = || {
         let text = fs::read_to_string(run.join("metrics.csv")).unwrap_or_default();
         let mut updates = text.lines().skip(1).filter_map(|row| row.split(',').nth(2));
         updates.any(|updates| updates != "0")
     };
-    while !has_learned() && Instant::now() < deadline {
+    while !has_learned() {
+        assert!(Instant::now() < deadline, "no update in time");
         std::thread::sleep(Duration::from_millis(20));
     }
     child.kill().unwrap();
+    fs::write(&go, "").unwrap();
     child.wait().unwrap();
     let output = driml(root.path(), &args);
     let said = String::from_utf8(output.stderr).unwrap();

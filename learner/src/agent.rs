@@ -5,6 +5,7 @@ use std::collections::HashMap;
 
 use candle_core::Tensor;
 use driml_model::{Compute, DimHeads, ModelConfig, Network, Parameters, StoredAs};
+use driml_protocol::fault;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
@@ -240,6 +241,7 @@ impl Agent {
     /// A batch that does not fit, or losses or gradients that are not finite: nothing has then changed. A step beyond the
     /// finite numbers, [`UpdateError::Diverged`]: the learner is then good for nothing, and can be neither published nor saved.
     pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
+        fault::hold(self.updates());
         // On a thread of the pool: from outside, every product would wake the pool up and be woken by it.
         rayon::scope(|_| self.update_here(batch))
     }

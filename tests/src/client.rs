@@ -12,7 +12,7 @@ use driml_protocol::{
 };
 use zenoh::{Session, Wait, qos::Priority};
 
-use crate::waiting::wait_for;
+use crate::waiting::{DEADLINE, wait_for};
 
 /// The prefix of a run's keys unless a part is told otherwise.
 const NAMESPACE: &str = "driml";
@@ -69,7 +69,12 @@ impl Client {
         }
     }
 
-    pub(crate) fn join(endpoint: &str, deadline: Instant) -> Self {
+    /// A client of the run at an endpoint, once its replay server answers.
+    ///
+    /// # Panics
+    /// At the deadline.
+    pub fn join(endpoint: &str) -> Self {
+        let deadline = Instant::now() + DEADLINE;
         let endpoints = Endpoints {
             listen: Vec::new(),
             connect: vec![endpoint.to_owned()],

@@ -5,10 +5,10 @@ use std::{
     fs,
     path::{Path, PathBuf},
     process::Command,
-    sync::atomic::{AtomicU32, Ordering},
-    time::Instant,
+    sync::atomic::{AtomicU32, AtomicU64, Ordering},
 };
 
+use driml_protocol::fault;
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
@@ -18,7 +18,7 @@ use crate::{
     client::Client,
     process::{Ended, Process},
     run_folder::RunFolder,
-    waiting::{DEADLINE, wait_for},
+    waiting::wait_for,
 };
 
 /// The variable that marks each process of a system. Children inherit it, so that those of a killed launcher are found too.
@@ -30,7 +30,14 @@ pub struct TestSystem {
     program: PathBuf,
     folder: tempfile::TempDir,
     mark: String,
+    /// After how many updates learners that are started wait; none do after [`NEVER`].
+    held_at: AtomicU64,
 }
+
+/// No learner makes so many updates.
+const NEVER: u64 = u64::MAX;
+/// The file that learners which are held wait for.
+const GO: &str = "go";
 
 /// A process of a system that is still there.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -56,7 +63,19 @@ impl TestSystem {
             program,
             folder,
             mark: format!("{}-{count}", std::process::id()),
+            held_at: AtomicU64::new(NEVER),
         }
+    }
+
+    /// Learners that are started from now on stand still after so many updates, until [`Self::let_go`]: their run is not over before a
+    /// test has seen and done what it has to, however slow the test is.
+    pub fn hold_at(&self, updates: u64) {
+        self.held_at.store(updates, Ordering::Relaxed);
+    }
+
+    /// Lets learners go on that are held, and holds no more.
+    pub fn let_go(&self) {
+        fs::write(self.path(GO), "").unwrap();
     }
 
     /// A path in the system's folder.
@@ -102,8 +121,16 @@ impl TestSystem {
             .args(args.split_whitespace())
             .current_dir(self.folder.path())
             .env(MARK, &self.mark)
+            .envs(self.hold())
             .env_remove("DRIML_LOG");
         command
+    }
+
+    /// The variable that holds learners, if they are to be.
+    fn hold(&self) -> Option<(&'static str, String)> {
+        let updates = self.held_at.load(Ordering::Relaxed);
+        let go = self.path(GO);
+        (updates != NEVER).then(|| (fault::HOLD, format!("{updates} {}", go.display())))
     }
 
     /// Runs the program to its end.
@@ -152,7 +179,7 @@ impl TestSystem {
 
     /// A client of the run at this system's endpoint, once its replay server answers.
     pub fn connect(&self) -> Client {
-        Client::join(&self.endpoint(), Instant::now() + DEADLINE)
+        Client::join(&self.endpoint())
     }
 
     /// Every process of this system that still runs, children of ended ones included.

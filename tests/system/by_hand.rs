@@ -157,7 +157,8 @@ fn parts_that_are_told_to_stop_lose_nothing() {
 #[test]
 fn an_actor_killed_and_started_again_goes_on() {
     let system = system();
-    // Long enough that the first actor cannot finish it before it is killed.
+    // The first actor cannot finish it before it is killed.
+    system.hold_at(100);
     let flags = "--env chain --preset smoke --frames 20008 --set replay.warmup_transitions=2000";
     let _server = system.start_replay_server(&format!(
         "--agent driml-ada {flags} --set replay.replay_ratio=2"
@@ -173,6 +174,7 @@ fn an_actor_killed_and_started_again_goes_on() {
     let before = client.wait_for_replay("the actor's absence", |replay| replay.actors == 0);
     assert!(!before.finished);
 
+    system.let_go();
     let again = system.start_actor(3);
     again.wait().expect_code(0);
     client.wait_for_learner("the learner's last update", |learner| learner.finished);

@@ -6,7 +6,7 @@ use std::{
     net::{Ipv4Addr, TcpListener},
 };
 
-use driml_tests::wait_for;
+use driml_tests::{Client, wait_for};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
@@ -72,19 +72,21 @@ fn c51_leaves_a_whole_run_folder() {
 #[test]
 fn driml_ada_with_two_actors_over_tcp() {
     let system = system();
-    // Long enough that the run is not over before its second actor has started.
+    // The run is not over before its second actor has started.
+    system.hold_at(1_000);
     let longer = SHORT.replace("--frames 1280", "--frames 5120");
     assert_ne!(longer, SHORT);
-    let flags = format!(
-        "{longer} --actors 2 --listen {} --run-dir run",
-        free_tcp_endpoint()
-    );
+    let endpoint = free_tcp_endpoint();
+    let flags = format!("{longer} --actors 2 --listen {endpoint} --run-dir run");
     // All three actions amount to one, so the learner's A is 1 everywhere and k goes as far as it may. Without the learner the
     // replay server's A is 1/3 everywhere: then the mean of k is at most 1 + 1/3 + .. + 1/81.
     let alphabet = "--set learner.affinity.alphabet=visible --set learner.affinity.visible=[0,0,0]";
-    system
-        .run(&format!("local --agent driml-ada {alphabet} {flags}"))
-        .expect_code(0);
+    let process = system.start(&format!("local --agent driml-ada {alphabet} {flags}"));
+    let client = Client::join(&endpoint);
+    client.wait_for_replay("both actors", |replay| replay.actors == 2);
+    drop(client);
+    system.let_go();
+    process.wait().expect_code(0);
     let run = system.run_folder("run");
     let summary = run.check_finished();
     assert_eq!(summary.replay_ratio, Some(8.0));

@@ -47,6 +47,7 @@ fn the_seed_decides_the_weights_in_bf16_too() {
 
 /// Starts a run, ends it with `signal` once it has saved and goes on, and resumes it to its end.
 fn interrupted(system: &TestSystem, flags: &str, signal: Signal) -> Summary {
+    system.hold_at(400);
     let process = system.start(&format!("local --lockstep {flags} --run-dir run"));
     let run = system.run_folder("run");
     // The first checkpoint is after 200.
@@ -54,6 +55,7 @@ fn interrupted(system: &TestSystem, flags: &str, signal: Signal) -> Summary {
         run.updates_recorded().filter(|&updates| updates > 300)
     });
     process.signal(signal);
+    system.let_go();
     let ended = process.wait();
     if signal == Signal::SIGINT {
         ended
@@ -74,7 +76,7 @@ fn interrupted(system: &TestSystem, flags: &str, signal: Signal) -> Summary {
 /// By Ctrl-C, which saves, and by death, after which what was learned since the last checkpoint is learned again.
 #[test]
 fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
-    // 6,300 updates, some seconds, so that it is caught on its way.
+    // 6,300 updates.
     let flags = "--env chain --preset smoke --frames 12800 --actors 2 \
                  --set replay.replay_ratio=8 --set learner.checkpoint_period_updates=200";
     let of = |agent: &str| format!("{flags} --agent {agent}");

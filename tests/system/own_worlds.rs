@@ -107,6 +107,8 @@ fn lockstep_goes_on(env: &str, flags: &str, frames: u64) {
     assert_eq!(result(prolonged), whole, "prolonged");
 
     for signal in [Signal::SIGINT, Signal::SIGKILL] {
+        let system = crate::system();
+        system.hold_at(150);
         let args = format!("local --lockstep {flags} --frames {frames} --run-dir {signal}");
         let process = start(&system, &args, env);
         let run = system.run_folder(signal.as_str());
@@ -115,6 +117,7 @@ fn lockstep_goes_on(env: &str, flags: &str, frames: u64) {
             run.updates_recorded().filter(|&updates| updates > 110)
         });
         process.signal(signal);
+        system.let_go();
         process.wait();
         system
             .run(&format!("local --resume {signal}"))
@@ -122,11 +125,11 @@ fn lockstep_goes_on(env: &str, flags: &str, frames: u64) {
         let resumed = run.check_finished();
         assert!(resumed.resumed_after_updates >= 100, "{resumed:#?}");
         assert_eq!(result(resumed), whole, "{signal}");
+        // A world whose run was killed is given a second to end by itself.
+        wait_for("the end of every world", || {
+            system.survivors().is_empty().then_some(())
+        });
     }
-    // A world whose run was killed is given a second to end by itself.
-    wait_for("the end of every world", || {
-        system.survivors().is_empty().then_some(())
-    });
 }
 
 #[test]

@@ -53,6 +53,7 @@ fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
 fn a_replay_server_that_dies_goes_on_with_equal_priorities() {
     let system = system();
     let longer = SHORT.replace("--frames 1280", "--frames 6400");
+    system.hold_at(1_000);
     let process = system.start(&format!(
         "local --durable --agent c51 {longer} {PRIORITISED} --listen {} --run-dir run",
         system.endpoint()
@@ -60,6 +61,7 @@ fn a_replay_server_that_dies_goes_on_with_equal_priorities() {
     let client = system.connect();
     client.wait_for_learner("some updates", |learner| learner.updates > 500);
     system.find_part("replay-server").signal(Signal::SIGKILL);
+    system.let_go();
     drop(client);
     process
         .wait()

@@ -92,10 +92,21 @@ fn keep_for(system: &TestSystem, folder: &str) -> RunSpec {
     spec
 }
 
-/// Waits until a server has begun to read, and makes its machine a slow one.
+/// Makes a server's machine a slow one, and waits until it has begun to read.
 fn slow_down(server: &mut Process) -> SlowMachine {
+    let slow = SlowMachine::for_process(server.pid());
     server.wait_for_stderr("reads the replay in ");
-    SlowMachine::for_process(server.pid())
+    slow
+}
+
+/// Starts a replay server that stands still until its machine is slowed down: it cannot have read all before.
+fn start_stopped(system: &TestSystem, flags: &str) -> Process {
+    let words = ["sh", "-c", "kill -STOP $$; exec \"$@\"", "sh"].map(String::from);
+    let serve = format!(
+        "replay-server --stay --listen {} {flags}",
+        system.endpoint()
+    );
+    system.start_part_after(&words, &serve)
 }
 
 /// How far the server is, as `driml status --json` has it; none once it has read all.
@@ -177,7 +188,7 @@ fn everybody_waits_for_a_server_that_reads_its_replay_back() {
     server.signal(Signal::SIGKILL);
     server.wait();
 
-    let mut server = system.start_replay_server(&serve);
+    let mut server = start_stopped(&system, &serve);
     let slow = slow_down(&mut server);
     let first = recovering(&system).expect("it has a long log");
     check_put_off(&system, &spec);
@@ -243,7 +254,7 @@ fn a_server_that_reads_is_stopped_and_started_again() {
     let system = system();
     keep_for(&system, "replay");
     let serve = format!("{} --replay-dir replay", flags());
-    let mut server = system.start_replay_server(&serve);
+    let mut server = start_stopped(&system, &serve);
     let slow = slow_down(&mut server);
     let mut actor = system.start_actor(0);
     actor.wait_for_stderr(WAITING);
@@ -288,10 +299,6 @@ fn a_resumed_run_shows_how_far_its_server_is() {
     let frames = WARMUP + (stored + 2_000).next_multiple_of(1024);
 
     process = system.start(&format!("local --resume run --frames {frames}"));
-    wait_for("a server that reads", || {
-        let log = fs::read_to_string(run.path().join("logs/replay-server.log")).ok()?;
-        log.contains("reads the replay in ").then_some(())
-    });
     let slow = SlowMachine::for_process(system.find_part("replay-server").pid);
     process.wait_for_stderr("replay-server: reads its replay back from disk, ");
     drop(slow);

@@ -17,15 +17,17 @@ fn killed_learners_cost_no_update_of_the_plan() {
     let server = system.start_replay_server(&format!(
         "--agent driml-ada {longer} --set learner.checkpoint_period_updates=200"
     ));
+    system.hold_at(400);
     let mut learner = system.start_learner("run");
     let actor = system.start_actor(0);
     let client = system.connect();
     let (mut version, mut forgotten) = (0, 0);
-    for updates in [250, 300, 350] {
-        client.wait_for_learner("updates", |it| it.updates > updates);
-        let killed = client.learner().unwrap();
+    // Each learner is held at the first number, and its successor, which begins at the checkpoint, at the second.
+    for (updates, successor) in [(400, 300), (300, 250), (250, 225)] {
+        let killed = client.wait_for_learner("updates", |it| it.updates == updates);
         learner.signal(Signal::SIGKILL);
         learner.wait();
+        system.hold_at(successor);
         learner = system.start_learner("run");
         let next = client.wait_for_learner("the successor", |it| it.weights_version > version);
         // A learner names a version when it hands it over: the last ones may not have left the one that was killed, and what
@@ -42,6 +44,7 @@ fn killed_learners_cost_no_update_of_the_plan() {
         assert!(replay.rows_unlearned > forgotten, "{replay:#?}");
         forgotten = replay.rows_unlearned;
     }
+    system.let_go();
     let learned = client.wait_for_learner("the last update", |it| it.finished);
     let replay = client.replay().unwrap();
     let planned = (replay.transitions_inserted - 200) * 8 / 16;

@@ -1,5 +1,6 @@
-//! A hidden fault for tests: with `DRIML_TEST_PANIC=NAME` in the environment, whoever comes to the point NAME panics.
-//! It exists in debug builds only; a release build reads no such variable.
+//! Hidden faults for tests: with `DRIML_TEST_PANIC=NAME` in the environment, whoever comes to the point NAME panics; with
+//! `DRIML_TEST_HOLD=UPDATES FILE` a learner that has made so many updates waits for the file.
+//! They exist in debug builds only; a release build reads no such variables.
 
 /// The variable that names the point at which to panic.
 pub const VARIABLE: &str = "DRIML_TEST_PANIC";
@@ -21,4 +22,32 @@ pub fn point(name: &str) {
     }
     #[cfg(not(debug_assertions))]
     let _ = name;
+}
+
+/// The variable that says after how many updates to wait, and for which file.
+pub const HOLD: &str = "DRIML_TEST_HOLD";
+
+/// Waits until the file exists that `DRIML_TEST_HOLD` names, if so many `updates` are made, in a debug build; else does nothing.
+///
+/// A run that is held is not over before the test that watches it has seen and done what it has to, however slow the test is.
+#[inline]
+pub fn hold(updates: u64) {
+    #[cfg(debug_assertions)]
+    {
+        use std::{path::Path, sync::OnceLock, time::Duration};
+
+        static WANTED: OnceLock<Option<(u64, String)>> = OnceLock::new();
+        let read = || {
+            let text = std::env::var(HOLD).ok()?;
+            let (count, file) = text.split_once(' ')?;
+            Some((count.parse().ok()?, file.to_owned()))
+        };
+        if let Some((count, file)) = WANTED.get_or_init(read) {
+            while updates >= *count && !Path::new(file).exists() {
+                std::thread::sleep(Duration::from_millis(10));
+            }
+        }
+    }
+    #[cfg(not(debug_assertions))]
+    let _ = updates;
 }
