@@ -14,6 +14,15 @@ pub(super) fn signed(it: &Difference) -> String {
     }
 }
 
+/// What a difference says.
+pub(super) fn verdict(difference: &Difference) -> &'static str {
+    match (difference.is_apart, difference.interval.mean > 0.0) {
+        (false, _) => "",
+        (true, true) => ", better than its base",
+        (true, false) => ", worse than its base",
+    }
+}
+
 /// A cell of a page, a dash if there is nothing.
 pub(super) fn cell<T>(value: Option<T>, text: impl Fn(T) -> String) -> String {
     value.map_or_else(|| "-".into(), text)
@@ -24,5 +33,26 @@ pub(super) fn table(header: &[&str], rows: Vec<Vec<String>>) -> Table {
     Table {
         header: header.iter().map(|&it| it.to_owned()).collect(),
         rows,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::statistics::difference;
+
+    #[test]
+    fn a_difference_is_put_into_words() {
+        let base = [0.0, 0.01, 0.02, 0.03];
+        let said = |values: &[f64]| {
+            let found = difference(&base, values).unwrap();
+            format!("{}{}", signed(&found), verdict(&found))
+        };
+        let better = said(&[1.0, 1.1, 1.2, 1.3]);
+        assert!(better.ends_with("], better than its base"), "{better}");
+        let worse = said(&[-1.0, -1.1, -1.2, -1.3]);
+        assert!(worse.ends_with("], worse than its base"), "{worse}");
+        assert!(said(&[-1.0, 1.0, 0.0]).ends_with(']'));
+        assert_eq!(said(&[1.0]), "+0.98 (one seed)");
     }
 }

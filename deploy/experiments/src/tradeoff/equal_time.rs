@@ -2,8 +2,7 @@
 //! Runs that ended alone are compared; the time is that at which those of the faster agent were done.
 
 use super::{
-    cells::{cell, signed, table},
-    page::verdict,
+    cells::{cell, signed, table, verdict},
     results::{PointResult, Results},
 };
 use crate::{

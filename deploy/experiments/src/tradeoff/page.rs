@@ -6,7 +6,7 @@ use anyhow::Context;
 use driml_machine::units::rough_duration;
 
 use super::{
-    cells::{cell, signed, table},
+    cells::{cell, signed, table, verdict},
     equal_time::{dim_table, equal_time},
     exactness,
     results::{LevelOf, Measure, PointResult, Results},
@@ -217,15 +217,6 @@ fn found(results: &Results, of: &LevelOf) -> String {
     )
 }
 
-/// What a difference says.
-pub(super) fn verdict(difference: &Difference) -> &'static str {
-    match (difference.is_apart, difference.interval.mean > 0.0) {
-        (false, _) => "",
-        (true, true) => ", better than its base",
-        (true, false) => ", worse than its base",
-    }
-}
-
 /// How many differences of the page's returns are judged, and how many of them would be called better or worse if no level changed
 /// anything and returns were normal.
 fn by_chance(results: &Results) -> (usize, f64) {
@@ -406,25 +397,4 @@ fn dials(results: &Results) -> Vec<String> {
         }
     }
     said
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::statistics::difference;
-
-    #[test]
-    fn a_difference_is_put_into_words() {
-        let base = [0.0, 0.01, 0.02, 0.03];
-        let said = |values: &[f64]| {
-            let found = difference(&base, values).unwrap();
-            format!("{}{}", signed(&found), verdict(&found))
-        };
-        let better = said(&[1.0, 1.1, 1.2, 1.3]);
-        assert!(better.ends_with("], better than its base"), "{better}");
-        let worse = said(&[-1.0, -1.1, -1.2, -1.3]);
-        assert!(worse.ends_with("], worse than its base"), "{worse}");
-        assert!(said(&[-1.0, 1.0, 0.0]).ends_with(']'));
-        assert_eq!(said(&[1.0]), "+0.98 (one seed)");
-    }
 }
