@@ -198,8 +198,8 @@ fn an_evaluation_can_be_kept_by_hand() {
 fn fewer_episodes_do_not_displace_the_best() {
     let system = with_run();
     let oldest = system.run_folder("run").checkpoints().remove(0);
-    let updates = oldest.display().to_string();
-    let updates = updates.rsplit('-').next().unwrap();
+    let name = oldest.display().to_string();
+    let updates = name.rsplit('-').next().unwrap().trim_start_matches('0');
     let keep = |flags: &str| {
         let ended = system.run(&format!("evaluate run --keep {flags}"));
         ended.expect_code(0).stdout
