@@ -356,7 +356,7 @@ fn parts_by_hand_go_on_when_the_server_is_started_again() {
 #[test]
 fn shards_come_back_each_by_itself() {
     let system = system();
-    let longer = SHORT.replace("--frames 1280", "--frames 12800");
+    let longer = SHORT.replace("--frames 1280", "--frames 6400");
     system.hold_at(2_000);
     let process = system.start(&format!(
         "local --durable --agent c51 {longer} --actors 2 --replay-shards 2 --run-dir run"

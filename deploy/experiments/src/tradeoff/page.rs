@@ -13,7 +13,7 @@ use super::{
 };
 use crate::{
     page::{Page, Table},
-    statistics::{Difference, Interval, Spread, apart_by_chance},
+    statistics::{Interval, Spread, apart_by_chance},
     template::Values,
 };
 
