@@ -101,6 +101,14 @@ pub(super) struct Report {
     pub(super) figures: Vec<Measurement>,
 }
 
+/// The figures as rows of three fields, which blanks part: value, unit, and all the rest of the line what was measured.
+fn rows(figures: &[Measurement]) -> String {
+    let rows = figures
+        .iter()
+        .map(|it| vec![table::number(it.value), it.unit.clone(), it.what.clone()]);
+    table::aligned(&rows.collect::<Vec<_>>(), &[0])
+}
+
 /// Prints the figures as a table, or writes them as the flags ask for.
 ///
 /// # Errors
@@ -111,11 +119,7 @@ pub(super) fn report(
     machine: MachineNote,
     flags: &BenchFlags,
 ) -> anyhow::Result<()> {
-    let rows = figures
-        .iter()
-        .map(|it| vec![it.what.clone(), table::number(it.value), it.unit.clone()]);
-    let table = table::aligned(&rows.collect::<Vec<_>>(), &[1]);
-    report_as(bench, figures, &table, machine, flags)
+    report_as(bench, figures, &rows(figures), machine, flags)
 }
 
 /// [`report`] with another table.
@@ -167,6 +171,30 @@ mod tests {
     #[test]
     fn the_load_is_described() {
         assert_eq!(load("6.60 5.35 4.10 3/200 1234"), Some(6.6));
+    }
+
+    #[test]
+    fn a_row_is_read_back_by_its_blanks() {
+        let figures = [
+            ("C51 + local-local DIM, 64x64x3", 5.25, "updates/s"),
+            ("32 rows: 1.20 GFLOP, arithmetic", 61_234.0, "GFLOP/s"),
+            ("learner", 0.5, "%"),
+        ]
+        .map(|(what, value, unit)| Measurement {
+            what: what.into(),
+            value,
+            unit: unit.into(),
+        });
+        let text = rows(&figures);
+        let read = text.lines().map(|line| {
+            let words: Vec<_> = line.split_whitespace().collect();
+            Measurement {
+                what: words[2..].join(" "),
+                value: words[0].parse().unwrap(),
+                unit: words[1].into(),
+            }
+        });
+        assert_eq!(read.collect::<Vec<_>>(), figures, "{text}");
     }
 
     #[test]
