@@ -16,7 +16,7 @@ use crate::heads::c51::expected_returns;
 use crate::heads::noise::HeadNoise;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::convolution::{Convolution, forward};
-use crate::kernels::images::{Images, PADDING, Pixels};
+use crate::kernels::images::{Images, Pixels};
 use crate::kernels::linear::relu_of;
 use crate::kernels::panels::{Matrix, Panels, Threads};
 use crate::kernels::precision::Precision;
@@ -227,23 +227,37 @@ impl<U: Unit> UnitWeights<U> {
         let count = values.len() * support.len() / self.head.bias.len();
         let mut maps = Buffer::<U::Element>::new(0);
         for (index, layer) in self.convolutions.iter().enumerate() {
-            let len = count * layer.shape.map_len();
-            let mut output = Buffer::<U::Element>::new(len + PADDING);
-            output[len..].fill(U::Element::default());
+            let mut output = Buffer::<U::Element>::new(count * layer.shape.map_len());
             let images = match index {
                 0 => Images::Pixels(Pixels::Bytes(frames)),
                 _ => Images::Maps(&maps),
             };
-            forward(unit, layer, images, &mut output[..len]);
+            forward(unit, layer, images, &mut output);
             maps = output;
         }
-        let hidden = self.fc.forward(unit, &maps, count);
+        let hidden = self
+            .fc
+            .forward(unit, &whole_steps(maps, self.fc.inputs), count);
         let stride = self.fc.bias.len().next_multiple_of(U::Element::DEPTH);
         let mut active = Buffer::<U::Element>::new(count * stride);
         activate(unit, &hidden, self.fc.bias.len(), &mut active);
         let logits = self.head.forward(unit, &active, count);
         expected_returns(&logits, support, values);
     }
+}
+
+/// Rows of `len` scalars as rows of whole steps.
+fn whole_steps<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> {
+    let stride = len.next_multiple_of(E::DEPTH);
+    if stride == len {
+        return rows;
+    }
+    let mut padded = Buffer::new(rows.len() / len * stride);
+    for (padded, row) in padded.chunks_exact_mut(stride).zip(rows.chunks_exact(len)) {
+        padded[..len].copy_from_slice(row);
+        padded[len..].fill(E::default());
+    }
+    padded
 }
 
 vectorized! {

@@ -112,9 +112,11 @@ pub(crate) fn forward<U: Unit, M: Element>(
     let shape = &layer.shape;
     let (out_width, out) = (shape.out_width(), shape.channels_out);
     let (mut room, mut row) = (Room::new(), Buffer::new(out_width * out));
+    // Where a run is odd, the last step of the last window reads one scalar further, times 0.
+    let len = (shape.image_len(), shape.run() % U::Element::DEPTH);
     for (index, maps) in maps.chunks_exact_mut(shape.map_len()).enumerate() {
         let left = Left {
-            values: images.image(unit, index, shape.image_len(), &mut room),
+            values: images.image(unit, index, len, &mut room),
             start: 0,
             row_stride: shape.shift(),
             step: U::Element::DEPTH,

@@ -29,15 +29,12 @@ impl Pixels<'_> {
     }
 }
 
-/// Scalars after the last image: where a run is odd, the last step of the last window reads one further, times 0.
-pub(crate) const PADDING: usize = 1;
-
 /// What a convolution reads.
 #[derive(Clone, Copy)]
 pub(crate) enum Images<'a, E> {
     /// Images that are not operands yet: each becomes one when its turn comes, and stays in the first cache meanwhile.
     Pixels(Pixels<'a>),
-    /// The maps of another layer, with `PADDING` after them.
+    /// The maps of another layer.
     Maps(&'a [E]),
 }
 
@@ -50,27 +47,29 @@ impl<E: Element> Images<'_, E> {
         }
     }
 
-    /// The image with this index, `len` scalars and `PADDING`, as an operand; `room` is for those that have to be made.
+    /// The image with this index as an operand, `len` scalars and `padding` zeros after them; `room` is for those that have to be made.
+    ///
+    /// What lies behind an image in memory is the next one, which is no padding: 0 times a NaN in it is NaN.
     pub(crate) fn image<'r, U: Unit<Element = E>>(
         &'r self,
         unit: U,
         index: usize,
-        len: usize,
+        (len, padding): (usize, usize),
         room: &'r mut Room<E>,
     ) -> &'r [E] {
         let range = index * len..(index + 1) * len;
-        match self {
-            Self::Maps(maps) => &maps[range.start..range.end + PADDING],
-            Self::Pixels(pixels) => {
-                let operand = room.of(len + PADDING);
-                operand[len..].fill(E::default());
-                match pixels {
-                    Pixels::Bytes(bytes) => store_bytes(unit, &bytes[range], operand),
-                    Pixels::Floats(floats) => store(unit, &floats[range], &mut operand[..len]),
-                }
-                operand
-            }
+        if let (Self::Maps(maps), 0) = (self, padding) {
+            return &maps[range];
         }
+        let operand = room.of(len + padding);
+        operand[len..].fill(E::default());
+        let image = &mut operand[..len];
+        match self {
+            Self::Maps(maps) => image.copy_from_slice(&maps[range]),
+            Self::Pixels(Pixels::Bytes(bytes)) => store_bytes(unit, &bytes[range], image),
+            Self::Pixels(Pixels::Floats(floats)) => store(unit, &floats[range], image),
+        }
+        operand
     }
 
     /// The image with this index as the operand of a sum over windows: each of its `len` scalars with the one `shift` further if
@@ -88,7 +87,7 @@ impl<E: Element> Images<'_, E> {
             store_steps_of_bytes(unit, &bytes[range], shift, steps);
             return steps;
         }
-        let image = &self.image(unit, index, len, single)[..len];
+        let image = self.image(unit, index, (len, 0), single);
         if E::DEPTH == 1 {
             return image;
         }

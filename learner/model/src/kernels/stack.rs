@@ -6,10 +6,10 @@ use rayon::prelude::*;
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::convolution::{ConvGradients, Convolution, backward, forward};
-use crate::kernels::images::{Images, PADDING, Pixels};
+use crate::kernels::images::{Images, Pixels};
 use crate::kernels::units::Unit;
 
-/// The maps of all layers but the last, one layer after the other, each with `PADDING`: what forward leaves to backward.
+/// The maps of all layers but the last, one layer after the other: what forward leaves to backward.
 pub(crate) type SavedActivations<E> = Buffer<E>;
 
 /// Scalars of all layers' parameters.
@@ -69,17 +69,14 @@ pub(crate) fn stack_forward<U: Unit>(
         unreachable!("a stack has at least one layer")
     };
     let count = maps.len() / last.shape.map_len();
-    let saved_len = inner
-        .iter()
-        .map(|layer| count * layer.shape.map_len() + PADDING);
+    let saved_len = inner.iter().map(|layer| count * layer.shape.map_len());
     let mut saved = Buffer::new(saved_len.sum());
     let mut input = Images::Pixels(images);
     let mut free = &mut saved[..];
     for layer in inner {
         let len = count * layer.shape.map_len();
-        let (output, rest) = std::mem::take(&mut free).split_at_mut(len + PADDING);
-        output[len..].fill(U::Element::default());
-        forward(unit, layer, input, &mut output[..len]);
+        let (output, rest) = std::mem::take(&mut free).split_at_mut(len);
+        forward(unit, layer, input, output);
         (input, free) = (Images::Maps(output), rest);
     }
     forward(unit, last, input, maps);
@@ -112,7 +109,7 @@ pub(crate) fn stack_backward<U: Unit>(
     for layer in rest.iter().rev() {
         let shape = &layer.shape;
         let input_len = count * shape.image_len();
-        let (earlier, input) = saved.split_at(saved.len() - input_len - PADDING);
+        let (earlier, input) = saved.split_at(saved.len() - input_len);
         saved = earlier;
         let mut grad_input = Buffer::zeros(input_len);
         let grads = ConvGradients::cut(&mut sums_left, shape, Some(&mut grad_input));
@@ -121,7 +118,7 @@ pub(crate) fn stack_backward<U: Unit>(
             (Some(output), Some(grad)) => backward(unit, layer, images, output, grad, grads),
             _ => backward(unit, layer, images, maps, grad_maps, grads),
         }
-        output = Some(&input[..input_len]);
+        output = Some(input);
         grad_output = Some(grad_input);
     }
     let images = Images::Pixels(images);

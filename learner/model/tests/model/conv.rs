@@ -280,6 +280,34 @@ fn nan_stays_nan() -> Result<()> {
 }
 
 #[test]
+fn a_nan_stays_in_its_image() -> Result<()> {
+    // Odd runs: the last step of a window reads one scalar beyond it.
+    let shapes = [([5, 3, 3, 3], 1), ([7, 5, 3, 3], 2), ([1, 7, 1, 1], 1)];
+    let rng = &mut rng(6);
+    let layers =
+        shapes.map(|(shape, stride)| (floats(&shape, rng), floats(&shape[..1], rng), stride));
+    let layers = layers
+        .each_ref()
+        .map(|(weight, bias, stride)| (weight, bias, *stride));
+    let good = floats(&[1, 9, 9, 3], rng);
+    let nan = good.ones_like()?.affine(0.0, f64::NAN)?;
+    for precision in Precision::ALL {
+        let alone = conv_stack(&good, &layers, precision)?;
+        let among = Tensor::cat(&[&nan, &good, &nan], 0)?;
+        let among = conv_stack(&among, &layers, precision)?;
+        let image = |index| among.narrow(0, index, 1).map(|image| values(&image));
+        assert_eq!(image(1)?, values(&alone), "{precision}");
+        for index in [0, 2] {
+            assert!(
+                image(index)?.iter().all(|value| value.is_nan()),
+                "{precision}"
+            );
+        }
+    }
+    Ok(())
+}
+
+#[test]
 fn shapes_that_do_not_match_are_errors() {
     let rng = &mut rng(4);
     let (images, weight, bias) = (

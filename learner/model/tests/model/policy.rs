@@ -70,11 +70,19 @@ fn it_agrees_with_the_network(config: ModelConfig) {
 /// An actor leaves states out in which chance decides: the others' values must not depend on it.
 #[test]
 fn a_state_has_the_same_values_in_any_company() {
-    let config = small();
-    let weights = parameters(&config, 3).to_safetensors(|_| true).unwrap();
+    // The last layer's maps are an even and an odd number of scalars.
+    let mut odd = small();
+    (odd.conv[2].out, odd.conv[2].kernel, odd.conv[2].stride) = (7, 3, 2);
+    for config in [small(), odd] {
+        has_the_same_values_in_any_company(&config);
+    }
+}
+
+fn has_the_same_values_in_any_company(config: &ModelConfig) {
+    let weights = parameters(config, 3).to_safetensors(|_| true).unwrap();
     let frames = bytes(70 * config.frame_len(), &mut rng(1));
     for precision in Precision::ALL {
-        let mut policy = PolicyNetwork::new(&config, &weights, precision).unwrap();
+        let mut policy = PolicyNetwork::new(config, &weights, precision).unwrap();
         let mut all = vec![0.0; 70 * 5];
         policy.q_values(&frames, &mut all).unwrap();
         for step in [2, 3, 7, 69] {
