@@ -50,12 +50,16 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         listen: Vec::new(),
         connect: args.connect,
     };
-    let session = session::open_as(
-        &endpoints,
+    let Some(session) = session::open_unless(
+        shutdown,
+        endpoints,
         &keys,
-        args.credentials.as_deref(),
+        args.credentials.as_ref(),
         session::SMALL_MESSAGE_BYTES_MAX,
-    )?;
+    )?
+    else {
+        return Ok(());
+    };
     let Some(hello) = join::hello(&session, &keys, shutdown)? else {
         return Ok(());
     };

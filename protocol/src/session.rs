@@ -1,7 +1,10 @@
 //! Opening a zenoh session that suits large, acknowledged messages, and the two ways to talk over it.
 //! It does not scout, gossip or mesh: one part listens, the others connect and redial.
 
-use std::time::Duration;
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use serde::{Deserialize, Serialize};
 use zenoh::{
@@ -14,6 +17,7 @@ use zenoh::{
 
 use crate::{
     messages::recovering::Recovering,
+    process::shutdown::Shutdown,
     reach::{self, Unreachable},
     tls::{self, Credentials, Role, TlsError},
     wire::{codec, error::CodecError, keys::Keys},
@@ -172,6 +176,30 @@ pub fn open_as(
         settings.push(("access_control", tls::rules(keys)));
     }
     open_with(endpoints, message_bytes_max, &settings)
+}
+
+/// [`open_as`] of a part that has to wait for its replay server; `None` if it is told to stop before.
+///
+/// # Errors
+/// As [`open_as`].
+pub fn open_unless(
+    shutdown: &Shutdown,
+    endpoints: Endpoints,
+    keys: &Keys,
+    credentials: Option<&Arc<Credentials>>,
+    message_bytes_max: usize,
+) -> Result<Option<Session>, SessionError> {
+    let (keys, credentials) = (keys.clone(), credentials.cloned());
+    let Endpoints { listen, connect } = endpoints.clone();
+    let open = move || open_as(&endpoints, &keys, credentials.as_deref(), message_bytes_max);
+    match shutdown.unless_set("connecting", open) {
+        Ok(opened) => opened.transpose(),
+        Err(e) => Err(SessionError::Open {
+            listen,
+            connect,
+            why: format!("starting a thread: {e}"),
+        }),
+    }
 }
 
 /// Whether an endpoint is reached over QUIC, with certificates.

@@ -97,7 +97,7 @@ fn a_panic_in_a_thread_of_several_parts_ends_the_run() {
     if skipped("a_panic_in_a_thread_of_several_parts_ends_the_run") {
         return;
     }
-    for point in ["signals", "reporter"] {
+    for point in ["signals", "reporter", "connecting"] {
         let ended = panicking(&system(), point, "");
         assert_eq!(ended.code, Some(1), "{point}: {ended:#?}");
         assert!(

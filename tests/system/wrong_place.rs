@@ -10,6 +10,7 @@ use std::{
 
 use driml_protocol::session::{self, Endpoints};
 use driml_tests::{Ended, TestSystem};
+use nix::sys::signal::Signal;
 
 use crate::system;
 
@@ -114,5 +115,27 @@ fn a_router_without_a_run_is_named_while_it_is_waited_for() {
             .run(&format!("{command} {endpoint}"))
             .expect_code(64)
             .expect_said("it is no replay server with the namespace \"driml\"");
+    }
+}
+
+/// Soon, and as one that plays or learns: with exit code 0.
+#[test]
+fn a_part_that_waits_for_its_server_ends_when_it_is_told_to() {
+    let system = system();
+    for command in [COMMANDS[0], COMMANDS[1]] {
+        for signal in [Signal::SIGINT, Signal::SIGTERM] {
+            // Nobody listens there.
+            let mut part = system.start(&format!("{command} {}", system.endpoint()));
+            part.wait_for_stderr("waiting for 10 s: nobody listens on ");
+            part.signal(signal);
+            part.wait().expect_code(0);
+            // Somebody does, and says nothing.
+            let (endpoint, listener) = listener();
+            let part = system.start(&format!("{command} {endpoint}"));
+            let connection = listener.accept().unwrap();
+            part.signal(signal);
+            part.wait().expect_code(0);
+            drop(connection);
+        }
     }
 }

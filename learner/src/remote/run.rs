@@ -59,7 +59,7 @@ pub struct RunArgs {
 /// A device that is not there, no replay server to join, settings that cannot work, an update that failed, a disk that refuses.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let credentials = args.credentials.as_deref();
+    let credentials = args.credentials.as_ref();
     let Some(shards) = Shards::join(&args.connect, &keys, credentials, shutdown)? else {
         return Ok(());
     };

@@ -1,7 +1,10 @@
 //! The replay's shards as the learner sees them: joining them all, and which rows of a batch come from which.
 //! It fetches nothing: `batch_source` does.
 
-use std::time::{Duration, Instant};
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use anyhow::{Context, ensure};
 use driml_protocol::{
@@ -39,7 +42,7 @@ impl Shards {
     pub(crate) fn join(
         connect: &[String],
         keys: &Keys,
-        credentials: Option<&Credentials>,
+        credentials: Option<&Arc<Credentials>>,
         shutdown: &Shutdown,
     ) -> anyhow::Result<Option<Self>> {
         let mut sessions = Vec::new();
@@ -49,8 +52,11 @@ impl Shards {
                 listen: Vec::new(),
                 connect: vec![endpoint.clone()],
             };
-            let session =
-                session::open_as(&endpoints, keys, credentials, session::MESSAGE_BYTES_MAX)?;
+            let max = session::MESSAGE_BYTES_MAX;
+            let opened = session::open_unless(shutdown, endpoints, keys, credentials, max)?;
+            let Some(session) = opened else {
+                return Ok(None);
+            };
             let Some(hello) = join::hello(&session, keys, shutdown)? else {
                 return Ok(None);
             };

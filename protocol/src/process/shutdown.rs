@@ -3,12 +3,18 @@
 
 use std::{
     ops::ControlFlow,
-    sync::{Arc, Condvar, Mutex},
+    sync::{Arc, Condvar, Mutex, mpsc},
     thread::JoinHandle,
     time::{Duration, Instant},
 };
 
-use super::end_signs::{self, EndSign};
+use super::{
+    end_signs::{self, EndSign},
+    fault,
+};
+
+/// How often it is looked whether the flag is raised, where something else is waited for too.
+const TICK: Duration = Duration::from_millis(50);
 
 /// A flag that is raised once and never lowered; clones share it.
 #[derive(Clone, Debug, Default)]
@@ -48,6 +54,32 @@ impl Shutdown {
             .0
             .lock()
             .expect("no thread panics while holding the flag")
+    }
+
+    /// What `work` gives, which runs on a thread of this `name`; `None` if the flag is raised before. Then nobody waits for the thread.
+    ///
+    /// # Errors
+    /// The operating system gave no thread.
+    pub fn unless_set<T: Send + 'static>(
+        &self,
+        name: &'static str,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> std::io::Result<Option<T>> {
+        let (tell, told) = mpsc::channel();
+        let thread = std::thread::Builder::new().name(name.into());
+        thread.spawn(move || {
+            fault::point(name);
+            // Nobody listens if the flag was raised meanwhile.
+            let _ = tell.send(work());
+        })?;
+        loop {
+            match told.recv_timeout(TICK) {
+                Ok(given) => return Ok(Some(given)),
+                // The thread ends without a word where it panics, and then the process ends.
+                Err(_) if self.is_set() => return Ok(None),
+                Err(_) => {}
+            }
+        }
     }
 
     /// A flag that is raised at the first sign that this process should end: a signal, or that nobody watches it any more. The
@@ -124,5 +156,19 @@ mod tests {
         shutdown.set();
         waiter.join().unwrap();
         assert!(shutdown.is_set());
+    }
+
+    #[test]
+    fn work_that_takes_too_long_is_left_when_the_flag_is_raised() {
+        let shutdown = Shutdown::default();
+        assert_eq!(shutdown.unless_set("work", || 5).unwrap(), Some(5));
+        let (until, released) = mpsc::channel::<()>();
+        let raised = shutdown.clone();
+        let work = move || {
+            raised.set();
+            released.recv()
+        };
+        assert_eq!(shutdown.unless_set("work", work).unwrap(), None);
+        drop(until);
     }
 }
