@@ -268,41 +268,30 @@ impl<M: Message> PendingReply<M> {
     ///
     /// # Errors
     /// As [`RunClient::ask`].
-    pub fn wait(self) -> Result<M, SessionError> {
-        let key = self.bytes.key().to_owned();
-        let bytes = self.bytes.wait()?;
-        decode(&key, &bytes, self.spec_hash)
+    pub fn wait(mut self) -> Result<M, SessionError> {
+        self.bytes.wait_for(|bytes| decode(bytes, self.spec_hash))
     }
 
     /// Waits for the reply, at most for `wait_max`; `None` if it has not come by then.
     ///
     /// # Errors
     /// As [`RunClient::ask`].
-    pub fn wait_within(&self, wait_max: Duration) -> Result<Option<M>, SessionError> {
-        let bytes = self.bytes.wait_within(wait_max)?;
-        bytes
-            .map(|bytes| decode(self.bytes.key(), &bytes, self.spec_hash))
-            .transpose()
+    pub fn wait_within(&mut self, wait_max: Duration) -> Result<Option<M>, SessionError> {
+        let read = |bytes: &ZBytes| decode(bytes, self.spec_hash);
+        self.bytes.wait_for_within(wait_max, read)
     }
 
     /// Waits for the reply and copies its payload into own memory of `pool`.
     ///
     /// # Errors
     /// As [`RunClient::ask`].
-    pub fn receive(self, pool: &BufferPool) -> Result<(M, Buffer), SessionError> {
-        let key = self.bytes.key().to_owned();
-        let bytes = self.bytes.wait()?;
-        codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))
-            .map_err(|why| SessionError::Unreadable { key, why })
+    pub fn receive(mut self, pool: &BufferPool) -> Result<(M, Buffer), SessionError> {
+        self.bytes.wait_for(|bytes| {
+            codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))
+        })
     }
 }
 
-fn decode<M: Message>(key: &str, bytes: &ZBytes, spec_hash: u64) -> Result<M, SessionError> {
-    match codec::decode(&bytes.to_bytes(), Some(spec_hash)) {
-        Ok((message, _)) => Ok(message),
-        Err(why) => Err(SessionError::Unreadable {
-            key: key.into(),
-            why,
-        }),
-    }
+fn decode<M: Message>(bytes: &ZBytes, spec_hash: u64) -> Result<M, CodecError> {
+    codec::decode(&bytes.to_bytes(), Some(spec_hash)).map(|(message, _)| message)
 }

@@ -82,17 +82,29 @@ pub fn hello(
 ) -> Result<Option<Hello>, JoinError> {
     let mut patience = Patience::begin();
     loop {
-        let (key, nothing) = (keys.of::<Hello>(), ZBytes::new());
-        match session::ask(session, &key, nothing, Hello::PRIORITY, TRY_MAX) {
-            Ok(answer) => {
-                return Ok(Some(codec::decode(&answer.to_bytes(), None)?.0));
-            }
+        match hello_within(session, keys, TRY_MAX) {
+            Ok(hello) => return Ok(Some(hello)),
+            Err(SessionError::Unreadable { why, .. }) => return Err(why.into()),
             Err(e) => patience.wait_after(e)?,
         }
         if shutdown.wait_timeout(PAUSE) {
             return Ok(None);
         }
     }
+}
+
+/// Asks the replay server once for the run's settings.
+///
+/// # Errors
+/// No answer within `wait_max`, or of another protocol version.
+pub fn hello_within(
+    session: &Session,
+    keys: &Keys,
+    wait_max: Duration,
+) -> Result<Hello, SessionError> {
+    let (key, nothing) = (keys.of::<Hello>(), ZBytes::new());
+    session::send(session, &key, nothing, Hello::PRIORITY, wait_max)?
+        .wait_for(|bytes| codec::decode(&bytes.to_bytes(), None).map(|(hello, _)| hello))
 }
 
 /// How long a part that joins waits for its replay server, and what it says meanwhile.

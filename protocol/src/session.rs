@@ -326,6 +326,8 @@ pub struct PendingBytes {
     key: String,
     timeout: Duration,
     replies: FifoChannelHandler<Reply>,
+    /// Why what has come so far is no answer.
+    failed: Option<SessionError>,
 }
 
 /// Sends one question; questions of one priority arrive in the order in which they were sent.
@@ -342,7 +344,8 @@ pub fn send(
     let replies = session
         .get(key)
         .payload(payload)
-        .target(QueryTarget::BestMatching)
+        // Whoever answers in the replay server's place, too: of one alone zenoh might choose that one.
+        .target(QueryTarget::All)
         .consolidation(ConsolidationMode::None)
         .congestion_control(CongestionControl::Block)
         .priority(priority)
@@ -356,46 +359,76 @@ pub fn send(
         key: key.into(),
         timeout,
         replies,
+        failed: None,
     })
 }
 
 impl PendingBytes {
-    /// Where it was asked.
-    pub(crate) fn key(&self) -> &str {
-        &self.key
-    }
-
     /// Waits for the one answer.
     ///
     /// # Errors
     /// Nobody there (at once), no answer in time, or the answerer's own error. All may be tried again.
-    pub fn wait(self) -> Result<ZBytes, SessionError> {
-        let reply = self.replies.recv().ok();
-        self.read(reply)
+    pub fn wait(mut self) -> Result<ZBytes, SessionError> {
+        self.wait_for(|bytes| Ok(bytes.clone()))
     }
 
-    /// Waits for the one answer, at most for `wait_max`; `None` if it has not come by then.
+    /// Waits for the one answer that `read` takes. Where there are no certificates others may answer too, what they like.
     ///
     /// # Errors
-    /// As [`PendingBytes::wait`].
-    pub fn wait_within(&self, wait_max: Duration) -> Result<Option<ZBytes>, SessionError> {
-        match self.replies.recv_timeout(wait_max) {
-            Ok(None) => Ok(None),
-            Ok(reply) => self.read(reply).map(Some),
-            Err(_) => self.read(None).map(Some),
+    /// As [`PendingBytes::wait`]; nothing that `read` takes.
+    pub(crate) fn wait_for<T>(
+        &mut self,
+        read: impl Fn(&ZBytes) -> Result<T, CodecError>,
+    ) -> Result<T, SessionError> {
+        loop {
+            let reply = self.replies.recv().ok();
+            if let Some(answer) = self.read(reply, &read)? {
+                return Ok(answer);
+            }
         }
     }
 
-    /// `reply` is none where nobody is there.
-    fn read(&self, reply: Option<Reply>) -> Result<ZBytes, SessionError> {
+    /// [`PendingBytes::wait_for`] at most for `wait_max`; `None` if it has not come by then.
+    ///
+    /// # Errors
+    /// As there.
+    pub(crate) fn wait_for_within<T>(
+        &mut self,
+        wait_max: Duration,
+        read: impl Fn(&ZBytes) -> Result<T, CodecError>,
+    ) -> Result<Option<T>, SessionError> {
+        let deadline = Instant::now() + wait_max;
+        loop {
+            let reply = match self.replies.recv_deadline(deadline) {
+                Ok(None) => return Ok(None),
+                Ok(reply) => reply,
+                Err(_) => None,
+            };
+            if let Some(answer) = self.read(reply, &read)? {
+                return Ok(Some(answer));
+            }
+        }
+    }
+
+    /// What `read` takes of a reply; `None` if there may be another. `reply` is none if there is not.
+    fn read<T>(
+        &mut self,
+        reply: Option<Reply>,
+        read: impl Fn(&ZBytes) -> Result<T, CodecError>,
+    ) -> Result<Option<T>, SessionError> {
         let key = || self.key.clone();
-        let reply = reply.ok_or_else(|| SessionError::Nobody { key: key() })?;
-        reply
-            .into_result()
-            .map(|it| it.payload().clone())
-            .map_err(|e| {
+        let Some(reply) = reply else {
+            let nobody = || SessionError::Nobody { key: key() };
+            return Err(self.failed.take().unwrap_or_else(nobody));
+        };
+        let failed = match reply.into_result() {
+            Ok(sample) => match read(sample.payload()) {
+                Ok(answer) => return Ok(Some(answer)),
+                Err(why) => SessionError::Unreadable { key: key(), why },
+            },
+            Err(e) => {
                 if let Ok((recovering, _)) = codec::decode(&e.payload().to_bytes(), None) {
-                    return SessionError::Recovering(recovering);
+                    return Err(SessionError::Recovering(recovering));
                 }
                 let why = e.payload().try_to_string().unwrap_or_default().into_owned();
                 match why.as_str() {
@@ -405,7 +438,10 @@ impl PendingBytes {
                     },
                     _ => SessionError::Zenoh { key: key(), why },
                 }
-            })
+            }
+        };
+        self.failed = Some(failed);
+        Ok(None)
     }
 }
 

@@ -1,7 +1,14 @@
 //! Well-formed lies: a second client that knows the run's hash and says of each kind of message what nobody would.
 //! Each is refused, counted, and logged at a bounded rate; the run goes on. Malformed messages are in `bad_messages`.
 
-use std::{fs, time::Duration};
+use std::{
+    fs,
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+    },
+    time::Duration,
+};
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Alive, BatchReply, BatchRequest, Chunk, ChunkHeader, Claim,
@@ -9,8 +16,8 @@ use driml_protocol::{
     PriorityPart, PriorityUpdate, ReplayStatus, RequestId, Tally, WeightsHeader, WeightsReply,
     WeightsRequest, WeightsUpload, WeightsVersion, codec, session,
 };
-use driml_tests::{Client, Process, TestSystem, new_learner};
-use zenoh::{Wait, qos::Priority};
+use driml_tests::{Client, Process, TestSystem, new_learner, wait_for};
+use zenoh::{Wait, qos::Priority, query::Query};
 
 use crate::{LONG, PRIORITISED, launched, system};
 
@@ -131,6 +138,30 @@ fn of_joining() {
         }
     }
     lied.goes_on();
+}
+
+/// Without certificates everybody may offer to answer what is the replay server's to answer.
+#[test]
+fn of_who_answers() {
+    let lied = lied();
+    let liar = lied.system.connect();
+    let asked = Arc::<AtomicUsize>::default();
+    let count = asked.clone();
+    let answer = move |query: Query| {
+        count.fetch_add(1, Ordering::Relaxed);
+        session::answer(&query, b"lies".to_vec().into());
+    };
+    let queryable = liar.session.declare_queryable("driml/**").complete(true);
+    let _lies = queryable.callback(answer).wait().unwrap();
+    let learned = || lied.client.learner().expect("it is there").updates;
+    let before = learned();
+    wait_for("200 lies, and the run beside them", || {
+        let is_learning = learned() > before + 200;
+        (is_learning && asked.load(Ordering::Relaxed) > 200).then_some(())
+    });
+    let log = fs::read_to_string(lied.system.path("run/logs/actor-0.log")).unwrap();
+    assert!(!log.contains("will be sent again"), "{log}");
+    lied.run.stop().expect_code(130);
 }
 
 /// More than a run may have, twice over; then one that is no stranger.

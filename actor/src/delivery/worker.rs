@@ -260,7 +260,7 @@ impl DeliveryWorker {
     /// The answer about the first chunk; none if the actor is to leave meanwhile, which the replay server does not know yet.
     fn wait_for_first(&mut self) -> Result<Option<InsertReply>, SessionError> {
         let first = &mut self.outgoing[0];
-        let Some(asked) = first.asked.take() else {
+        let Some(mut asked) = first.asked.take() else {
             unreachable!("the window has room for one");
         };
         loop {

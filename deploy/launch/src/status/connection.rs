@@ -5,13 +5,13 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{
-    CodecError, EpisodesReply, EpisodesRequest, Hello, Keyed, Keys, LearnerStatus, PartsStatus,
-    Recovering, ReplayStatus, RunClient, codec, reach,
+    CodecError, EpisodesReply, EpisodesRequest, Hello, Keys, LearnerStatus, PartsStatus,
+    Recovering, ReplayStatus, RunClient, join, reach,
     session::{self, Endpoints, SMALL_MESSAGE_BYTES_MAX, SessionError},
     tls::Credentials,
 };
 use driml_settings::config::RunConfig;
-use zenoh::{Wait, bytes::ZBytes};
+use zenoh::Wait;
 
 use super::{
     advice,
@@ -57,24 +57,16 @@ impl Connection {
             // Whoever only looks does not wait for somebody to come.
             reach::look(endpoint)?;
             let session = session::open_as(&reached, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
-            let nothing = ZBytes::new();
-            let hello = session::ask(
-                &session,
-                &keys.of::<Hello>(),
-                nothing,
-                Hello::PRIORITY,
-                ANSWER_MAX,
-            );
-            let (config_toml, after_updates) = match hello {
-                Ok(hello) => {
-                    let (hello, _) =
-                        codec::decode::<Hello>(&hello.to_bytes(), None).with_context(|| {
-                            format!("the greeting of the replay server on {endpoint}")
-                        })?;
-                    (
-                        hello.config_toml,
-                        hello.has_learner.then_some(hello.after_updates),
-                    )
+            let (config_toml, after_updates) = match join::hello_within(&session, &keys, ANSWER_MAX)
+            {
+                Ok(hello) => (
+                    hello.config_toml,
+                    hello.has_learner.then_some(hello.after_updates),
+                ),
+                Err(SessionError::Unreadable { why, .. }) => {
+                    return Err(why).with_context(|| {
+                        format!("the greeting of the replay server on {endpoint}")
+                    });
                 }
                 Err(SessionError::Recovering(Recovering {
                     config_toml: Some(config_toml),
