@@ -70,7 +70,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     }
     settings.set_world(args.world)?;
     if settings.transport.shared_memory && !hello.shared_memory {
-        tracing::info!("chunks go through sockets: the replay server cannot read shared memory");
+        tracing::info!(
+            "chunks go through sockets: the replay server takes none through shared memory"
+        );
         settings.transport.shared_memory = false;
     }
     let spec_hash = settings.spec.hash();

@@ -97,5 +97,5 @@ pub use sampling::{
     packed_batch::PackedBatch,
     rows::prioritised::{CHANCE_ERROR, PRIORITY_MIN, PriorityCounts},
 };
-pub use service::{RunArgs, run};
+pub use service::{RunArgs, run, shared_memory_bytes};
 pub use storage::frame_store::{PackedChunk, Packer};

@@ -34,6 +34,7 @@ mod resume;
 mod resume_fuzz;
 mod roles;
 mod several_machines;
+mod small_shared_memory;
 mod soak;
 mod status;
 mod successors;

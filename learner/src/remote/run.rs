@@ -76,12 +76,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         shared_memory: config.transport.shared_memory,
         unreachable_max: Duration::from_millis(config.learner.unreachable_max_ms),
     };
+    let batch = BatchHeader::of(&config.spec, rows).sampled_by(&config.sampling);
+    let each = shared_memory::process_bytes(batch.pool_bytes());
     if requests.shared_memory
-        && let Err(why) = shared_memory::check_lockable(
-            BatchHeader::of(&config.spec, rows)
-                .sampled_by(&config.sampling)
-                .pool_bytes(),
-        )
+        && let Err(why) = shared_memory::check_lockable(each * shards.sessions.len())
     {
         tracing::warn!("batches come through sockets, which is slower: {why}");
         requests.shared_memory = false;

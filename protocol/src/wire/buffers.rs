@@ -19,7 +19,7 @@ use zenoh::{
     },
 };
 
-use super::shared_memory::{self, FOLDER, Trust};
+use super::shared_memory::{self, METADATA_BYTES, Trust};
 
 /// Memory for the payload of a message. Clones have memory of their own.
 pub struct Buffer(Memory);
@@ -54,19 +54,12 @@ impl BufferPool {
     /// As [`BufferPool::new`], with shared memory for `count` pieces of `bytes` each; where the machine does not grant it,
     /// a warning says so and everything works without.
     pub fn shared(spare_max: usize, count: usize, bytes: usize) -> Self {
-        let shared = match provider(shared_memory::pool_bytes(count, bytes)) {
-            Ok(provider) => Some(Shared {
-                provider,
-                trust: Mutex::default(),
-            }),
-            Err(why) => {
-                tracing::warn!(
-                    "no shared memory, so messages go through sockets, which is slower: {why}; \
-                     --set transport.shared_memory=false asks for none"
-                );
-                None
-            }
-        };
+        let mut shared = None;
+        let asked = provider(shared_memory::pool_bytes(count, bytes));
+        shared_memory::is_granted(asked.map(|provider| {
+            let trust = Mutex::default();
+            shared = Some(Shared { provider, trust });
+        }));
         Self::with(spare_max, shared)
     }
 
@@ -138,20 +131,20 @@ impl Shared {
 }
 
 /// A pool of `bytes` bytes of shared memory, or why there is none.
+///
+/// zenoh makes its own part with the first piece, and panics where it cannot: so that piece is taken here, while there is room for
+/// it. All of it is locked in memory, so whoever fills the folder later takes nothing from this process.
 fn provider(bytes: usize) -> Result<ShmProvider<PosixShmProviderBackend>, String> {
-    // The system would grant more than there is, and kill the process that writes to it.
-    let free = nix::sys::statvfs::statvfs(FOLDER)
-        .map(|it| it.blocks_available().saturating_mul(it.fragment_size()))
-        .map_err(|e| format!("{FOLDER}: {e}"))?;
-    if free < bytes as u64 {
-        return Err(format!(
-            "{FOLDER} has {free} bytes free, {bytes} are needed (a container needs --shm-size)"
-        ));
-    }
-    shared_memory::check_lockable(bytes)?;
-    ShmProviderBuilder::default_backend(bytes)
-        .wait()
-        .map_err(|e| e.to_string())
+    let needed = shared_memory::process_bytes(bytes);
+    shared_memory::check_lockable(needed)?;
+    shared_memory::check_file_size(bytes.max(METADATA_BYTES))?;
+    shared_memory::take_room(needed, || {
+        let provider = ShmProviderBuilder::default_backend(bytes).wait();
+        let provider = provider.map_err(|e| e.to_string())?;
+        let first = provider.alloc(1).wait().map_err(|e| format!("{e:?}"))?;
+        drop(first);
+        Ok(provider)
+    })
 }
 
 impl Buffer {
@@ -258,6 +251,24 @@ mod tests {
         // One piece is kept: the first that came back.
         assert_eq!(pool.0.spare.lock().unwrap().len(), 1);
         assert_eq!(pool.take_own(3).len(), 3);
+    }
+
+    #[test]
+    fn zenoh_s_own_part_is_made_with_the_pool_and_is_as_long_as_reckoned() {
+        let pool = BufferPool::shared(1, 1, 1 << 12);
+        let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
+        let segments = maps.lines().filter(|line| line.ends_with(".zenoh"));
+        let lens = segments.map(|line| {
+            let (from, to) = line.split_once(' ').unwrap().0.split_once('-').unwrap();
+            let address = |hex| usize::from_str_radix(hex, 16).unwrap();
+            address(to) - address(from)
+        });
+        let lens: Vec<_> = lens.collect();
+        // Or this machine grants none.
+        assert!(
+            pool.0.shared.is_none() || lens.contains(&METADATA_BYTES),
+            "{lens:?}"
+        );
     }
 
     #[test]

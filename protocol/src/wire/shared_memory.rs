@@ -1,10 +1,28 @@
 //! When messages may go through shared memory: what the system grants a process, and whether what was sent so arrives.
 //! It moves no bytes.
 
-use nix::sys::resource::{Resource, getrlimit, setrlimit};
+use std::{
+    fs::File,
+    time::{Duration, Instant},
+};
+
+use nix::sys::{
+    resource::{Resource, getrlimit, setrlimit},
+    statvfs::statvfs,
+};
+
+use crate::process::lock_file;
 
 /// Where the operating system keeps memory that the processes of a host share.
 pub const FOLDER: &str = "/dev/shm";
+/// What zenoh itself keeps there for each process that makes shared memory: 32,768 headers of 32 bytes, and as many words of 8.
+pub const METADATA_BYTES: usize = 40 << 15;
+/// What zenoh keeps there for each session.
+pub const SESSION_BYTES: usize = 12 << 10;
+/// How long a process waits for others that look for room at the same time; each takes milliseconds.
+const OTHERS_MAX: Duration = Duration::from_secs(10);
+/// How often it looks whether they are done.
+const TICK: Duration = Duration::from_millis(2);
 /// After a message in shared memory was lost, how many go through the socket before shared memory is tried again.
 const AVOID_COUNT: u32 = 64;
 /// So many losses without a message that arrived between them, and shared memory is not tried again.
@@ -52,6 +70,86 @@ impl Trust {
 /// between pieces.
 pub const fn pool_bytes(count: usize, bytes: usize) -> usize {
     count.saturating_mul(bytes) / 4 * 5 + (1 << 16)
+}
+
+/// Bytes of [`FOLDER`] that a process takes which has a pool of so many.
+pub const fn process_bytes(pool: usize) -> usize {
+    pool.next_multiple_of(1 << 12) + METADATA_BYTES + SESSION_BYTES
+}
+
+/// Bytes that are free in [`FOLDER`].
+///
+/// # Errors
+/// It is not there; what the system says.
+pub fn free_bytes() -> Result<u64, String> {
+    statvfs(FOLDER)
+        .map(|it| it.blocks_available().saturating_mul(it.fragment_size()))
+        .map_err(|e| format!("{FOLDER}: {e}"))
+}
+
+/// Whether so many bytes are free in [`FOLDER`]. The system would grant more than there is, and kill the process that writes to it.
+///
+/// # Errors
+/// They are not; what to do, for a person.
+pub fn check_room(bytes: usize) -> Result<(), String> {
+    let free = free_bytes()?;
+    if free >= bytes as u64 {
+        return Ok(());
+    }
+    Err(format!(
+        "{FOLDER} has {:.1} MiB free, {:.1} MiB are needed: make it larger (`mount -o remount,size=1g {FOLDER}`, in a container \
+         --shm-size=1g)",
+        free as f64 / f64::from(1 << 20),
+        bytes as f64 / f64::from(1 << 20),
+    ))
+}
+
+/// Whether this process may make a file of so many bytes, as a piece of shared memory is one.
+///
+/// # Errors
+/// It may not; what to do, for a person.
+pub(super) fn check_file_size(bytes: usize) -> Result<(), String> {
+    match getrlimit(Resource::RLIMIT_FSIZE) {
+        Ok((most, _)) if most < bytes as u64 => Err(format!(
+            "this process may write files of {} KiB, {} KiB are needed: raise `ulimit -f`",
+            most >> 10,
+            bytes >> 10
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// Whether shared memory is granted; where it is not, a warning says why, and what that means.
+pub fn is_granted(asked: Result<(), String>) -> bool {
+    asked
+        .inspect_err(|why| {
+            tracing::warn!(
+                "no shared memory, so messages go through sockets, which is slower: {why}; \
+                 --set transport.shared_memory=false asks for none"
+            );
+        })
+        .is_ok()
+}
+
+/// Takes room in [`FOLDER`] by `take` if so many bytes are free there: of processes that look at the same time one after the other,
+/// so that all of them together take no more than there is.
+///
+/// # Errors
+/// There is too little, or what `take` says.
+pub(super) fn take_room<T>(
+    bytes: usize,
+    take: impl FnOnce() -> Result<T, String>,
+) -> Result<T, String> {
+    let folder = File::open(FOLDER).map_err(|e| format!("{FOLDER}: {e}"))?;
+    let started = Instant::now();
+    while matches!(lock_file::try_lock(&folder), Ok(false)) {
+        if started.elapsed() > OTHERS_MAX {
+            return Err(format!("{FOLDER} is locked by another process"));
+        }
+        std::thread::sleep(TICK);
+    }
+    check_room(bytes)?;
+    take()
 }
 
 /// Whether this process may lock `bytes` bytes, as zenoh does with the shared memory that it makes and that it reads.

@@ -10,7 +10,7 @@ use super::server::{Service, State};
 
 /// Lives of actors that may send through shared memory. What a reader has mapped stays mapped until it ends, also when whoever made
 /// it is gone (zenoh issue 2571): about 3 MiB and two descriptors a life. Later ones send through sockets.
-const SHARED_LIVES_MAX: u32 = 128;
+pub(super) const SHARED_LIVES_MAX: u32 = 128;
 
 impl Service {
     pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {

@@ -17,6 +17,7 @@ mod refused;
 mod run;
 mod run_args;
 mod server;
+mod shared_memory_bytes;
 mod status;
 mod timings;
 mod weights;
@@ -24,3 +25,4 @@ mod weights_store;
 
 pub use run::run;
 pub use run_args::RunArgs;
+pub use shared_memory_bytes::shared_memory_bytes;

@@ -9,7 +9,7 @@ use std::{
 
 use driml_protocol::{
     BatchHeader, BufferPool, Incoming, Keyed, Keys, POOL_BATCHES, QueryWorkers, Recovering,
-    Request, Responder, RunClient, RunSpec, Sampling, SeldomEach, Shutdown, TRANSITION_BYTES,
+    Request, Responder, RunClient, RunSpec, Sampling, SeldomEach, Shutdown,
     config::{Settings, TransportConfig},
     join_within,
     session::{self, Endpoints},
@@ -26,6 +26,7 @@ use super::{
     parked::{ParkedChunks, ParkedRequests},
     run_args::RunArgs,
     server::{Service, State},
+    shared_memory_bytes::shared_memory_bytes,
     timings::Timings,
 };
 use crate::{
@@ -64,15 +65,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let origin = Origin::find(&args, &spec, &config, batch_size)?;
     let transport: TransportConfig = settings.table("transport")?;
     let batch = BatchHeader::of(&spec, batch_size).sampled_by(&config.sampling);
-    let pool = if transport.shared_memory {
+    // Of the whole run: where it does not fit, all go through sockets.
+    let needed = shared_memory_bytes(&settings, 1)?;
+    let is_granted =
+        transport.shared_memory && shared_memory::is_granted(shared_memory::check_room(needed));
+    let pool = if is_granted {
         BufferPool::shared(SPARE_MAX, POOL_BATCHES, batch.payload_bytes())
     } else {
         BufferPool::new(SPARE_MAX)
     };
-    let reads_shared_memory = transport.shared_memory
-        && match shared_memory::check_lockable(
-            batch.pool_bytes() + chunk_pools_bytes(&settings, &spec)?,
-        ) {
+    let reads_shared_memory = is_granted
+        && match shared_memory::check_lockable(needed) {
             Ok(()) => true,
             Err(why) => {
                 tracing::warn!("chunks come through sockets, which is slower: {why}");
@@ -182,20 +185,6 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     }
     drop(state);
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
-}
-
-/// Bytes of shared memory that all actors of the run make for their chunks together, as far as the settings know of them.
-fn chunk_pools_bytes(settings: &Settings, spec: &RunSpec) -> anyhow::Result<usize> {
-    let actor = |key| anyhow::Ok(number(settings, "actor", key)? as usize);
-    let actors = number(settings, "local", "actors").unwrap_or(1) as usize;
-    let a_step = actor("envs")?;
-    // As actors reckon how long their chunks are.
-    let round_steps = actor("round_transitions_max").map(|it| it / (a_step * actors).max(1));
-    let steps = round_steps.unwrap_or(usize::MAX).max(1);
-    let steps = steps.min(actor("steps_per_chunk")?);
-    let chunk = a_step * steps * (spec.frame_bytes() + TRANSITION_BYTES);
-    let pool = shared_memory::pool_bytes(actor("chunks_in_flight_max")? + 1, chunk);
-    Ok(actors.saturating_mul(pool))
 }
 
 /// The threads that answer.

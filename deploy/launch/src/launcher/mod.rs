@@ -14,7 +14,8 @@ use driml_machine::{
     error::{Interrupted, Usage},
     units::duration,
 };
-use driml_protocol::{Keys, session};
+use driml_protocol::{Keys, config::Settings, session, shared_memory};
+use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
 use crate::{
@@ -101,8 +102,16 @@ pub fn run(
         config.updates(),
         resume_point,
     );
+    // What killed processes left is room again.
+    session::sweep_shared_memory();
+    let shared_memory = config.transport.shared_memory && {
+        let settings = Settings::parse(&config.to_toml())?;
+        let needed = shared_memory_bytes(&settings, config.replay.shards)?;
+        shared_memory::is_granted(shared_memory::check_room(needed))
+    };
     let mut launch = Launch {
         config,
+        shared_memory,
         run_dir,
         resume_point,
         servers,
@@ -119,7 +128,6 @@ pub fn run(
         statuses: None,
     };
 
-    session::sweep_shared_memory();
     let ran = launch.start_and_watch(&mut recorder);
     let ended = launch.end(&ran);
     session::sweep_shared_memory();
@@ -169,6 +177,8 @@ pub fn run(
 /// A run's processes and what is known of them.
 struct Launch<'a> {
     config: &'a RunConfig,
+    /// Whether chunks and batches go through shared memory: it is asked for, and there is enough for all processes.
+    shared_memory: bool,
     run_dir: &'a RunFolder,
     resume_point: ResumePoint,
     /// Names of the replay servers, one a shard, and where each listens.

@@ -149,6 +149,9 @@ impl Launch<'_> {
         if let Some(bug) = self.config.replay.reproduced_bug {
             args.extend(words(&["--reproduce-bug", bug.name()]));
         }
+        if self.config.transport.shared_memory && !self.shared_memory {
+            args.extend(words(&["--set", "transport.shared_memory=false"]));
+        }
         if self.config.local.durable {
             let folder = self.run_dir.replay().display().to_string();
             args.extend(words(&["--replay-dir", &folder]));

@@ -39,7 +39,7 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
         vectors(Vectors::this()),
         kernels(),
         memory(&machine),
-        shared_memory(free(Path::new(shared_memory::FOLDER))),
+        shared_memory(shared_memory::free_bytes()),
         locked_memory(lockable_bytes()),
         disk(runs),
     ]

@@ -1,0 +1,105 @@
+//! Shared memory of which there is too little, at the start or later: a run says so once, goes through sockets, and ends well.
+//! A small `/dev/shm` takes root's rights to mount; without them a line says what is skipped.
+
+use std::{
+    fs::{self, File},
+    io::Write,
+    process::Command,
+};
+
+use driml_tests::{Ended, skip};
+use nix::sys::signal::Signal;
+
+use crate::{LONG, SHORT, system};
+
+/// Words before a command that give it a `/dev/shm` of this size, for itself and its children; none, and a line that `test` is skipped, if
+/// that is not permitted.
+fn with_shared_memory(test: &str, size: &str) -> Option<Vec<String>> {
+    let mount = format!("mount -t tmpfs -o size={size} tmpfs /dev/shm && exec \"$0\" \"$@\"");
+    let words: Vec<String> = ["unshare", "-m", "sh", "-c", &mount]
+        .map(String::from)
+        .into();
+    let tried = Command::new(&words[0])
+        .args(&words[1..])
+        .arg("true")
+        .output();
+    match tried {
+        Ok(output) if output.status.success() => Some(words),
+        Ok(output) => {
+            skip(test, String::from_utf8_lossy(&output.stderr).trim());
+            None
+        }
+        Err(e) => {
+            skip(test, &format!("unshare: {e}"));
+            None
+        }
+    }
+}
+
+/// How often it was said that there is too little, or that what was sent so does not arrive.
+fn warnings(ended: &Ended) -> usize {
+    let lines = ended.stderr.lines();
+    lines.filter(|line| line.contains("shared memory")).count()
+}
+
+#[test]
+fn too_little_for_all_processes_is_said_once_and_sockets_serve() {
+    let test = "too_little_for_all_processes_is_said_once_and_sockets_serve";
+    // zenoh alone takes 1.3 MB of each process.
+    for (size, actors, enough) in [
+        ("512k", 2, false),
+        ("1m", 2, false),
+        ("2m", 2, false),
+        ("4m", 2, false),
+        ("9m", 8, false),
+        ("64m", 2, true),
+    ] {
+        let Some(words) = with_shared_memory(test, size) else {
+            return;
+        };
+        let system = system();
+        let run = format!("local --agent c51 {SHORT} --actors {actors} --run-dir run");
+        let ended = system.run_after(&words, &run).expect_code(0);
+        assert_eq!(warnings(&ended), usize::from(!enough), "{size}: {ended:#?}");
+        if !enough {
+            ended
+                .expect_said("no shared memory, so messages go through sockets, which is slower: /dev/shm has ")
+                .expect_said(" MiB are needed: make it larger")
+                .expect_said("--shm-size=1g")
+                .expect_said("--set transport.shared_memory=false asks for none");
+        }
+        system.run_folder("run").check_finished();
+    }
+}
+
+#[test]
+fn a_run_goes_on_when_others_fill_it_up() {
+    let Some(words) = with_shared_memory("a_run_goes_on_when_others_fill_it_up", "64m") else {
+        return;
+    };
+    let system = system();
+    let run = format!(
+        "local --agent c51 {LONG} --actors 2 --run-dir run --listen {}",
+        system.endpoint()
+    );
+    let mut process = driml_tests::Process::start(run.clone(), system.command_after(&words, &run));
+    let client = system.connect();
+    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    let mut filler = File::create(format!("/proc/{}/root/dev/shm/filler", process.pid())).unwrap();
+    while filler.write_all(&[0; 4096]).is_ok() {}
+    let then = client.learner().unwrap().updates;
+    client.wait_for_learner("more updates", |learner| learner.updates > then + 200);
+    // A process that starts now finds no room.
+    system.find_part("actor").signal(Signal::SIGKILL);
+    process.wait_for_stderr("is started again (1 of 16 times in a run)");
+    process.wait_for_stderr("no shared memory, so messages go through sockets");
+    client.wait_for_replay("both actors", |replay| replay.actors == 2);
+    let then = client.learner().unwrap().updates;
+    client.wait_for_learner("updates after that", |learner| learner.updates > then + 200);
+    drop(client);
+    process.signal(Signal::SIGINT);
+    let ended = process.wait().expect_code(130);
+    assert_eq!(warnings(&ended), 1, "{ended:#?}");
+    let log = fs::read_to_string(system.path("run/logs/replay-server.log")).unwrap();
+    assert!(!log.contains("panicked"), "{log}");
+}
