@@ -8,6 +8,9 @@ use driml_machine::error::{Usage, usage};
 /// The prefix of a run's keys unless it is told otherwise.
 pub const NAMESPACE: &str = "driml";
 
+/// The longest path of a unix socket, bytes: `sun_path` of `unix(7)`, whose last byte is 0.
+pub(crate) const SOCKET_PATH_MAX: usize = 107;
+
 /// What a person has said about who may connect.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Guard {
@@ -76,6 +79,11 @@ fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
             "{endpoint} needs certificates: add --tls-dir DIR, which deploy/certs.sh makes"
         )),
         Some(("tcp" | "quic", address)) if has_host(address) => Ok(()),
+        Some(("unixsock-stream", path)) if path.len() > SOCKET_PATH_MAX => Err(usage!(
+            "{endpoint}: the path of a unix socket has at most {SOCKET_PATH_MAX} bytes, and this one has {}: choose a shorter one, such \
+             as /tmp/driml.sock",
+            path.len()
+        )),
         Some(("unixsock-stream", path)) if !path.is_empty() => Ok(()),
         _ => Err(usage!(
             "{endpoint:?} is no endpoint: take tcp/HOST:PORT, quic/HOST:PORT or unixsock-stream/PATH"
@@ -97,6 +105,8 @@ fn is_open(endpoint: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::net::UnixListener;
+
     use super::*;
 
     fn listening(endpoint: &str, guard: Guard) -> Result<(), String> {
@@ -129,6 +139,24 @@ mod tests {
         ] {
             assert!(check_endpoints(&[bad.into()], false).is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    fn a_socket_s_path_is_short() {
+        let of_bytes = |bytes: usize| format!("unixsock-stream//{}", "x".repeat(bytes - 1));
+        assert!(check_endpoints(&[of_bytes(107)], false).is_ok());
+        let said = check_endpoints(&[of_bytes(108)], false).unwrap_err();
+        assert!(
+            said.to_string()
+                .contains("at most 107 bytes, and this one has 108"),
+            "{said}"
+        );
+        // As the system has it.
+        let folder = tempfile::tempdir_in("/tmp").unwrap();
+        let path = folder.path().display().to_string();
+        let path = |bytes: usize| format!("{path}/{}", "x".repeat(bytes - path.len() - 1));
+        assert!(UnixListener::bind(path(107)).is_ok());
+        assert!(UnixListener::bind(path(108)).is_err());
     }
 
     #[test]

@@ -9,14 +9,20 @@ use std::{
     fs::{self, File, Permissions},
     io,
     os::unix::fs::{MetadataExt, PermissionsExt},
-    path::Path,
+    path::{Path, PathBuf},
 };
 
 use anyhow::Context;
 use driml_protocol::lock_file;
 use nix::unistd::{dup2_stdin, geteuid};
 
+use crate::endpoint::SOCKET_PATH_MAX;
+
 const PREFIX: &str = "driml-run-";
+/// The longest name of a socket behind the folder for temporary files.
+const SOCKET: &str = "/driml-run-XXXXXX/replay-server-255.sock";
+/// Where the folder is if the one for temporary files has too long a name.
+const SHORT_PLACE: &str = "/tmp";
 /// The file whose lock says that the folder is used.
 const IN_USE: &str = "in-use";
 
@@ -33,9 +39,10 @@ impl Meeting {
     /// # Errors
     /// A file system that refuses.
     pub(crate) fn create() -> anyhow::Result<Self> {
-        let place = std::env::temp_dir();
+        let place = place_under(std::env::temp_dir());
         sweep(&place);
-        Self::create_in(&place).context("making a folder for the socket")
+        Self::create_in(&place)
+            .with_context(|| format!("making a folder for the socket in {}", place.display()))
     }
 
     fn create_in(place: &Path) -> io::Result<Self> {
@@ -75,11 +82,19 @@ impl Meeting {
     }
 }
 
+/// Where such folders are, beside other temporary files if these are in `folder`.
+fn place_under(folder: PathBuf) -> PathBuf {
+    match folder.as_os_str().len() + SOCKET.len() {
+        0..=SOCKET_PATH_MAX => folder,
+        _ => SHORT_PLACE.into(),
+    }
+}
+
 /// What a process does at its orderly end: uses no such folder any more, and sweeps, as its launcher may have been killed.
 pub fn leave() {
     let nothing = File::open("/dev/null").map_err(|e| e.to_string());
     match nothing.and_then(|nothing| dup2_stdin(nothing).map_err(|e| e.to_string())) {
-        Ok(()) => sweep(&std::env::temp_dir()),
+        Ok(()) => sweep(&place_under(std::env::temp_dir())),
         Err(e) => tracing::debug!("leaving the folder of the socket: {e}"),
     }
 }
@@ -114,6 +129,7 @@ pub(crate) fn is_used(path: &Path) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::endpoint::check_endpoints;
 
     fn folders(place: &Path) -> usize {
         fs::read_dir(place).unwrap().count()
@@ -146,6 +162,16 @@ mod tests {
         assert!(!is_used(&path), "it is gone");
         assert!(!path.exists());
         assert_eq!(folders(place.path()), 2);
+    }
+
+    #[test]
+    fn a_folder_whose_sockets_would_have_too_long_a_name_is_elsewhere() {
+        let name_of = |bytes: usize| PathBuf::from(format!("/{}", "x".repeat(bytes - 1)));
+        assert_eq!(place_under(name_of(67)), name_of(67));
+        assert_eq!(place_under(name_of(68)), Path::new("/tmp"));
+        let meeting = Meeting::create_in(&place_under(name_of(95))).unwrap();
+        let endpoint = meeting.endpoint("replay-server-255");
+        assert!(check_endpoints(&[endpoint], false).is_ok());
     }
 
     #[test]
