@@ -17,6 +17,7 @@ mod evaluate;
 mod failures;
 mod leftovers;
 mod lies;
+mod limits;
 mod local;
 mod lockstep;
 mod lost_batches;

@@ -34,6 +34,7 @@ pub mod live_view;
 pub mod lockstep;
 pub mod managed_process;
 pub mod meeting;
+pub mod open_files;
 pub mod panics;
 pub mod plan;
 pub mod process_log;

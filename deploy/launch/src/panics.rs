@@ -8,10 +8,13 @@ use std::{
     thread::ThreadId,
 };
 
+use driml_machine::limits;
+
 /// The thread that ends the process, once it has decided how.
 static ENDING: OnceLock<ThreadId> = OnceLock::new();
 
-/// Makes every panic say thread, place and message on stderr in one line, and then abort the process.
+/// Makes every panic say thread, place and message on stderr in one line, and then abort the process. That of a library says too what
+/// the system has nearly no more of: it may be why.
 ///
 /// The launcher shows that line and says which process it was; processes whose launcher aborts end in order.
 pub fn end_the_process() {
@@ -26,7 +29,11 @@ pub fn end_the_process() {
                 std::thread::park();
             }
         }
-        say(&line(panic, std::thread::current().name()));
+        let scarce = match panic.location() {
+            Some(place) if !is_ours(place.file()) => limits::scarce(),
+            _ => Vec::new(),
+        };
+        say(&line(panic, std::thread::current().name(), &scarce));
         let trace = Backtrace::capture();
         if trace.status() == BacktraceStatus::Captured {
             say(&trace.to_string());
@@ -49,7 +56,12 @@ fn say(text: &str) {
     let _ = nix::unistd::write(std::io::stderr(), format!("{text}\n").as_bytes());
 }
 
-fn line(panic: &PanicHookInfo<'_>, thread: Option<&str>) -> String {
+/// Whether a file is one of this program's own sources, whose names begin at the root of the repository.
+fn is_ours(file: &str) -> bool {
+    !file.starts_with('/')
+}
+
+fn line(panic: &PanicHookInfo<'_>, thread: Option<&str>, scarce: &[String]) -> String {
     let message = panic.payload();
     let message = message
         .downcast_ref::<&str>()
@@ -61,8 +73,15 @@ fn line(panic: &PanicHookInfo<'_>, thread: Option<&str>) -> String {
     let place = panic
         .location()
         .map_or(String::new(), |it| format!(" at {it}"));
+    let why = match scarce {
+        [] => "this is a fault of the program, which ends here".to_owned(),
+        scarce => format!(
+            "the program ends here, and the system is short of this: {}",
+            scarce.join("; ")
+        ),
+    };
     format!(
-        "error: the thread {} panicked{place}: {}; this is a fault of the program, which ends here",
+        "error: the thread {} panicked{place}: {}; {why}",
         thread.unwrap_or("without a name"),
         message.join("; ")
     )
@@ -71,11 +90,14 @@ fn line(panic: &PanicHookInfo<'_>, thread: Option<&str>) -> String {
 #[cfg(test)]
 mod tests {
     use std::{
+        fs::File,
         os::unix::process::ExitStatusExt,
         process::Command,
         sync::atomic::{AtomicBool, Ordering},
         time::{Duration, Instant},
     };
+
+    use zenoh::{Wait, shm::ShmProviderBuilder};
 
     use super::*;
 
@@ -118,5 +140,47 @@ mod tests {
         assert_eq!((status.code(), said), (Some(3), false));
         let (status, said) = child("goes on");
         assert_eq!((status.signal(), said), (Some(6), true));
+    }
+
+    #[test]
+    fn a_library_s_panic_names_what_was_scarce() {
+        if std::env::var(CHILD).is_ok() {
+            end_the_process();
+            let pool = ShmProviderBuilder::default_backend(1 << 12).wait().unwrap();
+            let open = || File::open("/dev/null").ok();
+            let _files: Vec<_> = std::iter::from_fn(open).collect();
+            // zenoh makes its own part with the first piece.
+            let _ = pool.alloc(1).wait();
+            std::process::exit(5);
+        }
+        let ended = Command::new("sh")
+            .args(["-c", "ulimit -n 60 && exec \"$0\" \"$@\""])
+            .arg(std::env::current_exe().unwrap())
+            .args([
+                "--exact",
+                "panics::tests::a_library_s_panic_names_what_was_scarce",
+            ])
+            .arg("--nocapture")
+            .env(CHILD, "")
+            .output()
+            .unwrap();
+        assert_eq!(ended.status.signal(), Some(6), "{ended:?}");
+        let stderr = String::from_utf8(ended.stderr).unwrap();
+        let line = stderr
+            .lines()
+            .find(|line| line.starts_with("error: "))
+            .unwrap();
+        assert!(line.contains("zenoh-shm"), "{line}");
+        let scarce = "; the program ends here, and the system is short of this: 60 of at most 60 files are open: raise the limit";
+        assert!(line.contains(scarce), "{line}");
+    }
+
+    #[test]
+    fn sources_of_this_program_are_told_from_others() {
+        assert!(is_ours(file!()));
+        assert!(!is_ours("/rustc/0/library/core/src/option.rs"));
+        assert!(!is_ours(
+            "/home/one/.cargo/registry/src/index/zenoh-shm-1.10.2/src/lib.rs"
+        ));
     }
 }

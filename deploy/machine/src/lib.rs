@@ -18,6 +18,7 @@ pub mod doctor;
 #[cfg(not(feature = "cuda"))]
 mod driml_cuda;
 pub mod error;
+pub mod limits;
 pub mod process_env;
 pub mod resources;
 pub mod units;

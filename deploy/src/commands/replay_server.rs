@@ -3,7 +3,10 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use driml_launch::endpoint::{check_endpoints, check_listening};
+use driml_launch::{
+    endpoint::{check_endpoints, check_listening},
+    open_files,
+};
 use driml_machine::{error::usage, resources::Machine};
 use driml_protocol::{TwoSteps, tls::Role};
 use driml_settings::flags::{self, RunFlags};
@@ -57,6 +60,7 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
     for note in &config.notes {
         tracing::warn!("{note}");
     }
+    open_files::warn_of_server(&config);
     let run = driml_replay_server::RunArgs {
         listen: args.listen,
         connect: args.connect,

@@ -45,6 +45,9 @@ pub fn listen(
         .build()?;
     let (mut interrupt, mut terminate, mut hangup) = {
         let _inside = runtime.enter();
+        // A file that may not grow any more (`ulimit -f`) is an error of whoever writes it, as a full disk is; left alone, this signal
+        // would end the process. Its handler stays.
+        drop(signal(SignalKind::from_raw(Number::SIGXFSZ as i32))?);
         (
             signal(SignalKind::interrupt())?,
             signal(SignalKind::terminate())?,

@@ -26,6 +26,7 @@ use crate::{
     interrupts::Interrupts,
     live_view::{Display, TEMPLATE, recovery, silence},
     meeting::Meeting,
+    open_files,
     processes::{Processes, Revived, stop},
     resume,
     run_folder::{Outcome, Recorded, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
@@ -72,6 +73,7 @@ pub fn run(
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
+    open_files::check_run(config)?;
     let servers = server_names(config.replay.shards);
     let names = process_names(config);
     let recorded = Recorded::of(config, names.clone());

@@ -1,0 +1,161 @@
+//! What the system grants a process: how many open files, and what of all that it grants is nearly used up.
+//! It ends nothing. A library's own words say what failed, and seldom of what there was too little.
+
+use std::fs;
+
+use driml_protocol::shared_memory::{self, FOLDER, METADATA_BYTES};
+use nix::{
+    errno::Errno,
+    sys::resource::{Resource, getrlimit, setrlimit},
+};
+
+use crate::resources::Machine;
+
+/// Open files that a library may want at once, to connect or to share memory: with fewer left, they are scarce.
+const FILES_SPARE: u64 = 8;
+/// Memory maps, likewise.
+const MAPS_SPARE: u64 = 64;
+/// Memory, likewise, bytes.
+const MEMORY_SPARE: u64 = 64 << 20;
+
+/// Open files that this process may have, once what may be raised is.
+pub fn open_files_max() -> u64 {
+    let Ok((soft, hard)) = getrlimit(Resource::RLIMIT_NOFILE) else {
+        return u64::MAX;
+    };
+    match setrlimit(Resource::RLIMIT_NOFILE, hard, hard) {
+        Ok(()) => hard,
+        Err(_) => soft,
+    }
+}
+
+/// Whether this process, or one that it starts, may have so many open files.
+///
+/// # Errors
+/// It may not; what to do, for a person.
+pub fn check_open_files(needed: u64, whose: &str) -> Result<(), String> {
+    let max = open_files_max();
+    if needed <= max {
+        return Ok(());
+    }
+    Err(format!(
+        "{whose} needs {needed} open files, and the system allows {max}: raise the limit (`ulimit -Hn`; a service needs \
+         LimitNOFILE={needed}, a container --ulimit nofile={needed}), or use fewer actors"
+    ))
+}
+
+/// What this process has nearly used up of what the system grants it, with how much there is and what to do.
+pub fn scarce() -> Vec<String> {
+    let all = [
+        open_files,
+        shared_memory,
+        locked_memory,
+        memory_maps,
+        memory,
+    ];
+    all.into_iter().filter_map(|look| look()).collect()
+}
+
+fn open_files() -> Option<String> {
+    let (max, _) = getrlimit(Resource::RLIMIT_NOFILE).ok()?;
+    let used = match fs::read_dir("/proc/self/fd") {
+        // This reading is one.
+        Ok(entries) => (entries.count() as u64).saturating_sub(1),
+        Err(e) if e.raw_os_error() == Some(Errno::EMFILE as i32) => max,
+        Err(_) => return None,
+    };
+    (used.saturating_add(FILES_SPARE) > max)
+        .then(|| format!("{used} of at most {max} files are open: raise the limit (`ulimit -n`)"))
+}
+
+fn shared_memory() -> Option<String> {
+    let free = shared_memory::free_bytes().ok()?;
+    (free < METADATA_BYTES as u64).then(|| {
+        format!(
+            "{free} bytes are free in {FOLDER}: make it larger (a container needs --shm-size), or --set transport.shared_memory=false"
+        )
+    })
+}
+
+fn locked_memory() -> Option<String> {
+    let max = shared_memory::lockable_bytes()?;
+    let locked = kib(&fs::read_to_string("/proc/self/status").ok()?, "VmLck:")? << 10;
+    (locked + METADATA_BYTES as u64 > max).then(|| {
+        format!(
+            "{} of at most {} KiB of memory are locked: raise the limit (`ulimit -l`), or --set transport.shared_memory=false",
+            locked >> 10,
+            max >> 10
+        )
+    })
+}
+
+fn memory_maps() -> Option<String> {
+    let max = fs::read_to_string("/proc/sys/vm/max_map_count").ok()?;
+    let max: u64 = max.trim().parse().ok()?;
+    let used = fs::read_to_string("/proc/self/maps").ok()?.lines().count() as u64;
+    (used + MAPS_SPARE > max)
+        .then(|| format!("{used} of at most {max} memory maps are used: raise vm.max_map_count"))
+}
+
+fn memory() -> Option<String> {
+    let free = Machine::this().memory_bytes;
+    (free < MEMORY_SPARE).then(|| format!("{} MiB of memory are free", free >> 20))
+}
+
+/// The number of KiB that stands behind `name` in one of the kernel's tables.
+fn kib(table: &str, name: &str) -> Option<u64> {
+    let line = table.lines().find_map(|line| line.strip_prefix(name))?;
+    line.trim().strip_suffix("kB")?.trim().parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{fs::File, os::unix::process::CommandExt, process::Command};
+
+    use super::*;
+
+    /// Set where this test is the process whose limit is low.
+    const CHILD: &str = "DRIML_TEST_OPEN_FILES";
+
+    #[test]
+    fn open_files_are_scarce_where_no_more_can_be_opened() {
+        if std::env::var(CHILD).is_ok() {
+            let max = open_files_max();
+            let open = || File::open("/dev/null").ok();
+            let files: Vec<_> = std::iter::from_fn(open).collect();
+            assert!((files.len() as u64) < max);
+            let said = open_files().unwrap();
+            drop(files);
+            assert_eq!(
+                said,
+                format!("{max} of at most {max} files are open: raise the limit (`ulimit -n`)")
+            );
+            assert_eq!(open_files(), None);
+            assert!(check_open_files(max, "this").is_ok());
+            let said = check_open_files(max + 1, "the launcher").unwrap_err();
+            let words = format!(
+                "the launcher needs {} open files, and the system allows {max}: ",
+                max + 1
+            );
+            assert!(said.starts_with(&words), "{said}");
+            return;
+        }
+        let name = "limits::tests::open_files_are_scarce_where_no_more_can_be_opened";
+        let ended = Command::new("sh")
+            .args(["-c", "ulimit -n 60 && exec \"$0\" \"$@\""])
+            .arg(std::env::current_exe().unwrap())
+            .args(["--exact", name])
+            .env(CHILD, "")
+            .process_group(0)
+            .output()
+            .unwrap();
+        assert!(ended.status.success(), "{ended:?}");
+    }
+
+    #[test]
+    fn what_is_locked_is_read_from_the_kernels_table() {
+        let status = "Name:\tdriml\nVmLck:\t    2048 kB\n";
+        assert_eq!(kib(status, "VmLck:"), Some(2048));
+        assert_eq!(kib("Name:\tdriml\n", "VmLck:"), None);
+    }
+}

@@ -1,0 +1,79 @@
+//! Limits of the system, on open files, sizes of files and names of sockets: a run is within them, or says before it starts that it
+//! cannot be. Memory that processes share is in `small_shared_memory`.
+
+use std::fs;
+
+use crate::{LONG, SHORT, system};
+
+/// Words before a command that set a limit of the shell's `ulimit`, for it and its children.
+fn limited(limit: &str) -> Vec<String> {
+    let limit = format!("ulimit {limit} && exec \"$0\" \"$@\"");
+    ["sh", "-c", &limit].map(String::from).into()
+}
+
+#[test]
+fn a_run_with_more_actors_than_files_may_be_open_does_not_start() {
+    let system = system();
+    let run = |actors| format!("local --agent c51 {SHORT} --actors {actors} --run-dir run");
+    system
+        .run_after(&limited("-n 60"), &run(20))
+        .expect_code(64)
+        .expect_said("the replay server of a run with 20 actors needs 128 open files, and the system allows 60: raise the limit");
+    assert!(!system.path("run").exists());
+    system.run_after(&limited("-n 60"), &run(2)).expect_code(0);
+    // What may be raised is.
+    let more = run(4).replace("--run-dir run", "--run-dir more");
+    system.run_after(&limited("-S -n 60"), &more).expect_code(0);
+}
+
+#[test]
+fn a_replay_server_warns_if_it_may_not_open_enough_files() {
+    let system = system();
+    let server = format!(
+        "replay-server --agent c51 {LONG} --actors 20 --listen {}",
+        system.endpoint()
+    );
+    let mut server = system.start_part_after(&limited("-n 60"), &server);
+    server.wait_for_stderr(
+        "a replay server for 20 actors needs 128 open files, and the system allows 60: ",
+    );
+    server.wait_for_stderr("replay server listens on ");
+    server.stop().expect_code(0);
+}
+
+#[test]
+fn a_file_that_may_not_grow_is_an_error_and_no_end() {
+    let system = system();
+    let server = format!(
+        "replay-server --agent c51 {LONG} --replay-dir replay --listen {}",
+        system.endpoint()
+    );
+    // Half a block of the system's is too little for a segment of shared memory, too.
+    let mut server = system.start_part_after(&limited("-f 64"), &server);
+    server.wait_for_stderr("replay server listens on ");
+    let (_learner, _actor) = (system.start_learner("run"), system.start_actor(0));
+    server.wait_for_stderr("cannot be written: File too large (os error 27)");
+    server.stop().expect_code(0);
+}
+
+#[test]
+fn a_temporary_folder_may_have_a_name_too_long_for_a_socket() {
+    let system = system();
+    let start = system.path("t");
+    let folder = format!(
+        "{}{}",
+        start.display(),
+        "t".repeat(95 - start.as_os_str().len())
+    );
+    fs::create_dir(&folder).unwrap();
+    let run = format!("local --agent c51 {SHORT} --run-dir run");
+    system
+        .start_with("TMPDIR", &folder, &run)
+        .wait()
+        .expect_code(0);
+    let endpoint = format!("unixsock-stream/{folder}/{}", "s".repeat(20));
+    system
+        .run(&format!("replay-server --agent c51 {SHORT} --listen {endpoint}"))
+        .expect_code(64)
+        .expect_said("the path of a unix socket has at most 107 bytes, and this one has 116: choose a shorter one");
+}
