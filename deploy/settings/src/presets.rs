@@ -41,7 +41,7 @@ pub struct Preset {
     layers: &'static [Layer],
     /// The worlds it is made for; none means all.
     families: &'static [&'static str],
-    /// Whether a run says what it gives up for speed, with its measured price.
+    /// Whether a run prints what it gives up for speed, with its measured price, in one line.
     pub(crate) is_priced: bool,
 }
 

@@ -145,10 +145,9 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
     if let Source::Layers(preset, ..) = source
         && preset.is_priced
     {
-        let given_up = presets::prices::given_up(preset.name, &table).into_iter();
         config
             .notes
-            .extend(given_up.map(|it| format!("{} gives up {it}", preset.name)));
+            .extend(presets::prices::note(preset.name, &table));
     }
     Ok(config)
 }

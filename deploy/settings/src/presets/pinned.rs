@@ -94,14 +94,14 @@ const PINNED: &[(&str, &[Pinned])] = &[
         ("learner.publish_as", r#""f32""#, "ours"),
     ]),
     ("variant/balanced", &[
-        ("actor.precision", r#""bf16""#, "prices.toml"),
+        ("actor.precision", r#""bf16""#, "prices.rs"),
         ("learner.precision", r#""f32""#, "ours"),
-        ("learner.publish_as", r#""f16""#, "prices.toml"),
+        ("learner.publish_as", r#""f16""#, "prices.rs"),
     ]),
     ("variant/fast", &[
-        ("actor.precision", r#""bf16""#, "prices.toml"),
-        ("learner.precision", r#""bf16""#, "prices.toml"),
-        ("learner.publish_as", r#""f16""#, "prices.toml"),
+        ("actor.precision", r#""bf16""#, "prices.rs"),
+        ("learner.precision", r#""bf16""#, "prices.rs"),
+        ("learner.publish_as", r#""f16""#, "prices.rs"),
     ]),
     ("world/mspacman", &[
         ("run.frame_stack", "4", "paper"),

@@ -1,152 +1,83 @@
-//! What a preset gives up for speed, with its measured gain and price: `presets/variant/prices.toml` and the figures of the experiments.
-//! A test holds that each setting in which such a preset differs from `exact` has its row. It measures nothing.
+//! What the presets `fast` and `balanced` change of `exact` for speed, and the largest price of each that was measured.
+//! A test compares the prices with the data in `deploy/experiments/results/tradeoff`.
 
-mod measured;
-
-use std::collections::BTreeMap;
-
-use serde::Deserialize;
 use toml::{Table, Value};
 
-use self::measured::{Measured, Number, Page};
-use crate::overrides::inline;
+/// Where the measurements are described.
+const MEASUREMENTS: &str = "deploy/experiments/results/tradeoff";
 
-const PRICES: &str = include_str!("../../presets/variant/prices.toml");
-
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct File {
-    price: Vec<Price>,
-    /// The settings that each preset gives up.
-    whole: BTreeMap<String, Vec<String>>,
-    together: Vec<Together>,
-}
-
-/// A setting that is faster and less exact.
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// A setting that is faster and less exact than that of `exact`.
 struct Price {
-    /// Its dotted path, which is the dial's name too.
-    setting: String,
-    value: String,
-    /// What `exact` has instead.
-    exact: String,
-    gain: Number,
-    error: Number,
+    /// Its dotted path, which is the dial's name in the data too.
+    setting: &'static str,
+    value: &'static str,
+    /// For the note.
+    name: &'static str,
+    /// The largest error that was measured, in percent.
+    percent: u32,
+    /// The price in words; {} is the percentage.
+    words: &'static str,
 }
 
-/// A dial whose levels are whole presets.
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Together {
-    dial: String,
-    text: String,
-}
-
-fn file() -> File {
-    toml::from_str(PRICES).unwrap_or_else(|e| {
-        panic!("presets/variant/prices.toml is built in, and a test reads it: {e}")
-    })
-}
+/// The most costly first.
+const PRICES: [Price; 3] = [
+    Price {
+        setting: "learner.precision",
+        value: "bf16",
+        name: "bf16 learner",
+        percent: 15,
+        words: "gradients off by up to {}%",
+    },
+    Price {
+        setting: "actor.precision",
+        value: "bf16",
+        name: "bf16 actors",
+        percent: 6,
+        words: "another greedy action in up to {}% of states",
+    },
+    Price {
+        setting: "learner.publish_as",
+        value: "f16",
+        name: "f16 weights",
+        percent: 1,
+        words: "another greedy action in up to {}% of states",
+    },
+];
 
 impl Price {
     fn is_paid(&self, settings: &Table) -> bool {
-        let (tables, key) = self.setting.rsplit_once('.').unwrap_or(("", &self.setting));
-        let inner = tables.split('.').filter(|name| !name.is_empty());
-        let inner = inner
-            .into_iter()
-            .try_fold(settings, |table, name| table.get(name)?.as_table());
-        let value: Option<&Value> = inner.and_then(|table| table.get(key));
-        value.is_some_and(|value| inline(value) == self.value)
-    }
-
-    fn line(&self, pages: &[Page]) -> String {
-        let Self {
-            setting,
-            value,
-            exact,
-            gain,
-            error,
-        } = self;
-        let measured: Vec<(&str, Measured<'_>)> = pages
-            .iter()
-            .filter_map(|page| Some((page.name, page.measured(setting, value)?)))
-            .collect();
-        let each = |text: &dyn Fn(&Measured<'_>) -> Option<String>| {
-            measured.iter().filter_map(|(_, it)| text(it)).collect()
-        };
-        let in_words = |number: &Number| {
-            let of_level = joined(each(&|it| it.level(number)));
-            let of_base = joined(each(&|it| it.base(number)));
-            let text = number.text.replace("{}", &of_level);
-            text.replace("{base}", &of_base)
-        };
-        format!(
-            "{setting} = {value} instead of {exact}. On {}. Gain: {}. Price: {}; training return {}.",
-            joined(
-                measured
-                    .iter()
-                    .map(|(name, _)| (*name).to_owned())
-                    .collect()
-            ),
-            in_words(gain),
-            in_words(error),
-            joined(each(&|it| it.training_return())),
-        )
-    }
-}
-
-/// "a, b and c".
-fn joined(mut items: Vec<String>) -> String {
-    match (items.pop(), items.is_empty()) {
-        (None, _) => String::new(),
-        (Some(only), true) => only,
-        (Some(last), false) => format!("{} and {last}", items.join(", ")),
-    }
-}
-
-impl Together {
-    /// What the preset `level` as a whole does; nothing if it was never run.
-    fn line(&self, level: &str, pages: &[Page]) -> Option<String> {
-        let each = pages.iter().filter_map(|page| {
-            let measured = page.measured(&self.dial, level)?;
-            let (learning, acting) = (measured.factor("rows_gain")?, measured.factor("act_gain")?);
-            Some(format!(
-                "{}: {learning} times the rows learned from a second, {acting} times the actions, training return {}",
-                page.name,
-                measured.training_return()?
-            ))
+        let value = self.setting.split_once('.').and_then(|(table, key)| {
+            let table = settings.get(table)?.as_table()?;
+            table.get(key).and_then(Value::as_str)
         });
-        let each: Vec<String> = each.collect();
-        (!each.is_empty()).then(|| format!("{}. {}.", self.text, each.join("; ")))
+        value == Some(self.value)
     }
 }
 
-/// What `settings`, by the preset of this name, give up: a line for each setting with its gain and its price, and what they do together
-/// where all of the preset's are as it has them.
-pub(crate) fn given_up(preset: &str, settings: &Table) -> Vec<String> {
-    let (file, pages) = (file(), measured::pages());
-    let mut paid = file.price;
-    paid.retain(|price| price.is_paid(settings));
-    let mut lines: Vec<String> = paid.iter().map(|price| price.line(&pages)).collect();
-    let is_paid = |setting: &String| paid.iter().any(|price| price.setting == *setting);
-    if file
-        .whole
-        .get(preset)
-        .is_some_and(|all| all.iter().all(is_paid))
-    {
-        let together = file.together.iter();
-        lines.extend(together.filter_map(|it| it.line(preset, &pages)));
-    }
-    lines
+/// One line about what `settings`, made by the preset of this name, give up; none if they give up nothing.
+pub(crate) fn note(preset: &str, settings: &Table) -> Option<String> {
+    let paid: Vec<_> = PRICES.iter().filter(|it| it.is_paid(settings)).collect();
+    let worst = paid.first()?;
+    let names: Vec<_> = paid.iter().map(|it| it.name).collect();
+    let price = worst.words.replace("{}", &worst.percent.to_string());
+    Some(format!(
+        "{preset}: {}; {price}, see {MEASUREMENTS}",
+        names.join(", ")
+    ))
 }
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use driml_envs::WorldName;
+    use expect_test::expect;
 
     use super::*;
-    use crate::presets::{AGENTS, layers, preset};
+    use crate::{
+        overrides::inline,
+        presets::{AGENTS, layers, preset},
+    };
 
     /// Dotted paths and values of everything that is not a table.
     fn leaves(table: &Table, path: &str, into: &mut Vec<(String, String)>) {
@@ -165,64 +96,64 @@ mod tests {
 
     #[test]
     fn every_setting_that_is_given_up_has_its_price() {
-        let File { price, whole, .. } = file();
         for world in WorldName::all() {
             for agent in 0..AGENTS.len() {
                 let mut exact = Vec::new();
                 leaves(&settings("exact", world, agent), "", &mut exact);
                 for name in ["fast", "balanced"] {
-                    let table = settings(name, world, agent);
                     let mut found = Vec::new();
-                    leaves(&table, "", &mut found);
+                    leaves(&settings(name, world, agent), "", &mut found);
                     found.retain(|leaf| !exact.contains(leaf));
-                    let mut paths: Vec<&String> = found.iter().map(|(path, _)| path).collect();
-                    let mut said: Vec<&String> = whole[name].iter().collect();
-                    paths.sort();
-                    said.sort();
-                    assert_eq!(paths, said, "{name} in {world}");
                     for (path, value) in &found {
-                        let row = price
+                        let has_price = PRICES
                             .iter()
-                            .find(|it| it.setting == *path && it.value == *value);
-                        let row =
-                            row.unwrap_or_else(|| panic!("{name}: {path} = {value} has no price"));
-                        let there = (path.clone(), row.exact.clone());
-                        assert!(exact.contains(&there), "{there:?} is not what exact has");
-                    }
-                    let given_up = given_up(name, &table);
-                    for path in paths {
-                        let of = format!("{path} = ");
-                        assert!(given_up.iter().any(|line| line.starts_with(&of)), "{of}");
+                            .any(|it| it.setting == path && it.value == value);
+                        assert!(has_price, "{name}: {path} = {value} has no price");
                     }
                 }
-                assert!(given_up("exact", &settings("exact", world, agent)).is_empty());
+                assert_eq!(note("exact", &settings("exact", world, agent)), None);
             }
         }
     }
 
     #[test]
-    fn every_price_is_measured_on_every_page() {
-        for price in file().price {
-            for page in measured::pages() {
-                let measured = page.measured(&price.setting, &price.value).unwrap();
-                for number in [&price.gain, &price.error] {
-                    assert!(number.text.contains("{}"), "{number:?}");
-                    assert!(measured.level(number).is_some() && measured.base(number).is_some());
-                }
-                assert!(measured.training_return().is_some(), "{}", page.name);
-            }
-        }
-    }
-
-    #[test]
-    fn a_preset_that_is_not_whole_says_nothing_of_the_whole() {
+    fn a_preset_has_one_line_with_one_number() {
         let mut table = settings("fast", "mspacman".parse().unwrap(), 0);
-        let together = |table: &Table| {
-            let lines = given_up("fast", table).into_iter();
-            lines.filter(|line| line.starts_with("all of it")).count()
-        };
-        assert!(together(&table) > 0);
+        let fast = note("fast", &table).unwrap();
+        expect!["fast: bf16 learner, bf16 actors, f16 weights; gradients off by up to 15%, see deploy/experiments/results/tradeoff"].assert_eq(&fast);
         table["learner"]["precision"] = "f32".into();
-        assert_eq!(together(&table), 0);
+        expect!["fast: bf16 actors, f16 weights; another greedy action in up to 6% of states, see deploy/experiments/results/tradeoff"].assert_eq(&note("fast", &table).unwrap());
+    }
+
+    #[test]
+    fn the_prices_are_the_largest_that_were_measured() {
+        let pages = [
+            include_str!("../../../experiments/results/tradeoff/mspacman/levels.csv"),
+            include_str!("../../../experiments/results/tradeoff/coinrun/levels.csv"),
+            include_str!("../../../experiments/results/tradeoff/fruitbot/levels.csv"),
+        ];
+        let rows: Vec<BTreeMap<String, String>> = pages
+            .iter()
+            .flat_map(|page| csv::Reader::from_reader(page.as_bytes()).into_deserialize())
+            .collect::<Result<_, _>>()
+            .unwrap();
+        let largest =
+            |dials: &[&str], levels: &[&str], error: fn(&BTreeMap<String, String>) -> f64| {
+                let is_of = |row: &&BTreeMap<String, String>| {
+                    dials.contains(&&*row["dial"]) && levels.contains(&&*row["level"])
+                };
+                (100.0 * rows.iter().filter(is_of).map(error).fold(0.0, f64::max)).ceil() as u32
+            };
+        let gradient =
+            |row: &BTreeMap<String, String>| row["gradient_error"].parse::<f64>().unwrap();
+        let action =
+            |row: &BTreeMap<String, String>| 1.0 - row["same_action_actor"].parse::<f64>().unwrap();
+        let [learner, actor, weights] = PRICES.map(|it| it.percent);
+        let presets = ["preset", "preset with DIM"];
+        let of_learner = [presets[0], presets[1], "learner.precision"];
+        assert_eq!(learner, largest(&of_learner, &["fast", "bf16"], gradient));
+        let of_actor = [presets[0], presets[1], "actor.precision"];
+        assert_eq!(actor, largest(&of_actor, &["balanced", "bf16"], action));
+        assert_eq!(weights, largest(&["learner.publish_as"], &["f16"], action));
     }
 }
