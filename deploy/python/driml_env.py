@@ -381,7 +381,13 @@ def parser():
 
 def main():
     args = parser().parse_args()
-    serve(lambda copies: Gymnasium(maker(args), copies, args.workers))
+    try:
+        serve(lambda copies: Gymnasium(maker(args), copies, args.workers))
+    except ModuleNotFoundError as missing:
+        package = {"gymnasium": "gymnasium", "numpy": "numpy", "ale_py": "ale-py"}.get(missing.name)
+        if not package:
+            raise
+        sys.exit(f"driml_env.py needs the package {package}: {sys.executable} -m pip install {package}")
 
 
 if __name__ == "__main__":

@@ -14,9 +14,13 @@ checkpoints of earlier versions, in the run's config.toml. Conventions: weights.
 import argparse
 import json
 import struct
+import sys
 from pathlib import Path
 
-import torch
+try:
+    import torch
+except ModuleNotFoundError:
+    sys.exit(f"driml_net.py needs the package torch: {sys.executable} -m pip install torch")
 from torch import nn
 from torch.nn import functional
 
@@ -204,7 +208,10 @@ def main():
     print(f"{sum(p.numel() for p in network.parameters())} parameters, states u8 {list(shape)}, {model['num_actions']} actions")
     print("values of a blank state:", " ".join(f"{value:.6f}" for value in values))
     if given.onnx:
-        export(network, described, given.onnx)
+        try:
+            export(network, described, given.onnx)
+        except ModuleNotFoundError as missing:
+            sys.exit(f"--onnx needs the package {missing.name}: {sys.executable} -m pip install onnx onnxscript")
         print(f"wrote {given.onnx}")
 
 

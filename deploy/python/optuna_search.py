@@ -9,9 +9,13 @@ that suit these seeds: judge the best anew with others, `driml grid --seeds`.
 import argparse
 import json
 import subprocess
+import sys
 from pathlib import Path
 
-import optuna
+try:
+    import optuna
+except ModuleNotFoundError:
+    sys.exit(f"optuna_search.py needs the package optuna: {sys.executable} -m pip install optuna")
 
 
 def suggest(trial):

@@ -7,10 +7,14 @@
 
 import argparse
 import csv
+import sys
 import tomllib
 from pathlib import Path
 
-import wandb
+try:
+    import wandb
+except ModuleNotFoundError:
+    sys.exit(f"wandb_offline.py needs the package wandb: {sys.executable} -m pip install wandb")
 
 
 def numbers(row):

@@ -1,7 +1,11 @@
 //! What others read of a run, with their own programs: `deploy/python` against the numbers that driml computes itself.
 //! Each test is skipped, by name, where no Python has what it needs.
 
-use std::fs;
+use std::{
+    fs,
+    io::Write,
+    process::{Command, Stdio},
+};
 
 use driml_envs::{CorridorWorld, IsingWorld, PacmanWorld, ProcgenWorld};
 use driml_learner::{Agent, Compute, checkpoint, insight::Insight};
@@ -192,5 +196,44 @@ fn optuna_searches() {
     search();
     for trial in ["trial0-seed1", "trial0-seed2", "trial1-seed2"] {
         assert!(out.join(trial).join("summary.json").exists(), "{trial}");
+    }
+}
+
+#[test]
+fn a_helper_without_its_package_says_which() {
+    let Some(python) = python_with("python::a_helper_without_its_package_says_which", &[]) else {
+        return;
+    };
+    for (script, args, package) in [
+        ("optuna_search.py", &[][..], "optuna"),
+        ("wandb_offline.py", &["run"], "wandb"),
+        ("driml_net.py", &["run"], "torch"),
+        ("driml_env.py", &["CartPole-v1"], "gymnasium"),
+    ] {
+        // Without `site` no installed package is found.
+        let mut command = Command::new(&python);
+        command.args([
+            "-S",
+            &root()
+                .join("deploy/python")
+                .join(script)
+                .display()
+                .to_string(),
+        ]);
+        command.args(args).env_remove("PYTHONPATH");
+        command.stdin(Stdio::piped()).stderr(Stdio::piped());
+        let mut process = command.spawn().unwrap();
+        let asks = b"{\"driml_env\": 1, \"copies\": 1}\n";
+        // One that does not get that far does not read it.
+        let _ = process.stdin.take().unwrap().write_all(asks);
+        let ended = process.wait_with_output().unwrap();
+        let said = String::from_utf8_lossy(&ended.stderr);
+        let names = format!("{script} needs the package {package}: ");
+        let install = format!("-m pip install {package}\n");
+        assert!(
+            said.starts_with(&names) && said.ends_with(&install),
+            "{said}"
+        );
+        assert_eq!(ended.status.code(), Some(1));
     }
 }
