@@ -23,8 +23,10 @@ pub struct Evaluation {
     pub steps_max: u64,
 }
 
-/// Returns of whole episodes of `policy` in `world`, in the order in which they ended; `rng` is for exploration alone. `watch` is
-/// shown every step and changes nothing.
+/// Is shown every step and the returns so far, and changes nothing.
+pub type Watch<'a> = &'a mut dyn FnMut(&Step<'_>, &[f64]);
+
+/// Returns of whole episodes of `policy` in `world`, in the order in which they ended; `rng` is for exploration alone.
 ///
 /// Each copy contributes the same number of episodes (the last round's surplus is dropped by copy order), so that short
 /// episodes are not favoured by being over first.
@@ -36,7 +38,7 @@ pub fn episode_returns(
     policy: &mut dyn Policy,
     evaluation: Evaluation,
     rng: ChaCha8Rng,
-    watch: &mut dyn FnMut(&Step<'_>),
+    watch: Watch<'_>,
 ) -> Result<Vec<f64>, ActError> {
     let Evaluation {
         frame_stack,
@@ -55,7 +57,6 @@ pub fn episode_returns(
             return Ok(returns);
         }
         let step = acting.step(policy, epsilon)?;
-        watch(&step);
         for copy in 0..envs {
             running[copy] += f64::from(step.rewards[copy]);
             if matches!(step.ends[copy], StepEnd::Terminal | StepEnd::TimedOut) {
@@ -66,6 +67,7 @@ pub fn episode_returns(
                 running[copy] = 0.0;
             }
         }
+        watch(&step, &returns);
     }
     if returns.len() < episodes {
         return Err(ActError::EndlessEpisodes {
@@ -157,9 +159,13 @@ mod tests {
             episodes,
             steps_max,
         };
-        let mut seen = 0;
-        let returns = episode_returns(world, &mut policy, evaluation, rng, &mut |_| seen += 1);
+        let (mut seen, mut shown) = (0, Vec::new());
+        let returns = episode_returns(world, &mut policy, evaluation, rng, &mut |_, returns| {
+            seen += 1;
+            shown = returns.to_vec();
+        });
         assert_eq!(seen, policy.0.len(), "every step is shown");
+        assert!(returns.as_ref().is_ok_and(|it| *it == shown) || returns.is_err());
         assert!(policy.0.iter().all(|&epsilon| epsilon == 0.25));
         returns
     }

@@ -79,7 +79,7 @@ pub use collect::{Collector, CollectorState, Incarnation};
 pub use config::{ActorSettings, Config, ConfigError, EpsilonLadder, SettingsError};
 pub use delivery::{Delivery, DeliveryError, DeliveryLimits};
 pub use error::ActError;
-pub use evaluate::{Evaluation, episode_returns};
+pub use evaluate::{Evaluation, Watch, episode_returns};
 pub use policy::{NetworkPolicy, Policy, RandomPolicy};
 pub use recorder::{ChunkNumbers, ChunkRecorder};
 pub use run::{RunArgs, run};

@@ -8,7 +8,7 @@ use std::{
 
 use anyhow::Context;
 use clap::ValueEnum;
-use driml_actor::{Evaluation, NetworkPolicy, Policy, RandomPolicy, Step, episode_returns};
+use driml_actor::{Evaluation, NetworkPolicy, Policy, RandomPolicy, Watch, episode_returns};
 use driml_envs::{CutFrames, FewerActions, WorldConfig};
 use driml_learner::{
     Agent, Compute, UpdateError, checkpoint,
@@ -168,7 +168,7 @@ impl Player {
         episodes: usize,
         seed: u64,
     ) -> anyhow::Result<Vec<f64>> {
-        self.play_watched(who, world, episodes, seed, &mut |_| ())
+        self.play_watched(who, world, episodes, seed, &mut |_, _| ())
     }
 
     /// [`Player::play`], with every step shown to `watch`, which changes nothing.
@@ -181,7 +181,7 @@ impl Player {
         world: &WorldConfig,
         episodes: usize,
         seed: u64,
-        watch: &mut dyn FnMut(&Step<'_>),
+        watch: Watch<'_>,
     ) -> anyhow::Result<Vec<f64>> {
         let mut policy: Box<dyn Policy> = match who {
             Who::Agent => Box::new(NetworkPolicy::new(
@@ -225,7 +225,7 @@ impl Player {
 pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow::Result<Vec<f64>> {
     let world = levels(&config.world, Levels::Train)?;
     let mut policy = random_policy(config)?;
-    play_with(config, &mut policy, &world, episodes, seed, &mut |_| ())
+    play_with(config, &mut policy, &world, episodes, seed, &mut |_, _| ())
 }
 
 fn random_policy(config: &RunConfig) -> anyhow::Result<RandomPolicy> {
@@ -238,7 +238,7 @@ fn play_with(
     world: &WorldConfig,
     episodes: usize,
     seed: u64,
-    watch: &mut dyn FnMut(&Step<'_>),
+    watch: Watch<'_>,
 ) -> anyhow::Result<Vec<f64>> {
     let spec = &config.run;
     let copies = Player::copies(episodes);

@@ -1,5 +1,6 @@
 //! `driml evaluate`: whole episodes with a run's newest checkpoint, and a random policy's beside them; a film of them on request.
 
+mod progress;
 mod recording;
 mod report;
 mod tile;
@@ -8,6 +9,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::Args;
+use driml_actor::Step;
 use driml_figure::Film;
 use driml_launch::{
     console::print,
@@ -18,7 +20,10 @@ use driml_launch::{
 use driml_machine::error::{EXIT_INTERRUPTED, usage};
 use driml_protocol::Shutdown;
 
-use self::recording::{RecordArgs, Recording};
+use self::{
+    progress::Progress,
+    recording::{RecordArgs, Recording},
+};
 
 #[derive(Debug, Args)]
 pub(crate) struct EvaluateArgs {
@@ -104,17 +109,21 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         player.config.actor.precision,
         args.seed
     ))?;
+    let episodes = args.episodes as usize;
+    let mut progress = Progress::new(&spec.agent, episodes);
     let returns = player.play_watched(
         Who::Agent,
         &world,
-        args.episodes as usize,
+        episodes,
         args.seed,
-        &mut |step| {
+        &mut |step, returns| {
+            progress.see(returns);
             if let Some(film) = &mut film {
                 film.see(step);
             }
         },
     );
+    drop(progress);
     let returns = match (returns, film) {
         (Ok(returns), None) => returns,
         (Ok(returns), Some(film)) => {
@@ -129,7 +138,10 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         }
     };
     said(&describe(&spec.agent, &returns))?;
-    let random = player.play(Who::Random, &world, args.episodes as usize, args.seed)?;
+    let mut progress = Progress::new("random", episodes);
+    let see = &mut |_: &Step<'_>, returns: &[f64]| progress.see(returns);
+    let random = player.play_watched(Who::Random, &world, episodes, args.seed, see)?;
+    drop(progress);
     said(&describe("random", &random))?;
     let played = [(spec.agent.as_str(), returns), ("random", random)];
     if let Some(table) = &mut table {
