@@ -157,3 +157,24 @@ fn what_cannot_be_resumed() {
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
     refused("local --resume run --frames 2000", "there is no checkpoint");
 }
+
+#[test]
+fn a_damaged_checkpoint_is_reported_once() {
+    let system = system();
+    system
+        .run(&format!("local --agent c51 {SHORT} --run-dir run"))
+        .expect_code(0);
+    let newest = system.run_folder("run").checkpoints().pop().unwrap();
+    fs::write(newest.join("online.safetensors"), "").unwrap();
+    let ended = system
+        .run("local --resume run --frames 2000")
+        .expect_code(1);
+    let times = |words: &str| ended.stderr.matches(words).count();
+    assert_eq!(
+        times("online.safetensors is damaged"),
+        1,
+        "{}",
+        ended.stderr
+    );
+    assert_eq!(times("goes on with it"), 0, "{}", ended.stderr);
+}

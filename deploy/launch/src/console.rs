@@ -2,8 +2,11 @@
 //! A terminal or pipe that is gone takes nothing and is no error here; `driml_protocol::end_signs` notices it.
 
 use std::{
+    collections::BTreeMap,
     fmt,
     io::{self, ErrorKind, IsTerminal, Write, stderr},
+    sync::{Arc, Mutex, MutexGuard},
+    time::{Duration, Instant},
 };
 
 use anyhow::Context as _;
@@ -59,6 +62,24 @@ pub fn describe(error: &anyhow::Error) -> String {
         }
     }
     text
+}
+
+/// Lines of the form `WHAT are lost: WHY`, those of the same cause in one.
+pub(crate) fn join_losses(lines: impl IntoIterator<Item = String>) -> Vec<String> {
+    const LOST: &str = " are lost: ";
+    let (mut by_cause, mut others) = (BTreeMap::<_, Vec<_>>::new(), Vec::new());
+    for line in lines {
+        match line.split_once(LOST) {
+            Some((what, why)) => by_cause
+                .entry(why.to_owned())
+                .or_default()
+                .push(what.to_owned()),
+            None => others.push(line),
+        }
+    }
+    let joined = by_cause.iter();
+    others.extend(joined.map(|(why, what)| format!("{}{LOST}{why}", what.join(", "))));
+    others
 }
 
 /// What is logged of zenoh and quinn, whatever is logged of driml.
@@ -154,10 +175,40 @@ fn text(event: &Event<'_>) -> String {
     text.0
 }
 
+/// How long one line about a full disk stands for those of all processes and files.
+const FULL_DISK_PERIOD: Duration = Duration::from_secs(600);
+
 /// Where messages go: stderr, above a progress bar if stderr is a terminal. Clones share the bar.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Screen {
     bar: Option<ProgressBar>,
+    full_disk: Arc<Mutex<FullDisk>>,
+}
+
+/// When a full disk was last reported, and how many lines about it were left out since.
+#[derive(Debug, Default)]
+struct FullDisk {
+    said: Option<Instant>,
+    left_out: u64,
+}
+
+impl FullDisk {
+    /// Whether a line is to be written.
+    fn is_due(&mut self, text: &str, now: Instant) -> bool {
+        let is_about_it = ["No space left on device", "Disk quota exceeded"]
+            .iter()
+            .any(|it| text.contains(it));
+        let is_fresh = |said| now.saturating_duration_since(said) < FULL_DISK_PERIOD;
+        if !is_about_it {
+            return true;
+        }
+        if self.said.is_some_and(is_fresh) {
+            self.left_out += 1;
+            return false;
+        }
+        self.said = Some(now);
+        true
+    }
 }
 
 impl Screen {
@@ -176,12 +227,15 @@ impl Screen {
             bar.set_style(style.expect("the template is a constant, and a test makes one"));
             bar
         });
-        Self { bar }
+        Self {
+            bar,
+            ..Self::default()
+        }
     }
 
     /// Without a progress bar.
-    pub const fn plain() -> Self {
-        Self { bar: None }
+    pub fn plain() -> Self {
+        Self::default()
     }
 
     /// The progress bar, if there is one.
@@ -189,8 +243,16 @@ impl Screen {
         self.bar.as_ref()
     }
 
-    /// Writes one line.
+    fn full_disk(&self) -> MutexGuard<'_, FullDisk> {
+        let full_disk = self.full_disk.lock();
+        full_disk.expect("a panic has ended the process")
+    }
+
+    /// Writes one line. Of many about a full disk the first stands for all.
     pub fn line(&self, text: &str) {
+        if !self.full_disk().is_due(text, Instant::now()) {
+            return;
+        }
         match &self.bar {
             Some(bar) => bar.suspend(|| line(text)),
             None => line(text),
@@ -201,6 +263,10 @@ impl Screen {
     pub fn clear(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
+        }
+        let more = std::mem::take(&mut self.full_disk().left_out);
+        if more > 0 {
+            line(&format!("and {more} more about the full disk"));
         }
     }
 }
@@ -320,6 +386,25 @@ mod tests {
         for raw in ["off", "debug,zenoh=info", "driml_actor=trace"] {
             assert_eq!(wanted_filter(raw), raw);
         }
+    }
+
+    #[test]
+    fn a_full_disk_is_one_line() {
+        let (mut full, start) = (FullDisk::default(), Instant::now());
+        let mut is_due = |text, seconds| full.is_due(text, start + Duration::from_secs(seconds));
+        assert!(is_due("a.csv: No space left on device (os error 28)", 0));
+        assert!(!is_due("b.csv: No space left on device (os error 28)", 1));
+        assert!(is_due("learner is gone", 1));
+        assert!(is_due("a.csv: No space left on device (os error 28)", 601));
+        assert_eq!(full.left_out, 1);
+
+        let lost = [
+            "2 rows of a are lost: full",
+            "x",
+            "1 rows of b are lost: full",
+        ];
+        let joined = join_losses(lost.map(str::to_owned));
+        assert_eq!(joined, ["x", "2 rows of a, 1 rows of b are lost: full"]);
     }
 
     #[test]

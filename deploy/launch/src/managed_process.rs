@@ -191,12 +191,11 @@ impl ManagedProcess {
                 (None, None) => "ended".into(),
             },
         };
-        let tail = self.log.tail();
-        let lines: String = tail.iter().map(|line| format!("\n  {line}")).collect();
-        let last = if lines.is_empty() {
-            String::new()
-        } else {
-            format!("; its last lines:{lines}")
+        let last = match (self.log.error(), self.log.tail()) {
+            // It says all.
+            (Some(error), _) => format!(": {error}"),
+            (None, tail) if tail.is_empty() => String::new(),
+            (None, tail) => format!("; its last lines:\n  {}", tail.join("\n  ")),
         };
         format!(
             "{} {how} (log: {}){last}",

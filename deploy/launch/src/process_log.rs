@@ -32,6 +32,8 @@ pub(crate) struct ProcessLog {
 struct Kept {
     file: File,
     tail: VecDeque<String>,
+    /// What the process says that it ended by.
+    error: Option<String>,
     /// Lines that could not be written.
     lost: u64,
     /// The first error.
@@ -50,6 +52,7 @@ impl ProcessLog {
         let kept = Kept {
             file,
             tail: VecDeque::new(),
+            error: None,
             lost: 0,
             failed: None,
         };
@@ -102,6 +105,11 @@ impl ProcessLog {
         lock(&self.kept).tail.iter().cloned().collect()
     }
 
+    /// The error with which the process ended, if it said one.
+    pub(crate) fn error(&self) -> Option<String> {
+        lock(&self.kept).error.clone()
+    }
+
     /// How many lines could not be written, and why; none if all were.
     pub(crate) fn missing(&self) -> Option<String> {
         let kept = lock(&self.kept);
@@ -132,6 +140,9 @@ impl Kept {
         if self.tail.len() == TAIL_LINES_MAX {
             self.tail.pop_front();
         }
+        if let Some(error) = line.strip_prefix("error: ") {
+            self.error = Some(error.into());
+        }
         self.tail.push_back(line);
         let error = written.err()?;
         self.lost += 1;
@@ -141,10 +152,11 @@ impl Kept {
     }
 }
 
-/// Whether a log line is a warning or worse: the level is the second word, after the time.
+/// Whether a log line is a warning or worse: the level is the second word, after the time. The `error:` with which a process ends is
+/// in its exit report.
 fn is_warning(line: &str) -> bool {
     let level = line.split_whitespace().nth(1);
-    matches!(level, Some("WARN" | "ERROR")) || line.starts_with("error:")
+    matches!(level, Some("WARN" | "ERROR"))
 }
 
 #[cfg(test)]
@@ -157,7 +169,7 @@ mod tests {
             "2026-01-01T00:00:00.1Z  WARN driml_actor: weights were refused"
         ));
         assert!(is_warning("2026-01-01T00:00:00.1Z ERROR driml_actor: gone"));
-        assert!(is_warning("error: nobody answers"));
+        assert!(!is_warning("error: it is in the exit report"));
         assert!(!is_warning(
             "2026-01-01T00:00:00.1Z  INFO driml_actor: ERROR is a word here"
         ));

@@ -152,12 +152,16 @@ pub fn run(
             tracing::debug!("removing {}: {e}", path.display());
         }
     }
-    if let Err(failed) = ran.and(ended) {
+    // A run that was resumed and learned nothing most likely failed because of what it was resumed from.
+    let has_learned = resumed.is_none() || summary.updates > resume_point.updates;
+    if let Err(failed) = ended {
         // It is what the run is remembered by; that the disk is full too is said before.
         if let Err(e) = written {
             console::line(&console::describe(&e));
         }
-        resume::say_how(&config.world, run_dir);
+        if has_learned {
+            resume::say_how(&config.world, run_dir);
+        }
         return Err(failed);
     }
     print(&summary.describe(run_dir))?;
@@ -417,8 +421,8 @@ impl Launch<'_> {
         };
         recorder.record(shards, &learner, &[]);
         let logs = self.processes.missing_log_lines();
-        let missing = recorder.missing().into_iter().chain(logs);
-        missing.for_each(|line| console::line(&line));
+        let missing = console::join_losses(recorder.missing().into_iter().chain(logs));
+        missing.iter().for_each(|line| console::line(line));
         let mut summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);
         summary.replay_servers_restarted = self.restarts;
         summary.actors_restarted = self.actor_restarts;

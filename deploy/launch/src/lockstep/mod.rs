@@ -122,7 +122,7 @@ pub fn run(
     let status = &status.clone();
     hear_episodes(&mut recorder, &mut episodes, &mut lockstep, &replay);
     recorder.record(std::slice::from_ref(&replay), status, &[]);
-    let missing = recorder.missing();
+    let missing = console::join_losses(recorder.missing());
     missing.iter().for_each(|line| console::line(line));
     let summary = recorder.summarise(outcome, &config.run, &replay, status);
     print(&summary.describe(run_dir))?;
