@@ -34,9 +34,10 @@ const LOOK: Duration = Duration::from_millis(250);
 /// progress.
 pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
     let saved = checkpoint::list(&folder.checkpoints()).unwrap_or_default();
-    saved
-        .last()
-        .is_some_and(|(_, newest)| world.is_resumable() || is_in_lockstep(newest).unwrap_or(false))
+    folder.config().exists()
+        && saved.last().is_some_and(|(_, newest)| {
+            world.is_resumable() || is_in_lockstep(newest).unwrap_or(false)
+        })
 }
 
 /// Whether a checkpoint is of a run in lockstep, and holds all its parts.

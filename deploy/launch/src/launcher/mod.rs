@@ -258,6 +258,7 @@ impl Launch<'_> {
             if self.interrupts.wait_timeout(POLL) > 0 {
                 return Ok(Outcome::Interrupted);
             }
+            self.run_dir.check_whole()?;
             self.revive_servers()?;
             self.revive_actors()?;
             self.processes.check_alive(self.revived())?;

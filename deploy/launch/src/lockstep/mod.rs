@@ -124,6 +124,7 @@ pub fn run(
     recorder.record(std::slice::from_ref(&replay), status, &[]);
     let missing = console::join_losses(recorder.missing());
     missing.iter().for_each(|line| console::line(line));
+    run_dir.check_whole()?;
     let summary = recorder.summarise(outcome, &config.run, &replay, status);
     print(&summary.describe(run_dir))?;
     summary.write(run_dir)?;

@@ -141,6 +141,23 @@ impl RunFolder {
         })
     }
 
+    /// Checks that what a run has written is still there.
+    ///
+    /// # Errors
+    /// Which files are gone.
+    pub(crate) fn check_whole(&self) -> anyhow::Result<()> {
+        // A run in lockstep has no logs.
+        let files = [self.config(), self.metrics(), self.episodes(), self.logs()];
+        let gone = files.iter().filter(|it| !it.exists());
+        let gone: Vec<_> = gone.map(|it| it.display().to_string()).collect();
+        anyhow::ensure!(
+            files[..3].iter().all(|it| it.exists()),
+            "the run folder was removed or moved while the run was going on; these are gone: {}",
+            gone.join(", ")
+        );
+        Ok(())
+    }
+
     /// Writes the settings.
     ///
     /// # Errors
@@ -207,5 +224,20 @@ mod tests {
                 .check_free()
                 .is_ok()
         );
+    }
+
+    #[test]
+    fn files_that_are_gone_are_named() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        for path in [folder.config(), folder.metrics()] {
+            fs::write(path, "").unwrap();
+        }
+        let said = folder.check_whole().unwrap_err().to_string();
+        let (episodes, logs) = (folder.episodes(), folder.logs());
+        let gone = format!("{}, {}", episodes.display(), logs.display());
+        assert!(said.ends_with(&gone), "{said}");
+        fs::write(folder.episodes(), "").unwrap();
+        assert!(folder.check_whole().is_ok());
     }
 }
