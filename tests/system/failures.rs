@@ -1,9 +1,9 @@
 //! Runs that end before their time: Ctrl-C, a part that dies, a launcher that dies. No process is ever left.
 //! What a dead part's successor may do is in `by_hand`.
 
-use std::process::Command;
+use std::{fs, process::Command};
 
-use driml_tests::{Process, wait_for};
+use driml_tests::{Process, TestSystem, wait_for};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, launched, system};
@@ -42,9 +42,91 @@ fn a_second_interrupt_ends_at_once() {
     process
         .wait()
         .expect_code(1)
-        .expect_said("ended at once by an interrupt: what was not saved is lost");
+        .expect_said("ended at once by a second interrupt: what was not saved is lost");
     assert_eq!(system.survivors(), []);
     assert_eq!(system.run_folder("run").summary().outcome, "failed");
+}
+
+/// No process listens for signals yet.
+#[test]
+fn an_interrupt_at_the_start_is_an_interrupt() {
+    let system = system();
+    for _ in 0..3 {
+        // In the same folder: nothing was learned in it.
+        let process = system.start(&format!("local --agent c51 {SHORT} --run-dir run"));
+        system.find_part("replay-server");
+        process.signal(Signal::SIGINT);
+        let ended = process.wait().expect_code(130);
+        assert!(!ended.stderr.contains("error:"), "{}", ended.stderr);
+        assert!(
+            ended.stdout.contains("no episode ended"),
+            "{}",
+            ended.stdout
+        );
+        assert_eq!(system.run_folder("run").summary().outcome, "interrupted");
+        assert_eq!(system.survivors(), []);
+    }
+}
+
+/// A run of two actors, of which one stands still, that has learned from all its transitions.
+fn complete_but_for_a_frozen_actor(system: &TestSystem) -> Process {
+    let flags = "--env chain --agent c51 --preset smoke --frames 6000 --actors 2";
+    let process = system.start(&format!(
+        "local {flags} --set replay.replay_ratio=8 --run-dir run --listen {}",
+        system.endpoint()
+    ));
+    let client = system.connect();
+    client.wait_for_replay("both actors", |replay| replay.actors == 2);
+    system.find_part("actor").signal(Signal::SIGSTOP);
+    client.wait_for_learner("the last update", |learner| learner.finished);
+    process
+}
+
+#[test]
+fn a_complete_run_is_finished_though_an_actor_stands_still() {
+    let system = system();
+    let process = complete_but_for_a_frozen_actor(&system);
+    let ended = process
+        .wait()
+        .expect_code(0)
+        .expect_said("did not end within 1 min 0 s and was killed");
+    assert!(ended.stdout.contains("finished: "), "{}", ended.stdout);
+    assert_eq!(system.run_folder("run").summary().outcome, "finished");
+    assert_eq!(system.survivors(), []);
+}
+
+/// The first interrupt waits for the actor, the second does not; neither makes the run another one.
+#[test]
+fn an_interrupt_of_a_complete_run_leaves_it_finished() {
+    let system = system();
+    let mut process = complete_but_for_a_frozen_actor(&system);
+    wait_for("the launcher's end", || {
+        if process.is_running() {
+            process.signal(Signal::SIGINT);
+            return None;
+        }
+        Some(())
+    });
+    let ended = process.wait().expect_code(0);
+    assert!(ended.stdout.contains("finished: "), "{}", ended.stdout);
+    assert_eq!(system.run_folder("run").summary().outcome, "finished");
+    assert_eq!(system.survivors(), []);
+}
+
+#[test]
+fn a_run_whose_folder_is_gone_says_what_is_lost() {
+    let system = system();
+    let process = launched(&system, 100);
+    fs::rename(system.path("run"), system.path("elsewhere")).unwrap();
+    let ended = process.wait().expect_code(1).expect_said(
+        "these are gone: run/config.toml, run/metrics.csv, run/episodes.csv, run/logs",
+    );
+    assert!(
+        !ended.stderr.contains("goes on with it"),
+        "{}",
+        ended.stderr
+    );
+    assert_eq!(system.survivors(), []);
 }
 
 /// Kills one part of a run; the launcher must say which and how to go on, and end the others.

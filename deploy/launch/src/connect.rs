@@ -41,10 +41,10 @@ pub(crate) fn connect(
         let thread = std::thread::Builder::new().name("connect".into());
         thread.spawn(open).context("starting a thread")?;
         let opened = loop {
-            check_alive()?;
             if interrupts.count() > 0 {
                 return Ok(None);
             }
+            check_alive()?;
             match told.recv_timeout(Duration::from_millis(50)) {
                 Ok(opened) => break opened,
                 Err(_) if Instant::now() > deadline => {

@@ -71,24 +71,36 @@ impl ManagedProcess {
             screen,
             meeting,
         } = surroundings;
-        let mut log = ProcessLog::open(name, logs)?;
+        let log = ProcessLog::open(name, logs)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
-        let starting = || format!("starting {name}");
         let stdin = match meeting {
-            Some(meeting) => meeting.hold().with_context(starting)?.into(),
+            Some(meeting) => {
+                let held = meeting.hold();
+                held.with_context(|| format!("starting {name}"))?.into()
+            }
             None => Stdio::null(),
         };
         let mut command = Command::new(program);
         set_thread_env(&mut command, threads);
-        let mut child = command
+        command
             .args(args)
             .args(exit_with_this_process())
-            .stdin(stdin)
+            .stdin(stdin);
+        Self::spawn(name, command, log, screen)
+    }
+
+    fn spawn(
+        name: &str,
+        mut command: Command,
+        mut log: ProcessLog,
+        screen: &Screen,
+    ) -> anyhow::Result<Self> {
+        let mut child = command
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .process_group(0)
             .spawn()
-            .with_context(starting)?;
+            .with_context(|| format!("starting {name}"))?;
         let (out, err) = (child.stdout.take(), child.stderr.take());
         if let Some(pipe) = out {
             log.follow(pipe, screen)?;
@@ -103,6 +115,15 @@ impl ManagedProcess {
             end: None,
             log,
         })
+    }
+
+    /// A process that runs a shell's `script`, for tests.
+    #[cfg(test)]
+    pub(crate) fn of_script(script: &str, logs: &Path) -> Self {
+        let mut command = Command::new("sh");
+        command.args(["-c", script]).stdin(Stdio::null());
+        let log = ProcessLog::open("script", logs).unwrap();
+        Self::spawn("script", command, log, &Screen::plain()).unwrap()
     }
 
     /// The process's number.

@@ -1,10 +1,14 @@
 //! The processes of a run, as far as they were started: replay servers, learner and actors.
 //! It does not know when they start or why they end.
 
-use std::time::{Duration, Instant};
+use std::{
+    os::unix::process::ExitStatusExt,
+    time::{Duration, Instant},
+};
 
 use anyhow::bail;
 use driml_machine::units::duration;
+use nix::sys::signal::Signal;
 
 use crate::managed_process::ManagedProcess;
 
@@ -73,7 +77,8 @@ pub(crate) struct Revived {
     pub(crate) actors: bool,
 }
 
-/// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left.
+/// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left. A process that is
+/// asked before it listens for signals dies of the request, and has nothing to save.
 pub(crate) fn stop(
     processes: &mut [ManagedProcess],
     ask: bool,
@@ -88,6 +93,7 @@ pub(crate) fn stop(
     for process in processes {
         match process.wait_until(deadline, abort) {
             Some(status) if status.success() => {}
+            Some(status) if ask && status.signal() == Some(Signal::SIGTERM as i32) => {}
             Some(_) => late.push(process.exit_report()),
             None => {
                 if !abort() {
@@ -103,4 +109,27 @@ pub(crate) fn stop(
         }
     }
     late
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_that_dies_of_the_request_to_stop_has_stopped() {
+        let logs = tempfile::tempdir().unwrap();
+        let stopped = |script: &str, ask| {
+            let process = ManagedProcess::of_script(script, logs.path());
+            stop(&mut [process], ask, Duration::from_secs(60), &|| false)
+        };
+        assert_eq!(stopped("exec sleep 600", true), [] as [String; 0]);
+        let killed = stopped("kill -TERM $$", false);
+        assert!(killed[0].contains("signal 15 SIGTERM"), "{killed:?}");
+        let failed = stopped("echo 'error: no room' >&2; exit 3", false);
+        let said = "script ended with exit code 3";
+        assert!(
+            failed[0].starts_with(said) && failed[0].ends_with(".log): no room"),
+            "{failed:?}"
+        );
+    }
 }

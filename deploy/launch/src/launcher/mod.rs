@@ -14,7 +14,7 @@ use driml_machine::{
     error::{Interrupted, Usage},
     units::duration,
 };
-use driml_protocol::{Keys, config::Settings, session, shared_memory};
+use driml_protocol::{Keys, Waiting, config::Settings, session, shared_memory};
 use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
@@ -131,7 +131,7 @@ pub fn run(
     };
 
     let ran = launch.start_and_watch(&mut recorder);
-    let ended = launch.end(&ran);
+    let ended = launch.end(ran);
     session::sweep_shared_memory();
     launch.screen.clear();
     let outcome = match (&ran, &ended) {
@@ -310,6 +310,8 @@ impl Launch<'_> {
                 evaluator.look(&self.screen);
             }
             if replay.finished && learner.finished {
+                self.display
+                    .show_alone("all frames and updates are done: the processes end");
                 return Ok(Outcome::Finished);
             }
             let counts = (replay.transitions_inserted, learner.updates);
@@ -329,15 +331,22 @@ impl Launch<'_> {
     }
 
     /// Ends all processes: actors first, so that what they have is stored; the learner saves; the replay server is last, so
-    /// that it can be asked for the final counts. A second interrupt ends everything at once.
-    fn end(&mut self, ran: &anyhow::Result<Outcome>) -> anyhow::Result<()> {
+    /// that it can be asked for the final counts. A second interrupt ends everything at once. Gives how the run ended.
+    ///
+    /// # Errors
+    /// What the run failed by. A run whose transitions and updates are complete cannot fail any more: who did not end well is a warning.
+    fn end(&mut self, ran: anyhow::Result<Outcome>) -> anyhow::Result<Outcome> {
+        let failed = ran.as_ref().err().map(|e| format!("{e:#}"));
+        // The signal that interrupted this process may have reached the others first.
+        let ran = match self.interrupts.count() {
+            0 => ran,
+            _ => ran.or(Ok(Outcome::Interrupted)),
+        };
         if matches!(ran, Ok(Outcome::Interrupted)) {
             self.screen.line("stopping: actors deliver what they have, the learner saves (Ctrl-C again ends at once)");
         }
-        // The interrupt that led here is the first.
-        let allowed = self.interrupts.count().min(1);
         let interrupts = self.interrupts.clone();
-        let abort = move || interrupts.count() > allowed;
+        let abort = move || interrupts.count() > 1;
         let finished = matches!(ran, Ok(Outcome::Finished));
         // Once a process has failed, what the actors still have will hardly be learned from.
         let actors_max = if ran.is_ok() {
@@ -345,24 +354,15 @@ impl Launch<'_> {
         } else {
             FAILED_DRAIN_MAX
         };
-        let mut late = Vec::new();
         // When the run is finished, actors hear it from the replay server and end by themselves.
         let actors = stop(&mut self.processes.actors, !finished, actors_max, &abort);
-        if finished {
-            late.extend(actors);
-        } else {
-            // What an actor could not deliver is in the count of lost transitions; all that was learned is still saved.
-            actors
-                .iter()
-                .for_each(|actor| self.screen.line(&format!("while stopping, {actor}")));
-        }
         self.wait_for_final_checkpoint(&abort);
-        late.extend(stop(
+        let mut others = stop(
             self.processes.learner.as_mut_slice(),
             true,
             LEARNER_DRAIN_MAX,
             &abort,
-        ));
+        );
         if let Some(statuses) = &mut self.statuses {
             if let Err(e) = statuses.ask_replay() {
                 tracing::debug!("the replay server's last word: {e:#}");
@@ -370,37 +370,70 @@ impl Launch<'_> {
             // Before its router goes away, so that it does not try to reach it again.
             statuses.close();
         }
-        late.extend(stop(
+        others.extend(stop(
             &mut self.processes.replay_servers,
             true,
             REPLAY_DRAIN_MAX,
             &abort,
         ));
-        if abort() {
-            bail!("ended at once by an interrupt: what was not saved is lost");
+        let is_complete = finished || self.is_complete();
+        let result = match ran {
+            _ if is_complete => self.run_dir.check_whole().map(|()| Outcome::Finished),
+            _ if abort() => Err(anyhow::anyhow!(
+                "ended at once by a second interrupt: what was not saved is lost"
+            )),
+            Ok(_) if !others.is_empty() => Err(anyhow::anyhow!(
+                "at the end of the run, {}",
+                others.join("; ")
+            )),
+            Ok(outcome) => self.run_dir.check_whole().map(|()| outcome),
+            Err(e) => Err(e),
+        };
+        // What an actor could not deliver is in the count of lost transitions; all that was learned is still saved.
+        let error = result
+            .as_ref()
+            .err()
+            .map_or(String::new(), |e| format!("{e:#}"));
+        let mut warnings: Vec<_> = actors.into_iter().chain(others).collect();
+        let failed = failed.filter(|it| !warnings.contains(it));
+        warnings.extend(failed);
+        for warning in warnings.iter().filter(|it| !error.contains(*it)) {
+            self.screen.line(&format!("while stopping, {warning}"));
         }
-        if ran.is_ok() && !late.is_empty() {
-            bail!("at the end of the run, {}", late.join("; "));
-        }
-        Ok(())
+        result
+    }
+
+    /// Whether all transitions are in and learned from, and the result saved, by the last answers.
+    fn is_complete(&self) -> bool {
+        self.statuses.as_ref().is_some_and(|it| {
+            let rows = it.learner.updates * u64::from(self.config.learner.batch_size);
+            it.replay.waiting == Waiting::Finished
+                && it.learner.finished
+                && rows >= it.replay.rows_sampled
+        })
     }
 
     /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
     fn wait_for_final_checkpoint(&mut self, abort: &impl Fn() -> bool) {
-        let Some(learner) = &mut self.processes.learner else {
+        let (Some(learner), Some(statuses)) = (&mut self.processes.learner, &mut self.statuses)
+        else {
             return;
         };
+        if learner.end().is_some() {
+            return;
+        }
+        // One that has finished may end as soon as it is told to.
+        if let Err(e) = statuses.ask_learner() {
+            tracing::debug!("a question before the last: {e:#}");
+        }
         learner.ask_to_stop();
         let deadline = Instant::now() + LEARNER_DRAIN_MAX;
-        let Some(statuses) = &mut self.statuses else {
-            return;
-        };
-        while Instant::now() < deadline && !abort() {
+        loop {
             if let Err(e) = statuses.ask_learner() {
                 tracing::debug!("a last question: {e:#}");
                 return;
             }
-            if statuses.learner.finished {
+            if statuses.learner.finished || Instant::now() > deadline || abort() {
                 return;
             }
             std::thread::sleep(DRAIN_POLL);
@@ -413,14 +446,14 @@ impl Launch<'_> {
         recorder: &mut RunRecorder,
         outcome: Outcome,
     ) -> (Summary, anyhow::Result<()>) {
-        let (shards, replay, learner) = match &mut self.statuses {
+        let (replay, learner) = match &mut self.statuses {
             Some(it) => {
                 recorder.hear_episodes(&it.shards, &it.episodes.take());
-                (&it.shards[..], it.replay.clone(), it.learner.clone())
+                recorder.record(&it.shards, &it.learner, &[]);
+                (it.replay.clone(), it.learner.clone())
             }
             None => Default::default(),
         };
-        recorder.record(shards, &learner, &[]);
         let logs = self.processes.missing_log_lines();
         let missing = console::join_losses(recorder.missing().into_iter().chain(logs));
         missing.iter().for_each(|line| console::line(line));
