@@ -184,6 +184,12 @@ fn a_dead_actor_is_started_again() {
         (0, 0)
     );
     assert_eq!(system.survivors(), []);
+
+    system
+        .run("local --resume run --frames 13000")
+        .expect_code(0);
+    let summary = system.run_folder("run").summary();
+    assert_eq!(summary.actors_restarted, 2, "of the whole run");
 }
 
 /// Its successor would count the episodes anew, and have other ghosts than the run is to have.

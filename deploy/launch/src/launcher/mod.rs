@@ -77,6 +77,12 @@ pub fn run(
     let servers = server_names(config.replay.shards);
     let names = process_names(config);
     let recorded = Recorded::of(config, names.clone());
+    // Opening the recorder removes it.
+    let restarts_before = resumed
+        .and_then(|_| Summary::read(run_dir).ok())
+        .map_or([0; 2], |it| {
+            [it.replay_servers_restarted, it.actors_restarted]
+        });
     let mut recorder = match resumed {
         Some(point) => RunRecorder::go_on(run_dir, recorded, point, config.frames())?,
         None => RunRecorder::create(run_dir, recorded)?,
@@ -134,13 +140,9 @@ pub fn run(
     let ended = launch.end(ran);
     session::sweep_shared_memory();
     launch.screen.clear();
-    let outcome = match (&ran, &ended) {
-        (Ok(Outcome::Finished), Ok(())) => Outcome::Finished,
-        (Ok(Outcome::Interrupted), Ok(())) => Outcome::Interrupted,
-        _ => Outcome::Failed,
-    };
-    let (summary, written) = launch.conclude(&mut recorder, outcome);
-    // Whoever interrupts a run, or whose run failed, does not wait for it.
+    let outcome = ended.as_ref().map_or(Outcome::Failed, |outcome| *outcome);
+    let (summary, written) = launch.conclude(&mut recorder, outcome, restarts_before);
+    // An interrupted or failed run does not wait for it.
     if let Some(mut evaluator) = launch.evaluator.take()
         && outcome == Outcome::Finished
     {
@@ -445,6 +447,7 @@ impl Launch<'_> {
         &mut self,
         recorder: &mut RunRecorder,
         outcome: Outcome,
+        [servers_before, actors_before]: [u32; 2],
     ) -> (Summary, anyhow::Result<()>) {
         let (replay, learner) = match &mut self.statuses {
             Some(it) => {
@@ -458,8 +461,8 @@ impl Launch<'_> {
         let missing = console::join_losses(recorder.missing().into_iter().chain(logs));
         missing.iter().for_each(|line| console::line(line));
         let mut summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);
-        summary.replay_servers_restarted = self.restarts;
-        summary.actors_restarted = self.actor_restarts;
+        summary.replay_servers_restarted = servers_before + self.restarts;
+        summary.actors_restarted = actors_before + self.actor_restarts;
         let written = summary.write(self.run_dir);
         (summary, written)
     }
