@@ -12,7 +12,7 @@ use driml_protocol::session::{self, Endpoints};
 use driml_tests::{Ended, TestSystem};
 use nix::sys::signal::Signal;
 
-use crate::system;
+use crate::{SHORT, system};
 
 /// The commands that connect to a replay server.
 const COMMANDS: [&str; 4] = [
@@ -138,4 +138,21 @@ fn a_part_that_waits_for_its_server_ends_when_it_is_told_to() {
             drop(connection);
         }
     }
+}
+
+#[test]
+fn an_endpoint_that_is_taken_is_named_before_anything_is_made() {
+    let system = system();
+    let (endpoint, _listener) = listener();
+    for command in ["local --run-dir run", "replay-server"] {
+        let ended = system
+            .run(&format!("{command} {SHORT} --listen {endpoint}"))
+            .expect_code(64)
+            .expect_said(&format!(
+                "error: cannot listen on {endpoint}: another process listens there"
+            ))
+            .expect_said("with --listen for this command");
+        assert_eq!(ended.stderr.lines().count(), 1, "{}", ended.stderr);
+    }
+    assert!(!system.path("run").exists());
 }

@@ -1,9 +1,13 @@
 //! Where the processes of a run meet: endpoints that zenoh can open, and the prefix of the run's keys.
-//! It opens nothing.
+//! It keeps nothing open.
 
-use std::net::ToSocketAddrs;
+use std::{
+    io::ErrorKind,
+    net::{TcpListener, ToSocketAddrs, UdpSocket},
+};
 
 use driml_machine::error::{Usage, usage};
+use driml_protocol::reach;
 
 /// The prefix of a run's keys unless it is told otherwise.
 pub const NAMESPACE: &str = "driml";
@@ -58,6 +62,31 @@ pub fn check_listening(endpoints: &[String], guard: Guard) -> Result<(), Usage> 
         );
     }
     Ok(())
+}
+
+/// Refuses endpoints to listen on that another process has, before anything is made; zenoh would say so in its own words.
+///
+/// # Errors
+/// The first that is taken, and what to do.
+pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
+    for endpoint in endpoints {
+        let is_used = match endpoint.split_once('/') {
+            Some(("tcp", address)) => is_taken(TcpListener::bind(address)),
+            Some(("quic", address)) => is_taken(UdpSocket::bind(address)),
+            _ => reach::look(endpoint).is_ok(),
+        };
+        if is_used {
+            return Err(usage!(
+                "cannot listen on {endpoint}: another process listens there. End it, or choose another port or path: with --listen for this \
+                 command, and the same with --connect for all that connect to it"
+            ));
+        }
+    }
+    Ok(())
+}
+
+fn is_taken<T>(bound: std::io::Result<T>) -> bool {
+    bound.is_err_and(|e| e.kind() == ErrorKind::AddrInUse)
 }
 
 fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
@@ -177,6 +206,33 @@ mod tests {
             assert!(said.contains("with --tls-dir it is quic/host:1"), "{said}");
             assert!(said.contains("issues/2557"), "{said}");
         }
+    }
+
+    #[test]
+    fn an_endpoint_that_another_process_has_is_refused() {
+        let (tcp, udp) = (
+            TcpListener::bind("127.0.0.1:0").unwrap(),
+            UdpSocket::bind("127.0.0.1:0").unwrap(),
+        );
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("s");
+        let socket = std::os::unix::net::UnixListener::bind(&path).unwrap();
+        let endpoints = [
+            format!("tcp/{}", tcp.local_addr().unwrap()),
+            format!("quic/{}", udp.local_addr().unwrap()),
+            format!("unixsock-stream/{}", path.display()),
+        ];
+        for endpoint in &endpoints {
+            let said = check_unused(std::slice::from_ref(endpoint)).unwrap_err();
+            let said = said.to_string();
+            let begins = format!("cannot listen on {endpoint}: another process listens there");
+            assert!(
+                said.starts_with(&begins) && said.contains("--listen"),
+                "{said}"
+            );
+        }
+        drop((tcp, udp, socket));
+        assert!(check_unused(&endpoints).is_ok());
     }
 
     #[test]

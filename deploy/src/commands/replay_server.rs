@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use driml_launch::{
-    endpoint::{check_endpoints, check_listening},
+    endpoint::{check_endpoints, check_listening, check_unused},
     open_files,
 };
 use driml_machine::{error::usage, resources::Machine};
@@ -47,6 +47,7 @@ pub(crate) struct ReplayServerArgs {
 /// A call or settings that cannot work, or what the server met.
 pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
     check_listening(&args.listen, args.network.guard(&args.tls))?;
+    check_unused(&args.listen)?;
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::ReplayServer)?;
     let (config, _) = flags::resolve(&args.run, &Machine::this())?;

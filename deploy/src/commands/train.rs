@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use driml_launch::{
     console::{self, print},
-    endpoint::check_listening,
+    endpoint::{check_listening, check_unused},
     launcher, lockstep, plan,
     resume::{self, Found},
     run_folder::RunFolder,
@@ -127,6 +127,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
         }
     };
     check_listening(args.listen.as_slice(), args.network.guard(&args.tls))?;
+    check_unused(args.listen.as_slice())?;
     if args.tls.is_set() && !args.listen.as_deref().is_some_and(session::is_quic) {
         return Err(usage!(
             "--tls-dir is for parts of other machines, which need somewhere to connect to: add --listen quic/HOST:PORT"

@@ -11,6 +11,13 @@ use driml_machine::error::{Usage, usage};
 use driml_protocol::{lock_file, whole_file};
 use nix::unistd::{AccessFlags, access};
 
+use super::columns::Columns;
+
+/// What the names of TensorBoard's files begin with.
+pub(super) const EVENTS: &str = "events.out.tfevents.";
+/// The file whose lock keeps other launchers out.
+const LOCK: &str = ".lock";
+
 /// The folder of a run, which need not be there yet.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RunFolder {
@@ -88,13 +95,14 @@ impl RunFolder {
         self.path.join("logs")
     }
 
-    /// Refuses a folder in which something lies, and one that cannot be made.
+    /// Refuses a folder in which something lies, and one that cannot be made. A run in which nothing was learned is nothing: the command
+    /// that is corrected takes its folder again.
     ///
     /// # Errors
     /// Says what to do.
     pub fn check_free(&self) -> Result<(), Usage> {
         let taken = match fs::read_dir(&self.path) {
-            Ok(mut entries) => entries.next().is_some(),
+            Ok(entries) => !self.is_empty_run(entries),
             Err(_) => self.path.exists(),
         };
         if taken {
@@ -104,6 +112,41 @@ impl RunFolder {
             ));
         }
         self.check_writable()
+    }
+
+    /// Whether nothing lies in the folder, or only what a run makes before its first frame.
+    fn is_empty_run(&self, entries: fs::ReadDir) -> bool {
+        let made = [
+            self.config(),
+            self.metrics(),
+            self.episodes(),
+            self.summary(),
+            self.endpoints(),
+            self.meeting(),
+            self.checkpoints(),
+            self.logs(),
+            self.path.join(LOCK),
+        ];
+        let frames = |path: PathBuf| -> u64 {
+            let text = fs::read(path).unwrap_or_default();
+            let rows = Columns::parse(&text).ok();
+            rows.and_then(|it| it.last("frames")).unwrap_or(0)
+        };
+        let entries: Vec<_> = entries.flatten().collect();
+        if entries.is_empty() {
+            return true;
+        }
+        let saved = driml_learner::checkpoint::list(&self.checkpoints());
+        let is_made = |it: &fs::DirEntry| {
+            let name = it.file_name();
+            made.contains(&it.path()) || name.to_string_lossy().starts_with(EVENTS)
+        };
+        entries.iter().all(is_made)
+            && self.config().exists()
+            && [self.metrics(), self.episodes()]
+                .into_iter()
+                .all(|it| frames(it) == 0)
+            && saved.is_ok_and(|all| all.is_empty())
     }
 
     /// Refuses a folder into which nothing could be written, before it is made.
@@ -129,7 +172,7 @@ impl RunFolder {
     /// # Errors
     /// Another launcher holds it, or a file system that refuses.
     pub fn lock(&self) -> anyhow::Result<File> {
-        let path = self.path.join(".lock");
+        let path = self.path.join(LOCK);
         let doing = || format!("locking {}", path.display());
         let lock = lock_file::create(&path, "start no other run there").with_context(doing)?;
         lock.ok_or_else(|| {
@@ -194,6 +237,30 @@ mod tests {
             "{said}"
         );
         assert!(check_free(&folder.path().join("x")).is_err());
+    }
+
+    #[test]
+    fn a_run_in_which_nothing_was_learned_gives_its_folder_back() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        let write = |path: PathBuf, text: &str| fs::write(path, text).unwrap();
+        write(folder.config(), "[run]\n");
+        write(folder.metrics(), "seconds,frames\n0.5,0\n");
+        write(folder.episodes(), "seconds,frames\n");
+        write(root.path().join(".lock"), "");
+        write(folder.summary(), "{}");
+        fs::create_dir_all(folder.logs()).unwrap();
+        fs::create_dir_all(folder.checkpoints()).unwrap();
+        assert!(folder.check_free().is_ok());
+
+        write(folder.metrics(), "seconds,frames\n0.5,32\n");
+        assert!(folder.check_free().is_err(), "it has frames");
+        write(folder.metrics(), "seconds,frames\n");
+        fs::create_dir(folder.checkpoints().join("checkpoint-0")).unwrap();
+        assert!(folder.check_free().is_err(), "it has a checkpoint");
+        fs::remove_dir(folder.checkpoints().join("checkpoint-0")).unwrap();
+        write(root.path().join("thesis.tex"), "");
+        assert!(folder.check_free().is_err(), "it has files of others");
     }
 
     #[test]

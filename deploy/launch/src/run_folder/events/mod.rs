@@ -17,7 +17,10 @@ use driml_learner::AffinityEstimator;
 use driml_protocol::ReplayStatus;
 
 use self::encode::{At, Value};
-use super::{folder::RunFolder, growing_file::GrowingFile};
+use super::{
+    folder::{EVENTS, RunFolder},
+    growing_file::GrowingFile,
+};
 
 /// How often histograms are written, and looked whether there is another A; curves are written with each row.
 const SLOW_PERIOD: Duration = Duration::from_secs(10);
@@ -53,8 +56,8 @@ impl Events {
     ) -> anyhow::Result<Self> {
         let seconds = now();
         let name = |number: u32| match number {
-            0 => format!("events.out.tfevents.{:010}.driml", seconds as u64),
-            _ => format!("events.out.tfevents.{:010}.driml.{number}", seconds as u64),
+            0 => format!("{EVENTS}{:010}.driml", seconds as u64),
+            _ => format!("{EVENTS}{:010}.driml.{number}", seconds as u64),
         };
         let mut paths = (0..).map(|number| folder.path().join(name(number)));
         let path = paths.find(|path| !path.exists());
