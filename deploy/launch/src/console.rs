@@ -45,6 +45,47 @@ pub fn print(text: &str) -> anyhow::Result<()> {
     }
 }
 
+/// [`print`] of lines that a narrow terminal would break inside words: a line goes on after `indent` blanks.
+///
+/// # Errors
+/// As [`print`].
+pub fn print_wrapped(text: &str, indent: usize) -> anyhow::Result<()> {
+    match io::stdout().is_terminal() {
+        true => print(&wrapped(text, " ", indent)),
+        false => print(text),
+    }
+}
+
+/// `text` with its lines broken where `separator` stands, so that none is wider than the terminal where that can be; a line goes on
+/// after `indent` blanks.
+pub(crate) fn wrapped(text: &str, separator: &str, indent: usize) -> String {
+    let width = Term::stderr()
+        .size_checked()
+        .map_or(usize::MAX, |it| it.1.into());
+    wrapped_to(text, separator, indent, width)
+}
+
+fn wrapped_to(text: &str, separator: &str, indent: usize, width: usize) -> String {
+    let mut lines = String::new();
+    for line in text.split_inclusive('\n') {
+        let mut column = 0;
+        for (number, word) in line.split(separator).enumerate() {
+            let length = word.trim_end_matches('\n').chars().count();
+            if number > 0 && column + separator.len() + length > width {
+                lines.push('\n');
+                lines.extend(std::iter::repeat_n(' ', indent));
+                column = indent;
+            } else if number > 0 {
+                lines.push_str(separator);
+                column += separator.len();
+            }
+            lines.push_str(word);
+            column += length;
+        }
+    }
+    lines
+}
+
 /// Whether writing failed because the pipe's reader has ended or the terminal was closed.
 fn is_gone(e: &io::Error) -> bool {
     e.kind() == ErrorKind::BrokenPipe || e.raw_os_error() == Some(nix::libc::EIO)
@@ -113,6 +154,7 @@ fn wanted_filter(wanted: &str) -> String {
 pub fn log_to_stderr(guarded: bool) {
     let usual = || EnvFilter::new(usual_filter("info"));
     let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
+    let is_debugged = wanted.is_some();
     let filter = wanted.map_or_else(usual, |wanted| {
         EnvFilter::try_new(wanted_filter(&wanted)).unwrap_or_else(|e| {
             line(&format!(
@@ -126,6 +168,8 @@ pub fn log_to_stderr(guarded: bool) {
         // It would say with `eprintln!`, which panics, that stderr cannot be written to.
         .log_internal_errors(false)
         .with_ansi(stderr().is_terminal())
+        // Paths of modules are for those who debug.
+        .with_target(is_debugged)
         .with_filter(filter.clone());
     let refusals = guarded.then(|| {
         let targets = Targets::new()
@@ -366,6 +410,17 @@ mod tests {
         let named = anyhow::Error::new(NamesItsCause { source: full() });
         let said = describe(&named.context("saving"));
         assert_eq!(said, format!("saving: cannot write x: {}", full()));
+    }
+
+    #[test]
+    fn no_word_is_broken_in_a_narrow_terminal() {
+        let text = "name    one two three\nx       four\n";
+        assert_eq!(wrapped_to(text, " ", 8, 80), text);
+        let narrow = "name    one two\n        three\nx       four\n";
+        assert_eq!(wrapped_to(text, " ", 8, 16), narrow);
+        let facts = "frames 1 of 2  updates 3 of 4";
+        let narrow = "frames 1 of 2\nupdates 3 of 4";
+        assert_eq!(wrapped_to(facts, "  ", 0, 20), narrow);
     }
 
     #[test]

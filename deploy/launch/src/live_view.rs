@@ -7,13 +7,15 @@ use driml_machine::units::duration;
 use driml_protocol::{LearnerStatus, RecoveryProgress, ReplayStatus, Waiting};
 
 use crate::{
-    console::Screen,
+    console::{self, Screen},
     rates::Rates,
     run_folder::{Episodes, ResumePoint},
 };
 
 /// How often a line is written where there is no terminal.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
+/// How long updates go on before the rates are steady enough for a time left.
+const STEADY_MIN: Duration = Duration::from_secs(5);
 /// How long a part may be silent before it is said.
 const SILENT_MAX: Duration = Duration::from_secs(10);
 /// The progress display: how far, then two lines of numbers.
@@ -27,12 +29,23 @@ pub fn loss_title(name: &str) -> String {
     }
 }
 
+/// A count beside what is planned, which the last round may exceed: `8000/8000 (+192)`.
+pub(crate) fn of_planned(count: u64, planned: u64) -> String {
+    match count.saturating_sub(planned) {
+        0 => format!("{count}/{planned}"),
+        more => format!("{planned}/{planned} (+{more})"),
+    }
+}
+
 /// The live view.
 #[derive(Debug)]
 pub struct Display {
     screen: Screen,
     frames_max: u64,
     updates_max: u64,
+    /// Updates with which it began, and when the first beyond them was seen.
+    updates_before: u64,
+    learns_since: Option<Instant>,
     rates: Rates,
     /// When the run began: a terminal's bar has a clock of its own.
     began: Instant,
@@ -54,6 +67,8 @@ impl Display {
             screen,
             frames_max,
             updates_max,
+            updates_before: resume_point.updates,
+            learns_since: None,
             rates,
             began,
             plain_next: began + PLAIN_PERIOD,
@@ -77,6 +92,9 @@ impl Display {
         let now = Instant::now();
         self.rates
             .add(now, replay.transitions_inserted, learner.updates);
+        if learner.updates > self.updates_before {
+            self.learns_since.get_or_insert(now);
+        }
         let mut texts = self.text(replay, learner, episodes).to_vec();
         if !notes.is_empty() {
             texts.push(notes.join("; "));
@@ -95,7 +113,7 @@ impl Display {
     fn write(&mut self, texts: &[String]) {
         let now = Instant::now();
         match self.screen.bar() {
-            Some(bar) => bar.set_message(texts.join("\n")),
+            Some(bar) => bar.set_message(console::wrapped(&texts.join("\n"), "  ", 0)),
             None if now >= self.plain_next => {
                 self.plain_next = now + PLAIN_PERIOD;
                 self.screen.line(&plain(now - self.began, texts));
@@ -114,36 +132,33 @@ impl Display {
         let number = |value: Option<f64>, digits: usize| {
             value.map_or("-".into(), |value| format!("{value:.digits$}"))
         };
-        let losses = learner.losses.iter();
-        let losses = losses.map(|(name, loss)| format!("  {} {loss:.3}", loss_title(name)));
+        // Before the first update there are none.
+        let losses = self.learns_since.map_or(String::new(), |_| {
+            let others = learner.losses.iter();
+            let others = others.map(|(name, loss)| format!("  {} {loss:.3}", loss_title(name)));
+            format!("  C51 {:.3}{}", learner.c51_kl, others.collect::<String>())
+        });
         let k = replay
             .mean_k()
             .map_or(String::new(), |k| format!("  mean k {k:.2}"));
-        let left = time_left(
-            (
-                self.frames_max.saturating_sub(replay.transitions_inserted),
-                frames_rate,
-            ),
-            (
-                self.updates_max.saturating_sub(learner.updates),
-                updates_rate,
-            ),
-        );
+        let is_steady = |since: Instant| since.elapsed() >= STEADY_MIN;
+        let left = self.learns_since.filter(|since| is_steady(*since));
+        let left = left.and_then(|_| {
+            let frames = self.frames_max.saturating_sub(replay.transitions_inserted);
+            let updates = self.updates_max.saturating_sub(learner.updates);
+            time_left((frames, frames_rate), (updates, updates_rate))
+        });
         [
             format!(
-                "frames {}/{} ({frames_rate:.0}/s)  updates {}/{} ({updates_rate:.1}/s)  replay ratio {}",
-                replay.transitions_inserted,
-                self.frames_max,
-                learner.updates,
-                self.updates_max,
+                "frames {} ({frames_rate:.0}/s)  updates {} ({updates_rate:.1}/s)  replay ratio {}",
+                of_planned(replay.transitions_inserted, self.frames_max),
+                of_planned(learner.updates, self.updates_max),
                 number(replay.replay_ratio(), 2),
             ),
             format!(
-                "return {} ({} episodes)  C51 {:.3}{}{k}  {}{}",
+                "return {} ({} episodes){losses}{k}  {}{}",
                 number(episodes.mean_return.map(|it| it.mean), 2),
                 episodes.count,
-                learner.c51_kl,
-                losses.collect::<String>(),
                 waiting(replay),
                 left.map_or(String::new(), |left| format!("  {} left", duration(left))),
             ),
@@ -231,20 +246,35 @@ mod tests {
         display
             .rates
             .add(start + Duration::from_secs(10), 33_000, 1000);
+        display.learns_since = start.checked_sub(STEADY_MIN);
         expect![[r#"
             frames 33000/200000 (160/s)  updates 1000/6218 (5.0/s)  replay ratio 8.00
             return 1.23 (45 episodes)  C51 0.123  DIM 4t4 4.000  mean k 2.25  23 of 24 actors wait for learner  17 min 23 s left"#]]
         .assert_eq(&display.text(&replay, &learner, episodes).join("\n"));
+    }
+
+    #[test]
+    fn before_the_first_update_there_is_no_loss_and_no_time_left() {
+        let mut display = Display::new(Screen::plain(), 8_000, 218, ResumePoint::default());
+        let (mut replay, mut learner) = (ReplayStatus::default(), LearnerStatus::default());
+        display.show(&replay, &learner, Episodes::default(), &[]);
         expect![[r#"
-            frames 0/200000 (160/s)  updates 0/6218 (5.0/s)  replay ratio -
-            return - (0 episodes)  C51 0.000  nobody waits  20 min 50 s left"#]]
+            frames 0/8000 (0/s)  updates 0/218 (0.0/s)  replay ratio -
+            return - (0 episodes)  nobody waits"#]]
         .assert_eq(
             &display
-                .text(
-                    &ReplayStatus::default(),
-                    &LearnerStatus::default(),
-                    Episodes::default(),
-                )
+                .text(&replay, &learner, Episodes::default())
+                .join("\n"),
+        );
+        (replay.transitions_inserted, learner.updates) = (8_192, 224);
+        display.rates = Rates::default();
+        display.show(&replay, &learner, Episodes::default(), &[]);
+        expect![[r#"
+            frames 8000/8000 (+192) (0/s)  updates 218/218 (+6) (0.0/s)  replay ratio 0.00
+            return - (0 episodes)  C51 0.000  nobody waits"#]]
+        .assert_eq(
+            &display
+                .text(&replay, &learner, Episodes::default())
                 .join("\n"),
         );
     }

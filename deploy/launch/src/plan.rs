@@ -22,6 +22,9 @@ use crate::run_folder::{ResumePoint, RunFolder};
 /// have narrower registers, so this is half of it.
 const GFLOPS_PER_CORE: f64 = 75.0;
 
+/// Columns before the facts of the plan.
+pub const INDENT: usize = 12;
+
 /// About how long the run takes on `cores` cores: its updates, and one forward pass a frame.
 pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
     let shape = UpdateShape::of(&config.learner, config.run.horizon.positives());
@@ -114,17 +117,17 @@ pub fn describe(
         (
             "time",
             format!(
-                "about {} (coarse: from the network's arithmetic)",
+                "{} (coarse: from the network's arithmetic)",
                 about(estimate(config, machine.cores).mul_f64(left))
             ),
         ),
     ];
     let mut text: String = lines
         .iter()
-        .map(|(name, fact)| format!("{name:<12}{fact}\n"))
+        .map(|(name, fact)| format!("{name:<INDENT$}{fact}\n"))
         .collect();
     for note in &config.notes {
-        text.push_str(&format!("{:<12}{note}\n", "note"));
+        text.push_str(&format!("{:<INDENT$}{note}\n", "note"));
     }
     text
 }
@@ -139,13 +142,14 @@ fn size(bytes: u64) -> String {
 
 /// A time that pretends to no more precision than an estimate has.
 fn about(time: Duration) -> String {
-    match time.as_secs() {
-        0..60 => "a minute".into(),
+    let time = match time.as_secs() {
+        0..60 => return "under a minute".into(),
         seconds @ 60..7200 => format!("{} min", seconds.div_ceil(60)),
         seconds => duration(Duration::from_secs(seconds.div_ceil(3600) * 3600))
             .replace(" 0 min", "")
             .replace(" 0 h", ""),
-    }
+    };
+    format!("about {time}")
 }
 
 #[cfg(test)]
@@ -207,6 +211,13 @@ mod tests {
     fn estimates_are_not_precise() {
         let texts =
             [5, 600, 7_300, 90_000, 86_400].map(|seconds| about(Duration::from_secs(seconds)));
-        assert_eq!(texts, ["a minute", "10 min", "3 h", "1 d 1 h", "1 d"]);
+        let expected = [
+            "under a minute",
+            "about 10 min",
+            "about 3 h",
+            "about 1 d 1 h",
+            "about 1 d",
+        ];
+        assert_eq!(texts, expected);
     }
 }

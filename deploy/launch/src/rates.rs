@@ -23,18 +23,22 @@ impl Rates {
         }
     }
 
-    /// Frames a second and updates a second; 0 before the second sample.
+    /// Frames a second and updates a second, each since the last moment at which nothing of it had happened yet; 0 before the second
+    /// sample.
     pub(crate) fn per_second(&self) -> (f64, f64) {
-        let (Some(first), Some(last)) = (self.samples.front(), self.samples.back()) else {
-            return (0.0, 0.0);
+        let rate = |count: fn(&(Instant, u64, u64)) -> u64| {
+            let (first, last) = (self.samples.front()?, self.samples.back()?);
+            let idle = self
+                .samples
+                .iter()
+                .rev()
+                .find(|it| count(it) == count(first))?;
+            let seconds = (last.0 - idle.0).as_secs_f64();
+            (seconds > 0.0).then(|| count(last).saturating_sub(count(idle)) as f64 / seconds)
         };
-        let seconds = (last.0 - first.0).as_secs_f64();
-        if seconds <= 0.0 {
-            return (0.0, 0.0);
-        }
         (
-            last.1.saturating_sub(first.1) as f64 / seconds,
-            last.2.saturating_sub(first.2) as f64 / seconds,
+            rate(|it| it.1).unwrap_or(0.0),
+            rate(|it| it.2).unwrap_or(0.0),
         )
     }
 }
@@ -56,5 +60,14 @@ mod tests {
         }
         assert_eq!(rates.per_second().0, 10.0);
         assert!(rates.samples.len() <= 22);
+    }
+
+    #[test]
+    fn a_warm_up_does_not_dilute_the_rate() {
+        let (mut rates, start) = (Rates::default(), Instant::now());
+        for (second, updates) in [(0, 7), (10, 7), (12, 47)] {
+            rates.add(start + Duration::from_secs(second), second, updates);
+        }
+        assert_eq!(rates.per_second(), (1.0, 20.0));
     }
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use driml_launch::{
-    console::{self, print},
+    console::{self, print_wrapped},
     endpoint::{check_listening, check_unused},
     launcher, lockstep, plan,
     resume::{self, Found},
@@ -162,14 +162,15 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             run_dir
         }
     };
-    print(&plan::describe(
+    let plan = plan::describe(
         &config,
         &from,
         &run_dir,
         args.lockstep,
         resume_point.unwrap_or_default(),
         &machine,
-    ))?;
+    );
+    print_wrapped(&plan, plan::INDENT)?;
     config.world.install(&mut console::line)?;
     if args.lockstep {
         lockstep::run(&config, &run_dir, resume_point, args.exit_with_parent)

@@ -20,7 +20,7 @@ use driml_settings::config::RunConfig;
 
 use crate::{
     connect::connect,
-    console::{self, Screen, print},
+    console::{self, Screen, print, print_wrapped},
     endpoint::NAMESPACE,
     evaluator::Evaluator,
     interrupts::Interrupts,
@@ -166,7 +166,7 @@ pub fn run(
         }
         return Err(failed);
     }
-    print(&summary.describe(run_dir))?;
+    print_wrapped(&summary.describe(run_dir), 2)?;
     written.with_context(|| {
         format!(
             "the run is over and its checkpoint saved, but there is no summary of it: make room on the disk, then `driml local --resume {}` \

@@ -19,7 +19,7 @@ use driml_protocol::{ReplayStatus, Shutdown};
 use driml_settings::config::{EvaluationConfig, RunConfig};
 
 use crate::{
-    console::{self, Screen, print},
+    console::{self, Screen, print, print_wrapped},
     ended_episodes::EndedEpisodes,
     evaluate::Which,
     keep::keep,
@@ -126,7 +126,7 @@ pub fn run(
     missing.iter().for_each(|line| console::line(line));
     run_dir.check_whole()?;
     let summary = recorder.summarise(outcome, &config.run, &replay, status);
-    print(&summary.describe(run_dir))?;
+    print_wrapped(&summary.describe(run_dir), 2)?;
     summary.write(run_dir)?;
     if outcome == Outcome::Interrupted {
         resume::say_how(&config.world, run_dir);

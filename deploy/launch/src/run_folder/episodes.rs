@@ -201,13 +201,17 @@ impl TrainingEpisodes {
     fn take(&mut self, ended: &EndedEpisode, seconds: Option<f64>) -> [String; HEADER.len()] {
         self.episode += 1;
         self.frames = self.frames.max(ended.frames);
-        if let Some(played) = ended.played {
+        let played = ended.played.map(|it| Played {
+            episode_return: rounded(it.episode_return),
+            ..it
+        });
+        if let Some(played) = played {
             if self.newest.len() == RETURNS_OF {
                 self.newest.pop_front();
             }
             self.newest.push_back(played.episode_return);
         }
-        let of_whole = |cell: fn(Played) -> String| ended.played.map_or(String::new(), cell);
+        let of_whole = |cell: fn(Played) -> String| played.map_or(String::new(), cell);
         [
             seconds.map_or(String::new(), |it| format!("{it:.3}")),
             self.frames.to_string(),
@@ -244,6 +248,16 @@ impl TrainingEpisodes {
         });
         self.table.missing().into_iter().chain(lost).collect()
     }
+}
+
+/// A sum of rewards that were f32 without the digits that their conversion added: -0.6, not -0.5999999940395355. Small numbers keep
+/// seven digits.
+pub fn rounded(value: f64) -> f64 {
+    let text = match value.abs() < 1e-3 {
+        true => format!("{value:.6e}"),
+        false => format!("{value:.6}"),
+    };
+    text.parse().unwrap_or(value)
 }
 
 /// Frames, number and return in a row.

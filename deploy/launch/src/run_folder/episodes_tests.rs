@@ -183,3 +183,17 @@ fn a_run_that_goes_on_has_the_episodes_before() {
     let said = TrainingEpisodes::go_on(&folder, 9, false).unwrap_err();
     assert!(said.to_string().contains("is no row of episodes"), "{said}");
 }
+
+#[test]
+fn returns_have_the_digits_of_their_rewards() {
+    let three_f32 = f64::from(-0.2f32) + f64::from(-0.2f32) + f64::from(-0.2f32);
+    for (value, text) in [
+        (three_f32, "-0.6"),
+        (f64::from(0.1f32), "0.1"),
+        (12_345.0, "12345"),
+        (0.0, "0"),
+        (f64::from(1e-7f32), "0.0000001"),
+    ] {
+        assert_eq!(rounded(value).to_string(), text);
+    }
+}

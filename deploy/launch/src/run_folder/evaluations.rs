@@ -10,7 +10,7 @@ use std::{
 use anyhow::Context;
 use driml_machine::error::usage;
 
-use super::{columns::Columns, folder::RunFolder};
+use super::{columns::Columns, episodes::rounded, folder::RunFolder};
 
 const HEADER: [&str; 6] = [
     "seconds",
@@ -150,8 +150,8 @@ impl Evaluated {
             self.frames.map(|it| it.to_string()).unwrap_or_default(),
             self.updates.to_string(),
             self.episodes.to_string(),
-            self.mean_return.to_string(),
-            self.deviation.to_string(),
+            rounded(self.mean_return).to_string(),
+            rounded(self.deviation).to_string(),
         ])?;
         // A whole row at once: others may read meanwhile.
         file.write_all(&csv.into_inner()?).with_context(doing)

@@ -12,14 +12,17 @@ mod recorder;
 mod resume_point;
 mod summary;
 
-pub(crate) use self::evaluations::Candidate;
 pub use self::{
     columns::Columns,
-    episodes::{Episodes, MeanReturn},
+    episodes::{Episodes, MeanReturn, rounded},
     evaluations::{Evaluated, sweep},
     folder::{RunFolder, write_whole},
     metrics::{Progress, progress},
     recorder::{Recorded, RunRecorder},
     resume_point::ResumePoint,
     summary::{Outcome, Summary},
+};
+pub(crate) use self::{
+    evaluations::Candidate,
+    summary::{commands, plot},
 };

@@ -267,3 +267,33 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         assert_eq!(rows("episodes.aside-2.csv"), 1, "{what}");
     }
 }
+
+fn summary(replay: &ReplayStatus) -> Summary {
+    let (learner, none) = (LearnerStatus::default(), Episodes::default());
+    Summary::of(Outcome::Finished, &spec(), replay, &learner, none, 2.0)
+}
+
+#[test]
+fn next_steps_stand_in_columns() {
+    let replay = ReplayStatus {
+        transitions_inserted: 1_280,
+        ..ReplayStatus::default()
+    };
+    // `expect!` takes the indent away.
+    expect![[r#"
+          driml plot runs/x --out plot.png            return, losses, k and speed
+          driml evaluate runs/x                       beside a random policy
+          driml train --resume runs/x --frames 2560   trains on
+    "#]]
+    .assert_eq(
+        &summary(&replay)
+            .next_steps(&RunFolder::new("runs/x"))
+            .replace("  driml", "driml"),
+    );
+}
+
+#[test]
+fn a_run_without_an_episode_has_no_mean_return() {
+    expect!["finished: 0 frames and 0 updates in 2 s (0 frames/s, 0.00 updates/s), replay ratio -, no episode ended"]
+        .assert_eq(&summary(&ReplayStatus::default()).counts());
+}

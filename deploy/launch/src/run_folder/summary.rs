@@ -211,11 +211,11 @@ impl Summary {
     pub fn next_steps(&self, run_dir: &RunFolder) -> String {
         let run = run_dir.display();
         let more = self.frames.saturating_mul(2);
-        format!(
-            "  driml plot {run} --out plot.png              return, losses, k and speed\n  \
-               driml evaluate --run {run}             beside a random policy\n  \
-               driml local --resume {run} --frames {more}   goes on\n"
-        )
+        commands(&[
+            plot(run_dir),
+            (format!("evaluate {run}"), "beside a random policy"),
+            (format!("train --resume {run} --frames {more}"), "trains on"),
+        ])
     }
 
     /// What is printed at the end.
@@ -226,22 +226,43 @@ impl Summary {
     /// How the run ended and what it counted, in one line.
     pub(crate) fn counts(&self) -> String {
         let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
+        let returns = match self.mean_return {
+            None => "no episode ended".into(),
+            Some(mean) => format!(
+                "mean return {mean:.2} over the last {} of {} episodes",
+                self.mean_return_of, self.episodes
+            ),
+        };
         let how = if self.outcome == Outcome::Finished {
             "finished"
         } else {
             "interrupted"
         };
         format!(
-            "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, mean return {} over the last {} of {} episodes",
+            "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, {returns}",
             self.frames,
             self.updates,
             duration(Duration::from_secs_f64(self.wall_seconds)),
             self.frames_per_second,
             self.updates_per_second,
             number(self.replay_ratio),
-            number(self.mean_return),
-            self.mean_return_of,
-            self.episodes,
         )
     }
+}
+
+/// The command that draws a run's curves, and what they are.
+pub(crate) fn plot(run_dir: &RunFolder) -> (String, &'static str) {
+    let command = format!("plot {} --out plot.png", run_dir.display());
+    (command, "return, losses, k and speed")
+}
+
+/// Commands and what each does, in columns.
+pub(crate) fn commands(commands: &[(String, &str)]) -> String {
+    let width = commands
+        .iter()
+        .map(|(command, _)| command.chars().count())
+        .max();
+    let width = width.unwrap_or(0);
+    let line = |(command, what): &(String, &str)| format!("  driml {command:width$}   {what}\n");
+    commands.iter().map(line).collect()
 }

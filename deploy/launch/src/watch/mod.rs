@@ -16,7 +16,7 @@ use crate::{
     console,
     interrupts::Interrupts,
     live_view::recovery,
-    run_folder::Outcome,
+    run_folder::{Outcome, commands, plot},
     status::{self, Connection, Snapshot},
 };
 pub use outputs::Outputs;
@@ -137,10 +137,7 @@ pub fn run(mut connection: Connection, outputs: &Outputs) -> anyhow::Result<()> 
     match run_dir {
         Some(folder) => {
             summary.write(folder)?;
-            let folder = folder.display();
-            console::print(&format!(
-                "  driml plot {folder} --out plot.png              return, losses, k and speed\n"
-            ))
+            console::print(&commands(&[plot(folder)]))
         }
         None => Ok(()),
     }

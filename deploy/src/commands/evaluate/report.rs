@@ -9,7 +9,10 @@ use std::{
 
 use anyhow::Context;
 use clap::ValueEnum;
-use driml_launch::evaluate::{Levels, Player, mean_and_deviation};
+use driml_launch::{
+    evaluate::{Levels, Player, mean_and_deviation},
+    run_folder::rounded,
+};
 use serde_json::json;
 
 /// Who played, and the returns of the episodes.
@@ -47,7 +50,7 @@ impl Table {
         writeln!(self.file, "policy,episode,return")?;
         for (name, returns) in played {
             for (episode, value) in (1..).zip(returns) {
-                writeln!(self.file, "{name},{episode},{value}")?;
+                writeln!(self.file, "{name},{episode},{}", rounded(*value))?;
             }
         }
         self.file.flush()
