@@ -5,7 +5,7 @@ use driml_protocol::session::{self, Endpoints};
 use driml_tests::{Ended, TestSystem, wait_for};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, system};
+use crate::{LONG, SHORT, system};
 
 fn status(system: &TestSystem) -> String {
     let ended = system.run(&format!("status --connect {}", system.endpoint()));
@@ -103,6 +103,23 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
         .run("status --run nowhere")
         .expect_code(64)
         .expect_said("nowhere is no run folder");
+}
+
+/// Its launcher still plays the last checkpoint, and nobody else is there.
+#[test]
+fn a_run_that_is_ending_is_no_riddle() {
+    let system = system();
+    let mut process = system.start(&format!(
+        "local --agent c51 {SHORT} --evaluate-every 1000 --evaluate-episodes 1000000 --run-dir run"
+    ));
+    process.wait_for_stderr("the last checkpoint is being played");
+    let ended = system.run("status --run run").expect_code(0);
+    let said = "the run in run is ending: all frames are in";
+    assert!(ended.stdout.contains(said), "{}", ended.stdout);
+    process.signal(Signal::SIGINT);
+    process.wait().expect_code(0);
+    let ended = system.run("status --run run").expect_code(0);
+    assert!(ended.stdout.contains("the run is over"), "{}", ended.stdout);
 }
 
 #[test]

@@ -38,9 +38,10 @@ impl LookFlags {
     pub(super) fn open(&self) -> anyhow::Result<Option<Connection>> {
         check_endpoints(&self.connect, self.tls.is_set())?;
         let credentials = self.tls.credentials(Role::Observer)?;
-        let endpoints = match &self.run {
+        let folder = self.folder();
+        let endpoints = match &folder {
             None => self.connect.clone(),
-            Some(folder) => match endpoints_of(&RunFolder::new(folder))? {
+            Some(folder) => match endpoints_of(folder)? {
                 Live::At(endpoints) => endpoints,
                 Live::Over(how) => {
                     console::print(&how)?;
@@ -48,6 +49,19 @@ impl LookFlags {
                 }
             },
         };
-        Connection::open(&endpoints, &self.namespace, credentials.as_deref()).map(Some)
+        let opened = Connection::open(&endpoints, &self.namespace, credentials.as_deref());
+        // It may have ended meanwhile.
+        if let (Err(_), Some(folder)) = (&opened, &folder)
+            && let Live::Over(how) = endpoints_of(folder)?
+        {
+            console::print(&how)?;
+            return Ok(None);
+        }
+        opened.map(Some)
+    }
+
+    /// The folder of the run, if it was given.
+    pub(super) fn folder(&self) -> Option<RunFolder> {
+        self.run.as_ref().map(RunFolder::new)
     }
 }

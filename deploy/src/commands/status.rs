@@ -23,7 +23,10 @@ pub(crate) struct StatusArgs {
 /// A call that cannot work, or nobody there.
 pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<()> {
     match args.look.open()? {
-        Some(mut connection) => status::run(&mut connection, args.watch, args.json).map(drop),
+        Some(mut connection) => {
+            let folder = args.look.folder();
+            status::run(&mut connection, folder.as_ref(), args.watch, args.json).map(drop)
+        }
         None => Ok(()),
     }
 }

@@ -43,7 +43,7 @@ pub(super) fn waits(snapshot: &Snapshot) -> Vec<String> {
 /// What is missing, the most important first.
 pub(super) fn to_go_on(snapshot: &Snapshot) -> Vec<String> {
     let mut needed = Vec::new();
-    for server in &snapshot.servers {
+    for server in snapshot.servers.iter().filter(|_| !snapshot.is_over()) {
         if server.is_another_run {
             needed.push(format!(
                 "a run with other settings has taken the place of this one on {}: ask anew",
@@ -52,6 +52,11 @@ pub(super) fn to_go_on(snapshot: &Snapshot) -> Vec<String> {
         } else if let Some(progress) = server.recovering {
             needed.push(format!(
                 "the replay server on {} reads its replay back from disk ({progress}): wait, all goes on by itself",
+                server.endpoint
+            ));
+        } else if server.is_gone {
+            needed.push(format!(
+                "the replay server on {} has ended: if the run is complete, this is its regular end; if not, start it again",
                 server.endpoint
             ));
         } else if let Some(error) = &server.error {
@@ -169,4 +174,62 @@ pub(crate) fn silent_actors(snapshot: &Snapshot, max: usize) -> Vec<String> {
         words.push(format!("and {more} more actors"));
     }
     words
+}
+
+#[cfg(test)]
+mod tests {
+    use expect_test::expect;
+
+    use super::*;
+    use crate::status::Numbers;
+    use driml_protocol::ReplayStatus;
+
+    /// A run whose only replay server does not answer any more; `waiting` is what it said last.
+    fn silent(is_gone: bool, waiting: Waiting) -> Snapshot {
+        let replay = ReplayStatus {
+            waiting,
+            ..ReplayStatus::default()
+        };
+        Snapshot {
+            world: "chain".into(),
+            agent: "c51".into(),
+            seed: 1,
+            run_spec: String::new(),
+            well: false,
+            numbers: Numbers::of(&replay, None, (0.0, 0.0)),
+            frames_planned: 2_000,
+            updates_planned: 100,
+            replay_ratio_planned: 8.0,
+            actors_planned: 1,
+            servers: vec![ServerAnswer {
+                endpoint: "tcp/host:1".into(),
+                replay: None,
+                parts: None,
+                recovering: None,
+                error: Some("no answer".into()),
+                is_gone,
+                is_another_run: false,
+            }],
+            replay,
+            learner: None,
+            waits: Vec::new(),
+            to_go_on: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn a_server_that_ended_is_told_from_one_that_stands_still() {
+        let said = [
+            (false, Waiting::Nobody),
+            (true, Waiting::Nobody),
+            (true, Waiting::Finished),
+        ]
+        .map(|(is_gone, waiting)| to_go_on(&silent(is_gone, waiting)).join("; "));
+        expect![[r#"
+            the replay server on tcp/host:1 does not answer (no answer): is its process frozen, or its machine cut off?
+            the replay server on tcp/host:1 has ended: if the run is complete, this is its regular end; if not, start it again
+        "#]]
+        .assert_eq(&said.join("\n"));
+        assert!(silent(true, Waiting::Finished).is_over());
+    }
 }

@@ -32,6 +32,8 @@ pub struct Connection {
     /// Each with its endpoint.
     servers: Vec<(String, RunClient)>,
     rates: Rates,
+    /// The last answers of all replay servers and of the learner.
+    last: (ReplayStatus, Option<LearnerStatus>),
     /// Episodes that ended and were not taken yet.
     episodes: EndedEpisodes,
 }
@@ -104,6 +106,7 @@ impl Connection {
             after_updates,
             servers,
             rates: Rates::default(),
+            last: Default::default(),
             episodes: EndedEpisodes::default(),
         })
     }
@@ -150,6 +153,7 @@ impl Connection {
                 Err(SessionError::Recovering(it)) => (None, Some(it.progress), None),
                 Err(e) => (None, None, Some(e.to_string())),
             };
+            let is_gone = error.is_some() && reach::look(endpoint).is_err();
             let (replay, parts) = answers.unzip();
             ServerAnswer {
                 endpoint: endpoint.clone(),
@@ -157,6 +161,7 @@ impl Connection {
                 parts,
                 recovering,
                 error,
+                is_gone,
                 is_another_run,
             }
         };
@@ -171,11 +176,18 @@ impl Connection {
         }
         let learner = first.and_then(|(_, client)| client.fetch::<LearnerStatus>(ANSWER_MAX).ok());
         let answered: Vec<_> = servers.iter().filter_map(|it| it.replay.clone()).collect();
-        let replay = ReplayStatus::merged(&answered);
+        let (replay, learner) = match servers.iter().all(|it| it.is_gone) {
+            true => self.last.clone(),
+            false => (ReplayStatus::merged(&answered), learner),
+        };
         if answered.len() == servers.len() && learner.is_some() {
             let updates = learner.as_ref().map_or(0, |it| it.updates);
             self.rates
                 .add(Instant::now(), replay.transitions_inserted, updates);
+        }
+        if answered.len() == servers.len() {
+            let learner = learner.clone().or(self.last.1.take());
+            self.last = (replay.clone(), learner);
         }
         let config = &self.config;
         let mut snapshot = Snapshot {

@@ -19,18 +19,24 @@ pub use self::{
     run_of_folder::{Live, endpoints_of},
     snapshot::{ServerAnswer, Snapshot},
 };
-use crate::{console, interrupts::Interrupts};
+use crate::{console, interrupts::Interrupts, run_folder::RunFolder};
 
 /// How often a run that is watched is asked.
 const PERIOD: Duration = Duration::from_secs(2);
 /// Between the two questions from which one answer's rates are taken.
 const BETWEEN: Duration = Duration::from_secs(1);
 
-/// Asks once, or again and again until it is interrupted, and prints what it is told; gives the last of it.
+/// Asks once, or again and again until it is interrupted, and prints what it is told; gives the last of it. Once nobody can be asked
+/// any more, the run's `folder` tells how it ended, if it is known.
 ///
 /// # Errors
 /// Nobody there, or not a run of this program; [`Interrupted`] if one answer was asked for and Ctrl-C came first.
-pub fn run(connection: &mut Connection, watch: bool, json: bool) -> anyhow::Result<Snapshot> {
+pub fn run(
+    connection: &mut Connection,
+    folder: Option<&RunFolder>,
+    watch: bool,
+    json: bool,
+) -> anyhow::Result<Snapshot> {
     let interrupts = Interrupts::listen(None)?;
     // For the rates: what has happened since.
     connection.ask();
@@ -40,6 +46,12 @@ pub fn run(connection: &mut Connection, watch: bool, json: bool) -> anyhow::Resu
     let terminal = console::Pages::on_stdout();
     loop {
         let snapshot = connection.ask();
+        if let Some(folder) = folder.filter(|_| snapshot.is_gone() && !json)
+            && let Live::Over(how) = endpoints_of(folder)?
+        {
+            console::print(&how)?;
+            return Ok(snapshot);
+        }
         let text = match json {
             true => format!("{}\n", serde_json::to_string(&snapshot)?),
             false => text::describe(&snapshot),

@@ -1,6 +1,7 @@
 //! Where the parts of the run in a folder can be asked, or what the folder says of a run that is over.
 
 use driml_machine::error::usage;
+use driml_protocol::reach;
 use driml_settings::config::RunConfig;
 
 use crate::{
@@ -12,7 +13,7 @@ use crate::{
 pub enum Live {
     /// The endpoints of its replay servers.
     At(Vec<String>),
-    /// Nobody: how it ended and how it would go on, for a person.
+    /// Nobody who can be asked: how it ended and how it would go on, for a person.
     Over(String),
 }
 
@@ -29,11 +30,24 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
         )
     })?;
     let endpoints = std::fs::read_to_string(folder.endpoints()).ok();
+    let config = RunConfig::parse(&folder.config().display().to_string(), &config)?;
     // Whoever runs there holds the lock.
     if folder.lock().is_err()
         && let Some(endpoints) = endpoints
     {
-        return Ok(Live::At(endpoints.lines().map(str::to_owned).collect()));
+        let endpoints: Vec<_> = endpoints.lines().map(str::to_owned).collect();
+        if endpoints.iter().any(|it| reach::look(it).is_ok()) {
+            return Ok(Live::At(endpoints));
+        }
+        let frames = progress(folder).map_or(0, |it| it.frames);
+        let how = match frames >= config.frames() {
+            true => "is ending: all frames are in and its replay server has ended",
+            false => "is starting or ending: no replay server listens",
+        };
+        let folder = folder.display();
+        return Ok(Live::Over(format!(
+            "the run in {folder} {how}. Its launcher still runs; ask again in a moment\n"
+        )));
     }
     if Summary::is_finished(folder) {
         let summary = Summary::read(folder)?.describe(folder);
@@ -42,7 +56,6 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
     let so_far = progress(folder).map_or("nothing".into(), |so_far| {
         format!("{} frames and {} episodes", so_far.frames, so_far.episodes)
     });
-    let config = RunConfig::parse(&folder.config().display().to_string(), &config)?;
     let next = match resume::is_resumable(&config.world, folder) {
         true => format!(
             "`driml local --resume {}` goes on with it",

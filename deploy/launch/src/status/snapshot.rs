@@ -1,6 +1,6 @@
 //! What a run says of itself when it is asked: one answer of all parts that can be asked.
 
-use driml_protocol::{LearnerStatus, PartsStatus, RecoveryProgress, ReplayStatus};
+use driml_protocol::{LearnerStatus, PartsStatus, RecoveryProgress, ReplayStatus, Waiting};
 use serde::Serialize;
 
 use super::numbers::Numbers;
@@ -54,6 +54,8 @@ pub struct ServerAnswer {
     pub recovering: Option<RecoveryProgress>,
     /// Why there is no answer.
     pub error: Option<String>,
+    /// Nothing listens there any more: its process has ended.
+    pub is_gone: bool,
     /// It answers, and for a run with other settings.
     pub is_another_run: bool,
 }
@@ -70,8 +72,13 @@ impl Snapshot {
         self.servers.iter().all(|it| it.replay.is_some())
     }
 
-    /// All is learned and saved.
+    /// Whether all replay servers have ended; the counts are then those of their last answers.
+    pub(crate) fn is_gone(&self) -> bool {
+        self.servers.iter().all(|it| it.is_gone)
+    }
+
+    /// All is learned and saved, or its replay servers have ended after all was sampled.
     pub fn is_over(&self) -> bool {
-        self.numbers.finished
+        self.numbers.finished || self.is_gone() && self.replay.waiting == Waiting::Finished
     }
 }

@@ -4,6 +4,8 @@ use std::fmt::Write;
 
 use driml_protocol::{LogStatus, PartStatus, Waiting};
 
+use crate::live_view::of_planned;
+
 use super::{
     numbers::seconds,
     snapshot::{ServerAnswer, Snapshot},
@@ -25,23 +27,22 @@ pub(super) fn describe(snapshot: &Snapshot) -> String {
         learner,
         ..
     } = snapshot;
-    let updates = learner
-        .as_ref()
-        .map_or("?".into(), |it| it.updates.to_string());
+    let (frames_max, updates_max) = (snapshot.frames_planned, snapshot.updates_planned);
+    let updates = learner.as_ref().map_or(format!("?/{updates_max}"), |it| {
+        of_planned(it.updates, updates_max)
+    });
     let ratio = replay
         .replay_ratio()
         .map_or("-".into(), |it| format!("{it:.2}"));
-    let frames = match snapshot.is_answered() {
-        true => replay.transitions_inserted.to_string(),
-        false => "?".into(),
+    let frames = match snapshot.is_answered() || snapshot.is_gone() {
+        true => of_planned(replay.transitions_inserted, frames_max),
+        false => format!("?/{frames_max}"),
     };
     // Writing to a string cannot fail.
     let _ = writeln!(
         page,
-        "{world}, {agent}: frames {frames}/{} ({:.0}/s)  updates {updates}/{} ({:.1}/s)  replay ratio {ratio} of {}",
-        snapshot.frames_planned,
+        "{world}, {agent}: frames {frames} ({:.0}/s)  updates {updates} ({:.1}/s)  replay ratio {ratio} of {}",
         snapshot.numbers.frames_per_second,
-        snapshot.updates_planned,
         snapshot.numbers.updates_per_second,
         snapshot.replay_ratio_planned,
     );
@@ -101,8 +102,10 @@ pub(super) fn describe(snapshot: &Snapshot) -> String {
         let _ = writeln!(page, "\n{who} warned {age} ago: {}", warning.text);
     }
     let _ = writeln!(page);
-    if snapshot.is_over() {
+    if snapshot.numbers.finished {
         let _ = writeln!(page, "the run is over: all is learned and saved");
+    } else if snapshot.is_over() {
+        let _ = writeln!(page, "the run has ended: all frames were in and sampled");
     } else if snapshot.to_go_on.is_empty() {
         let _ = writeln!(page, "nothing is missing");
     }
@@ -164,7 +167,11 @@ fn server_row(server: &ServerAnswer, of: usize) -> [String; 7] {
         return [&*name, "reads its replay back", &does, "", "", "", ""].map(str::to_owned);
     }
     let Some(account) = &server.parts else {
-        return [&*name, "does not answer", "", "", "", "", ""].map(str::to_owned);
+        let state = match server.is_gone {
+            true => "has ended",
+            false => "does not answer",
+        };
+        return [&*name, state, "", "", "", "", ""].map(str::to_owned);
     };
     let does = format!(
         "{} chunks ({:.1} MiB) and {} requests wait",

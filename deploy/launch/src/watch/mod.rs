@@ -33,7 +33,7 @@ const LAST_POLL: Duration = Duration::from_millis(200);
 /// # Errors
 /// The run is not well: somebody is missing, gone or silent. A file that cannot be written; [`Interrupted`].
 pub fn once(mut connection: Connection, outputs: &Outputs, json: bool) -> anyhow::Result<()> {
-    let snapshot = status::run(&mut connection, false, json)?;
+    let snapshot = status::run(&mut connection, None, false, json)?;
     connection.close();
     if let Some(path) = &outputs.prometheus
         && let Some(failed) = PrometheusFile::new(path).write(&snapshot)
