@@ -25,7 +25,7 @@ pub enum ActError {
     /// The world has another shape than the run's parts agreed on.
     #[error(
         "the world {world} gives (height, width, channels, actions) {given:?}, the run spec promises {promised:?}: \
-         write the run's settings anew with `driml local`"
+         write the run's settings anew with `driml train`"
     )]
     OtherShape {
         /// The world's name, as settings have it.

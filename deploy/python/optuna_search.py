@@ -1,4 +1,4 @@
-"""Searches settings with Optuna: each trial is `driml local` with other settings, judged by `driml evaluate --json`.
+"""Searches settings with Optuna: each trial is `driml train` with other settings, judged by `driml evaluate --json`.
 
     python optuna_search.py [--trials 20] [--env chain] [--agent driml-ada] [--frames 12000] [--seeds 2] [--out search]
 
@@ -19,7 +19,7 @@ except ModuleNotFoundError:
 
 
 def suggest(trial):
-    """The settings of a trial, as `driml local --set` takes them; `driml presets --game G --agent A` lists all."""
+    """The settings of a trial, as `driml train --set` takes them; `driml presets --game G --agent A` lists all."""
     return {
         "learner.update.adam.lr": trial.suggest_float("lr", 1e-5, 1e-2, log=True),
         "replay.replay_ratio": trial.suggest_categorical("replay_ratio", [4, 8, 16]),

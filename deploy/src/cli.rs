@@ -24,12 +24,12 @@ use crate::commands::{
     watch::{self, WatchArgs},
 };
 
-/// What `driml local --help` ends with.
+/// What `driml train --help` ends with.
 const EXAMPLES: &str = "\
 Examples:
-  driml local --env chain --agent c51
-  driml local --env procgen:starpilot --frames 1e6 --seed 3 --run-dir runs/starpilot
-  driml local --resume runs/starpilot
+  driml train --env chain --agent c51
+  driml train --env procgen:starpilot --frames 1e6 --seed 3 --run-dir runs/starpilot
+  driml train --resume runs/starpilot
 
 `driml presets --game starpilot --agent c51` prints what a preset sets: every setting with its source.";
 

@@ -253,7 +253,7 @@ pub enum LearnerConfigError {
     Update(#[from] UpdateError),
     /// Two tables are at odds.
     #[error(
-        "the [model] table's sizes do not follow from [run] and [input]: write the settings anew with `driml local`"
+        "the [model] table's sizes do not follow from [run] and [input]: write the settings anew with `driml train`"
     )]
     Sizes,
 }

@@ -140,7 +140,7 @@ fn dies(part: &str, name: &str) {
         .expect_said(&format!(
             "error: {name} was ended by signal 9 SIGKILL (log: "
         ))
-        .expect_said("`driml local --resume run` goes on with it");
+        .expect_said("`driml train --resume run` goes on with it");
     assert_eq!(system.survivors(), []);
     assert_eq!(system.run_folder("run").summary().outcome, "failed");
 }

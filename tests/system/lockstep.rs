@@ -60,7 +60,7 @@ fn interrupted(system: &TestSystem, flags: &str, signal: Signal) -> Summary {
     if signal == Signal::SIGINT {
         ended
             .expect_code(130)
-            .expect_said("`driml local --resume run` goes on with it");
+            .expect_said("`driml train --resume run` goes on with it");
     }
     let ended = system.run("local --resume run").expect_code(0);
     assert!(

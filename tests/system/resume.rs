@@ -63,7 +63,7 @@ fn an_interrupted_run_goes_on() {
     process
         .wait()
         .expect_code(130)
-        .expect_said("`driml local --resume run` goes on with it");
+        .expect_said("`driml train --resume run` goes on with it");
     let before = system.run_folder("run").summary();
     let summary = resumes(&system);
     // A few tens of episodes ended since, the short ones first; the mean return is of 100 all the same.

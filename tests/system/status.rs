@@ -95,7 +95,7 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
         ended.stdout.contains("nobody runs in run, which holds")
             && ended
                 .stdout
-                .contains("`driml local --resume run` goes on with it"),
+                .contains("`driml train --resume run` goes on with it"),
         "{}",
         ended.stdout
     );

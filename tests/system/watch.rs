@@ -105,7 +105,7 @@ fn a_launched_run_is_watched_and_goes_on_without() {
     system
         .run("watch --run run --run-dir run")
         .expect_code(64)
-        .expect_said("run is written by `driml local` or by another `driml watch`");
+        .expect_said("run is written by `driml train` or by another `driml watch`");
     // Another run's folder is not this one's.
     system
         .run(&format!("local --agent c51 {SHORT} --run-dir other"))

@@ -45,7 +45,7 @@ pub struct QueueFlags {
     /// Start nothing: figures, data and page of the runs that are finished
     #[arg(long)]
     pub(crate) report: bool,
-    /// One setting of every run, as `driml local` takes it; may be given several times
+    /// One setting of every run, as `driml train` takes it; may be given several times
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub(crate) sets: Vec<String>,
 }
@@ -125,10 +125,10 @@ pub struct TradeoffArgs {
 /// What `driml grid` takes.
 #[derive(Clone, Debug, Args)]
 pub struct GridArgs {
-    /// Worlds, such as coinrun,maze or mspacman [default: as `driml local`]
+    /// Worlds, such as coinrun,maze or mspacman [default: as `driml train`]
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) env: Vec<String>,
-    /// Agents, such as c51,driml-ada [default: as `driml local`]
+    /// Agents, such as c51,driml-ada [default: as `driml train`]
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) agent: Vec<String>,
     /// Named settings of every run; `driml presets` lists them

@@ -1,4 +1,4 @@
-//! `driml local --resume`: the settings of an interrupted run, and the point from which it goes on.
+//! `driml train --resume`: the settings of an interrupted run, and the point from which it goes on.
 //! It changes nothing in the run's folder, and waits until an earlier learner has saved there.
 
 use std::{
@@ -49,7 +49,7 @@ fn is_in_lockstep(checkpoint: &Path) -> Result<bool, CheckpointError> {
 pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
     if is_resumable(world, folder) {
         console::line(&format!(
-            "`driml local --resume {}` goes on with it",
+            "`driml train --resume {}` goes on with it",
             folder.display()
         ));
     }

@@ -124,7 +124,7 @@ pub fn sourced(preset: &'static Preset, world: WorldName, agent: &Agent) -> Resu
         note_sources(&layer, &world.with_own_library().to_string(), &mut sources);
     }
     let mut text = format!(
-        "# {} in {world}, preset {}: every setting and its source. `driml local --config` takes this file.\n",
+        "# {} in {world}, preset {}: every setting and its source. `driml train --config` takes this file.\n",
         agent.name, preset.name
     );
     write_table(&table, "", &sources, &mut text);

@@ -20,7 +20,7 @@ pub(crate) struct LookFlags {
     /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; once for each of the run's replay shards
     #[arg(long, value_name = "ENDPOINT", group = "whose")]
     connect: Vec<String>,
-    /// Folder of a run that `driml local` started on this machine
+    /// Folder of a run that `driml train` started on this machine
     #[arg(long, value_name = "DIR", group = "whose")]
     run: Option<PathBuf>,
     /// Prefix of the run's keys

@@ -25,7 +25,7 @@ pub(crate) struct PresetsArgs {
     pub(crate) preset: Option<String>,
 }
 
-/// Prints the menu, or the settings of a game and an agent as TOML that `driml local --config` takes.
+/// Prints the menu, or the settings of a game and an agent as TOML that `driml train --config` takes.
 ///
 /// # Errors
 /// Names that nothing has.

@@ -1,4 +1,4 @@
-//! `driml local`: settings, plan, engine, run folder, and then the processes, as processes or in lockstep.
+//! `driml train`: settings, plan, engine, run folder, and then the processes, as processes or in lockstep.
 //! Starting and ending them is for `driml_launch::launcher`.
 
 use std::path::PathBuf;

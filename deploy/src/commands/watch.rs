@@ -14,7 +14,7 @@ use super::look::LookFlags;
 pub(crate) struct WatchArgs {
     #[command(flatten)]
     look: LookFlags,
-    /// Write settings, metrics and summary there, as `driml local` does; a folder that holds the same run is gone on with
+    /// Write settings, metrics and summary there, as `driml train` does; a folder that holds the same run is gone on with
     #[arg(long, value_name = "DIR")]
     pub(crate) run_dir: Option<PathBuf>,
     /// Write events for TensorBoard too, in that folder

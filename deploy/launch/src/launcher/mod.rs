@@ -169,7 +169,7 @@ pub fn run(
     print_wrapped(&summary.describe(run_dir), 2)?;
     written.with_context(|| {
         format!(
-            "the run is over and its checkpoint saved, but there is no summary of it: make room on the disk, then `driml local --resume {}` \
+            "the run is over and its checkpoint saved, but there is no summary of it: make room on the disk, then `driml train --resume {}` \
              writes it",
             run_dir.display()
         )

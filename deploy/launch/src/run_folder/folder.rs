@@ -60,12 +60,12 @@ impl RunFolder {
         self.path.join("summary.json")
     }
 
-    /// The endpoints of the replay servers, a line each, while `driml local` runs here.
+    /// The endpoints of the replay servers, a line each, while `driml train` runs here.
     pub fn endpoints(&self) -> PathBuf {
         self.path.join("endpoints")
     }
 
-    /// The folder in which the processes of `driml local` meet, while it runs here.
+    /// The folder in which the processes of `driml train` meet, while it runs here.
     pub(crate) fn meeting(&self) -> PathBuf {
         self.path.join("meeting")
     }
@@ -206,7 +206,7 @@ impl RunFolder {
     /// # Errors
     /// A file system that refuses.
     pub(super) fn write_config(&self, config_toml: &str) -> anyhow::Result<()> {
-        let head = "# The resolved settings of this run; `driml local --config` with this file repeats it.\n\n";
+        let head = "# The resolved settings of this run; `driml train --config` with this file repeats it.\n\n";
         write_whole(&self.config(), format!("{head}{config_toml}").as_bytes())
     }
 }

@@ -58,7 +58,7 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
     });
     let next = match resume::is_resumable(&config.world, folder) {
         true => format!(
-            "`driml local --resume {}` goes on with it",
+            "`driml train --resume {}` goes on with it",
             folder.display()
         ),
         false => "it has no checkpoint to go on from".into(),

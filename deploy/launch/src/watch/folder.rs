@@ -49,7 +49,7 @@ fn in_use(folder: &RunFolder, e: anyhow::Error) -> anyhow::Error {
     match folder.lock() {
         Ok(_) => e,
         Err(_) => usage!(
-            "{} is written by `driml local` or by another `driml watch`: leave --run-dir out to look on, or choose another folder",
+            "{} is written by `driml train` or by another `driml watch`: leave --run-dir out to look on, or choose another folder",
             folder.display()
         )
         .into(),

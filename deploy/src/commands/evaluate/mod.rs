@@ -31,7 +31,7 @@ pub(crate) struct EvaluateArgs {
     #[arg(value_name = "RUN", required_unless_present = "run")]
     pub(crate) folder: Option<PathBuf>,
     /// The same
-    #[arg(long, value_name = "DIR", conflicts_with = "folder")]
+    #[arg(long, value_name = "DIR", conflicts_with = "folder", hide = true)]
     pub(crate) run: Option<PathBuf>,
     /// Whole episodes to play
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
