@@ -128,7 +128,12 @@ fn it_plays_checkpoints_while_the_run_goes_on() {
             Some("seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd")
         );
         let rows: Vec<Vec<f64>> = lines
-            .map(|row| row.split(',').map(|it| it.parse().unwrap()).collect())
+            .map(|row| {
+                let cells = row.split(',');
+                // Before the first row of metrics the run's seconds and frames are not known.
+                let cells = cells.map(|it| if it.is_empty() { "0" } else { it });
+                cells.map(|it| it.parse().unwrap()).collect()
+            })
             .collect();
         assert!(rows.len() >= rows_min, "{table}");
         let last = rows.last().unwrap();
