@@ -114,7 +114,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let (config, from, resume_point) = match &args.resume {
         Some(folder) => {
             let found = match resume::find(&RunFolder::new(folder), &args.run.over, &machine)? {
-                Found::Nothing(sentence) => return print(&format!("{sentence}\n")),
+                Found::Nothing(sentence) => return console::print(&format!("{sentence}\n")),
                 Found::Resumed(found) => found,
             };
             args.lockstep = found.lockstep;
