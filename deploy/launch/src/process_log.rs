@@ -32,8 +32,8 @@ pub(crate) struct ProcessLog {
 struct Kept {
     file: File,
     tail: VecDeque<String>,
-    /// What the process says that it ended by.
-    error: Option<String>,
+    /// The error with which the process says that it ended, and how many lines followed: its causes may take several.
+    error: Option<(String, usize)>,
     /// Lines that could not be written.
     lost: u64,
     /// The first error.
@@ -107,7 +107,14 @@ impl ProcessLog {
 
     /// The error with which the process ended, if it said one.
     pub(crate) fn error(&self) -> Option<String> {
-        lock(&self.kept).error.clone()
+        let kept = lock(&self.kept);
+        let (mut error, followed) = kept.error.clone()?;
+        let before = kept.tail.len().saturating_sub(followed);
+        for line in kept.tail.iter().skip(before) {
+            error.push_str("\n  ");
+            error.push_str(line);
+        }
+        Some(error)
     }
 
     /// How many lines could not be written, and why; none if all were.
@@ -140,8 +147,10 @@ impl Kept {
         if self.tail.len() == TAIL_LINES_MAX {
             self.tail.pop_front();
         }
-        if let Some(error) = line.strip_prefix("error: ") {
-            self.error = Some(error.into());
+        match (line.strip_prefix("error: "), &mut self.error) {
+            (Some(error), _) => self.error = Some((error.into(), 0)),
+            (None, Some((_, followed))) => *followed += 1,
+            (None, None) => {}
         }
         self.tail.push_back(line);
         let error = written.err()?;
@@ -187,6 +196,12 @@ mod tests {
         assert_eq!(std::fs::read_to_string(log.path()).unwrap(), lines);
         assert_eq!((log.tail().len(), log.tail()[7].as_str()), (8, "line 9"));
         assert_eq!(log.missing(), None);
+        assert_eq!(log.error(), None);
+        for line in ["error: it failed. Its last words:", "no", "more"] {
+            lock(&log.kept).add(line.into());
+        }
+        let said = "it failed. Its last words:\n  no\n  more";
+        assert_eq!(log.error().as_deref(), Some(said));
 
         lock(&log.kept).file = File::options().append(true).open("/dev/full").unwrap();
         let add = |line: &str| lock(&log.kept).add(line.into());
