@@ -138,8 +138,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         &activity,
         shutdown,
     );
-    if let Err(e) = &learned {
-        tracing::error!("ends after {} updates: {e:#}", learner.updates());
+    if learned.is_err() {
+        tracing::info!("ends early, after {} updates", learner.updates());
     }
     activity.begin("saves its last checkpoint");
     // What was stored since the last batch counts too.

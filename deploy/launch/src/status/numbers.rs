@@ -71,7 +71,9 @@ impl Numbers {
         let losses = learned.map_or(&[][..], |it| &it.losses);
         Self {
             frames: replay.transitions_inserted,
-            updates: learner.map(|it| it.updates),
+            updates: learner
+                .map(|it| it.updates)
+                .or_else(|| replay.learner_finished.then_some(replay.updates)),
             frames_per_second,
             updates_per_second,
             replay_ratio: replay.replay_ratio(),
@@ -96,7 +98,8 @@ impl Numbers {
             transitions_lost: replay.transitions_lost,
             transitions_duplicated: replay.transitions_duplicated,
             messages_refused: replay.messages_refused,
-            finished: replay.finished && learner.is_some_and(|it| it.finished),
+            finished: replay.learner_finished
+                || replay.finished && learner.is_some_and(|it| it.finished),
         }
     }
 }
