@@ -5,9 +5,9 @@
 use std::borrow::Cow;
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, Buffer, Chunk, Claim, CodecError,
-    EndedEpisode, EpisodesReply, Goodbye, InsertReply, Learned, LearnerJoin, LogStatus, Origin,
-    Played, PriorityUpdate, ReplayStatus, RequestId, RunSpec, Tally, Waiting, codec,
+    ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, Buffer, Chunk, ChunkHeader, Claim,
+    CodecError, EndedEpisode, EpisodesReply, Goodbye, InsertReply, Learned, LearnerJoin, LogStatus,
+    Origin, Played, PriorityUpdate, ReplayStatus, RequestId, RunSpec, Tally, Waiting, codec,
 };
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -20,7 +20,12 @@ use crate::{
         requests::{Dedup, Requests},
         statistics::Statistics,
     },
-    persist::{Log, Mark, PersistError, snapshot::Note, snapshot::Snapshot},
+    persist::{
+        error::PersistError,
+        log::Log,
+        segment::Mark,
+        snapshot::{Note, Snapshot},
+    },
     rate_limiter::RateLimiter,
     sampling::{
         assemble::{Assembler, RowStates},
@@ -43,6 +48,9 @@ const RNG_STREAM: u64 = u64::from_be_bytes(*b"replay-1");
 const VERSION_AHEAD_MAX: u64 = 1 << 32;
 /// Most updates and rows that a learner can have behind it.
 const LEARNED_MAX: u64 = 1 << 60;
+
+/// Transitions of one piece of what is gone.
+const GONE_PIECE: u64 = 256;
 
 /// Why there is no batch.
 #[derive(Clone, Debug, PartialEq)]
@@ -835,8 +843,88 @@ impl Replay {
         self.config.sampling.is_prioritised() == is_prioritised
     }
 
+    /// Takes back a snapshot. The transitions between what is stored and those that the snapshot knows are gone: of an empty replay
+    /// all, else they leave a gap, whose size is the result; 0 if it is so large that nothing before it is held.
+    ///
+    /// # Errors
+    /// It is none of a replay of this run; the reason, for a person.
+    pub(crate) fn restore(&mut self, mut snapshot: Snapshot) -> Result<u64, String> {
+        if let Some(why) = snapshot.unfit(&self.snapshot(), self.spec.num_actions) {
+            return Err(why.into());
+        }
+        let (stored, inserted) = (self.ring.inserted(), snapshot.inserted);
+        if self.ring.first() == stored {
+            self.ring.start_at(inserted);
+        } else if inserted.saturating_sub(stored) >= self.ring.capacity() {
+            // Nothing that is stored would be held.
+            let origin = self.origin;
+            *self = Self::shard(&self.spec, &self.config, self.batch_size, origin.shard)
+                .map_err(|e| e.to_string())?;
+            self.origin = origin;
+            self.ring.start_at(inserted);
+            snapshot.actors.cut_streams(stored);
+        }
+        let gap = inserted.checked_sub(self.ring.inserted()).ok_or_else(|| {
+            format!("a state after {inserted} transitions, where {stored} are stored")
+        })?;
+        if gap > 0 {
+            self.push_gone(gap);
+            snapshot.actors.cut_streams(stored);
+        }
+        self.forget_before(snapshot.oldest);
+        snapshot.actors.note_restored();
+        if gap == 0 {
+            snapshot.statistics.keep_newest_of(&mut self.statistics);
+        }
+        self.limiter.set_counts(snapshot.counts);
+        self.restore_rows(snapshot.oldest, &snapshot.rows);
+        let Snapshot {
+            actors,
+            learner,
+            learned,
+            resumed_after,
+            inserted_before,
+            rows_before,
+            affinity,
+            rng,
+            statistics,
+            starving,
+            ..
+        } = snapshot;
+        (self.actors, self.learner, self.learned) = (actors, learner, learned);
+        (self.resumed_after, self.starving) = (resumed_after, starving);
+        (self.inserted_before, self.rows_before) = (inserted_before, rows_before);
+        (self.affinity, self.rng, self.statistics) = (affinity, rng, statistics);
+        self.statistics.actors = 0;
+        Ok(gap)
+    }
+
+    /// Takes the place of `count` transitions that are gone.
+    fn push_gone(&mut self, mut count: u64) {
+        let packer = self.packer();
+        while count > 0 {
+            let steps = count.min(GONE_PIECE).min(self.ring.capacity());
+            let chunk = Chunk::zeroed(ChunkHeader {
+                actor: 0,
+                incarnation: 0,
+                sequence: 0,
+                first_transition: 0,
+                weights_version: 0,
+                leaving: false,
+                streams: 1,
+                steps: steps as u32,
+                frame_bytes: self.spec.frame_bytes() as u32,
+            });
+            let packed = packer.pack(Cow::Owned(chunk));
+            for run in packed.runs() {
+                self.ring.push_gone(run, steps);
+            }
+            count -= steps;
+        }
+    }
+
     /// Takes back how rows were drawn when `oldest` was the oldest transition.
-    pub(crate) fn restore_rows(&mut self, oldest: u64, state: &RowsState) {
+    fn restore_rows(&mut self, oldest: u64, state: &RowsState) {
         let (ring, episodes) = (&self.ring, &self.episodes);
         let held = Held { ring, episodes };
         self.rows.restore(held, oldest, state, &mut self.window);

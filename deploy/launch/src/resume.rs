@@ -158,11 +158,15 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         )
         .into());
     }
-    let (frames, rows) = (progress.frames(), progress.rows());
+    // Where nothing was learned, nothing is behind it.
+    let (frames, rows) = match updates {
+        0 => (0, 0),
+        _ => (progress.frames(), progress.rows()),
+    };
     let has_other_pace = before.learner.batch_size != config.learner.batch_size
         || before.replay.replay_ratio != config.replay.replay_ratio
         || before.replay.warmup_transitions != config.replay.warmup_transitions;
-    if has_other_pace {
+    if has_other_pace && updates > 0 {
         config.replay.since = Some(Since {
             transitions: frames,
             rows,

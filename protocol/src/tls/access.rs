@@ -205,6 +205,7 @@ mod tests {
                 "d/affinity",
                 "d/priorities",
                 "d/weights-upload",
+                "d/status/replay",
                 "d/report/learner",
                 "d/status/learner",
                 "d/alive/learner/*",

@@ -60,6 +60,14 @@ impl Statistics {
         self
     }
 
+    /// Takes the ended episodes that `before` keeps, if these counts are of the same moment: a snapshot has those alone that were not
+    /// recorded.
+    pub(crate) fn keep_newest_of(&mut self, before: &mut Self) {
+        if self.episodes == before.episodes {
+            self.newest = std::mem::take(&mut before.newest);
+        }
+    }
+
     /// What is counted of transitions stored, without what is counted of rows drawn.
     pub(crate) fn of_stored(self) -> Self {
         let mut stored = self.of_changes();

@@ -11,141 +11,20 @@
 //! What was answered has been written: it survives the death of the process at any moment. What was flushed, once in
 //! `replay.fsync_ms`, survives a power cut too.
 
-mod error;
+pub(crate) mod error;
 mod folder;
 mod journal;
+pub(crate) mod log;
 mod opening;
 mod progress;
 mod record;
 mod recover;
-mod segment;
+pub(crate) mod segment;
 pub(crate) mod snapshot;
 mod sync;
 
-use std::collections::VecDeque;
-
-use driml_protocol::LogStatus;
-
-use crate::storage::frame_store::PackedChunk;
 pub use error::PersistError;
-use folder::LogFolder;
-use journal::Journal;
 pub(crate) use opening::shard_dir;
 pub use opening::{KeptReplay, PersistArgs, Recovery};
 pub use progress::Reading;
 pub use segment::Mark;
-use snapshot::{Note, Snapshot};
-
-/// Marks that hold: if the newest is of a checkpoint that was not written whole, the one before it is wanted.
-const MARKS: usize = 2;
-
-/// The log of a replay.
-pub(crate) struct Log {
-    journal: Journal,
-    spec_hash: u64,
-    /// The last two marks that were not given up, the newest last.
-    marks: VecDeque<Marked>,
-    _folder: LogFolder,
-}
-
-/// A moment to which a replay can go back: what it needs stays in the log.
-#[derive(Clone, Copy, Debug)]
-struct Marked {
-    mark: Mark,
-    /// The oldest transition that was held.
-    oldest_row: u64,
-}
-
-impl Log {
-    /// Hash of the spec of the run whose chunks it holds.
-    pub(crate) const fn spec_hash(&self) -> u64 {
-        self.spec_hash
-    }
-
-    pub(crate) fn bytes(&self) -> u64 {
-        self.journal.bytes()
-    }
-
-    pub(crate) fn status(&self) -> LogStatus {
-        self.journal.status()
-    }
-
-    /// Whether all that was noted is written.
-    pub(crate) fn is_ready(&mut self) -> bool {
-        self.journal.is_ready()
-    }
-
-    /// Whether the disk refused what was to be written last.
-    pub(crate) const fn is_failing(&self) -> bool {
-        self.journal.is_failing()
-    }
-
-    pub(crate) fn is_full(&self) -> bool {
-        self.journal.is_full()
-    }
-
-    /// Where the disk budget does not allow another segment: the oldest transition that may stay.
-    pub(crate) fn over_budget(&self) -> Option<u64> {
-        self.journal.over_budget()
-    }
-
-    pub(crate) fn flush(&mut self) {
-        self.journal.flush();
-    }
-
-    /// Writes a chunk that is to be stored; `false`: the disk refuses, and it must not be.
-    ///
-    /// # Errors
-    /// A chunk that makes no message; the reason, for a person.
-    pub(crate) fn chunk(&mut self, packed: &PackedChunk<'_>) -> Result<bool, String> {
-        let chunk = &packed.chunk;
-        match &packed.sealed {
-            Some(Ok(head)) => Ok(self.journal.append_chunk(head, chunk.payload())),
-            Some(Err(e)) => Err(e.to_string()),
-            None => chunk
-                .seal(self.spec_hash)
-                .map(|(head, payload)| self.journal.append_chunk(&head, payload))
-                .map_err(|e| e.to_string()),
-        }
-    }
-
-    /// Writes down who came or went.
-    pub(crate) fn note(&mut self, note: &Note) {
-        if let Err(e) = self.journal.append_note(note) {
-            // A value over the codec's limit.
-            tracing::error!("a note cannot be written to the replay's log: {e}");
-        }
-    }
-
-    /// Begins another segment.
-    pub(crate) fn rotate(&mut self, snapshot: &Snapshot) {
-        if let Err(e) = self.journal.rotate(snapshot) {
-            tracing::error!("a segment of the replay's log cannot be begun: {e}");
-        }
-    }
-
-    /// Begins another segment, which is on the disk when this returns and stays.
-    pub(crate) fn mark(&mut self, snapshot: Snapshot) -> Result<Mark, PersistError> {
-        let oldest_row = snapshot.oldest;
-        let mark = self.journal.mark(&snapshot)?;
-        if self.marks.len() == MARKS {
-            self.marks.pop_front();
-        }
-        self.marks.push_back(Marked { mark, oldest_row });
-        Ok(mark)
-    }
-
-    /// Nothing will go back to `mark`.
-    pub(crate) fn give_up(&mut self, mark: Mark) {
-        self.marks.retain(|it| it.mark != mark);
-    }
-
-    /// Removes the segments that neither the ring, whose oldest transition is `oldest_row`, nor a mark needs.
-    pub(crate) fn prune(&mut self, oldest_row: u64) {
-        let (oldest, keep) = match self.marks.front() {
-            Some(first) => (oldest_row.min(first.oldest_row), first.mark.segment()),
-            None => (oldest_row, u64::MAX),
-        };
-        self.journal.prune(oldest, keep);
-    }
-}

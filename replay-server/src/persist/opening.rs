@@ -12,10 +12,10 @@ use super::{
     error::PersistError,
     folder::LogFolder,
     journal::{Journal, Limits, Place},
+    log::{Log, Marked},
     progress::Reading,
     recover::{Recovered, find_id, go_back, recover},
     segment::{FORMAT, LogId, Mark},
-    {Log, Marked},
 };
 use crate::{
     config::{Config, SEGMENT_BYTES_MIN},

@@ -105,7 +105,8 @@ pub(crate) fn replay(bytes: &[u8]) {
     }
     replay.check_valid();
     let status = replay.status();
-    assert!(status.transitions_held <= status.transitions_inserted);
+    let stored = status.transitions_inserted + status.transitions_refilled;
+    assert!(status.transitions_held <= stored);
 }
 
 fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {

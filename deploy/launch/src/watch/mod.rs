@@ -16,7 +16,7 @@ use crate::{
     console,
     interrupts::Interrupts,
     live_view::recovery,
-    run_folder::{Outcome, commands, plot},
+    run_folder::{Outcome, RunFolder, commands, plot},
     status::{self, Connection, Snapshot},
 };
 pub use outputs::Outputs;
@@ -95,7 +95,9 @@ pub fn run(mut connection: Connection, outputs: &Outputs) -> anyhow::Result<()> 
     if let Some(failed) = file.as_mut().and_then(|it| it.write(&snapshot)) {
         return Err(usage!("--prometheus: {failed}").into());
     }
-    let is_unknown = outputs.run_dir.is_some() && connection.after_updates.is_none();
+    let goes_on = |folder: &RunFolder| folder.metrics().exists();
+    let is_unknown =
+        outputs.run_dir.as_ref().is_some_and(goes_on) && connection.after_updates.is_none();
     if is_unknown || snapshot.recovering().next().is_some() {
         // What the run has done so far is not known before.
         snapshot = wait_until_known(&mut connection, &interrupts)?;
