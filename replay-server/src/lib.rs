@@ -95,7 +95,10 @@ pub use sampling::{
     assemble::{RETURN_ERROR, return_sum_error},
     horizon,
     packed_batch::PackedBatch,
-    rows::prioritised::{CHANCE_ERROR, PRIORITY_MIN, PriorityCounts},
+    rows::{
+        prioritised::{CHANCE_ERROR, PRIORITY_MIN},
+        sampler::PriorityCounts,
+    },
 };
 pub use service::{RunArgs, run, shared_memory_bytes};
 pub use storage::frame_store::{PackedChunk, Packer};

@@ -33,7 +33,10 @@ use crate::{
         horizon::Affinity,
         needed_frames::NeededFrames,
         packed_batch::{PackedBatch, PackedFrames},
-        rows::{self, Held, RowSampler, RowsState, prioritised::PriorityCounts},
+        rows::{
+            self,
+            sampler::{Held, PriorityCounts, RowSampler, RowsState},
+        },
     },
     storage::{
         frame_store::{Frames, PackedChunk, Packer},

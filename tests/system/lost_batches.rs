@@ -86,12 +86,16 @@ fn declare(
     declared.wait().unwrap()
 }
 
+/// A session, and what it answers.
+type Declared = (Session, [Queryable<()>; 2]);
+
 /// Replay servers of these shards, of which some batches get lost, and a learner's end of them.
 struct Shards {
     replays: Vec<Arc<Mutex<Replay>>>,
     drawn: Arc<AtomicU32>,
     source: BatchSource,
-    _served: (Vec<(Session, [Queryable<()>; 2])>, tempfile::TempDir),
+    _sessions: Vec<Declared>,
+    _folder: tempfile::TempDir,
 }
 
 fn serve(shards: Vec<Replay>) -> Shards {
@@ -134,7 +138,8 @@ fn serve(shards: Vec<Replay>) -> Shards {
         replays,
         drawn,
         source,
-        _served: (declared, folder),
+        _sessions: declared,
+        _folder: folder,
     }
 }
 
@@ -142,7 +147,7 @@ impl Shards {
     /// The next batch; none at the end of the run.
     fn next(&mut self) -> Option<Served> {
         match self.source.next(Duration::from_secs(60)).unwrap() {
-            Next::Batch(served) => Some(served),
+            Next::Batch(served) => Some(*served),
             Next::Finished => None,
             Next::NotYet(waiting) => panic!("no batch in a minute: {waiting}"),
         }

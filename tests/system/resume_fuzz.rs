@@ -216,7 +216,10 @@ fn resume_once(seed: u64) {
             // The log holds what came after the checkpoint, too.
             (false, _) => assert!(counted >= before.frames + delivered, "{said}"),
         }
-        assert!(store == "" || after.transitions_refilled == 0, "{said}");
+        assert!(
+            store.is_empty() || after.transitions_refilled == 0,
+            "{said}"
+        );
     }
     let episodes = run.episodes();
     assert!(

@@ -16,7 +16,7 @@ use driml_launch::{
 };
 use driml_learner::{
     LearnerConfig,
-    remote::batch_source::{BatchSource, Counters, Next, Requests, Served},
+    remote::batch_source::{BatchSource, Counters, Next, Requests},
 };
 use driml_protocol::{
     BufferPool, Keys, RunClient, Shutdown, join,
@@ -291,7 +291,8 @@ impl Run {
             &shutdown,
         )?;
         let rate = effort.rate_overall(|| match source.next(ANSWER_MAX)? {
-            Next::Batch(Served { batch, .. }) => {
+            Next::Batch(served) => {
+                let batch = &served.batch;
                 let planes = [batch.states_t(), batch.states_k(), batch.states_n()];
                 black_box(planes.map(|plane| touched(&plane)));
                 Ok(())

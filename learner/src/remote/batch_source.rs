@@ -100,7 +100,7 @@ pub struct Served {
 
 /// What a fetching thread says.
 enum Fetched {
-    Batch(Served),
+    Batch(Box<Served>),
     Finished,
     Failed(BatchError),
 }
@@ -119,7 +119,7 @@ pub struct BatchSource {
 /// What the learner gets when it asks for its next batch.
 pub enum Next {
     /// A batch to learn from.
-    Batch(Served),
+    Batch(Box<Served>),
     /// No batch came within the time given; ask again. The replay server says who waits for whom.
     NotYet(Waiting),
     /// The run is over: no further batch will come.
@@ -288,8 +288,8 @@ impl Fetcher {
                     continue;
                 }
             };
-            if let Fetched::Batch(Served { batch, .. }) = &fetched {
-                let header = &batch.header;
+            if let Fetched::Batch(served) = &fetched {
+                let header = &served.batch.header;
                 let (newest, oldest) = header.weights_versions;
                 tracing::debug!(
                     "a batch came: {} rows acted by weights {oldest} to {newest}",
@@ -316,7 +316,7 @@ impl Fetcher {
         Ok(match answer {
             Answer::Batch(batch) => {
                 let parts = vec![self.received(0, &batch)];
-                Some(Fetched::Batch(Served { batch, parts }))
+                Some(Fetched::Batch(Box::new(Served { batch, parts })))
             }
             Answer::Wait => None,
             Answer::Finished => Some(Fetched::Finished),
@@ -411,7 +411,7 @@ impl Fetcher {
             parts.clear();
             let parts = std::mem::take(from);
             partial.whole_at = Instant::now();
-            return Ok(Some(Fetched::Batch(Served { batch, parts })));
+            return Ok(Some(Fetched::Batch(Box::new(Served { batch, parts }))));
         }
         self.recount(&mut partial, |_, _| true)?;
         // A shard that has given its part knows of the others' transitions what they had then: it may be wrong about the end.

@@ -189,7 +189,7 @@ fn learn(
     let (mut waiting_since, mut said_next) = (Instant::now(), SILENT_MAX);
     while !shutdown.is_set() {
         let Served { batch, parts } = match batches.next(TICK)? {
-            Next::Batch(served) => served,
+            Next::Batch(served) => *served,
             Next::NotYet(waiting) => {
                 activity.begin("waits for a batch");
                 let since = waiting_since.elapsed();

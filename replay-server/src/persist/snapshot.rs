@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::{
     ledger::{actors::Actors, statistics::Statistics},
     rate_limiter::Counts,
-    sampling::{horizon::Affinity, rows::RowsState},
+    sampling::{horizon::Affinity, rows::sampler::RowsState},
 };
 
 /// Most of anything that a run counts.

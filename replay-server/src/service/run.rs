@@ -32,7 +32,7 @@ use super::{
 use crate::{
     config::Config,
     persist::{PersistError, Reading},
-    sampling::rows::prioritised::PriorityCounts,
+    sampling::rows::sampler::PriorityCounts,
 };
 
 /// Threads that make batches: one assembles while another's reply is being sent.

@@ -9,9 +9,11 @@ use std::collections::{BTreeMap, VecDeque};
 
 use driml_protocol::{Origin, PriorityPart, PriorityUpdate};
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
 
-use super::{Held, RowSampler, RowsState, sum_tree::SumTree};
+use super::{
+    sampler::{Held, PriorityCounts, RowSampler, RowsState, SavedPriorities},
+    sum_tree::SumTree,
+};
 use crate::{
     sampling::episodes::Window,
     storage::ring::{Link, Ring},
@@ -27,38 +29,6 @@ pub const CHANCE_ERROR: f64 = 6.1e-8;
 
 /// The highest priority before the first is known, as in Dopamine: any would do, as all are equal then.
 const FIRST_PRIORITY: f64 = 1.0;
-
-/// What became of the priorities that the learner has sent, in rows.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct PriorityCounts {
-    /// Rows whose transition has the priority now.
-    pub set: u64,
-    /// Rows whose transition was overwritten meanwhile, or was drawn by an earlier life of the replay server.
-    pub gone: u64,
-    /// Rows of updates that had come before.
-    pub repeated: u64,
-}
-
-/// What cannot be told from the transitions held.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct SavedPriorities {
-    /// The highest priority seen.
-    highest: f64,
-    /// Of each transition held, the oldest first, its mass.
-    masses: Vec<f64>,
-    last: Option<(u64, u64)>,
-    counts: PriorityCounts,
-}
-
-impl SavedPriorities {
-    /// Why these cannot be the priorities of `held` transitions; none if they can.
-    pub(super) fn unfit(&self, held: u64) -> Option<&'static str> {
-        let is_mass = |mass: &f64| mass.is_finite() && *mass >= 0.0;
-        let are_masses = self.masses.iter().chain([&self.highest]).all(is_mass);
-        let fits = self.masses.len() as u64 == held && are_masses;
-        (!fits).then_some("a state with priorities of other transitions, or with one below 0")
-    }
-}
 
 /// The priorities of the transitions held, those that can be anchors alone.
 pub(super) struct Priorities {

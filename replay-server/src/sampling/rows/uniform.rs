@@ -5,7 +5,7 @@ use driml_protocol::{Origin, PriorityUpdate};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::{Held, RowSampler, RowsState, prioritised::PriorityCounts};
+use super::sampler::{Held, PriorityCounts, RowSampler, RowsState};
 use crate::{
     sampling::episodes::Window,
     storage::ring::{Link, Ring},

@@ -1,0 +1,108 @@
+//! What a rule of drawing anchors does, and what of it is kept.
+//! The rules are in files of their own.
+
+use driml_protocol::{Origin, PriorityUpdate};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    sampling::episodes::{Episodes, Window},
+    storage::ring::{Link, Ring},
+};
+
+/// What became of the priorities that the learner has sent, in rows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PriorityCounts {
+    /// Rows whose transition has the priority now.
+    pub set: u64,
+    /// Rows whose transition was overwritten meanwhile, or was drawn by an earlier life of the replay server.
+    pub gone: u64,
+    /// Rows of updates that had come before.
+    pub repeated: u64,
+}
+
+/// What cannot be told from the transitions held.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedPriorities {
+    /// The highest priority seen.
+    pub(super) highest: f64,
+    /// Of each transition held, the oldest first, its mass.
+    pub(super) masses: Vec<f64>,
+    pub(super) last: Option<(u64, u64)>,
+    pub(super) counts: PriorityCounts,
+}
+
+impl SavedPriorities {
+    /// Why these cannot be the priorities of `held` transitions; none if they can.
+    pub(super) fn unfit(&self, held: u64) -> Option<&'static str> {
+        let is_mass = |mass: &f64| mass.is_finite() && *mass >= 0.0;
+        let are_masses = self.masses.iter().chain([&self.highest]).all(is_mass);
+        let fits = self.masses.len() as u64 == held && are_masses;
+        (!fits).then_some("a state with priorities of other transitions, or with one below 0")
+    }
+}
+
+/// The transitions held, and the episodes that they form.
+#[derive(Clone, Copy)]
+pub(crate) struct Held<'a> {
+    pub(crate) ring: &'a Ring,
+    pub(crate) episodes: &'a Episodes,
+}
+
+/// A rule by which anchors are drawn.
+pub(crate) trait RowSampler: Send {
+    /// A run of consecutive transitions of one stream was stored, those from `first` on; `link` was the first one's.
+    fn stored(&mut self, held: Held<'_>, first: u64, link: Link);
+
+    /// Transitions were let go.
+    fn forget(&mut self, ring: &Ring);
+
+    /// Leaves the window of an anchor in `window`; false if there is none.
+    fn draw(&mut self, held: Held<'_>, rng: &mut ChaCha8Rng, window: &mut Window) -> bool;
+
+    /// The probability with which each draw gives the anchor `index`; none where all anchors are equally likely.
+    fn probability(&self, index: u64) -> Option<f64>;
+
+    /// Takes the priorities that the learner found; those drawn by another `origin` change nothing.
+    ///
+    /// # Errors
+    /// A rule without priorities, or a transition that was never stored; the reason, for a person. Nothing has then changed.
+    fn update(
+        &mut self,
+        ring: &Ring,
+        update: &PriorityUpdate,
+        origin: Origin,
+    ) -> Result<(), String>;
+
+    /// What became of the priorities that came; none where there are no priorities.
+    fn priority_counts(&self) -> Option<PriorityCounts>;
+
+    /// What decides the next draws, beside what is held.
+    fn state(&self, ring: &Ring) -> RowsState;
+
+    /// Takes back a state; of transitions that are no longer held, or were not, nothing. `oldest` is the oldest that was held.
+    fn restore(&mut self, held: Held<'_>, oldest: u64, state: &RowsState, window: &mut Window);
+
+    /// Panics at the first thing that is wrong. Slow: for tests.
+    fn check_valid(&self, held: Held<'_>);
+}
+
+/// [`RowSampler::state`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) enum RowsState {
+    /// Whether the valid anchors are listed: a draw then takes other numbers from the generator.
+    Uniform {
+        are_listed: bool,
+    },
+    Prioritised(SavedPriorities),
+}
+
+impl RowsState {
+    /// Why this cannot be the state of a replay that held `held` transitions; none if it can.
+    pub(crate) fn unfit(&self, held: u64) -> Option<&'static str> {
+        match self {
+            Self::Uniform { .. } => None,
+            Self::Prioritised(saved) => saved.unfit(held),
+        }
+    }
+}
