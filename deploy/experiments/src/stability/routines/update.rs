@@ -224,10 +224,10 @@ fn larger(a: f64, b: f64) -> f64 {
     if a.is_nan() || a > b { a } else { b }
 }
 
-/// The middle one; NaN, which is the largest, of none.
-fn median(mut errors: Vec<f64>) -> f64 {
+/// The median; none of no errors.
+fn median(mut errors: Vec<f64>) -> Option<f64> {
     errors.sort_by(f64::total_cmp);
-    errors.get(errors.len() / 2).copied().unwrap_or(f64::NAN)
+    errors.get(errors.len() / 2).copied()
 }
 
 fn of_kernels(
@@ -259,7 +259,10 @@ fn of_kernels(
             found.extend(gradient);
             Ok(())
         })?;
-        gradients.see(median(found), || format!("weights x {scale:e}"));
+        // Of a few cases none may have a gradient that can be compared.
+        if let Some(error) = median(found) {
+            gradients.see(error, || format!("weights x {scale:e}"));
+        }
         context.progress.advance(0)?;
     }
     Ok([losses, gradients])
