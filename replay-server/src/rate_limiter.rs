@@ -97,7 +97,7 @@ impl RateLimiter {
         rows.saturating_add(other_shards.rows_sampled)
     }
 
-    /// Takes what the other shards had counted at a learner's checkpoint, in place of what was heard before.
+    /// Replaces the other shards' counts by those of a learner's checkpoint.
     pub(crate) const fn adopt_other_shards(&mut self, others: Tally) {
         self.counts.other_shards = others;
     }

@@ -205,7 +205,7 @@ impl Replay {
     }
 
     /// The same, drawing under this number: priorities of rows that were drawn under another one are counted and change nothing.
-    /// Whoever starts a replay server again that numbers its transitions anew, or lost some, gives another.
+    /// A replay server that is started again numbers its transitions anew, or has lost some, and so draws another number.
     #[must_use]
     pub const fn with_incarnation(mut self, incarnation: u64) -> Self {
         self.origin.incarnation = incarnation;
@@ -473,7 +473,7 @@ impl Replay {
         Ok(again)
     }
 
-    /// Goes on where a learner's checkpoint stands, if nothing is stored.
+    /// Counts on from a learner's checkpoint, if nothing is stored here.
     fn resume_empty(&mut self, join: &LearnerJoin) {
         if join.updates == 0 || self.ring.inserted() > 0 {
             return;
@@ -745,7 +745,7 @@ impl Replay {
         self.log.as_ref().map(Log::status)
     }
 
-    /// Whether all that was noted is on disk: while it is not, nobody is told that it has joined or may leave.
+    /// Whether all notes are on disk; until then joins and goodbyes get no answer.
     pub fn is_ready(&mut self) -> bool {
         self.log.as_mut().is_none_or(Log::is_ready)
     }

@@ -1,6 +1,6 @@
-//! Resumes at random: a run is stopped at any moment in any way, goes on with other settings, and its counts are those that the actors'
-//! logs, its checkpoint and the settings give by themselves.
-//! What is said where a run cannot be resumed is tested in `resume`.
+//! Random resumes: a run is stopped at any moment in any way and resumed with other settings. Its counts must equal those computed from
+//! the actors' logs, the checkpoint and the settings.
+//! Messages for runs that cannot be resumed are tested in `resume`.
 
 use std::{fmt::Write as _, fs, time::Duration};
 
@@ -148,7 +148,7 @@ fn resume_once(seed: u64) {
         Duration::from_millis(rng.random_range(0..1_500)),
     );
     let Some(before) = saved(&run) else {
-        // Nothing was saved yet, and that is said.
+        // Nothing was saved yet.
         system
             .run("local --resume run")
             .expect_code(64)

@@ -90,8 +90,8 @@ fn a_learner_whose_replay_server_is_gone_saves() {
     assert!(newest_checkpoint(&system) > 75);
 }
 
-/// A new replay server at the same place knows nothing of the run: those that took part in it end, and a learner with its checkpoint
-/// goes on with the counts of the run.
+/// A new replay server at the same endpoint knows nothing of the run: actors and learner of before exit, and a learner with the run's
+/// checkpoint resumes the run's counts.
 #[test]
 fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     let system = system();

@@ -76,7 +76,7 @@ struct Failing {
 }
 
 impl Journal {
-    /// Goes on after `older` segments, each with its first transition, in a new one that begins with `snapshot`.
+    /// Continues after `older` segments, each with its first transition, in a new one that begins with `snapshot`.
     ///
     /// # Errors
     /// A file system that refuses.

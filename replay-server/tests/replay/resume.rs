@@ -1,5 +1,5 @@
-//! A run that goes on where its learner's checkpoint stands, in a replay that is empty: what it counts, and what it waits for.
-//! That all processes go on together is an end-to-end test.
+//! A run that is resumed from its learner's checkpoint with an empty replay: what it counts, and what it waits for.
+//! Resuming all processes together is an end-to-end test.
 
 use driml_protocol::{InsertReply, LearnerJoin, Tally};
 use driml_replay_server::{Config, Replay, Since, Unready};
@@ -162,7 +162,7 @@ fn shards_of_a_resumed_run_count_on_each_for_itself() {
     }
 }
 
-/// A learner that comes back tells what each shard has of its epoch: a count that was heard before, and is higher, does not stay.
+/// A learner that comes back sends each shard's count at its checkpoint; it replaces a higher count from before.
 #[test]
 fn what_another_shard_had_given_to_a_learner_that_died_is_forgotten() {
     let config = Config {

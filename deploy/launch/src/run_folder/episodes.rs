@@ -71,7 +71,7 @@ impl TrainingEpisodes {
         Self::begin(folder, &[], false)
     }
 
-    /// Of a run that goes on: with what was heard until it had `frames_max` frames; `is_known` if its replay knows of them. The others are set aside in another file, which is said.
+    /// Of a run that goes on: with what was heard until it had `frames_max` frames; `is_known` if its replay knows of them. The others are moved to another file, and a line names it.
     ///
     /// # Errors
     /// A file that is none of this kind, a file system that refuses.

@@ -128,7 +128,7 @@ fn number(value: f64) -> String {
 }
 
 /// The rows of an interrupted run up to `resume_point`, of no more than `frames_max` frames, under this header; none where there is no
-/// such file. The others, which contradict what the run will do, are set aside in another file, which is said.
+/// such file. The others, which contradict what the run will do, are moved to another file, and a line names it.
 ///
 /// # Errors
 /// A file of something else, or a file system that refuses.
