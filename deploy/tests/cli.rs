@@ -51,7 +51,7 @@ fn names_that_nothing_has() {
     "#]]
     .assert_eq(&usage(&["local", "--agent", "driml"]));
     expect![[r#"
-        error: there is no preset "papper" (did you mean "paper"?); --preset takes paper, paper-observation, split, exact, balanced, fast, smoke (`driml presets` describes them)
+        error: there is no preset "papper" (did you mean "paper"?); --preset takes paper, tuned, paper-observation, split, exact, balanced, fast, smoke (`driml presets` describes them)
     "#]].assert_eq(&usage(&["local", "--preset", "papper"]));
     expect![[r#"
         error: preset "split" is for procgen only, not for mspacman; take --preset paper

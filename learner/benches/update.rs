@@ -41,6 +41,7 @@ fn agent(objective: Objective, lambda: Lambda) -> Agent {
         },
         target_period_updates: 312,
         target_tau: 0.95,
+        average_tau: None,
         own: if objective == Objective::of(&curl::CURL) {
             let table = toml::Table::from_iter([("key_tau".to_owned(), 0.001.into())]);
             toml::Table::from_iter([("curl".to_owned(), table.into())])

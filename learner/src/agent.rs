@@ -92,6 +92,8 @@ pub struct Agent {
     online_network: Network,
     target_network: Network,
     key: Option<KeyEncoder>,
+    /// Torso and head of the averaged network, if the settings ask for one.
+    average: Option<Parameters>,
     pub(crate) adam: Adam,
     pub(crate) updates: u64,
 }
@@ -157,7 +159,9 @@ impl Agent {
                 )));
             }
         };
+        let average = settings.average_tau.map(|_| online.without_dim());
         Ok(Self {
+            average: average.transpose()?,
             online_network: Network::with_kernels(&model, &online, kernels)?,
             target_network: Network::with_kernels(&model.without_dim(), &target, kernels)?,
             key,
@@ -216,6 +220,28 @@ impl Agent {
     /// The parameters of CURL's key encoder, if that is the objective.
     pub fn key(&self) -> Option<&Parameters> {
         self.key.as_ref().map(KeyEncoder::parameters)
+    }
+
+    /// The averaged network's parameters, torso and head, if the settings ask for one: after each update they move
+    /// `average_tau` of the way to the online network's. They start as a copy of it.
+    pub const fn average(&self) -> Option<&Parameters> {
+        self.average.as_ref()
+    }
+
+    /// The same agent with the averaged weights in its online network, to play with; none without an averaged network.
+    ///
+    /// # Errors
+    /// A tensor that cannot be copied on its device.
+    pub fn into_average(self) -> Result<Option<Self>, UpdateError> {
+        let Some(average) = &self.average else {
+            return Ok(None);
+        };
+        for (name, var) in average.iter() {
+            if let Some(online) = self.online.get(name) {
+                online.set(var)?;
+            }
+        }
+        Ok(Some(self))
     }
 
     /// What actors need, torso and head, as safetensors bytes.
@@ -388,6 +414,9 @@ impl Agent {
         if let Some(key) = &self.key {
             key.follow(&self.online)?;
         }
+        if let (Some(average), Some(tau)) = (&self.average, self.settings.average_tau) {
+            target::follow(average, &self.online, tau, self.compute.kernels)?;
+        }
         if self
             .updates
             .is_multiple_of(self.settings.target_period_updates)
@@ -396,6 +425,11 @@ impl Agent {
             target::follow(&self.target, &self.online, tau, kernels)?;
         }
         Ok(norm)
+    }
+
+    /// Replaces the averaged network.
+    pub(crate) fn restore_average(&mut self, average: Parameters) {
+        self.average = Some(average);
     }
 
     const fn bellman(&self) -> Bellman<'_> {

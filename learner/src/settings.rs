@@ -45,6 +45,10 @@ pub struct LearnerSettings {
     /// Share of the online network in a move of the target network, from 1e-5 to 1. Parameters are f32, and a target stands
     /// still within a relative 6e-8 / tau of the online network: 6e-4 at 1e-4, and 6e-3 at the least.
     pub target_tau: f64,
+    /// Share of the online network in an update's move of the averaged network, from 1e-5 to 1; without it there is none. The
+    /// averaged network is saved in checkpoints and played by `evaluate --checkpoint average`; training does not use it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub average_tau: Option<f64>,
     /// The objective's own numbers, a table of its name such as `[learner.update.curl]`; none for an objective that has none.
     #[serde(flatten, deserialize_with = "own_tables")]
     pub own: toml::Table,
@@ -69,6 +73,9 @@ impl LearnerSettings {
         check_range("tanh_clip", self.tanh_clip, TANH_CLIP)?;
         check_range("max_grad_norm", self.max_grad_norm, MAX_GRAD_NORM)?;
         check_range("target_tau", self.target_tau, TAU)?;
+        if let Some(tau) = self.average_tau {
+            check_range("average_tau", tau, TAU)?;
+        }
         if self.target_period_updates == 0 {
             return Err(UpdateError::Settings("target_period_updates = 0".into()));
         }

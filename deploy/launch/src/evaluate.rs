@@ -54,6 +54,8 @@ pub enum Which {
     After(u64),
     /// The one that earned most when checkpoints were played.
     Best,
+    /// The averaged weights of the newest one.
+    Average,
 }
 
 impl FromStr for Which {
@@ -63,10 +65,13 @@ impl FromStr for Which {
         match text {
             "best" => Ok(Self::Best),
             "newest" => Ok(Self::Newest),
+            "average" => Ok(Self::Average),
             _ => whole_number::within(1..=u64::MAX)(text)
                 .map(Self::After)
                 .map_err(|e| {
-                    format!("{e}: give the updates of a checkpoint, \"best\" or \"newest\"")
+                    format!(
+                        "{e}: give the updates of a checkpoint, \"best\", \"newest\" or \"average\""
+                    )
                 }),
         }
     }
@@ -107,7 +112,11 @@ impl Player {
     /// A folder that is no run's or does not have that checkpoint, a damaged checkpoint.
     pub fn load_at(folder: &RunFolder, which: Which) -> anyhow::Result<Self> {
         let config = config_of(folder)?;
-        Self::read(config, &checkpoint_at(folder, which)?)
+        let player = Self::read(config, &checkpoint_at(folder, which)?)?;
+        match which {
+            Which::Average => player.averaged(folder),
+            _ => Ok(player),
+        }
     }
 
     /// Its weights as the learner published them: an actor of the run plays no others.
@@ -126,6 +135,22 @@ impl Player {
             weights,
             updates,
             agent: restored.agent,
+        })
+    }
+
+    /// The same with the averaged weights of its checkpoint.
+    fn averaged(self, folder: &RunFolder) -> anyhow::Result<Self> {
+        let agent = self.agent.into_average()?.ok_or_else(|| {
+            usage!(
+                "the checkpoints in {} have no averaged weights: train with --set learner.update.average_tau=0.001, or leave out \
+                 --checkpoint average",
+                folder.display()
+            )
+        })?;
+        Ok(Self {
+            weights: agent.weights_as(self.config.learner.publish_as)?,
+            agent,
+            ..self
         })
     }
 
@@ -278,7 +303,7 @@ pub(crate) fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
 /// The folder of a checkpoint.
 pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<PathBuf> {
     let updates = match which {
-        Which::Newest => None,
+        Which::Newest | Which::Average => None,
         Which::After(updates) => Some(updates),
         Which::Best => {
             let mut best = checkpoint::list(&folder.best())?;

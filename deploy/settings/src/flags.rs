@@ -30,7 +30,7 @@ pub struct RunFlags {
     /// Agent: c51, rainbow, driml-fix, driml-ada, driml-randk, driml-noact, cpc or curl [default: driml-ada]
     #[arg(long, value_name = "AGENT")]
     pub agent: Option<String>,
-    /// Named settings; `driml presets` lists them [default: paper]
+    /// Named settings; `driml presets` lists them [default: tuned on Procgen, paper elsewhere]
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
     /// Resolved settings of another run, its config.toml, instead of world, agent and preset
@@ -61,8 +61,10 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
                 .parse()
                 .map_err(|e| usage!("--env: {e}"))?;
             let agent = presets::agent(args.agent.as_deref().unwrap_or(AGENT))?;
-            let preset =
-                presets::preset(args.preset.as_deref().unwrap_or(presets::PRESETS[0].name))?;
+            let preset = match args.preset.as_deref() {
+                Some(name) => presets::preset(name)?,
+                None => presets::default_preset(world),
+            };
             (
                 Source::Layers(preset, world, agent.name),
                 format!("preset {}", preset.name),

@@ -37,7 +37,7 @@ pub struct Preset {
     pub name: &'static str,
     /// One line for `driml presets`.
     pub about: &'static str,
-    /// Laid over base, world and agent.
+    /// Laid over base and world, under the agent: what makes an agent, such as Rainbow without epsilon, no preset changes.
     layers: &'static [Layer],
     /// The worlds it is made for; none means all.
     families: &'static [&'static str],
@@ -45,13 +45,30 @@ pub struct Preset {
     pub(crate) is_priced: bool,
 }
 
-/// Every preset, the default first.
+const TUNED: &str = "tuned";
+
+/// The preset of a run that names none: `tuned` in the worlds for which it was searched, `paper` elsewhere.
+pub fn default_preset(world: WorldName) -> &'static Preset {
+    let tuned = PRESETS
+        .iter()
+        .find(|it| it.name == TUNED && it.families.contains(&world.kind()));
+    tuned.unwrap_or(&PRESETS[0])
+}
+
+/// Every preset, `paper` first.
 pub const PRESETS: &[Preset] = &[
     Preset {
         name: "paper",
-        about: "as the paper's authors ran it, at the world's own frame size (the default)",
+        about: "as the paper's authors ran it, at the world's own frame size (the default outside Procgen)",
         layers: &[],
         families: &[],
+        is_priced: false,
+    },
+    Preset {
+        name: TUNED,
+        about: "what learns Procgen within minutes on two cores (the default there)",
+        layers: &[layer!("variant/tuned")],
+        families: &["procgen"],
         is_priced: false,
     },
     Preset {
@@ -241,9 +258,10 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
 /// The files that are laid over one another, the lowest first.
 pub(crate) fn stack(preset: &Preset, world: WorldName, agent: &Agent) -> Vec<Layer> {
     let over = preset.layers.iter().copied();
-    [BASE, world_layer(world), agent.layer]
+    [BASE, world_layer(world)]
         .into_iter()
         .chain(over)
+        .chain([agent.layer])
         .collect()
 }
 
@@ -337,6 +355,29 @@ mod tests {
             text: layer.text,
         });
         agents.chain(worlds).chain(variants).chain([BASE]).collect()
+    }
+
+    #[test]
+    fn a_run_without_a_preset_is_tuned_on_procgen_and_the_papers_elsewhere() {
+        for (name, preset) in [
+            ("coinrun", "tuned"),
+            ("mspacman", "paper"),
+            ("chain", "paper"),
+        ] {
+            assert_eq!(default_preset(world(name).unwrap()).name, preset, "{name}");
+        }
+    }
+
+    #[test]
+    fn a_preset_leaves_an_agent_what_it_is() {
+        let layers = |agent_name| {
+            let (world, agent) = (world("coinrun").unwrap(), agent(agent_name).unwrap());
+            layers(preset(TUNED).unwrap(), world, agent).unwrap()
+        };
+        for (name, epsilon) in [("rainbow", 0.0), ("c51", 1.0)] {
+            let start = layers(name)["actor"]["epsilon_start"].as_float();
+            assert_eq!(start, Some(epsilon), "{name}");
+        }
     }
 
     #[test]

@@ -3,10 +3,7 @@
 use clap::Args;
 use driml_launch::console::print;
 use driml_machine::error::usage;
-use driml_settings::{
-    menu,
-    presets::{self, PRESETS},
-};
+use driml_settings::{menu, presets};
 
 /// World and agent where none is given: those of `driml train`.
 const GAME: &str = "bigfish";
@@ -33,9 +30,12 @@ pub(crate) fn run(args: &PresetsArgs) -> anyhow::Result<()> {
     if args.game.is_none() && args.agent.is_none() && args.preset.is_none() {
         return print(&menu::menu()?);
     }
-    let preset = presets::preset(args.preset.as_deref().unwrap_or(PRESETS[0].name))?;
     let game = args.game.as_deref().unwrap_or(GAME);
     let world = presets::world(game).map_err(|e| usage!("--game: {e}"))?;
+    let preset = match args.preset.as_deref() {
+        Some(name) => presets::preset(name)?,
+        None => presets::default_preset(world),
+    };
     let agent = presets::agent(args.agent.as_deref().unwrap_or(AGENT))?;
     print(&menu::sourced(preset, world, agent)?)
 }

@@ -18,6 +18,8 @@ pub(super) const ONLINE: &str = "online.safetensors";
 pub(super) const TARGET: &str = "target.safetensors";
 /// CURL's key encoder; there for that objective alone.
 pub(super) const KEY: &str = "key.safetensors";
+/// The averaged network; there if the settings ask for one.
+pub(super) const AVERAGE: &str = "average.safetensors";
 /// Adam's moments.
 pub(super) const OPTIMIZER: &str = "optimizer.safetensors";
 /// What whoever drives the learner keeps with it; there if it keeps something.

@@ -8,7 +8,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{
     contents::{
-        COMPANION, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of, sha256_of,
+        AVERAGE, COMPANION, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of,
+        sha256_of,
     },
     description,
     error::{CheckpointError, damaged},
@@ -82,15 +83,23 @@ pub fn load(
         loaded.map_err(|why| damaged(path, name, why.to_string()))
     };
     let key = has_key.then(|| parameters(model, Encoder::has, KEY));
+    let has_average = state.sha256.contains_key(AVERAGE);
+    let average = (settings.average_tau.is_some() && has_average)
+        .then(|| parameters(&model.without_dim(), |_| true, AVERAGE));
     let networks = NetworkParameters {
         online: parameters(model, |_| true, ONLINE)?,
         target: parameters(&model.without_dim(), |_| true, TARGET)?,
         key: key.transpose()?,
     };
+    let average = average.transpose()?;
     let moments = candle_core::safetensors::load_buffer(&tensors(OPTIMIZER)?, &Device::Cpu)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
     let (model, settings) = (model.clone(), settings.clone());
     let mut agent = Agent::from_parameters(model, settings, compute, networks)?;
+    // A run that asks for it only now averages from here.
+    if let Some(average) = average {
+        agent.restore_average(average);
+    }
     agent
         .restore_progress(state.updates, state.adam_step, moments)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;

@@ -11,8 +11,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{
     contents::{
-        COMPANION, FORMAT, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of,
-        sha256_of,
+        AVERAGE, COMPANION, FORMAT, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET,
+        hex_of, sha256_of,
     },
     description,
     error::{CheckpointError, io_error},
@@ -125,6 +125,9 @@ fn tensor_files(
     ];
     if let Some(key) = agent.key() {
         files.push((KEY, everything(key)?));
+    }
+    if let Some(average) = agent.average() {
+        files.push((AVERAGE, everything(average)?));
     }
     Ok(files)
 }

@@ -166,6 +166,7 @@ impl Case {
             // One update: the target network does not move.
             target_period_updates: u64::MAX,
             target_tau: 1.0,
+            average_tau: None,
             own: own.into_iter().collect(),
         };
         let mut case = Self {

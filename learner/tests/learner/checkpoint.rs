@@ -598,3 +598,50 @@ fn the_networks_say_what_they_are_and_need_not() {
     });
     assert_eq!(Run::resume(&folder.0).bytes(), run.bytes());
 }
+
+/// Against float64; the average is no part of what is learned.
+#[test]
+fn averaged_weights_follow_and_are_saved_and_played() {
+    const TAU: f64 = 0.25;
+    let folder = Folder::new("average");
+    let mut run = Run::new();
+    let mut settings = run.agent.settings().clone();
+    settings.average_tau = Some(TAU);
+    let rng = &mut ChaCha8Rng::seed_from_u64(1);
+    let new = |settings, rng: &mut ChaCha8Rng| {
+        Agent::new(model(ALL_DIM), settings, &Compute::CPU, rng).unwrap()
+    };
+    run.agent = new(settings.clone(), rng);
+    let values = |parameters: &Parameters| -> Vec<f64> {
+        let all = parameters
+            .iter()
+            .filter(|(name, _)| !name.starts_with("dim."));
+        all.flat_map(|(_, var)| var.flatten_all().unwrap().to_vec1::<f32>().unwrap())
+            .map(f64::from)
+            .collect()
+    };
+    let mut expected = values(run.agent.online());
+    for _ in 0..5 {
+        run.updates(1);
+        for (average, online) in expected.iter_mut().zip(values(run.agent.online())) {
+            *average += TAU * (online - *average);
+        }
+    }
+    let average = values(run.agent.average().unwrap());
+    let worst = average.iter().zip(&expected).map(|(a, b)| (a - b).abs());
+    assert!(worst.fold(0.0, f64::max) < 1e-6);
+    assert_ne!(average, values(run.agent.online()));
+
+    run.save(&folder.0, 1);
+    let load = |settings: &_| {
+        let restored = load_latest(&folder.0, &model(ALL_DIM), settings, &Compute::CPU, SPEC);
+        restored.unwrap().unwrap().agent
+    };
+    let restored = load(&settings);
+    assert_eq!(values(restored.average().unwrap()), average);
+    assert_eq!(values(restored.online()), values(run.agent.online()));
+    let played = restored.into_average().unwrap().unwrap();
+    assert_eq!(values(played.online()), average);
+    settings.average_tau = None;
+    assert!(load(&settings).into_average().unwrap().is_none());
+}

@@ -74,6 +74,7 @@ pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
         },
         target_period_updates: 3,
         target_tau: 0.95,
+        average_tau: None,
         own: toml::Table::new(),
     }
 }

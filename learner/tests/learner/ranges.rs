@@ -8,7 +8,7 @@ use crate::made_up::{ALL_DIM, settings};
 type Change = fn(&mut LearnerSettings, f64);
 
 /// A setting's name, how it is set, values that are refused and values that are not.
-const RANGES: [(&str, Change, &[f64], &[f64]); 7] = [
+const RANGES: [(&str, Change, &[f64], &[f64]); 8] = [
     (
         "tanh_clip",
         |settings, value| settings.tanh_clip = value,
@@ -26,6 +26,12 @@ const RANGES: [(&str, Change, &[f64], &[f64]); 7] = [
         |settings, value| settings.target_tau = value,
         &[0.0, 1e-6, 1e-300, 1.0 + 1e-9],
         &[1e-5, 0.95, 1.0],
+    ),
+    (
+        "average_tau",
+        |settings, value| settings.average_tau = Some(value),
+        &[0.0, 1e-6, 1e-300, 1.0 + 1e-9],
+        &[1e-5, 0.001, 1.0],
     ),
     (
         "adam.lr",

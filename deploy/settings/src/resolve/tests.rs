@@ -59,12 +59,12 @@ fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
             }
         }
     }
-    // Five presets are for all worlds, two for Procgen's games.
+    // Five presets are for all worlds, three for Procgen's games.
     let all = WorldName::all().count();
     let games = WorldName::all()
         .filter(|world| world.kind() == "procgen")
         .count();
-    assert_eq!(resolved, (5 * all + 2 * games) * AGENTS.len());
+    assert_eq!(resolved, (5 * all + 3 * games) * AGENTS.len());
 }
 
 #[test]

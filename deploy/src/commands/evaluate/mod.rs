@@ -42,7 +42,8 @@ pub(crate) struct EvaluateArgs {
     /// Seed of the worlds and of exploration
     #[arg(long, value_name = "S", default_value_t = 0)]
     pub(crate) seed: u64,
-    /// Play with the checkpoint after so many updates, or with the "best" of those that were played and kept
+    /// Play the checkpoint after so many updates, the "best" of those that were played and kept, or the "average": the newest
+    /// one's averaged weights (learner.update.average_tau)
     #[arg(long, value_name = "UPDATES", default_value = "newest")]
     pub(crate) checkpoint: Which,
     /// Add the agent's mean return to the run's evaluations.csv, and keep the checkpoint as the run's best if it earned most
