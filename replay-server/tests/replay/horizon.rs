@@ -6,7 +6,7 @@ use std::collections::HashMap;
 use driml_protocol::{AffinityUpdate, ChunkHeader, Horizon};
 use driml_replay_server::{
     Replay,
-    horizon::{Affinity, draw_k, nhg, uniform},
+    horizon::{Affinity, draw_k, nhg},
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -86,13 +86,18 @@ fn nhg_follows_its_law() {
 fn uniform_follows_its_law() {
     let mut rng = ChaCha8Rng::seed_from_u64(12);
     let mut chi = ChiSquare::default();
+    let affinity = Affinity::uniform(1);
+    let mut draw = |k_max, steps_left| {
+        let horizon = Horizon::Uniform { k_max };
+        draw_k(horizon, &affinity, &vec![0; steps_left], &mut rng).unwrap()
+    };
     for (k_max, steps_left) in [(5, 5), (5, 9), (5, 3), (2, 7), (9, 2)] {
-        let h = k_max.min(steps_left) as usize;
-        let counts = count(h, 5_000, || uniform::draw_k(k_max, steps_left, &mut rng));
+        let h = steps_left.min(k_max as usize);
+        let counts = count(h, 5_000, || draw(k_max, steps_left));
         chi.add(&counts, &vec![1.0 / h as f64; h]);
     }
     chi.check("uniform");
-    assert_eq!(uniform::draw_k(5, 1, &mut rng), 1, "the end of the episode");
+    assert_eq!(draw(5, 1), 1, "the end of the episode");
 }
 
 /// Action 1 always follows action 0, and never action 1: A = 1 goes on to the end, A = 0 stops at once.
