@@ -139,6 +139,11 @@ pub(crate) const fn reach(spec: &RunSpec) -> u32 {
     }
 }
 
+fn bad(key: &'static str, value: impl ToString, why: String) -> Result<(), ConfigError> {
+    let value = value.to_string();
+    Err(ConfigError::Key { key, value, why })
+}
+
 impl Config {
     /// Checks that nothing is set that needs a replay on disk, for one that is in memory alone; `to_keep_it` are the flags that would
     /// change that.
@@ -171,12 +176,12 @@ impl Config {
     /// The first key that cannot work, its value and what to do.
     pub fn validate(&self, spec: &RunSpec, batch_size: u32) -> Result<(), ConfigError> {
         spec.validate()?;
-        let bad = |key, value: String, why: String| Err(ConfigError::Key { key, value, why });
-        let ratio = self.replay_ratio;
+        let (ratio, capacity) = (self.replay_ratio, self.capacity_transitions);
+        let (warmup, slack) = (self.warmup_transitions, self.slack_transitions);
         if !(ratio.is_finite() && ratio > 0.0) {
             return bad(
                 "replay.replay_ratio",
-                ratio.to_string(),
+                ratio,
                 "rows per transition must be a number above 0".into(),
             );
         }
@@ -184,22 +189,18 @@ impl Config {
         let rows_max = rows_max(spec, &self.sampling);
         if batch_size == 0 || batch_size > rows_max {
             let why = format!("a batch of this run has 1 to {rows_max} rows");
-            return bad("learner.batch_size", batch_size.to_string(), why);
+            return bad("learner.batch_size", batch_size, why);
         }
         if !(1..=SHARDS_MAX).contains(&self.shards) {
             let why = format!("a replay has 1 to {SHARDS_MAX} shards");
-            return bad("replay.shards", self.shards.to_string(), why);
+            return bad("replay.shards", self.shards, why);
         }
         let window = u64::from(reach(spec)) + u64::from(spec.frame_stack);
-        if self.capacity_transitions / u64::from(self.shards) < window {
+        if capacity / u64::from(self.shards) < window {
             let why = format!(
                 "one sample spans {window} transitions (the longer of n_step and k_max, and the frame stack); hold at least that many in each shard for each copy of the world"
             );
-            return bad(
-                "replay.capacity_transitions",
-                self.capacity_transitions.to_string(),
-                why,
-            );
+            return bad("replay.capacity_transitions", capacity, why);
         }
         if self
             .capacity_transitions
@@ -207,11 +208,7 @@ impl Config {
             .is_none_or(|b| b > isize::MAX as u64)
         {
             let why = "this many frames exceed any machine's address space; hold fewer".into();
-            return bad(
-                "replay.capacity_transitions",
-                self.capacity_transitions.to_string(),
-                why,
-            );
+            return bad("replay.capacity_transitions", capacity, why);
         }
         if let Some(max) = self.compressed_bytes_max {
             let least = compressed_bytes_least(window, spec.frame_bytes()) * u64::from(self.shards);
@@ -226,7 +223,7 @@ impl Config {
                 Compression::Lz4 => None,
             };
             if let Some(why) = why {
-                return bad("replay.compressed_bytes_max", max.to_string(), why);
+                return bad("replay.compressed_bytes_max", max, why);
             }
         }
         if let Some(max) = self.disk_bytes_max {
@@ -235,39 +232,31 @@ impl Config {
                 let why = format!(
                     "it must hold the transitions before the first batch twice, and some segments; use at least {least}"
                 );
-                return bad("replay.disk_bytes_max", max.to_string(), why);
+                return bad("replay.disk_bytes_max", max, why);
             }
         }
-        if self.warmup_transitions > self.capacity_transitions {
+        if warmup > capacity {
             let why = format!(
                 "the first of them would be overwritten before any is sampled; use at most capacity_transitions = {}",
-                self.capacity_transitions
+                capacity
             );
-            return bad(
-                "replay.warmup_transitions",
-                self.warmup_transitions.to_string(),
-                why,
-            );
+            return bad("replay.warmup_transitions", warmup, why);
         }
-        if (self.slack_transitions as f64) * ratio < f64::from(batch_size) {
+        if (slack as f64) * ratio < f64::from(batch_size) {
             let least = (f64::from(batch_size) / ratio).ceil();
             let why = format!(
                 "actors and learner would wait for each other; use at least learner.batch_size / replay_ratio = {batch_size} / {ratio} = {least}"
             );
-            return bad(
-                "replay.slack_transitions",
-                self.slack_transitions.to_string(),
-                why,
-            );
+            return bad("replay.slack_transitions", slack, why);
         }
         if let (Some(max), None) = (self.transitions_max, self.since) {
             let batch = (f64::from(batch_size) / ratio).ceil();
-            let least = self.warmup_transitions as f64 + batch;
+            let least = warmup as f64 + batch;
             if (max as f64) < least {
                 let why = format!(
                     "the run would end before its first batch; use at least warmup_transitions + learner.batch_size / replay_ratio = {least}"
                 );
-                return bad("replay.transitions_max", max.to_string(), why);
+                return bad("replay.transitions_max", max, why);
             }
         }
         Ok(())

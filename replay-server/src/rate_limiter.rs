@@ -78,23 +78,14 @@ impl RateLimiter {
 
     /// Transitions stored in all shards.
     pub const fn inserted_total(&self) -> u64 {
-        let Counts {
-            this_shard,
-            other_shards,
-            ..
-        } = &self.counts;
-        this_shard.inserted.saturating_add(other_shards.inserted)
+        let here = self.counts.this_shard.inserted;
+        here.saturating_add(self.counts.other_shards.inserted)
     }
 
     /// Rows sampled from all shards.
     pub const fn rows_sampled_total(&self) -> u64 {
-        let Counts {
-            this_shard,
-            other_shards,
-            ..
-        } = &self.counts;
-        let rows = this_shard.rows_sampled;
-        rows.saturating_add(other_shards.rows_sampled)
+        let here = self.counts.this_shard.rows_sampled;
+        here.saturating_add(self.counts.other_shards.rows_sampled)
     }
 
     /// Replaces the other shards' counts by those of a learner's checkpoint.

@@ -249,15 +249,14 @@ impl Replay {
     /// Makes room for an actor if a run's number of them is reached: forgets those that never sent a chunk and of which
     /// `is_connected` says that their life is gone, as somebody who joins under one number after the other leaves behind.
     pub(crate) fn forget_absent_actors(&mut self, is_connected: impl Fn(u32, u64) -> bool) {
-        let absent = self.actors.absent(is_connected);
-        self.actors.forget(&absent);
+        self.actors.forget_absent(is_connected);
     }
 
     /// Compresses chunks for this replay; it can do so while the replay is in use elsewhere.
     pub fn packer(&self) -> Packer {
         Packer {
             compression: self.config.compression,
-            seal_for: self.log.as_ref().map(Log::spec_hash),
+            seal_for: self.log.as_ref().map(|log| log.spec_hash),
         }
     }
 
@@ -301,11 +300,11 @@ impl Replay {
     /// leaves; else, and while the disk refuses, the answer is to wait.
     pub fn admit(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
         if !(self.limiter.may_insert() || self.starving || packed.chunk.header.leaving) {
-            return self.wait();
+            return self.wait(false);
         }
         match self.log.as_mut().map_or(Ok(true), |log| log.chunk(packed)) {
             Ok(true) => {}
-            Ok(false) => return self.wait(),
+            Ok(false) => return self.wait(false),
             Err(why) => return InsertReply::Refused { why },
         }
         self.store(packed);
@@ -325,10 +324,11 @@ impl Replay {
         }
     }
 
-    const fn wait(&self) -> InsertReply {
+    /// The answer that a chunk has to wait; `kept` says whether it waits here.
+    pub(crate) const fn wait(&self, kept: bool) -> InsertReply {
         InsertReply::Wait {
             inserted_total: self.inserted_total(),
-            kept: false,
+            kept,
         }
     }
 
@@ -730,35 +730,32 @@ impl Replay {
 
 /// The log on disk, if there is one.
 impl Replay {
-    /// Whether it is kept on disk.
-    pub const fn is_durable(&self) -> bool {
-        self.log.is_some()
-    }
-
     /// Bytes of the log; 0 without one.
     pub fn log_bytes(&self) -> u64 {
-        self.log.as_ref().map_or(0, Log::bytes)
+        self.log.as_ref().map_or(0, |log| log.journal.bytes())
     }
 
     /// How the log stands; none without one.
     pub fn log_status(&self) -> Option<LogStatus> {
-        self.log.as_ref().map(Log::status)
+        self.log.as_ref().map(|log| log.journal.status())
     }
 
     /// Whether all notes are on disk; until then joins and goodbyes get no answer.
     pub fn is_ready(&mut self) -> bool {
-        self.log.as_mut().is_none_or(Log::is_ready)
+        let log = self.log.as_mut();
+        log.is_none_or(|log| log.journal.is_ready())
     }
 
     /// Whether the disk refused what was to be written last.
     pub fn is_refused_by_disk(&self) -> bool {
-        self.log.as_ref().is_some_and(Log::is_failing)
+        let log = self.log.as_ref();
+        log.is_some_and(|log| log.journal.is_failing())
     }
 
     /// Flushes what was written to the disk: nothing more is to come.
     pub fn flush(&mut self) {
         if let Some(log) = &mut self.log {
-            log.flush();
+            log.journal.flush();
         }
     }
 
@@ -791,8 +788,9 @@ impl Replay {
 
     /// Begins another segment when one is full, and removes those that are not needed any more.
     pub(crate) fn tidy(&mut self) {
-        if self.log.as_ref().is_some_and(Log::is_full) {
-            if let Some(oldest) = self.log.as_ref().and_then(Log::over_budget) {
+        let journal = self.log.as_ref().map(|log| &log.journal);
+        if let Some(journal) = journal.filter(|it| it.is_full()) {
+            if let Some(oldest) = journal.over_budget() {
                 self.forget_before(oldest);
                 self.prune();
             }
@@ -881,23 +879,13 @@ impl Replay {
         }
         self.limiter.set_counts(snapshot.counts);
         self.restore_rows(snapshot.oldest, &snapshot.rows);
-        let Snapshot {
-            actors,
-            learner,
-            learned,
-            resumed_after,
-            inserted_before,
-            rows_before,
-            affinity,
-            rng,
-            statistics,
-            starving,
-            ..
-        } = snapshot;
-        (self.actors, self.learner, self.learned) = (actors, learner, learned);
-        (self.resumed_after, self.starving) = (resumed_after, starving);
-        (self.inserted_before, self.rows_before) = (inserted_before, rows_before);
-        (self.affinity, self.rng, self.statistics) = (affinity, rng, statistics);
+        self.actors = snapshot.actors;
+        (self.learner, self.learned) = (snapshot.learner, snapshot.learned);
+        (self.resumed_after, self.starving) = (snapshot.resumed_after, snapshot.starving);
+        self.inserted_before = snapshot.inserted_before;
+        self.rows_before = snapshot.rows_before;
+        (self.affinity, self.rng) = (snapshot.affinity, snapshot.rng);
+        self.statistics = snapshot.statistics;
         self.statistics.actors = 0;
         Ok(gap)
     }

@@ -57,6 +57,12 @@ struct Actor {
     insisted: Option<u64>,
 }
 
+impl Actor {
+    fn is_past(&self, incarnation: u64) -> bool {
+        self.past.iter().any(|it| it.incarnation == incarnation)
+    }
+}
+
 /// What is to be done with a chunk.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Verdict {
@@ -113,11 +119,7 @@ impl Actors {
             if known.current.incarnation == incarnation {
                 return Ok(());
             }
-            if known
-                .past
-                .iter()
-                .any(|past| past.incarnation == incarnation)
-            {
+            if known.is_past(incarnation) {
                 return Err(replaced(actor));
             }
             if known.past.len() == PAST_INCARNATIONS_MAX {
@@ -164,14 +166,7 @@ impl Actors {
     fn living(&self, actor: u32, incarnation: u64) -> Result<&Actor, String> {
         match self.actors.get(&actor) {
             Some(known) if known.current.incarnation == incarnation => Ok(known),
-            Some(known)
-                if known
-                    .past
-                    .iter()
-                    .any(|past| past.incarnation == incarnation) =>
-            {
-                Err(replaced(actor))
-            }
+            Some(known) if known.is_past(incarnation) => Err(replaced(actor)),
             _ => Err(format!(
                 "this replay server does not know this life of actor {actor}: it was started anew since the actor joined, \
                  and what it held is gone; start the actor again"
@@ -333,23 +328,13 @@ impl Actors {
             .ok_or_else(|| format!("no such life of actor {} has joined", goodbye.actor))
     }
 
-    /// Actors that never sent a chunk and are not connected, if there is no room for one more.
-    pub(crate) fn absent(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
-        if self.actors.len() < ACTORS_MAX {
-            return Vec::new();
-        }
-        let is_absent = |(number, actor): &(&u32, &Actor)| {
-            let has_sent = actor.expected > 0 || !actor.past.is_empty();
-            !has_sent && !is_connected(**number, actor.current.incarnation)
-        };
-        let absent = self.actors.iter().filter(is_absent);
-        absent.map(|(&number, _)| number).collect()
-    }
-
-    /// Forgets these actors.
-    pub(crate) fn forget(&mut self, actors: &[u32]) {
-        for actor in actors {
-            self.actors.remove(actor);
+    /// Forgets actors that never sent a chunk and are not connected, if there is no room for one more.
+    pub(crate) fn forget_absent(&mut self, is_connected: impl Fn(u32, u64) -> bool) {
+        if self.actors.len() >= ACTORS_MAX {
+            self.actors.retain(|&number, actor| {
+                let has_sent = actor.expected > 0 || !actor.past.is_empty();
+                has_sent || is_connected(number, actor.current.incarnation)
+            });
         }
     }
 }

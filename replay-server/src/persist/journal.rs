@@ -31,7 +31,7 @@ struct Segment {
 }
 
 /// The writing side of a log.
-pub(super) struct Journal {
+pub(crate) struct Journal {
     folder: PathBuf,
     id: LogId,
     /// All in the folder, the oldest first; the last one is written.
@@ -132,13 +132,13 @@ impl Journal {
     }
 
     /// Flushes what was written.
-    pub(super) fn flush(&mut self) {
+    pub(crate) fn flush(&mut self) {
         self.is_ready();
         self.syncer.flush();
     }
 
     /// How it stands.
-    pub(super) fn status(&self) -> LogStatus {
+    pub(crate) fn status(&self) -> LogStatus {
         let refused = self.failing.as_ref();
         LogStatus {
             folder: self.folder.display().to_string(),
@@ -151,12 +151,12 @@ impl Journal {
     }
 
     /// Bytes on disk.
-    pub(super) fn bytes(&self) -> u64 {
+    pub(crate) fn bytes(&self) -> u64 {
         self.segments.iter().map(|it| it.bytes).sum()
     }
 
     /// Writes what the disk has refused before; whether all of it is written now.
-    pub(super) fn is_ready(&mut self) -> bool {
+    pub(crate) fn is_ready(&mut self) -> bool {
         if self.pending.is_empty() {
             return true;
         }
@@ -208,7 +208,7 @@ impl Journal {
     }
 
     /// Whether the disk has refused what was to be written last.
-    pub(super) const fn is_failing(&self) -> bool {
+    pub(crate) const fn is_failing(&self) -> bool {
         self.failing.is_some()
     }
 
@@ -264,7 +264,7 @@ impl Journal {
     }
 
     /// Whether the newest segment is full.
-    pub(super) fn is_full(&self) -> bool {
+    pub(crate) fn is_full(&self) -> bool {
         self.pending.is_empty()
             && self
                 .segments
@@ -273,7 +273,7 @@ impl Journal {
     }
 
     /// Where the disk budget does not allow another segment: the oldest transition that may stay.
-    pub(super) fn over_budget(&self) -> Option<u64> {
+    pub(crate) fn over_budget(&self) -> Option<u64> {
         let max = self.limits.disk_bytes_max?;
         let mut bytes = self.bytes() + self.limits.segment_bytes + self.largest;
         let mut keep = None;

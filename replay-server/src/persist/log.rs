@@ -3,8 +3,6 @@
 
 use std::collections::VecDeque;
 
-use driml_protocol::LogStatus;
-
 use super::{
     error::PersistError,
     folder::LogFolder,
@@ -19,8 +17,9 @@ const MARKS: usize = 2;
 
 /// The log of a replay.
 pub(crate) struct Log {
-    pub(super) journal: Journal,
-    pub(super) spec_hash: u64,
+    pub(crate) journal: Journal,
+    /// Of the run whose chunks it holds.
+    pub(crate) spec_hash: u64,
     /// The last two marks that were not given up, the newest last.
     pub(super) marks: VecDeque<Marked>,
     pub(super) _folder: LogFolder,
@@ -35,42 +34,6 @@ pub(super) struct Marked {
 }
 
 impl Log {
-    /// Hash of the spec of the run whose chunks it holds.
-    pub(crate) const fn spec_hash(&self) -> u64 {
-        self.spec_hash
-    }
-
-    pub(crate) fn bytes(&self) -> u64 {
-        self.journal.bytes()
-    }
-
-    pub(crate) fn status(&self) -> LogStatus {
-        self.journal.status()
-    }
-
-    /// Whether all that was noted is written.
-    pub(crate) fn is_ready(&mut self) -> bool {
-        self.journal.is_ready()
-    }
-
-    /// Whether the disk refused what was to be written last.
-    pub(crate) const fn is_failing(&self) -> bool {
-        self.journal.is_failing()
-    }
-
-    pub(crate) fn is_full(&self) -> bool {
-        self.journal.is_full()
-    }
-
-    /// Where the disk budget does not allow another segment: the oldest transition that may stay.
-    pub(crate) fn over_budget(&self) -> Option<u64> {
-        self.journal.over_budget()
-    }
-
-    pub(crate) fn flush(&mut self) {
-        self.journal.flush();
-    }
-
     /// Writes a chunk that is to be stored; `false`: the disk refuses, and it must not be.
     ///
     /// # Errors

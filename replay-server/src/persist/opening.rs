@@ -74,8 +74,6 @@ impl Replay {
 /// The folder of a replay, which nobody else uses any more and which is this run's. What is kept there is not read yet.
 pub struct KeptReplay {
     args: PersistArgs,
-    config: Config,
-    num_actions: u32,
     /// Of this run and shard, if the log is new.
     id: LogId,
     is_new: bool,
@@ -111,8 +109,6 @@ impl KeptReplay {
         folder.check(&id, &ours)?;
         Ok(Self {
             args: args.clone(),
-            config: config.clone(),
-            num_actions: spec.num_actions,
             id,
             is_new: known.is_none(),
             limits: limits(args, spec, config),
@@ -130,8 +126,6 @@ impl KeptReplay {
         let started = Instant::now();
         let Self {
             args,
-            config,
-            num_actions,
             id,
             is_new,
             limits,
@@ -141,23 +135,22 @@ impl KeptReplay {
         if let Some(mark) = args.mark {
             go_back(&folder, mark)?;
         }
-        let found = match is_new {
-            false => recover(&folder, id, num_actions, &mut replay, args.mark, reading)?,
+        let known = match is_new {
+            false => recover(&folder, id, &mut replay, args.mark, reading)?,
             true => None,
         };
-        let mut recovery = Recovery {
-            found: found.is_some(),
-            ..Recovery::default()
-        };
-        let found = match found {
+        let was_found = known.is_some();
+        let found = match known {
             Some(found) => found,
             None => {
                 folder.write_id(&id)?;
                 Recovered::nothing(folder.first_number()?)
             }
         };
-        (recovery.bytes, recovery.warnings) = (found.bytes, found.warnings);
-        let fsync = config.fsync_ms.map_or(FSYNC_DEFAULT, Duration::from_millis);
+        let fsync = replay
+            .config
+            .fsync_ms
+            .map_or(FSYNC_DEFAULT, Duration::from_millis);
         let journal = Journal::begin(
             Place {
                 folder: args.dir.clone(),
@@ -179,7 +172,12 @@ impl KeptReplay {
             _folder: folder,
         });
         replay.tidy();
-        recovery.took = started.elapsed();
+        let recovery = Recovery {
+            found: was_found,
+            bytes: found.bytes,
+            took: started.elapsed(),
+            warnings: found.warnings,
+        };
         Ok((replay, recovery))
     }
 }

@@ -12,8 +12,6 @@ use std::{
     path::Path,
 };
 
-use driml_protocol::BufferPool;
-
 /// Bytes before the body.
 pub(super) const HEAD_BYTES: usize = 32;
 const MAGIC: u32 = u32::from_le_bytes(*b"DRL1");
@@ -61,10 +59,8 @@ pub(super) fn head(kind: RecordKind, ordinal: u64, checked: &[u8], rest: usize) 
     head.extend_from_slice(&ordinal.to_le_bytes());
     head.extend_from_slice(&length.to_le_bytes());
     head.extend_from_slice(&(checked.len() as u32).to_le_bytes());
-    let mut sum = crc32fast::Hasher::new();
-    sum.update(&head);
-    sum.update(checked);
-    head.extend_from_slice(&sum.finalize().to_le_bytes());
+    let sum = checksum(&head, checked);
+    head.extend_from_slice(&sum.to_le_bytes());
     head.extend_from_slice(checked);
     head
 }
@@ -84,6 +80,25 @@ pub(super) enum Broken {
     Torn,
     /// Bytes that are no record, with others after them.
     Damaged,
+}
+
+impl Broken {
+    const fn torn_if(is_torn: bool) -> Self {
+        if is_torn { Self::Torn } else { Self::Damaged }
+    }
+}
+
+/// The u32 at byte `at` of a head.
+fn number(head: &[u8; HEAD_BYTES], at: usize) -> u32 {
+    u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]])
+}
+
+/// The checksum of a record with this head, of whose body it covers `checked`.
+fn checksum(head: &[u8], checked: &[u8]) -> u32 {
+    let mut sum = crc32fast::Hasher::new();
+    sum.update(&head[..HEAD_BYTES - 4]);
+    sum.update(checked);
+    sum.finalize()
 }
 
 /// Reads a segment's records from the first on.
@@ -137,9 +152,8 @@ impl RecordReader {
             return Ok(Some(Err(Broken::Torn)));
         }
         self.file.read_exact(&mut head)?;
-        let number =
-            |at: usize| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
-        let long = |at: usize| u64::from(number(at)) | u64::from(number(at + 4)) << 32;
+        let number = |at| number(&head, at);
+        let long = |at| u64::from(number(at)) | u64::from(number(at + 4)) << 32;
         let (ordinal, body_bytes, checked) = (long(8), long(16), u64::from(number(24)));
         let kind = RecordKind::of(number(4));
         let sane = number(0) == MAGIC
@@ -149,30 +163,20 @@ impl RecordReader {
         let Some(kind) = kind.filter(|_| sane) else {
             // A machine that lost its power leaves zeros where it had not written yet.
             let zeros = head.iter().all(|&byte| byte == 0) && self.rest_is_zero()?;
-            return Ok(Some(Err(if zeros {
-                Broken::Torn
-            } else {
-                Broken::Damaged
-            })));
+            return Ok(Some(Err(Broken::torn_if(zeros))));
         };
         if left - (HEAD_BYTES as u64) < body_bytes {
             // Where others follow, it is its length that is wrong.
             let follows = self.a_record_follows()?;
-            return Ok(Some(Err(if follows {
-                Broken::Damaged
-            } else {
-                Broken::Torn
-            })));
+            return Ok(Some(Err(Broken::torn_if(!follows))));
         }
         self.body.resize(body_bytes as usize, 0);
         self.file.read_exact(&mut self.body)?;
-        let mut sum = crc32fast::Hasher::new();
-        sum.update(&head[..HEAD_BYTES - 4]);
-        sum.update(&self.body[..checked as usize]);
+        let sum = checksum(&head, &self.body[..checked as usize]);
         let end = self.at + HEAD_BYTES as u64 + body_bytes;
-        if sum.finalize() != number(28) {
+        if sum != number(28) {
             let last = end == self.length || self.rest_is_zero()?;
-            return Ok(Some(Err(if last { Broken::Torn } else { Broken::Damaged })));
+            return Ok(Some(Err(Broken::torn_if(last))));
         }
         self.at = end;
         Ok(Some(Ok(Record {
@@ -210,19 +214,6 @@ fn begins_with_a_record(bytes: &[u8]) -> bool {
     let Some((head, after)) = bytes.split_first_chunk::<HEAD_BYTES>() else {
         return false;
     };
-    let number = |at: usize| {
-        u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]) as usize
-    };
-    let mut sum = crc32fast::Hasher::new();
-    sum.update(&head[..HEAD_BYTES - 4]);
-    let Some(checked) = after.get(..number(24)) else {
-        return false;
-    };
-    sum.update(checked);
-    sum.finalize() as usize == number(28)
-}
-
-/// Memory for chunks that are read, used again and again.
-pub(super) fn pool() -> BufferPool {
-    BufferPool::new(2)
+    let checked = after.get(..number(head, 24) as usize);
+    checked.is_some_and(|checked| checksum(head, checked) == number(head, 28))
 }

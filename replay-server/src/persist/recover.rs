@@ -13,7 +13,7 @@ use super::{
     error::PersistError,
     folder::{LogFolder, io_error},
     progress::Reading,
-    record::{self, Broken, Record, RecordKind, RecordReader},
+    record::{Broken, Record, RecordKind, RecordReader},
     segment::{self, LogId, Mark, SegmentFile, SegmentHeader},
     snapshot::Note,
 };
@@ -64,7 +64,6 @@ struct Recovery<'a> {
     replay: &'a mut Replay,
     packer: Packer,
     pool: BufferPool,
-    num_actions: u32,
     found: Recovered,
     /// Number of the next record; none before the first.
     expected: Option<u64>,
@@ -117,7 +116,6 @@ fn cut_off(file: &SegmentFile, at: u64) -> Result<(), PersistError> {
 pub(super) fn recover(
     folder: &LogFolder,
     id: LogId,
-    num_actions: u32,
     replay: &mut Replay,
     mark: Option<Mark>,
     reading: &Reading,
@@ -131,15 +129,8 @@ pub(super) fn recover(
         id,
         replay,
         packer,
-        pool: record::pool(),
-        num_actions,
-        found: Recovered {
-            segments: Vec::new(),
-            number,
-            ordinal: 0,
-            bytes: 0,
-            warnings: Vec::new(),
-        },
+        pool: BufferPool::new(2),
+        found: Recovered::nothing(number),
         expected: None,
         oldest: 0,
         same_capacity: false,
@@ -335,7 +326,8 @@ impl Recovery<'_> {
             RecordKind::Segment => Err("a segment begins within another".into()),
             RecordKind::Chunk => {
                 let (hash, len) = (self.id.spec_hash, record.body.len());
-                let chunk = Chunk::receive([record.body], len, &self.pool, hash, self.num_actions)
+                let num_actions = self.replay.spec.num_actions;
+                let chunk = Chunk::receive([record.body], len, &self.pool, hash, num_actions)
                     .map_err(|e| e.to_string())?;
                 if let Some(why) = self.replay.unfit(&chunk) {
                     return Err(why);

@@ -122,9 +122,7 @@ impl Syncer {
             None => flush(&self.shared),
         }
     }
-}
 
-impl Syncer {
     /// Flushes now.
     ///
     /// # Errors

@@ -82,11 +82,7 @@ impl Service {
             let now = Instant::now();
             let mut answers = state.admit(now);
             for question in state.chunks.overdue(now, self.hold_max) {
-                let wait = InsertReply::Wait {
-                    inserted_total: state.replay.inserted_total(),
-                    kept: true,
-                };
-                answers.push((question, wait));
+                answers.push((question, state.replay.wait(true)));
             }
             if answers.is_empty() {
                 let due_in = state.chunks.due_in(now, self.hold_max).unwrap_or(IDLE);
@@ -126,10 +122,7 @@ impl State {
         let reply = match replay.settle(&packed) {
             Some(reply) => reply,
             // Those that came before go first.
-            None if !chunks.is_empty() && !header.leaving => InsertReply::Wait {
-                inserted_total: replay.inserted_total(),
-                kept: false,
-            },
+            None if !chunks.is_empty() && !header.leaving => replay.wait(false),
             None => match replay.admit(&packed) {
                 stored @ InsertReply::Stored { .. } => {
                     let now = Instant::now();
@@ -174,11 +167,7 @@ impl State {
             return vec![(question, reply)];
         }
         let Some(parked) = self.chunks.claimed(claim) else {
-            let wait = InsertReply::Wait {
-                inserted_total: self.replay.inserted_total(),
-                kept: false,
-            };
-            return vec![(question, wait)];
+            return vec![(question, self.replay.wait(false))];
         };
         let asked = question.arrived;
         parked.ask(question, asked);
@@ -219,31 +208,15 @@ impl State {
     fn leave_line(
         &mut self,
         parked: ParkedChunk<Question>,
-        reply: InsertReply,
+        mut reply: InsertReply,
     ) -> Option<(Question, InsertReply)> {
-        if matches!(reply, InsertReply::Stored { .. }) {
+        if let InsertReply::Stored { waited, .. } = &mut reply {
+            *waited = true;
             let version = parked.chunk.chunk.header.weights_version;
             let now = Instant::now();
             let waited = now.saturating_duration_since(parked.arrived);
             self.timings.stored(version, waited, now);
         }
-        let reply = after_waiting(reply);
         parked.question.map(|question| (question, reply))
-    }
-}
-
-/// The answer about a chunk that was parked.
-fn after_waiting(reply: InsertReply) -> InsertReply {
-    match reply {
-        InsertReply::Stored {
-            inserted_total,
-            actors,
-            ..
-        } => InsertReply::Stored {
-            inserted_total,
-            actors,
-            waited: true,
-        },
-        other => other,
     }
 }

@@ -1,16 +1,15 @@
 //! Parts that join: what they are told of the run, and whether they are let in.
-//! Who is connected and who is served is kept in `members`.
+//! Who is connected and who is served is kept in `accounts`.
 
 use std::time::Instant;
 
 use driml_protocol::{ActorJoin, Alive, Hello, Incoming, JoinReply, LearnerJoin, Responder};
 use zenoh::sample::SampleKind;
 
-use super::server::{Service, State};
-
-/// Lives of actors that may send through shared memory. What a reader has mapped stays mapped until it ends, also when whoever made
-/// it is gone (zenoh issue 2571): about 3 MiB and two descriptors a life. Later ones send through sockets.
-pub(super) const SHARED_LIVES_MAX: u32 = 128;
+use super::{
+    limits::SHARED_LIVES_MAX,
+    server::{Service, State},
+};
 
 impl Service {
     pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {

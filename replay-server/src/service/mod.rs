@@ -7,22 +7,15 @@
 mod accounts;
 mod batches;
 mod chunks;
-mod entrance;
 mod joining;
 mod limits;
-mod members;
-mod origin;
 mod parked;
-mod refused;
 mod run;
-mod run_args;
 mod server;
-mod shared_memory_bytes;
 mod status;
 mod timings;
 mod weights;
 mod weights_store;
 
-pub use run::run;
-pub use run_args::RunArgs;
-pub use shared_memory_bytes::shared_memory_bytes;
+pub use limits::shared_memory_bytes;
+pub use run::{RunArgs, run};

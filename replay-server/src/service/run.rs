@@ -2,6 +2,7 @@
 //! What an answer is, is in the files named for the messages.
 
 use std::{
+    path::{Path, PathBuf},
     sync::{Arc, Condvar, Mutex},
     thread::JoinHandle,
     time::{Duration, Instant},
@@ -13,25 +14,23 @@ use driml_protocol::{
     config::{Settings, TransportConfig},
     join_within,
     session::{self, Endpoints},
-    shared_memory, tls,
+    shared_memory,
+    tls::{self, Credentials},
 };
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
 use super::{
-    accounts::Accounts,
-    entrance::Entrance,
-    limits::{Limits, number},
-    members::Members,
-    origin::Origin,
+    accounts::{Accounts, Members},
+    limits::{Limits, number, shared_memory_bytes},
     parked::{ParkedChunks, ParkedRequests},
-    run_args::RunArgs,
-    server::{Service, State},
-    shared_memory_bytes::shared_memory_bytes,
+    server::{Entrance, Service, State},
     timings::Timings,
+    weights_store::WeightsStore,
 };
 use crate::{
     config::Config,
-    persist::{PersistError, Reading},
+    persist::{KeptReplay, PersistArgs, PersistError, Reading, shard_dir},
+    replay::Replay,
     sampling::rows::sampler::PriorityCounts,
 };
 
@@ -48,6 +47,32 @@ const SPARE_MAX: usize = 8;
 
 /// How long the threads may take to end.
 const THREADS_END_MAX: Duration = Duration::from_secs(2);
+
+/// What a replay server is told at its start.
+#[derive(Clone, Debug)]
+pub struct RunArgs {
+    /// Endpoints to listen on.
+    pub listen: Vec<String>,
+    /// Routers to connect to, if any.
+    pub connect: Vec<String>,
+    /// With which certificate it takes part; none without TLS.
+    pub credentials: Option<Arc<Credentials>>,
+    /// Prefix of the run's keys.
+    pub namespace: String,
+    /// Which of the replay's shards this is, from 0.
+    pub shard: u32,
+    /// Bytes of a version of the weights, of which the replay server itself knows nothing; longer uploads are refused.
+    pub weights_bytes_max: usize,
+    /// The folder in which the replay is kept, if it is kept on disk; of several shards each has a folder of its own there.
+    pub dir: Option<PathBuf>,
+    /// Stay when the run is over, to be asked, until `ending` or `shutdown`.
+    pub stay: bool,
+    /// Raised when this process is to end, but not before its parts have delivered what they have and left: its launcher has died,
+    /// which ends them too. It waits for them for at most 10 s. What is to end it at once raises this and `shutdown`.
+    pub ending: Shutdown,
+    /// The run's resolved settings, which it hands to whoever joins.
+    pub config_toml: String,
+}
 
 /// Runs the replay server until its run is over, `args.ending` or `shutdown`.
 ///
@@ -185,6 +210,87 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     }
     drop(state);
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+}
+
+/// Where the replay comes from.
+enum Origin {
+    /// It begins empty, and is kept in memory alone.
+    Memory(Box<Replay>),
+    /// It is kept in this folder, and not read yet.
+    Folder(PathBuf, Box<KeptReplay>),
+}
+
+impl Origin {
+    /// Finds it at once, however much is kept.
+    ///
+    /// # Errors
+    /// Settings that cannot work, memory that the system does not grant, a folder that cannot be used.
+    fn find(
+        args: &RunArgs,
+        spec: &RunSpec,
+        config: &Config,
+        batch_size: u32,
+    ) -> Result<Self, PersistError> {
+        let Some(dir) = &args.dir else {
+            let replay = Replay::shard(spec, config, batch_size, args.shard)?;
+            return Ok(Self::Memory(Box::new(replay)));
+        };
+        let dir = shard_dir(dir, args.shard, config.shards);
+        let kept = PersistArgs {
+            dir: dir.clone(),
+            shard: args.shard,
+            segment_bytes: None,
+            mark: None,
+        };
+        let kept = KeptReplay::find(&kept, spec, config, batch_size)?;
+        Ok(Self::Folder(dir, Box::new(kept)))
+    }
+
+    /// The replay, and the newest weights that were handed over.
+    ///
+    /// # Errors
+    /// Those of [`KeptReplay::read`].
+    fn read(
+        self,
+        reading: &Reading,
+        spec_hash: u64,
+    ) -> Result<(Replay, WeightsStore), PersistError> {
+        match self {
+            Self::Memory(replay) => Ok((*replay, WeightsStore::default())),
+            Self::Folder(dir, kept) => {
+                let replay = read_kept(&dir, *kept, reading)?;
+                Ok((replay, WeightsStore::kept_in(&dir, spec_hash)))
+            }
+        }
+    }
+}
+
+/// Reads the replay that is kept in `dir`, and says what was found.
+fn read_kept(dir: &Path, kept: KeptReplay, reading: &Reading) -> Result<Replay, PersistError> {
+    let (replay, recovery) = kept.read(reading)?;
+    for warning in &recovery.warnings {
+        tracing::warn!("{}: {warning}", dir.display());
+    }
+    if recovery.found {
+        let status = replay.status();
+        tracing::info!(
+            "goes on with the replay in {}: {} transitions stored, {} held, {} rows served; {} MiB read in {:.1} s",
+            dir.display(),
+            status.transitions_inserted,
+            status.transitions_held,
+            status.rows_sampled,
+            recovery.bytes >> 20,
+            recovery.took.as_secs_f64()
+        );
+        if replay.priority_counts().is_some() {
+            tracing::info!(
+                "priorities are those of the last checkpoint: each transition that came later has the highest one"
+            );
+        }
+    } else {
+        tracing::info!("keeps the replay in {}", dir.display());
+    }
+    Ok(replay)
 }
 
 /// The threads that answer.

@@ -2,24 +2,23 @@
 //! What each message does is in the file named for it.
 
 use std::{
-    sync::{Condvar, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError},
     time::{Duration, Instant},
 };
 
 use driml_protocol::{
-    Announcer, BatchReply, BufferPool, CodecError, Incoming, InsertReply, Request, Responder,
-    SeldomEach, Shutdown, WeightsVersion,
+    Announcer, BatchReply, BufferPool, CodecError, Incoming, InsertReply, Recovering, Request,
+    Responder, SeldomEach, Shutdown, WeightsVersion,
 };
 
 use super::{
-    accounts::Accounts,
+    accounts::{Accounts, Members},
     limits::Limits,
-    members::Members,
     parked::{ParkedChunks, ParkedRequests},
     timings::Timings,
     weights_store::WeightsStore,
 };
-use crate::{replay::Replay, storage::frame_store::Packer};
+use crate::{persist::Reading, replay::Replay, storage::frame_store::Packer};
 
 /// What all threads share.
 pub(super) struct Service {
@@ -126,6 +125,56 @@ impl State {
     pub(super) fn say(&mut self, kind: &str, line: &str) {
         if let Some(more) = self.said.due(kind) {
             tracing::warn!("{line}{more}");
+        }
+    }
+}
+
+/// What stands between the questions and the service: until the replay is read back from disk everybody is told how far it is.
+pub(super) struct Entrance {
+    service: OnceLock<Arc<Service>>,
+    reading: Reading,
+    config_toml: String,
+}
+
+impl Entrance {
+    /// Nobody is let in yet.
+    pub(super) const fn closed(reading: Reading, config_toml: String) -> Self {
+        Self {
+            service: OnceLock::new(),
+            reading,
+            config_toml,
+        }
+    }
+
+    /// Lets everybody in, for good.
+    pub(super) fn open(&self, service: Arc<Service>) {
+        let opened = self.service.set(service);
+        assert!(opened.is_ok(), "a replay is read back once");
+    }
+
+    /// The service, once it is there.
+    pub(super) fn service(&self) -> Option<&Arc<Service>> {
+        self.service.get()
+    }
+
+    /// How far the reading is, and whether it need go on.
+    pub(super) const fn reading(&self) -> &Reading {
+        &self.reading
+    }
+
+    /// What whoever asks is told meanwhile.
+    pub(super) fn put_off(&self) -> Recovering {
+        Recovering {
+            progress: self.reading.progress(),
+            config_toml: None,
+        }
+    }
+
+    /// The same for whoever asks which run it is.
+    pub(super) fn put_off_with_settings(&self) -> Recovering {
+        Recovering {
+            config_toml: Some(self.config_toml.clone()),
+            ..self.put_off()
         }
     }
 }

@@ -1,15 +1,24 @@
 //! The small messages that need no file of their own: an actor's goodbye, the learner's affinity, reports, and the status.
 //! None of them ever waits.
 
-use std::time::{Duration, Instant};
+use std::{
+    sync::{
+        Arc,
+        mpsc::{Receiver, RecvTimeoutError},
+    },
+    thread::JoinHandle,
+    time::{Duration, Instant},
+};
 
 use driml_protocol::{
     AffinityUpdate, Done, EpisodesRequest, Goodbye, Incoming, PartName, PartsStatus,
-    PriorityUpdate, ReplayStatus, Report, Responder, Shutdown, fault,
+    PriorityUpdate, ReplayStatus, Report, Responder, Shutdown, fault, tls,
 };
 
 use super::{accounts::own_warning, server::Service};
 
+/// How often the thread that hears of who was refused looks whether it should end.
+const TICK: Duration = Duration::from_millis(200);
 /// How often it is looked whether somebody is missing.
 const LOOK: Duration = Duration::from_secs(1);
 /// How long a replay server stays for parts that do not leave when the run is over.
@@ -208,5 +217,37 @@ impl Service {
         status.weights_behind_updates = state.timings.weights_behind_updates();
         drop(state);
         responder.reply(&status);
+    }
+
+    /// Starts the thread that hears of those that were not let in at all, by certificate or role; it ends after the shutdown.
+    pub(super) fn start_hearing(
+        self: Arc<Self>,
+        reports: Receiver<tls::Report>,
+    ) -> std::io::Result<JoinHandle<()>> {
+        let thread = std::thread::Builder::new().name("refused".into());
+        thread.spawn(move || {
+            while !self.shutdown.is_set() {
+                fault::point("refused");
+                match reports.recv_timeout(TICK) {
+                    Ok(report) => self.hear(report),
+                    Err(RecvTimeoutError::Timeout) => {}
+                    Err(RecvTimeoutError::Disconnected) => return,
+                }
+            }
+        })
+    }
+
+    fn hear(&self, report: tls::Report) {
+        let mut state = self.state();
+        match report {
+            tls::Report::Connection(why) => {
+                state.connections_refused += 1;
+                state.say(&why, &format!("a connection was refused: {why}"));
+            }
+            tls::Report::Message(why) => {
+                state.replay.note_refused_message();
+                state.say(&why, &format!("a message was refused: {why}"));
+            }
+        }
     }
 }

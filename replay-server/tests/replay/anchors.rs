@@ -3,13 +3,13 @@
 
 use std::collections::HashMap;
 
-use driml_protocol::{ChunkHeader, Horizon, InsertReply, Sampling, Waiting};
-use driml_replay_server::{Compression, Config, Replay, Unready};
+use driml_protocol::{ChunkHeader, Horizon, InsertReply, Waiting};
+use driml_replay_server::{Config, Replay, Unready};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::{join, stored, wait},
+    calls::{header, join, stored, wait},
     history::{History, identity, spec, unlimited},
     law::ChiSquare,
 };
@@ -37,15 +37,9 @@ impl Setup {
     fn insert(&mut self, actor: u32, sequence: u64, streams: u32, steps: u32) -> InsertReply {
         let chunk = self.history.next_chunk(
             ChunkHeader {
-                actor,
-                incarnation: 1,
-                sequence,
-                first_transition: sequence * u64::from(streams * steps),
-                weights_version: 0,
-                leaving: false,
                 streams,
                 steps,
-                frame_bytes: self.history.spec.frame_bytes() as u32,
+                ..header(actor, 1, sequence, sequence * u64::from(streams * steps))
             },
             0,
             &mut self.rng,
@@ -106,33 +100,18 @@ fn few_anchors_are_equally_likely() {
 #[test]
 fn without_any_anchor_actors_go_on_and_the_end_has_a_reason() {
     let config = Config {
-        capacity_transitions: 10_000,
-        shards: 1,
-        compression: Compression::None,
-        compressed_bytes_max: None,
-        sampling: Sampling::Uniform,
-        disk_bytes_max: None,
-        fsync_ms: None,
-        since: None,
-        reproduced_bug: None,
         replay_ratio: 64.0,
-        warmup_transitions: 0,
         slack_transitions: 1,
         transitions_max: Some(60),
+        ..unlimited(10_000)
     };
     let spec = spec(3, 1, 4, Horizon::None);
     let mut replay = Replay::new(&spec, &config, 64).unwrap();
     join(&mut replay, 0, 1);
     let mut header = ChunkHeader {
-        actor: 0,
-        incarnation: 1,
-        sequence: 0,
-        first_transition: 0,
-        weights_version: 0,
-        leaving: false,
         streams: 20,
         steps: 1,
-        frame_bytes: spec.frame_bytes() as u32,
+        ..header(0, 1, 0, 0)
     };
     for total in [20, 40, 60] {
         let chunk = driml_protocol::Chunk::zeroed(header);

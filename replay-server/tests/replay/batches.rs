@@ -4,8 +4,8 @@
 use std::collections::{HashMap, HashSet};
 
 use driml_protocol::{
-    Batch, BatchHeader, Chunk, ChunkHeader, End, Goodbye, Horizon, InsertReply, RunSpec,
-    TimeoutRule, Waiting,
+    Batch, BatchHeader, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
+    Waiting,
 };
 use driml_replay_server::{Compression, PackedBatch, Replay, ReproducedBug, Unready};
 use proptest::prelude::*;
@@ -13,7 +13,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::{header, join, small_spec, stored},
+    calls::{header, join, last_word, small_spec, stored},
     history::{History, identity, spec, unlimited},
 };
 
@@ -50,15 +50,11 @@ pub(crate) fn check_rows(batch: &Batch, history: &History) -> (f64, (u64, u64)) 
         assert_eq!(state(&states_t, row), history.state(key, t), "{context}");
         assert_eq!(batch.actions()[row], want.action, "{context}");
         assert_eq!(batch.next_actions()[row], want.next_action, "{context}");
+        let (sum, discount) = (f64::from(returns[row]), f64::from(discounts[row]));
+        assert!((sum - want.n_step_return).abs() < 1e-5, "{context}: {sum}");
         assert!(
-            (f64::from(returns[row]) - want.n_step_return).abs() < 1e-5,
-            "{context}: {}",
-            returns[row]
-        );
-        assert!(
-            (f64::from(discounts[row]) - want.discount).abs() < 1e-6,
-            "{context}: {}",
-            discounts[row]
+            (discount - want.discount).abs() < 1e-6,
+            "{context}: {discount}"
         );
         // A state that counts for nothing does not travel.
         if let Some(i) = want.bootstrap.filter(|_| discounts[row] != 0.0) {
@@ -181,10 +177,7 @@ proptest! {
         for _ in 0..150 {
             let number = rng.random_range(0..actors);
             let fresh = |incarnation| Actor {
-                next: ChunkHeader {
-                    actor: number, incarnation, sequence: 0, first_transition: 0, weights_version: 0, leaving: false,
-                    streams, steps: 1, frame_bytes: spec.frame_bytes() as u32,
-                },
+                next: ChunkHeader { streams, steps: 1, frame_bytes: spec.frame_bytes() as u32, ..header(number, incarnation, 0, 0) },
                 part: 0,
             };
             let actor = known.entry(number).or_insert_with(|| fresh(1));
@@ -263,7 +256,7 @@ proptest! {
         }
         for (&actor, Actor { next, .. }) in &known {
             if next.sequence > 0 {
-                replay.goodbye(&Goodbye { actor, incarnation: next.incarnation, produced: next.first_transition });
+                replay.goodbye(&last_word(actor, next.incarnation, next.first_transition));
             }
         }
         let status = replay.status();

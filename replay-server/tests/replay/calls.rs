@@ -2,7 +2,8 @@
 //! It tests nothing.
 
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, Horizon, InsertReply, LearnerJoin, RunSpec, Tally,
+    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Goodbye, Horizon, InsertReply, Learned,
+    LearnerJoin, RunSpec, Tally,
 };
 use driml_replay_server::Replay;
 
@@ -12,6 +13,7 @@ pub(crate) fn small_spec() -> RunSpec {
     spec(3, 1, 1, Horizon::None)
 }
 
+/// Of a chunk with frames as `small_spec` and other runs of three channels have them.
 pub(crate) fn header(
     actor: u32,
     incarnation: u64,
@@ -31,8 +33,37 @@ pub(crate) fn header(
     }
 }
 
+pub(crate) const fn life(actor: u32, incarnation: u64) -> ActorJoin {
+    ActorJoin { actor, incarnation }
+}
+
 pub(crate) fn join(replay: &mut Replay, actor: u32, incarnation: u64) {
-    replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
+    replay.join_actor(life(actor, incarnation)).unwrap();
+}
+
+pub(crate) const fn last_word(actor: u32, incarnation: u64, produced: u64) -> Goodbye {
+    Goodbye {
+        actor,
+        incarnation,
+        produced,
+    }
+}
+
+pub(crate) const fn affinity(version: u64, num_actions: u32, matrix: Vec<f32>) -> AffinityUpdate {
+    AffinityUpdate {
+        learner: 1,
+        version,
+        num_actions,
+        matrix,
+    }
+}
+
+pub(crate) const fn learned(updates: u64, saved_updates: u64, rows_received: u64) -> Learned {
+    Learned {
+        updates,
+        saved_updates,
+        rows_received,
+    }
 }
 
 /// Inserts a chunk; an actor that is new joins with it.
@@ -51,6 +82,10 @@ pub(crate) const fn stored(inserted_total: u64) -> InsertReply {
         actors: 0,
         waited: false,
     }
+}
+
+pub(crate) fn is_stored(reply: &InsertReply) -> bool {
+    matches!(reply, InsertReply::Stored { .. })
 }
 
 pub(crate) const fn wait(inserted_total: u64) -> InsertReply {

@@ -8,7 +8,7 @@ use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::join,
+    calls::{header, is_stored, join},
     history::{spec, unlimited},
 };
 
@@ -74,15 +74,10 @@ impl Actor {
     fn new(spec: &RunSpec, streams: u32, seed: u64) -> Self {
         Self {
             next: ChunkHeader {
-                actor: 0,
-                incarnation: 1,
-                sequence: 0,
-                first_transition: 0,
                 weights_version: 1,
-                leaving: false,
                 streams,
-                steps: 1,
                 frame_bytes: spec.frame_bytes() as u32,
+                ..header(0, 1, 0, 0)
             },
             rng: ChaCha8Rng::seed_from_u64(seed),
         }
@@ -111,7 +106,7 @@ impl Actor {
 
 fn store(replay: &mut Replay, chunk: &Chunk) {
     let reply = replay.insert(chunk);
-    assert!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
+    assert!(is_stored(&reply), "{reply:?}");
 }
 
 proptest! {

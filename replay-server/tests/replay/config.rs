@@ -1,26 +1,18 @@
 //! Settings that cannot work are refused, by key, with what to do.
 //! It does not test the effects of settings.
 
-use driml_protocol::{Horizon, RunSpec, Sampling};
+use driml_protocol::{Horizon, RunSpec};
 use driml_replay_server::{Compression, Config, ConfigError, Replay};
 
-use crate::history::spec;
+use crate::history::{spec, unlimited};
 
 fn good() -> Config {
     Config {
-        capacity_transitions: 10_000,
-        shards: 1,
-        compression: Compression::None,
-        compressed_bytes_max: None,
-        sampling: Sampling::Uniform,
-        disk_bytes_max: None,
-        fsync_ms: None,
-        since: None,
-        reproduced_bug: None,
         replay_ratio: 8.0,
         warmup_transitions: 1000,
         slack_transitions: 32,
         transitions_max: Some(1032),
+        ..unlimited(10_000)
     }
 }
 
@@ -35,87 +27,31 @@ fn refusal(config: &Config, spec: &RunSpec, batch_size: u32) -> String {
 fn each_fault_names_its_key_and_a_way_out() {
     let spec = spec(3, 4, 7, Horizon::Nhg { k_max: 5 });
     assert!(Replay::new(&spec, &good(), 256).is_ok());
-    let cases = [
+    let cases: [(fn(&mut Config), &str); 11] = [
+        (|it| it.replay_ratio = 0.0, "replay_ratio = 0"),
+        (|it| it.replay_ratio = f64::NAN, "replay_ratio = NaN"),
+        (|it| it.replay_ratio = f64::INFINITY, "replay_ratio = inf"),
+        (|it| it.capacity_transitions = 10, "spans 11 transitions"),
+        (|it| it.capacity_transitions = u64::MAX, "hold fewer"),
+        (|it| it.capacity_transitions = 1 << 57, "hold fewer"),
         (
-            Config {
-                replay_ratio: 0.0,
-                ..good()
-            },
-            "replay_ratio = 0",
-        ),
-        (
-            Config {
-                replay_ratio: f64::NAN,
-                ..good()
-            },
-            "replay_ratio = NaN",
-        ),
-        (
-            Config {
-                replay_ratio: f64::INFINITY,
-                ..good()
-            },
-            "replay_ratio = inf",
-        ),
-        (
-            Config {
-                capacity_transitions: 10,
-                ..good()
-            },
-            "spans 11 transitions",
-        ),
-        (
-            Config {
-                capacity_transitions: u64::MAX,
-                ..good()
-            },
-            "hold fewer",
-        ),
-        (
-            Config {
-                capacity_transitions: 1 << 57,
-                ..good()
-            },
-            "hold fewer",
-        ),
-        (
-            Config {
-                compressed_bytes_max: Some(1 << 30),
-                ..good()
-            },
+            |it| it.compressed_bytes_max = Some(1 << 30),
             "nothing is compressed",
         ),
         (
-            Config {
-                compression: Compression::Lz4,
-                compressed_bytes_max: Some(1 << 20),
-                ..good()
-            },
+            |it| (it.compression, it.compressed_bytes_max) = (Compression::Lz4, Some(1 << 20)),
             "use at least 3146124",
         ),
         (
-            Config {
-                warmup_transitions: 10_001,
-                ..good()
-            },
+            |it| it.warmup_transitions = 10_001,
             "at most capacity_transitions = 10000",
         ),
-        (
-            Config {
-                slack_transitions: 31,
-                ..good()
-            },
-            "256 / 8 = 32",
-        ),
-        (
-            Config {
-                transitions_max: Some(1031),
-                ..good()
-            },
-            "= 1032",
-        ),
+        (|it| it.slack_transitions = 31, "256 / 8 = 32"),
+        (|it| it.transitions_max = Some(1031), "= 1032"),
     ];
-    for (config, expected) in cases {
+    for (spoil, expected) in cases {
+        let mut config = good();
+        spoil(&mut config);
         let text = refusal(&config, &spec, 256);
         assert!(
             text.starts_with("replay.") && text.contains(expected),

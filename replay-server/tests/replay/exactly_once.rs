@@ -2,17 +2,17 @@
 //! their answers.
 //! It does not look at rows.
 
-use driml_protocol::{
-    ActorJoin, AffinityUpdate, Buffer, ChunkHeader, Claim, Goodbye, Horizon, InsertReply, Learned,
-    LearnerJoin, RequestId,
-};
+use driml_protocol::{Buffer, ChunkHeader, Claim, Horizon, InsertReply, LearnerJoin, RequestId};
 use driml_replay_server::{Replay, Unready};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::{header, insert, is_refused, join, learner, small_spec, stored},
+    calls::{
+        affinity, header, insert, is_refused, join, last_word, learned, learner, life, small_spec,
+        stored,
+    },
     history::{spec, unlimited},
 };
 
@@ -58,7 +58,7 @@ proptest! {
         }
         let produced: Vec<u64> = (0..actors).map(|actor| first(actor, chunks)).collect();
         for (actor, &produced) in produced.iter().enumerate() {
-            replay.goodbye(&Goodbye { actor: actor as u32, incarnation: 9, produced });
+            replay.goodbye(&last_word(actor as u32, 9, produced));
         }
         let status = replay.status();
         prop_assert_eq!(status.transitions_inserted, produced.iter().sum::<u64>());
@@ -118,45 +118,21 @@ proptest! {
 #[test]
 fn what_never_arrived_counts_as_lost_once() {
     let mut replay = Replay::new(&small_spec(), &unlimited(1000), 8).unwrap();
+    let lost = |replay: &Replay| replay.status().transitions_lost;
     assert_eq!(insert(&mut replay, header(0, 1, 0, 4)), stored(6));
-    assert_eq!(
-        replay.status().transitions_lost,
-        4,
-        "before the first chunk"
-    );
+    assert_eq!(lost(&replay), 4, "before the first chunk");
     assert_eq!(insert(&mut replay, header(0, 1, 1, 10)), stored(12));
     assert_eq!(insert(&mut replay, header(0, 1, 2, 17)), stored(18));
-    assert_eq!(replay.status().transitions_lost, 5, "between chunks");
-    let goodbye = Goodbye {
-        actor: 0,
-        incarnation: 1,
-        produced: 30,
-    };
-    replay.goodbye(&goodbye);
-    replay.goodbye(&goodbye);
-    assert_eq!(
-        replay.status().transitions_lost,
-        12,
-        "after the last chunk, heard twice"
-    );
-    let nothing_arrived = Goodbye {
-        actor: 1,
-        incarnation: 1,
-        produced: 3,
-    };
+    assert_eq!(lost(&replay), 5, "between chunks");
+    replay.goodbye(&last_word(0, 1, 30));
+    replay.goodbye(&last_word(0, 1, 30));
+    assert_eq!(lost(&replay), 12, "after the last chunk, heard twice");
+    let nothing_arrived = last_word(1, 1, 3);
     replay.goodbye(&nothing_arrived);
-    assert_eq!(
-        replay.status().transitions_lost,
-        12,
-        "nobody that has joined"
-    );
+    assert_eq!(lost(&replay), 12, "nobody that has joined");
     join(&mut replay, 1, 1);
     replay.goodbye(&nothing_arrived);
-    assert_eq!(
-        replay.status().transitions_lost,
-        15,
-        "an actor of which nothing arrived"
-    );
+    assert_eq!(lost(&replay), 15, "an actor of which nothing arrived");
     assert_eq!(replay.status().transitions_duplicated, 0);
 }
 
@@ -166,19 +142,11 @@ fn what_was_stored_and_never_produced_counts_as_duplicated() {
     insert(&mut replay, header(0, 1, 0, 0));
     insert(&mut replay, header(0, 1, 1, 4));
     assert_eq!(replay.status().transitions_duplicated, 2);
-    replay.goodbye(&Goodbye {
-        actor: 0,
-        incarnation: 1,
-        produced: 9,
-    });
+    replay.goodbye(&last_word(0, 1, 9));
     assert_eq!(replay.status().transitions_duplicated, 3);
     for actor in [1, 2] {
         join(&mut replay, actor, 0);
-        replay.goodbye(&Goodbye {
-            actor,
-            incarnation: 0,
-            produced: u64::MAX,
-        });
+        replay.goodbye(&last_word(actor, 0, u64::MAX));
     }
     let status = replay.status();
     assert_eq!(
@@ -188,11 +156,7 @@ fn what_was_stored_and_never_produced_counts_as_duplicated() {
     );
     // The largest that a run could have add up without an overflow.
     for actor in [1, 2] {
-        replay.goodbye(&Goodbye {
-            actor,
-            incarnation: 0,
-            produced: 1 << 48,
-        });
+        replay.goodbye(&last_word(actor, 0, 1 << 48));
     }
     assert_eq!(replay.status().transitions_lost, 1 << 49);
 }
@@ -201,11 +165,7 @@ fn what_was_stored_and_never_produced_counts_as_duplicated() {
 fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
     let mut replay = Replay::new(&small_spec(), &unlimited(1000), 8).unwrap();
     insert(&mut replay, header(0, 1, 0, 0));
-    replay.goodbye(&Goodbye {
-        actor: 0,
-        incarnation: 1,
-        produced: 6,
-    });
+    replay.goodbye(&last_word(0, 1, 6));
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     assert!(is_refused(&insert(&mut replay, header(0, 1, 1, 6))));
     assert!(
@@ -213,11 +173,7 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
         "a life that has not joined"
     );
     // Nor does its goodbye make it one.
-    let goodbye = Goodbye {
-        actor: 0,
-        incarnation: 2,
-        produced: 6,
-    };
+    let goodbye = last_word(0, 2, 6);
     replay.goodbye(&goodbye);
     join(&mut replay, 0, 2);
     assert_eq!(
@@ -229,19 +185,10 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
         is_refused(&insert(&mut replay, header(0, 1, 0, 0))),
         "a past life"
     );
-    let again = replay.join_actor(ActorJoin {
-        actor: 0,
-        incarnation: 2,
-    });
+    let again = replay.join_actor(life(0, 2));
     assert_eq!(again, Ok(1), "one life before it");
-    let back = ActorJoin {
-        actor: 0,
-        incarnation: 1,
-    };
-    assert!(
-        replay.join_actor(back).is_err(),
-        "and it does not come back"
-    );
+    let back = replay.join_actor(life(0, 1));
+    assert!(back.is_err(), "and it does not come back");
     let status = replay.status();
     assert_eq!(
         (
@@ -260,11 +207,7 @@ fn what_a_replaced_life_could_not_deliver_counts_as_lost() {
     insert(&mut replay, header(0, 1, 0, 0));
     join(&mut replay, 0, 2);
     assert!(is_refused(&insert(&mut replay, header(0, 1, 1, 6))));
-    let last_word = Goodbye {
-        actor: 0,
-        incarnation: 1,
-        produced: 18,
-    };
+    let last_word = last_word(0, 1, 18);
     replay.goodbye(&last_word);
     replay.goodbye(&last_word);
     assert_eq!(replay.status().transitions_lost, 12);
@@ -309,19 +252,9 @@ fn rows_that_nobody_learned_from_do_not_count() {
         replay.sample(8).unwrap();
     }
     assert_eq!(replay.sample(8), Err(Unready::Finished));
-    let affinity = |version, p| AffinityUpdate {
-        learner: 1,
-        version,
-        num_actions: 5,
-        matrix: vec![p; 25],
-    };
+    let affinity = |version, p| affinity(version, 5, vec![p; 25]);
     replay.set_affinity(&affinity(9, 0.5)).unwrap();
-    let learned = Learned {
-        updates: 8,
-        saved_updates: 5,
-        rows_received: 72,
-    };
-    replay.note_learned(learned).unwrap();
+    replay.note_learned(learned(8, 5, 72)).unwrap();
 
     assert_eq!(replay.join_learner(learner(2, 5, 40, 18)), Ok(3));
     replay.check_valid();
@@ -377,12 +310,7 @@ fn a_learner_needs_a_checkpoint_of_the_run_or_the_word_to_restart() {
         for _ in 0..8 {
             replay.sample(8).unwrap();
         }
-        let learned = Learned {
-            updates: 8,
-            saved_updates: 5,
-            rows_received: 64,
-        };
-        replay.note_learned(learned).unwrap();
+        replay.note_learned(learned(8, 5, 64)).unwrap();
         let joined = replay.join_learner(join);
         assert_eq!(joined, expected.map_err(String::from), "a learner {which}");
         let rows = match (joined.is_ok(), join.learner) {

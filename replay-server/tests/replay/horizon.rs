@@ -6,13 +6,13 @@ use std::collections::HashMap;
 use driml_protocol::{AffinityUpdate, ChunkHeader, Horizon};
 use driml_replay_server::{
     Replay,
-    horizon::{Affinity, draw_k, nhg, uniform},
+    horizon::{Affinity, draw_k, nhg},
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::join,
+    calls::{affinity, header, join},
     history::{History, identity, spec, unlimited},
     law::ChiSquare,
 };
@@ -27,15 +27,10 @@ fn random_affinity(num_actions: u32, spread: f32, rng: &mut ChaCha8Rng) -> Affin
         let sum: f32 = row.iter().sum();
         matrix.extend(row.iter().map(|e| e / sum));
     }
-    AffinityUpdate {
-        learner: 1,
-        version: 1,
-        num_actions,
-        matrix,
-    }
+    affinity(1, num_actions, matrix)
 }
 
-fn affinity(update: &AffinityUpdate) -> Affinity {
+fn taken(update: &AffinityUpdate) -> Affinity {
     let mut affinity = Affinity::uniform(update.num_actions);
     affinity.update(update).unwrap();
     affinity
@@ -76,7 +71,7 @@ fn nhg_follows_its_law() {
         let num_actions = rng.random_range(1..16);
         let spread = rng.random_range(0.0..6.0);
         let update = random_affinity(num_actions, spread, &mut rng);
-        let affinity = affinity(&update);
+        let affinity = taken(&update);
         let h = rng.random_range(1..10);
         let actions: Vec<u8> = (0..h)
             .map(|_| rng.random_range(0..num_actions as u8))
@@ -91,68 +86,52 @@ fn nhg_follows_its_law() {
 fn uniform_follows_its_law() {
     let mut rng = ChaCha8Rng::seed_from_u64(12);
     let mut chi = ChiSquare::default();
+    let affinity = Affinity::uniform(1);
+    let mut draw = |k_max, steps_left| {
+        let horizon = Horizon::Uniform { k_max };
+        draw_k(horizon, &affinity, &vec![0; steps_left], &mut rng).unwrap()
+    };
     for (k_max, steps_left) in [(5, 5), (5, 9), (5, 3), (2, 7), (9, 2)] {
-        let h = k_max.min(steps_left) as usize;
-        let counts = count(h, 5_000, || uniform::draw_k(k_max, steps_left, &mut rng));
+        let h = steps_left.min(k_max as usize);
+        let counts = count(h, 5_000, || draw(k_max, steps_left));
         chi.add(&counts, &vec![1.0 / h as f64; h]);
     }
     chi.check("uniform");
-    assert_eq!(uniform::draw_k(5, 1, &mut rng), 1, "the end of the episode");
+    assert_eq!(draw(5, 1), 1, "the end of the episode");
 }
 
 /// Action 1 always follows action 0, and never action 1: A = 1 goes on to the end, A = 0 stops at once.
 #[test]
 fn certain_affinities_leave_no_choice() {
-    let certain = AffinityUpdate {
-        learner: 1,
-        version: 1,
-        num_actions: 2,
-        matrix: vec![0.0, 1.0, 1.0, 0.0],
-    };
-    let affinity = affinity(&certain);
+    let affinity = taken(&affinity(1, 2, vec![0.0, 1.0, 1.0, 0.0]));
     let rng = &mut ChaCha8Rng::seed_from_u64(13);
     for _ in 0..200 {
-        assert_eq!(nhg::draw_k(&affinity, &[0, 0, 1, 0, 1], rng), 1, "A_1 = 0");
-        assert_eq!(
-            nhg::draw_k(&affinity, &[0, 1, 0, 1, 0], rng),
-            5,
-            "A_i = 1 up to H"
-        );
-        assert_eq!(nhg::draw_k(&affinity, &[0, 1, 0, 0, 1], rng), 3, "A_3 = 0");
-        assert_eq!(nhg::draw_k(&affinity, &[0], rng), 1, "one step left");
+        let mut k = |actions: &[u8]| nhg::draw_k(&affinity, actions, rng);
+        assert_eq!(k(&[0, 0, 1, 0, 1]), 1, "A_1 = 0");
+        assert_eq!(k(&[0, 1, 0, 1, 0]), 5, "A_i = 1 up to H");
+        assert_eq!(k(&[0, 1, 0, 0, 1]), 3, "A_3 = 0");
+        assert_eq!(k(&[0]), 1, "one step left");
     }
 }
 
 #[test]
 fn every_rule_stays_within_k_max_and_the_episode() {
-    let affinity = affinity(&AffinityUpdate {
-        learner: 1,
-        version: 1,
-        num_actions: 1,
-        matrix: vec![1.0],
-    });
+    let affinity = taken(&affinity(1, 1, vec![1.0]));
     let rng = &mut ChaCha8Rng::seed_from_u64(14);
-    assert_eq!(draw_k(Horizon::None, &affinity, &[0; 3], rng), None);
-    assert_eq!(
-        draw_k(Horizon::Fixed { k: 4 }, &affinity, &[0; 9], rng),
-        Some(4)
-    );
-    assert_eq!(
-        draw_k(Horizon::Fixed { k: 4 }, &affinity, &[0; 2], rng),
-        Some(2)
-    );
-    for (steps, furthest) in [(9, 4), (4, 4), (2, 2)] {
-        let all = Horizon::All { k_max: 4 };
-        assert_eq!(draw_k(all, &affinity, &vec![0; steps], rng), Some(furthest));
+    let nhg = Horizon::Nhg { k_max: 4 };
+    let mut cases = vec![
+        (Horizon::None, 3, None),
+        (nhg, 9, Some(4)),
+        (nhg, 2, Some(2)),
+    ];
+    for (k_max, steps_left, expected) in [(1, 1, 1), (1, 7, 1), (4, 9, 4), (4, 4, 4), (4, 2, 2)] {
+        let rules = [Horizon::Fixed { k: k_max }, Horizon::All { k_max }];
+        cases.extend(rules.map(|it| (it, steps_left, Some(expected))));
     }
-    assert_eq!(
-        draw_k(Horizon::Nhg { k_max: 4 }, &affinity, &[0; 9], rng),
-        Some(4)
-    );
-    assert_eq!(
-        draw_k(Horizon::Nhg { k_max: 4 }, &affinity, &[0; 2], rng),
-        Some(2)
-    );
+    for (horizon, steps_left, expected) in cases {
+        let k = draw_k(horizon, &affinity, &vec![0; steps_left], rng);
+        assert_eq!(k, expected, "{horizon:?}, {steps_left} left");
+    }
     for _ in 0..100 {
         assert!(draw_k(Horizon::Uniform { k_max: 4 }, &affinity, &[0; 9], rng).unwrap() <= 4);
     }
@@ -160,33 +139,19 @@ fn every_rule_stays_within_k_max_and_the_episode() {
 
 #[test]
 fn an_older_or_broken_affinity_is_not_taken() {
-    let mut affinity = Affinity::uniform(2);
-    assert_eq!((affinity.version(), affinity.get(0, 1)), (0, 0.5));
-    let update = |version, matrix| AffinityUpdate {
-        learner: 1,
-        version,
-        num_actions: 2,
-        matrix,
-    };
-    affinity
-        .update(&update(3, vec![0.0, 1.0, 0.25, 0.75]))
-        .unwrap();
-    affinity
-        .update(&update(2, vec![1.0, 0.0, 1.0, 0.0]))
-        .unwrap();
-    assert_eq!((affinity.version(), affinity.get(1, 0)), (3, 0.25));
-    assert!(affinity.update(&update(4, vec![0.5; 3])).is_err());
-    assert!(
-        affinity
-            .update(&update(4, vec![0.5, f32::NAN, 0.5, 0.5]))
-            .is_err()
-    );
-    assert!(
-        affinity
-            .update(&update(4, vec![0.5, 1.5, 0.5, 0.5]))
-            .is_err()
-    );
-    assert_eq!((affinity.version(), affinity.get(1, 0)), (3, 0.25));
+    let mut current = Affinity::uniform(2);
+    assert_eq!((current.version(), current.get(0, 1)), (0, 0.5));
+    for (version, matrix, is_valid) in [
+        (3, vec![0.0, 1.0, 0.25, 0.75], true),
+        (2, vec![1.0, 0.0, 1.0, 0.0], true),
+        (4, vec![0.5; 3], false),
+        (4, vec![0.5, f32::NAN, 0.5, 0.5], false),
+        (4, vec![0.5, 1.5, 0.5, 0.5], false),
+    ] {
+        let taken = current.update(&affinity(version, 2, matrix));
+        assert_eq!(taken.is_ok(), is_valid, "{taken:?}");
+        assert_eq!((current.version(), current.get(1, 0)), (3, 0.25));
+    }
 }
 
 /// k as it leaves the server, anchor by anchor: the walk must read the actions that follow that anchor.
@@ -200,15 +165,8 @@ fn the_k_served_follow_the_law() {
     let mut history = History::new(&spec, 150);
     for sequence in 0..20 {
         let header = ChunkHeader {
-            actor: 0,
-            incarnation: 1,
-            sequence,
-            first_transition: sequence * 10,
-            weights_version: 0,
-            leaving: false,
-            streams: 2,
             steps: 5,
-            frame_bytes: spec.frame_bytes() as u32,
+            ..header(0, 1, sequence, sequence * 10)
         };
         replay.insert(&history.next_chunk(header, 0, &mut rng));
     }
@@ -221,12 +179,7 @@ fn the_k_served_follow_the_law() {
                 replay.set_affinity(&update).unwrap();
                 update
             }
-            None => AffinityUpdate {
-                learner: 1,
-                version: 0,
-                num_actions: 5,
-                matrix: vec![0.2; 25],
-            },
+            None => affinity(0, 5, vec![0.2; 25]),
         };
         let mut counts: HashMap<_, Vec<u64>> = HashMap::new();
         for _ in 0..600 {

@@ -1,14 +1,14 @@
 //! What a replay refuses or lets wait, and where a run ends.
 //! It does not look at rows, and no message is lost or repeated.
 
-use driml_protocol::{
-    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, End, Goodbye, InsertReply, RunSpec, Tally,
-    Waiting,
-};
+use driml_protocol::{Chunk, ChunkHeader, End, InsertReply, RunSpec, Tally, Waiting};
 use driml_replay_server::{ACTORS_MAX, Replay, STREAMS_MAX, Unready};
 
 use crate::{
-    calls::{header, insert, is_refused, join, small_spec, stored, wait},
+    calls::{
+        affinity, header, insert, is_refused, is_stored, join, last_word, life, small_spec, stored,
+        wait,
+    },
     history::unlimited,
 };
 
@@ -85,31 +85,17 @@ fn actors_and_streams_are_bounded() {
     let mut replay = Replay::new(&small_spec(), &unlimited(1 << 15), 8).unwrap();
     for actor in 0..ACTORS_MAX as u32 {
         join(&mut replay, actor, 1);
-        assert!(matches!(
-            replay.insert(&Chunk::zeroed(header(actor, 1, 0, 0))),
-            InsertReply::Stored { .. }
-        ));
+        let reply = replay.insert(&Chunk::zeroed(header(actor, 1, 0, 0)));
+        assert!(is_stored(&reply), "{reply:?}");
     }
     let one_more = ACTORS_MAX as u32;
-    let join = ActorJoin {
-        actor: one_more,
-        incarnation: 1,
-    };
-    assert!(replay.join_actor(join).is_err());
-    assert!(is_refused(
-        &replay.insert(&Chunk::zeroed(header(one_more, 1, 0, 0)))
-    ));
-    replay.goodbye(&Goodbye {
-        actor: one_more,
-        incarnation: 1,
-        produced: 6,
-    });
+    assert!(replay.join_actor(life(one_more, 1)).is_err());
+    let reply = replay.insert(&Chunk::zeroed(header(one_more, 1, 0, 0)));
+    assert!(is_refused(&reply), "{reply:?}");
+    replay.goodbye(&last_word(one_more, 1, 6));
     assert_eq!(replay.status().transitions_lost, 0);
-    let last = header(one_more - 1, 1, 1, 6);
-    assert!(
-        matches!(insert(&mut replay, last), InsertReply::Stored { .. }),
-        "the known ones go on"
-    );
+    let last = insert(&mut replay, header(one_more - 1, 1, 1, 6));
+    assert!(is_stored(&last), "the known ones go on");
     let wide = ChunkHeader {
         streams: STREAMS_MAX + 1,
         steps: 1,
@@ -121,23 +107,15 @@ fn actors_and_streams_are_bounded() {
 #[test]
 fn the_run_ends_when_all_is_in_and_sampled() {
     let mut config = unlimited(1000);
-    (
-        config.replay_ratio,
-        config.slack_transitions,
-        config.warmup_transitions,
-    ) = (4.0, 6, 6);
-    config.transitions_max = Some(18);
+    (config.replay_ratio, config.slack_transitions) = (4.0, 6);
+    (config.warmup_transitions, config.transitions_max) = (6, Some(18));
     let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
-    assert_eq!(replay.waiting(), Waiting::WarmUp { have: 0, need: 6 });
-    assert_eq!(
-        replay.sample(8),
-        Err(Unready::Wait(Waiting::WarmUp { have: 0, need: 6 }))
-    );
+    let warm_up = Waiting::WarmUp { have: 0, need: 6 };
+    assert_eq!(replay.waiting(), warm_up);
+    assert_eq!(replay.sample(8), Err(Unready::Wait(warm_up)));
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
-    assert_eq!(
-        replay.sample(8),
-        Err(Unready::Wait(Waiting::LearnerWaitsForActors))
-    );
+    let hungry = Err(Unready::Wait(Waiting::LearnerWaitsForActors));
+    assert_eq!(replay.sample(8), hungry);
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(12));
     assert_eq!(
         insert(&mut replay, header(1, 1, 0, 0)),
@@ -150,14 +128,10 @@ fn the_run_ends_when_all_is_in_and_sampled() {
         stored(18),
         "a retry is still a retry"
     );
-    assert_eq!(
-        insert(&mut replay, header(0, 1, 2, 12)),
-        InsertReply::Finished { inserted_total: 18 }
-    );
-    assert_eq!(
-        insert(&mut replay, header(0, 1, 7, 12)),
-        InsertReply::Finished { inserted_total: 18 }
-    );
+    for sequence in [2, 7] {
+        let reply = insert(&mut replay, header(0, 1, sequence, 12));
+        assert_eq!(reply, InsertReply::Finished { inserted_total: 18 });
+    }
     for _ in 0..6 {
         replay.sample(8).unwrap();
     }
@@ -168,11 +142,7 @@ fn the_run_ends_when_all_is_in_and_sampled() {
         Some(4.0),
         "48 rows of 12 transitions after the warm-up"
     );
-    replay.goodbye(&Goodbye {
-        actor: 0,
-        incarnation: 1,
-        produced: 12,
-    });
+    replay.goodbye(&last_word(0, 1, 12));
     assert_eq!(replay.status().transitions_lost, 0);
 }
 
@@ -206,12 +176,7 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
         replay.sample(8).unwrap();
     }
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(18));
-    let foreign = AffinityUpdate {
-        learner: 1,
-        version: 1,
-        num_actions: 4,
-        matrix: vec![0.25; 16],
-    };
+    let foreign = affinity(1, 4, vec![0.25; 16]);
     assert!(replay.set_affinity(&foreign).is_err());
     assert_eq!(replay.status().messages_refused, 3);
 }
@@ -252,12 +217,7 @@ fn a_version_of_the_affinity_that_no_run_reaches_is_refused() {
     let mut replay = Replay::new(&small_spec(), &unlimited(1000), 8).unwrap();
     insert(&mut replay, header(0, 1, 0, 0));
     replay.sample(8).unwrap();
-    let affinity = |version| AffinityUpdate {
-        learner: 1,
-        version,
-        num_actions: 5,
-        matrix: vec![0.2; 25],
-    };
+    let affinity = |version| affinity(version, 5, vec![0.2; 25]);
     // 2^32 ahead of the rows.
     let most: u64 = 8 + (1 << 32);
     for version in [most + 1, u64::MAX] {

@@ -2,15 +2,11 @@
 //! What damage costs is in `durable_damage`.
 
 use std::{
-    borrow::Cow,
     fs,
     path::{Path, PathBuf},
 };
 
-use driml_protocol::{
-    ActorJoin, AffinityUpdate, Buffer, ChunkHeader, Goodbye, Horizon, InsertReply, Learned,
-    RequestId, RunSpec, Shutdown,
-};
+use driml_protocol::{Batch, Buffer, Chunk, ChunkHeader, Horizon, RequestId, RunSpec, Shutdown};
 use driml_replay_server::{
     Compression, Config, KeptReplay, PersistArgs, PersistError, Reading, Recovery, Replay,
 };
@@ -20,7 +16,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batches::check_batch,
-    calls::learner,
+    calls::{self, affinity, header, is_stored, join, last_word, learned, learner},
     history::{History, spec, unlimited},
 };
 
@@ -75,6 +71,11 @@ pub(crate) fn segments(dir: &Path) -> Vec<PathBuf> {
     all
 }
 
+fn bytes_in(dir: &Path) -> u64 {
+    let lengths = segments(dir).into_iter();
+    lengths.map(|it| fs::metadata(it).unwrap().len()).sum()
+}
+
 /// Copies all files of a folder into another.
 pub(crate) fn copy(from: &Path, to: &Path) {
     fs::create_dir_all(to).unwrap();
@@ -82,6 +83,11 @@ pub(crate) fn copy(from: &Path, to: &Path) {
         let path = entry.unwrap().path();
         fs::copy(&path, to.join(path.file_name().unwrap())).unwrap();
     }
+}
+
+/// Whether the newest transitions are held, as many as the capacity says.
+fn is_held_by_number(config: &Config) -> bool {
+    config.compressed_bytes_max.is_none() && config.disk_bytes_max.is_none()
 }
 
 /// What a log brings back of a server that died.
@@ -101,16 +107,10 @@ impl Life {
         let (mut replay, recovery) = open(&args, &config).unwrap();
         assert!(!recovery.found);
         for actor in 0..2 {
-            let join = ActorJoin {
-                actor,
-                incarnation: 1,
-            };
-            replay.join_actor(join).unwrap();
+            join(&mut replay, actor, 1);
         }
         replay.join_learner(learner(77, 0, 0, 0)).unwrap();
-        let mut history = History::new(&test_spec(), config.capacity_transitions);
-        // What compresses badly may leave earlier than the reference thinks.
-        history.ends = true;
+        let history = History::new(&test_spec(), config.capacity_transitions);
         Self {
             args,
             config,
@@ -127,20 +127,13 @@ impl Life {
     pub(crate) fn store(&mut self, actor: usize) {
         let (incarnation, sequence, produced) = self.actors[actor];
         let header = ChunkHeader {
-            actor: actor as u32,
-            incarnation,
-            sequence,
-            first_transition: produced,
             weights_version: self.rng.random_range(0..9),
-            leaving: false,
-            streams: 2,
             steps: self.rng.random_range(1..6),
-            frame_bytes: test_spec().frame_bytes() as u32,
+            ..header(actor as u32, incarnation, sequence, produced)
         };
         let chunk = self.history.next_chunk(header, 0, &mut self.rng);
-        let packed = self.replay.packer().pack(Cow::Borrowed(&chunk));
-        let reply = self.replay.insert_packed(&packed);
-        assert!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
+        let reply = self.replay.insert(&chunk);
+        assert!(is_stored(&reply), "{reply:?}");
         self.actors[actor] = (
             incarnation,
             sequence + 1,
@@ -149,7 +142,7 @@ impl Life {
     }
 
     /// A batch for a request of a client, or why there is none.
-    pub(crate) fn draw(&mut self, client: usize) -> Option<driml_protocol::Batch> {
+    pub(crate) fn draw(&mut self, client: usize) -> Option<Batch> {
         let id = self.requests[client];
         self.replay
             .draw_for(id, ROWS, Buffer::zeroed)
@@ -173,10 +166,8 @@ impl Life {
                 } else {
                     id.next()
                 };
-                let held_by_number = self.config.compressed_bytes_max.is_none()
-                    && self.config.disk_bytes_max.is_none();
                 if let Some(batch) = self.draw(client)
-                    && held_by_number
+                    && is_held_by_number(&self.config)
                 {
                     check_batch(&batch, &self.history);
                 }
@@ -186,28 +177,16 @@ impl Life {
                 let matrix = (0..25)
                     .map(|at| if at % 5 == 0 { 0.6 } else { 0.1 })
                     .collect();
-                let update = AffinityUpdate {
-                    num_actions: 5,
-                    learner: 77,
-                    version: self.versions,
-                    matrix,
-                };
+                let update = affinity(self.versions, 5, matrix);
                 self.replay.set_affinity(&update).unwrap();
             }
             17 => {
                 let actor = self.rng.random_range(0..2);
                 let (incarnation, _, produced) = self.actors[actor];
-                self.replay.goodbye(&Goodbye {
-                    actor: actor as u32,
-                    incarnation,
-                    produced,
-                });
+                self.replay
+                    .goodbye(&last_word(actor as u32, incarnation, produced));
                 self.actors[actor] = (incarnation + 1, 0, 0);
-                let join = ActorJoin {
-                    actor: actor as u32,
-                    incarnation: incarnation + 1,
-                };
-                self.replay.join_actor(join).unwrap();
+                join(&mut self.replay, actor as u32, incarnation + 1);
             }
             18 => {
                 let served = self.replay.tally().rows_sampled;
@@ -232,18 +211,12 @@ fn record_end(bytes: &[u8], at: u64) -> u64 {
 /// The log of a replay that died is used: what the learner says it has counts, and rows are right.
 fn check_goes_on(life: &Life, mut replay: Replay) {
     let rows = life.replay.tally().rows_sampled;
-    let learned = Learned {
-        rows_received: rows,
-        ..Learned::default()
-    };
-    replay.note_learned(learned).unwrap();
+    replay.note_learned(learned(0, 0, rows)).unwrap();
     assert_eq!(replay.tally(), life.replay.tally());
-    let is_held_by_number =
-        life.config.compressed_bytes_max.is_none() && life.config.disk_bytes_max.is_none();
     for client in 0..6 {
         let id = RequestId::first(1000 + client);
         if let Ok(batch) = replay.draw_for(id, ROWS, Buffer::zeroed)
-            && is_held_by_number
+            && is_held_by_number(&life.config)
         {
             check_batch(&batch.unpack(), &life.history);
         }
@@ -335,17 +308,6 @@ fn retries_are_recognised_after_a_restart() {
     for _ in 0..20 {
         life.store(0);
     }
-    let header = ChunkHeader {
-        actor: 0,
-        incarnation: 1,
-        sequence: 19,
-        first_transition: 0,
-        weights_version: 0,
-        leaving: false,
-        streams: 2,
-        steps: 3,
-        frame_bytes: test_spec().frame_bytes() as u32,
-    };
     let id = life.requests[0];
     assert!(life.draw(0).is_some());
     let served = life.replay.status();
@@ -354,23 +316,10 @@ fn retries_are_recognised_after_a_restart() {
     let (mut replay, recovery) = open(&args, &config).unwrap();
     assert!(recovery.found);
     assert_eq!(replay.learner(), Some(77));
-    let chunk = driml_protocol::Chunk::zeroed(header);
-    let packed = replay.packer().pack(Cow::Borrowed(&chunk));
-    let reply = replay.insert_packed(&packed);
-    let inserted_total = served.transitions_inserted;
-    assert_eq!(
-        reply,
-        InsertReply::Stored {
-            inserted_total,
-            actors: 0,
-            waited: false
-        }
-    );
+    let reply = replay.insert(&Chunk::zeroed(header(0, 1, 19, 0)));
+    assert_eq!(reply, calls::stored(served.transitions_inserted));
     // The learner says how many rows it has; the batch that did not reach it is not among them.
-    let learned = Learned {
-        rows_received: served.rows_sampled - u64::from(ROWS),
-        ..Learned::default()
-    };
+    let learned = learned(0, 0, served.rows_sampled - u64::from(ROWS));
     replay.note_learned(learned).unwrap();
     assert!(replay.draw_for(id.again(), ROWS, Buffer::zeroed).is_ok());
     replay.note_learned(learned).unwrap();
@@ -389,16 +338,9 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
         life.store(0);
     }
     // 100 transitions of 36 + 6 bytes each are held, and the newest segments are not full.
-    assert!(
-        life.replay.log_bytes() < 20_000,
-        "{}",
-        life.replay.log_bytes()
-    );
-    let on_disk: u64 = segments(&life.args.dir)
-        .iter()
-        .map(|it| fs::metadata(it).unwrap().len())
-        .sum();
-    assert_eq!(on_disk, life.replay.log_bytes());
+    let bytes = life.replay.log_bytes();
+    assert!(bytes < 20_000, "{bytes}");
+    assert_eq!(bytes_in(&life.args.dir), bytes);
 
     // A ring that is larger than the budget: the oldest leave it too.
     let mut config = unlimited(1_000_000);
@@ -406,11 +348,8 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
     let mut life = Life::begin(&root.path().join("budget"), config, 200_000, 5);
     while life.history.inserted < 150_000 {
         life.store(1);
-        assert!(
-            life.replay.log_bytes() <= 4 << 20,
-            "{}",
-            life.replay.log_bytes()
-        );
+        let bytes = life.replay.log_bytes();
+        assert!(bytes <= 4 << 20, "{bytes}");
     }
     let status = life.replay.status();
     assert!(
@@ -483,10 +422,7 @@ fn reading_says_how_far_it_is_and_can_be_broken_off() {
     }
     let (before, args, config) = (stored(&life.replay), life.args.clone(), life.config.clone());
     drop(life);
-    let bytes = || -> u64 {
-        let lengths = segments(root.path()).into_iter();
-        lengths.map(|it| fs::metadata(it).unwrap().len()).sum()
-    };
+    let bytes = || bytes_in(root.path());
     let find = || KeptReplay::find(&args, &test_spec(), &config, ROWS).unwrap();
 
     let (kept, all, stop) = (find(), bytes(), Shutdown::default());

@@ -1,7 +1,6 @@
 //! A log with bits flipped, files missing or foreign: it is said, the rest is used, and rows of batches are right all the same.
 
 use std::{
-    borrow::Cow,
     fs,
     path::{Path, PathBuf},
 };
@@ -15,6 +14,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batches::{check_batch, check_rows},
+    calls::{header, is_stored},
     history::{History, unlimited},
     persist::{Life, ROWS, args, open, segments, stored, test_spec},
 };
@@ -66,6 +66,18 @@ impl Kept {
 
     fn open(&self) -> (Replay, Recovery) {
         open(&self.args, &self.config).unwrap()
+    }
+
+    /// Opens it, which warns of all of these and of nothing where there are none.
+    fn open_saying(&self, words: &[&str]) -> Replay {
+        let (replay, recovery) = self.open();
+        let said = |words: &&str| recovery.warnings.iter().any(|it| it.contains(words));
+        assert!(words.iter().all(said), "{words:?}: {recovery:?}");
+        assert!(
+            !words.is_empty() || recovery.warnings.is_empty(),
+            "{recovery:?}"
+        );
+        replay
     }
 
     /// Checks batches of what came back, which holds `held` transitions or more: nothing of what is gone is in them.
@@ -142,18 +154,12 @@ proptest! {
     }
 }
 
-fn said(recovery: &Recovery, words: &str) -> bool {
-    recovery.warnings.iter().any(|it| it.contains(words))
-}
-
 #[test]
 fn a_flipped_bit_costs_its_segment_alone() {
     let kept = Kept::new(10_000);
     let segments = kept.segments();
     flip(&segments[5], |length| length * 2 / 3);
-    let (mut replay, recovery) = kept.open();
-    assert!(said(&recovery, "is damaged at byte"), "{recovery:?}");
-    assert!(said(&recovery, "are gone"), "{recovery:?}");
+    let mut replay = kept.open_saying(&["is damaged at byte", "are gone"]);
     let status = replay.status();
     assert_eq!(status.transitions_inserted, kept.history.inserted);
     assert_eq!(status.transitions_lost, 0);
@@ -161,11 +167,8 @@ fn a_flipped_bit_costs_its_segment_alone() {
     kept.check(&mut replay);
     // The next chunk of the actor is the next.
     drop(replay);
-    let (_, recovery) = kept.open();
-    assert!(
-        said(&recovery, "are gone"),
-        "as long as they would be held: {recovery:?}"
-    );
+    // As long as they would be held.
+    kept.open_saying(&["are gone"]);
 }
 
 /// A length that became too large looks like a write that the end of the process cut off. Nobody was told of such a one; of what is
@@ -180,8 +183,7 @@ fn a_damaged_length_is_no_torn_write() {
     assert!(heads.len() > 4, "{}", heads.len());
     // The third byte of the length of the second record.
     flip(&newest, |_| heads[1].0 + 16 + 3);
-    let (replay, recovery) = kept.open();
-    assert!(said(&recovery, "are cut off"), "{recovery:?}");
+    let replay = kept.open_saying(&["are cut off"]);
     replay.check_valid();
 }
 
@@ -190,8 +192,7 @@ fn a_damaged_beginning_costs_its_segment_and_it_is_set_aside() {
     let kept = Kept::new(10_000);
     let segments = kept.segments();
     flip(&segments[4], |_| 40);
-    let (mut replay, recovery) = kept.open();
-    assert!(said(&recovery, "its beginning is damaged"), "{recovery:?}");
+    let mut replay = kept.open_saying(&["its beginning is damaged"]);
     assert!(segments[4].with_extension("unusable").exists());
     assert_eq!(replay.status().transitions_inserted, kept.history.inserted);
     kept.check(&mut replay);
@@ -202,11 +203,7 @@ fn missing_segments_are_said_wherever_they_are() {
     let kept = Kept::new(10_000);
     let all = kept.segments();
     fs::remove_file(&all[7]).unwrap();
-    let (mut replay, recovery) = kept.open();
-    assert!(
-        said(&recovery, "are gone") && said(&recovery, "missing"),
-        "{recovery:?}"
-    );
+    let mut replay = kept.open_saying(&["are gone", "missing"]);
     assert_eq!(replay.status().transitions_inserted, kept.history.inserted);
     kept.check(&mut replay);
 
@@ -214,29 +211,20 @@ fn missing_segments_are_said_wherever_they_are() {
     let all = kept.segments();
     fs::remove_file(&all[0]).unwrap();
     fs::remove_file(&all[1]).unwrap();
-    let (mut replay, recovery) = kept.open();
-    assert!(
-        said(&recovery, "the oldest segments are missing"),
-        "{recovery:?}"
-    );
+    let mut replay = kept.open_saying(&["the oldest segments are missing"]);
     assert_eq!(stored(&replay).len(), kept.stored.len());
     kept.check(&mut replay);
 
     let kept = Kept::new(10_000);
     let all = kept.segments();
     fs::remove_file(all.last().unwrap()).unwrap();
-    let (replay, recovery) = kept.open();
-    assert!(
-        said(&recovery, "is missing: the replay is what it was"),
-        "{recovery:?}"
-    );
+    let replay = kept.open_saying(&["is missing: the replay is what it was"]);
     assert!(replay.status().transitions_inserted < kept.history.inserted);
     replay.check_valid();
 
     // None is missing where the oldest were removed with their transitions.
     let kept = Kept::new(100);
-    let (mut replay, recovery) = kept.open();
-    assert_eq!(recovery.warnings, [""; 0]);
+    let mut replay = kept.open_saying(&[]);
     assert_eq!(stored(&replay), kept.stored);
     kept.check(&mut replay);
 }
@@ -247,40 +235,25 @@ fn after_a_loss_an_actor_goes_on_and_the_loss_is_counted() {
     let kept = Kept::new(10_000);
     let newest = kept.segments().pop().unwrap();
     flip(&newest, |length| length * 3 / 4);
-    let (mut replay, recovery) = kept.open();
-    assert!(said(&recovery, "are cut off"), "{recovery:?}");
+    let mut replay = kept.open_saying(&["are cut off"]);
     let before = replay.status();
     let lost = kept.history.inserted - before.transitions_inserted;
     assert!(lost > 0);
     let header = |sequence| ChunkHeader {
-        actor: 0,
-        incarnation: 1,
-        sequence,
-        first_transition: kept.produced,
-        weights_version: 0,
-        leaving: false,
-        streams: 2,
         steps: 4,
-        frame_bytes: test_spec().frame_bytes() as u32,
+        ..header(0, 1, sequence, kept.produced)
     };
     // Far beyond what came back.
     let sequence = 10_000;
-    let mut insert = |sequence| {
-        let chunk = Chunk::zeroed(header(sequence));
-        let packed = replay.packer().pack(Cow::Borrowed(&chunk));
-        replay.insert_packed(&packed)
-    };
+    let mut insert = |sequence| replay.insert(&Chunk::zeroed(header(sequence)));
     // One that overtook the one before it is told so; an actor that then sends the same again has nothing older.
     assert!(matches!(
         insert(sequence + 1),
         InsertReply::OutOfOrder { .. }
     ));
     assert!(matches!(insert(sequence), InsertReply::OutOfOrder { .. }));
-    assert!(matches!(insert(sequence), InsertReply::Stored { .. }));
-    assert!(
-        matches!(insert(sequence), InsertReply::Stored { .. }),
-        "a retry"
-    );
+    assert!(is_stored(&insert(sequence)));
+    assert!(is_stored(&insert(sequence)), "a retry");
     let status = replay.status();
     assert_eq!(status.transitions_inserted, before.transitions_inserted + 8);
     assert_eq!(
@@ -290,8 +263,7 @@ fn after_a_loss_an_actor_goes_on_and_the_loss_is_counted() {
     replay.check_valid();
     let after = stored(&replay);
     drop(replay);
-    let (replay, recovery) = kept.open();
-    assert_eq!(recovery.warnings, [""; 0]);
+    let replay = kept.open_saying(&[]);
     assert_eq!(stored(&replay), after);
 }
 
@@ -302,8 +274,7 @@ fn a_power_cut_that_leaves_zeros_is_a_torn_write() {
     let mut bytes = fs::read(&newest).unwrap();
     bytes.extend_from_slice(&[0; 5_000]);
     fs::write(&newest, &bytes).unwrap();
-    let (replay, recovery) = kept.open();
-    assert_eq!(recovery.warnings, [""; 0]);
+    let replay = kept.open_saying(&[]);
     assert_eq!(stored(&replay), kept.stored);
     assert!(fs::metadata(&newest).unwrap().len() < bytes.len() as u64);
     drop(replay);
@@ -311,8 +282,7 @@ fn a_power_cut_that_leaves_zeros_is_a_torn_write() {
     let next = kept.segments().pop().unwrap();
     let next = next.with_file_name("segment-000000000999.log");
     fs::write(&next, &bytes[..20]).unwrap();
-    let (replay, recovery) = kept.open();
-    assert_eq!(recovery.warnings, [""; 0]);
+    let replay = kept.open_saying(&[]);
     assert_eq!(stored(&replay), kept.stored);
 }
 
@@ -321,11 +291,7 @@ fn what_is_not_of_this_log_is_left_alone() {
     let (kept, other) = (Kept::new(10_000), Kept::new(10_000));
     let foreign = kept.args.dir.join("segment-000000000500.log");
     fs::copy(&other.segments()[3], &foreign).unwrap();
-    let (replay, recovery) = kept.open();
-    assert!(
-        said(&recovery, "segment-000000000500.log is not of this log"),
-        "{recovery:?}"
-    );
+    let replay = kept.open_saying(&["segment-000000000500.log is not of this log"]);
     assert_eq!(stored(&replay), kept.stored);
     assert!(foreign.exists());
     drop(replay);
@@ -337,18 +303,13 @@ fn what_is_not_of_this_log_is_left_alone() {
         kept.args.dir.join("segment-000000000600.log"),
     )
     .unwrap();
-    let (replay, recovery) = kept.open();
-    assert!(
-        said(&recovery, "is not the segment that belongs here"),
-        "{recovery:?}"
-    );
+    let replay = kept.open_saying(&["is not the segment that belongs here"]);
     assert_eq!(stored(&replay), kept.stored);
     drop(replay);
 
     // Who it is is known from the segments, too.
     fs::remove_file(kept.args.dir.join("log.toml")).unwrap();
-    let (replay, recovery) = kept.open();
-    assert_eq!(recovery.warnings, [""; 0]);
+    let replay = kept.open_saying(&[]);
     assert_eq!(stored(&replay), kept.stored);
 }
 

@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batches::check_rows,
-    calls::join,
+    calls::{header, join},
     history::{History, StreamKey, identity, spec, unlimited},
     law::ChiSquare,
 };
@@ -72,15 +72,9 @@ impl Setup {
     fn insert(&mut self, actor: u32, streams: u32, steps: u32) {
         let (sequence, transitions) = &mut self.produced[actor as usize];
         let header = ChunkHeader {
-            actor,
-            incarnation: 1,
-            sequence: *sequence,
-            first_transition: *transitions,
-            weights_version: 0,
-            leaving: false,
             streams,
             steps,
-            frame_bytes: self.history.spec.frame_bytes() as u32,
+            ..header(actor, 1, *sequence, *transitions)
         };
         *sequence += 1;
         *transitions += u64::from(streams * steps);

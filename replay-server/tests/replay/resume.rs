@@ -1,11 +1,11 @@
 //! A run that is resumed from its learner's checkpoint with an empty replay: what it counts, and what it waits for.
 //! Resuming all processes together is an end-to-end test.
 
-use driml_protocol::{InsertReply, LearnerJoin, Tally};
+use driml_protocol::{LearnerJoin, Tally};
 use driml_replay_server::{Config, Replay, Since, Unready};
 
 use crate::{
-    calls::{header, insert, learner, small_spec},
+    calls::{header, insert, is_stored, learner, small_spec},
     history::unlimited,
 };
 
@@ -25,7 +25,7 @@ fn play(replay: &mut Replay, rows: u32) -> (u64, u64) {
             Err(Unready::Finished) => return (sequence, batches),
             Err(Unready::Wait(_)) => {
                 let reply = insert(replay, header(0, 1, sequence, 6 * sequence));
-                assert!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
+                assert!(is_stored(&reply), "{reply:?}");
                 sequence += 1;
             }
             Err(e) => panic!("{e:?}"),
@@ -36,81 +36,42 @@ fn play(replay: &mut Replay, rows: u32) -> (u64, u64) {
 /// 60 transitions warm up, 120 allow 480 rows: 60 updates of 8. What the checkpoint has, and what is left of it, in chunks and batches.
 #[test]
 fn a_resumed_run_counts_on_and_fills_its_replay_first() {
-    let changed = Since {
+    let since = Some(Since {
         transitions: 120,
         rows: 232,
         updates: 29,
+    });
+    let unchanged = config();
+    let shorter = Config {
+        transitions_max: Some(100),
+        ..config()
     };
+    let larger_batches = Config { since, ..config() };
+    let other_ratio = Config {
+        replay_ratio: 2.0,
+        ..larger_batches.clone()
+    };
+    let at = |updates, inserted| learner(1, updates, 8 * updates, inserted);
     let cases = [
+        ("from the start", &unchanged, at(0, 0), 8, (30, 60), 0),
+        ("same settings", &unchanged, at(29, 120), 8, (20, 31), 60),
+        ("all frames", &unchanged, at(55, 180), 8, (10, 5), 60),
+        ("nothing left", &unchanged, at(60, 180), 8, (0, 0), 0),
+        ("fewer frames", &shorter, at(30, 120), 8, (0, 0), 0),
+        // 60 transitions allow 120 rows.
+        ("another ratio", &other_ratio, at(29, 120), 8, (20, 15), 60),
+        // 240 rows.
         (
-            "from the start",
-            config(),
-            learner(1, 0, 0, 0),
-            8,
-            (30, 60),
-            0,
-        ),
-        (
-            "same settings",
-            config(),
-            learner(1, 29, 232, 120),
-            8,
-            (20, 31),
-            60,
-        ),
-        (
-            "all frames, not all updates",
-            config(),
-            learner(1, 55, 440, 180),
-            8,
-            (10, 5),
-            60,
-        ),
-        (
-            "nothing left",
-            config(),
-            learner(1, 60, 480, 180),
-            8,
-            (0, 0),
-            0,
-        ),
-        (
-            "fewer frames",
-            Config {
-                transitions_max: Some(100),
-                ..config()
-            },
-            learner(1, 30, 240, 120),
-            8,
-            (0, 0),
-            0,
-        ),
-        (
-            "another ratio: 60 transitions allow 120 rows",
-            Config {
-                replay_ratio: 2.0,
-                since: Some(changed),
-                ..config()
-            },
-            learner(1, 29, 232, 120),
-            8,
-            (20, 15),
-            60,
-        ),
-        (
-            "another batch size: 240 rows",
-            Config {
-                since: Some(changed),
-                ..config()
-            },
-            learner(1, 29, 232, 120),
+            "larger batches",
+            &larger_batches,
+            at(29, 120),
             16,
             (20, 15),
             60,
         ),
     ];
     for (what, config, join, rows, expected, refilled) in cases {
-        let mut replay = Replay::new(&small_spec(), &config, rows).unwrap();
+        let mut replay = Replay::new(&small_spec(), config, rows).unwrap();
         assert_eq!(replay.join_learner(join), Ok(0), "{what}");
         assert_eq!(play(&mut replay, rows), expected, "{what}");
         let status = replay.status();
