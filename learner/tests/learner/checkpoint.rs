@@ -608,10 +608,7 @@ fn averaged_weights_follow_and_are_saved_and_played() {
     let mut settings = run.agent.settings().clone();
     settings.average_tau = Some(TAU);
     let rng = &mut ChaCha8Rng::seed_from_u64(1);
-    let new = |settings, rng: &mut ChaCha8Rng| {
-        Agent::new(model(ALL_DIM), settings, &Compute::CPU, rng).unwrap()
-    };
-    run.agent = new(settings.clone(), rng);
+    run.agent = Agent::new(model(ALL_DIM), settings.clone(), &Compute::CPU, rng).unwrap();
     let values = |parameters: &Parameters| -> Vec<f64> {
         let all = parameters
             .iter()

@@ -1,8 +1,11 @@
-//! How far ahead a positive lies, by each rule; the adaptive one has a file of its own.
+//! How far ahead a positive lies: one file a rule.
 //! It does not know the ring: the actions of one window come in, k comes out.
 
 pub mod affinity;
+pub mod all;
+pub mod fixed;
 pub mod nhg;
+pub mod uniform;
 
 use driml_protocol::Horizon;
 use rand::Rng;
@@ -24,12 +27,13 @@ pub fn draw_k(
     assert!(steps_left > 0, "an anchor with a positive has a successor");
     match horizon {
         Horizon::None => None,
-        Horizon::Fixed { k } | Horizon::All { k_max: k } => Some(k.min(steps_left)),
-        // DRIML-randk.
-        Horizon::Uniform { k_max } => Some(rng.random_range(1..=k_max.min(steps_left))),
-        Horizon::Nhg { k_max } => {
-            let walked = &actions[..actions.len().min(k_max as usize)];
-            Some(nhg::draw_k(affinity, walked, rng))
-        }
+        Horizon::Fixed { k } => Some(fixed::draw_k(k, steps_left)),
+        Horizon::Uniform { k_max } => Some(uniform::draw_k(k_max, steps_left, rng)),
+        Horizon::Nhg { k_max } => Some(nhg::draw_k(
+            affinity,
+            &actions[..actions.len().min(k_max as usize)],
+            rng,
+        )),
+        Horizon::All { k_max } => Some(all::furthest(k_max, steps_left)),
     }
 }
