@@ -27,7 +27,8 @@ fn refusal(config: &Config, spec: &RunSpec, batch_size: u32) -> String {
 fn each_fault_names_its_key_and_a_way_out() {
     let spec = spec(3, 4, 7, Horizon::Nhg { k_max: 5 });
     assert!(Replay::new(&spec, &good(), 256).is_ok());
-    let cases: [(fn(&mut Config), &str); 11] = [
+    type Spoil = fn(&mut Config);
+    let cases: [(Spoil, &str); 11] = [
         (|it| it.replay_ratio = 0.0, "replay_ratio = 0"),
         (|it| it.replay_ratio = f64::NAN, "replay_ratio = NaN"),
         (|it| it.replay_ratio = f64::INFINITY, "replay_ratio = inf"),
