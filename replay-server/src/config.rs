@@ -130,13 +130,8 @@ impl From<SamplingError> for ConfigError {
 }
 
 /// Environment steps that must follow an anchor in its stream, unless its episode ends before: max(n_step, k_max).
-pub(crate) const fn reach(spec: &RunSpec) -> u32 {
-    let k_max = spec.horizon.k_max();
-    if spec.n_step > k_max {
-        spec.n_step
-    } else {
-        k_max
-    }
+pub(crate) fn reach(spec: &RunSpec) -> u32 {
+    spec.n_step.max(spec.horizon.k_max())
 }
 
 fn bad(key: &'static str, value: impl ToString, why: String) -> Result<(), ConfigError> {

@@ -22,7 +22,6 @@ pub struct RateLimiter {
     counts: Counts,
 }
 
-/// What a limiter counts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Counts {
     pub(crate) this_shard: Tally,

@@ -33,10 +33,8 @@ struct Request {
 impl Requests {
     /// Takes note of a request; the same one may come here any number of times until it is given rows.
     pub(crate) fn begin(&mut self, id: RequestId) -> Dedup {
-        let known = self
-            .last
-            .iter()
-            .position(|it| it.id.client_id == id.client_id);
+        let mut last = self.last.iter();
+        let known = last.position(|it| it.id.client_id == id.client_id);
         if known.is_some_and(|at| self.last[at].id == id && self.last[at].given.is_none()) {
             return Dedup::Fresh(Vec::new());
         }

@@ -67,7 +67,6 @@ pub(super) struct Limits {
     pub(super) disk_bytes_max: Option<u64>,
 }
 
-/// A disk that refuses.
 struct Failing {
     since: Instant,
     /// What it said last.
@@ -77,9 +76,6 @@ struct Failing {
 
 impl Journal {
     /// Continues after `older` segments, each with its first transition, in a new one that begins with `snapshot`.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(super) fn begin(
         place: Place,
         older: &[(segment::SegmentFile, u64)],
@@ -131,13 +127,11 @@ impl Journal {
         })
     }
 
-    /// Flushes what was written.
     pub(crate) fn flush(&mut self) {
         self.is_ready();
         self.syncer.flush();
     }
 
-    /// How it stands.
     pub(crate) fn status(&self) -> LogStatus {
         let refused = self.failing.as_ref();
         LogStatus {
@@ -320,9 +314,6 @@ impl Journal {
     }
 
     /// Begins another segment with `snapshot`, which is on the disk when this returns.
-    ///
-    /// # Errors
-    /// A disk that refuses.
     pub(super) fn mark(&mut self, snapshot: &Snapshot) -> Result<Mark, PersistError> {
         let before = self.newest().number;
         if self.is_ready() {

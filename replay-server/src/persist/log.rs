@@ -58,7 +58,6 @@ impl Log {
         }
     }
 
-    /// Begins another segment.
     pub(crate) fn rotate(&mut self, snapshot: &Snapshot) {
         if let Err(e) = self.journal.rotate(snapshot) {
             tracing::error!("a segment of the replay's log cannot be begun: {e}");

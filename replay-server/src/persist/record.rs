@@ -24,7 +24,6 @@ const CANDIDATES_MAX: usize = 64;
 /// Bytes read at once.
 const READ_BYTES: usize = 1 << 18;
 
-/// What a record is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub(super) enum RecordKind {
@@ -104,7 +103,6 @@ fn checksum(head: &[u8], checked: &[u8]) -> u32 {
 /// Reads a segment's records from the first on.
 pub(super) struct RecordReader {
     file: BufReader<File>,
-    /// Bytes of the file.
     length: u64,
     /// Where the next record begins.
     at: u64,
@@ -133,15 +131,11 @@ impl RecordReader {
         self.at
     }
 
-    /// Bytes of the file.
     pub(super) const fn length(&self) -> u64 {
         self.length
     }
 
     /// The next record; `None` at the end of the file.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(super) fn next(&mut self) -> io::Result<Option<Result<Record<'_>, Broken>>> {
         let left = self.length - self.at;
         if left == 0 {

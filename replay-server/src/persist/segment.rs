@@ -42,7 +42,6 @@ impl Mark {
     }
 }
 
-/// Which log it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct LogId {
     pub(super) format: u32,

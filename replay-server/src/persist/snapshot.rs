@@ -17,11 +17,8 @@ const COUNT_MAX: u64 = 1 << 60;
 /// Who came and went: what the log holds beside chunks and snapshots.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Note {
-    /// An actor has joined.
     ActorJoined(ActorJoin),
-    /// An actor has left.
     Goodbye(Goodbye),
-    /// A learner has joined.
     LearnerJoined(LearnerJoin),
 }
 
@@ -32,7 +29,6 @@ pub(crate) struct Snapshot {
     pub(crate) inserted: u64,
     /// The oldest that is held.
     pub(crate) oldest: u64,
-    /// Most that are held.
     pub(crate) capacity: u64,
     pub(crate) actors: Actors,
     pub(crate) learner: Option<LearnerJoin>,

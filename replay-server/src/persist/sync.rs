@@ -123,10 +123,6 @@ impl Syncer {
         }
     }
 
-    /// Flushes now.
-    ///
-    /// # Errors
-    /// The disk refuses.
     pub(super) fn flushed(&self) -> io::Result<()> {
         flush(&self.shared)
     }

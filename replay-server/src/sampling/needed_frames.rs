@@ -19,7 +19,6 @@ pub(crate) struct NeededFrames {
 }
 
 impl NeededFrames {
-    /// Those of these rows.
     pub(crate) fn of<'a>(
         ring: &Ring,
         episodes: &Episodes,
@@ -48,7 +47,6 @@ impl NeededFrames {
         this
     }
 
-    /// How many they are.
     pub(crate) const fn count(&self) -> usize {
         self.indices.len()
     }

@@ -200,7 +200,6 @@ impl Accounts {
         report.is_some_and(|(report, _)| report.finished.is_some())
     }
 
-    /// Parts that are connected.
     pub(super) fn connected(&self) -> usize {
         let accounts = self.parts.values();
         accounts.filter(|account| account.is_connected).count()

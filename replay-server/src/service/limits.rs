@@ -27,7 +27,6 @@ const PRIORITY_BYTES_MAX: usize = 9 + 4;
 /// Bytes of the longest message of each kind.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Limits {
-    /// A chunk.
     pub(super) chunk: usize,
     /// An upload of weights.
     pub(super) weights: usize,
@@ -72,7 +71,6 @@ impl Limits {
         })
     }
 
-    /// The longest of all.
     pub(super) fn largest(&self) -> usize {
         let learned = self.weights.max(self.affinity).max(self.priorities);
         self.chunk.max(learned)

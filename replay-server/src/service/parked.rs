@@ -48,7 +48,6 @@ impl<Q> ParkedChunks<Q> {
         self.line.len()
     }
 
-    /// Their bytes in memory.
     pub(super) const fn bytes(&self) -> usize {
         self.bytes
     }
@@ -195,7 +194,6 @@ impl<Q> ParkedRequests<Q> {
         self.0.len()
     }
 
-    /// When the oldest came.
     pub(super) fn oldest(&self) -> Option<Instant> {
         self.0.iter().map(|it| it.arrived).min()
     }

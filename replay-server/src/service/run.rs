@@ -247,9 +247,6 @@ impl Origin {
     }
 
     /// The replay, and the newest weights that were handed over.
-    ///
-    /// # Errors
-    /// Those of [`KeptReplay::read`].
     fn read(
         self,
         reading: &Reading,
@@ -293,7 +290,6 @@ fn read_kept(dir: &Path, kept: KeptReplay, reading: &Reading) -> Result<Replay, 
     Ok(replay)
 }
 
-/// The threads that answer.
 type Threads = Vec<JoinHandle<()>>;
 
 /// Everything that the replay server answers: each message by threads of its own.

@@ -1,5 +1,5 @@
-//! The small messages that need no file of their own: an actor's goodbye, the learner's affinity, reports, and the status.
-//! None of them ever waits.
+//! What needs no file of its own: an actor's goodbye, the learner's affinity, reports, the status, and who was not let in.
+//! None of it ever waits.
 
 use std::{
     sync::{

@@ -85,7 +85,6 @@ impl Timings {
         self.behind_updates.saturating_record(updates);
     }
 
-    /// New weights came.
     pub(super) fn weights_came(&mut self, weights: &WeightsHeader, now: Instant) {
         if self.versions.len() == VERSIONS_MAX {
             self.versions.pop_front();

@@ -80,12 +80,8 @@ impl Step {
     }
 
     /// Index of the successor in the same episode; a successor is newer, so it is held whenever this step is.
-    pub(crate) const fn next(&self) -> Option<u64> {
-        if self.next == NO_NEXT {
-            None
-        } else {
-            Some(self.next)
-        }
+    pub(crate) fn next(&self) -> Option<u64> {
+        (self.next != NO_NEXT).then_some(self.next)
     }
 }
 
@@ -215,7 +211,6 @@ impl Ring {
         ((index - self.first) % self.capacity) as usize
     }
 
-    /// Most transitions held.
     pub(crate) const fn capacity(&self) -> u64 {
         self.capacity
     }

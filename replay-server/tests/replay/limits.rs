@@ -117,17 +117,11 @@ fn the_run_ends_when_all_is_in_and_sampled() {
     let hungry = Err(Unready::Wait(Waiting::LearnerWaitsForActors));
     assert_eq!(replay.sample(8), hungry);
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(12));
-    assert_eq!(
-        insert(&mut replay, header(1, 1, 0, 0)),
-        stored(18),
-        "6 ahead, of a slack of 6"
-    );
+    // 6 ahead, of a slack of 6.
+    assert_eq!(insert(&mut replay, header(1, 1, 0, 0)), stored(18));
     assert!(replay.status().finished);
-    assert_eq!(
-        insert(&mut replay, header(0, 1, 1, 6)),
-        stored(18),
-        "a retry is still a retry"
-    );
+    // A retry is still a retry.
+    assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(18));
     for sequence in [2, 7] {
         let reply = insert(&mut replay, header(0, 1, sequence, 12));
         assert_eq!(reply, InsertReply::Finished { inserted_total: 18 });
@@ -137,11 +131,8 @@ fn the_run_ends_when_all_is_in_and_sampled() {
     }
     assert_eq!(replay.sample(8), Err(Unready::Finished));
     assert_eq!(replay.waiting(), Waiting::Finished);
-    assert_eq!(
-        replay.status().replay_ratio(),
-        Some(4.0),
-        "48 rows of 12 transitions after the warm-up"
-    );
+    // 48 rows of 12 transitions after the warm-up.
+    assert_eq!(replay.status().replay_ratio(), Some(4.0));
     replay.goodbye(&last_word(0, 1, 12));
     assert_eq!(replay.status().transitions_lost, 0);
 }
@@ -153,25 +144,20 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
     let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), wait(6));
-    assert_eq!(
-        insert(&mut replay, header(0, 1, 2, 12)),
-        InsertReply::OutOfOrder { expected: 1 }
-    );
+    let early = insert(&mut replay, header(0, 1, 2, 12));
+    assert_eq!(early, InsertReply::OutOfOrder { expected: 1 });
     assert_eq!(replay.waiting(), Waiting::ActorsWaitForLearner);
-    assert!(
-        matches!(replay.sample(9), Err(Unready::Refused { .. })),
-        "more than slack * ratio rows"
-    );
-    assert!(matches!(replay.sample(0), Err(Unready::Refused { .. })));
+    // None, and more than slack * ratio.
+    for rows in [0, 9] {
+        let drawn = replay.sample(rows);
+        assert!(matches!(drawn, Err(Unready::Refused { .. })), "{drawn:?}");
+    }
     let leaving = ChunkHeader {
         leaving: true,
         ..header(1, 1, 0, 0)
     };
-    assert_eq!(
-        insert(&mut replay, leaving),
-        stored(12),
-        "an actor that leaves does not wait"
-    );
+    // An actor that leaves does not wait.
+    assert_eq!(insert(&mut replay, leaving), stored(12));
     for _ in 0..5 {
         replay.sample(8).unwrap();
     }

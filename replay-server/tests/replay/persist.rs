@@ -351,18 +351,15 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
         let bytes = life.replay.log_bytes();
         assert!(bytes <= 4 << 20, "{bytes}");
     }
-    let status = life.replay.status();
-    assert!(
-        (40_000..100_000).contains(&status.transitions_held),
-        "{status:?}"
-    );
+    let held = life.replay.status().transitions_held;
+    assert!((40_000..100_000).contains(&held), "{held}");
     life.replay.check_valid();
     assert!(life.draw(0).is_some());
     let before = stored(&life.replay);
     let (args, config) = life.end();
     let (replay, _) = open(&args, &config).unwrap();
     assert_eq!(stored(&replay), before);
-    assert_eq!(replay.status().transitions_held, status.transitions_held);
+    assert_eq!(replay.status().transitions_held, held);
 }
 
 #[test]
@@ -393,10 +390,8 @@ fn a_resumed_run_goes_on_with_what_was_kept() {
             .unwrap();
         let status = replay.status();
         assert_eq!(status.transitions_inserted, before.transitions_inserted);
-        assert_eq!(
-            (status.rows_sampled, status.transitions_refilled),
-            (rows, 0)
-        );
+        assert_eq!(status.rows_sampled, rows);
+        assert_eq!(status.transitions_refilled, 0);
         assert_eq!(replay.resumed_after(), 0, "the replay is of the whole run");
         replay.check_valid();
     }

@@ -9,13 +9,8 @@ use proptest::prelude::*;
 fn a_run_from_first_to_last() {
     let rows = 256;
     let mut limiter = RateLimiter::new(8.0, 1000, 64, Some(1100));
-    assert_eq!(
-        limiter.waiting(rows),
-        Waiting::WarmUp {
-            have: 0,
-            need: 1000
-        }
-    );
+    let (have, need) = (0, 1000);
+    assert_eq!(limiter.waiting(rows), Waiting::WarmUp { have, need });
     limiter.inserted(1000);
     assert!(limiter.may_insert() && !limiter.may_sample(rows));
     assert_eq!(limiter.waiting(rows), Waiting::LearnerWaitsForActors);

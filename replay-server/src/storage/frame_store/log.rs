@@ -3,7 +3,6 @@
 
 use std::{collections::VecDeque, ops::Range};
 
-/// Size of a segment.
 const SEGMENT_BYTES: usize = 1 << 20;
 /// Most that a log holds beyond its contents: three segments.
 pub(crate) const OVERHEAD_BYTES_MAX: u64 = 3 * SEGMENT_BYTES as u64;
@@ -78,12 +77,10 @@ impl Log {
         self.start
     }
 
-    /// Bytes of contents.
     pub(crate) const fn len(&self) -> u64 {
         self.end - self.start
     }
 
-    /// Bytes of memory taken.
     pub(crate) fn bytes_held(&self) -> u64 {
         ((self.segments.len() + usize::from(self.spare.is_some())) * SEGMENT_BYTES) as u64
     }
