@@ -2,6 +2,7 @@
 //! It prints nothing. What the best is worth, `driml evaluate` says on other episodes: the best of many is best by luck, too.
 
 use driml_learner::checkpoint;
+use driml_machine::error::usage;
 
 use crate::{
     evaluate::{Levels, Player, Which, Who, checkpoint_at, config_of, levels, mean_and_deviation},
@@ -31,6 +32,12 @@ pub struct Judged {
 /// # Errors
 /// As [`Player::load_at`] and [`Player::play`], and a file system that refuses.
 pub fn keep(folder: &RunFolder, which: Which, episodes: u32) -> anyhow::Result<Judged> {
+    if which == Which::Average {
+        return Err(usage!(
+            "--keep compares checkpoints by their newest weights: leave out --checkpoint average, or --keep"
+        )
+        .into());
+    }
     let path = checkpoint_at(folder, which)?;
     let candidate = Candidate::hold(folder, &path)?;
     let play = |player: Player| -> anyhow::Result<Evaluated> {
@@ -57,4 +64,16 @@ pub fn keep(folder: &RunFolder, which: Which, episodes: u32) -> anyhow::Result<J
         is_best,
         best_before,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn averaged_weights_are_not_kept_as_the_newest() {
+        let folder = RunFolder::new("no-such-run");
+        let error = keep(&folder, Which::Average, 1).unwrap_err().to_string();
+        assert!(error.contains("--checkpoint average"), "{error}");
+    }
 }

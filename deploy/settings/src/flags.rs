@@ -61,10 +61,7 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
                 .parse()
                 .map_err(|e| usage!("--env: {e}"))?;
             let agent = presets::agent(args.agent.as_deref().unwrap_or(AGENT))?;
-            let preset = match args.preset.as_deref() {
-                Some(name) => presets::preset(name)?,
-                None => presets::default_preset(world),
-            };
+            let preset = presets::preset_or_default(args.preset.as_deref(), world)?;
             (
                 Source::Layers(preset, world, agent.name),
                 format!("preset {}", preset.name),

@@ -37,7 +37,7 @@ pub struct Preset {
     pub name: &'static str,
     /// One line for `driml presets`.
     pub about: &'static str,
-    /// Laid over base and world, under the agent: what makes an agent, such as Rainbow without epsilon, no preset changes.
+    /// Laid over base and world, under the agent: a preset does not change what makes an agent, such as Rainbow's epsilon of 0.
     layers: &'static [Layer],
     /// The worlds it is made for; none means all.
     families: &'static [&'static str],
@@ -47,12 +47,16 @@ pub struct Preset {
 
 const TUNED: &str = "tuned";
 
-/// The preset of a run that names none: `tuned` in the worlds for which it was searched, `paper` elsewhere.
-pub fn default_preset(world: WorldName) -> &'static Preset {
-    let tuned = PRESETS
-        .iter()
-        .find(|it| it.name == TUNED && it.families.contains(&world.kind()));
-    tuned.unwrap_or(&PRESETS[0])
+/// The preset of this name for a run in `world`. Without a name it is `tuned` on Procgen and `paper` elsewhere.
+///
+/// # Errors
+/// A name that no preset has; the error lists those that there are.
+pub fn preset_or_default(name: Option<&str>, world: WorldName) -> Result<&'static Preset, Usage> {
+    let name = name.unwrap_or(match world.kind() {
+        "procgen" => TUNED,
+        _ => PRESETS[0].name,
+    });
+    preset(name)
 }
 
 /// Every preset, `paper` first.
@@ -66,7 +70,7 @@ pub const PRESETS: &[Preset] = &[
     },
     Preset {
         name: TUNED,
-        about: "what learns Procgen within minutes on two cores (the default there)",
+        about: "more exploration, fewer and smaller updates, a soft target network (the default on Procgen)",
         layers: &[layer!("variant/tuned")],
         families: &["procgen"],
         is_priced: false,
@@ -364,7 +368,8 @@ mod tests {
             ("mspacman", "paper"),
             ("chain", "paper"),
         ] {
-            assert_eq!(default_preset(world(name).unwrap()).name, preset, "{name}");
+            let found = preset_or_default(None, world(name).unwrap()).unwrap();
+            assert_eq!(found.name, preset, "{name}");
         }
     }
 

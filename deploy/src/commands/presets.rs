@@ -32,10 +32,7 @@ pub(crate) fn run(args: &PresetsArgs) -> anyhow::Result<()> {
     }
     let game = args.game.as_deref().unwrap_or(GAME);
     let world = presets::world(game).map_err(|e| usage!("--game: {e}"))?;
-    let preset = match args.preset.as_deref() {
-        Some(name) => presets::preset(name)?,
-        None => presets::default_preset(world),
-    };
+    let preset = presets::preset_or_default(args.preset.as_deref(), world)?;
     let agent = presets::agent(args.agent.as_deref().unwrap_or(AGENT))?;
     print(&menu::sourced(preset, world, agent)?)
 }
