@@ -328,7 +328,7 @@ impl Actors {
             .ok_or_else(|| format!("no such life of actor {} has joined", goodbye.actor))
     }
 
-    /// Forgets actors that never sent a chunk and are not connected, if there is no room for one more.
+    /// Forgets actors that never sent a chunk and are not connected, if the run has its largest number of actors.
     pub(crate) fn forget_absent(&mut self, is_connected: impl Fn(u32, u64) -> bool) {
         if self.actors.len() >= ACTORS_MAX {
             self.actors.retain(|&number, actor| {

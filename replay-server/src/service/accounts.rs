@@ -52,7 +52,7 @@ impl Members {
         self.connected.iter().filter(takes_part).count() as u32
     }
 
-    /// Nobody is connected yet; chunks of these actors have come before.
+    /// No process is connected yet; chunks of these actors have come before.
     pub(super) fn with_acting(actors: impl Iterator<Item = u32>) -> Self {
         Self {
             connected: HashSet::new(),

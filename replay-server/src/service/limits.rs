@@ -14,8 +14,8 @@ use crate::config::Config;
 /// What stands before a payload: the prefix and the header.
 const HEAD_BYTES_MAX: usize = 1 << 12;
 
-/// Lives of actors that may send through shared memory. What a reader has mapped stays mapped until it ends, also when whoever made
-/// it is gone (zenoh issue 2571): about 3 MiB and two descriptors a life. Later ones send through sockets.
+/// Lives of actors that may send through shared memory. A reader keeps what it has mapped until it exits, also after the
+/// writer has exited (zenoh issue 2571): about 3 MiB and two descriptors a life. Later ones send through sockets.
 pub(super) const SHARED_LIVES_MAX: u32 = 128;
 
 /// Sessions of others at each replay server, which make no messages in shared memory: learner, launcher, and some that look.

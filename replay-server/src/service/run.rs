@@ -63,14 +63,14 @@ pub struct RunArgs {
     pub shard: u32,
     /// Bytes of a version of the weights, of which the replay server itself knows nothing; longer uploads are refused.
     pub weights_bytes_max: usize,
-    /// The folder in which the replay is kept, if it is kept on disk; of several shards each has a folder of its own there.
+    /// The folder in which the replay is kept, if it is kept on disk. Each of several shards has its own folder in it.
     pub dir: Option<PathBuf>,
     /// Stay when the run is over, to be asked, until `ending` or `shutdown`.
     pub stay: bool,
     /// Raised when this process is to end, but not before its parts have delivered what they have and left: its launcher has died,
     /// which ends them too. It waits for them for at most 10 s. What is to end it at once raises this and `shutdown`.
     pub ending: Shutdown,
-    /// The run's resolved settings, which it hands to whoever joins.
+    /// The run's resolved settings, which it sends to each process that joins.
     pub config_toml: String,
 }
 

@@ -137,7 +137,7 @@ pub(super) struct Entrance {
 }
 
 impl Entrance {
-    /// Nobody is let in yet.
+    /// Rejects every request until [`Entrance::open`].
     pub(super) const fn closed(reading: Reading, config_toml: String) -> Self {
         Self {
             service: OnceLock::new(),
@@ -162,7 +162,7 @@ impl Entrance {
         &self.reading
     }
 
-    /// What whoever asks is told meanwhile.
+    /// The answer to a request until then.
     pub(super) fn put_off(&self) -> Recovering {
         Recovering {
             progress: self.reading.progress(),
@@ -170,7 +170,7 @@ impl Entrance {
         }
     }
 
-    /// The same for whoever asks which run it is.
+    /// The answer to a request for the run's settings.
     pub(super) fn put_off_with_settings(&self) -> Recovering {
         Recovering {
             config_toml: Some(self.config_toml.clone()),
