@@ -162,6 +162,15 @@ unsafe fn upper(pairs: __m256i) -> __m256 {
     }
 }
 
+/// `sums` plus the products of both bf16 of each pair.
+#[inline(always)]
+unsafe fn mul_add_pairs(sums: __m256, row: __m256i, columns: __m256i) -> __m256 {
+    unsafe {
+        let first = _mm256_fmadd_ps(lower(row), lower(columns), sums);
+        _mm256_fmadd_ps(upper(row), upper(columns), first)
+    }
+}
+
 impl Vector for Rounded {
     type Element = bf16;
     type Sums = Sums;
@@ -189,11 +198,12 @@ impl Vector for Rounded {
 
     #[inline(always)]
     unsafe fn mul_add(sums: Sums, row: [__m256i; 2], columns: [__m256i; 2]) -> Sums {
+        // No closure: it may be compiled without AVX2, and each instruction is then a call.
         unsafe {
-            std::array::from_fn(|half| {
-                let first = _mm256_fmadd_ps(lower(row[half]), lower(columns[half]), sums[half]);
-                _mm256_fmadd_ps(upper(row[half]), upper(columns[half]), first)
-            })
+            [
+                mul_add_pairs(sums[0], row[0], columns[0]),
+                mul_add_pairs(sums[1], row[1], columns[1]),
+            ]
         }
     }
 

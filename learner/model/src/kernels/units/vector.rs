@@ -41,8 +41,11 @@ pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
         for _ in 0..tile.runs {
             let mut at = run;
             for _ in 0..tile.steps {
-                let columns: [V::Operand; VECS] =
-                    std::array::from_fn(|v| V::columns(panel.add(v * LANES * V::Element::DEPTH)));
+                // No closure here: it may be compiled without the unit's instructions, and each is then a call.
+                let mut columns = [V::columns(panel); VECS];
+                for (v, columns) in columns.iter_mut().enumerate().skip(1) {
+                    *columns = V::columns(panel.add(v * LANES * V::Element::DEPTH));
+                }
                 for (r, sums) in sums.iter_mut().enumerate() {
                     let row = V::row(at.add(r * tile.row_stride));
                     for (sums, columns) in sums.iter_mut().zip(columns) {
@@ -55,9 +58,10 @@ pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
             }
             run = run.wrapping_add(tile.run_stride);
         }
-        for (r, sums) in sums.iter().enumerate() {
+        // By value: references to the sums would keep them in memory in the loops above.
+        for (r, sums) in sums.into_iter().enumerate() {
             let out = tile.out.add(r * tile.out_stride);
-            for (v, &sums) in sums.iter().enumerate() {
+            for (v, sums) in sums.into_iter().enumerate() {
                 let count = tile.cols.saturating_sub(v * LANES).min(LANES);
                 V::write(
                     sums,
