@@ -165,6 +165,7 @@ mod tests {
     const MACHINE: Machine = Machine {
         cores: 2,
         memory_bytes: 16 << 30,
+        fast_bf16: false,
     };
 
     fn config(world: &str, agent: &'static str) -> RunConfig {

@@ -33,6 +33,8 @@ pub struct Machine {
     pub cores: u32,
     /// Memory that can be taken now, bytes.
     pub memory_bytes: u64,
+    /// Whether its processor multiplies faster in bf16 than in f32.
+    pub fast_bf16: bool,
 }
 
 impl Machine {
@@ -43,6 +45,7 @@ impl Machine {
         Self {
             cores,
             memory_bytes,
+            fast_bf16: driml_model::is_bf16_fast(),
         }
     }
 
@@ -142,6 +145,7 @@ mod tests {
             let machine = Machine {
                 cores,
                 memory_bytes: 1 << 30,
+                fast_bf16: false,
             };
             assert!(machine.actors() >= 1 && machine.actors() <= 4);
         }

@@ -88,6 +88,21 @@ pub(crate) fn declare(table: &mut Table, command: &str) -> Result<(), Usage> {
     Ok(())
 }
 
+/// Chooses a precision that is `auto`: bf16 where the processor multiplies faster in it and does the learning, else f32.
+pub(crate) fn precision(table: &mut Table, fast_bf16: bool) {
+    let device = find(table, "local.learner_device").and_then(Value::as_str);
+    let on_cpu = device.is_none_or(|device| device == "cpu");
+    for (path, fast) in [
+        ("actor.precision", fast_bf16),
+        ("learner.precision", fast_bf16 && on_cpu),
+    ] {
+        if find(table, path).and_then(Value::as_str) == Some("auto") {
+            let name = if fast { "bf16" } else { "f32" };
+            put(table, path, Value::String(name.into()));
+        }
+    }
+}
+
 /// Lets frames be cut to what the network reads. Settings of earlier versions do not: what they say of a run stays true of it.
 pub(crate) fn cut_frames(table: &mut Table) {
     put(table, FRAME, Value::Table(Table::new()));

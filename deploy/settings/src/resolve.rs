@@ -135,6 +135,7 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
     }
     set_reproduced_bug(&mut table, flags.reproduce_bug)?;
     let capacity_set = set(&mut table, &flags.sets)? || !sized_by_machine;
+    derived::precision(&mut table, machine.fast_bf16);
     let note = memory::fit(&mut table, capacity_set, machine)?;
     derive(&mut table)?;
     let mut config = RunConfig::from_table(&table).map_err(|e| match source {

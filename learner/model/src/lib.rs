@@ -62,7 +62,7 @@ pub use kernels::conv::{conv_stack, conv2d_relu};
 pub use kernels::exponentials::{exp_below, soft_clip};
 pub use kernels::linear::{linear, linear_relu, relu};
 pub use kernels::precision::{Precision, UnknownPrecision};
-pub use kernels::units::kernels_in_words;
+pub use kernels::units::{is_bf16_fast, kernels_in_words};
 pub use network::{Features, Network};
 pub use parameters::Parameters;
 pub use policy::PolicyNetwork;

@@ -15,6 +15,7 @@ fn config(world: &str, agent: &'static str, preset: usize, sets: &[&str]) -> Run
     let machine = Machine {
         cores: 2,
         memory_bytes: 64 << 30,
+        fast_bf16: false,
     };
     let source = Source::Layers(&PRESETS[preset], world.parse().unwrap(), agent);
     let flags = Flags {

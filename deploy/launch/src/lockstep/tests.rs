@@ -12,6 +12,7 @@ fn config(world: &str, agent: &'static str, frames: u64, sets: &[&str]) -> RunCo
     let machine = Machine {
         cores: 2,
         memory_bytes: 16 << 30,
+        fast_bf16: false,
     };
     let source = Source::Layers(preset("smoke").unwrap(), world.parse().unwrap(), agent);
     let flags = Flags {

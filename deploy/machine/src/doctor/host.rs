@@ -65,6 +65,7 @@ fn cores(cores: u32) -> Fact {
     let machine = Machine {
         cores,
         memory_bytes: 0,
+        fast_bf16: false,
     };
     let text = format!(
         "{cores}, all of them for the learner; --actors is {} unless given",
@@ -218,6 +219,7 @@ mod tests {
             memory(&Machine {
                 cores: 2,
                 memory_bytes,
+                fast_bf16: false,
             })
             .state
         };

@@ -11,6 +11,7 @@ use crate::presets::{AGENTS, PRESETS};
 const MACHINE: Machine = Machine {
     cores: 2,
     memory_bytes: 16 << 30,
+    fast_bf16: false,
 };
 
 fn source(preset: &str, world: &str, agent: &str) -> Source {
@@ -394,14 +395,36 @@ fn flags_come_before_set_and_both_before_the_machine() {
 }
 
 #[test]
+fn an_automatic_precision_is_the_processors_fastest_and_f32_on_a_gpu() {
+    let of = |fast_bf16, sets: &[&str]| {
+        let flags = Flags {
+            sets: sets.iter().map(ToString::to_string).collect(),
+            ..Flags::default()
+        };
+        let machine = Machine {
+            fast_bf16,
+            ..MACHINE
+        };
+        let config = resolve(&source("tuned", "procgen:maze", "c51"), &flags, &machine).unwrap();
+        [config.actor.precision, config.learner.precision].map(|it| it.to_string())
+    };
+    let cuda = "local.learner_device=cuda:0";
+    assert_eq!(of(true, &[]), ["bf16", "bf16"]);
+    assert_eq!(of(false, &[]), ["f32", "f32"]);
+    assert_eq!(of(true, &[cuda]), ["bf16", "f32"]);
+    assert_eq!(of(true, &["learner.precision=f32"]), ["bf16", "f32"]);
+    assert_eq!(of(false, &["actor.precision=bf16"]), ["bf16", "f32"]);
+}
+
+#[test]
 fn the_replay_fits_the_memory_and_says_so() {
     let flags = Flags {
         frames: Some(50_000_000),
         ..Flags::default()
     };
     let small = Machine {
-        cores: 2,
         memory_bytes: 8 << 30,
+        ..MACHINE
     };
     let config = resolve(
         &source("paper", "procgen:bigfish", "driml-fix"),
@@ -412,8 +435,8 @@ fn the_replay_fits_the_memory_and_says_so() {
     expect!["the replay holds the newest 348617 transitions instead of 1000000: 8.0 GiB of memory are free, and it takes half, or what actors and learner leave"].assert_eq(&config.notes.join("\n"));
     assert!(config.replay.capacity_transitions < 400_000);
     let large = Machine {
-        cores: 2,
         memory_bytes: 64 << 30,
+        ..MACHINE
     };
     let config = resolve(
         &source("paper", "procgen:heist", "driml-fix"),

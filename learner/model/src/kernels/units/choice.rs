@@ -64,6 +64,11 @@ fn with_unit_of<F: ForUnit>(_: Instructions, precision: Precision, work: F) -> F
     }
 }
 
+/// Whether this processor multiplies faster in bf16 than in f32: it has AVX512_BF16 or AMX.
+pub fn is_bf16_fast() -> bool {
+    instructions() >= Instructions::Avx512Bf16
+}
+
 /// What products of this precision run on here, in words: for `driml doctor` and the head of a table of figures.
 pub fn kernels_in_words(precision: Precision) -> &'static str {
     match (precision, instructions()) {
