@@ -15,26 +15,6 @@ pub(crate) const SHARDS_MAX: u32 = 256;
 /// Smallest segment of a replay that is kept on disk.
 pub(crate) const SEGMENT_BYTES_MIN: u64 = 1 << 20;
 
-/// A known bug of the paper's published code, reproduced to show what it does. No other run has one.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum ReproducedBug {
-    /// The n-step return bootstraps from s_{t+1} instead of s_{t+n}, at gamma^n, unless step t itself ended the episode.
-    BootstrapFromNextState,
-}
-
-impl ReproducedBug {
-    /// Every bug there is.
-    pub const ALL: [Self; 1] = [Self::BootstrapFromNextState];
-
-    /// As settings and `--reproduce-bug` have it.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::BootstrapFromNextState => "bootstrap-from-next-state",
-        }
-    }
-}
-
 /// How frames are kept in memory. Batches are the same, bit for bit, whatever it is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -87,9 +67,6 @@ pub struct Config {
     /// warm-up.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub since: Option<Since>,
-    /// A known bug to train with, chosen by `--reproduce-bug`; none in every other run.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub reproduced_bug: Option<ReproducedBug>,
 }
 
 /// A point in a run: what was counted when it was resumed with other settings. `driml train --resume` writes it.

@@ -44,7 +44,6 @@
 //!     slack_transitions: 100,
 //!     transitions_max: None,
 //!     since: None,
-//!     reproduced_bug: None,
 //! };
 //! let mut replay = Replay::new(&spec, &config, 4)?;
 //! replay.join_actor(ActorJoin { actor: 0, incarnation: 1 })?;
@@ -86,7 +85,7 @@ mod sampling;
 mod service;
 mod storage;
 
-pub use config::{Compression, Config, ConfigError, ReproducedBug, Since};
+pub use config::{Compression, Config, ConfigError, Since};
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use persist::{KeptReplay, Mark, PersistArgs, PersistError, Reading, Recovery};
 pub use rate_limiter::RateLimiter;

@@ -193,7 +193,7 @@ impl Replay {
                 incarnation: 0,
             },
             window: Window::default(),
-            assembler: Assembler::new(spec, config.reproduced_bug),
+            assembler: Assembler::new(spec),
             affinity: Affinity::uniform(spec.num_actions),
             rng,
             statistics: Statistics::new(spec.horizon.k_max(), spec.num_actions),

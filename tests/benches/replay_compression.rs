@@ -59,7 +59,6 @@ fn replay(compression: Compression, frame_stack: u32) -> Replay {
         disk_bytes_max: None,
         fsync_ms: None,
         since: None,
-        reproduced_bug: None,
         replay_ratio: 1e9,
         warmup_transitions: 0,
         slack_transitions: 1 << 50,

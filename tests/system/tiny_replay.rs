@@ -36,7 +36,6 @@ pub(crate) fn config(transitions: u64) -> Config {
         slack_transitions: transitions,
         transitions_max: None,
         since: None,
-        reproduced_bug: None,
     }
 }
 

@@ -135,11 +135,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
     // First, as a run that is still ending holds memory.
     wait_until_free(folder)?;
     let before = RunConfig::parse(&name, &text)?;
-    let flags = Flags {
-        reproduce_bug: before.replay.reproduced_bug,
-        ..flags.clone()
-    };
-    let mut config = resolve(&Source::File(name, text), &flags, machine)?;
+    let mut config = resolve(&Source::File(name, text), flags, machine)?;
     let checkpoints = folder.checkpoints();
     let all = checkpoint::list(&checkpoints).context("looking for checkpoints")?;
     let Some((_, newest)) = all.last() else {

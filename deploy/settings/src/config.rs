@@ -164,11 +164,6 @@ impl RunConfig {
         let mut config = parts_read(table)?;
         config.validate()?;
         config.notes = presets::notes(&config.run.agent, &config.run.world);
-        if config.replay.reproduced_bug.is_some() {
-            let note =
-                "the targets have a known bug of the paper's published code (--reproduce-bug)";
-            config.notes.push(note.into());
-        }
         Ok(config)
     }
 

@@ -11,7 +11,7 @@ use toml::{Table, Value};
 use crate::overrides::inline;
 
 /// What follows, and from what.
-const FOLLOWS: [(&str, &str); 17] = [
+const FOLLOWS: [(&str, &str); 16] = [
     ("run.world", "is chosen by --env"),
     ("run.agent", "is chosen by --agent"),
     (
@@ -49,10 +49,6 @@ const FOLLOWS: [(&str, &str); 17] = [
         "follows from the world and actor.actions",
     ),
     ("model.dim", "follows from learner.update"),
-    (
-        "replay.reproduced_bug",
-        "is a known bug to train with, and chosen by --reproduce-bug",
-    ),
 ];
 
 /// Where a whole frame's size is, if frames are cut.

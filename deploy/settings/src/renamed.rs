@@ -5,10 +5,7 @@ use driml_machine::error::{Usage, usage};
 use toml::{Table, Value};
 
 /// Table, old key and new key.
-const RENAMED: &[(&str, &str, &str)] = &[
-    ("learner", "batch_rows", "batch_size"),
-    ("replay", "study", "reproduced_bug"),
-];
+const RENAMED: &[(&str, &str, &str)] = &[("learner", "batch_rows", "batch_size")];
 
 /// Gives the settings of an older version the names of today. A file with both names keeps both, for its reader to refuse the
 /// old one.

@@ -1,17 +1,13 @@
 //! From presets or a file, flags and `--set` to the settings of a run.
 //! It fills in no number but those that follow from others and those that the machine decides.
 
-use clap::{
-    Args,
-    builder::{PossibleValue, PossibleValuesParser, TypedValueParser},
-};
+use clap::Args;
 use driml_envs::WorldName;
 use driml_machine::{
     error::{Usage, usage},
     resources::Machine,
     whole_number,
 };
-use driml_replay_server::ReproducedBug;
 use toml::{Table, Value};
 
 use crate::{
@@ -50,30 +46,9 @@ pub struct Flags {
     /// Seed of every generator of the run
     #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = whole_number::within(0..=i64::MAX as u64))]
     pub seed: Option<u64>,
-    /// Train with a known bug of the paper's published code, to see what it does
-    #[arg(long, value_name = "BUG", value_parser = reproduced_bugs())]
-    pub reproduce_bug: Option<ReproducedBug>,
     /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
-}
-
-/// The bugs by their names, with what they are for `--help`.
-fn reproduced_bugs() -> impl TypedValueParser<Value = ReproducedBug> {
-    let named = |bug: ReproducedBug| {
-        let about = match bug {
-            ReproducedBug::BootstrapFromNextState => {
-                "n-step returns that bootstrap from s_{t+1}, with the end of an episode seen at step t alone"
-            }
-        };
-        PossibleValue::new(bug.name()).help(about)
-    };
-    PossibleValuesParser::new(ReproducedBug::ALL.map(named)).map(|name| {
-        let known = ReproducedBug::ALL
-            .into_iter()
-            .find(|bug| bug.name() == name);
-        known.expect("clap lets no other name pass")
-    })
 }
 
 /// Resolves the settings of a run: source, flags, `--set`, what the machine decides, what follows from the rest.
@@ -133,7 +108,6 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
             Override::number(path, value)?.apply(&mut table)?;
         }
     }
-    set_reproduced_bug(&mut table, flags.reproduce_bug)?;
     let capacity_set = set(&mut table, &flags.sets)? || !sized_by_machine;
     derived::precision(&mut table, machine.fast_bf16);
     let note = memory::fit(&mut table, capacity_set, machine)?;
@@ -151,24 +125,6 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
             .extend(presets::prices::note(preset.name, &table));
     }
     Ok(config)
-}
-
-/// Sets the bug to train with; refuses settings that have one without the flag.
-fn set_reproduced_bug(table: &mut Table, asked: Option<ReproducedBug>) -> Result<(), Usage> {
-    let Some(replay) = table.get_mut("replay").and_then(Value::as_table_mut) else {
-        return Ok(());
-    };
-    if let (Some(found), None) = (replay.get("reproduced_bug"), asked) {
-        return Err(usage!(
-            "replay.reproduced_bug = {found}: these settings train with a known bug; add --reproduce-bug {} if that is meant",
-            found.as_str().unwrap_or("BUG")
-        ));
-    }
-    if let Some(bug) = asked {
-        let name = Value::try_from(bug).map_err(|e| usage!("--reproduce-bug as TOML: {e}"))?;
-        replay.insert("reproduced_bug".into(), name);
-    }
-    Ok(())
 }
 
 /// Applies every `--set`; returns whether the replay's capacity was among them.

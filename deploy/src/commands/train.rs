@@ -27,7 +27,7 @@ use driml_settings::{
 use super::join::{NetworkFlag, TlsFlags};
 
 /// What a resumed run has settled.
-const RESUMED: [&str; 11] = [
+const RESUMED: [&str; 10] = [
     "env",
     "agent",
     "preset",
@@ -36,7 +36,6 @@ const RESUMED: [&str; 11] = [
     "replay_shards",
     "envs",
     "seed",
-    "reproduce_bug",
     "run_dir",
     "lockstep",
 ];

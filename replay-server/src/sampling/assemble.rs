@@ -8,7 +8,7 @@ use super::{
     episodes::Window,
     horizon::{self, Affinity},
 };
-use crate::{config::ReproducedBug, storage::ring::Step};
+use crate::storage::ring::Step;
 
 /// The states of a row, as indices in the ring.
 #[derive(Clone, Copy)]
@@ -49,19 +49,17 @@ impl RowStates {
 pub(crate) struct Assembler {
     horizon: Horizon,
     timeout: TimeoutRule,
-    reproduced_bug: Option<ReproducedBug>,
     /// gamma^0 ..= gamma^n.
     discounts: Vec<f64>,
     actions: Vec<u8>,
 }
 
 impl Assembler {
-    pub(crate) fn new(spec: &RunSpec, reproduced_bug: Option<ReproducedBug>) -> Self {
+    pub(crate) fn new(spec: &RunSpec) -> Self {
         let powers = std::iter::successors(Some(1.0), |power| Some(power * spec.gamma));
         Self {
             horizon: spec.horizon,
             timeout: spec.timeout,
-            reproduced_bug,
             discounts: powers.take(spec.n_step as usize + 1).collect(),
             actions: Vec::with_capacity(spec.horizon.k_max() as usize),
         }
@@ -81,12 +79,8 @@ impl Assembler {
             NO_ACTION
         };
         let (n_step_return, follows) = n_step_return(&self.discounts, self.timeout, window.steps());
-        let bootstrap = match self.reproduced_bug {
-            None => follows.map(|i| (i, self.discounts[i])),
-            Some(ReproducedBug::BootstrapFromNextState) => self.next_state(window),
-        };
-        // A state that counts for nothing is none.
-        let bootstrap = bootstrap.filter(|&(_, discount)| discount as f32 != 0.0);
+        // A state that counts for nothing does not travel.
+        let bootstrap = follows.filter(|&i| self.discounts[i] as f32 != 0.0);
         let furthest = self.draw_k(affinity, window, rng).unwrap_or(0);
         let k_first = match self.horizon {
             Horizon::All { .. } => 1,
@@ -94,7 +88,7 @@ impl Assembler {
         };
         let mut states = RowStates {
             t: window.index(0),
-            n: bootstrap.map(|(i, _)| window.index(i)),
+            n: bootstrap.map(|i| window.index(i)),
             k_first,
             positives: 0,
             s_tpk: [0; POSITIVES_MAX],
@@ -108,17 +102,11 @@ impl Assembler {
             action: anchor.action,
             next_action,
             n_step_return: return_f32(n_step_return),
-            bootstrap_discount: bootstrap.map_or(0.0, |(_, discount)| discount as f32),
+            bootstrap_discount: bootstrap.map_or(0.0, |i| self.discounts[i] as f32),
             positives: states.positives as u32,
             k_first,
         };
         (scalars, states)
-    }
-
-    /// s_{t+1} at gamma^n, unless step t ended its episode: the bug of [`ReproducedBug::BootstrapFromNextState`].
-    fn next_state(&self, window: &Window) -> Option<(usize, f64)> {
-        let n = self.discounts.len() - 1;
-        (!window.step(0).end.is_episode_end()).then(|| (1, self.discounts[n]))
     }
 
     /// k, or none where no positive is served or a_t ended its episode or level.

@@ -7,7 +7,7 @@ use driml_protocol::{
     Batch, BatchHeader, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
     Waiting,
 };
-use driml_replay_server::{Compression, PackedBatch, Replay, ReproducedBug, Unready};
+use driml_replay_server::{Compression, PackedBatch, Replay, Unready};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -155,7 +155,6 @@ proptest! {
         horizon in horizons(),
         bootstrap in any::<bool>(),
         lz4 in any::<bool>(),
-        has_bug in any::<bool>(),
         capacity in 24u64..160,
         (actors, streams) in (1u32..4, 1u32..4),
     ) {
@@ -168,10 +167,8 @@ proptest! {
         if lz4 {
             config.compression = Compression::Lz4;
         }
-        config.reproduced_bug = has_bug.then_some(ReproducedBug::BootstrapFromNextState);
         let mut replay = Replay::new(&spec, &config, 8).unwrap();
         let mut history = History::new(&spec, capacity);
-        history.reproduced_bug = config.reproduced_bug;
         let mut known: HashMap<u32, Actor> = HashMap::new();
         let (mut lost, mut retried, mut refused, mut rows_sampled) = (0, 0, 0, 0);
         for _ in 0..150 {

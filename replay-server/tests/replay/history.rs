@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use driml_protocol::{Chunk, ChunkHeader, End, Horizon, NO_ACTION, RunSpec, Sampling, TimeoutRule};
-use driml_replay_server::{Compression, Config, ReproducedBug};
+use driml_replay_server::{Compression, Config};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -24,7 +24,6 @@ pub(crate) type StreamKey = (u8, u8, u8, u8);
 /// Everything that was stored.
 pub(crate) struct History {
     pub(crate) spec: RunSpec,
-    pub(crate) reproduced_bug: Option<ReproducedBug>,
     pub(crate) capacity: u64,
     pub(crate) inserted: u64,
     /// Whether episodes and levels ever end.
@@ -76,7 +75,6 @@ pub(crate) fn unlimited(capacity_transitions: u64) -> Config {
         disk_bytes_max: None,
         fsync_ms: None,
         since: None,
-        reproduced_bug: None,
         replay_ratio: 1e6,
         warmup_transitions: 0,
         slack_transitions: 1 << 40,
@@ -115,7 +113,6 @@ impl History {
     pub(crate) fn new(spec: &RunSpec, capacity: u64) -> Self {
         Self {
             spec: spec.clone(),
-            reproduced_bug: None,
             capacity,
             inserted: 0,
             ends: true,
@@ -255,10 +252,6 @@ impl History {
                 break;
             }
         }
-        let mut power = bootstrap.unwrap_or(0);
-        if self.reproduced_bug == Some(ReproducedBug::BootstrapFromNextState) {
-            (bootstrap, power) = (Some(1).filter(|_| !records[t].end.is_episode_end()), n);
-        }
         let in_level = records[t..]
             .iter()
             .take_while(|record| record.end == End::Running)
@@ -271,7 +264,7 @@ impl History {
                 NO_ACTION
             },
             n_step_return: sum,
-            discount: bootstrap.map_or(0.0, |_| self.spec.gamma.powi(power as i32)),
+            discount: bootstrap.map_or(0.0, |i| self.spec.gamma.powi(i as i32)),
             bootstrap,
             steps_left: in_level.min(self.spec.horizon.k_max() as usize),
         }

@@ -82,7 +82,6 @@ fn config(shards: u32, sampling: Sampling) -> Config {
         slack_transitions: 16,
         transitions_max: (shards == 1).then_some(4096),
         since: None,
-        reproduced_bug: None,
     }
 }
 

@@ -77,7 +77,6 @@ fn config() -> Config {
         slack_transitions: 1 << 40,
         transitions_max: None,
         since: None,
-        reproduced_bug: None,
     }
 }
 

@@ -146,9 +146,6 @@ impl Launch<'_> {
         if shard == 0 {
             args.extend(self.outside.flags());
         }
-        if let Some(bug) = self.config.replay.reproduced_bug {
-            args.extend(words(&["--reproduce-bug", bug.name()]));
-        }
         if self.config.transport.shared_memory && !self.shared_memory {
             args.extend(words(&["--set", "transport.shared_memory=false"]));
         }

@@ -377,7 +377,6 @@ fn flags_come_before_set_and_both_before_the_machine() {
         replay_shards: None,
         frames: Some(7_000),
         seed: Some(5),
-        reproduce_bug: None,
         actors: Some(3),
         envs: Some(2),
         sets: vec!["run.seed=6".into()],
@@ -472,39 +471,6 @@ fn a_compressed_replay_is_bounded_in_bytes_instead() {
     expect!["replay.compressed_bytes_max = 1000 cannot work: one sample spans 8 transitions, which may not compress; use at least 3232128"].assert_eq(&said("replay.compressed_bytes_max=1000"));
     expect!["in the settings' [replay] table: unknown variant `zip`, expected `none` or `lz4`, in `compression`"]
         .assert_eq(&said("replay.compression=zip"));
-}
-
-#[test]
-fn a_known_bug_is_trained_with_only_where_it_is_asked_for() {
-    let plain = with("chain", "c51", &[]).unwrap();
-    assert_eq!(plain.replay.reproduced_bug, None);
-    expect![
-        "replay.reproduced_bug cannot be set by hand: it is a known bug to train with, and chosen by --reproduce-bug"
-    ]
-    .assert_eq(&with("chain", "c51", &["replay.reproduced_bug=bootstrap-from-next-state"]).unwrap_err());
-    let asked = Flags {
-        reproduce_bug: Some(ReproducedBug::BootstrapFromNextState),
-        ..Flags::default()
-    };
-    let faulty = resolve(&source("paper", "chain", "c51"), &asked, &MACHINE).unwrap();
-    assert_eq!(faulty.replay.reproduced_bug, asked.reproduce_bug);
-    assert!(faulty.notes.iter().any(|note| note.contains("known bug")));
-
-    // Nor does a file bring it in by itself.
-    let file = Source::File("faulty.toml".into(), faulty.to_toml());
-    let said = resolve(&file, &Flags::default(), &MACHINE)
-        .unwrap_err()
-        .to_string();
-    assert!(
-        said.contains("add --reproduce-bug bootstrap-from-next-state if that is meant"),
-        "{said}"
-    );
-    assert!(resolve(&file, &asked, &MACHINE).is_ok());
-    let old = faulty.to_toml().replace("reproduced_bug", "study");
-    let old = RunConfig::parse("old.toml", &old).unwrap();
-    assert_eq!(old.replay, faulty.replay);
-    // What was trained with it can still be looked at.
-    assert!(RunConfig::parse("faulty.toml", &faulty.to_toml()).is_ok());
 }
 
 #[test]

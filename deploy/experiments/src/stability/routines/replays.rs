@@ -51,7 +51,6 @@ pub(super) const fn config(capacity_transitions: u64) -> Config {
         slack_transitions: 1 << 40,
         transitions_max: None,
         since: None,
-        reproduced_bug: None,
     }
 }
 
